@@ -1,0 +1,1 @@
+"""tkamb: what happens inside a total knee replacement."""

@@ -1,0 +1,1 @@
+"""The rigid-body side: chain, loads, ligaments, muscles and inverse dynamics."""

@@ -1,0 +1,28 @@
+"""The one error family: what went wrong, where, and how to mend it, in one line."""
+
+
+class TkambError(Exception):
+    """Base of every error that tkamb raises on purpose.
+
+    Args:
+        what: what is wrong.
+        where: file, key or frame number, if there is one.
+        mend: what the user can do about it.
+    """
+
+    exit_status = 1
+
+    def __init__(self, what: str, where: object = None, mend: str | None = None) -> None:
+        self.what, self.where, self.mend = what, where, mend
+        message = what if where is None else f"{where}: {what}"
+        super().__init__(" ".join((message if mend is None else f"{message}; {mend}").split()))
+
+
+class InputError(TkambError):
+    """The user's input cannot be used: exit status 2, nothing written."""
+
+    exit_status = 2
+
+
+class ComputationError(TkambError):
+    """Sound input, but nothing could be computed from it: exit status 1."""

@@ -1,0 +1,1 @@
+"""Surfaces, frames, rays, closest points and sections: what body and contact both need."""

@@ -1,0 +1,93 @@
+"""Poses as 4x4 matrices and the knee coordinates of Grood and Suntay.
+
+`pose_A_in_B` maps points given in frame A to frame B. Every function broadcasts over
+leading axes.
+
+The insert frame is x anterior, y superior, z to the subject's right. For a right knee
+(left knees are mirrored at input) the femoral component stands in it by
+
+    R = Ry(-axial_rotation) Rx(-adduction) Rz(flexion),   t = (ap, si, ml)
+
+flexion about the femoral ML axis (positive in flexion), adduction about the floating axis
+(positive: varus), axial rotation about the tibial SI axis (positive: femur external).
+
+Reference: Grood & Suntay, J Biomech Eng 105:136 (1983), doi:10.1115/1.3138397.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+KNEE_COORDINATES = ("ap", "si", "ml", "axial_rotation", "adduction", "flexion")
+"""Order of the six knee coordinates: translations (m), then rotations (rad)."""
+
+
+def pose(rotation: ArrayLike, translation: ArrayLike) -> Array:
+    """Return the pose(s) (..., 4, 4) with rotation (..., 3, 3) and translation (..., 3)."""
+    rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
+    shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    result = np.zeros((*shape, 4, 4))
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = translation
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def inverse(pose_a_in_b: ArrayLike) -> Array:
+    """Return pose_b_in_a (..., 4, 4)."""
+    pose_a_in_b = np.asarray(pose_a_in_b, float)
+    transposed = np.swapaxes(pose_a_in_b[..., :3, :3], -1, -2)
+    return pose(transposed, -np.einsum("...ij,...j->...i", transposed, pose_a_in_b[..., :3, 3]))
+
+
+def transform(pose_a_in_b: ArrayLike, points: ArrayLike) -> Array:
+    """Return points (n, 3) of frame A in frame B; also (f, 4, 4) with (3,) or (f, n, 3)."""
+    pose_a_in_b, points = np.asarray(pose_a_in_b, float), np.asarray(points, float)
+    rotation, translation = pose_a_in_b[..., :3, :3], pose_a_in_b[..., :3, 3]
+    if points.ndim == 1:
+        return np.einsum("...ij,j->...i", rotation, points) + translation
+    return points @ np.swapaxes(rotation, -1, -2) + translation[..., None, :]
+
+
+def rotate(pose_a_in_b: ArrayLike, vectors: ArrayLike) -> Array:
+    """Return free vectors (n, 3) or (3,) of frame A in frame B."""
+    rotation = np.asarray(pose_a_in_b, float)[..., :3, :3]
+    vectors = np.asarray(vectors, float)
+    if vectors.ndim == 1:
+        return np.einsum("...ij,j->...i", rotation, vectors)
+    return vectors @ np.swapaxes(rotation, -1, -2)
+
+
+def knee_pose(coordinates: ArrayLike) -> Array:
+    """Return pose_femoral_in_insert (..., 4, 4) from knee coordinates (..., 6), m and rad."""
+    c: Any = np.asarray(coordinates, float)
+    angles = np.stack([-c[..., 3], -c[..., 4], c[..., 5]], axis=-1)
+    rotation = Rotation.from_euler("YXZ", angles.reshape(-1, 3)).as_matrix()
+    return pose(rotation.reshape(*c.shape[:-1], 3, 3), c[..., :3])
+
+
+def knee_coordinates(pose_femoral_in_insert: ArrayLike) -> Array:
+    """Return knee coordinates (..., 6) from pose_femoral_in_insert (..., 4, 4).
+
+    Flexion is unwrapped along the first axis so that deep flexion never jumps by 360 deg.
+    """
+    p = np.asarray(pose_femoral_in_insert, float)
+    euler = Rotation.from_matrix(p[..., :3, :3].reshape(-1, 3, 3)).as_euler("YXZ")
+    angles = euler.reshape(*p.shape[:-2], 3) * np.array([-1.0, -1.0, 1.0])
+    if angles.ndim > 1:
+        angles = np.unwrap(angles, axis=0)
+    return np.concatenate([p[..., :3, 3], angles], axis=-1)
+
+
+MIRROR = np.diag([1.0, 1.0, -1.0])
+"""Reflection in the sagittal plane: turns a left knee into a right one, at input."""
+
+
+def mirrored_pose(pose_a_in_b: ArrayLike) -> Array:
+    """Return the pose (..., 4, 4) between the mirrored frames."""
+    p = np.asarray(pose_a_in_b, float)
+    return pose(MIRROR @ p[..., :3, :3] @ MIRROR, p[..., :3, 3] @ MIRROR)

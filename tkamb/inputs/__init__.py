@@ -1,0 +1,1 @@
+"""Files into clean SI objects: patient, motion, force plate, meshes."""

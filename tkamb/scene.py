@@ -1,0 +1,366 @@
+"""The scene: what exists and what is to be modelled. An absent table is not modelled.
+
+A scene is a TOML file. Units are in the key names, paths are relative to the file, an
+unknown key is an error. `load_scene` reads and validates it; nothing else is opened.
+"""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from tkamb.errors import InputError
+
+LengthUnit = Literal["m", "cm", "mm"]
+AngleUnit = Literal["rad", "deg"]
+Vector = tuple[float, float, float]
+ColumnTriple = tuple[str, str, str]
+
+
+def _axes(text: str) -> str:
+    names = [part.strip() for part in text.split(",")]
+    if len(names) != 3 or sorted(n.lstrip("+-") for n in names) != ["x", "y", "z"]:
+        raise ValueError(
+            "must name three different axes for anterior, superior and right, e.g. '-x,+y,-z'"
+        )
+    return ",".join(n if n[0] in "+-" else f"+{n}" for n in names)
+
+
+Axes = Annotated[str, AfterValidator(_axes)]
+
+
+class _Table(BaseModel):
+    """A table of the scene file: frozen, and unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class PatientTable(_Table):
+    """Who it is. The URDF holds the chain ankle-tibia-femur-patella."""
+
+    urdf: Path
+    side: Literal["right", "left"] = Field(description="the knee that is modelled")
+    mass_kg: float = Field(gt=0, description="body mass; forces in BW are relative to it")
+    sex: Literal["male", "female"] | None = Field(
+        None, description="only for segments without <inertial>: picks the de Leva table"
+    )
+    height_mm: float | None = Field(None, gt=0)
+
+
+class MotionTable(_Table):
+    """The knee's recorded motion.
+
+    `interpretation = "coordinates"`: columns are the six knee coordinates (Grood-Suntay) of
+    the femoral component in the insert frame. `"pose"`: columns are a rotation sequence and
+    a translation that place the femoral mesh in the insert mesh's own axes.
+    """
+
+    file: Path
+    format: Literal["csv", "sto", "mot"] | None = Field(None, description="default: the suffix")
+    interpretation: Literal["coordinates", "pose"] = "coordinates"
+    sequence: str | None = Field(
+        None,
+        pattern="^[xyzXYZ]{3}$",
+        description="pose only: upper case = intrinsic, as in scipy ('XYZ' is Rx Ry Rz)",
+    )
+    columns: dict[str, str] = Field(
+        default_factory=dict,
+        description=(
+            "role -> column name, where it differs from the role. Roles: time, flexion, "
+            "adduction, axial_rotation, ap, si, ml (coordinates); time, rotation_1..3, "
+            "translation_1..3 (pose); patella_ap, patella_si, patella_rotation"
+        ),
+    )
+    angle_unit: AngleUnit
+    length_unit: LengthUnit
+    cutoff_Hz: float | Literal["none"] = Field(
+        description="low-pass cut-off of the differentiation; 'none' trusts the samples"
+    )
+    cycle_s: tuple[float, float] | None = Field(
+        None,
+        description="the motion's time column is per cent of a cycle, which lies on this interval",
+    )
+    cycle_offset_percent: float = Field(0.0, description="per cent of the cycle at cycle_s[0]")
+    frames: int | None = Field(
+        None, ge=2, description="resample to so many frames; default: as recorded"
+    )
+
+    @model_validator(mode="after")
+    def _sequence_goes_with_pose(self) -> Self:
+        if (self.interpretation == "pose") != (self.sequence is not None):
+            raise ValueError("'sequence' belongs to interpretation = 'pose', and is needed there")
+        return self
+
+
+class TibiaTable(_Table):
+    """How the shank stands in the laboratory (x forward, y up, z right).
+
+    One of: `sagittal` (a lean angle about z over a fixed ankle), `pose` (columns of a
+    file), `markers` (rigid fit of shank markers).
+    """
+
+    kind: Literal["sagittal", "pose", "markers"]
+    file: Path
+    columns: dict[str, str] = Field(
+        default_factory=dict,
+        description="role -> column: time, angle | time, rotation_1..3, translation_1..3",
+    )
+    sequence: str | None = Field(None, pattern="^[xyzXYZ]{3}$")
+    angle_unit: AngleUnit = "deg"
+    length_unit: LengthUnit | None = None
+    ankle_mm: Vector = Field((0.0, 0.0, 0.0), description="sagittal: the fixed ankle in the lab")
+    markers: dict[str, Vector] = Field(
+        default_factory=dict, description="markers: name -> position in the tibia link"
+    )
+    markers_unit: LengthUnit = "mm"
+    laboratory_axes: Axes = Field(
+        "+x,+y,+z", description="axes of the file that point forward, up and right"
+    )
+
+
+class GroundReactionTable(_Table):
+    """The force that the ground exerts on the foot, in laboratory axes."""
+
+    file: Path
+    format: Literal["csv", "sto", "mot"] | None = None
+    columns: dict[str, str] = Field(
+        default_factory=dict,
+        description=(
+            "role -> column: time, force_1..3 (N, forward-up-right after laboratory_axes), "
+            "point_1..3 (centre of pressure), moment_1..3 (free moment at that point; optional)"
+        ),
+    )
+    length_unit: LengthUnit
+    laboratory_axes: Axes = "+x,+y,+z"
+    applied: Literal["cop", "ankle"] = Field(
+        "cop", description="'ankle' applies the force alone at the ankle centre (the source)"
+    )
+    cutoff_Hz: float | Literal["none"]
+
+
+class FemoralImplantTable(_Table):
+    """Femoral component: its mesh and where it sits on the femur link."""
+
+    mesh: Path
+    unit: LengthUnit
+    axes: Axes = "+x,+y,+z"
+    position_mm: Vector = Field(
+        (0.0, 0.0, 0.0), description="mesh origin in the femur link, anatomical axes"
+    )
+    rotation_deg: Vector = Field((0.0, 0.0, 0.0), description="intrinsic x-y-z, after axes")
+
+
+class InsertImplantTable(_Table):
+    """Insert: its mesh gives the insert frame (centre of the flat bottom's rectangle)."""
+
+    mesh: Path
+    unit: LengthUnit
+    axes: Axes = "+x,+y,+z"
+    bearing: Literal["fixed", "mobile"] = "fixed"
+
+
+class PatellarImplantTable(_Table):
+    """Patellar button: its mesh and where it sits on the patella link."""
+
+    mesh: Path
+    unit: LengthUnit
+    axes: Axes = "+x,+y,+z"
+    position_mm: Vector = (0.0, 0.0, 0.0)
+    rotation_deg: Vector = (0.0, 0.0, 0.0)
+
+
+class ImplantTable(_Table):
+    """The parts of the implant."""
+
+    femoral: FemoralImplantTable | None = None
+    insert: InsertImplantTable | None = None
+    patella: PatellarImplantTable | None = None
+
+
+class Attachment(_Table):
+    """A point fixed to a link of the URDF."""
+
+    link: str
+    point_mm: Vector
+
+
+class LigamentTable(_Table):
+    """One bundle: tension only, on a straight line.
+
+    `law = "two-line"` (Shin 2007, the source) takes `stiffness_N_per_mm`;
+    `law = "quadratic-toe"` (Blankevoort 1991) takes `stiffness_N_per_strain`.
+    """
+
+    name: str = Field(pattern="^[A-Za-z0-9_]+$")
+    proximal: Attachment
+    distal: Attachment
+    law: Literal["two-line", "quadratic-toe"]
+    stiffness_N_per_mm: float | None = Field(None, gt=0)
+    stiffness_N_per_strain: float | None = Field(None, gt=0)
+    slack_length_mm: float | None = Field(None, gt=0)
+    reference_strain: float | None = Field(
+        None, gt=-1, description="instead of slack_length_mm: strain at the reference pose"
+    )
+    reference_flexion_deg: float = Field(
+        0.0, description="the recorded frame nearest to this flexion is the reference pose"
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        wanted = (
+            self.stiffness_N_per_mm if self.law == "two-line" else self.stiffness_N_per_strain
+        )
+        other = self.stiffness_N_per_strain if self.law == "two-line" else self.stiffness_N_per_mm
+        if wanted is None or other is not None:
+            unit = "N_per_mm" if self.law == "two-line" else "N_per_strain"
+            raise ValueError(f"law '{self.law}' takes stiffness_{unit}, and only that")
+        if (self.slack_length_mm is None) == (self.reference_strain is None):
+            raise ValueError("give either slack_length_mm or reference_strain")
+        return self
+
+
+class QuadricepsTable(_Table):
+    """Quadriceps line: from the vastus intermedius origin to the patella."""
+
+    origin: Attachment
+    insertion: Attachment
+
+
+class PatellarLigamentTable(_Table):
+    """Patellar ligament line: from the patella to the tibial tuberosity."""
+
+    proximal: Attachment
+    distal: Attachment
+
+
+class PatellaTable(_Table):
+    """Whether the patella's sagittal motion was recorded or is to be found."""
+
+    motion: Literal["recorded", "solved"]
+
+
+class ContactTable(_Table):
+    """The femorotibial contact."""
+
+    model: str = Field(description="a name of `tkamb contact list`")
+    resolution_mm: float = Field(1.0, gt=0)
+    material: str = Field("polyethylene", description="a name of `tkamb.contact.materials`")
+    friction: float = Field(0.05, ge=0, le=1, description="Coulomb coefficient")
+    adjust: bool = Field(False, description="femoral adjustment before contact")
+    coupling: Literal["none", "points"] = "none"
+    options: dict[str, Any] = Field(default_factory=dict, description="the model's own options")
+
+
+class OutputTable(_Table):
+    """What is written and how it is read."""
+
+    directory: Path | None = None
+    yield_stress_MPa: float = Field(21.0, gt=0)
+    axis: Literal["flexion", "cycle", "time"] = Field(
+        "flexion", description="the report's horizontal axis"
+    )
+    notes: list[str] = Field(default_factory=list, description="printed in the report")
+
+
+class Scene(_Table):
+    """Everything a run needs to know; see the tables."""
+
+    patient: PatientTable
+    motion: MotionTable
+    tibia: TibiaTable | None = None
+    ground_reaction: GroundReactionTable | None = None
+    implant: ImplantTable = ImplantTable()
+    ligament: tuple[LigamentTable, ...] = ()
+    quadriceps: QuadricepsTable | None = None
+    patellar_ligament: PatellarLigamentTable | None = None
+    patella: PatellaTable | None = None
+    contact: ContactTable | None = None
+    output: OutputTable = OutputTable()
+
+    @model_validator(mode="after")
+    def _belongs_together(self) -> Self:
+        names = [ligament.name for ligament in self.ligament]
+        if len(names) != len(set(names)):
+            raise ValueError("two [[ligament]] tables have the same name")
+        parts = (self.quadriceps, self.patellar_ligament, self.patella)
+        if any(parts) and not all(parts):
+            raise ValueError(
+                "[quadriceps], [patellar_ligament] and [patella] go together: give all or none"
+            )
+        if self.contact and not (self.implant.femoral and self.implant.insert):
+            raise ValueError("[contact] needs [implant.femoral] and [implant.insert]")
+        if self.ground_reaction and not self.tibia:
+            raise ValueError("[ground_reaction] needs [tibia]: how the shank stands in the lab")
+        return self
+
+
+def load_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> Scene:
+    """Read and validate a scene file.
+
+    Args:
+        path: a TOML file; paths inside it are relative to its folder.
+        overrides: dotted key ("contact.model") -> value, applied before validation.
+
+    Raises:
+        InputError: unreadable file, unknown key, missing unit, value out of range.
+    """
+    path = Path(path)
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError("no such scene file", path, "check the path") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read ({error})", path) from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"is not TOML ({error})", path) from None
+    for key, value in (overrides or {}).items():
+        _override(content, key, value)
+    try:
+        scene = Scene.model_validate(content)
+    except ValidationError as error:
+        raise InputError(_first_complaint(error), path, _count(error)) from None
+    return _resolved(scene, path.parent)
+
+
+def scene_schema() -> dict[str, Any]:
+    """Return the JSON schema of the scene file."""
+    return Scene.model_json_schema()
+
+
+def _override(content: dict[str, Any], dotted: str, value: Any) -> None:
+    *tables, key = dotted.split(".")
+    for name in tables:
+        content = content.setdefault(name, {})
+        if not isinstance(content, dict):
+            raise InputError(f"'{dotted}' does not lead through tables", "--set")
+    content[key] = value
+
+
+def _first_complaint(error: ValidationError) -> str:
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return f"unknown key '{where}'"
+    if first["type"] == "missing":
+        return f"missing key '{where}'"
+    message = first["msg"].removeprefix("Value error, ")
+    return f"'{where}': {message}" if where else message
+
+
+def _count(error: ValidationError) -> str:
+    more = error.error_count() - 1
+    advice = "`tkamb scene --schema` lists every key"
+    return advice if more == 0 else f"{advice} ({more} more after this one)"
+
+
+def _resolved(model: Any, folder: Path) -> Any:
+    """Return the model with its paths made absolute against the scene's folder."""
+    changed: dict[str, Any] = {}
+    for name in type(model).model_fields:
+        value = getattr(model, name)
+        if isinstance(value, Path):
+            changed[name] = (folder / value).absolute()
+        elif isinstance(value, _Table):
+            changed[name] = _resolved(value, folder)
+    return model.model_copy(update=changed) if changed else model

@@ -1,0 +1,15 @@
+"""Units at the file edges; inside the package everything is SI and radians."""
+
+import math
+
+MILLIMETRE = 1e-3
+MEGAPASCAL = 1e6
+DEGREE = math.pi / 180.0
+STANDARD_GRAVITY = 9.80665
+"""Standard gravity, m/s² (CGPM 1901)."""
+
+LENGTH = {"m": 1.0, "cm": 1e-2, "mm": MILLIMETRE}
+"""Metres per unit of length."""
+
+ANGLE = {"rad": 1.0, "deg": DEGREE}
+"""Radians per unit of angle."""
