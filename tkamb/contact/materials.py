@@ -1,0 +1,288 @@
+"""What the insert is made of: one-dimensional stress-strain laws and Poisson's ratio.
+
+The laws relate true (Cauchy) stress to true (logarithmic) strain, odd-symmetric in tension
+and compression, as the polyethylene data were measured and fitted. A model that works in
+small strain feeds its engineering strain instead and says so (the two differ by 5 % at 10 %
+strain). Loading and unloading follow the same curve: no hysteresis, no set.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import PchipInterpolator
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.units import MEGAPASCAL
+
+
+class StressStrainLaw(Protocol):
+    """The shape of a stress-strain curve whose slope at the origin is Young's modulus."""
+
+    def stress(self, strain: Array, young_modulus: float) -> Array:
+        """Return stress, Pa."""
+
+    def tangent(self, strain: Array, young_modulus: float) -> Array:
+        """Return d stress / d strain, Pa."""
+
+
+@dataclass(frozen=True)
+class LinearElastic:
+    """Hooke: sigma = E eps, at any strain."""
+
+    def stress(self, strain: Array, young_modulus: float) -> Array:
+        """Return stress, Pa."""
+        return young_modulus * strain
+
+    def tangent(self, strain: Array, young_modulus: float) -> Array:
+        """Return the constant tangent, Pa."""
+        return np.full_like(strain, young_modulus)
+
+
+@dataclass(frozen=True)
+class RambergOsgood:
+    """Ramberg and Osgood: eps = sigma/E + alpha (|sigma|/sigma0)^(n-1) sigma/E.
+
+    Stress is found by Newton's method from above on the convex increasing function
+    u + alpha u^n = E |eps| / sigma0, u = |sigma|/sigma0, which never overshoots, to machine
+    precision. Defined for every finite strain up to 1000; NaN stays NaN. Beyond the strain
+    that was measured the curve is an extrapolation, and it has no barrier at -100 %.
+
+    Args:
+        alpha: yield offset, >= 0.
+        reference_stress: sigma0, Pa.
+        exponent: n, >= 1.
+
+    Reference: Ramberg & Osgood, NACA Technical Note 902 (1943).
+    """
+
+    alpha: float
+    reference_stress: float
+    exponent: float
+
+    def __post_init__(self) -> None:
+        if not (self.alpha >= 0 and self.reference_stress > 0 and self.exponent >= 1):
+            raise InputError(
+                f"alpha={self.alpha}, reference_stress={self.reference_stress}, "
+                f"exponent={self.exponent} is no Ramberg-Osgood law",
+                "material",
+                "alpha >= 0, reference_stress > 0 and exponent >= 1 are needed",
+            )
+
+    def stress(self, strain: Array, young_modulus: float) -> Array:
+        """Return stress, Pa."""
+        return np.sign(strain) * self.reference_stress * self._ratio(strain, young_modulus)
+
+    def tangent(self, strain: Array, young_modulus: float) -> Array:
+        """Return d sigma / d eps = E / (1 + alpha n u^(n-1)), Pa."""
+        ratio = self._ratio(strain, young_modulus)
+        softening = self.alpha * self.exponent * ratio ** (self.exponent - 1)
+        return np.asarray(young_modulus / (1 + softening))
+
+    def _ratio(self, strain: Array, young_modulus: float) -> Array:
+        """Return u = |sigma| / sigma0."""
+        elastic = np.abs(strain) * (young_modulus / self.reference_stress)
+        if self.alpha == 0:
+            return elastic
+        ratio = np.minimum(elastic, (elastic / self.alpha) ** (1 / self.exponent))
+        for _ in range(60):
+            power = self.alpha * ratio ** (self.exponent - 1)
+            step = (ratio + power * ratio - elastic) / (1 + self.exponent * power)
+            ratio = np.maximum(ratio - step, 0.0)
+            if not np.any(np.abs(step) > 2e-16 * ratio):
+                break
+        return ratio
+
+
+@dataclass(frozen=True)
+class TabulatedLaw:
+    """A measured true stress-strain curve, monotone and once differentiable (PCHIP).
+
+    The table is mirrored through the origin, scaled so that its slope there is 1, and
+    multiplied by Young's modulus: changing E scales the whole curve. Beyond the last point
+    it goes on straight with the slope of that point.
+
+    Args:
+        strain: increasing, from 0.
+        values: stress at those strains, Pa, not falling, from 0.
+    """
+
+    strain: tuple[float, ...]
+    values: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        strain, values = np.asarray(self.strain, float), np.asarray(self.values, float)
+        sound = (
+            strain.ndim == 1
+            and strain.shape == values.shape
+            and len(strain) >= 2
+            and np.isfinite([strain, values]).all()
+            and strain[0] == values[0] == 0
+            and (np.diff(strain) > 0).all()
+            and (np.diff(values) >= 0).all()
+            and values[1] > 0
+        )
+        if not sound:
+            raise InputError(
+                "is no stress-strain table",
+                "material",
+                "give two equally long finite columns from (0, 0), strain increasing, "
+                "stress not falling",
+            )
+
+    @cached_property
+    def _curve(self) -> PchipInterpolator:
+        strain, values = np.asarray(self.strain, float), np.asarray(self.values, float)
+        return PchipInterpolator(
+            np.concatenate([-strain[:0:-1], strain]), np.concatenate([-values[:0:-1], values])
+        )
+
+    @cached_property
+    def _slope(self) -> PchipInterpolator:
+        return self._curve.derivative()
+
+    @cached_property
+    def young_modulus(self) -> float:
+        """Slope of the table at the origin, Pa."""
+        return float(self._slope(0.0))
+
+    def stress(self, strain: Array, young_modulus: float) -> Array:
+        """Return stress, Pa."""
+        inside = np.clip(strain, -self.strain[-1], self.strain[-1])
+        beyond = (strain - inside) * self._slope(self.strain[-1])
+        return np.asarray((self._curve(inside) + beyond) * (young_modulus / self.young_modulus))
+
+    def tangent(self, strain: Array, young_modulus: float) -> Array:
+        """Return d stress / d strain, Pa."""
+        inside = np.clip(strain, -self.strain[-1], self.strain[-1])
+        return np.asarray(self._slope(inside) * (young_modulus / self.young_modulus))
+
+
+@dataclass(frozen=True)
+class Material:
+    """An isotropic material with a one-dimensional stress-strain law.
+
+    Args:
+        name: what to call it.
+        young_modulus: E, Pa, the slope at the origin.
+        poisson_ratio: nu, -1 < nu < 0.5.
+        law: shape of the curve.
+
+    Raises:
+        InputError: E not positive and finite, or nu out of range.
+    """
+
+    name: str
+    young_modulus: float
+    poisson_ratio: float
+    law: StressStrainLaw = LinearElastic()
+
+    def __post_init__(self) -> None:
+        if not 0 < self.young_modulus < np.inf:
+            raise InputError(
+                f"Young's modulus {self.young_modulus} Pa", f"material '{self.name}'", "give > 0"
+            )
+        if not -1 < self.poisson_ratio < 0.5:
+            raise InputError(
+                f"Poisson's ratio {self.poisson_ratio}",
+                f"material '{self.name}'",
+                "give a value between -1 and 0.5",
+            )
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether stress is proportional to strain."""
+        return isinstance(self.law, LinearElastic)
+
+    @property
+    def shear_modulus(self) -> float:
+        """G = E / (2 (1 + nu)), Pa, at the origin."""
+        return self.young_modulus / (2 * (1 + self.poisson_ratio))
+
+    @property
+    def bulk_modulus(self) -> float:
+        """K = E / (3 (1 - 2 nu)), Pa, at the origin."""
+        return self.young_modulus / (3 * (1 - 2 * self.poisson_ratio))
+
+    @property
+    def confined_modulus(self) -> float:
+        """M = E (1 - nu) / ((1 + nu)(1 - 2 nu)), Pa: no lateral strain, at the origin."""
+        nu = self.poisson_ratio
+        return self.young_modulus * (1 - nu) / ((1 + nu) * (1 - 2 * nu))
+
+    def stress(self, strain: ArrayLike) -> Array:
+        """Return stress (Pa) at strain, any shape, positive in tension."""
+        return self.law.stress(np.asarray(strain, float), self.young_modulus)
+
+    def tangent(self, strain: ArrayLike) -> Array:
+        """Return d stress / d strain (Pa) at strain, any shape."""
+        return self.law.tangent(np.asarray(strain, float), self.young_modulus)
+
+    def secant(self, strain: ArrayLike) -> Array:
+        """Return stress / strain (Pa) at strain, any shape; E where strain is 0."""
+        strain = np.asarray(strain, float)
+        zero = strain == 0
+        ratio = self.stress(strain) / np.where(zero, 1.0, strain)
+        return np.where(zero, self.young_modulus, ratio)
+
+
+_POLYETHYLENE = {
+    "young_modulus": 561.5 * MEGAPASCAL,
+    "poisson_ratio": 0.45,
+    "alpha": 0.0389,
+    "reference_stress": 8.4194 * MEGAPASCAL,
+    "exponent": 4.5485,
+}
+"""The source's fit (section 5.2) to the true stress-strain data of Halloran et al., J Biomech
+38:323 (2005), doi:10.1016/j.jbiomech.2004.02.046."""
+
+MATERIALS = {
+    "polyethylene": "Ramberg-Osgood fit to true stress-strain of UHMWPE, E 561.5 MPa, nu 0.45",
+    "polyethylene-linear": "linear elastic, E 561.5 MPa, nu 0.45",
+}
+"""Names that `material` knows, and what they are."""
+
+
+def material(name: str, **overrides: float) -> Material:
+    """Return the material of that name.
+
+    Args:
+        name: a key of `MATERIALS`.
+        overrides: young_modulus (Pa), poisson_ratio; for "polyethylene" also alpha,
+            reference_stress (Pa), exponent.
+
+    Raises:
+        InputError: unknown name or override, or a value out of range.
+    """
+    if name not in MATERIALS:
+        raise InputError(f"no material '{name}'", mend=f"there are: {', '.join(MATERIALS)}")
+    linear = name == "polyethylene-linear"
+    allowed = ("young_modulus", "poisson_ratio") if linear else tuple(_POLYETHYLENE)
+    for key in overrides:
+        if key not in allowed:
+            raise InputError(
+                f"material '{name}' has no '{key}'", mend=f"it has: {', '.join(allowed)}"
+            )
+    values = {**_POLYETHYLENE, **overrides}
+    law: StressStrainLaw = LinearElastic()
+    if not linear:
+        law = RambergOsgood(values["alpha"], values["reference_stress"], values["exponent"])
+    return Material(name, values["young_modulus"], values["poisson_ratio"], law)
+
+
+def tabulated_material(
+    name: str, strain: ArrayLike, stress: ArrayLike, poisson_ratio: float
+) -> Material:
+    """Return a material from a true stress-strain table (n,), (n,) Pa; see `TabulatedLaw`.
+
+    Raises:
+        InputError: the table does not rise from (0, 0).
+    """
+    law = TabulatedLaw(
+        tuple(np.asarray(strain, float).ravel().tolist()),
+        tuple(np.asarray(stress, float).ravel().tolist()),
+    )
+    return Material(name, law.young_modulus, poisson_ratio, law)
