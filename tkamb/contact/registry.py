@@ -1,0 +1,112 @@
+"""Contact models by name: the built-in ones and those of other packages.
+
+A built-in is one row here, "name": "module:Class", imported only when asked for. Another
+package offers a model through the entry-point group `tkamb.contact`:
+
+    [project.entry-points."tkamb.contact"]
+    my-model = "my_package.my_module:MyModel"
+"""
+
+import math
+from dataclasses import fields
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from tkamb.contact.model import ContactModel
+from tkamb.errors import InputError
+from tkamb.units import MILLIMETRE
+
+ENTRY_POINT_GROUP = "tkamb.contact"
+
+BUILT_IN = {
+    "hertz": "tkamb.contact.hertz:Hertz",
+    "foundation": "tkamb.contact.foundation:ElasticFoundation",
+    "foundation-linear": "tkamb.contact.foundation:LinearFoundation",
+}
+
+
+def contact_names() -> tuple[str, ...]:
+    """Return the names of all contact models, built-in ones first.
+
+    Raises:
+        InputError: two packages offer the same name.
+    """
+    return tuple(_offers())
+
+
+def contact_class(name: str) -> type[ContactModel]:
+    """Return the class behind a name.
+
+    Raises:
+        InputError: no such name, a name clash, or the class cannot be imported.
+    """
+    offers = _offers()
+    if name not in offers:
+        raise InputError(f"no contact model '{name}'", mend=f"there are: {', '.join(offers)}")
+    where = f"contact model '{name}' ({offers[name]})"
+    module, _, attribute = offers[name].partition(":")
+    try:
+        found = getattr(import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"cannot be loaded ({error})", where, "install what it needs") from error
+    if not (isinstance(found, type) and issubclass(found, ContactModel)):
+        raise InputError("is not a subclass of tkamb.contact.model.ContactModel", where)
+    return found
+
+
+def contact_model(name: str, resolution_mm: float = 1.0, **options: Any) -> ContactModel:
+    """Return the contact model of that name.
+
+    Args:
+        name: one of `contact_names()`.
+        resolution_mm: spacing of its map points, mm.
+        options: the model's own options, the fields of its class (SI).
+
+    Raises:
+        InputError: no such name or option, or a resolution that is not positive.
+    """
+    found = contact_class(name)
+    if not (math.isfinite(resolution_mm) and resolution_mm > 0):
+        raise InputError(f"resolution {resolution_mm} mm", f"contact model '{name}'", "give > 0")
+    known = [field.name for field in fields(found) if field.init]  # type: ignore[arg-type]
+    for option in options:
+        if option not in known:
+            raise InputError(
+                f"has no option '{option}'",
+                f"contact model '{name}'",
+                f"it has: {', '.join(known)}",
+            )
+    return found(resolution=resolution_mm * MILLIMETRE, **options)  # type: ignore[call-arg]
+
+
+def contact_descriptions() -> dict[str, str]:
+    """Return for every name one line: what the model assumes and what it needs.
+
+    A model that cannot be loaded says so in its line.
+    """
+    lines = {}
+    for name in contact_names():
+        try:
+            found = contact_class(name)
+            lines[name] = f"assumes {found.assumes}; needs {found.needs}"
+        except InputError as error:
+            lines[name] = str(error)
+    return lines
+
+
+def _offers() -> dict[str, str]:
+    """Return name -> "module:Class"."""
+    offers = dict(BUILT_IN)
+    for point in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: p.name):
+        known = offers.setdefault(point.name, point.value)
+        if known != point.value:
+            raise InputError(
+                f"two contact models are called '{point.name}': {known} and {_origin(point)}",
+                mend="uninstall or rename one",
+            )
+    return offers
+
+
+def _origin(point: EntryPoint) -> str:
+    return point.value if point.dist is None else f"{point.value} of {point.dist.name}"
