@@ -1,0 +1,152 @@
+"""The rigid-body chain in Pinocchio: motion in, inertial forces and load columns out.
+
+The root is always free (a free-flyer), so that the measured ground reaction enters as a
+load; an ankle joint in the URDF is locked, its motion is the root's.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from tkamb.body.load import PointForces
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, inverse, rotate, transform
+
+KNEE = ("knee_ap", "knee_si", "knee_ml", "knee_axial_rotation", "knee_adduction", "knee_flexion")
+PATELLA = ("patella_ap", "patella_si", "patella_rotation")
+
+
+@dataclass(frozen=True, eq=False)
+class ChainMotion:
+    """Where the chain is at one instant, SI.
+
+    Args:
+        tibia: (4, 4) pose_tibia_in_laboratory (x forward, y up, z right).
+        tibia_velocity: (6,) spatial velocity (linear, angular) in the tibia's own frame.
+        tibia_acceleration: (6,) spatial acceleration, same frame.
+        joints: (3, 6) or (3, 9): knee (and patella) coordinates, rates, accelerations.
+    """
+
+    tibia: Array
+    tibia_velocity: Array
+    tibia_acceleration: Array
+    joints: Array
+
+
+class Chain:
+    """The patient as a Pinocchio model with a free root.
+
+    Args:
+        urdf: text of a checked URDF (`tkamb.inputs.patient.load_urdf`).
+        with_patella: whether the patella moves, or rides on the femur at its neutral pose.
+        gravity: m/s², downwards in the laboratory.
+    """
+
+    def __init__(self, urdf: str, with_patella: bool, gravity: float = 9.80665) -> None:
+        try:
+            full = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
+        except (ValueError, RuntimeError) as error:
+            raise InputError(f"Pinocchio cannot build the chain ({error})", "URDF") from None
+        self.joints = KNEE + (PATELLA if with_patella else ())
+        keep = {"universe", "root_joint", *self.joints}
+        lock = [full.getJointId(name) for name in full.names if name not in keep]
+        model = pin.buildReducedModel(full, lock, pin.neutral(full)) if lock else full
+        model.gravity = pin.Motion(np.array([0.0, -gravity, 0.0]), np.zeros(3))
+        self.model = model
+        self._columns = [model.joints[model.getJointId(name)].idx_v for name in self.joints]
+        base = model.getJointId("knee_ap")
+        self._insert_in_root = model.jointPlacements[base].homogeneous
+        self._tibia_in_root = model.frames[self.frame_id("tibia")].placement.homogeneous
+
+    def frame_id(self, link: str) -> int:
+        """Return Pinocchio's id of a link's frame, or raise InputError naming the links."""
+        if not self.model.existFrame(link, pin.FrameType.BODY):
+            names = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
+            raise InputError(f"no link '{link}' in the URDF", None, f"links: {', '.join(names)}")
+        return int(self.model.getFrameId(link, pin.FrameType.BODY))
+
+    @property
+    def insert_in_tibia(self) -> Array:
+        """pose_insert_in_tibia (4, 4)."""
+        return inverse(self._tibia_in_root) @ self._insert_in_root
+
+    def knee_columns(self) -> list[int]:
+        """Rows of the generalised force that belong to the six knee coordinates."""
+        return self._columns[:6]
+
+    def at(self, motion: ChainMotion) -> "ChainState":
+        """Return the chain at one instant, with its inertial forces."""
+        model = self.model
+        root_in_tibia = pin.SE3(inverse(self._tibia_in_root))
+        q, v, a = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
+        q[:7] = pin.SE3ToXYZQUAT(pin.SE3(motion.tibia) * root_in_tibia)
+        v[:6] = root_in_tibia.actInv(pin.Motion(motion.tibia_velocity)).vector
+        a[:6] = root_in_tibia.actInv(pin.Motion(motion.tibia_acceleration)).vector
+        for name, column, (x, rate, acceleration) in zip(
+            self.joints, self._columns, motion.joints.T, strict=True
+        ):
+            q[model.joints[model.getJointId(name)].idx_q] = x
+            v[column], a[column] = rate, acceleration
+        return ChainState(self, q, v, a)
+
+
+class ChainState:
+    """The chain at one instant. Poses and loads are in the insert frame.
+
+    Attributes:
+        inertial: (nv,) RNEA(q, v, a): what gravity and inertia ask of all loads together.
+    """
+
+    def __init__(self, chain: Chain, q: Array, v: Array, a: Array) -> None:
+        self.chain, self.q, self.v, self.a = chain, q, v, a
+        self.data = chain.model.createData()
+        self.inertial: Array = pin.rnea(chain.model, self.data, q, v, a).copy()
+        pin.computeJointJacobians(chain.model, self.data, q)
+        pin.updateFramePlacements(chain.model, self.data)
+        root = self.data.oMi[chain.model.getJointId("root_joint")].homogeneous
+        self.insert_in_laboratory: Array = root @ chain._insert_in_root
+        self._jacobians: dict[int, tuple[Array, Array]] = {}
+
+    @cached_property
+    def laboratory_in_insert(self) -> Array:
+        """pose_laboratory_in_insert (4, 4)."""
+        return inverse(self.insert_in_laboratory)
+
+    def pose(self, link: str) -> Array:
+        """Return pose_link_in_insert (4, 4)."""
+        placement = self.data.oMf[self.chain.frame_id(link)].homogeneous
+        return self.laboratory_in_insert @ placement
+
+    def point(self, link: str, point: Array) -> Array:
+        """Return a point (3,) of a link in the insert frame."""
+        return transform(self.pose(link), point)
+
+    def generalised(self, load: PointForces) -> Array:
+        """Return J^T w (nv,): the generalised force of a load given in the insert frame."""
+        jacobian, joint_in_insert = self._joint(load.link)
+        force_and_moment = load.wrench_at(joint_in_insert[:3, 3])
+        turn = joint_in_insert[:3, :3]
+        local = np.concatenate([force_and_moment[:3] @ turn, force_and_moment[3:] @ turn])
+        return np.asarray(jacobian.T @ local)
+
+    def ground_reaction(self, force: Array, point: Array, moment: Array) -> PointForces:
+        """Return a laboratory force (3,), its point (3,) and moment (3,) as load on the tibia."""
+        here = self.laboratory_in_insert
+        return PointForces(
+            "tibia",
+            transform(here, point)[None],
+            rotate(here, force)[None],
+            rotate(here, moment),
+        )
+
+    def _joint(self, link: str) -> tuple[Array, Array]:
+        """Return the local Jacobian (6, nv) and pose in the insert of a link's joint."""
+        joint = self.chain.model.frames[self.chain.frame_id(link)].parentJoint
+        if joint not in self._jacobians:
+            model, data = self.chain.model, self.data
+            jacobian = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL)
+            pose_in_insert = self.laboratory_in_insert @ data.oMi[joint].homogeneous
+            self._jacobians[joint] = (jacobian, pose_in_insert)
+        return self._jacobians[joint]

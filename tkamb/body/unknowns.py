@@ -1,0 +1,135 @@
+"""The unknown loads of the knee, each a line of action or an axis, per unit magnitude.
+
+All points and directions are in the insert frame, SI. A pair of loads is equal and
+opposite, so that only the hip and the ground act on the leg from outside.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tkamb.body.inverse_dynamics import Unknown
+from tkamb.body.load import PointForces
+from tkamb.geometry.frames import Array
+
+AXES = {"ap": np.array([1.0, 0, 0]), "si": np.array([0, 1.0, 0]), "ml": np.array([0, 0, 1.0])}
+"""Insert axes: x anterior, y superior, z to the right."""
+
+STANDSTILL = 1e-3
+"""m/s: friction fades below this sliding speed, where its direction is not defined."""
+
+
+@dataclass(frozen=True, eq=False)
+class CondylePoint:
+    """Where one condyle touches the insert.
+
+    Args:
+        point: (3,) m.
+        normal: (3,) unit, out of the insert into the femur.
+        sliding: (3,) m/s, velocity of the femur's point relative to the insert's.
+        gap: m, positive when apart.
+    """
+
+    point: Array
+    normal: Array
+    sliding: Array
+    gap: float
+
+    def direction(self, friction: float) -> Array:
+        """Return the contact force on the femur (3,) per unit normal force.
+
+        n - mu t, with t = v / sqrt(|v|² + v0²) for the tangential velocity v: Coulomb
+        friction against the sliding, fading below v0 = 1 mm/s.
+        """
+        tangential = self.sliding - (self.sliding @ self.normal) * self.normal
+        speed = np.sqrt(tangential @ tangential + STANDSTILL**2)
+        return self.normal - friction * tangential / speed
+
+
+def pair(link: str, other: str, point: Array, force: Array) -> tuple[PointForces, ...]:
+    """Return `force` (3,) on `link` and its opposite on `other`, both at `point`."""
+    return PointForces(link, point[None], force[None]), PointForces(
+        other, point[None], -force[None]
+    )
+
+
+def moment_pair(link: str, other: str, moment: Array) -> tuple[PointForces, ...]:
+    """Return a free `moment` (3,) on `link` and its opposite on `other`."""
+    nothing = np.zeros((1, 3))
+    return (
+        PointForces(link, nothing, nothing, moment),
+        PointForces(other, nothing, nothing, -moment),
+    )
+
+
+def hip(point: Array) -> list[Unknown]:
+    """Return hip force and moment on the femur at the hip centre (3,)."""
+    nothing = np.zeros((1, 3))
+    forces = [
+        Unknown(f"hip_force_{name}", (PointForces("femur", point[None], axis[None]),))
+        for name, axis in AXES.items()
+    ]
+    moments = [
+        Unknown(f"hip_moment_{name}", (PointForces("femur", nothing, nothing, axis),))
+        for name, axis in AXES.items()
+    ]
+    return forces + moments
+
+
+def intersegmental(point: Array, rotation_axes: dict[str, Array]) -> list[Unknown]:
+    """Return the knee's force and moment on the femur, as if one joint carried all of it.
+
+    Args:
+        point: (3,) knee centre.
+        rotation_axes: name -> unit axis, the three moments' axes.
+    """
+    forces = [
+        Unknown(f"knee_force_{name}", pair("femur", "tibia", point, axis))
+        for name, axis in AXES.items()
+    ]
+    moments = [
+        Unknown(f"knee_moment_{name}", moment_pair("femur", "tibia", axis))
+        for name, axis in rotation_axes.items()
+    ]
+    return forces + moments
+
+
+def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown]:
+    """Return the patellofemoral force in the femur's sagittal plane.
+
+    Args:
+        point: (3,) contact point.
+        normal: (3,) unit, out of the femur into the patella, in the sagittal plane.
+        femur_ml: (3,) the femur's ML axis.
+    """
+    tangent = np.cross(femur_ml, normal)
+    return [
+        Unknown("patellofemoral", pair("patella", "femur", point, normal)),
+        Unknown("patellofemoral_tangential", pair("patella", "femur", point, tangent)),
+    ]
+
+
+def condyle(side: str, contact: CondylePoint, friction: float) -> Unknown:
+    """Return the contact force of one condyle; its magnitude is the normal force."""
+    force = contact.direction(friction)
+    return Unknown(f"{side}_normal", pair("femur", "tibia", contact.point, force))
+
+
+def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
+    """Return what an exact model would make zero.
+
+    Args:
+        point: (3,) where the residual forces act: midpoint of the contact points.
+        lifted: one condyle is off, a coronal moment takes the place of its force.
+        extensor: muscles are modelled; without them the flexion moment joins the residuals.
+    """
+    found = [
+        Unknown("residual_ap", pair("femur", "tibia", point, AXES["ap"])),
+        Unknown("residual_ml", pair("femur", "tibia", point, AXES["ml"])),
+        Unknown("residual_axial", moment_pair("femur", "tibia", AXES["si"])),
+    ]
+    if lifted:
+        found.append(Unknown("residual_coronal", moment_pair("femur", "tibia", AXES["ap"])))
+    if not extensor:
+        found.append(Unknown("residual_flexion", moment_pair("femur", "tibia", AXES["ml"])))
+    return found
