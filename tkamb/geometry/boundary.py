@@ -1,0 +1,111 @@
+"""Where a triangulated surface ends: its open edges, traced into loops."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from tkamb.geometry.frames import Array
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class BoundaryLoop:
+    """One closed loop of open edges, walked as its triangles walk them.
+
+    Args:
+        vertices: (n,) vertex indices in order; the loop closes from the last to the first.
+        centre: (3,) mean of its vertices, units of the surface.
+        width: smallest distance between two parallel lines that enclose the loop in its
+            best-fitting plane, units of the surface.
+        perimeter: length of the loop, units of the surface.
+    """
+
+    vertices: Indices
+    centre: Array
+    width: float
+    perimeter: float
+
+
+def half_edges(faces: Indices) -> Indices:
+    """Return the directed edges (3k, 2) of the faces (k, 3), face by face."""
+    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+def edge_use(faces: Indices) -> tuple[Indices, Indices]:
+    """Return for every half edge its undirected edge (3k,), and how many faces use each edge."""
+    ends = np.sort(half_edges(faces), axis=1)
+    key = ends[:, 0] * (int(faces.max(initial=0)) + 1) + ends[:, 1]
+    _, edge, count = np.unique(key, return_inverse=True, return_counts=True)
+    return edge.reshape(-1), count
+
+
+def open_edges(faces: Indices) -> Indices:
+    """Return the directed edges (m, 2) that only one face uses."""
+    edge, count = edge_use(faces)
+    return half_edges(faces)[count[edge] == 1]
+
+
+def boundary_loops(vertices: Array, faces: Indices) -> list[BoundaryLoop]:
+    """Return the loops of open edges, widest first.
+
+    Two holes that touch in a vertex come out as two loops. Chains that do not close (where
+    the winding is inconsistent) are returned as if they did.
+    """
+    loops = [_measured(vertices, loop) for loop in _traced(open_edges(faces))]
+    return sorted(loops, key=lambda loop: -loop.width)
+
+
+def _traced(edges: Indices) -> list[Indices]:
+    following: dict[int, list[int]] = {}
+    for start, end in edges.tolist():
+        following.setdefault(start, []).append(end)
+    loops: list[Indices] = []
+    while following:
+        path = [next(iter(following))]
+        position = {path[0]: 0}
+        while path:
+            ends = following.get(path[-1])
+            if not ends:
+                if len(path) > 1:
+                    loops.append(np.array(path, np.int64))
+                break
+            end = ends.pop()
+            if not ends:
+                del following[path[-1]]
+            if end in position:
+                start = position[end]
+                loops.append(np.array(path[start:], np.int64))
+                for vertex in path[start + 1 :]:
+                    del position[vertex]
+                del path[start + 1 :]
+                if end not in following:
+                    if start == 0:
+                        break
+                    continue
+            else:
+                position[end] = len(path)
+                path.append(end)
+    return loops
+
+
+def _measured(vertices: Array, loop: Indices) -> BoundaryLoop:
+    points = vertices[loop]
+    centre = points.mean(axis=0)
+    perimeter = float(np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
+    return BoundaryLoop(loop, centre, _width(points - centre), perimeter)
+
+
+def _width(points: Array) -> float:
+    plane = np.linalg.svd(points, full_matrices=False)[2][:2]
+    flat = points @ plane.T
+    try:
+        hull = flat[ConvexHull(flat).vertices]
+    except (QhullError, ValueError):
+        return 0.0
+    along = np.roll(hull, -1, axis=0) - hull
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return float(np.ptp(hull @ across.T, axis=0).min())

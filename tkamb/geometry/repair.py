@@ -1,0 +1,239 @@
+"""What can be mended in a triangulated surface, mended; and said."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from tkamb.geometry.boundary import BoundaryLoop, boundary_loops, edge_use, half_edges, open_edges
+from tkamb.geometry.frames import Array
+
+Indices = NDArray[np.int64]
+
+WELD_DISTANCE = 5e-5
+"""m; open edges whose ends are closer than this are one edge."""
+GAP_WIDTH = 2e-3
+"""m; a hole up to this wide (about one lattice cell) is closed by a fan of triangles."""
+TRIANGLE_WIDTH = 5e-3
+"""m; a hole of three edges is one lost triangle, and is put back up to this width."""
+
+
+@dataclass(frozen=True, eq=False)
+class Repair:
+    """A mended surface and what was done to it.
+
+    Args:
+        vertices: (n, 3) m.
+        faces: (k, 3), wound consistently; outward if closed.
+        notices: one phrase per kind of repair; empty when there was nothing to mend.
+        holes: the loops that stay open, widest first.
+        forks: (m,) vertex indices where an odd number (3 or more) of faces share an edge.
+        one_sided: whether the surface has no consistent winding (a Möbius strip).
+    """
+
+    vertices: Array
+    faces: Indices
+    notices: tuple[str, ...]
+    holes: tuple[BoundaryLoop, ...]
+    forks: Indices
+    one_sided: bool
+
+
+def repair(vertices: Array, faces: Indices) -> Repair:
+    """Mend duplicate and degenerate faces, winding, cracks, small holes, loose vertices.
+
+    The corners of the triangles may be unmerged, as in an STL file; merging equal corners
+    is not a repair. Triangles of no area but three different corners stay: they close the
+    surface.
+
+    Args:
+        vertices: (n, 3) m, finite.
+        faces: (k, 3) indices into the vertices.
+    """
+    notices: list[str] = []
+    unused = len(vertices) - len(np.unique(faces))
+    vertices, faces = _merged(vertices, faces)
+    faces, collapsed = _without_collapsed(faces)
+    faces, duplicates = _without_duplicates(faces)
+    faces, turned, one_sided = _wound(vertices, faces)
+    faces, welded = _welded(vertices, faces)
+    if welded:
+        faces, more = _without_collapsed(faces)
+        collapsed += more
+        faces, more = _without_duplicates(faces)
+        duplicates += more
+        faces, more, one_sided = _wound(vertices, faces)
+        turned += more
+    vertices, faces, filled, widest = _filled(vertices, faces)
+    faces, inside_out = _outward(vertices, faces)
+    vertices, faces = _referenced(vertices, faces)
+    for count, phrase in (
+        (duplicates, "duplicate face{s} removed"),
+        (collapsed, "degenerate face{s} removed"),
+        (turned, "face{s} with flipped winding turned"),
+        (inside_out, "face{s} of an inside-out body turned"),
+        (unused, "unreferenced {vertices} removed"),
+        (welded, "open {vertices} welded to a neighbour"),
+        (filled, f"small hole{{s}} closed (up to {1e3 * widest:.2g} mm wide)"),
+    ):
+        if count:
+            one = count == 1
+            words = phrase.format(s="" if one else "s", vertices="vertex" if one else "vertices")
+            notices.append(f"{count} {words}")
+    holes = tuple(boundary_loops(vertices, faces))
+    return Repair(vertices, faces, tuple(notices), holes, _forks(faces), one_sided)
+
+
+def _merged(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
+    rows = np.ascontiguousarray(vertices + 0.0).view("V24").reshape(-1)
+    _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return vertices[first[order]] + 0.0, rank[inverse.reshape(-1)][faces]
+
+
+def _without_collapsed(faces: Indices) -> tuple[Indices, int]:
+    a, b, c = faces.T
+    good = (a != b) & (b != c) & (c != a)
+    return faces[good], int((~good).sum())
+
+
+def _without_duplicates(faces: Indices) -> tuple[Indices, int]:
+    """Keep one of equal faces; of two back to back (a fold without thickness) keep none."""
+    corners = np.sort(faces, axis=1)
+    _, first, group, count = np.unique(
+        corners, axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    if (count == 1).all():
+        return faces, 0
+    group = group.reshape(-1)
+    start = np.argmin(faces, axis=1)
+    second = faces[np.arange(len(faces)), (start + 1) % 3]
+    sign = np.where(second == corners[:, 1], 1, -1)
+    net = np.bincount(group, weights=sign, minlength=len(count))
+    keep = np.zeros(len(faces), bool)
+    keep[first[net != 0]] = True
+    agrees = sign == np.sign(net[group])
+    for g in np.flatnonzero((count > 1) & (net != 0)):
+        members = np.flatnonzero((group == g) & agrees)
+        keep[first[g]] = False
+        keep[members[0]] = True
+    return faces[keep], int((count - 1).sum())
+
+
+def _wound(vertices: Array, faces: Indices) -> tuple[Indices, int, bool]:
+    """Turn the minority (by area) of each connected part so that neighbours agree.
+
+    Every face is two nodes, as it is and turned; neighbours are linked in the states that
+    agree. The two states of a face end in one component only on a one-sided surface.
+    """
+    k = len(faces)
+    edge, count = edge_use(faces)
+    directed = half_edges(faces)
+    order = np.argsort(edge, kind="stable")
+    pairs = order[np.repeat(count == 2, count)].reshape(-1, 2)
+    left, right = pairs[:, 0] // 3, pairs[:, 1] // 3
+    differ = directed[pairs[:, 0], 0] == directed[pairs[:, 1], 0]
+    rows = np.concatenate([left, left + k])
+    columns = np.concatenate([right + k * differ, right + k * ~differ])
+    graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * k, 2 * k))
+    labels = connected_components(graph, directed=False)[1]
+    here, turned = labels[:k], labels[k:]
+    one_sided = bool((here == turned).any())
+    corners = vertices[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.bincount(here, np.linalg.norm(cross, axis=1) + 1e-30, labels.max() + 1)
+    flip = (area[turned] > area[here]) | ((area[turned] == area[here]) & (turned < here))
+    result = faces.copy()
+    if not one_sided:
+        result[flip] = result[flip][:, ::-1]
+    return result, 0 if one_sided else int(flip.sum()), one_sided
+
+
+def _welded(vertices: Array, faces: Indices) -> tuple[Indices, int]:
+    """Join ends of open edges that lie within WELD_DISTANCE of one another."""
+    loose = np.unique(open_edges(faces))
+    if len(loose) == 0:
+        return faces, 0
+    pairs = cKDTree(vertices[loose]).query_pairs(WELD_DISTANCE, output_type="ndarray")
+    if len(pairs) == 0:
+        return faces, 0
+    graph = coo_matrix((np.ones(len(pairs), bool), pairs.T), shape=(len(loose), len(loose)))
+    label = connected_components(graph, directed=False)[1]
+    _, first = np.unique(label, return_index=True)
+    target = np.arange(len(vertices))
+    target[loose] = loose[first[label]]
+    return target[faces], int((target != np.arange(len(vertices))).sum())
+
+
+def _filled(vertices: Array, faces: Indices) -> tuple[Array, Indices, int, float]:
+    """Close small holes: three edges by their triangle, more by a fan about their centre."""
+    new_vertices, new_faces = [vertices], [faces]
+    widest, total, filled = 0.0, len(vertices), 0
+    for loop in boundary_loops(vertices, faces):
+        ring = loop.vertices[::-1]
+        if len(ring) < 3 or loop.width > (TRIANGLE_WIDTH if len(ring) == 3 else GAP_WIDTH):
+            continue
+        if len(ring) == 3:
+            new_faces.append(ring[None])
+        else:
+            new_vertices.append(loop.centre[None])
+            fan = np.stack([ring, np.roll(ring, -1), np.full(len(ring), total)], axis=1)
+            new_faces.append(fan)
+            total += 1
+        filled, widest = filled + 1, max(widest, loop.width)
+    return np.concatenate(new_vertices), np.concatenate(new_faces), filled, widest
+
+
+def _outward(vertices: Array, faces: Indices) -> tuple[Indices, int]:
+    """Turn closed bodies that are inside out; a void within another body stays one."""
+    part = connected_parts(faces)
+    open_parts = set(np.unique(part[np.isin(faces, open_edges(faces)).any(axis=1)]))
+    volume = np.bincount(part, signed_volumes(vertices, faces))
+    boxes = [_box(vertices[faces[part == p]]) for p in range(len(volume))]
+    result, turned = faces.copy(), 0
+    for p in np.flatnonzero(volume < 0):
+        within = any(
+            (boxes[q][0] < boxes[p][0]).all() and (boxes[p][1] < boxes[q][1]).all()
+            for q in range(len(volume))
+        )
+        if p in open_parts or within:
+            continue
+        members = part == p
+        result[members] = result[members][:, ::-1]
+        turned += int(members.sum())
+    return result, turned
+
+
+def _box(corners: Array) -> tuple[Array, Array]:
+    return corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+
+
+def connected_parts(faces: Indices) -> Indices:
+    """Return for every face (k,) the number of the connected part that it belongs to."""
+    n = int(faces.max(initial=0)) + 1
+    edges = half_edges(faces)
+    graph = coo_matrix((np.ones(len(edges), bool), edges.T), shape=(n, n))
+    label = connected_components(graph, directed=False)[1]
+    return np.unique(label[faces[:, 0]], return_inverse=True)[1].reshape(-1)
+
+
+def signed_volumes(vertices: Array, faces: Indices) -> Array:
+    """Return the volume (k,) that each face spans with the centre of the vertices, m³."""
+    a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
+    return np.asarray(np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
+
+
+def _referenced(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
+    used, index = np.unique(faces, return_inverse=True)
+    return vertices[used], index.reshape(faces.shape).astype(np.int64)
+
+
+def _forks(faces: Indices) -> Indices:
+    edge, count = edge_use(faces)
+    odd = (count > 2) & (count % 2 == 1)
+    return np.unique(half_edges(faces)[odd[edge]])
