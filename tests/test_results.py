@@ -1,0 +1,189 @@
+"""results.csv, summary.json and contact.h5: exact round trip, whole files, a kill."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from synthetic_run import make_run
+
+from tkamb.columns import COLUMNS, columns_as_markdown, is_ligament, ligament_of
+from tkamb.errors import InputError
+from tkamb.output.maps_file import ContactMaps, MapWriter, read_maps, write_maps
+from tkamb.results import Results, claim_directory, read_results, write_results
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_round_trip_is_bit_for_bit(tmp_path):
+    run = make_run("gait", frames=21)
+    run.columns["force_ap_N"][3] = np.nextafter(0.1, 1)
+    run.columns["force_ap_N"][4] = 5e-324
+    run.columns["force_ap_N"][5] = -0.0
+    write_results(run, tmp_path)
+    again = read_results(tmp_path)
+    assert list(again.columns) == list(run.columns)
+    for name, values in run.columns.items():
+        if name == "status":
+            assert again.status == values
+        else:
+            assert np.array_equal(again[name], values, equal_nan=True), name
+            assert np.array_equal(np.signbit(again[name]), np.signbit(values)), name
+    assert again.summary == json.loads((tmp_path / "summary.json").read_text())
+    for name in ("points_m", "triangles", "time_s", "pressure_Pa", "gap_m", "nodal_force_N"):
+        assert np.array_equal(getattr(again.maps, name), getattr(run.maps, name)), name
+    assert again.maps.attributes["model"] == "synthetic"
+    assert again.maps.attributes["units"].startswith("SI")
+
+
+def test_columns_stand_in_the_order_of_the_table():
+    run = make_run(frames=5, maps=False)
+    fixed = [column.name for column in COLUMNS if "<" not in column.name]
+    assert [name for name in run.columns if not is_ligament(name)] == fixed
+    ligaments = [name for name in run.columns if is_ligament(name)]
+    assert [ligament_of(name) for name in ligaments] == ["PCL_anterolateral", "MCL_anterior"]
+    names = list(run.columns)
+    assert names.index(ligaments[0]) == names.index("external_adduction_moment_Nm") + 1
+
+
+def test_what_is_not_modelled_is_an_empty_cell(tmp_path):
+    run = Results({"time_s": [0.0, 0.5], "flexion_deg": [0.0, 60.0], "status": ["ok", "singular"]})
+    assert "force_total_N" in run.not_modelled
+    assert "flexion_deg" not in run.not_modelled
+    run.write_csv(tmp_path / "results.csv")
+    header, first, second = (tmp_path / "results.csv").read_text().splitlines()
+    row = dict(zip(header.split(","), second.split(","), strict=True))
+    assert row["force_total_N"] == ""
+    assert row["flexion_deg"] == "60.0"
+    assert row["status"] == "singular"
+    assert len(first.split(",")) == len(COLUMNS) - 1
+
+
+@pytest.mark.parametrize(
+    ("columns", "complaint"),
+    [
+        ({"time_s": [0.0], "status": ["ok"], "force_N": [1.0]}, "unknown column 'force_N'"),
+        ({"time_s": [0.0, 1.0], "status": ["ok"]}, "time_s"),
+        ({"time_s": [0.0]}, "'status' is missing"),
+    ],
+)
+def test_columns_are_checked(columns, complaint):
+    with pytest.raises(InputError, match=complaint):
+        Results(columns)
+
+
+def test_damaged_csv_is_one_clear_line(tmp_path):
+    write_results(make_run(frames=5, maps=False), tmp_path)
+    path = tmp_path / "results.csv"
+    text = path.read_text()
+    path.write_text(text + "1,2,3\n")
+    with pytest.raises(InputError, match="line 7 has 3 cells"):
+        read_results(tmp_path)
+    path.write_text(text.replace("3.0,", "three,"))
+    with pytest.raises(InputError, match="time_s"):
+        read_results(tmp_path)
+    path.unlink()
+    with pytest.raises(InputError, match="no such file"):
+        read_results(tmp_path)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    write_results(make_run(frames=5, maps=False), tmp_path)
+    before = (tmp_path / "results.csv").read_text()
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InputError, match="No space left"):
+        make_run(frames=9, maps=False).write_csv(tmp_path / "results.csv")
+    assert (tmp_path / "results.csv").read_text() == before
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_claiming_a_folder(tmp_path):
+    assert claim_directory(tmp_path / "a" / "b").is_dir()
+    assert not list((tmp_path / "a" / "b").iterdir())
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        claim_directory(tmp_path / "file")
+    with pytest.raises(InputError, match="cannot be written"):
+        claim_directory(tmp_path / "file" / "below")
+
+
+def test_stale_maps_do_not_pass_for_this_run(tmp_path):
+    write_results(make_run(frames=5), tmp_path)
+    assert (tmp_path / "contact.h5").exists()
+    write_results(make_run(frames=5, maps=False), tmp_path)
+    assert read_results(tmp_path).maps is None
+
+
+def test_maps_are_read_only_when_asked(tmp_path):
+    run = make_run(frames=5)
+    write_maps(run.maps, tmp_path / "contact.h5")
+    maps = ContactMaps(tmp_path / "contact.h5")
+    assert "pressure_Pa" not in vars(maps)
+    assert maps.pressure_Pa.shape == (5, len(maps.points_m))
+    with pytest.raises(InputError, match="no such file"):
+        read_maps(tmp_path / "nothing.h5")
+    (tmp_path / "text.h5").write_text("not HDF5")
+    with pytest.raises(InputError, match="HDF5"):
+        read_maps(tmp_path / "text.h5")
+
+
+def test_failed_frame_is_nan_in_the_maps(tmp_path):
+    points = np.zeros((4, 3))
+    with MapWriter(tmp_path / "contact.h5", points, [[0, 1, 2]], {}) as writer:
+        writer.append(0.0, np.ones(4), np.zeros(4), np.zeros((4, 3)), np.eye(4))
+        writer.append_failed(0.1)
+    maps = read_maps(tmp_path / "contact.h5")
+    assert np.array_equal(maps.time_s, [0.0, 0.1])
+    assert np.isfinite(maps.pressure_Pa[0]).all()
+    assert np.isnan(maps.pressure_Pa[1]).all()
+    assert np.isnan(maps.nodal_force_N[1]).all()
+
+
+WRITER = """
+import sys, numpy as np
+from tkamb.output.maps_file import MapWriter
+n = 500
+rng = np.random.default_rng(1)
+noise = rng.normal(size=n)
+with MapWriter(sys.argv[1], np.zeros((n, 3)), [[0, 1, 2]], {"model": "kill"}) as writer:
+    for k in range(1_000_000):
+        writer.append(k, noise + k, noise - k, np.full((n, 3), k), np.eye(4) * k)
+        print(k, flush=True)
+"""
+
+
+@pytest.mark.parametrize("frames", [1, 7, 40, 111])
+def test_a_kill_leaves_a_readable_part(tmp_path, frames):
+    path = tmp_path / "contact.h5"
+    process = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, cwd=ROOT
+    )
+    for _ in range(frames):
+        process.stdout.readline()
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    maps = read_maps(path)
+    assert len(maps) >= frames
+    k = np.arange(len(maps))
+    assert np.array_equal(maps.time_s, k)
+    assert np.allclose(maps.pressure_Pa - maps.pressure_Pa[0], k[:, None])
+    assert np.allclose(maps.gap_m - maps.gap_m[0], -k[:, None])
+    assert np.array_equal(maps.nodal_force_N[:, 3, 1], k)
+    assert np.array_equal(maps.femoral_pose[:, 2, 2], k)
+    with h5py.File(path) as file:
+        assert file.attrs["model"] == "kill"
+
+
+def test_documentation_lists_every_column():
+    page = ROOT / "docs" / "results.md"
+    assert columns_as_markdown() in page.read_text(encoding="utf-8")
