@@ -1,0 +1,175 @@
+"""Taut paths: analytic lengths, moment arms against finite differences, exact balance."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from tkamb.body.lines import StringLine
+from tkamb.body.load import total_wrench
+from tkamb.body.wrapping import loads_per_unit_tension, taut_path
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.frames import knee_pose
+from tkamb.geometry.sections import convex_outline, sagittal_outline, sagittal_section
+from tkamb.geometry.surface import Surface
+
+RADIUS = 0.03
+CIRCLE = RADIUS * np.column_stack(
+    [np.cos(np.arange(0, 2 * np.pi, 0.002)), np.sin(np.arange(0, 2 * np.pi, 0.002))]
+)
+FLEXION = np.deg2rad(np.arange(0.0, 140.1, 1.0))
+
+
+def ellipse(a: float, b: float, n: int = 400) -> np.ndarray:
+    angle = 2 * np.pi * np.arange(n) / n
+    return np.column_stack([a * np.cos(angle), b * np.sin(angle)])
+
+
+def circle_length(start: np.ndarray, end: np.ndarray, radius: float) -> float:
+    """Geodesic of a circular cylinder, clockwise from start to end."""
+    a, b = np.linalg.norm(start[:2]), np.linalg.norm(end[:2])
+    around = -np.arctan2(start[0] * end[1] - start[1] * end[0], start[:2] @ end[:2])
+    sweep = around % (2 * np.pi) - np.arccos(radius / a) - np.arccos(radius / b)
+    plane = np.sqrt(a**2 - radius**2) + np.sqrt(b**2 - radius**2) + radius * sweep
+    return float(np.hypot(plane, end[2] - start[2]))
+
+
+def quadriceps() -> StringLine:
+    """A femur with an elliptic outline; the patella is carried by the insert frame here."""
+    return StringLine(
+        "quadriceps",
+        "femur",
+        np.array([0.012, 0.2, 0.006]),
+        "tibia",
+        np.array([0.05, 0.02, -0.004]),
+        ellipse(0.034, 0.03),
+        "femur",
+    )
+
+
+def poses_at(flexion: float) -> dict[str, np.ndarray]:
+    pose = knee_pose([0.002 - 0.004 * flexion, 0.03, 0.001, 0.1 * flexion, 0.02, flexion])
+    return {"femur": pose, "tibia": np.eye(4)}
+
+
+def test_length_on_circular_cylinder_is_the_helix() -> None:
+    start, end = np.array([0.01, 0.2, 0.02]), np.array([-0.01, -0.06, -0.01])
+    path = taut_path(start, end, CIRCLE)
+    assert path.length == pytest.approx(circle_length(start, end, RADIUS), rel=1e-6)
+    assert path.wrapped
+    assert path.points[:, 0].max() == pytest.approx(RADIUS, rel=1e-5)  # in front of the bone
+
+
+def test_free_path_is_straight() -> None:
+    path = taut_path(np.array([0.05, 0.2, 0.0]), np.array([0.04, -0.1, 0.01]), CIRCLE)
+    assert not path.wrapped
+    assert path.wrap_angle == 0.0
+
+
+@pytest.mark.parametrize("angle_deg", [-60.0, 0.0, 60.0, 120.0, 170.0, 200.0])
+def test_side_is_anterior_and_wrap_angle_is_the_turn(angle_deg: float) -> None:
+    """The end swept clockwise from straight above the bone, up to past its back."""
+    angle = np.pi / 2 - np.deg2rad(angle_deg)
+    start = np.array([0.0, 0.2, 0.0])
+    end = 0.06 * np.array([np.cos(angle), np.sin(angle), 0.0])
+    path = taut_path(start, end, CIRCLE)
+    expected = np.deg2rad(angle_deg) - np.arccos(RADIUS / 0.2) - np.arccos(RADIUS / 0.06)
+    assert path.wrap_angle == pytest.approx(max(expected, 0.0), abs=3e-3)
+
+
+def test_unit_tension_balances_exactly() -> None:
+    for flexion in FLEXION[::20]:
+        line = quadriceps()
+        path = line.path(poses_at(float(flexion)))
+        wrench = total_wrench(line.loads(path), np.array([0.1, -0.2, 0.3]))
+        assert np.abs(wrench).max() < 1e-14
+
+
+def test_reaction_presses_the_bone_without_friction() -> None:
+    path = taut_path(np.array([0.0, 0.2, 0.02]), np.array([0.0, -0.06, -0.01]), CIRCLE)
+    reaction = loads_per_unit_tension(path, "a", "b", "bone")[2]
+    assert np.abs(reaction.forces[:, 2]).max() < 1e-12
+    assert (np.sum(reaction.forces * reaction.points, axis=1) < 0.0).all()
+
+
+@pytest.mark.parametrize("coordinate", range(6))
+def test_moment_arm_is_derivative_of_length(coordinate: int) -> None:
+    """r = dL/dq by central differences to 1e-5 over 0-140 deg, wrapped and not."""
+    line, step = quadriceps(), 2e-7
+    worst = 0.0
+    wrapped = set()
+    for flexion in FLEXION:
+        q = np.array([0.002 - 0.004 * flexion, 0.03, 0.001, 0.1 * flexion, 0.02, flexion])
+        lengths = []
+        twists = []
+        for sign in (-1.0, 1.0):
+            moved = q.copy()
+            moved[coordinate] += sign * step
+            poses = {"femur": knee_pose(moved), "tibia": np.eye(4)}
+            lengths.append(line.path(poses).length)
+            twists.append(poses["femur"])
+        path = line.path({"femur": knee_pose(q), "tibia": np.eye(4)})
+        wrapped.add(path.wrapped)
+        pose_rate = (twists[1] - twists[0]) / (2 * step)
+        power = 0.0
+        for load in line.loads(path):
+            if load.link == "femur":
+                here = np.linalg.inv(knee_pose(q))
+                for point, force in zip(load.points, load.forces, strict=True):
+                    material = here @ np.append(point, 1.0)
+                    power += (pose_rate @ material)[:3] @ force
+        difference = (lengths[1] - lengths[0]) / (2 * step)
+        scale = 0.03 if coordinate > 2 else 1.0
+        worst = max(worst, abs(difference + power) / max(abs(difference), scale))
+    assert wrapped == {True, False}
+    assert worst < 1e-5
+
+
+def test_moment_arm_has_no_jump_when_wrapping_starts() -> None:
+    """Near the first wrapping frame the flexion moment arm changes by no more than elsewhere."""
+    line = quadriceps()
+
+    def arm(flexion: float) -> float:
+        wrench = total_wrench(
+            [p for p in line.loads(line.path(poses_at(flexion))) if p.link == "femur"], np.zeros(3)
+        )
+        return float(wrench[5])
+
+    low, high = 0.0, np.deg2rad(140.0)
+    while high - low > 1e-9:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if line.path(poses_at(middle)).wrapped else (middle, high)
+    assert not line.path(poses_at(low)).wrapped
+    assert line.path(poses_at(high)).wrapped
+    assert abs(arm(low) - arm(high)) < 1e-9
+
+
+def test_inside_start_is_refused() -> None:
+    with pytest.raises(ComputationError, match="inside"):
+        taut_path(np.zeros(3), np.array([0.1, 0.0, 0.0]), CIRCLE)
+
+
+def test_section_of_a_cylinder_is_its_circle() -> None:
+    mesh = trimesh.creation.cylinder(radius=0.02, height=0.08, sections=180)
+    surface = Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), "cylinder")
+    cut = sagittal_section(surface, 0.01)
+    radius = np.linalg.norm(cut, axis=2)
+    assert np.all((radius <= 0.02 + 1e-12) & (radius >= 0.02 * np.cos(np.pi / 180) - 1e-12))
+    perimeter = np.linalg.norm(cut[:, 1] - cut[:, 0], axis=1).sum()
+    assert perimeter == pytest.approx(2 * np.pi * 0.02, rel=1e-3)
+
+
+def test_outline_grows_by_the_tendon() -> None:
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.5, 0.5]])
+    grown = convex_outline(square, 0.1)
+    edges = np.roll(grown, -1, axis=0) - grown
+    area = 0.5 * (grown[:, 0] * edges[:, 1] - grown[:, 1] * edges[:, 0]).sum()
+    assert area == pytest.approx(1.0 + 4 * 0.1 + np.pi * 0.01, rel=1e-4)
+
+
+def test_outline_stops_below_the_start() -> None:
+    mesh = trimesh.creation.box(extents=(0.02, 0.4, 0.04))
+    surface = Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), "shaft")
+    outline = sagittal_outline([surface], [0.0], offset=0.002, below=0.1)
+    assert outline[:, 1].max() == pytest.approx(0.1)
+    with pytest.raises(InputError, match="no surface is cut"):
+        sagittal_outline([surface], [1.0])
