@@ -1,0 +1,266 @@
+"""The insert's flat bottom, and the insert frame that it defines."""
+
+import logging
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, pose
+from tkamb.geometry.surface import Surface
+
+FLATNESS = 5e-5
+"""m; corners of one flat may lie this far from its plane (noise of the mesh)."""
+TILT_LIMIT = math.radians(30.0)
+"""A bottom tilted by less than this from -y is turned level."""
+COMPARABLE = 0.5
+"""Flats whose area is at least this share of the largest compete with it."""
+CLEAR = 0.9
+"""Between two flats that face down, the larger wins below this ratio of areas."""
+_LEVEL = 1e-6
+"""rad; a smaller tilt is rounding and stays as it is."""
+_CONE = math.radians(15.0)
+
+_log = logging.getLogger("tkamb")
+
+
+@dataclass(frozen=True, eq=False)
+class FlatBottom:
+    """A flat: the triangles of one plane.
+
+    Args:
+        normal: (3,) unit outward normal, in the surface's frame.
+        centre: (3,) m, centre of area.
+        area: m².
+        faces: (k,) indices of its triangles.
+        vertices: (n,) indices of the surface's vertices that lie in its plane.
+        noise: m, root mean square distance of the vertices from the plane.
+    """
+
+    normal: Array
+    centre: Array
+    area: float
+    faces: NDArray[np.int64]
+    vertices: NDArray[np.int64]
+    noise: float
+
+
+def find_flats(surface: Surface) -> list[FlatBottom]:
+    """Return the flats that compete to be the bottom, largest first.
+
+    Area-weighted clustering over normal and offset: the normals vote on a sphere, the
+    faces within 15 deg of a peak vote on the offset, a plane is fitted to the winners and
+    refitted with tolerances that follow the mesh's own noise. Its triangles are set aside
+    and the search repeats while a flat of comparable area is found.
+    """
+    corners = surface.triangles
+    normals = surface.face_normals
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.linalg.norm(cross, axis=1)
+    free = area > 0
+    flats: list[FlatBottom] = []
+    for _ in range(12):
+        flat = _largest_flat(surface, normals, area, free) if free.any() else None
+        if flat is None or (flats and flat.area < COMPARABLE * max(f.area for f in flats)):
+            break
+        flats.append(flat)
+        free = free.copy()
+        free[flat.faces] = False
+    largest = max((flat.area for flat in flats), default=0.0)
+    flats = [flat for flat in flats if flat.area >= COMPARABLE * largest]
+    return sorted(flats, key=lambda flat: -flat.area)
+
+
+def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBottom:
+    """Return the flat that the insert stands on: the largest one, which must face -y.
+
+    A flat of at least half the largest one's area is taken instead if it faces -y (within
+    30 deg) and the largest does not; with a notice if it is clearly smaller.
+
+    Args:
+        surface: the insert in anatomical axes (x anterior, y superior, z right), m.
+        rotation: (3, 3) from mesh axes to anatomical axes, to name the mesh's own axes in
+            messages.
+
+    Raises:
+        InputError: no flat, a flat that faces another axis, or two that are equally good.
+    """
+    rotation = np.eye(3) if rotation is None else rotation
+    flats = find_flats(surface)
+    if not flats:
+        raise InputError(f"{surface.name} has no flat bottom", None, "is it a tibial insert?")
+    down = [flat for flat in flats if -flat.normal[1] >= math.cos(TILT_LIMIT)]
+    if not down:
+        raise InputError(
+            f"flat bottom of {surface.name} ({_described(flats[0], rotation)}) faces "
+            f"{facing(flats[0].normal, rotation)} of the mesh; axes say that "
+            f"{facing(np.array([0.0, -1.0, 0.0]), rotation)} is inferior",
+            None,
+            "name the axes that point anterior, superior and right so that superior is "
+            f"{facing(-flats[0].normal, rotation)}",
+        )
+    if len(down) > 1 and down[1].area >= CLEAR * down[0].area:
+        raise InputError(
+            f"{surface.name} has two flats that could be its bottom: "
+            f"{_described(down[0], rotation)}, and {_described(down[1], rotation)}",
+            None,
+            "remove one, or give the part without its underside",
+        )
+    if down[0].area < CLEAR * flats[0].area:
+        _log.warning(
+            "%s: the flat that faces inferior (%s) is taken as the bottom, though another is "
+            "larger (%s)",
+            surface.name,
+            _described(down[0], rotation),
+            _described(flats[0], rotation),
+        )
+    return down[0]
+
+
+def insert_placement(surface: Surface, rotation: Array | None = None) -> Array:
+    """Return the pose (4, 4) of the insert's mesh, in anatomical axes, in the insert frame.
+
+    The insert frame stands on the flat bottom: y = 0 is its plane, facing -y; the origin is
+    the centre of its bounding rectangle in x and z. A tilt of the mesh is turned level by
+    the smallest rotation; x and z come from the declared axes.
+
+    Args:
+        surface: the insert in anatomical axes, about its mesh's own origin, m.
+        rotation: as for `find_flat_bottom`.
+
+    Raises:
+        InputError: see `find_flat_bottom`.
+    """
+    flat = find_flat_bottom(surface, rotation)
+    level = _levelling(flat.normal)
+    bottom = surface.vertices[flat.vertices] @ level.T
+    low, high = bottom.min(axis=0), bottom.max(axis=0)
+    height = np.median(bottom[:, 1])
+    return pose(level, -np.array([(low[0] + high[0]) / 2, height, (low[2] + high[2]) / 2]))
+
+
+def facing(direction: Array, rotation: Array | None = None) -> str:
+    """Return the mesh axis ("+x" … "-z") nearest to a direction in anatomical axes."""
+    own = direction if rotation is None else rotation.T @ direction
+    axis = int(np.argmax(np.abs(own)))
+    return f"{'-' if own[axis] < 0 else '+'}{'xyz'[axis]}"
+
+
+def _described(flat: FlatBottom, rotation: Array) -> str:
+    x, y, z = 1e3 * (rotation.T @ flat.centre)
+    return (
+        f"{1e6 * flat.area:.4g} mm² at ({x:.1f}, {y:.1f}, {z:.1f}) mm, "
+        f"facing {facing(flat.normal, rotation)}"
+    )
+
+
+def _levelling(normal: Array) -> Array:
+    """Return the smallest rotation (3, 3) that turns the normal to -y."""
+    axis = np.cross(normal, [0.0, -1.0, 0.0])
+    sine = float(np.linalg.norm(axis))
+    if sine < _LEVEL:
+        return np.eye(3)
+    angle = math.atan2(sine, -normal[1])
+    return np.asarray(Rotation.from_rotvec(axis / sine * angle).as_matrix())
+
+
+def _largest_flat(
+    surface: Surface, normals: Array, area: Array, free: NDArray[np.bool_]
+) -> FlatBottom | None:
+    best: FlatBottom | None = None
+    for seed in _peaks(normals[free], area[free]):
+        flat = _grown(surface, normals, area, free, seed)
+        if flat is not None and (best is None or flat.area > best.area):
+            best = flat
+    return best
+
+
+def _peaks(normals: Array, area: Array) -> list[Array]:
+    """Return the directions (3,) that the most area faces, at most 8, 15 deg apart."""
+    cells, cell = np.unique(np.round(normals * 6.0), axis=0, return_inverse=True)
+    cell = cell.reshape(-1)
+    weight = np.bincount(cell, area, len(cells))
+    mean = np.stack([np.bincount(cell, area * n, len(cells)) for n in normals.T], axis=1)
+    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+    votes = np.array([weight[mean @ m > math.cos(_CONE / 2)].sum() for m in mean])
+    peaks: list[Array] = []
+    for index in np.argsort(-votes):
+        if all(mean[index] @ peak < math.cos(_CONE) for peak in peaks):
+            peaks.append(mean[index])
+        if len(peaks) == 8:
+            break
+    return peaks
+
+
+def _grown(
+    surface: Surface, normals: Array, area: Array, free: NDArray[np.bool_], seed: Array
+) -> FlatBottom | None:
+    near = np.flatnonzero(free & (normals @ seed > math.cos(_CONE)))
+    corners, weight = surface.triangles[near], area[near]
+    normal, cone = _sharpened(seed, normals[near], weight), _CONE
+    offset = _densest(corners.mean(axis=1) @ normal, weight, 20 * FLATNESS)
+    tolerances = (20 * FLATNESS, 8 * FLATNESS, 3 * FLATNESS, FLATNESS, 0.0, 0.0)
+    chosen = np.zeros(len(near), bool)
+    for tolerance in tolerances:
+        if tolerance == 0.0:
+            spread = _median(np.abs(corners @ normal - offset).max(axis=1)[chosen], weight[chosen])
+            lean = _median(np.arccos(np.clip(normals[near] @ normal, -1, 1))[chosen], weight[chosen])
+            tolerance = min(max(3 * spread, 1e-6), FLATNESS)
+            cone = min(max(6 * lean, math.radians(0.5)), _CONE)
+        apart = np.abs(corners @ normal - offset).max(axis=1)
+        chosen = (apart <= tolerance) & (normals[near] @ normal > math.cos(cone))
+        if chosen.sum() == 0:
+            return None
+        normal, offset = _plane(corners[chosen], weight[chosen], normal)
+    faces = near[chosen]
+    vertices = np.flatnonzero(np.abs(surface.vertices @ normal - offset) <= tolerance)
+    noise = float(np.sqrt(np.mean((surface.vertices[vertices] @ normal - offset) ** 2)))
+    total = float(weight[chosen].sum())
+    centre = weight[chosen] @ corners[chosen].mean(axis=1) / total
+    return FlatBottom(normal, centre, total, faces, vertices, noise)
+
+
+def _sharpened(direction: Array, normals: Array, weight: Array) -> Array:
+    """Return the direction shifted to the mean of narrowing cones about it."""
+    for cone in np.radians([15.0, 8.0, 4.0, 2.0, 2.0]):
+        mean = (weight * (normals @ direction > math.cos(cone))) @ normals
+        length = np.linalg.norm(mean)
+        if length == 0:
+            break
+        direction = mean / length
+    return direction
+
+
+def _densest(offsets: Array, weight: Array, window: float) -> float:
+    """Return the middle of the window of offsets that holds the most area."""
+    order = np.argsort(offsets)
+    offsets, total = offsets[order], np.concatenate([[0.0], np.cumsum(weight[order])])
+    last = np.searchsorted(offsets, offsets + window, side="right")
+    first = int(np.argmax(total[last] - total[:-1]))
+    inside = slice(first, last[first])
+    return float(np.average(offsets[inside], weights=weight[order][inside]))
+
+
+def _median(values: Array, weight: Array) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weight[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])
+
+
+def _plane(corners: Array, weight: Array, towards: Array) -> tuple[Array, float]:
+    """Return normal and offset of the plane that fits triangles (k, 3, 3) best.
+
+    The second moment of each triangle about the common centre is exact.
+    """
+    total = weight.sum()
+    middle = corners.mean(axis=1)
+    centre = weight @ middle / total
+    arms = np.concatenate([(corners - centre).reshape(-1, 3), 3 * (middle - centre)])
+    scale = np.concatenate([np.repeat(weight, 3), weight]) / 12
+    moment = np.einsum("i,ij,ik->jk", scale, arms, arms)
+    normal = np.linalg.eigh(moment)[1][:, 0]
+    normal = normal if normal @ towards > 0 else -normal
+    return normal, float(normal @ centre)
