@@ -61,7 +61,7 @@ class MotionTable(_Table):
     interpretation: Literal["coordinates", "pose"] = "coordinates"
     sequence: str | None = Field(
         None,
-        pattern="^[xyzXYZ]{3}$",
+        pattern="^([xyz]{3}|[XYZ]{3})$",
         description="pose only: upper case = intrinsic, as in scipy ('XYZ' is Rx Ry Rz)",
     )
     columns: dict[str, str] = Field(
@@ -96,47 +96,74 @@ class MotionTable(_Table):
 class TibiaTable(_Table):
     """How the shank stands in the laboratory (x forward, y up, z right).
 
-    One of: `sagittal` (a lean angle about z over a fixed ankle), `pose` (columns of a
-    file), `markers` (rigid fit of shank markers).
+    One of: `sagittal` (a forward lean about z over a fixed ankle), `pose` (columns of a
+    file that place the tibia link), `markers` (rigid fit of shank markers).
     """
 
     kind: Literal["sagittal", "pose", "markers"]
     file: Path
     columns: dict[str, str] = Field(
         default_factory=dict,
-        description="role -> column: time, angle | time, rotation_1..3, translation_1..3",
+        description=(
+            "role -> column: time, angle (sagittal; forward lean is positive) | "
+            "time, rotation_1..3, translation_1..3 (pose)"
+        ),
     )
-    sequence: str | None = Field(None, pattern="^[xyzXYZ]{3}$")
+    sequence: str | None = Field(
+        None,
+        pattern="^([xyz]{3}|[XYZ]{3})$",
+        description="pose only: upper case = intrinsic, as in scipy",
+    )
     angle_unit: AngleUnit = "deg"
-    length_unit: LengthUnit | None = None
+    length_unit: LengthUnit | None = Field(
+        None, description="of the file; needed for pose, and for markers unless the file says"
+    )
+    cutoff_Hz: float | Literal["none"] | None = Field(
+        None, description="low-pass cut-off; default: the motion's"
+    )
     ankle_mm: Vector = Field((0.0, 0.0, 0.0), description="sagittal: the fixed ankle in the lab")
-    markers: dict[str, Vector] = Field(
+    markers_mm: dict[str, Vector] = Field(
         default_factory=dict, description="markers: name -> position in the tibia link"
     )
-    markers_unit: LengthUnit = "mm"
     laboratory_axes: Axes = Field(
         "+x,+y,+z", description="axes of the file that point forward, up and right"
     )
 
+    @model_validator(mode="after")
+    def _kind_is_complete(self) -> Self:
+        if (self.kind == "pose") != (self.sequence is not None):
+            raise ValueError("'sequence' belongs to kind = 'pose', and is needed there")
+        if self.kind == "pose" and self.length_unit is None:
+            raise ValueError("kind = 'pose' needs 'length_unit'")
+        if (self.kind == "markers") != bool(self.markers_mm):
+            raise ValueError("'markers_mm' belongs to kind = 'markers', and is needed there")
+        return self
+
 
 class GroundReactionTable(_Table):
-    """The force that the ground exerts on the foot, in laboratory axes."""
+    """The force that the ground exerts on the foot, measured on one level plate."""
 
     file: Path
     format: Literal["csv", "sto", "mot"] | None = None
     columns: dict[str, str] = Field(
         default_factory=dict,
         description=(
-            "role -> column: time, force_1..3 (N, forward-up-right after laboratory_axes), "
-            "point_1..3 (centre of pressure), moment_1..3 (free moment at that point; optional)"
+            "role -> column: time, force_1..3 (N, along the file's x, y, z), "
+            "point_1..3 (centre of pressure), moment_1..3 (N·m, free moment at that point; "
+            "those not named and not in the file are zero)"
         ),
     )
     length_unit: LengthUnit
-    laboratory_axes: Axes = "+x,+y,+z"
+    laboratory_axes: Axes = Field(
+        "+x,+y,+z", description="axes of the file that point forward, up and right"
+    )
     applied: Literal["cop", "ankle"] = Field(
         "cop", description="'ankle' applies the force alone at the ankle centre (the source)"
     )
     cutoff_Hz: float | Literal["none"]
+    unloaded_N: float = Field(
+        20.0, gt=0, description="below this vertical force the centre of pressure is held"
+    )
 
 
 class FemoralImplantTable(_Table):

@@ -1,0 +1,224 @@
+"""Zero-phase low-pass filter and differentiation of recorded motion, on any time grid.
+
+The filter is the quintic smoothing spline: of all functions s it takes the one with the
+least
+
+    sum_i w_i (x_i - s(t_i))^2 + lambda * integral (s''')^2 dt,     lambda = (2 pi f_c)^-6
+
+with w_i the spacing of the samples. Away from the ends its frequency response is
+1 / (1 + (f / f_c)^6), that of a third-order Butterworth filter run forwards and backwards
+(one half at the cut-off f_c, no phase), but samples may be uneven and first and second
+derivatives are those of one smooth curve. Polynomials of degree two pass unchanged. Ends
+are natural: nothing is padded, and within about half a period of the cut-off of an end
+the curve and above all its acceleration are less certain. `periodic=True` closes the
+curve instead: the last sample is the first one of the next cycle, and there are no ends.
+
+`cutoff_Hz = "none"` interpolates the samples with a quintic spline.
+
+References:
+    Woltring, Adv Eng Softw 8:104 (1986), doi:10.1016/0141-1195(86)90098-7;
+    Craven & Wahba, Numer Math 31:377 (1979), doi:10.1007/BF01404567.
+"""
+
+import math
+from typing import Literal
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, pose
+
+Cutoff = float | Literal["none"]
+
+DEGREE = 5
+KNOTS_PER_PERIOD = 16
+"""Knots per period of the cut-off; with more samples than that, knots are thinned."""
+SHORTEST_PERIODS = 1.0
+"""A motion shorter than this many periods of the cut-off is refused."""
+
+
+def differentiate_coordinates(
+    time: Array,
+    coordinates: Array,
+    cutoff_Hz: Cutoff,
+    at: Array | None = None,
+    periodic: bool = False,
+    name: str = "motion",
+) -> tuple[Array, Array, Array]:
+    """Low-pass filter coordinates and differentiate them twice.
+
+    Args:
+        time: (n,) s, strictly rising.
+        coordinates: (n, k) or (n,), any unit; angles unwrapped.
+        cutoff_Hz: frequency at which the amplitude is halved, or "none".
+        at: (f,) s, where to evaluate; default: at `time`. Never outside it.
+        periodic: the samples are one closed cycle, time[-1] = time[0] + its period.
+        name: what to call the data in messages.
+
+    Returns:
+        Value, first and second derivative, each (f, k) or (f,).
+
+    Raises:
+        InputError: non-finite, unsorted or too few samples, cut-off at or above half the
+            sampling rate, motion too short for the cut-off, `at` outside `time`.
+    """
+    time, values = np.asarray(time, float), np.asarray(coordinates, float)
+    at = time if at is None else np.asarray(at, float)
+    _check_samples(time, values, at, name)
+    if cutoff_Hz == "none":
+        curve = _interpolating_spline(time, values, periodic)
+    else:
+        _check_cutoff(time, cutoff_Hz, name)
+        curve = _smoothing_spline(time, values, float(cutoff_Hz), periodic)
+    return curve(at), curve(at, 1), curve(at, 2)
+
+
+def differentiate_poses(
+    time: Array,
+    poses: Array,
+    cutoff_Hz: Cutoff,
+    at: Array | None = None,
+    name: str = "motion",
+) -> tuple[Array, Array, Array]:
+    """Low-pass filter poses of a body and differentiate them twice.
+
+    Positions are filtered as coordinates, orientations as sign-continuous quaternions that
+    are normalised afterwards; that does not depend on the axes chosen for either frame
+    (only, for positions, on the body's origin). With s the filtered quaternion,
+
+        omega = 2 vec(s* s') / |s|^2,   alpha = 2 vec(s* s'') / |s|^2 - 2 omega (s . s') / |s|^2
+
+    Args:
+        time: (n,) s.
+        poses: (n, 4, 4) pose_body_in_world, m.
+        cutoff_Hz: as in `differentiate_coordinates`, which states the errors too.
+        at: (f,) s.
+        name: what to call the data in messages.
+
+    Returns:
+        Poses (f, 4, 4); spatial velocity (f, 6) and spatial acceleration (f, 6), both
+        linear then angular, in the body's axes at the body's origin: v = (R^T p', omega),
+        a = dv/dt component by component, Pinocchio's convention for a free flyer.
+    """
+    poses = np.asarray(poses, float)
+    if not np.isfinite(poses).all():
+        raise InputError("a pose is not finite", name)
+    p, dp, ddp = differentiate_coordinates(time, poses[:, :3, 3], cutoff_Hz, at, name=name)
+    quaternions = _continuous(Rotation.from_matrix(poses[:, :3, :3]).as_quat())
+    s, ds, dds = differentiate_coordinates(time, quaternions, cutoff_Hz, at, name=name)
+    square = np.sum(s * s, axis=1, keepdims=True)
+    omega = 2.0 * _relative_vector(s, ds) / square
+    alpha = 2.0 * _relative_vector(s, dds) / square
+    alpha -= 2.0 * omega * np.sum(s * ds, axis=1, keepdims=True) / square
+    rotation = Rotation.from_quat(s).as_matrix()
+    linear = np.einsum("fji,fj->fi", rotation, dp)
+    linear_rate = np.einsum("fji,fj->fi", rotation, ddp) - np.cross(omega, linear)
+    velocity = np.concatenate([linear, omega], axis=1)
+    return pose(rotation, p), velocity, np.concatenate([linear_rate, alpha], axis=1)
+
+
+def _continuous(quaternions: Array) -> Array:
+    """Return the same rotations with signs that never jump from one row to the next."""
+    turns = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
+    signs = np.cumprod(np.where(np.concatenate([[False], turns]), -1.0, 1.0))
+    return np.asarray(quaternions * signs[:, None])
+
+
+def _relative_vector(s: Array, r: Array) -> Array:
+    """Return the vector part of conj(s) r for quaternions (f, 4), scalar last."""
+    sv, sw, rv, rw = s[:, :3], s[:, 3:], r[:, :3], r[:, 3:]
+    return np.asarray(sw * rv - rw * sv - np.cross(sv, rv))
+
+
+def _check_samples(time: Array, values: Array, at: Array, name: str) -> None:
+    if not (np.isfinite(time).all() and np.isfinite(values).all()):
+        raise InputError("a time or value is missing or not finite", name, "fill or cut the gap")
+    if np.any(np.diff(time) <= 0):
+        raise InputError("times do not rise strictly", name, "sort them and drop duplicates")
+    if len(time) < DEGREE + 1:
+        raise InputError(
+            f"{len(time)} samples are too few to differentiate twice",
+            name,
+            f"record at least {DEGREE + 1}",
+        )
+    slack = 1e-9 * (time[-1] - time[0])
+    outside = at[(at < time[0] - slack) | (at > time[-1] + slack)]
+    if len(outside):
+        raise InputError(
+            f"covers {time[0]:g} to {time[-1]:g} s, but {outside[0]:g} s is needed",
+            name,
+            "choose an interval inside the recording",
+        )
+
+
+def _check_cutoff(time: Array, cutoff_Hz: float, name: str) -> None:
+    duration, half_rate = time[-1] - time[0], 0.5 / np.diff(time).max()
+    if not (math.isfinite(cutoff_Hz) and cutoff_Hz > 0):
+        raise InputError(f"cut-off {cutoff_Hz:g} Hz is not a positive number", name)
+    if cutoff_Hz >= half_rate:
+        raise InputError(
+            f"cut-off {cutoff_Hz:g} Hz is not below {half_rate:g} Hz, half the sampling rate "
+            "at the widest step",
+            name,
+            'lower cutoff_Hz, or "none" to trust the samples',
+        )
+    if duration * cutoff_Hz < SHORTEST_PERIODS:
+        raise InputError(
+            f"{duration:g} s are shorter than one period of the cut-off {cutoff_Hz:g} Hz",
+            name,
+            'record longer, raise cutoff_Hz, or "none" to trust the samples',
+        )
+
+
+def _interpolating_spline(time: Array, values: Array, periodic: bool) -> BSpline:
+    if periodic:
+        values = values.copy()
+        values[0] = values[-1] = 0.5 * (values[0] + values[-1])
+        return make_interp_spline(time, values, DEGREE, bc_type="periodic")
+    return make_interp_spline(time, values, DEGREE)
+
+
+def _smoothing_spline(time: Array, values: Array, cutoff_Hz: float, periodic: bool) -> BSpline:
+    """Return the penalised least-squares spline of the module's equation."""
+    unit = 1.0 / (2.0 * math.pi * cutoff_Hz)  # in this unit of time lambda is one
+    start, end = time[0] / unit, time[-1] / unit
+    wanted = math.ceil((end - start) * KNOTS_PER_PERIOD / math.tau)
+    spans = max(DEGREE + 1, min(2 * len(time), wanted))
+    step = (end - start) / spans
+    knots = start + step * np.arange(-DEGREE, spans + DEGREE + 1)
+    design = BSpline.design_matrix(np.clip(time / unit, start, end), knots, DEGREE)
+    weights = np.gradient(time / unit)
+    if periodic:
+        weights[[0, -1]] *= 0.5  # both are the sample at phase zero
+    wrap = sp.eye_array(spans + DEGREE, format="csr")
+    if periodic:
+        wrap = sp.vstack([wrap[:spans, :spans], wrap[:DEGREE, :spans]], format="csr")
+    penalty = wrap.T @ _third_derivative_gram(spans, step) @ wrap
+    design = design @ wrap
+    normal = design.T @ sp.diags_array(weights) @ design + penalty
+    right = design.T @ (weights[:, None] * values.reshape(len(values), -1))
+    coefficients = wrap @ splu(normal.tocsc()).solve(right)
+    return BSpline(knots * unit, coefficients.reshape(-1, *values.shape[1:]), DEGREE)
+
+
+def _third_derivative_gram(spans: int, step: float) -> sp.csr_array:
+    """Return the integrals of B_i''' B_j''' over all spans of uniform knots.
+
+    The third derivative of a spline of degree five has the third differences of its
+    coefficients, over step^3, as coefficients of degree two; three Gauss points per span
+    integrate their products exactly.
+    """
+    knots = np.arange(-2.0, spans + 3.0)
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    points = (np.arange(spans)[:, None] + 0.5 + 0.5 * nodes).ravel()
+    quadratic = BSpline.design_matrix(points, knots, 2)
+    size = spans + DEGREE
+    third = sp.diags_array(
+        [-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(size - 3, size), format="csr"
+    )
+    basis = quadratic @ third / step**3
+    return sp.csr_array(basis.T @ sp.diags_array(np.tile(0.5 * step * weights, spans)) @ basis)

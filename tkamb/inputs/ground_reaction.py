@@ -1,0 +1,128 @@
+"""The ground reaction on the foot, from one force plate.
+
+The centre of pressure is a quotient, M/F, that means nothing near F = 0. So force and
+moment about the fixed laboratory origin are filtered, which is linear, and the centre of
+pressure is recomputed from them on the plate's level h:
+
+    x = (M_z + h F_x) / F_y,   z = (h F_z - M_x) / F_y,   T_y = M_y - (z F_x - x F_z)
+
+Below `unloaded_N` of vertical force the point is carried over linearly in time between the
+loaded frames on either side and the moment is whatever the wrench needs about that point:
+force and moment stay exactly as measured and filtered, only their point is conventional.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import MIRROR, Array
+from tkamb.inputs.filtering import differentiate_coordinates
+from tkamb.inputs.laboratory import check_roles, laboratory_rotation
+from tkamb.inputs.tables import Table, read_table
+from tkamb.scene import GroundReactionTable
+
+LEVEL_TOLERANCE = 0.01
+"""m; a centre of pressure that rises by more than this is not on a level plate."""
+
+
+@dataclass(frozen=True, eq=False)
+class GroundReaction:
+    """Force on the foot in the laboratory (x forward, y up, z right), a right foot's.
+
+    Args:
+        force: (f, 3) N.
+        point: (f, 3) m, the centre of pressure.
+        moment: (f, 3) N·m about that point; vertical while the foot is loaded.
+        loaded: (f,) whether the vertical force is at or above `unloaded_N`.
+    """
+
+    force: Array
+    point: Array
+    moment: Array
+    loaded: np.ndarray
+
+
+def load_ground_reaction(
+    table: GroundReactionTable, time: Array, side: Literal["right", "left"]
+) -> GroundReaction:
+    """Return the ground reaction at the frames of the knee's motion.
+
+    Args:
+        table: the scene's [ground_reaction].
+        time: (f,) s of the frames, on the file's clock.
+        side: of the knee; a left foot is mirrored.
+
+    Raises:
+        InputError: file or columns cannot be used, do not cover `time`, or a centre of
+            pressure is missing or not level while the plate is loaded.
+    """
+    recorded = read_table(table.file, table.format)
+    stamps = recorded.time(table.columns.get("time", "time"))
+    force, point, moment = _recorded(table, recorded)
+    loaded = force[:, 1] >= table.unloaded_N
+    point = _held(stamps, point, loaded, recorded)
+    level = float(np.median(point[loaded, 1])) if loaded.any() else 0.0
+    if loaded.any() and np.abs(point[loaded, 1] - level).max() > LEVEL_TOLERANCE:
+        raise InputError(
+            "the centre of pressure leaves the plate's level while it is loaded",
+            recorded.path,
+            "check columns point_1..3, length_unit and laboratory_axes",
+        )
+    if side == "left":
+        force, point, moment = force @ MIRROR, point @ MIRROR, -moment @ MIRROR
+    wrench = np.concatenate([force, np.cross(point, force) + moment], axis=1)
+    filtered, _, _ = differentiate_coordinates(
+        stamps, wrench, table.cutoff_Hz, time, name=str(recorded.path)
+    )
+    return _at_centre_of_pressure(filtered, level, table.unloaded_N, time, stamps, point)
+
+
+def _recorded(table: GroundReactionTable, recorded: Table) -> tuple[Array, Array, Array]:
+    """Return force (N), point (m) and free moment (N·m), each (n, 3), in the laboratory."""
+    roles = [f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)]
+    check_roles(table.columns, ("time", *roles), recorded.path, "ground_reaction")
+    rotation = laboratory_rotation(table.laboratory_axes, recorded.path)
+    columns = []
+    for role in roles:
+        column = table.columns.get(role, role)
+        if role.startswith("point"):
+            columns.append(recorded.column(column))  # undefined while unloaded
+        elif role.startswith("force") or role in table.columns or column in recorded.columns:
+            columns.append(recorded.complete_column(column))
+        else:
+            columns.append(np.zeros_like(columns[0]))
+    values = np.stack(columns, axis=1).reshape(-1, 3, 3) @ rotation.T
+    scale = recorded.unit_scale(table.length_unit, "length_unit")
+    return values[:, 0], values[:, 1] * scale, values[:, 2]
+
+
+def _held(stamps: Array, point: Array, loaded: np.ndarray, recorded: Table) -> Array:
+    """Return the points with those of the unloaded plate carried over in time."""
+    missing = loaded & ~np.isfinite(point).all(axis=1)
+    if missing.any():
+        raise InputError(
+            f"the centre of pressure is missing at {stamps[np.argmax(missing)]:g} s, "
+            "where the plate is loaded",
+            recorded.path,
+            "fill the gap",
+        )
+    if not loaded.any():
+        return np.zeros_like(point)
+    return np.stack([np.interp(stamps, stamps[loaded], point[loaded, k]) for k in range(3)], axis=1)
+
+
+def _at_centre_of_pressure(
+    wrench: Array, level: float, unloaded_N: float, time: Array, stamps: Array, held: Array
+) -> GroundReaction:
+    """Return force, point and moment of wrenches (f, 6) about the laboratory origin."""
+    force, about_origin = wrench[:, :3], wrench[:, 3:]
+    loaded = force[:, 1] >= unloaded_N
+    point = np.stack([np.interp(time, stamps, held[:, k]) for k in range(3)], axis=1)
+    point[:, 1] = level
+    fx, fy, fz = force[loaded].T
+    point[loaded, 0] = (about_origin[loaded, 2] + level * fx) / fy
+    point[loaded, 2] = (level * fz - about_origin[loaded, 0]) / fy
+    moment = about_origin - np.cross(point, force)
+    return GroundReaction(force, point, moment, loaded)

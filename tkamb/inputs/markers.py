@@ -1,0 +1,92 @@
+"""Rigid fit of skin markers: where a body stands, from the markers on it."""
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, pose, transform
+from tkamb.inputs.tables import Table
+
+WRONG_MARKERS = 0.05
+"""m; a median residual above this is a wrong marker, unit or set, not soft tissue."""
+
+
+def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) -> Array:
+    """Return the markers (n, m, 3), m, in the file's axes; gaps are NaN.
+
+    Raises:
+        InputError: a marker is not in the file; the message lists the nearest names.
+    """
+    known = {column[:-2] for column in table.columns if column.endswith("_x")}
+    for name in names:
+        if name not in known:
+            table.column(f"{name}_x")
+    columns = [[table.column(f"{name}_{axis}") for axis in "xyz"] for name in names]
+    return np.moveaxis(np.array(columns), 2, 0) * metres_per_unit
+
+
+def fit_rigid(points: Array, reference: Array) -> tuple[Array, Array]:
+    """Return the poses that carry the reference markers closest to the measured ones.
+
+    Least squares over rotations (Kabsch): with H = sum (r - r_mean)(p - p_mean)^T = U S V^T
+    the rotation is V diag(1, 1, det(V U^T)) U^T.
+
+    Args:
+        points: (n, m, 3) m, measured.
+        reference: (m, 3) m, the same markers in the body's frame.
+
+    Returns:
+        pose_body_in_world (n, 4, 4) and the root mean square distance (n,), m, between
+        measured and fitted markers.
+
+    Raises:
+        InputError: fewer than three markers, or all on one line.
+
+    Reference: Kabsch, Acta Cryst A32:922 (1976), doi:10.1107/S0567739476001873.
+    """
+    centred = reference - reference.mean(axis=0)
+    if len(reference) < 3 or np.linalg.svd(centred, compute_uv=False)[1] < 1e-3:
+        raise InputError(
+            "markers fix no orientation: fewer than three, or all on one line",
+            "[tibia] markers_mm",
+            "name three or more that span a triangle",
+        )
+    means = points.mean(axis=1)
+    h = np.einsum("mi,nmj->nij", centred, points - means[:, None])
+    u, _, vt = np.linalg.svd(h)
+    v, ut = np.swapaxes(vt, 1, 2), np.swapaxes(u, 1, 2)
+    signs = np.ones((len(points), 3))
+    signs[:, 2] = np.sign(np.linalg.det(v @ ut))
+    rotation = (v * signs[:, None, :]) @ ut
+    poses = pose(rotation, means - rotation @ reference.mean(axis=0))
+    fitted = transform(poses, np.broadcast_to(reference, points.shape))
+    residual = np.sqrt(np.mean(np.sum((fitted - points) ** 2, axis=2), axis=1))
+    return poses, np.asarray(residual)
+
+
+def complete_run(points: Array, time: Array, start: float, end: float, table: Table) -> slice:
+    """Return the longest run of frames around [start, end] in which no marker is missing.
+
+    Raises:
+        InputError: the recording does not cover the interval, or a marker is missing in it.
+    """
+    first = int(np.searchsorted(time, start + 1e-9, side="right")) - 1
+    last = int(np.searchsorted(time, end - 1e-9, side="left"))
+    if first < 0 or last >= len(time):
+        raise InputError(
+            f"covers {time[0]:g} to {time[-1]:g} s, but {start:g} to {end:g} s is needed",
+            table.path,
+            "choose an interval inside the recording",
+        )
+    gaps = np.logical_not(np.isfinite(points).reshape(len(points), -1).all(axis=1))
+    if gaps[first : last + 1].any():
+        frame = first + int(np.argmax(gaps[first : last + 1]))
+        raise InputError(
+            f"a shank marker is missing at {time[frame]:g} s",
+            table.path,
+            "leave that marker out, or choose another interval",
+        )
+    before = np.flatnonzero(gaps[:first])
+    after = np.flatnonzero(gaps[last:])
+    return slice(
+        int(before[-1]) + 1 if len(before) else 0, last + int(after[0]) if len(after) else None
+    )

@@ -1,0 +1,226 @@
+"""Read recorded tables: `.csv`, OpenSim `.sto` and `.mot`, and `.trc` markers."""
+
+import difflib
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.units import LENGTH
+
+FORMATS = ("csv", "sto", "mot", "trc")
+TRC_ROUNDING_S = 1e-3
+"""Cameras write `.trc` times rounded to the millisecond; the header's rate is exact."""
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Named columns of equal length, in the units of the file.
+
+    Args:
+        path: the file.
+        columns: name -> (n,) values. A `.trc` marker M has columns M_x, M_y, M_z.
+        length_unit: the unit that the file itself states (`.trc`), else None.
+        in_degrees: what the file itself states about angles (`.sto`, `.mot`), else None.
+    """
+
+    path: Path
+    columns: dict[str, Array]
+    length_unit: str | None = None
+    in_degrees: bool | None = None
+
+    def column(self, name: str) -> Array:
+        """Return one column.
+
+        Raises:
+            InputError: no such column; the message lists the nearest names.
+        """
+        if name not in self.columns:
+            raise InputError(f"has no column '{name}'", self.path, _near(name, self.columns))
+        return self.columns[name]
+
+    def complete_column(self, name: str) -> Array:
+        """Return one column that has no gap.
+
+        Raises:
+            InputError: no such column, or a value that is missing or not finite.
+        """
+        values = self.column(name)
+        gaps = np.flatnonzero(~np.isfinite(values))
+        if len(gaps):
+            raise InputError(
+                f"column '{name}' has {len(gaps)} missing or non-finite value(s), "
+                f"the first in data row {gaps[0] + 1}",
+                self.path,
+                "fill or cut the gap",
+            )
+        return values
+
+    def time(self, name: str = "time") -> Array:
+        """Return the time column, which must rise strictly.
+
+        Raises:
+            InputError: no such column, a gap, or a time that does not rise.
+        """
+        values = self.complete_column(name)
+        falls = np.flatnonzero(np.diff(values) <= 0)
+        if len(falls):
+            row = int(falls[0])
+            raise InputError(
+                f"column '{name}' does not rise from data row {row + 1} ({values[row]:g}) "
+                f"to {row + 2} ({values[row + 1]:g})",
+                self.path,
+                "sort the rows by time and drop duplicates",
+            )
+        return values
+
+    def unit_scale(self, length_unit: str | None, key: str) -> float:
+        """Return metres per unit of length of this file.
+
+        Args:
+            length_unit: the scene's word, or None to trust the file's own header.
+            key: the scene's key, for the message.
+
+        Raises:
+            InputError: neither states a unit, or they contradict each other.
+        """
+        unit = length_unit or self.length_unit
+        if unit not in LENGTH:
+            raise InputError("states no unit of length", self.path, f"give '{key}' in the scene")
+        if length_unit and self.length_unit and length_unit != self.length_unit:
+            raise InputError(
+                f"is in {self.length_unit} by its own header, but the scene says {length_unit}",
+                self.path,
+                f"correct '{key}'",
+            )
+        return LENGTH[unit]
+
+
+def read_table(path: Path, format: str | None = None) -> Table:
+    """Read a table.
+
+    Args:
+        path: the file.
+        format: "csv", "sto", "mot" or "trc"; by default the suffix.
+
+    Raises:
+        InputError: missing or unreadable file, unknown format, a malformed header or row.
+    """
+    path = Path(path)
+    kind = format or path.suffix.lower().lstrip(".")
+    if kind not in FORMATS:
+        raise InputError(f"unknown table format '{kind}'", path, f"use {', '.join(FORMATS)}")
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except FileNotFoundError:
+        raise InputError("no such file", path, "check the path") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read ({error})", path) from None
+    if kind == "csv":
+        return _read_csv(path, lines)
+    return _read_trc(path, lines) if kind == "trc" else _read_storage(path, lines)
+
+
+def _read_csv(path: Path, lines: list[str]) -> Table:
+    """Comma-separated: one header row; empty lines and lines that begin with # are skipped."""
+    rows = [
+        (number, line.split(","))
+        for number, line in enumerate(lines, 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not rows:
+        raise InputError("is empty", path)
+    names = [name.strip().strip('"') for name in rows[0][1]]
+    return Table(path, _columns(path, names, rows[1:]))
+
+
+def _read_storage(path: Path, lines: list[str]) -> Table:
+    """OpenSim storage: `key=value` lines to `endheader`, column names, rows."""
+    ends = [k for k, line in enumerate(lines) if line.strip().lower() == "endheader"]
+    if not ends:
+        raise InputError("has no 'endheader' line", path, "is it an OpenSim storage file?")
+    header = {}
+    for line in lines[: ends[0]]:
+        key, _, value = line.partition("=")
+        header[key.strip().lower()] = value.strip().lower()
+    rows = [
+        (number, line.split())
+        for number, line in enumerate(lines[ends[0] + 1 :], ends[0] + 2)
+        if line.strip()
+    ]
+    if not rows:
+        raise InputError("has no columns after 'endheader'", path)
+    degrees = {"yes": True, "no": False}.get(header.get("indegrees", ""))
+    return Table(path, _columns(path, rows[0][1], rows[1:]), in_degrees=degrees)
+
+
+def _read_trc(path: Path, lines: list[str]) -> Table:
+    """Markers. A marker at exactly (0, 0, 0), an empty cell and NaN are gaps."""
+    if len(lines) < 6 or not lines[0].startswith("PathFileType"):
+        raise InputError("is not a .trc file: too short or no 'PathFileType' line", path)
+    header = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=False))
+    names = [name.strip() for name in lines[3].split("\t")]
+    markers = [name for name in names[2:] if name]
+    columns = ["frame", "time", *(f"{m}_{axis}" for m in markers for axis in "xyz")]
+    rows = []
+    for number, line in enumerate(lines[5:], 6):
+        if line.strip():
+            cells = line.split("\t")
+            padded = cells[: len(columns)] + [""] * (len(columns) - len(cells))
+            rows.append((number, padded if not any(cells[len(columns) :]) else cells))
+    table = _columns(path, columns, rows)
+    for marker in markers:
+        absent = np.all([table[f"{marker}_{axis}"] == 0.0 for axis in "xyz"], axis=0)
+        for axis in "xyz":
+            table[f"{marker}_{axis}"][absent] = np.nan
+    frame = table.pop("frame")
+    table["time"] = _exact_time(table["time"], frame, header.get("DataRate", ""))
+    return Table(path, table, length_unit=header.get("Units", "").strip() or None)
+
+
+def _exact_time(time: Array, frame: Array, rate: str) -> Array:
+    """Return the camera's even time if the column is that, rounded; else the column.
+
+    The even time is the one that fits the rounded column best.
+    """
+    try:
+        period = 1.0 / float(rate)
+    except (ValueError, ZeroDivisionError):
+        return time
+    even = (frame - frame[0]) * period
+    even = even + (time - even).mean()
+    return even if np.abs(even - time).max() <= TRC_ROUNDING_S else time
+
+
+def _columns(path: Path, names: list[str], rows: list[tuple[int, list[str]]]) -> dict[str, Array]:
+    if not rows:
+        raise InputError("has no data rows", path)
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"has two columns named '{repeated[0]}'", path, "rename one")
+    values = np.empty((len(rows), len(names)))
+    for k, (number, cells) in enumerate(rows):
+        if len(cells) != len(names):
+            raise InputError(f"line {number} has {len(cells)} cells, the header {len(names)}", path)
+        values[k] = [_number(cell, path, number) for cell in cells]
+    return {name: values[:, k].copy() for k, name in enumerate(names)}
+
+
+def _number(cell: str, path: Path, line: int) -> float:
+    text = cell.strip()
+    if not text or "nan" in text.lower():
+        return math.nan
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"line {line} holds '{text}', which is no number", path) from None
+
+
+def _near(name: str, columns: dict[str, Array]) -> str:
+    lower = {column.lower(): column for column in columns}
+    close = difflib.get_close_matches(name.lower(), list(lower), n=4, cutoff=0.5)
+    listed = [lower[c] for c in close] or list(columns)[:8]
+    more = "" if close or len(columns) <= 8 else ", …"
+    return f"{'did you mean' if close else 'it has'} {', '.join(listed)}{more}"

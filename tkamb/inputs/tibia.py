@@ -1,0 +1,133 @@
+"""How the shank stands in the laboratory: a sagittal lean, poses, or shank markers.
+
+The laboratory is x forward, y up, z to the subject's right. The tibia link's origin is the
+ankle centre. A left shank is mirrored here, so that the mechanics see a right one.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, pose
+from tkamb.inputs.filtering import Cutoff, differentiate_coordinates, differentiate_poses
+from tkamb.inputs.laboratory import (
+    angle_scale,
+    check_roles,
+    laboratory_rotation,
+    poses_of_columns,
+)
+from tkamb.inputs.markers import WRONG_MARKERS, complete_run, fit_rigid, marker_trajectories
+from tkamb.inputs.tables import Table, read_table
+from tkamb.scene import TibiaTable
+from tkamb.units import MILLIMETRE
+
+
+@dataclass(frozen=True, eq=False)
+class BodyMotion:
+    """The motion of a body in the laboratory, SI.
+
+    Args:
+        time: (f,) s.
+        pose: (f, 4, 4) pose_tibia_in_laboratory, m.
+        velocity: (f, 6) spatial velocity in the body's axes at its origin, linear (m/s)
+            then angular (rad/s): Pinocchio's free flyer.
+        acceleration: (f, 6) its rate, component by component.
+        residual: (f,) m, root mean square distance of the marker fit before filtering; None
+            if the pose was not fitted.
+    """
+
+    time: Array
+    pose: Array
+    velocity: Array
+    acceleration: Array
+    residual: Array | None = None
+
+
+def load_tibia(
+    table: TibiaTable, time: Array, side: Literal["right", "left"], cutoff_Hz: Cutoff
+) -> BodyMotion:
+    """Return the tibia's motion at the frames of the knee's motion.
+
+    The whole record is filtered and then evaluated, so that a record longer than the
+    interval has no end effect in it.
+
+    Args:
+        table: the scene's [tibia].
+        time: (f,) s of the frames, on the file's clock.
+        side: of the knee.
+        cutoff_Hz: the motion's cut-off, which holds unless the table has its own.
+
+    Raises:
+        InputError: file, columns or markers cannot be used, or do not cover `time`.
+    """
+    cutoff: Cutoff = cutoff_Hz if table.cutoff_Hz is None else table.cutoff_Hz
+    recorded = read_table(table.file)
+    if table.kind == "sagittal":
+        return _sagittal(table, recorded, time, side, cutoff)
+    stamps = recorded.time(table.columns.get("time", "time"))
+    rotation = pose(laboratory_rotation(table.laboratory_axes, recorded.path), np.zeros(3))
+    residual = None
+    if table.kind == "markers":
+        stamps, poses, residual = _fitted(table, recorded, stamps, time)
+    else:
+        poses = _recorded_poses(table, recorded)
+    poses = rotation @ poses
+    if side == "left":
+        poses = mirrored_pose(poses)
+    name = str(recorded.path)
+    filtered, velocity, acceleration = differentiate_poses(stamps, poses, cutoff, time, name)
+    at_frames = None if residual is None else np.interp(time, stamps, residual)
+    return BodyMotion(time, filtered, velocity, acceleration, at_frames)
+
+
+def _sagittal(
+    table: TibiaTable, recorded: Table, time: Array, side: str, cutoff: Cutoff
+) -> BodyMotion:
+    """Return the lean about the laboratory's z over a fixed ankle."""
+    check_roles(table.columns, ("time", "angle"), recorded.path, "tibia")
+    stamps = recorded.time(table.columns.get("time", "time"))
+    lean = recorded.complete_column(table.columns.get("angle", "angle"))
+    lean = lean * angle_scale(recorded, table.angle_unit)
+    angle, rate, rate_of_rate = differentiate_coordinates(
+        stamps, -lean, cutoff, time, name=str(recorded.path)
+    )
+    ankle = np.array(table.ankle_mm) * MILLIMETRE
+    if side == "left":
+        ankle = MIRROR @ ankle
+    velocity, acceleration = np.zeros((len(time), 6)), np.zeros((len(time), 6))
+    velocity[:, 5], acceleration[:, 5] = rate, rate_of_rate
+    rotation = Rotation.from_euler("z", angle).as_matrix()
+    return BodyMotion(time, pose(rotation, ankle), velocity, acceleration)
+
+
+def _recorded_poses(table: TibiaTable, recorded: Table) -> Array:
+    assert table.sequence is not None
+    assert table.length_unit is not None
+    kinds = ("rotation", "translation")
+    roles = tuple(f"{kind}_{k}" for kind in kinds for k in (1, 2, 3))
+    check_roles(table.columns, ("time", *roles), recorded.path, "tibia")
+    return poses_of_columns(
+        recorded, table.columns, table.sequence, table.angle_unit, table.length_unit
+    )
+
+
+def _fitted(
+    table: TibiaTable, recorded: Table, stamps: Array, time: Array
+) -> tuple[Array, Array, Array]:
+    """Return times, poses and residuals of the marker fit, around the frames."""
+    names = list(table.markers_mm)
+    scale = recorded.unit_scale(table.length_unit, "length_unit")
+    points = marker_trajectories(recorded, names, scale)
+    run = complete_run(points, stamps, time[0], time[-1], recorded)
+    reference = np.array([table.markers_mm[name] for name in names]) * MILLIMETRE
+    poses, residual = fit_rigid(points[run], reference)
+    if np.median(residual) > WRONG_MARKERS:
+        raise InputError(
+            f"shank markers fit the tibia only to {np.median(residual) / MILLIMETRE:.0f} mm",
+            recorded.path,
+            "check the names and positions in [tibia] markers_mm, and length_unit",
+        )
+    return stamps[run], poses, residual
