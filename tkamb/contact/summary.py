@@ -1,0 +1,90 @@
+"""What each condyle carries, summed from a pressure map."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from tkamb.contact.model import CondyleContact
+from tkamb.geometry.frames import Array, inverse, transform
+
+
+def medial_points(points: Array, pose: Array, split: float | None) -> NDArray[np.bool_]:
+    """Say which map points (n, 3) lie under the medial condyle.
+
+    A point belongs to the condyle on whose side of the femoral component it lies: femoral
+    z < split is medial (right knee; left ones are mirrored at input).
+
+    Args:
+        points: (n, 3) m, insert frame.
+        pose: (4, 4) pose_femoral_in_insert.
+        split: z between the condyles in the femoral frame, m; None: one condyle, all medial.
+    """
+    if split is None:
+        return np.ones(len(points), bool)
+    return np.asarray(transform(inverse(pose), points)[:, 2] < split)
+
+
+def summarise_condyles(
+    medial: NDArray[np.bool_],
+    points: Array,
+    pressure: Array,
+    area: Array,
+    nodal_force: Array,
+    thickness: Array,
+) -> tuple[CondyleContact | None, CondyleContact | None]:
+    """Return what the medial and the lateral condyle carry, None where there is no pressure.
+
+    Args:
+        medial: (n,) which points belong to the medial condyle, see `medial_points`.
+        points: (n, 3) m, insert frame.
+        pressure: (n,) Pa.
+        area: (n,) m², tributary area.
+        nodal_force: (n, 3) N on the insert.
+        thickness: (n,) m, insert below each point along y.
+    """
+    loaded = pressure > 0
+    arrays = (points, pressure, area, nodal_force, thickness)
+    return (
+        _summarise(loaded & medial, *arrays),
+        _summarise(loaded & ~medial, *arrays),
+    )
+
+
+def wrench_of(points: Array, nodal_force: Array) -> Array:
+    """Return force (N) and moment about the insert origin (N·m), (6,), of nodal forces."""
+    moment = np.cross(points, nodal_force).sum(axis=0)
+    return np.concatenate([nodal_force.sum(axis=0), moment])
+
+
+def _summarise(
+    chosen: NDArray[np.bool_],
+    points: Array,
+    pressure: Array,
+    area: Array,
+    nodal_force: Array,
+    thickness: Array,
+) -> CondyleContact | None:
+    if not chosen.any():
+        return None
+    force = np.linalg.norm(nodal_force[chosen].sum(axis=0))
+    weight = np.linalg.norm(nodal_force[chosen], axis=1)
+    centre = weight @ points[chosen] / weight.sum()
+    covered = area[chosen].sum()
+    return CondyleContact(
+        force=float(force),
+        area=float(covered),
+        mean_pressure=float(force / covered),
+        peak_pressure=float(pressure[chosen].max()),
+        centre_of_pressure=centre,
+        thickness=thickness_under(centre, points, thickness),
+    )
+
+
+def thickness_under(place: Array, points: Array, thickness: Array) -> float:
+    """Return the insert's thickness (m) under a place (3,), between the nearest map points.
+
+    Inverse-distance weights of the four points nearest in x and z.
+    """
+    away, near = cKDTree(points[:, [0, 2]]).query(place[[0, 2]], k=min(4, len(points)))
+    weight = 1.0 / np.maximum(np.atleast_1d(away), 1e-9)
+    return float(weight @ thickness[np.atleast_1d(near)] / weight.sum())
