@@ -1,0 +1,79 @@
+"""Global matrices from cell matrices: one cached pattern of 3×3 node blocks."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import NDArray
+
+from tkamb.geometry.frames import Array
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """Where each cell's node pairs go in the global matrix of 3×3 blocks.
+
+    Args:
+        indptr: (n + 1,) start of each node's row.
+        indices: (b,) column node of each block.
+        slot: (c, 64) block of each ordered node pair of each cell.
+    """
+
+    indptr: Indices
+    indices: Indices
+    slot: Indices
+
+    @classmethod
+    def of_cells(cls, cells: Indices, nodes: int) -> "Pattern":
+        """Return the pattern of cells (c, 8) on so many nodes."""
+        rows = np.repeat(cells, 8, axis=1).ravel().astype(np.int64)
+        columns = np.tile(cells, (1, 8)).ravel()
+        keys, slot = np.unique(rows * nodes + columns, return_inverse=True)
+        indptr = np.searchsorted(keys, np.arange(nodes + 1) * nodes)
+        return cls(indptr, keys % nodes, slot.reshape(len(cells), 64))
+
+    @property
+    def nodes(self) -> int:
+        """How many nodes."""
+        return len(self.indptr) - 1
+
+    def assemble(self, matrices: Array, shape: Indices | None = None) -> sparse.csr_matrix:
+        """Return the sum (3n, 3n) of cell matrices.
+
+        Args:
+            matrices: (c, 24, 24), or (s, 24, 24) with `shape`.
+            shape: (c,) which matrix each cell takes.
+        """
+        blocks = matrices.reshape(-1, 8, 3, 8, 3).transpose(2, 4, 0, 1, 3).reshape(9, -1, 64)
+        data = np.empty((len(self.indices), 9))
+        flat = self.slot.ravel()
+        for entry in range(9):
+            values = blocks[entry] if shape is None else blocks[entry][shape]
+            data[:, entry] = np.bincount(flat, values.ravel(), len(self.indices))
+        return sparse.bsr_matrix(
+            (data.reshape(-1, 3, 3), self.indices, self.indptr), (3 * self.nodes, 3 * self.nodes)
+        ).tocsr()
+
+
+@dataclass(frozen=True, eq=False)
+class CellScatter:
+    """Sums per-cell nodal vectors into global ones.
+
+    Args:
+        cells: (c, 8) nodes of each cell.
+        nodes: how many nodes.
+    """
+
+    cells: Indices
+    nodes: int
+
+    def gather(self, displacement: Array) -> Array:
+        """Return (c, 24) from nodal (n, 3)."""
+        return displacement[self.cells].reshape(len(self.cells), 24)
+
+    def sum(self, forces: Array) -> Array:
+        """Return nodal (n, 3) from per-cell (c, 24)."""
+        flat, parts = self.cells.ravel(), forces.reshape(-1, 3)
+        return np.stack([np.bincount(flat, parts[:, d], self.nodes) for d in range(3)], axis=1)

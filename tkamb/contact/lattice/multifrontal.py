@@ -1,0 +1,170 @@
+"""Multifrontal Cholesky factorisation on a dissection tree, dense fronts by LAPACK.
+
+Each tree member gathers its rows and its children's updates into a dense front, eliminates
+its own unknowns and hands the rest up (Duff & Reid, ACM TOMS 9:302, 1983,
+doi:10.1145/356044.356047). The factor keeps, per member, W = [L11⁻¹; L21 L11⁻¹], so that
+either half of a solve is one product per member.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import NDArray
+from scipy.linalg import blas, lapack
+
+from tkamb.contact.lattice.dissection import Dissection
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Array
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Front:
+    """One member of the factor.
+
+    Args:
+        start: first own unknown in elimination order.
+        stop: one past the last own unknown.
+        boundary: (m,) later unknowns that it touches, increasing.
+        parent: member above, -1 at a root.
+        block: (k + m, k) W = [L11⁻¹; L21 L11⁻¹].
+    """
+
+    start: int
+    stop: int
+    boundary: Indices
+    parent: int
+    block: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CholeskyFactor:
+    """P A Pᵀ = L Lᵀ of a symmetric positive definite matrix.
+
+    Args:
+        order: (n,) unknowns in elimination order.
+        fronts: members, children before parents.
+    """
+
+    order: Indices
+    fronts: list[Front]
+
+    @property
+    def entries(self) -> int:
+        """How many numbers the factor holds."""
+        return sum(front.block.size for front in self.fronts)
+
+    def solve(self, right: Array) -> Array:
+        """Return x of A x = right, (n,) or (n, r)."""
+        x = np.array(right[self.order], order="F")
+        self.forward(x)
+        self.backward(x)
+        result = np.empty_like(x)
+        result[self.order] = x
+        return result
+
+    def forward(self, x: Array) -> None:
+        """Turn x into L⁻¹ x in place, in elimination order."""
+        for front in self.fronts:
+            k = front.stop - front.start
+            y = front.block @ x[front.start : front.stop]
+            x[front.start : front.stop] = y[:k]
+            x[front.boundary] -= y[k:]
+
+    def backward(self, x: Array) -> None:
+        """Turn x into L⁻ᵀ x in place, in elimination order."""
+        for front in reversed(self.fronts):
+            k = front.stop - front.start
+            own = front.block[:k].T @ x[front.start : front.stop]
+            x[front.start : front.stop] = own - front.block[k:].T @ x[front.boundary]
+
+
+def factorise(
+    matrix: sparse.csr_matrix, tree: Dissection, unknowns: list[Indices]
+) -> CholeskyFactor:
+    """Return the Cholesky factor.
+
+    Args:
+        matrix: (n, n) symmetric positive definite.
+        tree: dissection; used for its parents.
+        unknowns: unknowns that each tree member eliminates.
+
+    Raises:
+        ComputationError: the matrix is not positive definite.
+    """
+    order = np.concatenate(unknowns)
+    permuted = matrix[order][:, order].tocsc()
+    permuted.sort_indices()
+    updates: dict[int, list[tuple[Indices, Array]]] = {}
+    place = np.empty(len(order), np.int64)
+    fronts: list[Front] = []
+    start = 0
+    for member, own in enumerate(unknowns):
+        stop = start + len(own)
+        front, update = _eliminate(
+            permuted, start, stop, updates.pop(member, []), place, tree.parent[member]
+        )
+        fronts.append(front)
+        if len(front.boundary):
+            updates.setdefault(front.parent, []).append((front.boundary, update))
+        start = stop
+    return CholeskyFactor(order, fronts)
+
+
+def _eliminate(
+    matrix: sparse.csc_matrix,
+    start: int,
+    stop: int,
+    children: list[tuple[Indices, Array]],
+    place: Indices,
+    parent: int,
+) -> tuple[Front, Array]:
+    """Return a member's front and the update for its parent."""
+    k = stop - start
+    first, last = matrix.indptr[start], matrix.indptr[stop]
+    rows, values = matrix.indices[first:last], matrix.data[first:last]
+    columns = np.repeat(np.arange(k), np.diff(matrix.indptr[start : stop + 1]))
+    below = rows >= stop
+    boundary = np.unique(
+        np.concatenate([rows[below], *(b[np.searchsorted(b, stop) :] for b, _ in children)])
+    ).astype(np.int64)
+    m = len(boundary)
+    own, mixed, rest = (np.zeros(size, order="F") for size in ((k, k), (m, k), (m, m)))
+    inside = (rows >= start) & ~below
+    own[rows[inside] - start, columns[inside]] = values[inside]
+    place[boundary] = np.arange(m)
+    mixed[place[rows[below]], columns[below]] = values[below]
+    for indices, update in children:
+        split = int(np.searchsorted(indices, stop))
+        here, there = indices[:split] - start, place[indices[split:]]
+        _extend_add(own, here, here, update[:split, :split])
+        _extend_add(mixed, there, here, update[split:, :split])
+        _extend_add(rest, there, there, update[split:, split:])
+    lower, info = lapack.dpotrf(own, lower=1, clean=1, overwrite_a=1)
+    if info:
+        raise ComputationError("the stiffness matrix is not positive definite")
+    inverse, _ = lapack.dtrtri(lower, lower=1)
+    if m:
+        mixed = blas.dtrmm(1.0, inverse, mixed, side=1, lower=1, trans_a=1, overwrite_b=1)
+        rest = blas.dsyrk(-1.0, mixed, 1.0, rest, lower=1, overwrite_c=1)
+        mixed = blas.dtrmm(1.0, inverse, mixed, side=1, lower=1, overwrite_b=1)
+    block = np.concatenate([inverse, mixed])
+    return Front(start, stop, boundary, parent, block), rest
+
+
+def _extend_add(target: Array, rows: Indices, columns: Indices, update: Array) -> None:
+    """Add update to target[rows, columns], run by run of consecutive indices."""
+    for a, b in _runs(rows):
+        for c, d in _runs(columns):
+            target[rows[a] : rows[b - 1] + 1, columns[c] : columns[d - 1] + 1] += update[a:b, c:d]
+
+
+def _runs(indices: Indices) -> list[tuple[int, int]]:
+    """Return the stretches [a, b) of consecutive values of an increasing list."""
+    if not len(indices):
+        return []
+    breaks = np.flatnonzero(np.diff(indices) != 1) + 1
+    edges = [0, *breaks.tolist(), len(indices)]
+    return list(zip(edges[:-1], edges[1:], strict=True))
