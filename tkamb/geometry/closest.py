@@ -1,0 +1,206 @@
+"""Closest and lowest points of the femoral condyles, and the gap to the insert."""
+
+from dataclasses import dataclass
+
+import fcl
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.geometry.condyles import condyle_faces
+from tkamb.geometry.frames import Array, transform
+from tkamb.geometry.nearest import NearestPoints
+from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.surface import Surface
+
+Indices = NDArray[np.int64]
+
+_ROUNDS = 4
+_KEPT = 8
+_BATCH = 64
+
+
+@dataclass(frozen=True, eq=False)
+class CondyleGap:
+    """How far one condyle is from the insert, and where.
+
+    Args:
+        gap: m, distance of the closest points; negative: depth of the deepest femoral point
+            below the insert's surface.
+        point_on_femoral: (3,) m, insert frame.
+        point_on_insert: (3,) m, insert frame.
+        normal: (3,) unit, insert frame, out of the insert into the femur.
+    """
+
+    gap: float
+    point_on_femoral: Array
+    point_on_insert: Array
+    normal: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CondyleGaps:
+    """Both condyles; `lateral` is None where the femoral part has one condyle only."""
+
+    medial: CondyleGap
+    lateral: CondyleGap | None
+
+
+class ClosestPointQuery:
+    """Closest points of one pair of bodies, prepared for many poses.
+
+    Apart, the distance of the two triangulated surfaces (python-fcl, exact). Overlapping,
+    the largest distance of a point of the femoral surface inside the insert from the
+    insert's surface: vertices first, then the triangles about the deepest one, cut finer
+    (to about 1/16 of an edge). Both are the smallest signed distance to the insert over the
+    condyle, so the gap is continuous through touch.
+
+    The normal is the insert's vertex normals interpolated at the closest point, not the
+    normal of a facet nor the line between the points: it stays defined at touch and turns
+    smoothly as the contact moves, and serves as line of action.
+
+    Args:
+        femoral: femoral component, femoral frame.
+        insert: insert, insert frame.
+        split: z between the condyles in the femoral frame, None for one condyle.
+    """
+
+    def __init__(self, femoral: Surface, insert: Surface, split: float | None) -> None:
+        self.femoral, self.insert, self.split = femoral, insert, split
+        self._nearest = NearestPoints(insert)
+        self._rays = RayCaster(insert)
+        self._insert_tree = _tree(insert, np.arange(len(insert.faces)))
+        medial, lateral = condyle_faces(femoral, split)
+        self._condyles = [_Condyle(femoral, faces) for faces in (medial, lateral) if len(faces)]
+
+    def at(self, pose_femoral_in_insert: Array) -> CondyleGaps:
+        """Return the gaps at a pose (4, 4)."""
+        pose = np.asarray(pose_femoral_in_insert, float)
+        gaps = [self._gap(condyle, pose) for condyle in self._condyles]
+        return CondyleGaps(gaps[0], gaps[1] if len(gaps) > 1 else None)
+
+    def _gap(self, condyle: "_Condyle", pose: Array) -> CondyleGap:
+        deepest = self._deepest_vertex(condyle, pose)
+        if deepest is not None:
+            return self._refined(condyle.around(deepest), pose)
+        apart = self._apart(condyle, pose)
+        if apart.gap > 0:
+            return apart
+        return self._refined(condyle.faces[self._crossed(condyle, pose)], pose)
+
+    def _apart(self, condyle: "_Condyle", pose: Array) -> CondyleGap:
+        request = fcl.DistanceRequest(enable_nearest_points=True)
+        result = fcl.DistanceResult()
+        femoral, insert = condyle.placed(pose), fcl.CollisionObject(self._insert_tree)
+        distance = fcl.distance(femoral, insert, request, result)
+        on_femoral, on_insert = (np.asarray(point, float) for point in result.nearest_points)
+        normal = self._nearest.normals_at(on_insert[None], np.array([result.b2]))[0]
+        return CondyleGap(float(distance), on_femoral, on_insert, normal)
+
+    def _crossed(self, condyle: "_Condyle", pose: Array) -> Indices:
+        """Return which triangles of the condyle cut through the insert's surface."""
+        request = fcl.CollisionRequest(num_max_contacts=_BATCH, enable_contact=True)
+        result = fcl.CollisionResult()
+        fcl.collide(condyle.placed(pose), fcl.CollisionObject(self._insert_tree), request, result)
+        return np.unique([contact.b1 for contact in result.contacts])
+
+    def _deepest_vertex(self, condyle: "_Condyle", pose: Array) -> Indices | None:
+        """Return the deepest few vertices inside the insert, deepest first; None if none is.
+
+        The depth along y bounds the depth from above and orders the search.
+        """
+        points = transform(pose, condyle.points)
+        low, high = self.insert.bounds
+        near = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
+        below = self._depth_along_y(points[near])
+        order = np.argsort(-below)
+        order = order[below[order] > 0]
+        depth = np.zeros(0)
+        for start in range(0, len(order), _BATCH):
+            batch = order[start : start + _BATCH]
+            if len(depth) and below[batch[0]] < depth.max():
+                break
+            depth = np.append(depth, self._nearest.at(points[near[batch]]).distance)
+        if len(depth) == 0:
+            return None
+        return condyle.vertices[near[order[np.argsort(-depth)[:_KEPT]]]]
+
+    def _depth_along_y(self, points: Array) -> Array:
+        """Return the distance (n,) up to the insert's surface, 0 for points outside it."""
+        distance, face = self._rays.first(points, np.array([0.0, 1.0, 0.0]))
+        inside = (face >= 0) & (self.insert.face_normals[face, 1] > 0)
+        return np.where(inside, distance, 0.0)
+
+    def _refined(self, faces: Indices, pose: Array) -> CondyleGap:
+        """Return the deepest point of the given triangles, cutting the best ones finer."""
+        triangles = transform(pose, self.femoral.triangles[faces].reshape(-1, 3)).reshape(-1, 3, 3)
+        for _ in range(_ROUNDS):
+            triangles = _quartered(triangles)
+            middles = triangles.mean(axis=1)
+            near = self._nearest.at(middles)
+            inside = self._depth_along_y(middles) > 0
+            depth = np.where(inside, near.distance, -near.distance)
+            triangles = triangles[np.argsort(-depth)[:_KEPT]]
+        corners = np.concatenate([triangles.reshape(-1, 3), triangles.mean(axis=1)])
+        near = self._nearest.at(corners)
+        depth = np.where(self._depth_along_y(corners) > 0, near.distance, -near.distance)
+        best = int(np.argmax(depth))
+        return CondyleGap(
+            -float(depth[best]), corners[best], near.points[best], near.normals[best]
+        )
+
+
+class _Condyle:
+    """The triangles of one condyle: their tree, their vertices."""
+
+    def __init__(self, femoral: Surface, faces: Indices) -> None:
+        self.faces = faces
+        self.tree = _tree(femoral, faces)
+        self.vertices = np.unique(femoral.faces[faces])
+        self.points = femoral.vertices[self.vertices]
+        self._corners = femoral.faces[faces]
+
+    def placed(self, pose: Array) -> fcl.CollisionObject:
+        """Return the condyle's tree at a pose (4, 4)."""
+        return fcl.CollisionObject(self.tree, fcl.Transform(pose[:3, :3], pose[:3, 3]))
+
+    def around(self, vertices: Indices) -> Indices:
+        """Return the triangles that touch the vertices."""
+        return self.faces[np.isin(self._corners, vertices).any(axis=1)]
+
+
+def closest_points(
+    femoral: Surface, insert: Surface, pose_femoral_in_insert: Array, split: float | None
+) -> CondyleGaps:
+    """Return the gaps at one pose; `ClosestPointQuery` is the way to many."""
+    return ClosestPointQuery(femoral, insert, split).at(pose_femoral_in_insert)
+
+
+def lowest_points(
+    femoral: Surface, pose_femoral_in_insert: Array, split: float | None
+) -> tuple[Array, Array | None]:
+    """Return the lowest point (3,), insert frame, of the medial and the lateral condyle.
+
+    Lowest along the insert's y. The lateral one is None without a split.
+    """
+    points = transform(pose_femoral_in_insert, femoral.vertices)
+    lowest = []
+    for faces in condyle_faces(femoral, split):
+        vertices = np.unique(femoral.faces[faces])
+        lowest.append(points[vertices[np.argmin(points[vertices, 1])]] if len(faces) else None)
+    return lowest[0], lowest[1]
+
+
+def _tree(surface: Surface, faces: Indices) -> fcl.BVHModel:
+    model = fcl.BVHModel()
+    model.beginModel(len(surface.vertices), len(faces))
+    model.addSubModel(surface.vertices, surface.faces[faces])
+    model.endModel()
+    return model
+
+
+def _quartered(triangles: Array) -> Array:
+    """Return the four halves-by-edge triangles (4k, 3, 3) of triangles (k, 3, 3)."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    return np.concatenate([np.stack(part, axis=1) for part in parts])

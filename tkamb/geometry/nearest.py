@@ -1,0 +1,139 @@
+"""Nearest points of a triangulated surface."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from tkamb.geometry.frames import Array
+from tkamb.geometry.surface import Surface
+
+Indices = NDArray[np.int64]
+
+_MOST_SAMPLES = 150_000
+_CANDIDATES = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Nearest:
+    """Nearest points of a surface to n points.
+
+    Args:
+        distance: (n,) m.
+        points: (n, 3) m, on the surface.
+        faces: (n,) triangle of each.
+        normals: (n, 3) unit normals there, interpolated from the vertices.
+    """
+
+    distance: Array
+    points: Array
+    faces: Indices
+    normals: Array
+
+
+class NearestPoints:
+    """Answers for the nearest points of one surface.
+
+    Samples of the surface in a k-d tree pick a few triangles for each point; the nearest
+    point of those triangles is exact. A triangle can be missed only where another one is as
+    near to within second order of the spacing (tested against all triangles: < 1 µm at the
+    default spacing on implants).
+    """
+
+    def __init__(self, surface: Surface, spacing: float = 7e-4) -> None:
+        self.surface = surface
+        samples, self._faces = sampled(surface, spacing)
+        self._tree = cKDTree(samples)
+
+    @cached_property
+    def vertex_normals(self) -> Array:
+        """Unit normals (n, 3) of the vertices, weighted by the areas of their triangles."""
+        return vertex_normals(self.surface)
+
+    def at(self, points: ArrayLike) -> Nearest:
+        """Return the nearest points to `points` (n, 3), m, in the surface's frame."""
+        points = np.asarray(points, float).reshape(-1, 3)
+        count = min(_CANDIDATES, len(self._faces))
+        near = self._tree.query(points, k=count)[1].reshape(len(points), count)
+        candidates = self._faces[near]
+        triangles = self.surface.triangles[candidates.reshape(-1)]
+        repeated = np.repeat(points, count, axis=0)
+        feet = trimesh.triangles.closest_point(triangles, repeated).reshape(-1, count, 3)
+        apart = np.linalg.norm(feet - points[:, None], axis=2)
+        row, best = np.arange(len(points)), apart.argmin(axis=1)
+        foot, face = feet[row, best], candidates[row, best]
+        return Nearest(apart[row, best], foot, face, self.normals_at(foot, face))
+
+    def normals_at(self, points: Array, faces: Indices) -> Array:
+        """Return the interpolated unit normals (n, 3) at points (n, 3) of given triangles."""
+        corners = self.surface.faces[faces]
+        weights = barycentric(self.surface.vertices[corners], points)
+        normal = np.einsum("ij,ijk->ik", weights, self.vertex_normals[corners])
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        return np.asarray(np.divide(normal, length, out=np.zeros_like(normal), where=length > 0))
+
+
+def sampled(surface: Surface, spacing: float) -> tuple[Array, Indices]:
+    """Return samples (n, 3) that cover every triangle, and the triangle (n,) of each.
+
+    A triangle is cut into n² like ones so that no edge is longer than the spacing; the
+    samples are their centres. The spacing grows where a surface would need more than
+    150 000 samples.
+    """
+    triangles = surface.triangles
+    longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
+    cuts = np.maximum(np.ceil(longest / spacing).astype(int), 1)
+    while (cuts**2).sum() > max(_MOST_SAMPLES, len(triangles)) and cuts.max() > 1:
+        spacing *= 1.2
+        cuts = np.maximum(np.ceil(longest / spacing).astype(int), 1)
+    samples, faces = [], []
+    for n in np.unique(cuts):
+        members = np.flatnonzero(cuts == n)
+        samples.append(np.einsum("sj,kjc->ksc", _centres(int(n)), triangles[members]))
+        faces.append(np.repeat(members, n * n))
+    return np.concatenate([s.reshape(-1, 3) for s in samples]), np.concatenate(faces)
+
+
+def vertex_normals(surface: Surface) -> Array:
+    """Return the unit normals (n, 3) of the vertices, weighted by area; outward."""
+    corners = surface.triangles
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    index = surface.faces.reshape(-1)
+    total = _summed(index, np.repeat(cross, 3, axis=0), len(surface.vertices))
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0))
+
+
+def barycentric(triangles: Array, points: Array) -> Array:
+    """Return the barycentric coordinates (n, 3) of points in triangles (n, 3, 3)."""
+    a = triangles[:, 0]
+    u, v, w = triangles[:, 1] - a, triangles[:, 2] - a, points - a
+    uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)
+    wu, wv = _dot(w, u), _dot(w, v)
+    scale = uu * vv - uv * uv
+    flat = scale <= 1e-14 * uu * vv
+    scale = np.where(flat, 1.0, scale)
+    second, third = (vv * wu - uv * wv) / scale, (uu * wv - uv * wu) / scale
+    weights = np.clip(np.stack([1 - second - third, second, third], axis=1), 0.0, 1.0)
+    weights[flat] = 1 / 3
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+
+def _summed(index: Indices, rows: Array, count: int) -> Array:
+    return np.stack([np.bincount(index, column, count) for column in rows.T], axis=1)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray(np.einsum("ij,ij->i", a, b))
+
+
+def _centres(n: int) -> Array:
+    """Return barycentric centres (n², 3) of a triangle cut n times along each edge."""
+    i, j = np.divmod(np.arange(n * n), n)
+    upright, inverted = i + j < n, i + j < n - 1
+    first = np.concatenate([i[upright] + 1 / 3, i[inverted] + 2 / 3]) / n
+    second = np.concatenate([j[upright] + 1 / 3, j[inverted] + 2 / 3]) / n
+    return np.stack([1 - first - second, first, second], axis=1)
