@@ -1,0 +1,301 @@
+"""The patella's place in the sagittal plane when its motion was not recorded.
+
+Three unknowns per frame, the joint coordinates patella_ap, patella_si and patella_rotation,
+and three equations of a massless patella without friction:
+
+    gap to the femoral component = 0
+    length of the patellar ligament = its given length
+    quadriceps, ligament and contact force meet in one point (moment balance in the plane)
+
+By virtual work the third says that the quadriceps' length is stationary among all places
+that satisfy the first two; a stable patella sits at a minimum of it. So the search turns
+the patella in the direction of the unbalanced moment until that changes sign.
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+from itertools import pairwise
+
+import numpy as np
+from scipy.optimize import brentq
+
+from tkamb.body.patellofemoral import PatellarContact, PatellofemoralContact
+from tkamb.body.wrapping import TautPath, path_in_link
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Array, inverse, rotate, transform
+
+TOLERANCE = 1e-8
+"""m, of gap and ligament length."""
+
+FIRST_STEP = np.deg2rad(0.5)
+WIDEST_TURN = np.deg2rad(40.0)
+"""rad: first step and end of the search about the guess."""
+
+
+class PatellaStatus(Enum):
+    """How the search ended."""
+
+    OK = "ok"
+    SEVERAL = "several_solutions"
+    EDGE = "contact_on_edge_of_femoral_mesh"
+    NO_CONTACT = "no_contact"
+    NOT_FOUND = "not_found"
+
+
+@dataclass(frozen=True, eq=False)
+class PatellaState:
+    """The patella at one frame.
+
+    Args:
+        coordinates: (3,) patella_ap, patella_si (m), patella_rotation (rad); NaN if not found.
+        contact_point: (3,) m, on the line of action, insert frame.
+        contact_normal: (3,) unit, out of the femur into the patella, in the femur's sagittal
+            plane, insert frame.
+        contact_on_patella: (3,) m, the same point in the patella's frame.
+        gap: m, positive when apart.
+        ligament_ratio: patellar ligament tension per quadriceps tension, massless patella.
+        patellofemoral_ratio: patellofemoral force per quadriceps tension, massless patella.
+        lateral: lateral part of the unit contact force that the groove leaves unbalanced.
+        status: how the search ended.
+    """
+
+    coordinates: Array
+    contact_point: Array
+    contact_normal: Array
+    contact_on_patella: Array
+    gap: float
+    ligament_ratio: float
+    patellofemoral_ratio: float
+    lateral: float
+    status: PatellaStatus
+
+
+@dataclass(frozen=True, eq=False)
+class ExtensorMechanism:
+    """What stays the same over all frames.
+
+    Args:
+        contact: button against femoral component, in the patellar joint's frame.
+        pose_joint_in_femur: (4, 4), the patellar joint's frame on the femur link.
+        quadriceps_origin: (3,) m, femur link.
+        quadriceps_insertion: (3,) m, patella link.
+        ligament_proximal: (3,) m, patella link.
+        ligament_distal: (3,) m, insert frame.
+        ligament_length: m.
+        femoral_outline: (n, 2) m, in the femur link's x-y plane; None: no wrapping.
+        insert_outline: (n, 2) m, in the insert's x-y plane; None: no wrapping.
+    """
+
+    contact: PatellofemoralContact
+    pose_joint_in_femur: Array
+    quadriceps_origin: Array
+    quadriceps_insertion: Array
+    ligament_proximal: Array
+    ligament_distal: Array
+    ligament_length: float
+    femoral_outline: Array | None = None
+    insert_outline: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Balance:
+    """Forces on the patella per unit quadriceps tension, in the joint's frame."""
+
+    coordinates: Array
+    contact: PatellarContact
+    quadriceps: TautPath
+    ligament: TautPath
+    ligament_force: float
+    normal_force: float
+    moment: float
+
+
+def solve_patella(
+    mechanism: ExtensorMechanism,
+    pose_femur_in_insert: Array,
+    guess: Array | None = None,
+) -> PatellaState:
+    """Return the patella's place at one frame.
+
+    Args:
+        mechanism: points, lengths, outlines and surfaces.
+        pose_femur_in_insert: (4, 4) of the femur link.
+        guess: (3,) coordinates of the previous frame; None searches all rotations.
+
+    Returns:
+        The state; coordinates and forces are NaN unless status is OK, SEVERAL or EDGE.
+    """
+    frame = _Frame(mechanism, pose_femur_in_insert)
+    several = False
+    try:
+        found = None if guess is None or not np.isfinite(guess).all() else frame.follow(guess)
+        if found is None:
+            found, several = frame.scan()
+    except ComputationError:
+        found = None
+    if found is None:
+        return _nothing(PatellaStatus.NOT_FOUND)
+    if found.normal_force <= 0.0 or found.ligament_force <= 0.0:
+        return _nothing(PatellaStatus.NO_CONTACT)
+    status = PatellaStatus.SEVERAL if several else PatellaStatus.OK
+    if found.contact.at_edge:
+        status = PatellaStatus.EDGE
+    return frame.state(found, status)
+
+
+def patella_at(
+    mechanism: ExtensorMechanism, pose_femur_in_insert: Array, coordinates: Array
+) -> PatellaState:
+    """Return the contact of a patella whose place was recorded; its gap is as recorded."""
+    frame = _Frame(mechanism, pose_femur_in_insert)
+    balance = frame.balance(np.asarray(coordinates, float))
+    edge = balance.contact.at_edge
+    return frame.state(balance, PatellaStatus.EDGE if edge else PatellaStatus.OK)
+
+
+class _Frame:
+    """The mechanism at one frame, in the patellar joint's frame."""
+
+    def __init__(self, mechanism: ExtensorMechanism, pose_femur_in_insert: Array) -> None:
+        self.mechanism = mechanism
+        self.in_insert = np.asarray(pose_femur_in_insert, float) @ mechanism.pose_joint_in_femur
+        self.insert = inverse(self.in_insert)
+        self.femur = inverse(mechanism.pose_joint_in_femur)
+        self.origin = transform(self.femur, mechanism.quadriceps_origin)
+        self.tuberosity = transform(self.insert, mechanism.ligament_distal)
+
+    def balance(self, coordinates: Array) -> _Balance:
+        """Return the forces with the force balance met and the moment left over (m)."""
+        m = self.mechanism
+        here = m.contact.pose(coordinates)
+        contact = m.contact.at(coordinates)
+        quadriceps = path_in_link(
+            self.origin, transform(here, m.quadriceps_insertion), m.femoral_outline, self.femur
+        )
+        ligament = path_in_link(
+            transform(here, m.ligament_proximal), self.tuberosity, m.insert_outline, self.insert
+        )
+        pull, hold = -quadriceps.end_direction[:2], ligament.start_direction[:2]
+        sides = np.column_stack([hold, contact.normal[:2]])
+        if abs(np.linalg.det(sides)) < 1e-6:
+            raise ComputationError("the patellar ligament runs along the contact normal")
+        ligament_force, normal_force = np.linalg.solve(sides, -pull)
+        moment = (
+            _cross(quadriceps.points[-1], pull)
+            + ligament_force * _cross(ligament.points[0], hold)
+            + normal_force * _cross(contact.point, contact.normal)
+        )
+        return _Balance(
+            coordinates,
+            contact,
+            quadriceps,
+            ligament,
+            float(ligament_force),
+            float(normal_force),
+            float(moment),
+        )
+
+    def settled(self, start: Array, rotation: float) -> _Balance | None:
+        """Return the balance where gap and ligament length hold at a rotation (Newton)."""
+        coordinates = np.array([start[0], start[1], rotation])
+        for _ in range(40):
+            balance = self.balance(coordinates)
+            errors = np.array(
+                [balance.contact.gap, balance.ligament.length - self.mechanism.ligament_length]
+            )
+            if np.abs(errors).max() < TOLERANCE:
+                return balance
+            slopes = np.stack([balance.contact.normal[:2], -balance.ligament.start_direction[:2]])
+            step = np.linalg.solve(slopes, -errors)
+            step *= min(1.0, 5e-3 / np.linalg.norm(step))
+            coordinates = coordinates + np.append(step, 0.0)
+        return None
+
+    def follow(self, guess: Array) -> _Balance | None:
+        """Return the stable balance next to a guess: turn with the moment to its zero."""
+        here = self.settled(guess, float(guess[2]))
+        if here is None:
+            return None
+        step = FIRST_STEP
+        while abs(here.coordinates[2] - guess[2]) < WIDEST_TURN:
+            turn = here.coordinates[2] + np.sign(here.moment) * step
+            there = self.settled(here.coordinates, float(turn))
+            if there is None:
+                return None
+            if there.moment * here.moment <= 0.0:
+                return self.between(here, there)
+            here, step = there, 1.6 * step
+        return None
+
+    def between(self, here: _Balance, there: _Balance) -> _Balance | None:
+        """Return the balance at the zero of the moment between two rotations."""
+        last = here
+
+        def moment(rotation: float) -> float:
+            nonlocal last
+            settled = self.settled(last.coordinates, rotation)
+            if settled is None:
+                raise ComputationError("the patella's search left the femoral component")
+            last = settled
+            return settled.moment
+
+        ends = (here.coordinates[2], there.coordinates[2])
+        brentq(moment, *ends, xtol=1e-9, rtol=1e-12)
+        return last
+
+    def scan(self) -> tuple[_Balance | None, bool]:
+        """Return the stable balance with the shortest quadriceps, and whether there are more."""
+        flexion = np.arctan2(self.in_insert[1, 0], self.in_insert[0, 0])
+        rotations = -0.65 * flexion + np.deg2rad(np.arange(-50.0, 50.1, 10.0))
+        places = [self.first_touch(float(rotation)) for rotation in rotations]
+        found = []
+        for here, there in pairwise(places):
+            if here and there and here.moment > 0.0 >= there.moment:
+                balance = self.between(here, there)
+                if balance is not None:
+                    found.append(balance)
+        if not found:
+            return None, False
+        return min(found, key=lambda b: b.quadriceps.length), len(found) > 1
+
+    def first_touch(self, rotation: float) -> _Balance | None:
+        """Return the balance at a rotation, the patella swung in on its ligament from in front."""
+        m = self.mechanism
+        turned = m.contact.pose(np.array([0.0, 0.0, rotation]))
+        proximal = transform(turned, m.ligament_proximal)
+        radius = np.sqrt(max(m.ligament_length**2 - (proximal[2] - self.tuberosity[2]) ** 2, 1e-8))
+        axes = self.insert[:2, :2]
+        for lean in np.deg2rad(np.arange(75.0, -75.1, -3.0)):
+            swing = axes @ (radius * np.array([np.sin(lean), np.cos(lean)]))
+            place = self.tuberosity[:2] + swing - proximal[:2]
+            if m.contact.at(np.append(place, rotation)).gap <= 0.0:
+                try:
+                    return self.settled(place, rotation)
+                except ComputationError:
+                    return None
+        return None
+
+    def state(self, balance: _Balance, status: PatellaStatus) -> PatellaState:
+        """Return the result in the insert frame."""
+        contact = balance.contact
+        in_patella = inverse(self.mechanism.contact.pose(balance.coordinates))
+        return PatellaState(
+            balance.coordinates,
+            transform(self.in_insert, contact.point),
+            rotate(self.in_insert, contact.normal),
+            transform(in_patella, contact.point),
+            contact.gap,
+            balance.ligament_force,
+            balance.normal_force,
+            contact.lateral,
+            status,
+        )
+
+
+def _cross(a: Array, b: Array) -> float:
+    return float(a[0] * b[1] - a[1] * b[0])
+
+
+def _nothing(status: PatellaStatus) -> PatellaState:
+    nan = np.full(3, np.nan)
+    return PatellaState(nan, nan, nan, nan, np.nan, np.nan, np.nan, np.nan, status)
