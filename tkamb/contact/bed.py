@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.smooth_normals import smooth_normals
 from tkamb.geometry.surface import Surface
 
 DOWN = np.array([0.0, -1.0, 0.0])
@@ -16,8 +17,6 @@ RIM_RAYS = 8
 """Rays per edge of a cell at the rim, to find how much of it is covered."""
 STEEPEST = 0.1
 """Smallest n_y taken for a tributary area: 84 deg from the horizontal."""
-SMOOTH = np.cos(np.radians(30.0))
-"""Beyond this angle from its triangle's normal an interpolated normal crosses an edge."""
 MOST_CELLS = 4_000_000
 
 
@@ -27,7 +26,7 @@ class Bed:
 
     Args:
         points: (n, 3) m, insert frame, on the mesh itself.
-        normals: (n, 3) outward unit normals, interpolated between vertices.
+        normals: (n, 3) outward unit normals, see `smooth_normals`.
         area: (n,) m², tributary area on the true surface: the part of the grid cell that
             the insert covers, divided by n_y. Under a uniform pressure the vertical force
             is exactly pressure times covered projection.
@@ -64,31 +63,10 @@ def sample_bed(insert: Surface, resolution: float) -> Bed:
     hit = np.isfinite(_first(caster, centres)[0])
     xz, covered, cell = _cells(caster, centres, hit.reshape(shape), resolution)
     points, face, thickness = _through(caster, xz, insert)
-    normals = surface_normals(insert, points, face)
+    normals = smooth_normals(insert, points, face)
     area = covered * resolution**2 / np.maximum(normals[:, 1], STEEPEST)
     triangles = _grid_triangles(cell, shape)
     return Bed(points, normals, area, thickness, triangles, resolution)
-
-
-def surface_normals(surface: Surface, points: Array, face: NDArray[np.int64]) -> Array:
-    """Return unit normals (n, 3) at points (n, 3) on triangles `face` (n,).
-
-    Angle-weighted vertex normals, interpolated; the triangle's own normal where a sharp edge
-    is near (the two differ by more than 30 deg).
-    """
-    corners = surface.triangles[face]
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    cross = np.cross(a, b)
-    square = np.einsum("ij,ij->i", cross, cross)
-    offset = points - corners[:, 0]
-    v = np.einsum("ij,ij->i", np.cross(offset, b), cross) / square
-    w = np.einsum("ij,ij->i", np.cross(a, offset), cross) / square
-    weights = np.stack([1 - v - w, v, w], axis=1)
-    normals = np.einsum("ij,ijk->ik", weights, surface.mesh.vertex_normals[surface.faces[face]])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    own = surface.face_normals[face]
-    sharp = np.einsum("ij,ij->i", normals, own) < SMOOTH
-    return np.where(sharp[:, None], own, normals)
 
 
 def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:
