@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
@@ -61,7 +60,7 @@ class NearestPoints:
         candidates = self._faces[near]
         triangles = self.surface.triangles[candidates.reshape(-1)]
         repeated = np.repeat(points, count, axis=0)
-        feet = trimesh.triangles.closest_point(triangles, repeated).reshape(-1, count, 3)
+        feet = nearest_on_triangles(triangles, repeated).reshape(-1, count, 3)
         apart = np.linalg.norm(feet - points[:, None], axis=2)
         row, best = np.arange(len(points)), apart.argmin(axis=1)
         foot, face = feet[row, best], candidates[row, best]
@@ -107,19 +106,43 @@ def vertex_normals(surface: Surface) -> Array:
     return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0))
 
 
+def nearest_on_triangles(triangles: Array, points: Array) -> Array:
+    """Return for each point (n, 3) the nearest one (n, 3) of its own triangle (n, 3, 3).
+
+    The foot on the triangle's plane where that lies inside, else the nearest of the feet on
+    the three edges. Free of absolute tolerances, so right for triangles of any size.
+    """
+    weights = _plane_weights(triangles, points)
+    feet = np.einsum("ij,ijk->ik", weights, triangles)
+    outside = ~(weights >= 0).all(axis=1)
+    start, target = triangles[outside], points[outside, None]
+    along = np.roll(start, -1, axis=1) - start
+    length = np.einsum("ijk,ijk->ij", along, along)
+    part = np.einsum("ijk,ijk->ij", target - start, along)
+    part = np.clip(np.divide(part, length, out=np.zeros_like(part), where=length > 0), 0, 1)
+    on_edges = start + part[:, :, None] * along
+    nearest = ((on_edges - target) ** 2).sum(axis=2).argmin(axis=1)
+    feet[outside] = on_edges[np.arange(len(start)), nearest]
+    return np.asarray(feet)
+
+
 def barycentric(triangles: Array, points: Array) -> Array:
-    """Return the barycentric coordinates (n, 3) of points in triangles (n, 3, 3)."""
+    """Return the barycentric coordinates (n, 3) of points on triangles (n, 3, 3)."""
+    weights = _plane_weights(triangles, points)
+    weights = np.where(np.isnan(weights), 1 / 3, np.clip(weights, 0.0, 1.0))
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+
+def _plane_weights(triangles: Array, points: Array) -> Array:
+    """Return barycentric coordinates (n, 3) of the feet on the planes; NaN without area."""
     a = triangles[:, 0]
     u, v, w = triangles[:, 1] - a, triangles[:, 2] - a, points - a
     uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)
     wu, wv = _dot(w, u), _dot(w, v)
     scale = uu * vv - uv * uv
-    flat = scale <= 1e-14 * uu * vv
-    scale = np.where(flat, 1.0, scale)
+    scale = np.where(scale > 1e-14 * uu * vv, scale, np.nan)
     second, third = (vv * wu - uv * wv) / scale, (uu * wv - uv * wu) / scale
-    weights = np.clip(np.stack([1 - second - third, second, third], axis=1), 0.0, 1.0)
-    weights[flat] = 1 / 3
-    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+    return np.stack([1 - second - third, second, third], axis=1)
 
 
 def _summed(index: Indices, rows: Array, count: int) -> Array:
