@@ -93,6 +93,21 @@ class MotionTable(_Table):
         return self
 
 
+class JointCentreTable(_Table):
+    """A joint centre known from the neighbouring segment's markers: one more shank marker.
+
+    For shanks with fewer than three markers: the ankle centre is carried by the markers of
+    the foot, the knee centre by those of the thigh.
+    """
+
+    name: str
+    markers_mm: dict[str, Vector] = Field(
+        description="the neighbour's markers: name -> position in the neighbour's own frame"
+    )
+    centre_mm: Vector = Field(description="the joint centre in the neighbour's own frame")
+    tibia_mm: Vector = Field(description="the joint centre in the tibia link")
+
+
 class TibiaTable(_Table):
     """How the shank stands in the laboratory (x forward, y up, z right).
 
@@ -125,6 +140,9 @@ class TibiaTable(_Table):
     markers_mm: dict[str, Vector] = Field(
         default_factory=dict, description="markers: name -> position in the tibia link"
     )
+    joint_centre: tuple[JointCentreTable, ...] = Field(
+        (), description="markers: joint centres that neighbouring segments carry"
+    )
     laboratory_axes: Axes = Field(
         "+x,+y,+z", description="axes of the file that point forward, up and right"
     )
@@ -135,7 +153,7 @@ class TibiaTable(_Table):
             raise ValueError("'sequence' belongs to kind = 'pose', and is needed there")
         if self.kind == "pose" and self.length_unit is None:
             raise ValueError("kind = 'pose' needs 'length_unit'")
-        if (self.kind == "markers") != bool(self.markers_mm):
+        if (self.kind == "markers") != bool(self.markers_mm or self.joint_centre):
             raise ValueError("'markers_mm' belongs to kind = 'markers', and is needed there")
         return self
 
@@ -247,18 +265,41 @@ class LigamentTable(_Table):
         return self
 
 
+class BoneTable(_Table):
+    """A bone's mesh, which a line may wrap beside the implant."""
+
+    mesh: Path
+    unit: LengthUnit
+    axes: Axes = "+x,+y,+z"
+    link: str = Field(description="link in whose frame the mesh stands")
+
+
 class QuadricepsTable(_Table):
-    """Quadriceps line: from the vastus intermedius origin to the patella."""
+    """Quadriceps line: from the vastus intermedius origin to the patella.
+
+    It wraps the sagittal outline of the femoral component, and of `bone` if given.
+    """
 
     origin: Attachment
     insertion: Attachment
+    wrap: bool = True
+    bone: BoneTable | None = None
+    half_thickness_mm: float = Field(3.5, ge=0, description="of the tendon, off the outline")
 
 
 class PatellarLigamentTable(_Table):
-    """Patellar ligament line: from the patella to the tibial tuberosity."""
+    """Patellar ligament line: from the patella to the tibial tuberosity.
+
+    It wraps the insert's front lip when the insert is there.
+    """
 
     proximal: Attachment
     distal: Attachment
+    length_mm: float | None = Field(
+        None, gt=0, description="its constant length; needed where the patella is solved"
+    )
+    wrap: bool = True
+    half_thickness_mm: float = Field(2.5, ge=0)
 
 
 class PatellaTable(_Table):
@@ -315,6 +356,10 @@ class Scene(_Table):
             raise ValueError(
                 "[quadriceps], [patellar_ligament] and [patella] go together: give all or none"
             )
+        ligament = self.patellar_ligament
+        if self.patella and self.patella.motion == "solved":
+            if ligament is None or ligament.length_mm is None:
+                raise ValueError("[patella] motion = 'solved' needs [patellar_ligament] length_mm")
         if self.contact and not (self.implant.femoral and self.implant.insert):
             raise ValueError("[contact] needs [implant.femoral] and [implant.insert]")
         if self.ground_reaction and not self.tibia:

@@ -5,6 +5,8 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, pose, transform
 from tkamb.inputs.tables import Table
+from tkamb.scene import TibiaTable
+from tkamb.units import MILLIMETRE
 
 WRONG_MARKERS = 0.05
 """m; a median residual above this is a wrong marker, unit or set, not soft tissue."""
@@ -24,15 +26,51 @@ def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) 
     return np.moveaxis(np.array(columns), 2, 0) * metres_per_unit
 
 
-def fit_rigid(points: Array, reference: Array) -> tuple[Array, Array]:
+def shank_points(table: TibiaTable, recorded: Table) -> tuple[Array, Array]:
+    """Return the shank's markers and joint centres, measured and in the tibia link.
+
+    A joint centre is carried by a rigid fit of the neighbouring segment's markers.
+
+    Returns:
+        Points (n, m, 3), m, in the file's axes, gaps NaN; reference points (m, 3), m.
+
+    Raises:
+        InputError: no unit, unknown markers, or a neighbour's markers that do not fit.
+    """
+    scale = recorded.unit_scale(table.length_unit, "length_unit")
+    points = [marker_trajectories(recorded, [name], scale) for name in table.markers_mm]
+    reference = list(table.markers_mm.values())
+    for joint in table.joint_centre:
+        measured = marker_trajectories(recorded, list(joint.markers_mm), scale)
+        own = np.array(list(joint.markers_mm.values())) * MILLIMETRE
+        poses, residual = fit_rigid(measured, own, joint.name)
+        check_fit(residual, f"the markers of joint centre '{joint.name}'", recorded)
+        points.append(transform(poses, np.array(joint.centre_mm) * MILLIMETRE)[:, None])
+        reference.append(joint.tibia_mm)
+    return np.concatenate(points, axis=1), np.array(reference) * MILLIMETRE
+
+
+def check_fit(residual: Array, what: str, recorded: Table) -> None:
+    """Raise InputError if a fit is so poor that markers or units must be wrong."""
+    known = residual[np.isfinite(residual)]
+    if len(known) and np.median(known) > WRONG_MARKERS:
+        raise InputError(
+            f"{what} fit only to {np.median(known) / MILLIMETRE:.0f} mm",
+            recorded.path,
+            "check names and positions in [tibia], and length_unit",
+        )
+
+
+def fit_rigid(points: Array, reference: Array, name: str = "the tibia") -> tuple[Array, Array]:
     """Return the poses that carry the reference markers closest to the measured ones.
 
     Least squares over rotations (Kabsch): with H = sum (r - r_mean)(p - p_mean)^T = U S V^T
     the rotation is V diag(1, 1, det(V U^T)) U^T.
 
     Args:
-        points: (n, m, 3) m, measured.
+        points: (n, m, 3) m, measured; frames with a gap give NaN.
         reference: (m, 3) m, the same markers in the body's frame.
+        name: of the body, for the message.
 
     Returns:
         pose_body_in_world (n, 4, 4) and the root mean square distance (n,), m, between
@@ -46,25 +84,43 @@ def fit_rigid(points: Array, reference: Array) -> tuple[Array, Array]:
     centred = reference - reference.mean(axis=0)
     if len(reference) < 3 or np.linalg.svd(centred, compute_uv=False)[1] < 1e-3:
         raise InputError(
-            "markers fix no orientation: fewer than three, or all on one line",
-            "[tibia] markers_mm",
-            "name three or more that span a triangle",
+            f"markers of {name} fix no orientation: fewer than three, or all on one line",
+            "[tibia]",
+            "name three or more that span a triangle, or add a [[tibia.joint_centre]]",
         )
-    means = points.mean(axis=1)
-    h = np.einsum("mi,nmj->nij", centred, points - means[:, None])
+    complete = np.isfinite(points).reshape(len(points), -1).all(axis=1)
+    result, residual = np.full((len(points), 4, 4), np.nan), np.full(len(points), np.nan)
+    if complete.any():
+        result[complete], residual[complete] = _fitted(points[complete], reference)
+    return result, residual
+
+
+def _fitted(points: Array, reference: Array) -> tuple[Array, Array]:
+    means, centre = points.mean(axis=1), reference.mean(axis=0)
+    h = np.einsum("mi,nmj->nij", reference - centre, points - means[:, None])
     u, _, vt = np.linalg.svd(h)
     v, ut = np.swapaxes(vt, 1, 2), np.swapaxes(u, 1, 2)
     signs = np.ones((len(points), 3))
     signs[:, 2] = np.sign(np.linalg.det(v @ ut))
     rotation = (v * signs[:, None, :]) @ ut
-    poses = pose(rotation, means - rotation @ reference.mean(axis=0))
+    poses = pose(rotation, means - rotation @ centre)
     fitted = transform(poses, np.broadcast_to(reference, points.shape))
     residual = np.sqrt(np.mean(np.sum((fitted - points) ** 2, axis=2), axis=1))
     return poses, np.asarray(residual)
 
 
-def complete_run(points: Array, time: Array, start: float, end: float, table: Table) -> slice:
+def complete_run(
+    points: Array, names: list[str], time: Array, start: float, end: float, table: Table
+) -> slice:
     """Return the longest run of frames around [start, end] in which no marker is missing.
+
+    Args:
+        points: (n, m, 3), gaps NaN.
+        names: of the m markers, for the message.
+        time: (n,) s.
+        start: s.
+        end: s.
+        table: the recording, for the message.
 
     Raises:
         InputError: the recording does not cover the interval, or a marker is missing in it.
@@ -77,11 +133,13 @@ def complete_run(points: Array, time: Array, start: float, end: float, table: Ta
             table.path,
             "choose an interval inside the recording",
         )
-    gaps = np.logical_not(np.isfinite(points).reshape(len(points), -1).all(axis=1))
+    missing = np.logical_not(np.isfinite(points).all(axis=2))
+    gaps = missing.any(axis=1)
     if gaps[first : last + 1].any():
         frame = first + int(np.argmax(gaps[first : last + 1]))
         raise InputError(
-            f"a shank marker is missing at {time[frame]:g} s",
+            f"shank marker '{names[int(np.argmax(missing[frame]))]}' is missing at "
+            f"{time[frame]:g} s",
             table.path,
             "leave that marker out, or choose another interval",
         )

@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, pose
 from tkamb.inputs.filtering import Cutoff, differentiate_coordinates, differentiate_poses
 from tkamb.inputs.laboratory import (
@@ -19,7 +18,7 @@ from tkamb.inputs.laboratory import (
     laboratory_rotation,
     poses_of_columns,
 )
-from tkamb.inputs.markers import WRONG_MARKERS, complete_run, fit_rigid, marker_trajectories
+from tkamb.inputs.markers import check_fit, complete_run, fit_rigid, shank_points
 from tkamb.inputs.tables import Table, read_table
 from tkamb.scene import TibiaTable
 from tkamb.units import MILLIMETRE
@@ -118,16 +117,10 @@ def _fitted(
     table: TibiaTable, recorded: Table, stamps: Array, time: Array
 ) -> tuple[Array, Array, Array]:
     """Return times, poses and residuals of the marker fit, around the frames."""
-    names = list(table.markers_mm)
-    scale = recorded.unit_scale(table.length_unit, "length_unit")
-    points = marker_trajectories(recorded, names, scale)
-    run = complete_run(points, stamps, time[0], time[-1], recorded)
-    reference = np.array([table.markers_mm[name] for name in names]) * MILLIMETRE
+    check_roles(table.columns, ("time",), recorded.path, "tibia")
+    points, reference = shank_points(table, recorded)
+    names = [*table.markers_mm, *(joint.name for joint in table.joint_centre)]
+    run = complete_run(points, names, stamps, time[0], time[-1], recorded)
     poses, residual = fit_rigid(points[run], reference)
-    if np.median(residual) > WRONG_MARKERS:
-        raise InputError(
-            f"shank markers fit the tibia only to {np.median(residual) / MILLIMETRE:.0f} mm",
-            recorded.path,
-            "check the names and positions in [tibia] markers_mm, and length_unit",
-        )
+    check_fit(residual, "shank markers", recorded)
     return stamps[run], poses, residual
