@@ -133,6 +133,7 @@ def _derived(columns: dict[str, Any]) -> None:
     columns["residual_ap_N"] = 0.02 * total * np.sin(5 * s)
     columns["residual_ml_N"] = 0.03 * total * np.cos(4 * s)
     columns["residual_axial_Nm"] = 2 * np.sin(7 * s)
+    columns["residual_sensitivity_N"] = 0.01 * total
     columns["condition_number"] = 20 + 60 * (1 - s) ** 4
     columns["body_seconds"] = np.full(len(s), 0.004)
     columns["contact_seconds"] = np.full(len(s), 0.05)

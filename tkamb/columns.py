@@ -16,12 +16,14 @@ class Column:
         meaning: one line; vectors are in the insert frame unless it says otherwise.
         needs: scene tables without which the column is empty.
         kind: how its cells are written.
+        optional: in the file only when the run gives it; the others always stand there.
     """
 
     name: str
     meaning: str
     needs: str = ""
     kind: Kind = "number"
+    optional: bool = False
 
 
 _GROUND = "[ground_reaction]"
@@ -38,10 +40,10 @@ COLUMNS: tuple[Column, ...] = (
     Column("flexion_deg", "knee flexion (Grood-Suntay)"),
     Column("adduction_deg", "knee adduction, positive: varus"),
     Column("axial_rotation_deg", "positive: the femur rotates externally on the tibia"),
-    Column("force_si_N", "contact force on the insert, compression positive, no residuals"),
-    Column("force_ap_N", "anterior component of the contact force on the insert"),
-    Column("force_ml_N", "component of the contact force on the insert along insert z"),
-    Column("force_total_N", "magnitude of the contact force on the insert"),
+    Column("force_si_N", "contact force on the femur, no residuals: insert y, compression > 0"),
+    Column("force_ap_N", "the same, insert x"),
+    Column("force_ml_N", "the same, insert z"),
+    Column("force_total_N", "magnitude of that force"),
     Column("force_total_BW", "the same in body weights (mass x 9.80665 m/s²)"),
     Column("medial_force_N", "normal force on the medial condyle, by deformation", _CONTACT),
     Column("lateral_force_N", "normal force on the lateral condyle, by deformation", _CONTACT),
@@ -81,9 +83,9 @@ COLUMNS: tuple[Column, ...] = (
     Column("adjust_translation_mm", "femoral adjustment along insert y", _ADJUST),
     Column("adjust_coronal_deg", "femoral adjustment in the coronal plane", _ADJUST),
     Column("adjust_restored", "1: the adjustment was undone after the contact", _ADJUST, "integer"),
-    Column("residual_ap_N", "residual force on the tibia that balance needs, insert x"),
-    Column("residual_ml_N", "residual force on the tibia that balance needs, insert z"),
-    Column("residual_axial_Nm", "residual moment on the tibia that balance needs, about insert y"),
+    Column("residual_ap_N", "force that balance needs beyond the modelled loads, insert x"),
+    Column("residual_ml_N", "the same, insert z"),
+    Column("residual_axial_Nm", "moment that balance needs beyond them, about insert y"),
     Column("medial_area_above_yield", "share of the medial area above the yield stress", _CONTACT),
     Column("lateral_area_above_yield", "share of the lateral area above yield", _CONTACT),
     Column("medial_thickness_mm", "insert under the medial centre of pressure", _CONTACT),
@@ -93,6 +95,12 @@ COLUMNS: tuple[Column, ...] = (
     Column("contact_seconds", "computing time of the contact", _CONTACT),
     Column("iterations", "of the contact solver", _CONTACT, "integer"),
     Column("status", "ok, or reason words joined by ;", kind="text"),
+    Column("residual_coronal_Nm", "residual moment about insert x, one condyle off", optional=True),
+    Column(
+        "residual_sensitivity_N",
+        "largest change of force_total_N when the residuals act 10 mm higher or lower",
+        optional=True,
+    ),
 )
 
 KINDS: dict[str, Kind] = {column.name: column.kind for column in COLUMNS}
@@ -115,11 +123,15 @@ def ligament_of(column: str) -> str:
 
 
 def ordered_names(present: Iterable[str]) -> tuple[str, ...]:
-    """Return every fixed column in order, with the ligament columns of `present` in place."""
+    """Return every fixed column in order, with what else is `present` in its place."""
+    present = list(present)
     ligaments = [name for name in present if is_ligament(name)]
     names: list[str] = []
     for column in COLUMNS:
-        names.extend(ligaments if column.name == LIGAMENT else [column.name])
+        if column.name == LIGAMENT:
+            names.extend(ligaments)
+        elif not column.optional or column.name in present:
+            names.append(column.name)
     return tuple(names)
 
 
@@ -127,5 +139,6 @@ def columns_as_markdown() -> str:
     """Return the table of the columns for the documentation."""
     lines = ["| column | meaning | empty without |", "| --- | --- | --- |"]
     for column in COLUMNS:
-        lines.append(f"| `{column.name}` | {column.meaning} | {column.needs} |")
+        where = "(only when it is given)" if column.optional else column.needs
+        lines.append(f"| `{column.name}` | {column.meaning} | {where} |")
     return "\n".join(lines) + "\n"

@@ -1,0 +1,145 @@
+"""What a reader learns in the first half minute: a few cards and sentences, in plain words."""
+
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from tkamb.geometry.frames import Array
+from tkamb.output import metrics
+from tkamb.output.axis import HorizontalAxis
+from tkamb.results import Results
+
+
+@dataclass(frozen=True)
+class Card:
+    """One headline number.
+
+    Args:
+        title: what it is.
+        value: the number with its unit.
+        detail: where it occurs and what it means.
+        warning: shown as something to look at.
+    """
+
+    title: str
+    value: str
+    detail: str
+    warning: bool = False
+
+    def html(self) -> str:
+        """Return the card as HTML."""
+        kind = "card warning" if self.warning else "card"
+        return (
+            f'<div class="{kind}"><h3>{escape(self.title)}</h3>'
+            f'<p class="value">{escape(self.value)}</p><p>{escape(self.detail)}</p></div>'
+        )
+
+
+def cards(results: Results, axis: HorizontalAxis) -> list[Card]:
+    """Return the headline numbers that the run has."""
+    found = (
+        _peak_force(results, axis),
+        _shares(results),
+        _peak_pressure(results, axis),
+        _extensor(results, axis),
+        _residuals(results),
+        _frames(results),
+    )
+    return [card for card in found if card is not None]
+
+
+def _where(results: Results, axis: HorizontalAxis, frame: int) -> str:
+    flexion = f"{results['flexion_deg'][frame]:.0f}° of flexion"
+    if axis.kind == "flexion":
+        return f"at {flexion}"
+    name = f"{axis.at(frame)} of the cycle" if axis.kind == "cycle" else axis.at(frame)
+    return f"at {name} ({flexion})"
+
+
+def _peak_force(results: Results, axis: HorizontalAxis) -> Card | None:
+    found = metrics.peak(results, "force_total_BW")
+    if found is None:
+        return None
+    share = results["force_si_N"][found.frame] / results["force_total_N"][found.frame]
+    detail = (
+        f"{results['force_total_N'][found.frame]:.0f} N {_where(results, axis, found.frame)}; "
+        f"{100 * share:.0f} % of it superior–inferior"
+    )
+    return Card("Peak contact force", f"{found.value:.2f} BW", detail)
+
+
+def _shares(results: Results) -> Card | None:
+    texts = {}
+    for estimate in ("deformation", "equilibrium"):
+        share = 100 * metrics.medial_share(results, estimate)
+        if np.isfinite(share).any():
+            texts[estimate] = _range(share, " %")
+    if not texts:
+        return None
+    first = next(iter(texts))
+    rest = [f"by {name} {text}" for name, text in texts.items() if name != first]
+    detail = "; ".join([f"by {first}, the rest lateral", *rest])
+    return Card("Medial share of the load", texts[first], detail)
+
+
+def _peak_pressure(results: Results, axis: HorizontalAxis) -> Card | None:
+    found = metrics.peak(results, "<side>_peak_pressure_MPa")
+    if found is None:
+        return None
+    detail = f"{found.side}, {_where(results, axis, found.frame)}"
+    stress = results.summary.get("yield_stress_MPa")
+    above = metrics.peak(results, "<side>_area_above_yield")
+    if stress is not None and above is not None:
+        if above.value > 0:
+            detail += (
+                f"; up to {100 * above.value:.0f} % of the {above.side} area "
+                f"is above yield ({stress:g} MPa)"
+            )
+        else:
+            detail += f"; never above yield ({stress:g} MPa)"
+    return Card("Peak contact pressure", f"{found.value:.1f} MPa", detail)
+
+
+def _extensor(results: Results, axis: HorizontalAxis) -> Card | None:
+    found = metrics.peak(results, "quadriceps_N")
+    if found is None:
+        return None
+    value = found.value / metrics.body_weight(results)
+    ligament = _range(metrics.tension_ratio(results, "patellar_ligament_N"), "", 2)
+    patella = _range(metrics.tension_ratio(results, "patellofemoral_N"), "", 2)
+    detail = f"{_where(results, axis, found.frame)}; PL/Q {ligament}, PF/Q {patella}"
+    return Card("Peak quadriceps tension", f"{value:.2f} BW", detail)
+
+
+def _residuals(results: Results) -> Card | None:
+    share = 100 * metrics.residual_share(results)
+    if not np.isfinite(share).any():
+        return None
+    middle = f"{np.nanmedian(share):.1f} %"
+    detail = f"median over the frames, at most {np.nanmax(share):.1f} %, of the SI contact force"
+    if "residual_sensitivity_N" in results.columns:
+        change = 100 * results["residual_sensitivity_N"] / results["force_total_N"]
+        if np.isfinite(change).any():
+            detail += (
+                f"; acting 10 mm higher or lower changes the total by ≤ {np.nanmax(change):.1f} %"
+            )
+    return Card("Residual force", middle, detail, bool(np.nanmax(share) > 10))
+
+
+def _frames(results: Results) -> Card:
+    failed = int(metrics.failed(results).sum())
+    flagged = int(metrics.flagged(results).sum())
+    value = f"{len(results) - failed} of {len(results)}"
+    if failed or flagged:
+        detail = f"{failed} failed and hold no numbers; {flagged} more to be read with care (below)"
+    else:
+        detail = "none failed, none flagged"
+    return Card("Frames computed", value, detail, bool(failed or flagged))
+
+
+def _range(values: Array, unit: str, digits: int = 0) -> str:
+    if not np.isfinite(values).any():
+        return "–"
+    low, high = f"{np.nanmin(values):.{digits}f}", f"{np.nanmax(values):.{digits}f}"
+    return f"{low}{unit}" if low == high else f"{low}–{high}{unit}"

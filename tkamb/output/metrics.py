@@ -1,0 +1,116 @@
+"""The few numbers that say what happened in a run."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.results import Results
+from tkamb.units import STANDARD_GRAVITY
+
+SIDES = ("medial", "lateral")
+SMALLEST_TENSION = 1.0
+"""N: below this quadriceps tension its ratios are not shown."""
+
+
+@dataclass(frozen=True)
+class Peak:
+    """The largest value of a quantity.
+
+    Args:
+        value: in the column's unit.
+        frame: where it occurs.
+        side: "medial" or "lateral", or "" when it has no side.
+    """
+
+    value: float
+    frame: int
+    side: str = ""
+
+
+def body_weight(results: Results) -> float:
+    """Return body weight, N: mass x 9.80665 m/s².
+
+    Raises:
+        InputError: the summary has no body mass.
+    """
+    mass = results.summary.get("body_mass_kg")
+    if not mass:
+        raise InputError("has no 'body_mass_kg'", "summary", "forces in BW need it")
+    return float(mass) * STANDARD_GRAVITY
+
+
+def has(results: Results, *names: str) -> bool:
+    """Return whether any of the columns holds a number."""
+    return any(name in results.columns and bool(np.isfinite(results[name]).any()) for name in names)
+
+
+def peak(results: Results, column: str) -> Peak | None:
+    """Return the largest value of a column, or of its two sides for "<side>_..."."""
+    sides = SIDES if column.startswith("<side>") else ("",)
+    found = [
+        Peak(float(np.nanmax(values)), int(np.nanargmax(values)), side)
+        for side in sides
+        if np.isfinite(values := results[column.replace("<side>", side)]).any()
+    ]
+    return max(found, key=lambda one: one.value, default=None)
+
+
+def medial_share(results: Results, estimate: str) -> Array:
+    """Return the medial share (f,) by "deformation" or by "equilibrium"."""
+    if estimate == "equilibrium":
+        return results["medial_share_equilibrium"]
+    medial = results["medial_force_N"]
+    lateral = results["lateral_force_N"]
+    both = np.where(np.isnan(medial) & np.isnan(lateral), np.nan, 1.0)
+    total = np.nan_to_num(medial) + np.nan_to_num(lateral)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return both * np.where(total > 0, np.nan_to_num(medial) / total, np.nan)
+
+
+def tension_ratio(results: Results, column: str) -> Array:
+    """Return a force (f,) relative to the quadriceps tension."""
+    quadriceps = results["quadriceps_N"]
+    with np.errstate(invalid="ignore"):
+        taut = np.where(quadriceps > SMALLEST_TENSION, quadriceps, np.nan)
+    return results[column] / taut
+
+
+def residual_force(results: Results) -> Array:
+    """Return the magnitude (f,) of the AP and ML residual forces, N."""
+    return np.hypot(results["residual_ap_N"], results["residual_ml_N"])
+
+
+def residual_share(results: Results) -> Array:
+    """Return that magnitude relative to the superior-inferior contact force (f,)."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return residual_force(results) / np.abs(results["force_si_N"])
+
+
+def failed(results: Results) -> NDArray[np.bool_]:
+    """Return which frames (f,) were not ok and have no contact force."""
+    return ~_clean(results) & np.isnan(results["force_total_N"])
+
+
+def flagged(results: Results) -> NDArray[np.bool_]:
+    """Return which frames (f,) have numbers and a reason to look at them with care."""
+    return ~_clean(results) & ~failed(results)
+
+
+def _clean(results: Results) -> NDArray[np.bool_]:
+    return np.array([status == "ok" for status in results.status], bool)
+
+
+def status_runs(results: Results) -> list[tuple[int, int, str]]:
+    """Return (first frame, last frame, status) of each stretch of frames that are not ok."""
+    runs: list[tuple[int, int, str]] = []
+    for frame, status in enumerate(results.status):
+        if status == "ok":
+            continue
+        if runs and runs[-1][1] == frame - 1 and runs[-1][2] == status:
+            runs[-1] = (runs[-1][0], frame, status)
+        else:
+            runs.append((frame, frame, status))
+    return runs

@@ -1,0 +1,276 @@
+"""What the report draws: one entry per plot, its lines and what they mean."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tkamb.columns import is_ligament, ligament_of
+from tkamb.geometry.frames import Array
+from tkamb.output import style
+from tkamb.output.metrics import body_weight, medial_share, residual_share, tension_ratio
+from tkamb.output.style import BLACK, BLUE, GREEN, GREY, PURPLE, SIDE_COLOURS, VERMILLION
+from tkamb.results import Results
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """One curve.
+
+    Args:
+        name: unique in its panel; a column's name, or what was made from columns.
+        label: as the legend shows it.
+        values: (f,) in the panel's unit.
+        colour: of the line.
+        dashed: drawn dashed.
+    """
+
+    name: str
+    label: str
+    values: Array
+    colour: str
+    dashed: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One plot.
+
+    Args:
+        name: id of the plot in the page.
+        title: what it shows.
+        unit: of the vertical axis.
+        lines: its curves.
+        note: a sentence under the plot.
+        level: (value, label) of a horizontal reference line.
+        second: (factor, unit) of a second vertical axis on the right.
+        logarithmic: vertical axis.
+    """
+
+    name: str
+    title: str
+    unit: str
+    lines: tuple[Line, ...]
+    note: str = ""
+    level: tuple[float, str] | None = None
+    second: tuple[float, str] | None = None
+    logarithmic: bool = False
+
+
+def panels(results: Results) -> tuple[Panel, ...]:
+    """Return the plots whose numbers the run has, in the report's order."""
+    makers: tuple[Callable[[Results], Panel], ...] = (
+        _total, _condyles, _share, _extensor, _ratios, _areas, _pressures, _yield, _external,
+        _ground, _ligaments, _residuals, _residual_moment, _hip_force, _hip_moment, _motion,
+        _slip, _adjustment, _condition,
+    )  # fmt: skip
+    made = (make(results) for make in makers)
+    kept = (replace(p, lines=tuple(n for n in p.lines if _has_numbers(n))) for p in made)
+    return tuple(panel for panel in kept if panel.lines)
+
+
+def lateral_axis_name(results: Results) -> str:
+    """Return what insert z points to: "lateral" unless the summary's `lateral_axis` is "-z"."""
+    return "lateral" if results.summary.get("lateral_axis", "+z") == "+z" else "medial"
+
+
+def _has_numbers(line: Line) -> bool:
+    return bool(np.isfinite(line.values).any())
+
+
+def _line(
+    results: Results,
+    column: str,
+    label: str,
+    colour: str,
+    dashed: bool = False,
+    scale: float = 1.0,
+) -> Line:
+    values = results.columns.get(column, np.full(len(results), np.nan))
+    return Line(column, label, values * scale, colour, dashed)
+
+
+def _components(results: Results, stem: str, unit: str, scale: float = 1.0) -> tuple[Line, ...]:
+    right = lateral_axis_name(results)
+    return (
+        _line(results, f"{stem}_si_{unit}", "superior", BLUE, scale=scale),
+        _line(results, f"{stem}_ap_{unit}", "anterior", VERMILLION, scale=scale),
+        _line(results, f"{stem}_ml_{unit}", right, GREEN, scale=scale),
+    )
+
+
+def _both_sides(
+    results: Results, column: str, label: str = "", dashed: bool = False, scale: float = 1.0
+) -> tuple[Line, ...]:
+    return tuple(
+        _line(results, f"{side}_{column}", f"{side}{label}", colour, dashed, scale)
+        for side, colour in SIDE_COLOURS.items()
+    )
+
+
+def _total(results: Results) -> Panel:
+    scale = 1 / body_weight(results)
+    total = Line("force_total_BW", "total", results["force_total_BW"], BLACK)
+    lines = (total, *_components(results, "force", "N", scale))
+    note = "On the femur, along the insert axes. Residuals are not included."
+    return Panel("forces", "Tibiofemoral contact force", "BW", lines, note)
+
+
+def _condyles(results: Results) -> Panel:
+    scale = 1 / body_weight(results)
+    lines = (
+        *_both_sides(results, "force_N", ", deformation", scale=scale),
+        *_both_sides(results, "force_equilibrium_N", ", equilibrium", dashed=True, scale=scale),
+    )
+    note = (
+        "Deformation: the total load is pressed in at the measured rotation. "
+        "Equilibrium: balance of coronal moments."
+    )
+    return Panel("condyles", "Medial and lateral force, two estimates", "BW", lines, note)
+
+
+def _share(results: Results) -> Panel:
+    lines = (
+        Line("deformation", "by deformation", medial_share(results, "deformation"), BLACK),
+        Line("equilibrium", "by equilibrium", medial_share(results, "equilibrium"), PURPLE, True),
+    )
+    title = "Medial share of the load"
+    return Panel("share", title, "medial / (medial + lateral)", lines, level=(0.5, "even"))
+
+
+def _extensor(results: Results) -> Panel:
+    scale = 1 / body_weight(results)
+    tangential = ("patellofemoral_tangential_N", "patellofemoral, tangential", GREY, True)
+    lines = (
+        _line(results, "quadriceps_N", "quadriceps", BLACK, scale=scale),
+        _line(results, "patellar_ligament_N", "patellar ligament", BLUE, scale=scale),
+        _line(results, "patellofemoral_N", "patellofemoral", VERMILLION, scale=scale),
+        _line(results, *tangential, scale=scale),
+    )
+    return Panel("extensor", "Extensor mechanism", "BW", lines)
+
+
+def _ratios(results: Results) -> Panel:
+    ligament = tension_ratio(results, "patellar_ligament_N")
+    patella = tension_ratio(results, "patellofemoral_N")
+    lines = (
+        Line("PL/Q", "patellar ligament, PL/Q", ligament, BLUE),
+        Line("PF/Q", "patellofemoral, PF/Q", patella, VERMILLION),
+    )
+    return Panel("ratios", "Ratios to the quadriceps tension", "force / quadriceps", lines)
+
+
+def _areas(results: Results) -> Panel:
+    return Panel("areas", "Contact area", "mm²", _both_sides(results, "area_mm2"))
+
+
+def _pressures(results: Results) -> Panel:
+    lines = (
+        *_both_sides(results, "peak_pressure_MPa", ", peak"),
+        *_both_sides(results, "mean_pressure_MPa", ", mean", dashed=True),
+    )
+    stress = results.summary.get("yield_stress_MPa")
+    level = None if stress is None else (float(stress), f"yield {stress:g} MPa")
+    return Panel("pressures", "Contact pressure", "MPa", lines, level=level)
+
+
+def _yield(results: Results) -> Panel:
+    lines = _both_sides(results, "area_above_yield", scale=100)
+    return Panel("above_yield", "Contact area above yield", "% of the condyle's area", lines)
+
+
+def _external(results: Results) -> Panel:
+    lines = (
+        _line(results, "external_flexion_moment_Nm", "flexing", BLUE),
+        _line(results, "external_adduction_moment_Nm", "adducting", VERMILLION),
+    )
+    height = results.summary.get("height_mm")
+    second = None
+    if height:
+        second = (100 / (body_weight(results) * float(height) * 1e-3), "% BW·height")
+    return Panel("external", "External knee moments", "N·m", lines, second=second)
+
+
+def _ground(results: Results) -> Panel:
+    lines = _components(results, "ground_reaction", "N", 1 / body_weight(results))
+    return Panel("ground", "Ground reaction along the insert axes", "BW", lines)
+
+
+def _ligaments(results: Results) -> Panel:
+    names = [name for name in results.columns if is_ligament(name)]
+    count = len(style.CYCLE)
+    lines = tuple(
+        _line(
+            results, name, ligament_of(name).replace("_", " "), style.CYCLE[k % count], k >= count
+        )
+        for k, name in enumerate(names)
+    )
+    return Panel("ligaments", "Ligament tension", "N", lines)
+
+
+def _residuals(results: Results) -> Panel:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        percent = 100 / np.abs(results["force_si_N"])
+        sensitivity = _line(
+            results, "residual_sensitivity_N", "effect of ±10 mm on the total", PURPLE, True
+        )
+        lines = (
+            Line("size", "magnitude", 100 * residual_share(results), BLACK),
+            Line("ap", "anterior", results["residual_ap_N"] * percent, VERMILLION),
+            Line("ml", lateral_axis_name(results), results["residual_ml_N"] * percent, GREEN),
+            replace(sensitivity, values=sensitivity.values * percent),
+        )
+    note = (
+        "Forces that balance needs beyond the modelled loads; an exact model has none. "
+        "Dashed: change of the total contact force when they act 10 mm higher or lower."
+    )
+    return Panel("residuals", "Residual forces", "% of the SI contact force", lines, note)
+
+
+def _residual_moment(results: Results) -> Panel:
+    lines = (
+        _line(results, "residual_axial_Nm", "axial", BLUE),
+        _line(results, "residual_coronal_Nm", "coronal, one condyle off", VERMILLION),
+    )
+    return Panel("residual_moment", "Residual moments", "N·m", lines)
+
+
+def _hip_force(results: Results) -> Panel:
+    lines = _components(results, "hip_force", "N", 1 / body_weight(results))
+    return Panel("hip_force", "Intersegmental force on the femur at the hip", "BW", lines)
+
+
+def _hip_moment(results: Results) -> Panel:
+    lines = _components(results, "hip_moment", "Nm")
+    note = "About the axes named; stands for the muscles across the hip, which are not modelled."
+    return Panel("hip_moment", "Intersegmental moment on the femur at the hip", "N·m", lines, note)
+
+
+def _motion(results: Results) -> Panel:
+    lines = [
+        _line(results, "adduction_deg", "adduction", VERMILLION),
+        _line(results, "axial_rotation_deg", "axial rotation", GREEN),
+    ]
+    if results.summary.get("axis", "flexion") != "flexion":
+        lines.insert(0, _line(results, "flexion_deg", "flexion", BLACK))
+    note = "Grood–Suntay; adduction positive in varus, axial rotation when the femur turns out."
+    return Panel("motion", "Knee rotations", "deg", tuple(lines), note)
+
+
+def _slip(results: Results) -> Panel:
+    return Panel("slip", "Slip since the first frame", "mm", _both_sides(results, "slip_mm"))
+
+
+def _adjustment(results: Results) -> Panel:
+    lines = (
+        _line(results, "adjust_translation_mm", "translation, mm", BLUE),
+        _line(results, "adjust_coronal_deg", "coronal angle, deg", VERMILLION),
+    )
+    return Panel("adjustment", "Femoral adjustment before contact", "mm or deg", lines)
+
+
+def _condition(results: Results) -> Panel:
+    lines = (_line(results, "condition_number", "condition number", BLACK),)
+    note = "How much an input error may grow in the solution (scaled columns)."
+    title = "Condition number of the equilibrium"
+    return Panel("condition", title, "–", lines, note, logarithmic=True)

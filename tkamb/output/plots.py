@@ -1,0 +1,146 @@
+"""Line plots of a run, drawn in time order against flexion, cycle or time."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, MultipleLocator
+
+from tkamb.output.axis import HorizontalAxis, horizontal_axis
+from tkamb.output.metrics import failed, flagged
+from tkamb.output.panels import Panel, panels
+from tkamb.output.style import BLACK, GREY, ORANGE, legend_above, new_figure, settings
+from tkamb.results import Results
+
+WIDTH, HEIGHT = 5.4, 3.1
+DASHES = (0, (4, 2))
+
+
+def draw_panel(panel: Panel, results: Results, axis: HorizontalAxis) -> Figure:
+    """Return one plot with its flagged and failed frames marked along the bottom.
+
+    Each curve's id in the picture is its line's name.
+    """
+    with settings():
+        figure = new_figure(WIDTH, HEIGHT)
+        axes = figure.add_subplot()
+        _draw_lines(axes, panel, axis)
+        _dress(axes, panel, axis)
+        mark_frames(axes, results, axis)
+        legend_above(axes, _legend_columns(panel))
+    return figure
+
+
+def plot(results: Results, names: tuple[str, ...] = (), axis: str | None = None) -> Figure:
+    """Return the plots of a run in one figure, for notebooks.
+
+    Args:
+        results: the run.
+        names: panels by their ids in the report ("forces", "condyles", "pressures", ...);
+            default: forces, condyles, ratios and pressures, as far as the run has them.
+        axis: "flexion", "cycle" or "time"; default: as the scene asks.
+
+    Raises:
+        InputError: an axis that does not exist.
+    """
+    wanted = names or ("forces", "condyles", "ratios", "pressures")
+    chosen = [panel for panel in panels(results) if panel.name in wanted]
+    horizontal = horizontal_axis(results, axis)
+    with settings():
+        rows = max(1, -(-len(chosen) // 2))
+        figure = new_figure(2 * WIDTH, rows * HEIGHT)
+        for k, panel in enumerate(chosen):
+            axes = figure.add_subplot(rows, min(2, len(chosen)), k + 1)
+            _draw_lines(axes, panel, horizontal)
+            _dress(axes, panel, horizontal)
+            mark_frames(axes, results, horizontal)
+            axes.set_title(panel.title, loc="left", pad=28, fontweight="bold")
+            legend_above(axes, _legend_columns(panel))
+    return figure
+
+
+def mark_frames(axes: Axes, results: Results, axis: HorizontalAxis) -> None:
+    """Mark flagged frames with ticks and failed ones with crosses along the bottom."""
+    transform = axes.get_xaxis_transform()
+    for mask, marker, colour, name in (
+        (flagged(results), "|", ORANGE, "flagged"),
+        (failed(results), "x", BLACK, "failed"),
+    ):
+        if mask.any():
+            x = axis.values[mask]
+            axes.plot(
+                x,
+                np.full(len(x), 0.025),
+                linestyle="none",
+                marker=marker,
+                color=colour,
+                markersize=7 if marker == "|" else 5,
+                markeredgewidth=1.6,
+                transform=transform,
+                gid=f"frames-{name}",
+            )
+
+
+def _draw_lines(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:
+    for line in panel.lines:
+        x, y = axis.broken(line.values)
+        dashes = DASHES if line.dashed else "-"
+        gid = f"line-{line.name}"
+        axes.plot(x, y, color=line.colour, linestyle=dashes, label=line.label, gid=gid)
+
+
+def _legend_columns(panel: Panel) -> int:
+    """Return how many legend entries stand beside each other."""
+    return 2 if sum(len(line.label) + 6 for line in panel.lines) > 72 else 4
+
+
+def _dress(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:
+    axes.set_xlabel(axis.label)
+    axes.set_ylabel(panel.unit)
+    low, high = float(np.min(axis.values)), float(np.max(axis.values))
+    margin = 0.01 * (high - low) or 0.5
+    axes.set_xlim(low - margin, high + margin)
+    if axis.kind != "time" and high - low > 40:
+        axes.xaxis.set_major_locator(MultipleLocator(20 if high - low > 70 else 10))
+    if panel.logarithmic:
+        axes.set_yscale("log")
+    else:
+        axes.yaxis.set_major_locator(MaxNLocator(6))
+        low, high = axes.get_ylim()
+        axes.set_ylim(low - 0.06 * (high - low), high)
+        if low < 0 < high:
+            axes.axhline(0, color=GREY, linewidth=0.8, zorder=1)
+    if panel.level:
+        _draw_level(axes, *panel.level)
+    if panel.second:
+        _draw_second(axes, *panel.second)
+
+
+def _draw_level(axes: Axes, value: float, label: str) -> None:
+    axes.axhline(value, color=GREY, linewidth=1, linestyle=":", zorder=1, gid="level")
+    low, high = axes.get_ylim()
+    span = high - low
+    axes.set_ylim(min(low, value - 0.05 * span), max(high, value + 0.08 * span))
+    axes.text(
+        0.995,
+        value,
+        label,
+        transform=axes.get_yaxis_transform(),
+        ha="right",
+        va="bottom",
+        fontsize=8,
+        color=GREY,
+    )
+
+
+def _draw_second(axes: Axes, factor: float, unit: str) -> None:
+    def there(value: Any) -> Any:
+        return np.asarray(value, float) * factor
+
+    def back(value: Any) -> Any:
+        return np.asarray(value, float) / factor
+
+    right = axes.secondary_yaxis("right", functions=(there, back))
+    right.set_ylabel(unit)
+    right.spines["right"].set_visible(True)

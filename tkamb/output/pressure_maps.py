@@ -1,0 +1,204 @@
+"""Pressure on the insert seen from above, and the paths of the centres of pressure.
+
+Anterior is up and the subject's right is on the right of the page, as one looks down on the
+insert; for a left knee, which is mirrored at input, the picture is mirrored back.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.tri import Triangulation
+from numpy.typing import NDArray
+
+from tkamb.geometry.frames import Array
+from tkamb.output.axis import HorizontalAxis
+from tkamb.output.maps_file import ContactMaps
+from tkamb.output.panels import lateral_axis_name
+from tkamb.output.style import BLACK, GREY, PRESSURE_MAP, SIDE_COLOURS, new_figure, settings
+from tkamb.results import Results
+from tkamb.units import MEGAPASCAL, MILLIMETRE
+
+TOUCHED = 1e-3
+"""Share of the largest pressure from which a point is coloured."""
+
+
+class TopView:
+    """The insert as one looks down on it, in page coordinates (mm, right and up).
+
+    Args:
+        maps: points and triangles.
+        side: "right" or "left": the subject's knee.
+        lateral: what insert z points to, "lateral" or "medial".
+    """
+
+    def __init__(self, maps: ContactMaps, side: str, lateral: str) -> None:
+        self.side = side
+        self.sign = -1.0 if side == "left" and lateral == "lateral" else 1.0
+        points = maps.points_m
+        self.across = self.sign * points[:, 2] / MILLIMETRE
+        self.up = points[:, 0] / MILLIMETRE
+        height = points[maps.triangles, 1].mean(axis=1)
+        self.triangles = maps.triangles[np.argsort(height)]
+        self.shade = _shade(points, self.triangles)
+
+    def place(self, ap: Array, ml: Array) -> tuple[Array, Array]:
+        """Return page coordinates (mm) of insert x and z (mm)."""
+        return self.sign * ml, ap
+
+    def draw_insert(self, axes: Axes) -> None:
+        """Draw the insert in greys that show its dishes, and dress the axes."""
+        corners = np.stack([self.across, self.up], axis=1)[self.triangles]
+        greys = np.repeat(self.shade[:, None], 3, axis=1)
+        axes.add_collection(
+            PolyCollection(
+                list(corners), facecolors=greys, edgecolors=greys, linewidths=0.3, rasterized=True
+            )
+        )
+        margin = 2.0
+        axes.set_xlim(self.across.min() - margin, self.across.max() + margin)
+        axes.set_ylim(self.up.min() - margin, self.up.max() + margin)
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+
+    def draw_labels(self, axes: Axes) -> None:
+        """Write where anterior, medial and lateral are, and a 10 mm scale."""
+        left, right = ("medial", "lateral") if self.side == "right" else ("lateral", "medial")
+        style: Any = {"fontsize": 7.5, "color": GREY, "transform": axes.transAxes}
+        axes.text(0.0, -0.01, left, ha="left", va="top", **style)
+        axes.text(1.0, -0.01, right, ha="right", va="top", **style)
+        low = self.up.min() - 3.0
+        axes.plot([-5, 5], [low, low], color=GREY, linewidth=2, clip_on=False)
+        axes.text(0, low - 0.8, "10 mm", ha="center", va="top", fontsize=7, color=GREY)
+
+
+def top_view(results: Results) -> TopView | None:
+    """Return the view of the run's insert; None without maps."""
+    if results.maps is None or len(results.maps.triangles) == 0:
+        return None
+    side = str(results.summary.get("side", "right"))
+    return TopView(results.maps, side, lateral_axis_name(results))
+
+
+def mapped_frames(results: Results, axis: HorizontalAxis, count: int = 8) -> list[int]:
+    """Return frames with a pressure map, spread over the motion."""
+    if results.maps is None or len(results.maps) != len(results):
+        return []
+    good = np.flatnonzero(np.isfinite(results.maps.pressure_Pa).all(axis=1))
+    if not len(good):
+        return []
+    return sorted({int(good[np.argmin(np.abs(good - frame))]) for frame in axis.stops(count)})
+
+
+def draw_maps(
+    results: Results, view: TopView, axis: HorizontalAxis, frames: Sequence[int]
+) -> Figure:
+    """Return pressure maps of these frames on one colour scale, 0 to the run's largest."""
+    pressure = _pressure(results)
+    largest = float(np.nanmax(pressure))
+    scale = Normalize(0.0, largest if largest > 0 else 1.0)
+    across = min(4, len(frames))
+    down = -(-len(frames) // across)
+    ratio = np.ptp(view.up) / np.ptp(view.across)
+    with settings():
+        figure = new_figure(11.0, down * (10.0 / 4 * ratio + 0.75))
+        grid = figure.subplots(down, across, squeeze=False).ravel()
+        for axes, frame in zip(grid, frames, strict=False):
+            view.draw_insert(axes)
+            _draw_pressure(axes, view, pressure[frame], scale)
+            _draw_centres(axes, view, results, frame)
+            view.draw_labels(axes)
+            axes.set_title(_caption(results, axis, frame), fontsize=8.5)
+        for axes in grid[len(frames) :]:
+            axes.set_axis_off()
+        mappable = ScalarMappable(scale, PRESSURE_MAP)
+        bar = figure.colorbar(mappable, ax=list(grid), fraction=0.02, pad=0.01, aspect=30)
+        bar.set_label("contact pressure (MPa)")
+        stress = results.summary.get("yield_stress_MPa")
+        if stress is not None and stress < float(scale.vmax or 1.0):
+            bar.ax.axhline(stress, color="white", linewidth=1.5)
+            bar.ax.text(-0.2, stress, "yield", ha="right", va="center", fontsize=7.5)
+    return figure
+
+
+def draw_paths(
+    results: Results, view: TopView, axis: HorizontalAxis, frames: Sequence[int]
+) -> Figure:
+    """Return the paths of both centres of pressure over the insert, in time order."""
+    with settings():
+        figure = new_figure(5.4, 3.7)
+        axes = figure.add_subplot()
+        view.draw_insert(axes)
+        for side, colour in SIDE_COLOURS.items():
+            x, y = view.place(results[f"{side}_cop_ap_mm"], results[f"{side}_cop_ml_mm"])
+            axes.plot(x, y, color=colour, linewidth=1.6, gid=f"path-{side}")
+            axes.plot(x[list(frames)], y[list(frames)], "o", color=colour, ms=4, mec="white")
+            _label_stops(axes, x, y, axis, frames, colour)
+        view.draw_labels(axes)
+    return figure
+
+
+def _pressure(results: Results) -> Array:
+    if results.maps is None:
+        raise ValueError("the run has no pressure maps")
+    return results.maps.pressure_Pa / MEGAPASCAL
+
+
+def _shade(points: Array, triangles: NDArray[np.int64]) -> Array:
+    """Return a grey level (k,) per triangle, lit obliquely from above."""
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    normal *= np.sign(normal[:, 1:2])
+    length = np.linalg.norm(normal, axis=1)
+    normal /= np.where(length > 0, length, 1.0)[:, None]
+    light = np.array([0.5, 0.8, -0.33])
+    return 0.55 + 0.4 * np.clip(normal @ (light / np.linalg.norm(light)), 0.0, 1.0)
+
+
+def _draw_pressure(axes: Axes, view: TopView, pressure: Array, scale: Normalize) -> None:
+    loaded = (pressure[view.triangles] > TOUCHED * float(scale.vmax or 1.0)).any(axis=1)
+    if not loaded.any():
+        return
+    mesh = Triangulation(view.across, view.up, view.triangles[loaded])
+    axes.tripcolor(
+        mesh, pressure, norm=scale, cmap=PRESSURE_MAP, shading="gouraud", rasterized=True
+    )
+
+
+def _draw_centres(axes: Axes, view: TopView, results: Results, frame: int) -> None:
+    for side in SIDE_COLOURS:
+        x, y = view.place(results[f"{side}_cop_ap_mm"][frame], results[f"{side}_cop_ml_mm"][frame])
+        axes.plot(x, y, "+", color="white", markersize=7, markeredgewidth=2.4)
+        axes.plot(x, y, "+", color=BLACK, markersize=6, markeredgewidth=1.1)
+
+
+def _caption(results: Results, axis: HorizontalAxis, frame: int) -> str:
+    force = results["force_total_BW"][frame]
+    return f"{axis.label.split(' (')[0]} {axis.at(frame)}, {force:.2f} BW"
+
+
+def _label_stops(
+    axes: Axes, x: Array, y: Array, axis: HorizontalAxis, frames: Sequence[int], colour: str
+) -> None:
+    """Write where the motion is beside the path's dots, as far as they have room."""
+    outward = 1.0 if np.nanmean(x) > 0 else -1.0
+    written: list[float] = []
+    for frame in frames:
+        if not np.isfinite(y[frame]) or any(abs(y[frame] - other) < 2.2 for other in written):
+            continue
+        written.append(float(y[frame]))
+        axes.annotate(
+            axis.at(frame),
+            (x[frame], y[frame]),
+            (7 * outward, 0),
+            textcoords="offset points",
+            ha="left" if outward > 0 else "right",
+            va="center",
+            fontsize=8,
+            color=colour,
+        )

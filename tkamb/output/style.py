@@ -1,0 +1,97 @@
+"""One look for every picture: colours that colour-blind readers can tell apart, and SVG text.
+
+Colours: Okabe & Ito (2008), Color Universal Design. Pressure: viridis, perceptually uniform.
+"""
+
+import base64
+import io
+import re
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+BLACK, GREY = "#1a1a1a", "#767676"
+BLUE, SKY = "#0072B2", "#56B4E9"
+VERMILLION, ORANGE = "#D55E00", "#E69F00"
+GREEN, PURPLE = "#009E73", "#CC79A7"
+MEDIAL, LATERAL = BLUE, VERMILLION
+SIDE_COLOURS = {"medial": MEDIAL, "lateral": LATERAL}
+CYCLE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK, GREY)
+PRESSURE_MAP = "viridis"
+
+SETTINGS: Any = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9,
+    "axes.labelsize": 9,
+    "axes.titlesize": 9,
+    "axes.edgecolor": "#8a8a8a",
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.7,
+    "lines.linewidth": 1.8,
+    "lines.solid_capstyle": "round",
+    "xtick.color": BLACK,
+    "ytick.color": BLACK,
+    "xtick.major.size": 3,
+    "ytick.major.size": 3,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "legend.handlelength": 2.2,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "tkamb",
+}
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure (inches) that needs no display."""
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def settings() -> Any:
+    """Return the context in which figures are made and written."""
+    return mpl.rc_context(SETTINGS)
+
+
+def svg_text(figure: Figure, name: str, dpi: int = 200) -> str:
+    """Return the figure as inline SVG that scales with the page.
+
+    Every id is prefixed with `name`, so that many figures live in one page.
+    """
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", dpi=dpi, metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
+    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
+    text = re.sub(r' xmlns(:xlink)?="[^"]*"', "", text)
+    text = text.replace("xlink:href=", "href=")
+    text = re.sub(r'\bid="([^"]+)"', rf'id="{name}-\1"', text)
+    text = re.sub(r'href="#([^"]+)"', rf'href="#{name}-\1"', text)
+    return re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", text)
+
+
+def png_uri(figure: Figure, dpi: int = 200) -> str:
+    """Return the figure as a data URI that an <img> shows."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def legend_above(axes: Axes, columns: int = 4) -> None:
+    """Put the legend over the plot, left-aligned, where it covers no line."""
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(0, 1),
+        ncols=columns,
+        borderaxespad=0.2,
+        columnspacing=1.4,
+        handletextpad=0.5,
+    )
