@@ -1,1 +1,35 @@
-"""tkamb: what happens inside a total knee replacement."""
+"""tkamb: what happens inside a total knee replacement.
+
+    import tkamb
+    scene = tkamb.load_scene("models/deep_knee_bend/scene.toml")
+    results = tkamb.simulate(scene, contact="foundation")
+    model = tkamb.contact_model("hertz", resolution_mm=1.0)
+
+Each name is imported when it is first used.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tkamb.contact.registry import contact_model
+    from tkamb.results import Results, read_results
+    from tkamb.scene import Scene, load_scene
+    from tkamb.simulate import simulate
+
+__all__ = ["Results", "Scene", "contact_model", "load_scene", "read_results", "simulate"]
+
+_HOMES = {
+    "Results": "tkamb.results",
+    "Scene": "tkamb.scene",
+    "contact_model": "tkamb.contact.registry",
+    "load_scene": "tkamb.scene",
+    "read_results": "tkamb.results",
+    "simulate": "tkamb.simulate",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'tkamb' has no attribute '{name}'")
+    return getattr(import_module(_HOMES[name]), name)

@@ -253,9 +253,7 @@ class LigamentTable(_Table):
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
-        wanted = (
-            self.stiffness_N_per_mm if self.law == "two-line" else self.stiffness_N_per_strain
-        )
+        wanted = self.stiffness_N_per_mm if self.law == "two-line" else self.stiffness_N_per_strain
         other = self.stiffness_N_per_strain if self.law == "two-line" else self.stiffness_N_per_mm
         if wanted is None or other is not None:
             unit = "N_per_mm" if self.law == "two-line" else "N_per_strain"
@@ -357,9 +355,9 @@ class Scene(_Table):
                 "[quadriceps], [patellar_ligament] and [patella] go together: give all or none"
             )
         ligament = self.patellar_ligament
-        if self.patella and self.patella.motion == "solved":
-            if ligament is None or ligament.length_mm is None:
-                raise ValueError("[patella] motion = 'solved' needs [patellar_ligament] length_mm")
+        solved = self.patella is not None and self.patella.motion == "solved"
+        if solved and (ligament is None or ligament.length_mm is None):
+            raise ValueError("[patella] motion = 'solved' needs [patellar_ligament] length_mm")
         if self.contact and not (self.implant.femoral and self.implant.insert):
             raise ValueError("[contact] needs [implant.femoral] and [implant.insert]")
         if self.ground_reaction and not self.tibia:

@@ -72,6 +72,18 @@ class Chain:
         """pose_insert_in_tibia (4, 4)."""
         return inverse(self._tibia_in_root) @ self._insert_in_root
 
+    @property
+    def patella_joint_in_femur(self) -> Array:
+        """pose_joint_in_femur (4, 4): where the patella's sagittal plane lies on the femur."""
+        return self.model.jointPlacements[self.model.getJointId("patella_ap")].homogeneous
+
+    def link_in(self, link: str, base: str) -> Array:
+        """Return pose_link_in_base (4, 4) of two links that are fixed to each other."""
+        frames = [self.model.frames[self.frame_id(name)] for name in (link, base)]
+        if frames[0].parentJoint != frames[1].parentJoint:
+            raise InputError(f"link '{link}' is not fixed to '{base}'", "URDF")
+        return inverse(frames[1].placement.homogeneous) @ frames[0].placement.homogeneous
+
     def knee_columns(self) -> list[int]:
         """Rows of the generalised force that belong to the six knee coordinates."""
         return self._columns[:6]

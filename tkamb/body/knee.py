@@ -9,6 +9,7 @@ and three residuals. Less is asked for when less is modelled:
   whole intersegmental wrench (without), act at the femoral origin.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -90,8 +91,18 @@ class KneeLoads:
     problems: tuple[str, ...]
 
 
+def unsolved(problems: Iterable[str]) -> KneeLoads:
+    """Return a frame without a number, and why."""
+    return KneeLoads({}, NAN3, np.nan, np.nan, np.nan, np.nan, frozenset(), tuple(problems))
+
+
 def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
-    """Return all loads of one frame; a condyle that would have to pull is lifted off."""
+    """Return all loads of one frame; a condyle that would have to pull is lifted off.
+
+    Args:
+        geometry: the frame.
+        friction: Coulomb coefficient of the femorotibial contact.
+    """
     problems: list[str] = []
     lifted = geometry.lifted
     solution = _solve(geometry, friction, lifted)
@@ -105,6 +116,7 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
         problems.append("singular equations")
     if pulling:
         problems.append("contact would have to pull")
+    if problems:
         solution = Solution(dict.fromkeys(solution.values, np.nan), solution.condition, False)
     force = _contact_force(geometry, solution, friction, lifted)
     flexion, adduction = _external_moments(geometry)

@@ -116,7 +116,7 @@ def condyle(side: str, contact: CondylePoint, friction: float) -> Unknown:
 
 
 def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
-    """Return what an exact model would make zero.
+    """Return what an exact model would make zero, on the tibia.
 
     Args:
         point: (3,) where the residual forces act: midpoint of the contact points.
@@ -124,12 +124,12 @@ def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
         extensor: muscles are modelled; without them the flexion moment joins the residuals.
     """
     found = [
-        Unknown("residual_ap", pair("femur", "tibia", point, AXES["ap"])),
-        Unknown("residual_ml", pair("femur", "tibia", point, AXES["ml"])),
-        Unknown("residual_axial", moment_pair("femur", "tibia", AXES["si"])),
+        Unknown("residual_ap", pair("tibia", "femur", point, AXES["ap"])),
+        Unknown("residual_ml", pair("tibia", "femur", point, AXES["ml"])),
+        Unknown("residual_axial", moment_pair("tibia", "femur", AXES["si"])),
     ]
     if lifted:
-        found.append(Unknown("residual_coronal", moment_pair("femur", "tibia", AXES["ap"])))
+        found.append(Unknown("residual_coronal", moment_pair("tibia", "femur", AXES["ap"])))
     if not extensor:
-        found.append(Unknown("residual_flexion", moment_pair("femur", "tibia", AXES["ml"])))
+        found.append(Unknown("residual_flexion", moment_pair("tibia", "femur", AXES["ml"])))
     return found

@@ -91,3 +91,27 @@ def mirrored_pose(pose_a_in_b: ArrayLike) -> Array:
     """Return the pose (..., 4, 4) between the mirrored frames."""
     p = np.asarray(pose_a_in_b, float)
     return pose(MIRROR @ p[..., :3, :3] @ MIRROR, p[..., :3, 3] @ MIRROR)
+
+
+def knee_twist(coordinates: ArrayLike, rates: ArrayLike) -> tuple[Array, Array]:
+    """Return the femur's velocity relative to the insert.
+
+    Args:
+        coordinates: (..., 6) knee coordinates, m and rad.
+        rates: (..., 6) their time derivatives.
+
+    Returns:
+        Velocity (..., 3) m/s of the femoral origin and angular velocity (..., 3) rad/s, both
+        in the insert frame.
+    """
+    c, rate = np.asarray(coordinates, float), np.asarray(rates, float)
+    zero, one = np.zeros_like(c[..., 0]), np.ones_like(c[..., 0])
+    superior = np.stack([zero, one, zero], axis=-1)
+    floating = np.stack([np.cos(c[..., 3]), zero, np.sin(c[..., 3])], axis=-1)
+    medial_lateral = knee_pose(c)[..., :3, 2]
+    spin = (
+        -rate[..., 3, None] * superior
+        - rate[..., 4, None] * floating
+        + rate[..., 5, None] * medial_lateral
+    )
+    return rate[..., :3], spin

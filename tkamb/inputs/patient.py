@@ -1,7 +1,7 @@
 """The patient's URDF: read, mirrored if left, completed with segment inertias, checked.
 
-Links that must exist: `tibia` (shank and foot, its origin at the ankle centre), `femur`, `patella`, and `hip`, a frame
-fixed to the femur at the hip centre. Joints: `ankle` (or the tibia as root), the six
+Links that must exist: `tibia` (shank and foot, its origin at the ankle centre), `femur`,
+`patella`, and `hip`, a frame fixed to the femur at the hip centre. Joints: `ankle` (or the tibia as root), the six
 single-axis knee joints in the order of `KNEE_JOINTS`, and the three of `PATELLA_JOINTS`.
 The origin of `knee_ap` is the insert frame in the tibia; the femur link's frame is that of
 the femoral component. Any other link fixed to these may carry attachment points.

@@ -27,6 +27,10 @@ class Card:
     detail: str
     warning: bool = False
 
+    def line(self) -> str:
+        """Return the card as one line of text."""
+        return f"{self.title}: {self.value} ({self.detail})"
+
     def html(self) -> str:
         """Return the card as HTML."""
         kind = "card warning" if self.warning else "card"

@@ -110,6 +110,11 @@ class MapWriter:
     def __len__(self) -> int:
         return int(self._file["time_s"].shape[0])
 
+    @property
+    def maps(self) -> "ContactMaps":
+        """What was written so far."""
+        return ContactMaps(self.path)
+
     def close(self) -> None:
         """Close the file; nothing can be appended after it."""
         self._file.close()

@@ -1,0 +1,55 @@
+"""Data flows one way: which module may import which, read from the code itself."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "tkamb"
+
+FORBIDDEN = {
+    "geometry": ("inputs", "body", "contact", "output"),
+    "body": ("contact", "inputs", "output"),
+    "contact": ("body", "inputs", "output"),
+    "inputs": ("body", "contact", "output"),
+    "output": ("body", "inputs"),
+}
+SEES_BODY_AND_CONTACT = {"equilibrium.py", "simulate.py"}
+
+
+def imported(path):
+    """Return the tkamb modules that a file imports, those for type checking left out."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+        elif isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+    return {name for name in names if name.startswith("tkamb")}
+
+
+@pytest.mark.parametrize("layer", sorted(FORBIDDEN))
+def test_layers_import_only_downwards(layer):
+    for path in (PACKAGE / layer).rglob("*.py"):
+        for name in imported(path):
+            for other in FORBIDDEN[layer]:
+                assert not name.startswith(f"tkamb.{other}"), f"{path.name} imports {name}"
+
+
+def test_the_layer_test_can_fail():
+    assert "tkamb.body.chain" in imported(PACKAGE / "mechanics.py")
+
+
+def test_only_two_files_see_body_and_contact():
+    for path in PACKAGE.glob("*.py"):
+        names = imported(path)
+        sees = {
+            layer
+            for layer in ("body", "contact")
+            for name in names
+            if name.startswith(f"tkamb.{layer}.")
+        }
+        through = {"tkamb.mechanics": "body", "tkamb.extensor": "body"}
+        sees |= {layer for module, layer in through.items() if module in names}
+        if len(sees) == 2:
+            assert path.name in SEES_BODY_AND_CONTACT, f"{path.name} sees {sees}"

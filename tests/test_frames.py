@@ -1,0 +1,62 @@
+"""Knee coordinates: signs of the field, round trip, and the twist by finite differences."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tkamb.geometry.frames import (
+    inverse,
+    knee_coordinates,
+    knee_pose,
+    knee_twist,
+    mirrored_pose,
+    pose,
+    transform,
+)
+from tkamb.units import DEGREE
+
+
+def test_signs_are_those_of_the_field():
+    """Flexion swings the femur's shaft back; varus opens laterally; external turns it out."""
+    shaft, anterior = np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
+    lateral_condyle = np.array([0.0, 0.0, 0.02])
+    turn = 5 * DEGREE
+    assert transform(knee_pose([0, 0, 0, 0, 0, turn]), shaft)[0] < -0.08
+    assert transform(knee_pose([0, 0, 0, 0, turn, 0]), lateral_condyle)[1] > 0.0017
+    assert transform(knee_pose([0, 0, 0, turn, 0, 0]), anterior)[2] > 0.08
+
+
+def test_round_trip_to_160_degrees():
+    rng = np.random.default_rng(1)
+    low = np.array([-0.02, 0, -0.01, -0.4, -0.2, -0.1])
+    high = np.array([0.02, 0.05, 0.01, 0.4, 0.2, 160 * DEGREE])
+    wanted = rng.uniform(low, high, (500, 6))
+    found = np.array([knee_coordinates(knee_pose(c)) for c in wanted])
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
+
+
+def test_any_other_angle_order_goes_through_the_matrix():
+    angles = np.array([0.3, -0.4, 1.1])
+    given = pose(Rotation.from_euler("XYZ", angles).as_matrix(), np.zeros(3))
+    again = knee_pose(knee_coordinates(given))
+    np.testing.assert_allclose(again, given, atol=1e-14)
+    assert abs(knee_coordinates(given)[4] + angles[0]) > 0.01
+
+
+def test_twist_is_the_derivative_of_the_pose():
+    rng = np.random.default_rng(2)
+    c, rate, step = rng.uniform(-0.5, 1.5, (40, 6)), rng.normal(size=(40, 6)), 1e-6
+    point = np.array([0.01, -0.02, 0.03])
+    velocity, spin = knee_twist(c, rate)
+    ahead = transform(knee_pose(c + step * rate), point)
+    behind = transform(knee_pose(c - step * rate), point)
+    arm = transform(knee_pose(c), point) - c[:, :3]
+    np.testing.assert_allclose(
+        (ahead - behind) / (2 * step), velocity + np.cross(spin, arm), atol=1e-9
+    )
+
+
+def test_inverse_and_mirror():
+    there = knee_pose([0.01, 0.03, 0.002, 0.1, 0.05, 1.0])
+    np.testing.assert_allclose(there @ inverse(there), np.eye(4), atol=1e-15)
+    c = knee_coordinates(mirrored_pose(there))
+    np.testing.assert_allclose(c, [0.01, 0.03, -0.002, -0.1, -0.05, 1.0], atol=1e-15)

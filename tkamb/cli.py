@@ -1,0 +1,225 @@
+"""The command line: arguments in, exit status out. Nothing is computed here."""
+
+import argparse
+import json
+import logging
+import sys
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tkamb.errors import TkambError
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `tkamb` and return its exit status: 0 done, 1 nothing computed, 2 bad input."""
+    options = _parser().parse_args(arguments)
+    logging.basicConfig(format="tkamb: %(levelname)s: %(message)s", level=logging.WARNING)
+    try:
+        return int(options.command(options))
+    except TkambError as error:
+        print(f"tkamb: {error}", file=sys.stderr)
+        return error.exit_status
+    except KeyboardInterrupt:
+        print("tkamb: interrupted; what was finished is kept", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="tkamb", description="What happens inside a total knee replacement."
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    _add_run(commands)
+    _add_press(commands)
+    _add_contact(commands)
+    _add_mesh(commands)
+    _add_scene(commands)
+    return parser
+
+
+def _add_run(commands: Any) -> None:
+    run = commands.add_parser("run", help="motion in, condyle forces and report out")
+    run.add_argument("scene", type=Path, help="scene.toml")
+    run.add_argument("--contact", metavar="NAME", help="contact model (`tkamb contact list`)")
+    run.add_argument("--resolution", type=float, metavar="MM", help="spacing of the map points")
+    run.add_argument("--out", type=Path, metavar="DIR", help="output folder")
+    run.add_argument("--frames", type=_slice, metavar="A:B:STEP", help="frames, as in Python")
+    run.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        type=_setting,
+        metavar="TABLE.KEY=VALUE",
+        help="override a key of the scene",
+    )
+    run.add_argument("--strict", action="store_true", help="exit 1 when a frame failed")
+    run.add_argument("--json", action="store_true", help="print summary.json")
+    run.set_defaults(command=_run)
+
+
+def _add_press(commands: Any) -> None:
+    press = commands.add_parser("press", help="contact alone: press two meshes together")
+    press.add_argument("femoral", type=Path)
+    press.add_argument("insert", type=Path)
+    press.add_argument("--load", type=float, required=True, metavar="N")
+    press.add_argument("--units", choices=("mm", "m"), default="mm", help="of both meshes")
+    pose = press.add_mutually_exclusive_group()
+    pose.add_argument(
+        "--pose",
+        type=float,
+        nargs=6,
+        metavar=("X", "Y", "Z", "RX", "RY", "RZ"),
+        help="femoral mesh in the insert mesh's axes: mesh units, degrees (intrinsic x-y-z)",
+    )
+    pose.add_argument("--pose-file", type=Path, metavar="F", help="the same six numbers in a file")
+    press.add_argument("--contact", default="foundation", metavar="NAME")
+    press.add_argument("--resolution", type=float, default=1.0, metavar="MM")
+    press.add_argument("--bearing", choices=("fixed", "mobile"), default="fixed")
+    press.add_argument("--material", default="polyethylene", metavar="NAME")
+    press.add_argument(
+        "--axes",
+        default="+x,+y,+z",
+        metavar="ANT,SUP,RIGHT",
+        help="mesh axes that point anterior, superior, right; write --axes=-x,+y,-z",
+    )
+    press.add_argument("--side", choices=("right", "left"), default="right")
+    press.add_argument("--adjust", action=argparse.BooleanOptionalAction, default=False)
+    press.add_argument("--json", action="store_true")
+    press.set_defaults(command=_press)
+
+
+def _add_contact(commands: Any) -> None:
+    contact = commands.add_parser("contact", help="contact models")
+    verbs = contact.add_subparsers(required=True, metavar="VERB")
+    verbs.add_parser("list", help="names, what each assumes and needs").set_defaults(
+        command=_contact_list
+    )
+
+
+def _add_mesh(commands: Any) -> None:
+    mesh = commands.add_parser("mesh", help="look at a mesh before it is used")
+    verbs = mesh.add_subparsers(required=True, metavar="VERB")
+    check = verbs.add_parser("check", help="health, and unit and axes as questions")
+    check.add_argument("files", type=Path, nargs="+", metavar="FILE")
+    check.add_argument("--json", action="store_true")
+    check.set_defaults(command=_mesh_check)
+
+
+def _add_scene(commands: Any) -> None:
+    scene = commands.add_parser("scene", help="the scene file")
+    scene.add_argument("--schema", action="store_true", required=True, help="print its JSON schema")
+    scene.set_defaults(command=_scene)
+
+
+def _slice(text: str) -> slice:
+    parts = text.split(":")
+    if not 2 <= len(parts) <= 3:
+        raise argparse.ArgumentTypeError(f"'{text}' is not A:B or A:B:STEP")
+    try:
+        return slice(*(int(part) if part else None for part in parts))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' holds something else than integers") from None
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise argparse.ArgumentTypeError(f"'{text}' is not TABLE.KEY=VALUE")
+    try:
+        return key.strip(), tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key.strip(), value.strip()
+
+
+def _run(options: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from tkamb.output.axis import horizontal_axis
+    from tkamb.output.headline import cards
+    from tkamb.results import claim_directory, write_results
+    from tkamb.scene import load_scene
+    from tkamb.simulate import simulate
+    from tkamb.status import FAILED
+
+    overrides = dict(options.set)
+    if options.contact:
+        overrides["contact.model"] = options.contact
+    if options.resolution is not None:
+        overrides["contact.resolution_mm"] = options.resolution
+    scene = load_scene(options.scene, overrides)
+    directory = options.out or scene.output.directory or _default_directory(options.scene)
+    results = simulate(
+        scene,
+        frames=options.frames,
+        directory=claim_directory(directory),
+        scene_path=options.scene,
+        progress=lambda frames: tqdm(frames, unit="frame", disable=None),
+    )
+    write_results(results, directory)
+    failed = [k for k, status in enumerate(results.status) if status.startswith(FAILED)]
+    for k in failed:
+        print(f"tkamb: frame {k}: {results.status[k]}", file=sys.stderr)
+    if options.json:
+        print((directory / "summary.json").read_text(encoding="utf-8"), end="")
+    else:
+        found = cards(results, horizontal_axis(results))
+        print("\n".join([*(card.line() for card in found), f"report: {directory / 'report.html'}"]))
+    return 1 if failed and (options.strict or len(failed) == len(results)) else 0
+
+
+def _default_directory(scene: Path) -> Path:
+    return Path("out") / scene.resolve().parent.name
+
+
+def _press(options: argparse.Namespace) -> int:
+    from tkamb.press import press_meshes, read_pose
+
+    pose = read_pose(options.pose_file) if options.pose_file else options.pose
+    report = press_meshes(
+        options.femoral,
+        options.insert,
+        options.load,
+        units=options.units,
+        pose=None if pose is None else tuple(pose),
+        contact=options.contact,
+        resolution_mm=options.resolution,
+        bearing=options.bearing,
+        material=options.material,
+        axes=options.axes,
+        side=options.side,
+        adjust=options.adjust,
+    )
+    print(json.dumps(report.as_dict(), indent=2) if options.json else "\n".join(report.lines()))
+    return 0 if report.carried else 1
+
+
+def _contact_list(options: argparse.Namespace) -> int:
+    from tkamb.contact.registry import contact_descriptions
+
+    for name, line in contact_descriptions().items():
+        print(f"{name:18s} {line}")
+    return 0
+
+
+def _mesh_check(options: argparse.Namespace) -> int:
+    from tkamb.inputs.mesh_check import check_mesh
+
+    found = [check_mesh(path) for path in options.files]
+    if options.json:
+        print(json.dumps([health.as_dict() for health in found], indent=2))
+    else:
+        print("\n".join(line for health in found for line in health.lines()))
+    return 0
+
+
+def _scene(options: argparse.Namespace) -> int:
+    from tkamb.scene import scene_schema
+
+    print(json.dumps(scene_schema(), indent=2))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

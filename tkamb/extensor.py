@@ -1,0 +1,210 @@
+"""The extensor mechanism of a case: the patella over all frames, and its lines of action."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.body.chain import ChainState
+from tkamb.body.knee import Extensor
+from tkamb.body.lines import StringLine
+from tkamb.body.load import PointForces
+from tkamb.body.patella import (
+    ExtensorMechanism,
+    PatellaState,
+    PatellaStatus,
+    patella_at,
+    solve_patella,
+)
+from tkamb.body.patellofemoral import PatellofemoralContact
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.frames import Array, inverse, transform
+from tkamb.geometry.sections import sagittal_outline
+from tkamb.inputs.filtering import differentiate_coordinates
+from tkamb.inputs.meshes import load_surface, mirrored
+from tkamb.scene import Attachment, BoneTable
+from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.case import Case
+    from tkamb.geometry.surface import Surface
+
+BAND = 0.012
+"""m: the lines wrap the sections within this distance of their own sagittal plane."""
+
+USABLE = (PatellaStatus.OK, PatellaStatus.SEVERAL, PatellaStatus.EDGE)
+
+
+class ExtensorFrames:
+    """Quadriceps, patella and patellar ligament over the frames of a case.
+
+    Args:
+        case: a case with [quadriceps], [patellar_ligament] and [patella].
+        poses: (f, 4, 4) pose_femur_in_insert.
+
+    Raises:
+        InputError: a line starts inside what it wraps, or no patella was recorded.
+    """
+
+    def __init__(self, case: "Case", poses: Array) -> None:
+        self.case = case
+        self.quadriceps, self.ligament = _quadriceps(case), _ligament(case)
+        mechanism = self._mechanism()
+        if case.scene.patella is not None and case.scene.patella.motion == "recorded":
+            motion = case.motion
+            if motion.patella is None:
+                raise InputError(
+                    "has no patella columns",
+                    case.scene.motion.file,
+                    "record patella_ap, patella_si, patella_rotation or set [patella] motion = "
+                    "'solved'",
+                )
+            assert motion.patella_velocity is not None and motion.patella_acceleration is not None
+            self._joints = np.stack(
+                [motion.patella, motion.patella_velocity, motion.patella_acceleration], axis=1
+            )
+            self.states = [
+                patella_at(mechanism, pose, coordinates)
+                for pose, coordinates in zip(poses, motion.patella, strict=True)
+            ]
+        else:
+            self.states = _solved(mechanism, poses)
+            self._joints = self._differentiated()
+
+    def joints(self, k: int) -> Array:
+        """Return patella coordinates, rates and accelerations (3, 3) of frame k; NaN if lost."""
+        return np.asarray(self._joints[k])
+
+    def at(self, k: int, state: ChainState) -> tuple[Extensor, float]:
+        """Return the loads of unit tensions, and the quadriceps' wrap (rad).
+
+        Raises:
+            ComputationError: no patella at this frame, or a line's end inside what it wraps.
+        """
+        patella = self.states[k]
+        if patella.status not in USABLE:
+            raise ComputationError(f"patella: {patella.status.value.replace('_', ' ')}")
+        lines = (self.quadriceps, self.ligament)
+        links = {link for line in lines for link in (line.start_link, line.end_link)}
+        poses = {link: state.pose(link) for link in links | {"femur"}} | {"insert": np.eye(4)}
+        quadriceps, ligament = (line.path(poses) for line in lines)
+        extensor = Extensor(
+            self.quadriceps.loads(quadriceps),
+            tuple(_on_tibia(load) for load in self.ligament.loads(ligament)),
+            patella.contact_point,
+            patella.contact_normal,
+        )
+        return extensor, quadriceps.wrap_angle
+
+    def _mechanism(self) -> ExtensorMechanism:
+        case, quadriceps, ligament = self.case, self.quadriceps, self.ligament
+        assert case.femoral is not None and case.patella is not None
+        chain, table = case.chain, case.scene.patellar_ligament
+        assert table is not None
+        joint = chain.patella_joint_in_femur
+        to_femur = chain.link_in(quadriceps.start_link, "femur")
+        to_tibia = chain.link_in(ligament.end_link, "tibia")
+        return ExtensorMechanism(
+            PatellofemoralContact(case.femoral.moved(inverse(joint)), case.patella),
+            joint,
+            transform(to_femur, quadriceps.start_point),
+            quadriceps.end_point,
+            ligament.start_point,
+            transform(inverse(chain.insert_in_tibia) @ to_tibia, ligament.end_point),
+            (table.length_mm or np.nan) * MILLIMETRE,
+            quadriceps.outline,
+            ligament.outline,
+        )
+
+    def _differentiated(self) -> Array:
+        """Return the solved coordinates with their rates (f, 3, 3), found frames only."""
+        motion, cutoff = self.case.motion, self.case.scene.motion.cutoff_Hz
+        places = np.array([state.coordinates for state in self.states])
+        found = np.isfinite(places).all(axis=1)
+        result = np.full((len(places), 3, 3), np.nan)
+        first, last = (int(np.argmax(found)), len(found) - int(np.argmax(found[::-1])))
+        if not found[first:last].all():
+            inner = np.flatnonzero(~found[first:last]) + first
+            raise InputError(
+                f"the patella is lost at frames {', '.join(map(str, inner[:5]))}, amid the motion",
+                "[patella]",
+                "check its mesh, the lines' points and length_mm",
+            )
+        if last - first < 2:
+            raise InputError("no place of the patella is found", "[patella]", "check its mesh")
+        part = slice(first, last)
+        x, v, a = differentiate_coordinates(motion.time[part], places[part], cutoff)
+        result[part] = np.stack([x, v, a], axis=1)
+        return result
+
+
+def _solved(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]:
+    """Solve frame after frame, each from the one before."""
+    states: list[PatellaState] = []
+    for pose in poses:
+        guess = states[-1].coordinates if states else None
+        states.append(solve_patella(mechanism, pose, guess))
+    return states
+
+
+def _quadriceps(case: "Case") -> StringLine:
+    table = case.scene.quadriceps
+    assert table is not None and case.femoral is not None
+    outline = None
+    ends = (_point(case, table.origin), _point(case, table.insertion))
+    if table.wrap:
+        surfaces = [case.femoral]
+        if table.bone:
+            surfaces.append(_bone(case, table.bone))
+        outline = sagittal_outline(
+            surfaces,
+            np.linspace(-BAND, BAND, 7) + case.chain.patella_joint_in_femur[2, 3],
+            table.half_thickness_mm * MILLIMETRE,
+            below=float(transform(case.chain.link_in(table.origin.link, "femur"), ends[0])[1]),
+        )
+    return StringLine(
+        "quadriceps", table.origin.link, ends[0], table.insertion.link, ends[1], outline, "femur"
+    )
+
+
+def _ligament(case: "Case") -> StringLine:
+    table = case.scene.patellar_ligament
+    assert table is not None
+    outline = None
+    ends = (_point(case, table.proximal), _point(case, table.distal))
+    if table.wrap and case.insert is not None:
+        place = transform(
+            inverse(case.chain.insert_in_tibia) @ case.chain.link_in(table.distal.link, "tibia"),
+            ends[1],
+        )
+        outline = sagittal_outline(
+            [case.insert],
+            np.linspace(-BAND, BAND, 7) + place[2],
+            table.half_thickness_mm * MILLIMETRE,
+        )
+    return StringLine(
+        "patellar_ligament",
+        table.proximal.link,
+        ends[0],
+        table.distal.link,
+        ends[1],
+        outline,
+        "insert",
+    )
+
+
+def _on_tibia(load: PointForces) -> PointForces:
+    """Return the load with the insert, which the tibia carries, named as the tibia."""
+    return replace(load, link="tibia") if load.link == "insert" else load
+
+
+def _point(case: "Case", end: Attachment) -> Array:
+    point = np.array(end.point_mm) * MILLIMETRE
+    return point * [1.0, 1.0, -1.0] if case.scene.patient.side == "left" else point
+
+
+def _bone(case: "Case", table: BoneTable) -> "Surface":
+    surface = load_surface(table.mesh, table.unit, table.axes, name="bone")
+    if case.scene.patient.side == "left":
+        surface = mirrored(surface)
+    return surface.moved(case.chain.link_in(table.link, "femur"))

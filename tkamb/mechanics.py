@@ -1,0 +1,161 @@
+"""The body side of a case: geometry of each frame in, loads of each frame out."""
+
+import time as clock
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.body.chain import ChainMotion, ChainState
+from tkamb.body.knee import KneeGeometry, KneeLoads, solve_knee, unsolved
+from tkamb.body.load import PointForces
+from tkamb.body.unknowns import CondylePoint
+from tkamb.case import Case
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import knee_pose, knee_twist
+from tkamb.units import DEGREE
+
+if TYPE_CHECKING:
+    from tkamb.body.ligaments import Ligament
+    from tkamb.geometry.closest import CondyleGap
+
+LIFT_OFF_ANGLE = 0.5 * DEGREE
+"""Coronal angle of the gaps beyond which a condyle is off the insert (the source, 4.3)."""
+
+FARTHEST_GAP = 3e-3
+"""m: a femoral component farther from the insert, or deeper in it, is misplaced."""
+
+NAN = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameLoads:
+    """The body side of one frame.
+
+    Args:
+        geometry: what the equations worked on.
+        loads: what they say.
+        tensions: ligament name -> N.
+        wrap: rad, by which the quadriceps wraps the femur; NaN if not modelled.
+        seconds: computing time.
+    """
+
+    geometry: KneeGeometry
+    loads: KneeLoads
+    tensions: dict[str, float]
+    wrap: float
+    seconds: float
+
+
+class Mechanics:
+    """The rigid-body mechanics of a case, frame by frame.
+
+    Args:
+        case: the scene with its files read.
+    """
+
+    def __init__(self, case: Case) -> None:
+        self.case = case
+        self.poses = knee_pose(case.motion.coordinates)
+        self._friction = case.scene.contact.friction if case.scene.contact else 0.0
+        self._query = None
+        if case.scene.contact:
+            from tkamb.geometry.closest import ClosestPointQuery
+
+            assert case.femoral is not None and case.insert is not None
+            self._query = ClosestPointQuery(case.femoral, case.insert, case.split)
+        self._extensor = None
+        if case.scene.patella:
+            from tkamb.extensor import ExtensorFrames
+
+            self._extensor = ExtensorFrames(case, self.poses)
+        self._ligaments = self._build_ligaments()
+
+    def frame(self, k: int) -> FrameLoads:
+        """Return the loads of frame k; a frame that cannot be solved holds NaN."""
+        start = clock.perf_counter()
+        state = self.case.chain.at(self._chain_motion(k))
+        poses = {link: state.pose(link) for link in self._attachment_links()}
+        tensions: dict[str, float] = {}
+        known: list[PointForces] = []
+        for bundle in self._ligaments:
+            tensions[bundle.name], pulls = bundle.loads(poses)
+            known += pulls
+        condyles, lifted, problems = self._condyles(k)
+        extensor, wrap = None, NAN
+        if self._extensor:
+            try:
+                extensor, wrap = self._extensor.at(k, state)
+            except ComputationError as error:
+                problems.append(str(error))
+        geometry = KneeGeometry(
+            state, self._ground(k, state), tuple(known), condyles, lifted, extensor
+        )
+        loads = unsolved(problems) if problems else solve_knee(geometry, self._friction)
+        return FrameLoads(geometry, loads, tensions, wrap, clock.perf_counter() - start)
+
+    def _chain_motion(self, k: int) -> ChainMotion:
+        motion, tibia = self.case.motion, self.case.tibia
+        joints = np.stack([motion.coordinates[k], motion.velocity[k], motion.acceleration[k]])
+        if self._extensor:
+            joints = np.hstack([joints, self._extensor.joints(k)])
+        if tibia is None:
+            return ChainMotion(np.eye(4), np.zeros(6), np.zeros(6), joints)
+        return ChainMotion(tibia.pose[k], tibia.velocity[k], tibia.acceleration[k], joints)
+
+    def _ground(self, k: int, state: ChainState) -> PointForces | None:
+        ground, table = self.case.ground, self.case.scene.ground_reaction
+        if ground is None or table is None:
+            return None
+        if table.applied == "ankle":
+            tibia = self.case.tibia
+            assert tibia is not None
+            return state.ground_reaction(ground.force[k], tibia.pose[k][:3, 3], np.zeros(3))
+        return state.ground_reaction(ground.force[k], ground.point[k], ground.moment[k])
+
+    def _condyles(self, k: int) -> tuple[dict[str, CondylePoint], frozenset[str], list[str]]:
+        """Return the contact points, the sides that are off, and what is wrong."""
+        if self._query is None:
+            return {}, frozenset(), []
+        gaps = self._query.at(self.poses[k])
+        found = {"medial": gaps.medial} | ({"lateral": gaps.lateral} if gaps.lateral else {})
+        condyles = {side: self._condyle(k, gap) for side, gap in found.items()}
+        nearest = min(gap.gap for gap in found.values())
+        problems = []
+        if abs(nearest) > FARTHEST_GAP:
+            word = "apart" if nearest > 0 else "overlapping"
+            problems.append(f"condyles {word} by {abs(nearest) * 1e3:.1f} mm")
+        return condyles, self._lifted(condyles), problems
+
+    def _condyle(self, k: int, gap: "CondyleGap") -> CondylePoint:
+        motion = self.case.motion
+        velocity, spin = knee_twist(motion.coordinates[k], motion.velocity[k])
+        arm = gap.point_on_femoral - self.poses[k][:3, 3]
+        sliding = velocity + np.cross(spin, arm)
+        return CondylePoint(gap.point_on_insert, gap.normal, sliding, gap.gap)
+
+    def _lifted(self, condyles: dict[str, CondylePoint]) -> frozenset[str]:
+        if len(condyles) < 2:
+            return frozenset()
+        medial, lateral = condyles["medial"], condyles["lateral"]
+        width = abs(lateral.point[2] - medial.point[2])
+        if abs(lateral.gap - medial.gap) <= LIFT_OFF_ANGLE * width:
+            return frozenset()
+        return frozenset({"lateral" if lateral.gap > medial.gap else "medial"})
+
+    def _build_ligaments(self) -> "tuple[Ligament, ...]":
+        if not self.case.scene.ligament:
+            return ()
+        from tkamb.body.ligaments import build_ligaments
+
+        states = [self.case.chain.at(self._chain_motion(k)) for k in range(len(self.poses))]
+        poses = {
+            link: np.stack([state.pose(link) for state in states])
+            for link in self._attachment_links()
+        }
+        flexion = self.case.motion.coordinates[:, 5]
+        return build_ligaments(self.case.scene.ligament, poses, flexion)
+
+    def _attachment_links(self) -> set[str]:
+        ends = [end for table in self.case.scene.ligament for end in (table.proximal, table.distal)]
+        return {end.link for end in ends}

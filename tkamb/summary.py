@@ -1,0 +1,116 @@
+"""What a run was made of: the summary that stands beside the numbers."""
+
+import hashlib
+import sys
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tkamb.case import Case
+from tkamb.status import FAILED
+
+RESIDUALS = (
+    "Residuals are the AP and ML force and the axial moment on the tibia that balance still "
+    "needs at the midpoint of the contact points; an exact model would leave none. "
+    "residual_sensitivity_N is the change of the total force when that point moves by 10 mm in y."
+)
+
+LIBRARIES = ("pin", "numpy", "scipy", "trimesh", "python-fcl")
+
+
+def summary_of(
+    case: Case, columns: dict[str, Any], seconds: dict[str, float], path: Path | None
+) -> dict[str, Any]:
+    """Return the JSON-able summary of a run; `tkamb.output.provenance` lists its keys.
+
+    Args:
+        case: the case.
+        columns: of results.csv.
+        seconds: part -> computing time.
+        path: of the scene file, if it came from one.
+    """
+    scene, statuses, times = case.scene, columns["status"], columns["time_s"]
+    left = scene.patient.side == "left"
+    summary: dict[str, Any] = {
+        "scene": None if path is None else str(path),
+        "scene_sha256": scene_hash(case),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": " ".join(["tkamb", *sys.argv[1:]]),
+        "versions": {"python": sys.version.split()[0], "tkamb": version("tkamb")}
+        | {name: version(name) for name in LIBRARIES},
+        "seconds": seconds,
+        "side": scene.patient.side,
+        "frame": "insert frame: x anterior, y superior, z "
+        + ("lateral (a left knee, computed as its mirror image)" if left else "right (lateral)"),
+        "body_mass_kg": scene.patient.mass_kg,
+        "height_mm": scene.patient.height_mm,
+        "yield_stress_MPa": scene.output.yield_stress_MPa,
+        "axis": scene.output.axis,
+        "frames": len(statuses),
+        "failed_frames": [
+            {"frame": k, "time_s": float(times[k]), "status": status}
+            for k, status in enumerate(statuses)
+            if status.startswith(FAILED)
+        ],
+        "flagged_frames": sum(s != "ok" and not s.startswith(FAILED) for s in statuses),
+        "peak_force_total_BW": _peak(columns["force_total_BW"]),
+        "not_modelled": not_modelled(case),
+        "assumptions": assumptions(case),
+        "notes": list(scene.output.notes),
+    }
+    if scene.contact:
+        summary["contact"] = scene.contact.model_dump(mode="json")
+        summary["residuals"] = RESIDUALS
+    if case.motion.cycle_percent is not None:
+        percent, time = case.motion.cycle_percent, case.motion.time
+        slope = (time[-1] - time[0]) / (percent[-1] - percent[0])
+        start = time[0] - percent[0] * slope
+        summary["cycle_percent_s"] = [start, start + 100.0 * slope]
+    return summary
+
+
+def scene_hash(case: Case) -> str:
+    """Return the SHA-256 of the validated scene."""
+    return hashlib.sha256(case.scene.model_dump_json().encode()).hexdigest()
+
+
+def not_modelled(case: Case) -> list[str]:
+    """Return the parts that the scene leaves out."""
+    scene = case.scene
+    parts = {
+        "ground reaction": scene.ground_reaction,
+        "ligaments": scene.ligament,
+        "quadriceps, patella and patellar ligament": scene.patella,
+        "femorotibial contact": scene.contact,
+    }
+    return [name for name, part in parts.items() if not part]
+
+
+def assumptions(case: Case) -> list[str]:
+    """Return what the numbers rest on, in plain words."""
+    scene = case.scene
+    said = [
+        "Segments are rigid; the hip carries the force and moment of all that crosses it.",
+        f"The motion is low-passed at {scene.motion.cutoff_Hz} Hz before differentiation.",
+    ]
+    if not scene.tibia:
+        said.append("No [tibia]: the shank stands upright and still.")
+    if scene.ground_reaction and scene.ground_reaction.applied == "ankle":
+        said.append("The ground reaction acts at the ankle centre, without moment (the source).")
+    if not scene.patella:
+        said.append("No muscles: the knee's flexion moment is carried by nothing (a residual).")
+    if scene.contact:
+        said.append(
+            "The contact model presses in the superior-inferior force at the measured rotation; "
+            "it does not feed back into the body."
+        )
+    if scene.patient.side == "left":
+        said.append("A left knee is computed as its mirror image: z is lateral.")
+    return said
+
+
+def _peak(values: Any) -> float | None:
+    return float(np.nanmax(values)) if np.isfinite(values).any() else None
