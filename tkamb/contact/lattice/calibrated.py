@@ -19,7 +19,8 @@ On a box this is K_spr - (5/3) V g gᵀ; on a sheared cell it keeps the patch ex
 
 import numpy as np
 
-from tkamb.contact.lattice.hexahedron import CORNERS, PAIR_AXES, PAIRS, mean_gradient
+from tkamb.contact.lattice.cells import CORNERS, PAIRS
+from tkamb.contact.lattice.hexahedron import PAIR_AXES, mean_gradient
 from tkamb.geometry.frames import Array
 
 EDGE_RATIO_LIMIT = 1.4

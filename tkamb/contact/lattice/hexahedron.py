@@ -3,20 +3,11 @@
 Corners are in VTK hexahedron order with the cell's own axes along x, y and z.
 """
 
-from itertools import combinations
-
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.contact.lattice.cells import CORNERS, PAIRS
 from tkamb.geometry.frames import Array
-
-CORNERS = np.array(
-    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
-)
-"""Which end of each axis a node is at (8, 3), VTK order."""
-
-PAIRS = np.array(list(combinations(range(8), 2)))
-"""The 28 pairs of a cell's nodes (28, 2)."""
 
 PAIR_AXES = np.abs(np.diff(CORNERS[PAIRS], axis=1))[:, 0]
 """Axes along which the ends of each pair differ (28, 3), 0 or 1: 1 edge, 2 face, 3 body."""

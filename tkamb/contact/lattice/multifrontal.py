@@ -7,6 +7,7 @@ either half of a solve is one product per member.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sparse
@@ -167,4 +168,4 @@ def _runs(indices: Indices) -> list[tuple[int, int]]:
         return []
     breaks = np.flatnonzero(np.diff(indices) != 1) + 1
     edges = [0, *breaks.tolist(), len(indices)]
-    return list(zip(edges[:-1], edges[1:], strict=True))
+    return list(pairwise(edges))

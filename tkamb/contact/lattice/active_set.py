@@ -1,0 +1,117 @@
+"""Unilateral frictionless contact of a condensed elastic body: a dense active set.
+
+Find pressures and approach with, for every candidate node,
+
+    gamma = gap + A lambda + D c >= 0,   lambda >= 0,   gamma lambda = 0
+
+and, when the load is given, -cᵀ lambda = load; when it is not, D is given. A is the symmetric
+positive definite compliance along the normals, c the normals' y. Primal-dual active set
+(Hintermueller, Ito & Kunisch, SIAM J Optim 13:865, 2002, doi:10.1137/S1052623401383558); when
+the set starts to cycle, only the worst node changes.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from tkamb.geometry.frames import Array
+
+Mask = NDArray[np.bool_]
+MOST_SETS = 200
+"""Sets tried before the search gives up."""
+PATIENCE = 12
+"""Sets after which only the worst node changes at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContactForces:
+    """What the active set found.
+
+    Args:
+        force: (n,) N along the normals, >= 0.
+        gap: (n,) m along the normals, >= 0.
+        approach: m, D.
+        active: (n,) nodes in contact.
+        sets: how many sets were solved.
+        converged: whether the set stopped changing.
+    """
+
+    force: Array
+    gap: Array
+    approach: float
+    active: Mask
+    sets: int
+    converged: bool
+
+
+def solve_contact(
+    compliance: Array,
+    gap: Array,
+    lean: Array,
+    load: float | None,
+    active: Mask,
+    approach: float = 0.0,
+) -> ContactForces:
+    """Solve the complementarity problem.
+
+    Args:
+        compliance: A (n, n), m/N.
+        gap: (n,) m at zero force and approach.
+        lean: c (n,), y of the femoral normals, negative.
+        load: N along -y, or None when the approach is given.
+        active: (n,) first guess of the nodes in contact.
+        approach: m, used when the load is None.
+    """
+    count = 0
+    active = active.copy()
+    seen: set[bytes] = set()
+    careful = False
+    while True:
+        if load is not None and not active.any():
+            active[np.argmin(gap / -lean)] = True
+        force, depth = _forces_of(compliance, gap, lean, load, active, approach)
+        opening = gap + compliance[:, active] @ force[active] + depth * lean
+        opening[active] = 0.0
+        count += 1
+        scale = 1e-12 * max(float(np.abs(force).max(initial=0)), 1e-300)
+        leave, join = active & (force < -scale), ~active & (opening < -1e-15)
+        if not (leave.any() or join.any()):
+            return ContactForces(np.maximum(force, 0), opening, depth, active, count, True)
+        if count >= MOST_SETS:
+            return ContactForces(np.maximum(force, 0), opening, depth, active, count, False)
+        key = active.tobytes()
+        careful = careful or key in seen or count > PATIENCE
+        seen.add(key)
+        active = _next_set(active, leave, join, force, opening, careful)
+
+
+def _next_set(
+    active: Mask, leave: Mask, join: Mask, force: Array, opening: Array, careful: bool
+) -> Mask:
+    """Return the next set: all changes at once, or when careful only the worst one."""
+    if not careful:
+        return (active & ~leave) | join
+    result = active.copy()
+    if leave.any():
+        result[np.argmin(np.where(leave, force, 0.0))] = False
+    else:
+        result[np.argmin(np.where(join, opening, 0.0))] = True
+    return result
+
+
+def _forces_of(
+    compliance: Array, gap: Array, lean: Array, load: float | None, active: Mask, approach: float
+) -> tuple[Array, float]:
+    """Return forces (n,) and approach that close the gap of the active nodes."""
+    force = np.zeros(len(gap))
+    if not active.any():
+        return force, approach
+    factor = cho_factor(compliance[np.ix_(active, active)], lower=True, check_finite=False)
+    right = np.column_stack([-gap[active], -lean[active]])
+    closing, per_depth = cho_solve(factor, right, check_finite=False).T
+    if load is not None:
+        approach = (load + lean[active] @ closing) / -(lean[active] @ per_depth)
+    force[active] = closing + approach * per_depth
+    return force, float(approach)

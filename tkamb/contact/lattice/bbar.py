@@ -1,0 +1,114 @@
+"""B-bar hexahedra: eight Gauss points for shear, the cell's mean dilatation for bulk.
+
+The yardstick of the lattice, on the same grid, with the same material and contact.
+Reference: Hughes, Int J Numer Meth Eng 15:1413 (1980), doi:10.1002/nme.1620150914.
+"""
+
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import NDArray
+
+from tkamb.contact.lattice.calibrated import DEVIATORIC, strain_matrix
+from tkamb.contact.lattice.curve import ShearCurve
+from tkamb.contact.lattice.hexahedron import gauss_gradients, mean_gradient
+from tkamb.contact.lattice.solid import Solid
+from tkamb.contact.materials import Material
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+
+_VALUES, _VECTORS = np.linalg.eigh(DEVIATORIC)
+_ROOT = (_VECTORS * np.sqrt(np.maximum(_VALUES, 0))).T[_VALUES > 1e-12]
+"""(5, 6) with rootᵀ root = the form 2 dev eps : dev eps."""
+
+
+class BbarHexahedra(Solid):
+    """Mean-dilatation hexahedra, small strain, J2 deformation theory at the Gauss points.
+
+    At each point e² = (2/3) dev eps : dev eps and 3 mu_s = q(e)/e; the bulk stays elastic.
+    See `Solid` for the arguments.
+
+    Raises:
+        InputError: the Jacobian is not positive at a Gauss point.
+    """
+
+    def __init__(
+        self, nodes: Array, cells: NDArray[np.int64], spacing: Array, material: Material
+    ) -> None:
+        super().__init__(nodes, cells, spacing, material)
+        gradients, self.weights = gauss_gradients(self.shapes)
+        if not (self.weights > 0).all():
+            raise InputError("a hexahedron is turned inside out", "lattice", "use finer cells")
+        self.shear = np.einsum("rq,sgqj->sgrj", _ROOT, strain_matrix(gradients))
+        mean, self.volume = mean_gradient(self.shapes)
+        self.dilatation = mean.reshape(-1, 24)
+        self.curve = ShearCurve.of(material)
+
+    def shape_stiffness(self) -> Array:
+        """Return the linear stiffness of each shape (s, 24, 24), N/m."""
+        shear = np.einsum("sg,sgri,sgrj->sij", self.weights, self.shear, self.shear, optimize=True)
+        return self.material.shear_modulus * shear + self._bulk
+
+    def correction(self, displacement: Array) -> Array:
+        """Return the sum over Gauss points of (mu - mu_s) times their unit shear forces, N."""
+        if self.curve.spline is None:
+            return np.zeros_like(displacement)
+        strain, equivalent = self._state(displacement)
+        lost = self.material.shear_modulus - self.curve.modulus(equivalent)
+        strain *= (lost * self.weights[self.shape_of_cell])[..., None]
+        return self.scatter.sum(self._per_cell_forces(strain))
+
+    def tangent(self, displacement: Array) -> sparse.csr_matrix:
+        """Return d f / d u (3n, 3n), N/m."""
+        strain, equivalent = self._state(displacement)
+        shape = self.shape_of_cell
+        secant, softening = self.curve.modulus(equivalent), self.curve.softening(equivalent)
+        matrices = self._bulk[shape]
+        for point in range(8):
+            weight, shear = self.weights[shape, point], self.shear[shape, point]
+            matrices += (weight * secant[:, point])[:, None, None] * (
+                np.swapaxes(shear, 1, 2) @ shear
+            )
+            force = np.einsum("cri,cr->ci", shear, strain[:, point])
+            scale = weight * softening[:, point] / 3
+            matrices += scale[:, None, None] * force[:, :, None] * force[:, None, :]
+        return self.pattern.assemble(matrices)
+
+    def equivalent_strain(self, displacement: Array) -> Array:
+        """Return the largest equivalent strain of each cell's Gauss points (c,)."""
+        return np.asarray(self._state(displacement)[1].max(axis=1))
+
+    @cached_property
+    def _bulk(self) -> Array:
+        g = self.dilatation
+        scale = self.material.bulk_modulus * self.volume
+        return np.asarray(scale[:, None, None] * g[:, :, None] * g[:, None, :])
+
+    @cached_property
+    def _kinds(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
+        """Cells of the most frequent shape, the others, and their (40, 24) shear matrices."""
+        common = int(np.bincount(self.shape_of_cell).argmax())
+        same = np.flatnonzero(self.shape_of_cell == common)
+        others = np.flatnonzero(self.shape_of_cell != common)
+        flat = self.shear.reshape(-1, 40, 24)
+        return same, others, flat[common], flat[self.shape_of_cell[others]]
+
+    def _state(self, displacement: Array) -> tuple[Array, Array]:
+        """Return scaled deviatoric strain (c, 8, 5) and equivalent strain (c, 8)."""
+        local = self.scatter.gather(displacement)
+        same, others, matrix, matrices = self._kinds
+        strain = np.empty((len(local), 40))
+        strain[same] = local[same] @ matrix.T
+        strain[others] = np.einsum("crj,cj->cr", matrices, local[others])
+        strain = strain.reshape(-1, 8, 5)
+        return strain, np.sqrt(np.einsum("cgr,cgr->cg", strain, strain) / 3)
+
+    def _per_cell_forces(self, stress: Array) -> Array:
+        """Return (c, 24) from weighted scaled stresses (c, 8, 5)."""
+        same, others, matrix, matrices = self._kinds
+        flat = stress.reshape(-1, 40)
+        force = np.empty((len(flat), 24))
+        force[same] = flat[same] @ matrix
+        force[others] = np.einsum("crj,cr->cj", matrices, flat[others])
+        return force

@@ -1,0 +1,102 @@
+"""The linear operator of one insert: factor, boundary conditions, response of contact nodes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import NDArray
+
+from tkamb.contact.lattice.dissection import dissect
+from tkamb.contact.lattice.multifrontal import CholeskyFactor, factorise
+from tkamb.contact.lattice.response import HalfResponse, half_response
+from tkamb.contact.model import Bearing
+from tkamb.geometry.frames import Array
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class ElasticOperator:
+    """K = L Lᵀ on the free unknowns, and L⁻¹ of unit forces at the contact nodes.
+
+    Args:
+        free: (3n,) which unknowns are free.
+        factor: of the free part of the stiffness matrix.
+        contact_nodes: (c,) nodes that the femoral component may touch.
+        half: L⁻¹ E of their 3c unit forces.
+    """
+
+    free: NDArray[np.bool_]
+    factor: CholeskyFactor
+    contact_nodes: Indices
+    half: HalfResponse
+
+    def solve(self, force: Array) -> Array:
+        """Return the displacement (n, 3), m, under nodal forces (n, 3), N."""
+        return self.finish(self.start(force))
+
+    def start(self, force: Array) -> Array:
+        """Return y = L⁻¹ f in elimination order, for nodal forces (n, 3)."""
+        y = force.ravel()[self.free][self.factor.order]
+        self.factor.forward(y)
+        return np.asarray(y)
+
+    def finish(self, y: Array) -> Array:
+        """Return nodal displacements (n, 3) = L⁻ᵀ y."""
+        x = y.copy()
+        self.factor.backward(x)
+        inner = np.empty_like(x)
+        inner[self.factor.order] = x
+        result = np.zeros(len(self.free))
+        result[self.free] = inner
+        return result.reshape(-1, 3)
+
+
+def fixed_unknowns(nodes: Array, bottom: Indices, bearing: Bearing) -> NDArray[np.bool_]:
+    """Return which of the 3n unknowns are held.
+
+    Fixed bearing: all of the bottom nodes' unknowns. Mobile bearing: their y, and x and z of
+    the two end nodes along z, which takes away the rigid modes (those nearest to x = 0).
+    """
+    held = np.zeros((len(nodes), 3), bool)
+    if bearing == "fixed":
+        held[bottom] = True
+        return held.ravel()
+    held[bottom, 1] = True
+    x, z = np.abs(nodes[bottom, 0]), nodes[bottom, 2]
+    tolerance = 1e-9 + 1e-6 * np.ptp(z)
+    for end in (z.min(), z.max()):
+        at_end = bottom[np.abs(z - end) <= tolerance]
+        held[at_end[np.argmin(x[np.abs(z - end) <= tolerance])], [0, 2]] = True
+    return held.ravel()
+
+
+def prepare_operator(
+    stiffness: sparse.csr_matrix, index: Indices, held: NDArray[np.bool_], contact_nodes: Indices
+) -> ElasticOperator:
+    """Factorise a stiffness matrix (3n, 3n) and work out the contact nodes' half response.
+
+    Args:
+        stiffness: symmetric, positive definite on the free unknowns.
+        index: (n, 3) place of each node in the lattice.
+        held: (3n,) unknowns that are zero.
+        contact_nodes: (c,).
+    """
+    free = ~held
+    number = np.cumsum(free) - 1
+    some = np.flatnonzero(free.reshape(-1, 3).any(axis=1))
+    joined = stiffness.tobsr((3, 3))
+    joined = sparse.csr_matrix(
+        (np.ones(len(joined.indices), np.int8), joined.indices, joined.indptr),
+        (len(index), len(index)),
+    )
+    tree = dissect(index[some], joined[some][:, some])
+    unknowns = []
+    for own in tree.own:
+        wanted = (3 * some[own][:, None] + np.arange(3)).ravel()
+        unknowns.append(number[wanted[free[wanted]]])
+    factor = factorise(stiffness[free][:, free], tree, unknowns)
+    place = np.full(len(free), -1)
+    place[np.flatnonzero(free)[factor.order]] = np.arange(len(factor.order))
+    wanted = place[(3 * contact_nodes[:, None] + np.arange(3)).ravel()]
+    return ElasticOperator(free, factor, contact_nodes, half_response(factor, wanted))

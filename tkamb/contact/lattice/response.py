@@ -1,0 +1,150 @@
+"""Response of the contact nodes to unit forces on them, from half a solve.
+
+With K = L Lᵀ and Z = L⁻¹ E (E picks the contact nodes' unknowns) the compliance between them
+is Eᵀ K⁻¹ E = Zᵀ Z: the backward half of the solves is never done. A column of Z is zero but on
+the path from its node to the root of the elimination tree, and the columns of one subtree
+follow each other, so Z is kept as one dense block per member of the tree.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.contact.lattice.multifrontal import CholeskyFactor
+from tkamb.geometry.frames import Array
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Rows [start, stop) of Z in its columns [first, last), the columns in sorted order.
+
+    Args:
+        start: first row, in elimination order.
+        stop: one past the last row.
+        first: first column.
+        last: one past the last column.
+        values: (stop - start, last - first).
+    """
+
+    start: int
+    stop: int
+    first: int
+    last: int
+    values: Array
+
+
+@dataclass(frozen=True, eq=False)
+class HalfResponse:
+    """Z = L⁻¹ E of q unknowns.
+
+    Args:
+        rank: (q,) sorted column of each unknown as the caller numbers them; -1 if it is held.
+        blocks: rows of Z that are not zero.
+    """
+
+    rank: Indices
+    blocks: list[Block]
+
+    def apply(self, force: Array, y: Array) -> None:
+        """Add Z f to y (in elimination order), for forces (q,) on the unknowns."""
+        ordered = np.zeros(self.columns)
+        ordered[self.rank[self.rank >= 0]] = force[self.rank >= 0]
+        for block in self.blocks:
+            part = ordered[block.first : block.last]
+            if part.any():
+                y[block.start : block.stop] += block.values @ part
+
+    def project(self, y: Array) -> Array:
+        """Return Zᵀ y (q,): displacement of the unknowns under the load whose L⁻¹ f is y."""
+        ordered = np.zeros(self.columns)
+        for block in self.blocks:
+            ordered[block.first : block.last] += y[block.start : block.stop] @ block.values
+        return np.where(self.rank >= 0, ordered[np.maximum(self.rank, 0)], 0.0)
+
+    def compliance(self, unknowns: Indices) -> Array:
+        """Return the compliance (u, u), m/N, among some of the unknowns."""
+        wanted = self.rank[unknowns]
+        live = np.flatnonzero(wanted >= 0)
+        order = live[np.argsort(wanted[live])]
+        columns = wanted[order]
+        inner = np.zeros((len(order), len(order)))
+        for block in self.blocks:
+            a, b = np.searchsorted(columns, [block.first, block.last])
+            if b > a:
+                part = block.values[:, columns[a:b] - block.first]
+                inner[a:b, a:b] += part.T @ part
+        result = np.zeros((len(unknowns), len(unknowns)))
+        result[np.ix_(order, order)] = inner
+        return result
+
+    @property
+    def columns(self) -> int:
+        """How many columns Z has."""
+        return int((self.rank >= 0).sum())
+
+
+def half_response(factor: CholeskyFactor, unknowns: Indices) -> HalfResponse:
+    """Return L⁻¹ of unit forces on unknowns given in elimination order (q,), -1 = held.
+
+    Work and memory go along the paths to the root only.
+    """
+    live = np.flatnonzero(unknowns >= 0)
+    order = live[np.argsort(unknowns[live])]
+    rows = unknowns[order]
+    rank = np.full(len(unknowns), -1)
+    rank[order] = np.arange(len(order))
+    spans = _column_spans(factor, rows)
+    values = {
+        member: np.zeros((front.stop - front.start, span[1] - span[0]), order="F")
+        for member, (front, span) in enumerate(zip(factor.fronts, spans, strict=True))
+        if span[1] > span[0]
+    }
+    blocks = []
+    for member, right in values.items():
+        front, (first, last) = factor.fronts[member], spans[member]
+        a, b = np.searchsorted(rows, [front.start, front.stop])
+        right[rows[a:b] - front.start, np.arange(a, b) - first] += 1.0
+        product = front.block @ right
+        _pass_up(factor, values, spans, member, product[front.stop - front.start :])
+        done = np.ascontiguousarray(product[: front.stop - front.start])
+        blocks.append(Block(front.start, front.stop, first, last, done))
+        values[member] = done
+    return HalfResponse(rank, blocks)
+
+
+def _column_spans(factor: CholeskyFactor, rows: Indices) -> list[tuple[int, int]]:
+    """Return for each member the columns [first, last) whose path to the root meets it."""
+    spans = [
+        (int(np.searchsorted(rows, f.start)), int(np.searchsorted(rows, f.stop)))
+        for f in factor.fronts
+    ]
+    for member, front in enumerate(factor.fronts):
+        first, last = spans[member]
+        if front.parent >= 0 and last > first:
+            begin, end = spans[front.parent]
+            empty = end == begin
+            spans[front.parent] = (first if empty else min(begin, first), max(last, end))
+    return spans
+
+
+def _pass_up(
+    factor: CholeskyFactor,
+    values: dict[int, Array],
+    spans: list[tuple[int, int]],
+    member: int,
+    passed: Array,
+) -> None:
+    """Take a member's products (m, columns) from the right-hand sides of those above it."""
+    boundary, above, at = factor.fronts[member].boundary, factor.fronts[member].parent, 0
+    first, last = spans[member]
+    while at < len(boundary):
+        upper = factor.fronts[above]
+        end = int(np.searchsorted(boundary, upper.stop))
+        if end > at:
+            start = spans[above][0]
+            local = boundary[at:end] - upper.start
+            values[above][local, first - start : last - start] -= passed[at:end]
+        above, at = upper.parent, end
