@@ -1,0 +1,163 @@
+"""Smooth shape of two meshes about a contact point: quadrics fitted to local patches."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tkamb.geometry.frames import Array, inverse, rotate, transform
+from tkamb.geometry.rays import RayCaster
+
+SAMPLES = 21
+"""Rays across a patch."""
+ROUNDS = 12
+SETTLED = 1e-7
+"""m; a contact point that moves less is found."""
+FARTHEST = 3.0
+"""Patch radii that the contact point may move away from where the meshes touch."""
+LEAST_COVER = 0.6
+"""Share of a patch that both meshes must cover."""
+
+
+@dataclass(frozen=True, eq=False)
+class OsculatingContact:
+    """Two quadrics at the place where the smooth surfaces are nearest along their normal.
+
+    Args:
+        point: (3,) m, insert frame, on the insert's quadric.
+        normal: (3,) unit, out of the insert.
+        axes: (2, 3) unit tangents along the smaller and the larger relative curvature.
+        gap: m, between the two quadrics at the point, along the normal.
+        relative: (2,) 1/m, relative curvatures along `axes`, ascending; the gap grows by
+            half of each times the squared distance.
+        insert_curvature: (2,) 1/m along `axes`, negative where the insert is concave.
+        femoral_curvature: (2,) 1/m along `axes`, positive where the femur is convex.
+    """
+
+    point: Array
+    normal: Array
+    axes: Array
+    gap: float
+    relative: Array
+    insert_curvature: Array
+    femoral_curvature: Array
+
+
+def osculate(
+    insert: RayCaster, femoral: RayCaster, pose: Array, start: Array, radius: float
+) -> OsculatingContact | None:
+    """Fit both surfaces about a contact point and move it to where the quadrics are nearest.
+
+    On a disc of `radius` in the tangent plane both meshes are sampled by rays along the
+    normal (uniformly, whatever their triangles), z = c0 + c1 u + c2 v + c3 u² + c4 uv +
+    c5 v² is fitted to each by least squares, and the disc is centred anew at the minimum of
+    the difference, with the mean normal there, until it stays. Facets smaller than the disc
+    average out; on a sphere of radius R curvature comes out too large by about radius²/(6 R²)
+    relative (the quartic term).
+
+    Args:
+        insert: ray caster, insert frame.
+        femoral: ray caster, femoral frame.
+        pose: (4, 4) pose_femoral_in_insert at which the meshes about touch.
+        start: (3,) m, where they touch, insert frame.
+        radius: m.
+
+    Returns:
+        None when a patch leaves a surface or the nearest place runs away: the surfaces do
+        not curve apart there.
+    """
+    point, normal = start, _start_normal(insert, start)
+    for _ in range(ROUNDS):
+        frame = np.stack([*_tangents(normal), normal])
+        fits = _fit(insert, femoral, pose, point, frame, radius)
+        if fits is None:
+            return None
+        of_insert, of_femoral = fits
+        difference = of_femoral - of_insert
+        step = _nearest_place(difference, radius)
+        if step is None or np.linalg.norm(point - start) > FARTHEST * radius:
+            return None
+        if np.linalg.norm(step) < SETTLED:
+            return _described(point, frame, of_insert, of_femoral)
+        point = point + np.append(step, _value(of_insert, step)) @ frame
+        slope = (_slope(of_insert, step) + _slope(of_femoral, step)) / 2
+        normal = np.append(-slope, 1.0) @ frame
+        normal /= np.linalg.norm(normal)
+    return None
+
+
+def _start_normal(insert: RayCaster, start: Array) -> Array:
+    """Return the normal of the insert's triangle under a point."""
+    above = start + np.array([0.0, 1e-3, 0.0])
+    _, face = insert.first(above[None], np.array([0.0, -1.0, 0.0]))
+    up = np.array([0.0, 1.0, 0.0])
+    return insert.surface.face_normals[face[0]] if face[0] >= 0 else up
+
+
+def _tangents(normal: Array) -> tuple[Array, Array]:
+    """Return two tangents; the first lies in the sagittal plane."""
+    first = np.cross(normal, [0.0, 0.0, 1.0])
+    first /= np.linalg.norm(first)
+    return first, np.cross(normal, first)
+
+
+def _fit(
+    insert: RayCaster, femoral: RayCaster, pose: Array, point: Array, frame: Array, radius: float
+) -> tuple[Array, Array] | None:
+    """Return quadric coefficients (6,) of the insert and of the femur over the tangent plane."""
+    ticks = np.linspace(-radius, radius, SAMPLES)
+    u, v = (grid.ravel() for grid in np.meshgrid(ticks, ticks))
+    disc = u**2 + v**2 <= radius**2 * 1.0001
+    u, v = u[disc], v[disc]
+    places = point + np.stack([u, v], axis=1) @ frame[:2]
+    back, normal = inverse(pose), frame[2]
+    over, _ = insert.first(places + radius * normal, -normal)
+    under, _ = femoral.first(transform(back, places - radius * normal), rotate(back, normal))
+    of_insert, of_femoral = radius - over, under - radius
+    known = (np.abs(of_insert) < radius) & (np.abs(of_femoral) < radius)
+    if known.mean() < LEAST_COVER:
+        return None
+    u, v = u[known], v[known]
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+    heights = np.stack([of_insert[known], of_femoral[known]], axis=1)
+    scale = radius ** np.array([0, 1, 1, 2, 2, 2])
+    found = np.linalg.lstsq(terms / scale, heights, rcond=None)[0] / scale[:, None]
+    return found[:, 0], found[:, 1]
+
+
+def _hessian(quadric: Array) -> Array:
+    return np.array([[2 * quadric[3], quadric[4]], [quadric[4], 2 * quadric[5]]])
+
+
+def _value(quadric: Array, place: Array) -> float:
+    u, v = place
+    return float(quadric @ np.array([1, u, v, u * u, u * v, v * v]))
+
+
+def _slope(quadric: Array, place: Array) -> Array:
+    return np.asarray(quadric[1:3] + _hessian(quadric) @ place)
+
+
+def _nearest_place(difference: Array, radius: float) -> Array | None:
+    """Return the minimum (2,) of the gap, at most one radius away; None if it has none."""
+    values, vectors = np.linalg.eigh(_hessian(difference))
+    if values[0] <= 0:
+        return None
+    step = -vectors @ ((vectors.T @ difference[1:3]) / values)
+    length = float(np.linalg.norm(step))
+    return np.asarray(step * min(1.0, radius / length)) if length > 0 else step
+
+
+def _described(
+    point: Array, frame: Array, of_insert: Array, of_femoral: Array
+) -> OsculatingContact:
+    values, vectors = np.linalg.eigh(_hessian(of_femoral - of_insert))
+    along = vectors.T
+    return OsculatingContact(
+        point=point + of_insert[0] * frame[2],
+        normal=frame[2],
+        axes=along @ frame[:2],
+        gap=float(of_femoral[0] - of_insert[0]),
+        relative=values,
+        insert_curvature=-np.einsum("ij,jk,ik->i", along, _hessian(of_insert), along),
+        femoral_curvature=np.einsum("ij,jk,ik->i", along, _hessian(of_femoral), along),
+    )
