@@ -1,0 +1,1 @@
+"""The insert as a lattice of springs: grid, cells, stiffness and solution."""

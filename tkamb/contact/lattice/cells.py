@@ -1,0 +1,153 @@
+"""Cells of eight nodes and the springs that join every node to its 26 neighbours."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.geometry.frames import Array
+
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+CORNERS = np.array(
+    [
+        [0, 0, 0],
+        [1, 0, 0],
+        [1, 1, 0],
+        [0, 1, 0],
+        [0, 0, 1],
+        [1, 0, 1],
+        [1, 1, 1],
+        [0, 1, 1],
+    ]
+)
+"""Corner offsets (i, j, k) of a cell in the order of VTK's hexahedron."""
+
+PAIRS = np.array([(a, b) for a in range(8) for b in range(a + 1, 8)])
+"""The 28 pairs of a cell's corners that are joined by springs."""
+
+DIRECTIONS = np.array(
+    [
+        [1, 0, 0],
+        [0, 1, 0],
+        [0, 0, 1],
+        [1, 1, 0],
+        [1, -1, 0],
+        [0, 1, 1],
+        [0, 1, -1],
+        [1, 0, 1],
+        [1, 0, -1],
+        [1, 1, 1],
+        [1, 1, -1],
+        [1, -1, 1],
+        [-1, 1, 1],
+    ]
+)
+"""The 13 directions of springs: edges x, y, z; face diagonals xy, yz, xz; body diagonals."""
+
+FAMILY_SHARE = np.array([0.25] * 3 + [0.5] * 6 + [1.0] * 4)
+"""Share of one cell in a spring of each direction: four cells meet in an edge, two in a face."""
+
+FACES = np.array(
+    [[0, 3, 7, 4], [1, 2, 6, 5], [0, 1, 5, 4], [3, 2, 6, 7], [0, 1, 2, 3], [4, 5, 6, 7]]
+)
+"""Corners of the six faces: -x, +x, -y, +y, -z, +z."""
+
+
+@dataclass(frozen=True, eq=False)
+class Springs:
+    """Every spring once, and where each cell finds its 28.
+
+    Args:
+        ends: (s, 2) nodes.
+        family: (s,) row of DIRECTIONS.
+        owners: (s,) number of cells that own it.
+        of_cell: (c, 28) spring of each of the cell's PAIRS.
+    """
+
+    ends: Index
+    family: NDArray[np.int8]
+    owners: Index
+    of_cell: Index
+
+
+def join_springs(cells: Index, node_count: int) -> Springs:
+    """Return the springs of cells (c, 8), each once; no sorting, the grid gives the keys."""
+    offset = CORNERS[PAIRS[:, 1]] - CORNERS[PAIRS[:, 0]]
+    forward = (offset[:, None, :] == DIRECTIONS).all(axis=2)
+    backward = (-offset[:, None, :] == DIRECTIONS).all(axis=2)
+    family = (forward | backward).argmax(axis=1)
+    start = np.where(forward.any(axis=1), PAIRS[:, 0], PAIRS[:, 1])
+    end = np.where(forward.any(axis=1), PAIRS[:, 1], PAIRS[:, 0])
+    key = cells[:, start] * len(DIRECTIONS) + family
+    owners = np.bincount(key.ravel(), minlength=node_count * len(DIRECTIONS))
+    used = np.flatnonzero(owners)
+    number = np.full(len(owners), -1)
+    number[used] = np.arange(len(used))
+    of_cell = number[key]
+    ends = np.empty((len(used), 2), np.int64)
+    ends[of_cell] = np.stack([cells[:, start], cells[:, end]], axis=-1)
+    return Springs(ends, (used % len(DIRECTIONS)).astype(np.int8), owners[used], of_cell)
+
+
+def spring_count(cells_x: int, cells_y: int, cells_z: int) -> int:
+    """Return the number of springs in a full block of cells (28 for one, 158 for 2 x 2 x 2)."""
+    nodes = np.array([cells_x, cells_y, cells_z]) + 1
+    return int(sum(np.prod(nodes - np.abs(direction)) for direction in DIRECTIONS))
+
+
+def corner_jacobians(points: Array) -> Array:
+    """Return the determinants (c, 8) of the three edges at every corner of cells (c, 8, 3)."""
+    result = np.empty(points.shape[:2])
+    for corner, offset in enumerate(CORNERS):
+        edges = _edges_at(points, corner, offset)
+        result[:, corner] = np.einsum("ci,ci->c", np.cross(edges[0], edges[1]), edges[2])
+    return result
+
+
+def scaled_jacobians(points: Array) -> Array:
+    """Return the least scaled Jacobian (c,) of cells (c, 8, 3): 1 for a box, <= 0 inverted."""
+    result = np.full(len(points), np.inf)
+    for corner, offset in enumerate(CORNERS):
+        x, y, z = _edges_at(points, corner, offset)
+        lengths = np.prod([np.linalg.norm(e, axis=1) for e in (x, y, z)], axis=0)
+        volume = np.einsum("ci,ci->c", np.cross(x, y), z)
+        result = np.minimum(result, np.divide(volume, lengths, where=lengths > 0, out=-lengths))
+    return result
+
+
+def _edges_at(points: Array, corner: int, offset: Index) -> list[Array]:
+    """Return the edges along +x, +y and +z of the cell that meet at one corner."""
+    edges = []
+    for axis in range(3):
+        other = offset.copy()
+        other[axis] = 1 - other[axis]
+        neighbour = int((other == CORNERS).all(axis=1).argmax())
+        sign = 1.0 if offset[axis] == 0 else -1.0
+        edges.append(sign * (points[:, neighbour] - points[:, corner]))
+    return edges
+
+
+def cell_volumes(points: Array) -> Array:
+    """Return the exact volumes (c,) of trilinear cells (c, 8, 3), by 2 x 2 x 2 Gauss points."""
+    gauss = (1.0 + np.array([-1.0, 1.0]) / np.sqrt(3.0)) / 2.0
+    volume = np.zeros(len(points))
+    for u in gauss:
+        for v in gauss:
+            for w in gauss:
+                gradient = _shape_gradients(np.array([u, v, w]))
+                jacobian = np.einsum("ncx,nd->cdx", points.transpose(1, 0, 2), gradient)
+                volume += np.linalg.det(jacobian) / 8.0
+    return volume
+
+
+def _shape_gradients(at: Array) -> Array:
+    """Return the gradients (8, 3) of the trilinear shape functions at a point of [0, 1]^3."""
+    factor = np.where(CORNERS == 1, at, 1.0 - at)
+    slope = np.where(CORNERS == 1, 1.0, -1.0)
+    columns = []
+    for axis in range(3):
+        others = [a for a in range(3) if a != axis]
+        columns.append(slope[:, axis] * factor[:, others].prod(axis=1))
+    return np.column_stack(columns)
