@@ -1,6 +1,7 @@
 """Rigid fit of skin markers: where a body stands, from the markers on it."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, pose, transform
@@ -88,7 +89,7 @@ def fit_rigid(points: Array, reference: Array, name: str = "the tibia") -> tuple
             "[tibia]",
             "name three or more that span a triangle, or add a [[tibia.joint_centre]]",
         )
-    complete = np.isfinite(points).reshape(len(points), -1).all(axis=1)
+    complete = np.isfinite(points.reshape(len(points), -1)).all(axis=1)
     result, residual = np.full((len(points), 4, 4), np.nan), np.full(len(points), np.nan)
     if complete.any():
         result[complete], residual[complete] = _fitted(points[complete], reference)
@@ -133,8 +134,8 @@ def complete_run(
             table.path,
             "choose an interval inside the recording",
         )
-    missing = np.logical_not(np.isfinite(points).all(axis=2))
-    gaps = missing.any(axis=1)
+    missing: NDArray[np.bool_] = np.asarray(np.isnan(points).any(axis=2))
+    gaps: NDArray[np.bool_] = np.asarray(missing.any(axis=1))
     if gaps[first : last + 1].any():
         frame = first + int(np.argmax(gaps[first : last + 1]))
         raise InputError(
