@@ -1,0 +1,123 @@
+"""The patella's sagittal motion: dome in the groove, ligament of constant length, at balance.
+
+In the femur's sagittal plane. The dome's centre runs on the curve one dome radius off the
+groove's floor, so the gap is zero by construction. The frictionless contact force passes
+through the dome's centre, so the massless patella is at rest when quadriceps and patellar
+ligament balance about that centre and across its normal.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.optimize import brentq
+
+from deep_knee_bend import button, femoral
+from deep_knee_bend import dimensions as d
+from tkamb.body.wrapping import taut_path
+from tkamb.geometry.frames import inverse, knee_pose, transform
+from tkamb.geometry.sections import sagittal_outline
+from tkamb.geometry.surface import Surface
+
+STEP = 1e-6
+BETA_RANGE = (-0.3, 0.4)
+
+
+@dataclass(frozen=True)
+class PatellaPose:
+    """Patella in the femoral frame: mm and rad, force ratios and where it touches (rad)."""
+
+    ap: float
+    si: float
+    rotation: float
+    ligament_ratio: float
+    contact_ratio: float
+    contact_phi: float
+    dome_angle: float
+    quadriceps_wrap: float
+
+
+def groove_frame(phi):
+    """Point (2,) and outward unit normal (2,) of the groove's floor."""
+    tangent = femoral.groove(phi + STEP) - femoral.groove(phi - STEP)
+    normal = np.array([tangent[1], -tangent[0]]) / np.linalg.norm(tangent)
+    return femoral.groove(phi), normal * np.sign(normal @ femoral.sagittal.normal(phi))
+
+
+@lru_cache(maxsize=1)
+def outline():
+    """Outline (n, 2) mm that the quadriceps wraps: the component's sections in its path."""
+    vertices, faces = femoral.mesh()
+    stations = np.linspace(-d.QUADRICEPS_WIDTH_HALF, d.QUADRICEPS_WIDTH_HALF, 7)
+    return sagittal_outline(
+        [Surface(vertices, faces)], stations, d.QUADRICEPS_HALF_THICKNESS, d.QUADRICEPS_ORIGIN[1]
+    )
+
+
+def _rotated(angle, point):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([c * point[0] - s * point[1], s * point[0] + c * point[1]])
+
+
+ARM = np.array(d.INFERIOR_POLE[:2]) - button.DOME_CENTRE
+"""From the dome's centre to the inferior pole, patellar frame."""
+
+
+def _dome_centre(phi):
+    point, normal = groove_frame(phi)
+    return point + d.DOME_RADIUS * normal
+
+
+def _contact(beta, tuberosity):
+    """Contact (rad) where the ligament spans when its bone arm is beta off the straight line."""
+    radius = np.linalg.norm(ARM)
+    square = d.PATELLAR_LIGAMENT_LENGTH**2 - tuberosity[2] ** 2
+    wanted = radius * np.cos(beta) + np.sqrt(square - (radius * np.sin(beta)) ** 2)
+
+    def excess(phi):
+        return np.linalg.norm(_dome_centre(phi) - tuberosity[:2]) - wanted
+
+    phis = np.radians(np.arange(-99.0, 60.0, 3.0))
+    signs = [excess(phi) > 0.0 for phi in phis]
+    last = signs.index(False)
+    return brentq(excess, phis[last - 1], phis[last], xtol=1e-14)
+
+
+def _cross(a, b):
+    return a[0] * b[1] - a[1] * b[0]
+
+
+def _state(beta, tuberosity):
+    """Pose of the patella at beta, and the moment about the dome's centre that is left over."""
+    phi = _contact(beta, tuberosity)
+    normal = groove_frame(phi)[1]
+    centre = _dome_centre(phi)
+    to = tuberosity[:2] - centre
+    rotation = np.arctan2(to[1], to[0]) - np.arctan2(ARM[1], ARM[0]) + beta
+    rotation = (rotation + np.pi) % (2.0 * np.pi) - np.pi
+    origin = centre - _rotated(rotation, button.DOME_CENTRE)
+    upper = origin + _rotated(rotation, d.SUPERIOR_POLE[:2])
+    lower = origin + _rotated(rotation, d.INFERIOR_POLE[:2])
+    path = taut_path(np.array(d.QUADRICEPS_ORIGIN), np.append(upper, 0.0), outline())
+    pull = -path.end_direction[:2]
+    span = np.append(tuberosity[:2] - lower, tuberosity[2])
+    ligament = (span / np.linalg.norm(span))[:2]
+    tangent = np.array([-normal[1], normal[0]])
+    ratio = -(pull @ tangent) / (ligament @ tangent)
+    total = pull + ratio * ligament
+    moment = _cross(upper - centre, pull) + ratio * _cross(lower - centre, ligament)
+    dome = np.arccos(np.clip(normal @ _rotated(rotation, np.array([1.0, 0.0])), -1.0, 1.0))
+    pose = PatellaPose(*origin, rotation, ratio, -total @ normal, phi, dome, path.wrap_angle)
+    return pose, moment
+
+
+def solve_patella(coordinates):
+    """Return the PatellaPose at knee coordinates (6,) in mm and rad."""
+    tuberosity = transform(inverse(knee_pose(coordinates)), np.array(d.TUBEROSITY))
+    beta = brentq(lambda b: _state(b, tuberosity)[1], *BETA_RANGE, xtol=1e-13)
+    return _state(beta, tuberosity)[0]
+
+
+def patella_motion(coordinates):
+    """Return the PatellaPose of every frame; coordinates (f, 6), mm and rad."""
+    return [solve_patella(row) for row in coordinates]

@@ -1,0 +1,26 @@
+"""All files of the model, made in order."""
+
+from deep_knee_bend import button, chain, femoral, insert, scene, solids, tables
+from deep_knee_bend.extensor import patella_motion
+from deep_knee_bend.motion import knee_motion
+from deep_knee_bend.squat import squat
+
+
+def make(folder):
+    """Write every made file into the folder."""
+    for name, part in (("femoral_component", femoral), ("insert", insert)):
+        solids.write_stl(folder / f"{name}.stl", *part.mesh())
+    solids.write_stl(folder / "patellar_button.stl", *button.mesh())
+    motion = knee_motion()
+    patella = patella_motion(motion.coordinates)
+    body = squat(motion.time, motion.coordinates[:, 5])
+    texts = {
+        "motion.csv": tables.motion_csv(motion, patella),
+        "tibia.csv": tables.tibia_csv(motion, body),
+        "ground_reaction.csv": tables.ground_reaction_csv(motion, body),
+        "patient.urdf": chain.urdf(motion.coordinates[0, 1]),
+        "scene.toml": scene.scene_toml(motion.coordinates),
+        "strains.md": tables.strain_table(motion.coordinates) + "\n",
+    }
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8", newline="\n")

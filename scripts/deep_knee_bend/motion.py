@@ -1,0 +1,69 @@
+"""The recorded motion of the knee: flexion, rotation and contact path chosen, the rest solved."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq
+
+from deep_knee_bend import dimensions as d
+from deep_knee_bend.touch import touch
+
+KNOTS = np.radians([0.0, 12.0, 24.0, 36.0, 60.0, 90.0, 120.0])
+
+
+@dataclass(frozen=True)
+class KneeMotion:
+    """Frames of the knee: s, mm and rad; coordinates (f, 6) in KNEE_COORDINATES' order."""
+
+    time: np.ndarray
+    coordinates: np.ndarray
+    contact: np.ndarray
+    """Contact points (f, 2, 3) on the insert, medial and lateral."""
+
+
+def flexion_at(time):
+    """Flexion (rad): constant rate between two smooth ramps, at rest at both ends."""
+    steady = d.FLEXION_END / (d.DURATION_S - d.RAMP_S)
+    s = np.clip(np.minimum(time, d.DURATION_S - time) / d.RAMP_S, 0.0, 1.0)
+    ramp = steady * d.RAMP_S * (s**6 - 3.0 * s**5 + 2.5 * s**4)
+    ramp = ramp + steady * np.clip(np.minimum(time, d.DURATION_S - time) - d.RAMP_S, 0.0, None)
+    return np.radians(np.where(time <= d.DURATION_S / 2, ramp, d.FLEXION_END - ramp))
+
+
+def axial_rotation_at(flexion):
+    """External rotation of the femur (rad): quick at first, flattening towards the end."""
+    return np.radians(d.AXIAL_ROTATION_END) * np.sin(
+        np.pi / 2 * flexion / np.radians(d.FLEXION_END)
+    )
+
+
+def contact_path_at(flexion):
+    """Mean AP position (mm) of the two contact points."""
+    s = flexion / np.radians(d.FLEXION_END)
+    return d.CONTACT_AP_START + (d.CONTACT_AP_END - d.CONTACT_AP_START) * s * s * (3.0 - 2.0 * s)
+
+
+def _ap_for(flexion):
+    """AP position of the flexion axis that puts the mean contact on its path."""
+    rotation, wanted = axial_rotation_at(flexion), contact_path_at(flexion)
+
+    def miss(ap):
+        return touch(ap, rotation, flexion).points[:, 0].mean() - wanted
+
+    return brentq(miss, -14.0, 4.0, xtol=1e-6)
+
+
+def knee_motion():
+    """Return the KneeMotion of all frames."""
+    time = np.linspace(0.0, d.DURATION_S, d.FRAMES)
+    flexion = flexion_at(time)
+    ap_at = CubicSpline(KNOTS, [round(_ap_for(f), 2) for f in KNOTS], bc_type="natural")
+    coordinates, contact, guess = [], [], 0.0
+    for angle in flexion:
+        ap, rotation = float(ap_at(angle)), float(axial_rotation_at(angle))
+        found = touch(ap, rotation, angle, guess)
+        guess = found.adduction
+        coordinates.append([ap, found.si, 0.0, rotation, found.adduction, angle])
+        contact.append(found.points)
+    return KneeMotion(time, np.array(coordinates), np.array(contact))
