@@ -90,6 +90,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("lateral_area_above_yield", "share of the lateral area above yield", _CONTACT),
     Column("medial_thickness_mm", "insert under the medial centre of pressure", _CONTACT),
     Column("lateral_thickness_mm", "insert under the lateral centre of pressure", _CONTACT),
+    Column("cycle_percent", "per cent of the cycle", "[motion] cycle_s"),
     Column("condition_number", "of the equilibrium system with scaled columns"),
     Column("body_seconds", "computing time of the rigid-body part"),
     Column("contact_seconds", "computing time of the contact", _CONTACT),

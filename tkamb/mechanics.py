@@ -13,14 +13,16 @@ from tkamb.body.unknowns import CondylePoint
 from tkamb.case import Case
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import knee_pose, knee_twist
-from tkamb.units import DEGREE
+from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.body.ligaments import Ligament
     from tkamb.geometry.closest import CondyleGap
 
 LIFT_OFF_ANGLE = 0.5 * DEGREE
-"""Coronal angle of the gaps beyond which a condyle is off the insert (the source, 4.3)."""
+LIFT_OFF_GAP = 0.5 * MILLIMETRE
+"""A condyle is off the insert where both its gap and the coronal angle of the two gaps exceed
+what fluoroscopy errs by (the source, 4.3)."""
 
 FARTHEST_GAP = 3e-3
 """m: a femoral component farther from the insert, or deeper in it, is misplaced."""
@@ -124,7 +126,7 @@ class Mechanics:
         problems = []
         if abs(nearest) > FARTHEST_GAP:
             word = "apart" if nearest > 0 else "overlapping"
-            problems.append(f"condyles {word} by {abs(nearest) * 1e3:.1f} mm")
+            problems.append(f"condyles {word} by {abs(nearest) / MILLIMETRE:.1f} mm")
         return condyles, self._lifted(condyles), problems
 
     def _condyle(self, k: int, gap: "CondyleGap") -> CondylePoint:
@@ -139,9 +141,9 @@ class Mechanics:
             return frozenset()
         medial, lateral = condyles["medial"], condyles["lateral"]
         width = abs(lateral.point[2] - medial.point[2])
-        if abs(lateral.gap - medial.gap) <= LIFT_OFF_ANGLE * width:
-            return frozenset()
-        return frozenset({"lateral" if lateral.gap > medial.gap else "medial"})
+        higher = "lateral" if lateral.gap > medial.gap else "medial"
+        tilted = abs(lateral.gap - medial.gap) > LIFT_OFF_ANGLE * width
+        return frozenset({higher} if tilted and condyles[higher].gap > LIFT_OFF_GAP else ())
 
     def _build_ligaments(self) -> "tuple[Ligament, ...]":
         if not self.case.scene.ligament:

@@ -2,6 +2,8 @@
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from tkamb.case import Case
 from tkamb.mechanics import FrameLoads
 from tkamb.units import DEGREE, MILLIMETRE
@@ -13,6 +15,10 @@ FILTER_TRANSLATION = 0.5 * MILLIMETRE
 FILTER_ROTATION = 0.5 * DEGREE
 """Where filtering moves a pose by more than fluoroscopy errs, the frame is flagged."""
 
+FLANK = 20.0 * DEGREE
+"""A condyle whose contact normal leans by more than this runs against eminence or lip: the
+recorded position, the ML one above all, deserves a look."""
+
 FAILED = "failed: "
 
 
@@ -21,12 +27,22 @@ def frame_status(case: Case, k: int, body: FrameLoads, contact: "FrameContact | 
     failures = list(body.loads.problems)
     if contact and contact.problem and not failures:
         failures.append(contact.problem)
-    words = [*_motion_flags(case, k)]
+    words = [*_motion_flags(case, k), *_flank_flags(body)]
     words += [f"{side} condyle off the insert" for side in sorted(body.loads.lifted)]
     words += list(contact.flags) if contact else []
     if failures:
         return FAILED + "; ".join([*failures, *words])
     return "; ".join(words) or "ok"
+
+
+def _flank_flags(body: FrameLoads) -> list[str]:
+    """Return a flag for each condyle whose contact normal leans far from the vertical."""
+    found = []
+    for side, condyle in body.geometry.condyles.items():
+        lean = float(np.arccos(np.clip(condyle.normal[1], -1.0, 1.0)))
+        if lean > FLANK and side not in body.loads.lifted:
+            found.append(f"{side} contact on a flank, normal {lean / DEGREE:.0f} deg from vertical")
+    return found
 
 
 def _motion_flags(case: Case, k: int) -> list[str]:

@@ -1,0 +1,124 @@
+"""The patient's URDF: mirror, default segments, and what is refused."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from knees import INERTIA, leg_urdf, random_motion
+from tkamb.body.chain import Chain, ChainMotion
+from tkamb.errors import InputError
+from tkamb.geometry.frames import MIRROR, mirrored_pose
+from tkamb.inputs.patient import load_urdf
+from tkamb.inputs.segments import segment_inertia
+from tkamb.scene import PatientTable
+
+
+def table(tmp_path, text, side="right", **more):
+    path = tmp_path / "leg.urdf"
+    path.write_text(text)
+    return PatientTable(urdf=path, side=side, mass_kg=75.0, **more)
+
+
+def left(text):
+    """Return the same leg as a left one: every number reflected in z."""
+    text = text.replace('axis xyz="0 -1 0"', 'axis xyz="0 1 0"')
+    text = text.replace('axis xyz="-1 0 0"', 'axis xyz="1 0 0"')
+    return text
+
+
+def test_a_left_leg_gives_the_numbers_of_its_mirror_image(tmp_path):
+    """RNEA of the mirrored leg under the mirrored motion has the mirrored forces."""
+    plain = {
+        "tibia": (4.2, "0.01 0.22 0.005", "0.06 0.008 0.061 0 0 0"),
+        "femur": (10.5, "0.012 0.24 -0.004", "0.2 0.04 0.21 0 0 0"),
+        "patella": (0.1, "0.004 0.001 0.002", "2e-5 2.5e-5 3e-5 0 0 0"),
+    }
+    text = left(leg_urdf(plain))
+    own = Chain(text.replace('rpy="0.1 -0.2 0.3"', 'rpy="0 0 0"'), True)
+    mended = load_urdf(
+        table(tmp_path, text.replace('rpy="0.1 -0.2 0.3"', 'rpy="0 0 0"'), "left"), True
+    )
+    turned = Chain(mended, True)
+    motion = random_motion(own, np.random.default_rng(0))
+    flip = np.diag([1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
+    joints = motion.joints.copy()
+    joints[:, 2] *= -1.0  # knee_ml keeps its axis, so its coordinate changes sign
+    mirrored = ChainMotion(
+        mirrored_pose(motion.tibia),
+        flip @ motion.tibia_velocity,
+        flip @ motion.tibia_acceleration,
+        joints,
+    )
+    wanted, found = own.at(motion).inertial, turned.at(mirrored).inertial
+    wanted = wanted.copy()
+    wanted[:6] = flip @ wanted[:6]
+    wanted[8] *= -1.0
+    np.testing.assert_allclose(found, wanted, atol=1e-10)
+    np.testing.assert_allclose(
+        turned.insert_in_tibia, mirrored_pose(own.insert_in_tibia), atol=1e-12
+    )
+
+
+def test_mirrored_inertia_is_the_reflected_tensor(tmp_path):
+    """I' = M I M about the reflected centre, also with a turned inertial frame."""
+    own = Chain(left(leg_urdf()), True).model
+    mended = load_urdf(table(tmp_path, left(leg_urdf()), "left"), True)
+    turned = Chain(mended, True).model
+    for name in ("root_joint", "knee_flexion", "patella_rotation"):
+        a, b = own.inertias[own.getJointId(name)], turned.inertias[turned.getJointId(name)]
+        np.testing.assert_allclose(b.lever, MIRROR @ a.lever, atol=1e-12)
+        np.testing.assert_allclose(b.inertia, MIRROR @ a.inertia @ MIRROR, atol=1e-12)
+
+
+def test_a_right_leg_is_not_touched(tmp_path):
+    urdf = load_urdf(table(tmp_path, leg_urdf()), True)
+    wanted = pin.buildModelFromXML(leg_urdf(), pin.JointModelFreeFlyer())
+    found = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
+    assert all(a.isApprox(b) for a, b in zip(wanted.inertias, found.inertias, strict=True))
+
+
+def test_missing_inertials_come_from_de_leva(tmp_path):
+    without = {"patella": INERTIA["patella"]}
+    urdf = load_urdf(table(tmp_path, leg_urdf(without), sex="male"), True)
+    model = Chain(urdf, True).model
+    femur = model.inertias[model.getJointId("knee_flexion")]
+    hip = np.array([0.003, 0.42, -0.01])
+    assert femur.mass == pytest.approx(0.1416 * 75, rel=1e-12)
+    np.testing.assert_allclose(femur.lever, hip * (1 - 0.4095), atol=1e-12)
+    shank = model.inertias[model.getJointId("root_joint")]
+    assert shank.mass == pytest.approx((0.0433 + 0.0137) * 75, rel=1e-12)
+
+
+def test_segment_inertia_is_that_of_its_radii():
+    thigh = segment_inertia("thigh", "female", 60.0, np.array([0, 0.4, 0]), np.zeros(3))
+    radii = np.sqrt(np.diag(thigh.tensor) / thigh.mass) / 0.4
+    np.testing.assert_allclose(radii, [0.369, 0.162, 0.364], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda t: t.replace('<link name="hip"/>', ""), "no link 'hip'"),
+        (lambda t: t.replace("knee_ml", "knee_z"), "no joint 'knee_ml'"),
+        (lambda t: t.replace('axis xyz="0 -1 0"', 'axis xyz="0 1 0"'), "knee_axial_rotation"),
+        (lambda t: t.replace('mass value="10.5"', 'mass value="0"'), "singular inertia"),
+        (lambda t: t.replace('ixx="0.2"', 'ixx="0.9"'), "singular inertia"),
+        (lambda t: t.replace('ixx="0.2"', 'ixx="wide"'), "not numbers"),
+        (lambda t: t[:-20], "not a readable URDF"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(tmp_path, change, words):
+    with pytest.raises(InputError, match=words) as caught:
+        load_urdf(table(tmp_path, change(leg_urdf())), True)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_sex_is_asked_for(tmp_path):
+    with pytest.raises(InputError, match="sex"):
+        load_urdf(table(tmp_path, leg_urdf({"patella": INERTIA["patella"]})), True)
+
+
+def test_missing_file_is_named(tmp_path):
+    nowhere = PatientTable(urdf=tmp_path / "none.urdf", side="right", mass_kg=75.0)
+    with pytest.raises(InputError, match=r"none\.urdf: no such URDF"):
+        load_urdf(nowhere, True)
