@@ -17,6 +17,8 @@ RIM_RAYS = 8
 """Rays per edge of a cell at the rim, to find how much of it is covered."""
 STEEPEST = 0.1
 """Smallest n_y taken for a tributary area: 84 deg from the horizontal."""
+SKIN = 1e-6
+"""m; rays into the insert start so far below its surface."""
 MOST_CELLS = 4_000_000
 
 
@@ -31,6 +33,7 @@ class Bed:
             the insert covers, divided by n_y. Under a uniform pressure the vertical force
             is exactly pressure times covered projection.
         thickness: (n,) m, along y from the point to where the insert ends below it.
+        depth: (n,) m, the same along the inward normal.
         triangles: (k, 3) map triangles between neighbouring points, facing up.
         resolution: m, edge of the grid cells.
     """
@@ -39,6 +42,7 @@ class Bed:
     normals: Array
     area: Array
     thickness: Array
+    depth: Array
     triangles: NDArray[np.int64]
     resolution: float
 
@@ -66,7 +70,9 @@ def sample_bed(insert: Surface, resolution: float) -> Bed:
     normals = smooth_normals(insert, points, face)
     area = covered * resolution**2 / np.maximum(normals[:, 1], STEEPEST)
     triangles = _grid_triangles(cell, shape)
-    return Bed(points, normals, area, thickness, triangles, resolution)
+    depth = SKIN + caster.first(points - SKIN * normals, -normals)[0]
+    depth = np.where(np.isfinite(depth), depth, thickness)
+    return Bed(points, normals, area, thickness, depth, triangles, resolution)
 
 
 def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:

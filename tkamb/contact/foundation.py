@@ -23,6 +23,8 @@ from tkamb.geometry.rays import RayCaster
 
 Law = Literal["nonlinear", "linear"]
 
+DEEPEST_STRAIN = 0.5
+"""Share of the thickness that the femoral component may penetrate."""
 THINNEST = 1e-6
 """m; a layer thinner than this, at the insert's rim, counts as this thick."""
 
@@ -79,8 +81,8 @@ class ElasticFoundation(ContactModel):
     Blankevoort's law p = -M ln(1 - d/h).
 
     Limits: neighbours do not help to carry, so that pressure ends at the edge of the
-    overlap and peaks at rims are too high; d >= h is OUT_OF_RANGE. Walls parallel to y
-    carry nothing.
+    overlap and peaks at rims are too high; d >= h/2 is OUT_OF_RANGE. Walls parallel
+    to y carry nothing.
 
     Args:
         resolution: m, spacing of the map points.
@@ -113,8 +115,8 @@ class ElasticFoundation(ContactModel):
         bed = state.bed
         gap = gaps_along_normals(bed, state.femoral_rays, pose)
         strain = np.maximum(-gap, 0.0) / np.maximum(bed.thickness, THINNEST)
-        if (strain >= 1).any():
-            return failed_result(state, pose, "the penetration reaches the insert's thickness")
+        if (strain >= DEEPEST_STRAIN).any():
+            return failed_result(state, pose, "the penetration exceeds half the insert's thickness")
         pressure = layer_pressure(self.law, state.pair.material, strain)
         nodal_force = -(pressure * bed.area)[:, None] * bed.normals
         medial, lateral = summarise_condyles(
@@ -162,14 +164,14 @@ def layer_pressure(law: Law, material: Material, strain: Array) -> Array:
 def gaps_along_normals(bed: Bed, femoral_rays: RayCaster, pose: Array) -> Array:
     """Return the gap (n,) m along the insert's normals; negative = penetration.
 
-    Rays start one thickness below the bed, outside the femoral component, and go up along
-    the normal; the first crossing counts. inf where no femoral surface lies above, and
-    minus the thickness where a ray starts inside the femoral component already.
+    Rays start half-way through the insert, outside the femoral component, and go up along
+    the normal; the first crossing counts. inf where no femoral surface lies above, -inf
+    where the femoral component reaches deeper than where the rays start.
     """
     back = inverse(pose)
     normals = rotate(back, bed.normals)
-    origins = transform(back, bed.points) - bed.thickness[:, None] * normals
+    below = DEEPEST_STRAIN * np.minimum(bed.thickness, bed.depth)
+    origins = transform(back, bed.points) - below[:, None] * normals
     distance, face = femoral_rays.first(origins, normals)
     facing = np.einsum("ij,ij->i", normals, femoral_rays.surface.face_normals[face])
-    inside = (face >= 0) & (facing > 0)
-    return np.where(inside, -bed.thickness, distance - bed.thickness)
+    return np.where((face >= 0) & (facing > 0), -np.inf, distance - below)

@@ -164,7 +164,7 @@ def _crossing(upper: Array, lower: Array) -> Touch | None:
         t = (w[..., 0] * u[..., 2] - w[..., 2] * u[..., 0]) / determinant
         high, low = p[..., 1] + s * u[..., 1], q[..., 1] + t * v[..., 1]
         inside = (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
-    clearance = np.where(inside, high - low, np.inf)
+        clearance = np.where(inside, high - low, np.inf)
     if clearance.size == 0 or not np.isfinite(clearance.min()):
         return None
     m, n = np.unravel_index(clearance.argmin(), clearance.shape)
