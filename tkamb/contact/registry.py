@@ -23,6 +23,9 @@ BUILT_IN = {
     "hertz": "tkamb.contact.hertz:Hertz",
     "foundation": "tkamb.contact.foundation:ElasticFoundation",
     "foundation-linear": "tkamb.contact.foundation:LinearFoundation",
+    "lattice": "tkamb.contact.lattice.model:CalibratedLattice",
+    "lattice-linear": "tkamb.contact.lattice.model:LinearLattice",
+    "fe": "tkamb.contact.fe:FiniteElements",
 }
 
 

@@ -46,7 +46,9 @@ class FemoralFloor:
         back = inverse(pose)
         lowest = self.surface.bounds
         start = float(pose[1, 3]) - 2 * float(np.abs(lowest).max()) - 1e-2
-        origins = transform(back, np.column_stack([points[:, 0], np.full(len(points), start), points[:, 2]]))
+        origins = transform(
+            back, np.column_stack([points[:, 0], np.full(len(points), start), points[:, 2]])
+        )
         distance, face = self.rays.first(origins, rotate(back, UP))
         hit = face >= 0
         places = np.full((len(points), 3), np.nan)

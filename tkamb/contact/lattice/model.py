@@ -1,0 +1,212 @@
+"""Contact models on a lattice of cells: the contract's prepare, evaluate and press."""
+
+from abc import abstractmethod
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.contact.lattice.candidates import CompliancePool, choose_start, guessed_depth
+from tkamb.contact.lattice.femoral import FemoralFloor
+from tkamb.contact.lattice.grid import Lattice, build_grid
+from tkamb.contact.lattice.memory import Memory
+from tkamb.contact.lattice.network import CalibratedNetwork
+from tkamb.contact.lattice.newton import solve_by_newton
+from tkamb.contact.lattice.operator import fixed_unknowns, prepare_operator
+from tkamb.contact.lattice.pressure_map import ContactMap, contact_map
+from tkamb.contact.lattice.problem import ContactProblem, vertical_gaps
+from tkamb.contact.lattice.report import PressureRule, result_of, untouched
+from tkamb.contact.lattice.solid import Solid
+from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve
+from tkamb.contact.materials import LinearElastic, Material
+from tkamb.contact.model import ContactModel, ContactPair, ContactResult, PreparedContact
+from tkamb.contact.pressing import check_load, failed_result, first_touch_height, pose_at_approach
+from tkamb.geometry.condyles import condyle_split
+from tkamb.geometry.frames import Array
+from tkamb.geometry.rays import RayCaster
+
+MOST_GROWTHS = 8
+"""How often the candidate set may grow before it counts as saturated."""
+REACH = 1.08
+"""Candidates must cover this many times the approach that was found."""
+
+
+@dataclass(frozen=True, eq=False)
+class LatticeState(PreparedContact):
+    """What depends on geometry and material alone.
+
+    Args:
+        pair: the two bodies.
+        lattice: the insert's grid.
+        problem: solid, factorised operator and femoral component.
+        map: contact surface.
+        split: z between the condyles in the femoral frame, m, or None.
+    """
+
+    pair: ContactPair
+    lattice: Lattice
+    problem: ContactProblem
+    map: ContactMap
+    split: float | None
+    pool: CompliancePool
+    memory: Memory = field(default_factory=Memory)
+
+    @property
+    def points(self) -> Array:  # type: ignore[override]
+        """Map points (n, 3) m, insert frame: the undeformed contact nodes."""
+        return self.map.points
+
+    @property
+    def triangles(self) -> NDArray[np.int64]:  # type: ignore[override]
+        """Map triangles (k, 3)."""
+        return self.map.triangles
+
+
+@dataclass(frozen=True)
+class CellContact(ContactModel):
+    """A solid of cells on the lattice's grid under a rigid femoral component.
+
+    Unilateral and frictionless: contact nodes may not pass the femoral surface, which they
+    meet along vertical rays, are pressed along its normal and slide on it freely. The
+    approach is an unknown of the same iteration. Small strain.
+
+    Args:
+        resolution: m, edge of the cells.
+        tolerance: largest out-of-balance force relative to the contact force, and largest
+            distance of an active node from the femoral surface relative to its displacement.
+        pressure_rule: "tributary" (force over the node's own area) or "source" (force over
+            total area by number of nodes, section 4.5.6 of the source).
+        newton: solve by full Newton steps (slow; the reference).
+    """
+
+    resolution: float = 1e-3
+    tolerance: float = 1e-3
+    pressure_rule: PressureRule = "tributary"
+    newton: bool = False
+
+    @abstractmethod
+    def solid(self, lattice: Lattice, material: Material) -> Solid:
+        """Return the solid on a lattice."""
+
+    def prepare(self, pair: ContactPair) -> LatticeState:
+        """Build the grid, factorise its stiffness, store the contact nodes' response."""
+        lattice = build_grid(pair.insert, self.resolution)
+        solid = self.solid(lattice, pair.material)
+        held = fixed_unknowns(lattice.nodes, lattice.bottom_nodes, pair.bearing)
+        nodes, surface = contact_map(lattice, pair.insert)
+        operator = prepare_operator(solid.stiffness, lattice.index, held, nodes)
+        floor = FemoralFloor(pair.femoral, RayCaster(pair.femoral))
+        problem = ContactProblem(solid, operator, lattice.index, held, floor)
+        pool = CompliancePool(operator.half)
+        return LatticeState(pair, lattice, problem, surface, condyle_split(pair.femoral), pool)
+
+    def evaluate(
+        self, state: LatticeState, pose: Array, guess: ContactResult | None = None
+    ) -> ContactResult:
+        """Return the contact at a pose; see `ContactModel`."""
+        pose = np.array(pose, float)
+        gaps = vertical_gaps(state.problem, pose)
+        if not np.isfinite(pose).all():
+            return failed_result(state, pose, "the pose is not finite")
+        deepest = -float(gaps.min())
+        if deepest <= 0:
+            return untouched(state, pose, gaps)
+        return self._solved(state, pose, None, gaps, deepest, guess)
+
+    def press(
+        self, state: LatticeState, load: float, pose: Array, guess: ContactResult | None = None
+    ) -> ContactResult:
+        """Find the approach that carries `load` (N); see `ContactModel`."""
+        check_load(load)
+        pose = np.array(pose, float)
+        if not np.isfinite(first_touch_height(state.pair, pose)):
+            return failed_result(state, pose, "the femoral component does not lie over the insert")
+        pose = pose_at_approach(state.pair, pose, 0.0)
+        gaps = vertical_gaps(state.problem, pose)
+        if load == 0:
+            return untouched(state, pose, gaps)
+        if not np.isfinite(gaps).any():
+            return failed_result(
+                state, pose, "no node of the insert lies under the femoral component"
+            )
+        depth = guessed_depth(state.problem, gaps, state.map.area, load)
+        if guess is not None and guess.approach > 0:
+            depth = guess.approach
+        return self._solved(state, pose, load, gaps, depth, guess)
+
+    def _solved(
+        self,
+        state: LatticeState,
+        pose: Array,
+        load: float | None,
+        gaps: Array,
+        depth: float,
+        guess: ContactResult | None,
+    ) -> ContactResult:
+        """Solve with growing candidate sets until they cover the approach."""
+        tolerance = Tolerance(self.tolerance)
+        lost = state.memory.of(guess)
+        touched = None if guess is None else guess.pressure > 0
+        for _ in range(MOST_GROWTHS):
+            start = choose_start(state.pool, gaps, depth, load is None, touched, lost)
+            solution = self._solution(state.problem, pose, load, start, tolerance)
+            covered = load is None or len(start.candidates) == np.isfinite(gaps).sum()
+            reached = solution.forces.approach * REACH - min(float(gaps.min()), 0.0)
+            if covered or reached <= start.reach:
+                result = result_of(state, pose, load, gaps, solution, self.pressure_rule)
+                if solution.lost is not None:
+                    state.memory.keep(result, solution.lost)
+                return result
+            depth, lost = 1.1 * solution.forces.approach, solution.lost
+            touched = None
+        return failed_result(state, pose, "the set of candidate nodes is saturated")
+
+    def _solution(
+        self,
+        problem: ContactProblem,
+        pose: Array,
+        load: float | None,
+        start: Start,
+        tolerance: Tolerance,
+    ) -> Solution:
+        """Solve by the stored response; by Newton's method when that does not converge."""
+        if self.newton:
+            return solve_by_newton(problem, pose, load, start, tolerance)
+        solution = solve(problem, pose, load, start, tolerance)
+        if solution.converged or problem.solid.material.is_linear:
+            return solution
+        return solve_by_newton(problem, pose, load, start, tolerance, solution.field)
+
+
+@dataclass(frozen=True)
+class CalibratedLattice(CellContact):
+    """The calibrated lattice: exact in the uniform-strain patch, any Poisson's ratio.
+
+    28 springs per cell weighted by the share of the cells that own them plus a cell volume
+    term; nonlinear by one secant shear modulus per cell (J2 deformation theory, elastic
+    bulk) from the material's curve, fed with small strain. See docs/lattice.md.
+    """
+
+    name: ClassVar[str] = "lattice"
+    assumes: ClassVar[str] = (
+        "a spring lattice calibrated to E, nu and the stress-strain curve; small strain, no friction"
+    )
+    needs: ClassVar[str] = "a closed insert; seconds to prepare, then tenths of a second"
+
+    def solid(self, lattice: Lattice, material: Material) -> Solid:
+        """Return the calibrated network."""
+        return CalibratedNetwork(lattice.nodes, lattice.cells, lattice.spacing, material)
+
+
+@dataclass(frozen=True)
+class LinearLattice(CalibratedLattice):
+    """The calibrated lattice with Hooke's law: contact condensed to the surface nodes."""
+
+    name: ClassVar[str] = "lattice-linear"
+    assumes: ClassVar[str] = "a spring lattice calibrated to E and nu; linear, no friction"
+    needs: ClassVar[str] = "a closed insert; seconds to prepare, then milliseconds"
+
+    def solid(self, lattice: Lattice, material: Material) -> Solid:
+        """Return the calibrated network with the material's E and nu alone."""
+        return super().solid(lattice, replace(material, law=LinearElastic()))

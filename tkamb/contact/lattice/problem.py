@@ -1,0 +1,90 @@
+"""One insert under one femoral component, discretised: what every contact solver needs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.contact.lattice.femoral import FemoralFloor
+from tkamb.contact.lattice.operator import ElasticOperator
+from tkamb.contact.lattice.solid import Solid
+from tkamb.geometry.frames import Array
+
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+STEEPEST = -0.05
+"""Largest y of a femoral normal that a vertical press can load: 87 deg from the vertical."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContactProblem:
+    """A solid, its linear operator, the nodes that can be touched and what touches them.
+
+    Args:
+        solid: cells and material.
+        operator: factor of the linear stiffness.
+        index: (n, 3) lattice place of each node.
+        held: (3n,) unknowns held by the boundary.
+        floor: the femoral component from below.
+    """
+
+    solid: Solid
+    operator: ElasticOperator
+    index: Indices
+    held: Mask
+    floor: FemoralFloor
+
+    @property
+    def contact_nodes(self) -> Indices:
+        """Nodes (c,) that can be touched."""
+        return self.operator.contact_nodes
+
+    @property
+    def surface_points(self) -> Array:
+        """Undeformed contact nodes (c, 3), m."""
+        return self.solid.nodes[self.operator.contact_nodes]
+
+
+@dataclass(frozen=True, eq=False)
+class Footing:
+    """Where some contact nodes meet the femoral surface, at zero approach.
+
+    Args:
+        places: (m, 3) femoral points on the verticals through the nodes.
+        normals: (m, 3) femoral outward unit normals there.
+    """
+
+    places: Array
+    normals: Array
+
+    def gap(self, positions: Array) -> Array:
+        """Return the gap (m,) of deformed nodes to the tangent planes, m."""
+        return np.asarray(np.einsum("ij,ij->i", self.normals, positions - self.places))
+
+    @property
+    def lean(self) -> Array:
+        """y of the normals (m,), negative."""
+        return self.normals[:, 1]
+
+
+def vertical_gaps(problem: ContactProblem, pose: Array) -> Array:
+    """Return the vertical gap (c,) of all undeformed contact nodes; inf where none is above."""
+    points = problem.surface_points
+    places, normals = problem.floor.over(points, pose)
+    usable = normals[:, 1] < STEEPEST
+    return np.where(usable, places[:, 1] - points[:, 1], np.inf)
+
+
+def footing(
+    problem: ContactProblem, positions: Array, pose: Array, last: Footing | None
+) -> Footing:
+    """Fire the vertical rays through displaced nodes again.
+
+    A node that has slid from under the femoral component keeps its last plane.
+    """
+    places, normals = problem.floor.over(positions, pose)
+    lost = ~(normals[:, 1] < STEEPEST)
+    if lost.any() and last is not None:
+        places[lost], normals[lost] = last.places[lost], last.normals[lost]
+    return Footing(places, normals)

@@ -1,0 +1,121 @@
+"""From a solution of the lattice to the contract's result: pressures, sums, flags."""
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from tkamb.contact.lattice.solver import Solution
+from tkamb.contact.model import ContactResult, ContactStatus
+from tkamb.contact.pressing import approach_at, failed_result
+from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
+from tkamb.geometry.frames import Array
+
+if TYPE_CHECKING:
+    from tkamb.contact.lattice.model import LatticeState
+
+PressureRule = Literal["tributary", "source"]
+
+STRAIN_FLAG = -0.4
+"""Principal strain below which a result is flagged: the law has no barrier at -100 %."""
+COLLAPSE = -1.0
+"""Principal strain at which a cell is compressed to nothing: out of range."""
+
+
+def untouched(state: "LatticeState", pose: Array, gaps: Array) -> ContactResult:
+    """Return a result without contact; gaps (c,) are vertical, m."""
+    nothing = np.zeros(len(gaps))
+    return ContactResult(
+        pose=pose,
+        points=state.map.points,
+        normals=state.map.normals,
+        pressure=nothing,
+        area=state.map.area,
+        gap=gaps,
+        nodal_force=np.zeros((len(gaps), 3)),
+        wrench_on_insert=np.zeros(6),
+        medial=None,
+        lateral=None,
+        approach=0.0,
+    )
+
+
+def result_of(
+    state: "LatticeState",
+    pose: Array,
+    load: float | None,
+    gaps: Array,
+    solution: Solution,
+    rule: PressureRule,
+) -> ContactResult:
+    """Return the contract's result.
+
+    Args:
+        state: prepared contact.
+        pose: (4, 4) at approach 0 of the solution.
+        load: N, or None when the pose was given.
+        gaps: (c,) vertical gaps at that pose, m.
+        solution: what the solver found.
+        rule: how a nodal force becomes a pressure.
+    """
+    approach = solution.forces.approach if load is not None else 0.0
+    pose = pose.copy()
+    pose[1, 3] -= approach
+    flags, collapsed = _strain_flags(state, solution)
+    if collapsed:
+        return failed_result(state, pose, *flags)
+    force = np.zeros_like(state.map.points)
+    force[solution.candidates] = solution.forces.force[:, None] * solution.footing.normals
+    size = np.zeros(len(force))
+    size[solution.candidates] = solution.forces.force
+    area = _areas(state, gaps - approach, size > 0, rule)
+    gap = gaps - approach
+    gap[solution.candidates] = solution.forces.gap
+    pressure = size / area
+    if not solution.converged:
+        flags = (*flags, "the solver has not converged")
+    medial, lateral = summarise_condyles(
+        medial_points(state.map.points, pose, state.split),
+        state.map.points, pressure, area, force, state.map.thickness,
+    )  # fmt: skip
+    return ContactResult(
+        pose=pose,
+        points=state.map.points,
+        normals=state.map.normals,
+        pressure=pressure,
+        area=area,
+        gap=gap,
+        nodal_force=force,
+        wrench_on_insert=wrench_of(state.map.points, force),
+        medial=medial,
+        lateral=lateral,
+        approach=approach if load is not None else approach_at(state.pair, pose),
+        status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
+        iterations=solution.passes,
+        residual=solution.residual,
+        flags=flags,
+    )
+
+
+def _areas(state: "LatticeState", gaps: Array, loaded: Array, rule: PressureRule) -> Array:
+    """Return the area (c,) that each node's force stands on, m².
+
+    The source's rule: femoral area that overlaps the undeformed insert, shared evenly by the
+    nodes in contact.
+    """
+    if rule == "tributary" or not loaded.any():
+        return state.map.area
+    overlap = float(state.map.area[gaps < 0].sum())
+    return np.where(loaded, overlap / loaded.sum(), state.map.area)
+
+
+def _strain_flags(state: "LatticeState", solution: Solution) -> tuple[tuple[str, ...], bool]:
+    """Return the flags and whether the insert is compressed to nothing."""
+    if solution.field is not None:
+        least, _ = state.problem.solid.principal_strain_range(solution.field)
+        kind = "principal strain"
+    else:
+        sunk = solution.displacement[:, 1] / state.map.thickness[solution.candidates]
+        least, kind = float(sunk.min(initial=0.0)), "mean strain of a column"
+    if least <= COLLAPSE:
+        return (f"{kind} {least:.2f}: the insert is compressed to nothing",), True
+    return ((f"{kind} {least:.2f} is below {STRAIN_FLAG}",) if least < STRAIN_FLAG else ()), False

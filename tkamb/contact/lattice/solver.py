@@ -1,0 +1,188 @@
+"""Frictionless contact of the lattice: force, approach and material in one iteration.
+
+Every pass fires the rays through the displaced contact nodes, solves the unilateral contact
+on the stored compliance of the linear operator (approach included), finds the displacement of
+all nodes, and replaces the forces h that the material has lost against the linear one:
+
+    K u = f_contact + h,    h = K u - f_internal(u)
+
+h is accelerated by Anderson's method; its change is the out-of-balance force. For a linear
+material h = 0 and the pass is repeated only until the sliding nodes rest.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.contact.lattice.active_set import ContactForces, solve_contact
+from tkamb.contact.lattice.anderson import AndersonMixer
+from tkamb.contact.lattice.problem import ContactProblem, Footing, footing
+from tkamb.geometry.frames import Array
+
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """When the iteration stops.
+
+    Args:
+        force: out-of-balance force and change of contact force, relative.
+        passes: most passes before giving up.
+    """
+
+    force: float = 1e-3
+    passes: int = 40
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where the iteration starts.
+
+    Args:
+        candidates: (m,) positions among the contact nodes.
+        compliance: (3m, 3m) m/N among them.
+        active: (m,) first guess of the active set.
+        lost: (n, 3) h, N, of an earlier solution, or None.
+        reach: m, every node with a smaller vertical gap is a candidate.
+    """
+
+    candidates: Indices
+    compliance: Array
+    active: Mask
+    lost: Array | None = None
+    reach: float = np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What the iteration found.
+
+    Args:
+        candidates: (m,) positions among the contact nodes.
+        forces: along the normals, with approach and active set.
+        footing: femoral points and normals of the candidates.
+        displacement: (m, 3) of the candidates, m.
+        field: (n, 3) displacement of all nodes, or None (linear material).
+        lost: (n, 3) h, N, or None (linear material).
+        passes: how many.
+        residual: last relative out-of-balance force, or change of contact force.
+        converged: whether it fell below the tolerance.
+    """
+
+    candidates: Indices
+    forces: ContactForces
+    footing: Footing
+    displacement: Array
+    field: Array | None
+    lost: Array | None
+    passes: int
+    residual: float
+    converged: bool
+
+
+def solve_pass(
+    compliance: Array,
+    offset: Array,
+    points: Array,
+    foot: Footing,
+    load: float | None,
+    active: Mask,
+) -> tuple[ContactForces, Array]:
+    """Solve the contact for given femoral planes; return it and the displacement (m, 3).
+
+    Args:
+        compliance: (3m, 3m) of the candidates.
+        offset: (m, 3) their displacement without contact forces.
+        points: (m, 3) undeformed.
+        foot: femoral planes.
+        load: N, or None for approach 0.
+        active: first guess.
+    """
+    normals, count = foot.normals, len(points)
+    blocks = compliance.reshape(count, 3, count, 3)
+    half = np.einsum("iajb,jb->iaj", blocks, normals, optimize=True)
+    along = np.einsum("iaj,ia->ij", half, normals)
+    forces = solve_contact(along, foot.gap(points + offset), foot.lean, load, active)
+    return forces, offset + half @ forces.force
+
+
+def solve(
+    problem: ContactProblem,
+    pose: Array,
+    load: float | None,
+    start: Start,
+    tolerance: Tolerance,
+) -> Solution:
+    """Return the contact at a pose under a load (N), or at approach 0 when load is None."""
+    if problem.solid.material.is_linear:
+        return _solve_linear(problem, pose, load, start, tolerance)
+    operator, solid = problem.operator, problem.solid
+    points = problem.surface_points[start.candidates]
+    lost = np.zeros_like(solid.nodes) if start.lost is None else start.lost
+    mixer, active, moved, foot, residual = AndersonMixer(), start.active, None, None, np.inf
+    for count in range(1, tolerance.passes + 1):
+        begun = operator.start(lost)
+        offset = operator.half.project(begun).reshape(-1, 3)[start.candidates]
+        foot = footing(problem, points + (offset if moved is None else moved), pose, foot)
+        forces, moved = solve_pass(start.compliance, offset, points, foot, load, active)
+        active = forces.active
+        pushed = np.zeros((len(problem.contact_nodes), 3))
+        pushed[start.candidates] = forces.force[:, None] * foot.normals
+        operator.half.apply(pushed.ravel(), begun)
+        field = operator.finish(begun)
+        value = solid.correction(field)
+        value[problem.held.reshape(-1, 3)] = 0.0
+        size = max(float(np.linalg.norm(pushed)), 1e-300)
+        residual = float(np.linalg.norm(value - lost)) / size
+        if residual <= tolerance.force or not active.any():
+            foot_now = footing(problem, points + moved, pose, foot)
+            if violation(points, moved, foot_now, forces) <= tolerance.force:
+                break
+        lost = mixer.next(lost.ravel(), value.ravel()).reshape(-1, 3)
+    else:
+        forces = replace(forces, converged=False)
+    return Solution(
+        start.candidates, forces, foot, moved, field, lost, count, residual, forces.converged
+    )
+
+
+def _solve_linear(
+    problem: ContactProblem,
+    pose: Array,
+    load: float | None,
+    start: Start,
+    tolerance: Tolerance,
+) -> Solution:
+    """Repeat rays and contact until the sliding nodes rest."""
+    points = problem.surface_points[start.candidates]
+    nothing, moved, active = np.zeros_like(points), np.zeros_like(points), start.active
+    foot = footing(problem, points, pose, None)
+    for count in range(1, tolerance.passes + 1):
+        forces, moved = solve_pass(start.compliance, nothing, points, foot, load, active)
+        active = forces.active
+        foot_now = footing(problem, points + moved, pose, foot)
+        residual = violation(points, moved, foot_now, forces)
+        if residual <= tolerance.force:
+            break
+        foot = foot_now
+    else:
+        forces = replace(forces, converged=False)
+    return Solution(
+        start.candidates, forces, foot, moved, None, None, count, residual, forces.converged
+    )
+
+
+def violation(points: Array, moved: Array, foot: Footing, forces: ContactForces) -> float:
+    """Return the largest distance of an active node from the femoral surface where it now is.
+
+    Overlap of other nodes counts too. Relative to the largest displacement of an active node.
+    """
+    if not forces.active.any():
+        return 0.0
+    gap = foot.gap(points + moved) + forces.approach * foot.lean
+    miss = np.where(forces.active, np.abs(gap), np.maximum(-gap, 0))
+    size = float(np.abs(moved[forces.active]).max())
+    return float(np.nan_to_num(miss, nan=0.0).max()) / max(size, 1e-300)
