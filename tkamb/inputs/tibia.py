@@ -98,7 +98,7 @@ def _sagittal(
         ankle = MIRROR @ ankle
     velocity, acceleration = np.zeros((len(time), 6)), np.zeros((len(time), 6))
     velocity[:, 5], acceleration[:, 5] = rate, rate_of_rate
-    rotation = Rotation.from_euler("z", angle).as_matrix()
+    rotation = Rotation.from_euler("z", angle[:, None]).as_matrix()
     return BodyMotion(time, pose(rotation, ankle), velocity, acceleration)
 
 
