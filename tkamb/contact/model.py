@@ -133,7 +133,9 @@ class ContactModel(ABC):
         """Do the work that depends on geometry and material alone."""
 
     @abstractmethod
-    def evaluate(self, state: Any, pose: Array, guess: ContactResult | None = None) -> ContactResult:
+    def evaluate(
+        self, state: Any, pose: Array, guess: ContactResult | None = None
+    ) -> ContactResult:
         """Return the contact at a given pose_femoral_in_insert (4, 4)."""
 
     def press(

@@ -1,0 +1,280 @@
+"""Contact alone: two meshes, a pose, a load; what `tkamb press` does."""
+
+import math
+import resource
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tkamb.contact import materials
+from tkamb.contact.model import (
+    Bearing,
+    CondyleContact,
+    ContactPair,
+    ContactResult,
+    ContactStatus,
+)
+from tkamb.contact.pressing import check_load, first_touch_height
+from tkamb.contact.registry import contact_model
+from tkamb.errors import InputError
+from tkamb.geometry.flat_bottom import insert_placement
+from tkamb.geometry.frames import Array, mirrored_pose
+from tkamb.geometry.frames import pose as pose_matrix
+from tkamb.inputs.meshes import axes_rotation, load_surface, mirrored
+from tkamb.units import DEGREE, LENGTH, MEGAPASCAL, MILLIMETRE
+
+Side = Literal["right", "left"]
+
+
+@dataclass(frozen=True, eq=False)
+class PressReport:
+    """What a press found, and what it took.
+
+    Args:
+        contact: name of the contact model.
+        resolution_mm: spacing of its map points.
+        nodes: of the model (lattice, mesh), or map points where it has none.
+        load: N.
+        result: the contact, in the insert frame (mirrored for a left knee).
+        pair: the two bodies.
+        side: of the knee.
+        prepare_seconds: for the geometry.
+        solve_seconds: for the press.
+        peak_rss_MB: largest resident memory of the process so far.
+    """
+
+    contact: str
+    resolution_mm: float
+    nodes: int
+    load: float
+    result: ContactResult
+    pair: ContactPair
+    side: Side
+    prepare_seconds: float
+    solve_seconds: float
+    peak_rss_MB: float
+
+    @property
+    def carried(self) -> bool:
+        """Whether the load was reached."""
+        return self.result.status is ContactStatus.OK
+
+    def lines(self) -> list[str]:
+        """Return the report as lines of text."""
+        found = self.as_dict()
+        lines = [
+            f"{self.contact} at {self.resolution_mm:g} mm, {self.nodes} nodes: {found['status']}",
+            f"load {self.load:g} N, reaction {_text(found['reaction_N'])} N, "
+            f"approach {_text(found['approach_mm'])} mm",
+        ]
+        for name in ("medial", "lateral"):
+            if found[name] is not None:
+                lines.append(
+                    f"{name:8s}" + _CONDYLE.format(*found[name].pop("cop_mm"), **found[name])
+                )
+        lines += [f"note: {flag}" for flag in self.result.flags]
+        took = f"prepared in {self.prepare_seconds:.3g} s, solved in {self.solve_seconds:.3g} s"
+        return [*lines, f"{took}, {self.result.iterations} iterations"]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `tkamb press --json` prints; None stands for what is unknown.
+
+        Vectors are in the insert frame, z to the subject's right on either side.
+        """
+        result = self.result
+        return {
+            "contact": self.contact,
+            "resolution_mm": self.resolution_mm,
+            "nodes": self.nodes,
+            "load_N": self.load,
+            "reaction_N": _known(-result.wrench_on_insert[1]),
+            "approach_mm": _known(result.approach / MILLIMETRE),
+            "medial": _condyle(result.medial, self.side),
+            "lateral": _condyle(result.lateral, self.side),
+            "prepare_seconds": self.prepare_seconds,
+            "solve_seconds": self.solve_seconds,
+            "peak_rss_MB": self.peak_rss_MB,
+            "iterations": result.iterations,
+            "residual": _known(result.residual),
+            "status": result.status.value,
+        }
+
+
+def press_meshes(
+    femoral: str | Path,
+    insert: str | Path,
+    load: float,
+    *,
+    units: str = "mm",
+    pose: Sequence[float] | None = None,
+    contact: str = "foundation",
+    resolution_mm: float = 1.0,
+    bearing: Bearing = "fixed",
+    material: str = "polyethylene",
+    axes: str = "+x,+y,+z",
+    side: Side = "right",
+    adjust: bool = False,
+    options: dict[str, Any] | None = None,
+) -> PressReport:
+    """Press a femoral component into an insert until it carries the load.
+
+    Args:
+        femoral: mesh file of the femoral component.
+        insert: mesh file of the insert, closed.
+        load: N, along the insert's bottom normal.
+        units: unit of length of both files and of the pose, "mm", "cm" or "m".
+        pose: x, y, z (units), rx, ry, rz (deg, intrinsic x-y-z): places the femoral mesh in
+            the insert mesh's own axes. None: as the files have them, both about one origin.
+            Height above the insert does not matter: the press moves along the load.
+        contact: a name of `tkamb contact list`.
+        resolution_mm: spacing of the model's map points.
+        bearing: "fixed" or "mobile".
+        material: a name of `tkamb.contact.materials`.
+        axes: mesh axes that point anterior, superior and right.
+        side: of the knee; a left one is mirrored.
+        adjust: femoral adjustment before contact; not offered for meshes alone.
+        options: the model's own options.
+
+    Raises:
+        InputError: bad file, unit, axes, name or load, or a femoral component that does not
+            lie over the insert.
+    """
+    check_load(load)
+    if adjust:
+        raise InputError(
+            "femoral adjustment is not offered here", "adjust", "run a scene, or leave it off"
+        )
+    model = contact_model(contact, resolution_mm, **(options or {}))
+    pair, placed = load_pair(femoral, insert, units, pose, bearing, material, axes, side)
+    if not math.isfinite(first_touch_height(pair, placed)):
+        raise InputError(
+            "neither condyle lies over the insert",
+            femoral,
+            "check the pose, the axes and the unit",
+        )
+    started = time.perf_counter()
+    state = model.prepare(pair)
+    prepared = time.perf_counter()
+    result = model.press(state, load, placed)
+    solved = time.perf_counter()
+    return PressReport(
+        contact=contact,
+        resolution_mm=resolution_mm,
+        nodes=int(getattr(state, "node_count", len(state.points))),
+        load=load,
+        result=result,
+        pair=pair,
+        side=side,
+        prepare_seconds=prepared - started,
+        solve_seconds=solved - prepared,
+        peak_rss_MB=_peak_rss(),
+    )
+
+
+def load_pair(
+    femoral: str | Path,
+    insert: str | Path,
+    units: str,
+    pose: Sequence[float] | None,
+    bearing: Bearing,
+    material: str,
+    axes: str,
+    side: Side,
+) -> tuple[ContactPair, Array]:
+    """Return the bodies and pose_femoral_in_insert (4, 4); see `press_meshes`."""
+    rotation = axes_rotation(axes)
+    placed = mesh_pose(pose, units, rotation)
+    femoral_surface = load_surface(femoral, units, axes, name="femoral")
+    insert_surface = load_surface(insert, units, axes, name="insert", closed=True)
+    if side == "left":
+        femoral_surface, insert_surface = mirrored(femoral_surface), mirrored(insert_surface)
+        placed = mirrored_pose(placed)
+    elif side != "right":
+        raise InputError(f"'{side}' is no side", "side", "give right or left")
+    if bearing not in ("fixed", "mobile"):
+        raise InputError(f"'{bearing}' is no bearing", "bearing", "give fixed or mobile")
+    in_frame = insert_placement(insert_surface, rotation)
+    pair = ContactPair(
+        femoral_surface, insert_surface.moved(in_frame), materials.material(material), bearing
+    )
+    return pair, in_frame @ placed
+
+
+def mesh_pose(pose: Sequence[float] | None, units: str, rotation: Array) -> Array:
+    """Return the pose (4, 4) between the meshes, turned from mesh to anatomical axes.
+
+    Args:
+        pose: x, y, z (units), rx, ry, rz (deg, intrinsic x-y-z) in mesh axes, or None.
+        units: unit of length.
+        rotation: (3, 3) from mesh to anatomical axes.
+
+    Raises:
+        InputError: not six finite numbers.
+    """
+    if pose is None:
+        return np.eye(4)
+    values = np.asarray(pose, float)
+    if values.shape != (6,) or not np.isfinite(values).all():
+        raise InputError("is not six finite numbers", "pose", "give x y z rx ry rz")
+    if units not in LENGTH:
+        raise InputError(f"unknown unit '{units}'", "units", f"one of {', '.join(LENGTH)}")
+    turn = Rotation.from_euler("XYZ", values[3:] * DEGREE).as_matrix()
+    return pose_matrix(rotation @ turn @ rotation.T, rotation @ values[:3] * LENGTH[units])
+
+
+def read_pose(path: str | Path) -> tuple[float, ...]:
+    """Read x y z rx ry rz from a text file: six numbers parted by blanks, commas or lines.
+
+    Raises:
+        InputError: no such file, or not six numbers.
+    """
+    try:
+        words = Path(path).read_text(encoding="utf-8").replace(",", " ").split()
+        values = tuple(float(word) for word in words)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be read ({error})", path, _SIX) from None
+    if len(values) != 6:
+        raise InputError(f"holds {len(values)} numbers", path, _SIX)
+    return values
+
+
+_SIX = "give a text file of six numbers: x y z (mesh units) rx ry rz (deg)"
+
+
+def _condyle(carried: CondyleContact | None, side: Side) -> dict[str, Any] | None:
+    if carried is None:
+        return None
+    to_right = np.array([1.0, 1.0, -1.0 if side == "left" else 1.0])
+    return {
+        "force_N": carried.force,
+        "area_mm2": carried.area / MILLIMETRE**2,
+        "mean_pressure_MPa": carried.mean_pressure / MEGAPASCAL,
+        "peak_pressure_MPa": carried.peak_pressure / MEGAPASCAL,
+        "cop_mm": (carried.centre_of_pressure * to_right / MILLIMETRE).tolist(),
+    }
+
+
+_CONDYLE = (
+    "{force_N:8.1f} N {area_mm2:7.1f} mm2  mean {mean_pressure_MPa:5.2f}  "
+    "peak {peak_pressure_MPa:5.2f} MPa  centre ({:.1f}, {:.1f}, {:.1f}) mm"
+)
+
+
+def _text(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.6g}"
+
+
+def _known(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _peak_rss() -> float:
+    """Return the largest resident memory so far, MB (1e6 bytes)."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
