@@ -63,8 +63,8 @@ RAMP_S = 1.0
 FLEXION_END = 120.0
 AXIAL_ROTATION_END = 6.0
 CONTACT_AP_START = -2.0
-CONTACT_AP_END = -7.0
-SHANK_LEAN = (3.5, 32.0)
+CONTACT_AP_END = -5.5
+SHANK_LEAN = (4.0, 32.0)
 """Forward, standing and at the bottom."""
 
 # --- extensor mechanism ------------------------------------------------------------------
@@ -84,7 +84,7 @@ PATELLA_CENTRE_OF_MASS = (4.0, 0.0, 0.0)
 GRAVITY = 9.80665
 ANKLE_HEIGHT_SHARE = 0.039
 """Ankle centre above the floor, of body height."""
-CENTRE_OF_PRESSURE = (22.0, 60.0)
+CENTRE_OF_PRESSURE = (18.0, 60.0)
 """In front of the ankle when standing and at the bottom."""
 LEG_SHARE = (0.5, 0.7)
 """Of body weight on the tested leg, standing and at the bottom."""

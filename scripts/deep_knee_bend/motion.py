@@ -1,15 +1,19 @@
-"""The recorded motion of the knee: flexion, rotation and contact path chosen, the rest solved."""
+"""The recorded motion of the knee: flexion, rotation and contact path chosen, the rest solved.
+
+The femur lies where an evenly loaded frictionless femur would lie mediolaterally: the two
+contact points are as far from the middle as each other, so the dishes' slopes cancel.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.optimize import brentq
+from scipy.optimize import root
 
 from deep_knee_bend import dimensions as d
 from deep_knee_bend.touch import touch
 
-KNOTS = np.radians([0.0, 12.0, 24.0, 36.0, 60.0, 90.0, 120.0])
+KNOTS = np.radians([0.0, 6.0, 12.0, 24.0, 36.0, 60.0, 90.0, 120.0])
 
 
 @dataclass(frozen=True)
@@ -41,29 +45,32 @@ def axial_rotation_at(flexion):
 def contact_path_at(flexion):
     """Mean AP position (mm) of the two contact points."""
     s = flexion / np.radians(d.FLEXION_END)
-    return d.CONTACT_AP_START + (d.CONTACT_AP_END - d.CONTACT_AP_START) * s * s * (3.0 - 2.0 * s)
+    return d.CONTACT_AP_START + (d.CONTACT_AP_END - d.CONTACT_AP_START) * s * (2.0 - s)
 
 
-def _ap_for(flexion):
-    """AP position of the flexion axis that puts the mean contact on its path."""
+def _settled(flexion):
+    """AP and ML (mm) at a flexion: mean contact on its path, ML slopes under it balanced."""
     rotation, wanted = axial_rotation_at(flexion), contact_path_at(flexion)
 
-    def miss(ap):
-        return touch(ap, rotation, flexion).points[:, 0].mean() - wanted
+    def miss(place):
+        medial, lateral = touch(*place, rotation, flexion).points
+        inward = medial[2] + lateral[2]
+        return [(medial[0] + lateral[0]) / 2.0 - wanted, inward]
 
-    return brentq(miss, -14.0, 4.0, xtol=1e-6)
+    found = root(miss, [-5.0, 0.0], method="hybr", options={"eps": 1e-3, "xtol": 1e-6})
+    return [round(float(x), 3) for x in found.x]
 
 
 def knee_motion():
     """Return the KneeMotion of all frames."""
     time = np.linspace(0.0, d.DURATION_S, d.FRAMES)
     flexion = flexion_at(time)
-    ap_at = CubicSpline(KNOTS, [round(_ap_for(f), 2) for f in KNOTS], bc_type="natural")
+    place_at = CubicSpline(KNOTS, [_settled(f) for f in KNOTS], bc_type="natural")
     coordinates, contact, guess = [], [], 0.0
     for angle in flexion:
-        ap, rotation = float(ap_at(angle)), float(axial_rotation_at(angle))
-        found = touch(ap, rotation, angle, guess)
+        (ap, ml), rotation = place_at(angle), float(axial_rotation_at(angle))
+        found = touch(ap, ml, rotation, angle, guess)
         guess = found.adduction
-        coordinates.append([ap, found.si, 0.0, rotation, found.adduction, angle])
+        coordinates.append([ap, found.si, ml, rotation, found.adduction, angle])
         contact.append(found.points)
     return KneeMotion(time, np.array(coordinates), np.array(contact))

@@ -4,8 +4,8 @@ Both feet stand flat side by side and both legs do the same, so the body is a ch
 three: two shanks, two thighs, and head-arms-trunk. The trunk leans so that the centre of
 mass is over the planned centre of pressure. Force and true centre of pressure then follow
 from the centre of mass' acceleration and the rate of angular momentum. The tested leg takes
-its share, because the centre of mass moves sideways over it; each leg's force points at the
-centre of mass in the frontal plane.
+its share, because the centre of mass moves sideways towards it: upright forces under both
+feet balance the body in the frontal plane, so neither foot needs to push sideways.
 """
 
 from dataclasses import dataclass
@@ -104,11 +104,8 @@ def _dynamics(time, parts, centre):
 def _tested_leg(time, flexion, lean, trunk_lean, total, centre, cop):
     share = _between(d.LEG_SHARE, flexion)
     sideways = d.FOOT_SPACING_HALF * (2.0 * share - 1.0)
-    height = centre[:, 1]
-    up = share * total[:, 1]
-    towards = (sideways - d.FOOT_SPACING_HALF) / height
-    across = up * towards + share * d.MASS_KG * _second_derivative(time, sideways) * MILLI
-    force = np.stack([share * total[:, 0], up, across], axis=1)
+    across = d.MASS_KG * _second_derivative(time, sideways) * MILLI
+    force = share[:, None] * np.stack([total[:, 0], total[:, 1], across], axis=1)
     nothing = np.zeros_like(cop)
     point = np.stack([cop, nothing, nothing], axis=1)
     return Squat(lean, trunk_lean, force, point, centre)

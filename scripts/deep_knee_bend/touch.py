@@ -15,7 +15,7 @@ from tkamb.geometry.frames import knee_pose
 
 MEDIAL, LATERAL = -1.0, 1.0
 PHI_REACH, Z_REACH = np.radians(30.0), 9.0
-HALVINGS = 26
+HALVINGS = 18
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Touch:
     points: np.ndarray
 
 
-def _rigid(ap, axial_rotation, adduction, flexion):
-    return knee_pose([ap, 0.0, 0.0, axial_rotation, adduction, flexion])
+def _rigid(ap, ml, axial_rotation, adduction, flexion):
+    return knee_pose([ap, 0.0, ml, axial_rotation, adduction, flexion])
 
 
 def lowest(pose, flexion, side):
@@ -48,14 +48,14 @@ def lowest(pose, flexion, side):
     return gap, np.array([point[0], point[1] - gap, point[2]])
 
 
-def touch(ap, axial_rotation, flexion, guess=0.0):
-    """Return the Touch at the given AP (mm), axial rotation and flexion (rad), ML zero."""
+def touch(ap, ml, axial_rotation, flexion, guess=0.0):
+    """Return the Touch at the given AP and ML (mm), axial rotation and flexion (rad)."""
 
     def difference(adduction):
-        pose = _rigid(ap, axial_rotation, adduction, flexion)
+        pose = _rigid(ap, ml, axial_rotation, adduction, flexion)
         return lowest(pose, flexion, LATERAL)[0] - lowest(pose, flexion, MEDIAL)[0]
 
     adduction = brentq(difference, guess - 0.04, guess + 0.04, xtol=1e-12)
-    pose = _rigid(ap, axial_rotation, adduction, flexion)
+    pose = _rigid(ap, ml, axial_rotation, adduction, flexion)
     medial, lateral = (lowest(pose, flexion, side) for side in (MEDIAL, LATERAL))
     return Touch(-(medial[0] + lateral[0]) / 2.0, adduction, np.stack([medial[1], lateral[1]]))
