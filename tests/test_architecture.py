@@ -14,7 +14,7 @@ FORBIDDEN = {
     "inputs": ("body", "contact", "output"),
     "output": ("body", "inputs"),
 }
-SEES_BODY_AND_CONTACT = {"equilibrium.py", "simulate.py"}
+SEES_BODY_AND_CONTACT = {"equilibrium.py", "simulation.py"}
 
 
 def imported(path):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tkamb.contact.registry import contact_model
     from tkamb.results import Results, read_results
     from tkamb.scene import Scene, load_scene
-    from tkamb.simulate import simulate
+    from tkamb.simulation import simulate
 
 __all__ = ["Results", "Scene", "contact_model", "load_scene", "read_results", "simulate"]
 
@@ -25,11 +25,12 @@ _HOMES = {
     "contact_model": "tkamb.contact.registry",
     "load_scene": "tkamb.scene",
     "read_results": "tkamb.results",
-    "simulate": "tkamb.simulate",
+    "simulate": "tkamb.simulation",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'tkamb' has no attribute '{name}'")
-    return getattr(import_module(_HOMES[name]), name)
+    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
+    return value

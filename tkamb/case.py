@@ -3,7 +3,7 @@
 import logging
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, pose
 from tkamb.inputs.motion import KneeMotion, load_motion
 from tkamb.inputs.patient import load_urdf
-from tkamb.scene import FemoralImplantTable, PatellarImplantTable, Scene
+from tkamb.scene import Attachment, FemoralImplantTable, PatellarImplantTable, Scene
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ class Case:
     """What a run works on. Absent in the scene: None.
 
     Args:
-        scene: the scene.
+        scene: the scene; of a left knee with its points mirrored.
         chain: the patient in Pinocchio.
         motion: knee (and recorded patella) coordinates per frame.
         tibia: the shank in the laboratory; None: upright and at rest.
@@ -66,6 +66,8 @@ def load_case(scene: Scene) -> Case:
     Raises:
         InputError: whatever is wrong with them, in one line.
     """
+    if scene.patient.side == "left":
+        scene = _with_mirrored_attachments(scene)
     with_patella = scene.patella is not None
     chain = Chain(load_urdf(scene.patient, with_patella), with_patella)
     parts = _Parts(scene)
@@ -82,6 +84,26 @@ def load_case(scene: Scene) -> Case:
 
         ground = load_ground_reaction(scene.ground_reaction, motion.time, scene.patient.side)
     return Case(scene, chain, motion, tibia, ground, parts.femoral, parts.insert, parts.patella)
+
+
+def _with_mirrored_attachments(scene: Scene) -> Scene:
+    """Return a left knee's scene with the points of lines and ligaments reflected in z."""
+
+    def mirrored(table: Any) -> Any:
+        ends = {
+            name: end.model_copy(update={"point_mm": (*end.point_mm[:2], -end.point_mm[2])})
+            for name, end in table
+            if isinstance(end, Attachment)
+        }
+        return table.model_copy(update=ends)
+
+    lines = {
+        name: mirrored(table)
+        for name in ("quadriceps", "patellar_ligament")
+        if (table := getattr(scene, name)) is not None
+    }
+    bundles = tuple(mirrored(table) for table in scene.ligament)
+    return scene.model_copy(update={**lines, "ligament": bundles})
 
 
 class _Parts:

@@ -140,7 +140,7 @@ def _run(options: argparse.Namespace) -> int:
     from tkamb.output.headline import cards
     from tkamb.results import claim_directory, write_results
     from tkamb.scene import load_scene
-    from tkamb.simulate import simulate
+    from tkamb.simulation import simulate
     from tkamb.status import FAILED
 
     overrides = dict(options.set)

@@ -151,7 +151,7 @@ def _quadriceps(case: "Case") -> StringLine:
     table = case.scene.quadriceps
     assert table is not None and case.femoral is not None
     outline = None
-    ends = (_point(case, table.origin), _point(case, table.insertion))
+    ends = (_point(table.origin), _point(table.insertion))
     if table.wrap:
         surfaces = [case.femoral]
         if table.bone:
@@ -171,7 +171,7 @@ def _ligament(case: "Case") -> StringLine:
     table = case.scene.patellar_ligament
     assert table is not None
     outline = None
-    ends = (_point(case, table.proximal), _point(case, table.distal))
+    ends = (_point(table.proximal), _point(table.distal))
     if table.wrap and case.insert is not None:
         place = transform(
             inverse(case.chain.insert_in_tibia) @ case.chain.link_in(table.distal.link, "tibia"),
@@ -198,9 +198,8 @@ def _on_tibia(load: PointForces) -> PointForces:
     return replace(load, link="tibia") if load.link == "insert" else load
 
 
-def _point(case: "Case", end: Attachment) -> Array:
-    point = np.array(end.point_mm) * MILLIMETRE
-    return point * [1.0, 1.0, -1.0] if case.scene.patient.side == "left" else point
+def _point(end: Attachment) -> Array:
+    return np.array(end.point_mm) * MILLIMETRE
 
 
 def _bone(case: "Case", table: BoneTable) -> "Surface":

@@ -1,0 +1,49 @@
+"""The shipped knee bend as a starting point: copies of its scene with keys changed or left out."""
+
+import shutil
+from pathlib import Path
+
+import tomllib
+
+MODEL = Path(__file__).parents[1] / "models" / "deep_knee_bend"
+
+
+def write_scene(folder, drop=(), **changes):
+    """Write a copy of the shipped patient into `folder`; return the scene's path.
+
+    Args:
+        folder: where to; the model's files are copied there.
+        drop: tables to leave out.
+        changes: "table__key" = value.
+    """
+    shutil.copytree(MODEL, folder, dirs_exist_ok=True)
+    content = tomllib.loads((MODEL / "scene.toml").read_text(encoding="utf-8"))
+    for table in drop:
+        content.pop(table, None)
+    for dotted, value in changes.items():
+        *tables, key = dotted.split("__")
+        inner = content
+        for name in tables:
+            inner = inner.setdefault(name, {})
+        if value is None:
+            inner.pop(key, None)
+        else:
+            inner[key] = value
+    path = Path(folder) / "scene.toml"
+    path.write_text(as_toml(content), encoding="utf-8")
+    return path
+
+
+def as_toml(content):
+    """Return a dictionary of plain values as TOML (inline tables below the first level)."""
+    return "\n".join(f"{key} = {_value(value)}" for key, value in content.items()) + "\n"
+
+
+def _value(value):
+    if isinstance(value, dict):
+        return "{" + ", ".join(f'"{k}" = {_value(v)}' for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(_value(item) for item in value) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else repr(value)

@@ -1,0 +1,107 @@
+"""The pipeline on the shipped knee bend: what the numbers must obey, whoever made them."""
+
+import numpy as np
+import pytest
+
+from scenes import MODEL, write_scene
+from tkamb import load_scene, simulate
+from tkamb.columns import COLUMNS
+from tkamb.errors import InputError
+
+EVERY_TENTH = slice(0, 101, 10)
+
+CONTACT_COLUMNS = {column.name for column in COLUMNS if "[contact]" in column.needs}
+CLOCKS = {"body_seconds", "contact_seconds"}
+
+
+@pytest.fixture(scope="module")
+def bend():
+    return simulate(MODEL / "scene.toml", frames=EVERY_TENTH)
+
+
+def test_every_frame_has_numbers(bend):
+    assert len(bend) == 11
+    assert not any(status.startswith("failed") for status in bend.status)
+    for name in ("force_total_N", "quadriceps_N", "patellofemoral_N", "medial_area_mm2"):
+        assert np.isfinite(bend[name]).all(), name
+
+
+def test_forces_go_the_way_of_the_source(bend):
+    """Rising with flexion; PL/Q from about 1 down; PF/Q from about 0.3 up to about 1.
+
+    The source's PL/Q ends at 0.45; this knee's stays near 0.65 once the quadriceps wraps.
+    """
+    force, quadriceps = bend["force_total_BW"], bend["quadriceps_N"]
+    assert (np.diff(force[:-1]) > 0).all()
+    assert (np.diff(quadriceps[:-1]) > 0).all()
+    ligament = bend["patellar_ligament_N"] / quadriceps
+    patella = bend["patellofemoral_N"] / quadriceps
+    assert ligament[0] == pytest.approx(1.0, abs=0.1)
+    assert ligament[-1] < 0.7
+    assert (np.diff(ligament[:-1]) < 0.01).all()
+    assert patella[0] < 0.4
+    assert 0.9 < patella[-1] < 1.2
+
+
+def test_contact_force_is_mostly_superior_inferior(bend):
+    assert (bend["force_si_N"] / bend["force_total_N"] > 0.95).all()
+
+
+def test_residuals_are_small_against_it(bend):
+    residual = np.hypot(bend["residual_ap_N"], bend["residual_ml_N"])
+    assert (residual / bend["force_si_N"] < 0.2).all()
+
+
+def test_the_deformed_insert_carries_the_load_that_balance_asks_for(bend):
+    """Both condyles' nodal forces add up to the superior-inferior force of the body."""
+    carried = -bend.maps.nodal_force_N[:, :, 1].sum(axis=1)
+    np.testing.assert_allclose(carried, bend["force_si_N"], rtol=1e-5)
+
+
+def test_patella_balances_as_three_forces(bend):
+    """Light and slow: quadriceps, ligament and patellofemoral force close a triangle."""
+    q, pl = bend["quadriceps_N"], bend["patellar_ligament_N"]
+    pf = np.hypot(bend["patellofemoral_N"], bend["patellofemoral_tangential_N"])
+    for k in range(3, 11):
+        longest, a, b = sorted([q[k], pl[k], pf[k]], reverse=True)
+        assert longest < a + b
+
+
+def test_another_contact_model_changes_contact_columns_only(bend):
+    other = simulate(MODEL / "scene.toml", contact="hertz", frames=EVERY_TENTH)
+    changed = set()
+    for name in bend.columns:
+        if name in CLOCKS or name == "status":
+            continue
+        if not np.array_equal(bend[name], other[name], equal_nan=True):
+            changed.add(name)
+    assert changed <= CONTACT_COLUMNS
+    assert "medial_peak_pressure_MPa" in changed
+
+
+def test_a_left_knee_gives_the_right_knees_numbers(tmp_path, bend):
+    """Everything reflected in the sagittal plane, file by file, gives the same columns."""
+    from mirrored_patient import write_mirrored_patient
+
+    left = simulate(write_mirrored_patient(tmp_path), frames=EVERY_TENTH)
+    for name in bend.columns:
+        if name in CLOCKS or name == "status":
+            continue
+        a, b = bend[name], left[name]
+        scale = max(1.0, float(np.nanmax(np.abs(a), initial=0.0)))
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-10 * scale, err_msg=name)
+
+
+def test_body_weight_scales_everything_but_geometry(tmp_path):
+    scene = load_scene(MODEL / "scene.toml")
+    assert scene.patient.mass_kg == 75.0
+    results = simulate(write_scene(tmp_path, patient__mass_kg=150.0), frames=slice(50, 51))
+    assert results["force_total_BW"][0] == pytest.approx(
+        results["force_total_N"][0] / (150 * 9.80665), rel=1e-12
+    )
+
+
+@pytest.mark.parametrize("frames", [slice(0, 200), slice(-300, 10), slice(5, 5), slice(0, 9, 0)])
+def test_frames_outside_the_motion_are_refused(frames):
+    with pytest.raises(InputError, match="not in the motion"):
+        simulate(MODEL / "scene.toml", frames=frames)
