@@ -32,6 +32,10 @@ WIDEST_TURN = np.deg2rad(40.0)
 """rad: first step and end of the search about the guess."""
 
 
+NEAR = 5e-3
+"""m: a place found farther from where the button first touched lies behind the femur."""
+
+
 class PatellaStatus(Enum):
     """How the search ended."""
 
@@ -55,7 +59,8 @@ class PatellaState:
         gap: m, positive when apart.
         ligament_ratio: patellar ligament tension per quadriceps tension, massless patella.
         patellofemoral_ratio: patellofemoral force per quadriceps tension, massless patella.
-        lateral: lateral part of the unit contact force that the groove leaves unbalanced.
+        shift: m along z, the mediolateral shift that is left out of the motion; first order.
+        tilt: rad about y, likewise.
         status: how the search ended.
     """
 
@@ -66,7 +71,8 @@ class PatellaState:
     gap: float
     ligament_ratio: float
     patellofemoral_ratio: float
-    lateral: float
+    shift: float
+    tilt: float
     status: PatellaStatus
 
 
@@ -138,7 +144,7 @@ def solve_patella(
     if found.normal_force <= 0.0 or found.ligament_force <= 0.0:
         return _nothing(PatellaStatus.NO_CONTACT)
     status = PatellaStatus.SEVERAL if several else PatellaStatus.OK
-    if found.contact.at_edge:
+    if found.contact.on_edge > 0.5:
         status = PatellaStatus.EDGE
     return frame.state(found, status)
 
@@ -149,7 +155,7 @@ def patella_at(
     """Return the contact of a patella whose place was recorded; its gap is as recorded."""
     frame = _Frame(mechanism, pose_femur_in_insert)
     balance = frame.balance(np.asarray(coordinates, float))
-    edge = balance.contact.at_edge
+    edge = balance.contact.on_edge > 0.5
     return frame.state(balance, PatellaStatus.EDGE if edge else PatellaStatus.OK)
 
 
@@ -264,16 +270,27 @@ class _Frame:
         turned = m.contact.pose(np.array([0.0, 0.0, rotation]))
         proximal = transform(turned, m.ligament_proximal)
         radius = np.sqrt(max(m.ligament_length**2 - (proximal[2] - self.tuberosity[2]) ** 2, 1e-8))
-        axes = self.insert[:2, :2]
-        for lean in np.deg2rad(np.arange(75.0, -75.1, -3.0)):
-            swing = axes @ (radius * np.array([np.sin(lean), np.cos(lean)]))
-            place = self.tuberosity[:2] + swing - proximal[:2]
-            if m.contact.at(np.append(place, rotation)).gap <= 0.0:
-                try:
-                    return self.settled(place, rotation)
-                except ComputationError:
-                    return None
-        return None
+
+        def place(lean: float) -> Array:
+            swing = self.insert[:2, :2] @ (radius * np.array([np.sin(lean), np.cos(lean)]))
+            return np.append(self.tuberosity[:2] + swing - proximal[:2], rotation)
+
+        leans = np.deg2rad(np.arange(75.0, -75.1, -5.0))
+        if m.contact.touches(place(leans[0])):
+            return None
+        touching = next((k for k, lean in enumerate(leans) if m.contact.touches(place(lean))), 0)
+        if touching == 0:
+            return None
+        free, deep = leans[touching - 1], leans[touching]
+        for _ in range(6):
+            middle = 0.5 * (free + deep)
+            free, deep = (free, middle) if m.contact.touches(place(middle)) else (middle, deep)
+        try:
+            found = self.settled(place(free), rotation)
+        except ComputationError:
+            return None
+        far = found is None or np.linalg.norm((found.coordinates - place(free))[:2]) > NEAR
+        return None if far else found
 
     def state(self, balance: _Balance, status: PatellaStatus) -> PatellaState:
         """Return the result in the insert frame."""
@@ -287,7 +304,8 @@ class _Frame:
             contact.gap,
             balance.ligament_force,
             balance.normal_force,
-            contact.lateral,
+            contact.shift,
+            contact.tilt,
             status,
         )
 
@@ -297,5 +315,5 @@ def _cross(a: Array, b: Array) -> float:
 
 
 def _nothing(status: PatellaStatus) -> PatellaState:
-    nan = np.full(3, np.nan)
-    return PatellaState(nan, nan, nan, nan, np.nan, np.nan, np.nan, np.nan, status)
+    nan, none = float("nan"), np.full(3, np.nan)
+    return PatellaState(none, none, none, none, nan, nan, nan, nan, nan, status)

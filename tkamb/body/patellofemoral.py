@@ -3,39 +3,57 @@
 Everything is in the patellar joint's frame: the femur's, x anterior, y superior, z right;
 the patella moves in it in the sagittal plane only (x, y, rotation about z).
 
-A patella in its groove touches two facets, to the left and to the right of it. Each facet
-has its own closest points (python-fcl), gap g and unit normal n out of the femur. How the
-contact force is shared between them, lambda on the left and 1 - lambda on the right, follows
-from a patella that may yield mediolaterally by c times the lateral part of that share:
+The joint side of the button is sampled. Sample i has the signed distance d_i from the
+femoral component, there the nearest point p_i and its normal n_i. The single closest point
+of two faceted, nearly conforming surfaces jumps by centimetres from frame to frame; so the
+contact is the mean over a thin patch, with weights w_i ~ exp(-d_i/tau), for the samples on
+either side of the patella's middle:
 
-    gap = min over 0 <= lambda <= 1 of  lambda g_l + (1 - lambda) g_r + (c/2) n_z²,
-    n = lambda n_l + (1 - lambda) n_r
+    g = sum w_i d_i - tau,    p = sum w_i p_i,    n = sum w_i n_i
 
-For c -> 0 this is the nearer facet alone; for c -> infinity both facets press with no net
-lateral force. In between the line of action moves smoothly from frame to frame, where the
-single closest point would jump across the groove. The sagittal part of n is the direction
-of the patellofemoral force; its lateral part and tilting are not modelled.
+For a paraboloid of any curvature g is the distance of the closest points, exactly. A patella
+in its groove touches on its left and on its right. How the force is shared, lambda on the
+left and 1 - lambda on the right, follows from soft tissue that lets the patella shift by c
+times the lateral force and tilt by d times the tilting moment, per unit contact force:
+
+    gap = min over 0 <= lambda <= 1 of
+          lambda g_l + (1 - lambda) g_r + (c/2) n_z² + (d/2) a²
+    n_z = lambda n_lz + (1 - lambda) n_rz      a = lambda z_l + (1 - lambda) z_r
+
+z measured from the patella's middle. The sagittal part of lambda n_l + (1 - lambda) n_r is
+the direction of the patellofemoral force. Shift and tilt are estimated to first order and
+reported, not carried out.
 """
 
 from dataclasses import dataclass
 
-import fcl
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.geometry.corner_normals import corner_normals, sharp_edges
-from tkamb.geometry.frames import Array, pose
-from tkamb.geometry.nearest import barycentric
+from tkamb.geometry.frames import Array, pose, transform
+from tkamb.geometry.nearest import NearestPoints, barycentric
+from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
-SKIN = 1e-3
-"""m: the button is shrunk by this before distances are taken, which makes the gap smooth
-through zero and valid down to -1 mm."""
+PATCH_DEPTH = 5e-5
+"""m: tau above; a contact of relative radius R is averaged over about sqrt(R tau)."""
+
+SAMPLE_SPACING = 1e-3
+"""m: spacing of the samples of the button, in the patella's coronal plane."""
+
+REACH = 20.0 * PATCH_DEPTH
+"""m: samples farther than this behind the nearest one weigh nothing (exp(-20))."""
+
+COARSE = 60
+"""Samples that a quick look takes."""
 
 LATERAL_YIELD = 0.01
-"""m: c above, the patella's mediolateral travel if its contact force were purely lateral."""
+"""m: c above, the shift if the contact force were purely lateral."""
+
+TILT_YIELD = 10.0
+"""rad/m: d above, the tilt (5.7 deg) if the whole force acted 10 mm beside the middle."""
 
 EDGE_MARGIN = 0.02
 """Barycentric distance from a sharp edge within which a point lies on it."""
@@ -50,39 +68,35 @@ class PatellarContact:
         point: (3,) m, on the line of action, at the height of the facets' contact points.
         normal: (3,) unit, in the sagittal plane, out of the femur into the patella.
         share_left: lambda, the share of the facet on the -z side.
-        lateral: z component of the shared normal, 0 where the facets balance.
-        at_edge: the femoral point lies on a sharp or open edge of the mesh.
+        shift: m along z, by which soft tissue would let the patella yield; first order.
+        tilt: rad about y, likewise.
+        on_edge: share of the force on sharp or open edges of the femoral mesh.
     """
 
     gap: float
     point: Array
     normal: Array
     share_left: float
-    lateral: float
-    at_edge: bool
-
-
-@dataclass(frozen=True, eq=False)
-class _Facet:
-    """The femoral component on one side of the groove."""
-
-    collision: fcl.CollisionObject
-    triangles: Array
-    corner_normals: Array
-    sharp: NDArray[np.bool_]
+    shift: float
+    tilt: float
+    on_edge: float
 
 
 class PatellofemoralContact:
-    """Closest points between button and femoral component.
+    """Contact between button and femoral component, prepared for many positions.
+
+    Distances of samples that cannot matter are carried over from the position before, with
+    what the samples have moved since as a bound: this saves time and changes nothing.
 
     Args:
         femoral: femoral component in the patellar joint's frame; triangles share vertices.
         patellar: button in the patella's frame, x anterior: its joint side faces -x.
-        ml: m, z of the patella's frame in the joint's frame: also where the groove is split.
+        ml: m, z of the patella's frame in the joint's frame.
         lateral_yield: m, c in the module's equation.
+        tilt_yield: rad/m, d in the module's equation.
 
     Raises:
-        InputError: the femoral component lies on one side of the patella only.
+        InputError: the button has no surface that faces the femur on both sides.
     """
 
     def __init__(
@@ -91,10 +105,18 @@ class PatellofemoralContact:
         patellar: Surface,
         ml: float = 0.0,
         lateral_yield: float = LATERAL_YIELD,
+        tilt_yield: float = TILT_YIELD,
     ) -> None:
-        self.ml, self.lateral_yield = ml, lateral_yield
-        self._facets = [_facet(femoral, side) for side in _split(femoral, ml)]
-        self._button = fcl.CollisionObject(_tree(_shrunk(patellar)), fcl.Transform())
+        self.ml, self._yield = ml, np.array([lateral_yield, tilt_yield])
+        self._nearest = NearestPoints(femoral)
+        self._corner_normals, self._sharp = corner_normals(femoral), sharp_edges(femoral)
+        self._samples = _joint_side(patellar)
+        self._left: NDArray[np.bool_] = np.asarray(self._samples[:, 2] < 0.0)
+        count = len(self._samples)
+        self._seen_at = np.full((count, 3), np.inf)
+        self._distance = np.zeros(count)
+        self._foot, self._normal = np.zeros((count, 3)), np.zeros((count, 3))
+        self._on_edge = np.zeros(count)
 
     def pose(self, coordinates: Array) -> Array:
         """Return pose_patella_in_joint (4, 4) at (ap, si, rotation), m and rad."""
@@ -103,42 +125,98 @@ class PatellofemoralContact:
         return pose([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], [ap, si, self.ml])
 
     def at(self, coordinates: Array) -> PatellarContact:
-        """Return the contact at (ap, si, rotation), m and rad.
-
-        A button deeper in than the skin is drawn out anteriorly until its closest points
-        exist, and the gap is continued linearly from there: a bridge for the search only.
-        """
-        here = self.pose(np.asarray(coordinates, float))
-        outward = here[:3, 0]
-        for drawn in SKIN * np.concatenate([[0.0], np.geomspace(1.0, 60.0, 14)]):
-            self._button.setTransform(fcl.Transform(here[:3, :3], here[:3, 3] + drawn * outward))
-            found = [_closest(facet, self._button) for facet in self._facets]
-            if all(f[0] > 0.0 for f in found):
-                return self._shared(found, drawn * outward)
-        return self._shared([(max(f[0], 1e-9), *f[1:]) for f in found], drawn * outward)
-
-    def _shared(
-        self, found: list[tuple[float, Array, Array, bool]], drawn: Array
-    ) -> PatellarContact:
-        gaps = np.array([f[0] - SKIN - f[2] @ drawn for f in found])
-        points, normals = np.array([f[1] for f in found]), np.array([f[2] for f in found])
-        left = _share_left(gaps, normals[:, 2], self.lateral_yield)
+        """Return the contact at (ap, si, rotation), m and rad."""
+        self._measure(transform(self.pose(np.asarray(coordinates, float)), self._samples))
+        sides = [self._side(self._left), self._side(~self._left)]
+        gaps, points, normals, edges = (np.array(part) for part in zip(*sides, strict=True))
+        out_of_plane = np.stack([normals[:, 2], points[:, 2] - self.ml])
+        left = _share_left(gaps, out_of_plane, self._yield)
         weights = np.array([left, 1.0 - left])
-        force = weights @ normals
-        gap = weights @ gaps + 0.5 * self.lateral_yield * force[2] ** 2
-        point = _on_line_of_action(weights, points, normals)
+        force, sideways = weights @ normals, out_of_plane @ weights
         sagittal = np.array([force[0], force[1], 0.0])
-        edge = bool(found[0][3]) if left > 0.5 else bool(found[1][3])
-        unit = sagittal / np.linalg.norm(sagittal)
-        return PatellarContact(float(gap), point, unit, float(left), float(force[2]), edge)
+        shift, tilt = self._yield * sideways
+        return PatellarContact(
+            gap=float(weights @ gaps + 0.5 * self._yield @ sideways**2),
+            point=_on_line_of_action(weights, points, normals),
+            normal=sagittal / np.linalg.norm(sagittal),
+            share_left=left,
+            shift=float(shift),
+            tilt=float(tilt),
+            on_edge=float(weights @ edges),
+        )
+
+    def touches(self, coordinates: Array) -> bool:
+        """Return whether a few of the samples lie in the femur: a quick look for searches."""
+        few = self._samples[:: max(1, len(self._samples) // COARSE)]
+        here = transform(self.pose(np.asarray(coordinates, float)), few)
+        near = self._nearest.at(here)
+        apart = np.einsum("ij,ij->i", here - near.points, near.normals)
+        return bool((apart < 0.0).any())
+
+    def _measure(self, here: Array) -> None:
+        """Bring the distances up to date wherever they could matter."""
+        moved = np.linalg.norm(here - self._seen_at, axis=1)
+        for side in (self._left, ~self._left):
+            lower = np.where(np.isfinite(moved), self._distance - moved, -np.inf)
+            first = np.flatnonzero(side)[np.argmin(lower[side])]
+            self._look(here, np.array([first]))
+            moved[first] = 0.0
+            reach = self._distance[first] + REACH
+            stale = np.flatnonzero(side & (moved > 0.0) & (lower < reach))
+            self._look(here, stale)
+
+    def _look(self, here: Array, which: NDArray[np.int64]) -> None:
+        if len(which) == 0:
+            return
+        near = self._nearest.at(here[which])
+        weights = barycentric(self._nearest.surface.triangles[near.faces], near.points)
+        on_edge = np.asarray((self._sharp[near.faces] & (weights < EDGE_MARGIN)).any(axis=1))
+        smooth = np.einsum("ij,ijk->ik", weights, self._corner_normals[near.faces])
+        outward = np.where(on_edge[:, None], near.normals, smooth)
+        apart = here[which] - near.points
+        sign = np.where(np.einsum("ij,ij->i", apart, outward) < 0.0, -1.0, 1.0)
+        self._seen_at[which], self._foot[which] = here[which], near.points
+        self._distance[which] = sign * near.distance
+        self._normal[which] = outward / np.linalg.norm(outward, axis=1, keepdims=True)
+        self._on_edge[which] = on_edge
+
+    def _side(self, side: NDArray[np.bool_]) -> tuple[float, Array, Array, float]:
+        """Return g, p, n and the share on edges of one side."""
+        distance = self._distance[side]
+        weights = np.exp(-(distance - distance.min()) / PATCH_DEPTH)
+        weights /= weights.sum()
+        gap = float(weights @ distance) - PATCH_DEPTH
+        edge = float(weights @ self._on_edge[side])
+        return gap, weights @ self._foot[side], weights @ self._normal[side], edge
 
 
-def _share_left(gaps: Array, lateral: Array, lateral_yield: float) -> float:
+def _joint_side(patellar: Surface) -> Array:
+    """Return samples (n, 3) of the surface that a view along the patella's +x shows."""
+    low, high = patellar.bounds
+    axes = [np.arange(low[k] + 0.5 * SAMPLE_SPACING, high[k], SAMPLE_SPACING) for k in (1, 2)]
+    y, z = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
+    start = np.column_stack([np.full(len(y), low[0] - SAMPLE_SPACING), y, z])
+    distance, _ = RayCaster(patellar).first(start, np.array([1.0, 0.0, 0.0]))
+    hit = np.isfinite(distance)
+    samples = start[hit] + distance[hit, None] * np.array([1.0, 0.0, 0.0])
+    if not ((samples[:, 2] < 0.0).any() and (samples[:, 2] >= 0.0).any()):
+        raise InputError(
+            "does not lie on both sides of the patella's sagittal plane",
+            patellar.name,
+            "check the mesh's unit, axes and position on the patella",
+        )
+    return samples
+
+
+def _share_left(gaps: Array, out_of_plane: Array, yields: Array) -> float:
     """Return the minimiser lambda of the module's equation."""
-    difference, slope = gaps[0] - gaps[1], lateral[0] - lateral[1]
-    if abs(slope) < 1e-6:
+    slope = out_of_plane[:, 0] - out_of_plane[:, 1]
+    curvature = yields @ slope**2
+    difference = gaps[0] - gaps[1]
+    if curvature < 1e-12:
         return float(difference < 0.0)
-    return float(np.clip(-(lateral[1] + difference / (lateral_yield * slope)) / slope, 0.0, 1.0))
+    least = -(difference + (yields * slope) @ out_of_plane[:, 1]) / curvature
+    return float(np.clip(least, 0.0, 1.0))
 
 
 def _on_line_of_action(weights: Array, points: Array, normals: Array) -> Array:
@@ -148,62 +226,4 @@ def _on_line_of_action(weights: Array, points: Array, normals: Array) -> Array:
     arms = points - mean
     moment = (arms[:, 0] * forces[:, 1] - arms[:, 1] * forces[:, 0]).sum()
     shift = moment / (resultant @ resultant) * np.array([resultant[1], -resultant[0]])
-    return mean + np.append(shift, 0.0)
-
-
-def _split(femoral: Surface, ml: float) -> list[NDArray[np.int64]]:
-    """Return the faces of either side; those that straddle the plane belong to both."""
-    z = femoral.triangles[:, :, 2] - ml
-    sides = [np.flatnonzero((side * z > 0.0).any(axis=1)) for side in (-1.0, 1.0)]
-    if any(len(faces) == 0 for faces in sides):
-        raise InputError(
-            "the femoral component lies on one side of the patella only",
-            femoral.name,
-            "check the patella's ML position and the component's place on the femur",
-        )
-    return sides
-
-
-def _facet(femoral: Surface, faces: NDArray[np.int64]) -> _Facet:
-    part = Surface(femoral.vertices, femoral.faces[faces], femoral.name)
-    return _Facet(
-        fcl.CollisionObject(_tree(part), fcl.Transform()),
-        femoral.triangles[faces],
-        corner_normals(femoral)[faces],
-        sharp_edges(femoral)[faces],
-    )
-
-
-def _shrunk(patellar: Surface) -> Surface:
-    mesh = trimesh.Trimesh(patellar.vertices, patellar.faces, process=True, validate=False)
-    return Surface(
-        np.asarray(mesh.vertices - SKIN * mesh.vertex_normals),
-        np.asarray(mesh.faces),
-        patellar.name,
-    )
-
-
-def _tree(surface: Surface) -> fcl.BVHModel:
-    tree = fcl.BVHModel()
-    tree.beginModel(len(surface.faces), len(surface.vertices))
-    tree.addSubModel(surface.vertices, surface.faces)
-    tree.endModel()
-    return tree
-
-
-def _closest(facet: _Facet, button: fcl.CollisionObject) -> tuple[float, Array, Array, bool]:
-    """Return distance, femoral point, unit normal out of the femur, and whether on an edge.
-
-    The normal is interpolated from the corners' normals, which is one order smoother than
-    the direction between the closest points of two faceted surfaces; on an edge that
-    direction is taken, which is then the truth.
-    """
-    request, result = fcl.DistanceRequest(enable_nearest_points=True), fcl.DistanceResult()
-    distance = fcl.distance(facet.collision, button, request, result)
-    on_femur, on_button = (np.array(p, float) for p in result.nearest_points)
-    weights = barycentric(facet.triangles[result.b1][None], on_femur[None])[0]
-    edge = bool((weights[facet.sharp[result.b1]] < EDGE_MARGIN).any())
-    normal = weights @ facet.corner_normals[result.b1]
-    if edge and distance > 0.0:
-        normal = on_button - on_femur
-    return float(distance), on_femur, normal / np.linalg.norm(normal), edge
+    return np.asarray(mean + np.append(shift, 0.0))

@@ -1,0 +1,232 @@
+"""The solved patella against the exact three-force solution on a circular trochlea."""
+
+import fcl
+import numpy as np
+import pytest
+import trimesh
+from scipy.optimize import fsolve
+
+from tkamb.body.patella import (
+    ExtensorMechanism,
+    PatellaState,
+    PatellaStatus,
+    patella_at,
+    solve_patella,
+)
+from tkamb.body.patellofemoral import PatellofemoralContact
+from tkamb.geometry.frames import Array, inverse, knee_pose, transform
+from tkamb.geometry.surface import Surface
+
+TROCHLEA, DOME = 0.025, 0.02
+CENTRE = np.array([0.004, 0.0, 0.0])
+ORIGIN, INSERTION = np.array([0.028, 0.22, 0.0]), np.array([0.008, 0.02, 0.0])
+PROXIMAL, TUBEROSITY = np.array([0.006, -0.02, 0.0]), np.array([0.04, -0.065, 0.0])
+LENGTH = 0.065
+
+
+def surface(mesh: trimesh.Trimesh, name: str) -> Surface:
+    return Surface(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64), name)
+
+
+def dome() -> Surface:
+    """A spherical cap that faces -x, its sphere about CENTRE in the patella's frame."""
+    mesh = trimesh.creation.icosphere(subdivisions=5, radius=DOME)
+    vertices = np.array(mesh.vertices)
+    vertices[:, 0] = np.minimum(vertices[:, 0], 0.004)
+    return surface(trimesh.Trimesh(vertices + CENTRE, mesh.faces, process=False), "button")
+
+
+def cylinder() -> Surface:
+    return surface(trimesh.creation.cylinder(TROCHLEA, 0.08, sections=360), "trochlea")
+
+
+def groove(half_angle: float = 1.3) -> Surface:
+    """A V-shaped trochlea: two cones of revolution about z that meet in the groove."""
+    slope = 1.0 / np.tan(half_angle)
+    z = np.array([0.0, 0.02, 0.02, -0.02, -0.02])
+    r = np.array([0.02, 0.02 + 0.02 * slope, 0.0, 0.0, 0.02 + 0.02 * slope])
+    around = np.linspace(0.0, 2 * np.pi, 361)[:-1]
+    ring = np.stack([np.cos(around), np.sin(around)], axis=1)
+    vertices = np.array(
+        [[rk * c, rk * s, zk] for rk, zk in zip(r, z, strict=True) for c, s in ring]
+    )
+    faces = []
+    for k in range(5):
+        a, b = k * 360 + np.arange(360), ((k + 1) % 5) * 360 + np.arange(360)
+        faces += [
+            np.column_stack([a, np.roll(a, -1), b]),
+            np.column_stack([np.roll(a, -1), np.roll(b, -1), b]),
+        ]
+    mesh = trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
+    if mesh.volume < 0:
+        mesh.invert()
+    return surface(mesh, "groove")
+
+
+@pytest.fixture(scope="module")
+def mechanism() -> ExtensorMechanism:
+    return ExtensorMechanism(
+        PatellofemoralContact(cylinder(), dome()),
+        np.eye(4),
+        ORIGIN,
+        INSERTION,
+        PROXIMAL,
+        TUBEROSITY,
+        LENGTH,
+    )
+
+
+def knee_at(flexion_deg: float) -> Array:
+    return knee_pose([0.0, TROCHLEA, 0.0, 0.0, 0.0, np.deg2rad(flexion_deg)])
+
+
+def three_force(flexion_deg: float, guess: Array) -> tuple[Array, float, float]:
+    """Return coordinates, PL/Q and PF/Q of three concurrent forces, in closed form."""
+    tuberosity = transform(inverse(knee_at(flexion_deg)), TUBEROSITY)[:2]
+
+    def place(unknown: Array) -> tuple[Array, Array, Array, Array]:
+        angle, rotation = unknown
+        out = np.array([np.cos(angle), np.sin(angle)])
+        turn = np.array(
+            [[np.cos(rotation), -np.sin(rotation)], [np.sin(rotation), np.cos(rotation)]]
+        )
+        at = (TROCHLEA + DOME) * out - turn @ CENTRE[:2]
+        return at, out, at + turn @ INSERTION[:2], at + turn @ PROXIMAL[:2]
+
+    def errors(unknown: Array) -> list[float]:
+        _, out, insertion, proximal = place(unknown)
+        pull, hold = ORIGIN[:2] - insertion, tuberosity - proximal
+        meet = (
+            insertion
+            + pull * np.linalg.solve(np.column_stack([pull, -hold]), proximal - insertion)[0]
+        )
+        return [100 * (np.linalg.norm(hold) - LENGTH), 100 * (meet[0] * out[1] - meet[1] * out[0])]
+
+    at_guess = guess[:2] + CENTRE[:2]
+    angle, rotation = fsolve(errors, [np.arctan2(at_guess[1], at_guess[0]), guess[2]], xtol=1e-13)
+    at, out, insertion, proximal = place(np.array([angle, rotation]))
+    pull, hold = ORIGIN[:2] - insertion, tuberosity - proximal
+    pull, hold = pull / np.linalg.norm(pull), hold / np.linalg.norm(hold)
+    ligament, normal = np.linalg.solve(np.column_stack([hold, out]), -pull)
+    return np.append(at, rotation), float(ligament), float(normal)
+
+
+def solved(mechanism: ExtensorMechanism, angles: list[float]) -> list[PatellaState]:
+    states: list[PatellaState] = []
+    for angle in angles:
+        guess = states[-1].coordinates if states else None
+        states.append(solve_patella(mechanism, knee_at(angle), guess))
+    return states
+
+
+def test_circular_trochlea_is_the_three_force_solution(mechanism: ExtensorMechanism) -> None:
+    angles = [0.0, 10.0, 20.0, 30.0, 40.0]
+    states = solved(mechanism, angles)
+    assert all(state.status is PatellaStatus.OK for state in states)
+    for angle, state in zip(angles, states, strict=True):
+        exact, ligament, normal = three_force(angle, state.coordinates)
+        assert np.abs(state.coordinates[:2] - exact[:2]).max() < 5e-5
+        assert abs(state.coordinates[2] - exact[2]) < np.deg2rad(0.15)
+        assert state.ligament_ratio == pytest.approx(ligament, rel=3e-3)
+        assert state.patellofemoral_ratio == pytest.approx(normal, rel=3e-3)
+
+
+def test_contact_moves_superior_on_the_patella(mechanism: ExtensorMechanism) -> None:
+    height = [s.contact_on_patella[1] for s in solved(mechanism, [0.0, 10.0, 20.0, 30.0, 40.0])]
+    assert (np.diff(height) > 0.0).all()
+
+
+def test_conditions_hold_and_guess_does_not_matter(mechanism: ExtensorMechanism) -> None:
+    cold = solve_patella(mechanism, knee_at(25.0))
+    guess = cold.coordinates + np.array([1e-3, -1e-3, 0.05])
+    warm = solve_patella(mechanism, knee_at(25.0), guess)
+    assert np.abs(warm.coordinates - cold.coordinates).max() < 1e-5
+    assert abs(cold.gap) < 1e-7
+    pose = mechanism.contact.pose(cold.coordinates)
+    tuberosity = transform(inverse(knee_at(25.0)), TUBEROSITY)
+    assert np.linalg.norm(transform(pose, PROXIMAL) - tuberosity) == pytest.approx(LENGTH, abs=1e-7)
+
+
+def test_quadriceps_is_shortest_there(mechanism: ExtensorMechanism) -> None:
+    """Virtual work: turning the patella with contact and ligament kept lengthens the muscle."""
+    from tkamb.body.patella import _Frame
+
+    state = solve_patella(mechanism, knee_at(25.0))
+    frame = _Frame(mechanism, knee_at(25.0))
+    turn = np.deg2rad(4.0)
+    lengths = []
+    for step in (-turn, 0.0, turn):
+        balance = frame.settled(state.coordinates, float(state.coordinates[2] + step))
+        assert balance is not None
+        lengths.append(balance.quadriceps.length)
+    assert lengths[1] < min(lengths[0], lengths[2])
+    slope = (lengths[2] - lengths[0]) / (2 * turn)
+    curvature = (lengths[2] - 2 * lengths[1] + lengths[0]) / turn**2
+    assert abs(slope / curvature) < np.deg2rad(0.3)
+
+
+def test_gap_is_the_distance_of_the_closest_points() -> None:
+    """Against python-fcl, apart by 0.2-2 mm, dome on cylinder."""
+    contact = PatellofemoralContact(cylinder(), dome())
+    trees = []
+    for part in (cylinder(), dome()):
+        tree = fcl.BVHModel()
+        tree.beginModel(len(part.vertices), len(part.faces))
+        tree.addSubModel(part.vertices, part.faces)
+        tree.endModel()
+        trees.append(tree)
+    for gap in (2e-4, 1e-3, 2e-3):
+        for angle in (-0.5, 0.0, 0.4):
+            out = np.array([np.cos(angle), np.sin(angle)])
+            at = np.append((TROCHLEA + DOME + gap) * out - [0.004, 0.0], 0.0)
+            pose = contact.pose(at)
+            button = fcl.CollisionObject(trees[1], fcl.Transform(pose[:3, :3], pose[:3, 3]))
+            distance = fcl.distance(fcl.CollisionObject(trees[0]), button)
+            assert contact.at(at).gap == pytest.approx(distance, abs=1.5e-5)
+            assert contact.at(at).normal[:2] == pytest.approx(out, abs=5e-3)
+
+
+def test_gap_is_smooth_through_touch() -> None:
+    contact = PatellofemoralContact(cylinder(), dome())
+    x = TROCHLEA + DOME - 0.004 + np.linspace(-5e-4, 5e-4, 21)
+    gap = np.array([contact.at(np.array([xi, 0.0, 0.0])).gap for xi in x])
+    assert np.diff(gap) == pytest.approx(np.diff(x), rel=1e-3)
+
+
+def test_groove_shares_the_force_and_never_jumps() -> None:
+    """Centred: half each, no lateral force. Off centre: the share moves, smoothly."""
+    shares, normals = [], []
+    for beside in np.linspace(-2e-3, 2e-3, 21):
+        contact = PatellofemoralContact(groove(), dome(), ml=float(beside))
+        found = contact.at(np.array([0.0368, 0.0, 0.0]))
+        shares.append(found.share_left)
+        normals.append(found.normal)
+    assert shares[10] == pytest.approx(0.5, abs=0.01)
+    assert np.abs(np.diff(shares)).max() < 0.25
+    assert np.abs(np.diff(normals, axis=0)).max() < 0.02
+    assert (np.diff(shares) * (shares[-1] - shares[0]) >= -1e-6).all()
+
+
+def test_recorded_patella_keeps_its_gap(mechanism: ExtensorMechanism) -> None:
+    place = np.array([TROCHLEA + DOME - 0.004 + 1e-3, 0.0, 0.0])
+    state = patella_at(mechanism, knee_at(0.0), place)
+    assert state.gap == pytest.approx(1e-3, abs=1e-5)
+    assert (state.coordinates == place).all()
+
+
+def test_ligament_too_short_to_reach_is_not_found(mechanism: ExtensorMechanism) -> None:
+    short = ExtensorMechanism(**{**vars(mechanism), "ligament_length": 0.005})
+    state = solve_patella(short, knee_at(20.0))
+    assert state.status is PatellaStatus.NOT_FOUND
+    assert np.isnan(state.coordinates).all()
+
+
+def test_end_of_the_femoral_mesh_is_reported(mechanism: ExtensorMechanism) -> None:
+    """The trochlea ends at y = -5 mm: contact beyond it is on the mesh's edge."""
+    whole = cylinder()
+    kept = whole.faces[(whole.triangles[:, :, 1] > -5e-3).all(axis=1)]
+    contact = PatellofemoralContact(Surface(whole.vertices, kept, "cut"), dome())
+    cut = ExtensorMechanism(**{**vars(mechanism), "contact": contact})
+    states = [solve_patella(cut, knee_at(angle)) for angle in (0.0, 40.0)]
+    assert states[0].status is PatellaStatus.OK
+    assert states[1].status in (PatellaStatus.EDGE, PatellaStatus.NOT_FOUND)
