@@ -10,8 +10,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from synthetic_run import make_run
 
+from synthetic_run import make_run
 from tkamb.columns import COLUMNS, columns_as_markdown, is_ligament, ligament_of
 from tkamb.errors import InputError
 from tkamb.output.maps_file import ContactMaps, MapWriter, read_maps, write_maps

@@ -40,7 +40,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("flexion_deg", "knee flexion (Grood-Suntay)"),
     Column("adduction_deg", "knee adduction, positive: varus"),
     Column("axial_rotation_deg", "positive: the femur rotates externally on the tibia"),
-    Column("force_si_N", "contact force on the femur, no residuals: insert y, compression > 0"),
+    Column("force_si_N", "contact force on the insert, no residuals: along -y, compression > 0"),
     Column("force_ap_N", "the same, insert x"),
     Column("force_ml_N", "the same, insert z"),
     Column("force_total_N", "magnitude of that force"),

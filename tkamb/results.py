@@ -17,6 +17,8 @@ from tkamb.geometry.frames import Array
 from tkamb.output.atomic import claim_directory, write_text
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from tkamb.output.maps_file import ContactMaps
 
 __all__ = ["COLUMNS", "Results", "claim_directory", "read_results", "write_results"]
@@ -69,6 +71,27 @@ class Results:
             for name, values in self.columns.items()
             if KINDS.get(name) != "text" and bool(np.isnan(values).all())
         )
+
+    def plot(self, *names: str, axis: str | None = None) -> "Figure":
+        """Return plots of the run in one matplotlib figure, which notebooks show.
+
+        Args:
+            names: ids of the report's plots ("forces", "condyles", "pressures", ...);
+                default: forces, condyles, ratios and pressures.
+            axis: "flexion", "cycle" or "time"; default: as the scene asks.
+
+        Raises:
+            InputError: a plot or an axis that does not exist.
+        """
+        from tkamb.output.plots import plot
+
+        return plot(self, names, axis)
+
+    def _repr_html_(self) -> str:
+        """Return the report's headline numbers, for notebooks."""
+        from tkamb.output.report import headline_html
+
+        return headline_html(self)
 
     def write_csv(self, path: str | Path) -> None:
         """Write results.csv, whole or not at all; NaN is an empty cell.

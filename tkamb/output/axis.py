@@ -76,8 +76,8 @@ def round_step(step: float) -> float:
 def horizontal_axis(results: Results, kind: str | None = None) -> HorizontalAxis:
     """Return the axis that the summary's `axis` (or `kind`) asks for.
 
-    Per cent of the cycle are counted from `cycle_percent_s` = (time of 0 %, time of 100 %),
-    or over the whole motion when the summary has none.
+    Per cent of the cycle are the column of that name; without it they are counted from the
+    summary's `cycle_percent_s` = (time of 0 %, time of 100 %), or over the whole motion.
 
     Raises:
         InputError: an axis that does not exist.
@@ -90,6 +90,9 @@ def horizontal_axis(results: Results, kind: str | None = None) -> HorizontalAxis
         return HorizontalAxis(kind, time)
     if kind != "cycle":
         raise InputError(f"there is no axis '{kind}'", "axis", f"one of {', '.join(LABELS)}")
+    percent = results["cycle_percent"]
+    if np.isfinite(percent).all():
+        return HorizontalAxis(kind, percent)
     start, end = results.summary.get("cycle_percent_s") or (time[0], time[-1])
     percent = 100 * (time - start) / (end - start)
     if percent.max() > 100 + 1e-6 or percent.min() < -1e-6:

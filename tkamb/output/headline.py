@@ -98,10 +98,10 @@ def _peak_pressure(results: Results, axis: HorizontalAxis) -> Card | None:
         if above.value > 0:
             detail += (
                 f"; up to {100 * above.value:.0f} % of the {above.side} area "
-                f"is above yield ({stress:g} MPa)"
+                f"is above yield ({stress:g}\u00a0MPa)"
             )
         else:
-            detail += f"; never above yield ({stress:g} MPa)"
+            detail += f"; never above yield ({stress:g}\u00a0MPa)"
     return Card("Peak contact pressure", f"{found.value:.1f} MPa", detail)
 
 
@@ -136,7 +136,7 @@ def _frames(results: Results) -> Card:
     flagged = int(metrics.flagged(results).sum())
     value = f"{len(results) - failed} of {len(results)}"
     if failed or flagged:
-        detail = f"{failed} failed and hold no numbers; {flagged} more to be read with care (below)"
+        detail = f"{failed} failed (no numbers); {flagged} others to be read with care, see below"
     else:
         detail = "none failed, none flagged"
     return Card("Frames computed", value, detail, bool(failed or flagged))

@@ -42,11 +42,6 @@ def body_weight(results: Results) -> float:
     return float(mass) * STANDARD_GRAVITY
 
 
-def has(results: Results, *names: str) -> bool:
-    """Return whether any of the columns holds a number."""
-    return any(name in results.columns and bool(np.isfinite(results[name]).any()) for name in names)
-
-
 def peak(results: Results, column: str) -> Peak | None:
     """Return the largest value of a column, or of its two sides for "<side>_..."."""
     sides = SIDES if column.startswith("<side>") else ("",)
@@ -90,8 +85,9 @@ def residual_share(results: Results) -> Array:
 
 
 def failed(results: Results) -> NDArray[np.bool_]:
-    """Return which frames (f,) were not ok and have no contact force."""
-    return ~_clean(results) & np.isnan(results["force_total_N"])
+    """Return which frames (f,) say that they failed, or are not ok and have no contact force."""
+    said = np.array([status.startswith("failed") for status in results.status], bool)
+    return said | (~_clean(results) & np.isnan(results["force_total_N"]))
 
 
 def flagged(results: Results) -> NDArray[np.bool_]:
@@ -101,16 +97,3 @@ def flagged(results: Results) -> NDArray[np.bool_]:
 
 def _clean(results: Results) -> NDArray[np.bool_]:
     return np.array([status == "ok" for status in results.status], bool)
-
-
-def status_runs(results: Results) -> list[tuple[int, int, str]]:
-    """Return (first frame, last frame, status) of each stretch of frames that are not ok."""
-    runs: list[tuple[int, int, str]] = []
-    for frame, status in enumerate(results.status):
-        if status == "ok":
-            continue
-        if runs and runs[-1][1] == frame - 1 and runs[-1][2] == status:
-            runs[-1] = (runs[-1][0], frame, status)
-        else:
-            runs.append((frame, frame, status))
-    return runs

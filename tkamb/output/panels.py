@@ -45,6 +45,8 @@ class Panel:
         level: (value, label) of a horizontal reference line.
         second: (factor, unit) of a second vertical axis on the right.
         logarithmic: vertical axis.
+        from_zero: the vertical axis holds zero.
+        limits: of the vertical axis, where they are known beforehand.
     """
 
     name: str
@@ -55,6 +57,8 @@ class Panel:
     level: tuple[float, str] | None = None
     second: tuple[float, str] | None = None
     logarithmic: bool = False
+    from_zero: bool = True
+    limits: tuple[float, float] | None = None
 
 
 def panels(results: Results) -> tuple[Panel, ...]:
@@ -111,8 +115,9 @@ def _both_sides(
 def _total(results: Results) -> Panel:
     scale = 1 / body_weight(results)
     total = Line("force_total_BW", "total", results["force_total_BW"], BLACK)
-    lines = (total, *_components(results, "force", "N", scale))
-    note = "On the femur, along the insert axes. Residuals are not included."
+    parts = _components(results, "force", "N", scale)
+    lines = (total, replace(parts[0], label="superior–inferior", dashed=True), *parts[1:])
+    note = "On the insert; SI positive in compression. Residuals are not included."
     return Panel("forces", "Tibiofemoral contact force", "BW", lines, note)
 
 
@@ -134,8 +139,8 @@ def _share(results: Results) -> Panel:
         Line("deformation", "by deformation", medial_share(results, "deformation"), BLACK),
         Line("equilibrium", "by equilibrium", medial_share(results, "equilibrium"), PURPLE, True),
     )
-    title = "Medial share of the load"
-    return Panel("share", title, "medial / (medial + lateral)", lines, level=(0.5, "even"))
+    title, unit = "Medial share of the load", "medial / (medial + lateral)"
+    return Panel("share", title, unit, lines, level=(0.5, "even"), limits=(0.0, 1.0))
 
 
 def _extensor(results: Results) -> Panel:
@@ -164,6 +169,13 @@ def _areas(results: Results) -> Panel:
     return Panel("areas", "Contact area", "mm²", _both_sides(results, "area_mm2"))
 
 
+def centre_panel(results: Results) -> Panel:
+    """Return the anterior positions of the centres of pressure over the motion."""
+    lines = _both_sides(results, "cop_ap_mm")
+    title = "Anterior position of the centres of pressure"
+    return Panel("centres", title, "mm", lines, "Insert x; zero is the middle of its bottom.")
+
+
 def _pressures(results: Results) -> Panel:
     lines = (
         *_both_sides(results, "peak_pressure_MPa", ", peak"),
@@ -176,6 +188,8 @@ def _pressures(results: Results) -> Panel:
 
 def _yield(results: Results) -> Panel:
     lines = _both_sides(results, "area_above_yield", scale=100)
+    if not any(np.nanmax(line.values, initial=0) > 0 for line in lines):
+        lines = ()
     return Panel("above_yield", "Contact area above yield", "% of the condyle's area", lines)
 
 
@@ -273,4 +287,4 @@ def _condition(results: Results) -> Panel:
     lines = (_line(results, "condition_number", "condition number", BLACK),)
     note = "How much an input error may grow in the solution (scaled columns)."
     title = "Condition number of the equilibrium"
-    return Panel("condition", title, "–", lines, note, logarithmic=True)
+    return Panel("condition", title, "–", lines, note, logarithmic=True, from_zero=False)

@@ -5,15 +5,23 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, MultipleLocator
+from matplotlib.ticker import (
+    LogLocator,
+    MaxNLocator,
+    MultipleLocator,
+    NullFormatter,
+    StrMethodFormatter,
+)
 
+from tkamb.errors import InputError
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
 from tkamb.output.metrics import failed, flagged
-from tkamb.output.panels import Panel, panels
+from tkamb.output.panels import Panel, centre_panel, panels
 from tkamb.output.style import BLACK, GREY, ORANGE, legend_above, new_figure, settings
 from tkamb.results import Results
 
 WIDTH, HEIGHT = 5.4, 3.1
+DEFAULT = ("forces", "condyles", "ratios", "pressures")
 DASHES = (0, (4, 2))
 
 
@@ -42,10 +50,15 @@ def plot(results: Results, names: tuple[str, ...] = (), axis: str | None = None)
         axis: "flexion", "cycle" or "time"; default: as the scene asks.
 
     Raises:
-        InputError: an axis that does not exist.
+        InputError: a plot or an axis that does not exist.
     """
-    wanted = names or ("forces", "condyles", "ratios", "pressures")
-    chosen = [panel for panel in panels(results) if panel.name in wanted]
+    known = {panel.name: panel for panel in (*panels(results), centre_panel(results))}
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise InputError(
+            f"the run has no plot '{unknown[0]}'", "plot", f"it has {', '.join(known)}"
+        )
+    chosen = [known[name] for name in names or DEFAULT if name in known]
     horizontal = horizontal_axis(results, axis)
     with settings():
         rows = max(1, -(-len(chosen) // 2))
@@ -97,41 +110,44 @@ def _legend_columns(panel: Panel) -> int:
 
 def _dress(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:
     axes.set_xlabel(axis.label)
-    axes.set_ylabel(panel.unit)
+    axes.set_ylabel(panel.unit if panel.unit != "–" else "")
     low, high = float(np.min(axis.values)), float(np.max(axis.values))
     margin = 0.01 * (high - low) or 0.5
     axes.set_xlim(low - margin, high + margin)
     if axis.kind != "time" and high - low > 40:
         axes.xaxis.set_major_locator(MultipleLocator(20 if high - low > 70 else 10))
-    if panel.logarithmic:
-        axes.set_yscale("log")
-    else:
-        axes.yaxis.set_major_locator(MaxNLocator(6))
-        low, high = axes.get_ylim()
-        axes.set_ylim(low - 0.06 * (high - low), high)
-        if low < 0 < high:
-            axes.axhline(0, color=GREY, linewidth=0.8, zorder=1)
+    _scale_vertically(axes, panel)
     if panel.level:
         _draw_level(axes, *panel.level)
     if panel.second:
         _draw_second(axes, *panel.second)
 
 
+def _scale_vertically(axes: Axes, panel: Panel) -> None:
+    if panel.logarithmic:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        return
+    axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
+    values = [line.values[np.isfinite(line.values)] for line in panel.lines]
+    values.append(np.zeros(int(panel.from_zero)))
+    values.append(np.array(panel.level[:1] if panel.level else ()))
+    low, high = (float(f(np.concatenate(values))) for f in (np.min, np.max))
+    if panel.limits:
+        low, high = panel.limits
+    span = high - low if high > low else 1.0
+    axes.set_ylim(low - 0.06 * span, high + 0.04 * span)
+    if low < 0 < high or panel.from_zero:
+        axes.axhline(0, color=GREY, linewidth=0.8, zorder=1)
+
+
 def _draw_level(axes: Axes, value: float, label: str) -> None:
     axes.axhline(value, color=GREY, linewidth=1, linestyle=":", zorder=1, gid="level")
-    low, high = axes.get_ylim()
-    span = high - low
-    axes.set_ylim(min(low, value - 0.05 * span), max(high, value + 0.08 * span))
-    axes.text(
-        0.995,
-        value,
-        label,
-        transform=axes.get_yaxis_transform(),
-        ha="right",
-        va="bottom",
-        fontsize=8,
-        color=GREY,
-    )
+    transform = axes.get_yaxis_transform()
+    words = label.replace(" ", "\n", 1)
+    axes.text(1.01, value, words, transform=transform, va="center", fontsize=8, color=GREY)
 
 
 def _draw_second(axes: Axes, factor: float, unit: str) -> None:

@@ -72,6 +72,8 @@ class TopView:
         style: Any = {"fontsize": 7.5, "color": GREY, "transform": axes.transAxes}
         axes.text(0.0, -0.01, left, ha="left", va="top", **style)
         axes.text(1.0, -0.01, right, ha="right", va="top", **style)
+        axes.text(0.0, 1.0, "anterior ↑", ha="left", va="top", **style)
+        axes.text(1.0, 1.0, self.side[0].upper(), ha="right", va="top", **style)
         low = self.up.min() - 3.0
         axes.plot([-5, 5], [low, low], color=GREY, linewidth=2, clip_on=False)
         axes.text(0, low - 0.8, "10 mm", ha="center", va="top", fontsize=7, color=GREY)
@@ -85,21 +87,29 @@ def top_view(results: Results) -> TopView | None:
     return TopView(results.maps, side, lateral_axis_name(results))
 
 
+def map_rows(results: Results) -> dict[int, int]:
+    """Return frame -> row of the maps of the same time, for every frame that has a map."""
+    if results.maps is None:
+        return {}
+    whole = np.atleast_1d(np.isfinite(results.maps.pressure_Pa).all(axis=1))
+    row_at = {float(t): row for row, t in enumerate(results.maps.time_s) if whole[row]}
+    times = [float(time) for time in results["time_s"]]
+    return {frame: row_at[time] for frame, time in enumerate(times) if time in row_at}
+
+
 def mapped_frames(results: Results, axis: HorizontalAxis, count: int = 8) -> list[int]:
-    """Return frames with a pressure map, spread over the motion."""
-    if results.maps is None or len(results.maps) != len(results):
+    """Return at most `count` frames with a pressure map, spread over the motion."""
+    frames = np.array(sorted(map_rows(results)), int)
+    if not len(frames):
         return []
-    good = np.flatnonzero(np.isfinite(results.maps.pressure_Pa).all(axis=1))
-    if not len(good):
-        return []
-    return sorted({int(good[np.argmin(np.abs(good - frame))]) for frame in axis.stops(count)})
+    return sorted({int(frames[np.argmin(np.abs(frames - stop))]) for stop in axis.stops(count)})
 
 
 def draw_maps(
     results: Results, view: TopView, axis: HorizontalAxis, frames: Sequence[int]
 ) -> Figure:
     """Return pressure maps of these frames on one colour scale, 0 to the run's largest."""
-    pressure = _pressure(results)
+    pressure, rows = _pressure(results), map_rows(results)
     largest = float(np.nanmax(pressure))
     scale = Normalize(0.0, largest if largest > 0 else 1.0)
     across = min(4, len(frames))
@@ -110,7 +120,7 @@ def draw_maps(
         grid = figure.subplots(down, across, squeeze=False).ravel()
         for axes, frame in zip(grid, frames, strict=False):
             view.draw_insert(axes)
-            _draw_pressure(axes, view, pressure[frame], scale)
+            _draw_pressure(axes, view, pressure[rows[frame]], scale)
             _draw_centres(axes, view, results, frame)
             view.draw_labels(axes)
             axes.set_title(_caption(results, axis, frame), fontsize=8.5)
@@ -122,7 +132,7 @@ def draw_maps(
         stress = results.summary.get("yield_stress_MPa")
         if stress is not None and stress < float(scale.vmax or 1.0):
             bar.ax.axhline(stress, color="white", linewidth=1.5)
-            bar.ax.text(-0.2, stress, "yield", ha="right", va="center", fontsize=7.5)
+            bar.ax.text(-0.25, stress, "yield", ha="right", va="center", fontsize=7.5)
     return figure
 
 

@@ -6,13 +6,14 @@ from typing import Any
 
 from tkamb.output.atomic import write_text
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
+from tkamb.output.cursor import cursor_bar
 from tkamb.output.headline import cards
 from tkamb.output.metrics import body_weight, failed, flagged
-from tkamb.output.panels import panels
+from tkamb.output.panels import Panel, centre_panel, panels
 from tkamb.output.plots import draw_panel
 from tkamb.output.pressure_maps import draw_maps, draw_paths, mapped_frames, top_view
 from tkamb.output.provenance import provenance_rows, sentences
-from tkamb.output.report_style import CSS
+from tkamb.output.report_style import CSS, NOTEBOOK_CSS
 from tkamb.output.style import svg_text
 from tkamb.output.tables import flags_table, motion_table
 from tkamb.results import Results
@@ -39,7 +40,17 @@ def report_html(results: Results) -> str:
         f"<header><h1>{title}</h1><p>{_subtitle(results)}</p></header>\n"
         f"{_summary_section(results, axis)}{_maps_section(results, axis)}"
         f"{_plots_section(results, axis)}{_tables_section(results, axis)}"
-        f"{_provenance_section(results)}</body></html>\n"
+        f"{_provenance_section(results)}{cursor_bar(results, axis)}</body></html>\n"
+    )
+
+
+def headline_html(results: Results) -> str:
+    """Return the headline numbers alone, with their style, for notebooks."""
+    boxes = "".join(card.html() for card in cards(results, horizontal_axis(results)))
+    title = escape(_title(results.summary))
+    return (
+        f"<div class='tkamb'><style>{NOTEBOOK_CSS}</style><h2>{title}</h2>"
+        f"<p>{_subtitle(results)}</p><div class='cards'>{boxes}</div></div>"
     )
 
 
@@ -54,9 +65,10 @@ def _title(summary: dict[str, Any]) -> str:
 def _subtitle(results: Results) -> str:
     summary = results.summary
     contact = summary.get("contact") or {}
+    weight = body_weight(results)
     parts = [
         f"{summary['side']} knee" if summary.get("side") else "",
-        f"{summary['body_mass_kg']:g} kg; one body weight (BW) is {body_weight(results):.0f} N",
+        f"{summary['body_mass_kg']:g} kg; one body weight (BW) is {weight:.0f} N",
         _contact_words(contact),
     ]
     return " · ".join(escape(part) for part in parts if part)
@@ -87,6 +99,7 @@ def _maps_section(results: Results, axis: HorizontalAxis) -> str:
         return ""
     maps = svg_text(draw_maps(results, view, axis, frames), "maps")
     paths = svg_text(draw_paths(results, view, axis, frames), "paths")
+    centres = _plot(centre_panel(results), results, axis)
     side = results.summary.get("side", "right")
     return (
         "<section><h2>Pressure on the insert</h2>"
@@ -96,22 +109,25 @@ def _maps_section(results: Results, axis: HorizontalAxis) -> str:
         "<div class='grid'>"
         f"<figure id='figure-paths'><h3>Paths of the centres of pressure</h3>{paths}"
         "<figcaption>Blue: medial, red: lateral. Dots: the frames above.</figcaption></figure>"
-        "</div></section>\n"
+        f"{centres}</div></section>\n"
     )
 
 
 def _plots_section(results: Results, axis: HorizontalAxis) -> str:
-    drawn = []
-    for panel in panels(results):
-        picture = svg_text(draw_panel(panel, results, axis), panel.name)
-        note = f"<figcaption>{escape(panel.note)}</figcaption>" if panel.note else ""
-        drawn.append(
-            f"<figure id='figure-{panel.name}'><h3>{escape(panel.title)}"
-            f" <small>({escape(panel.unit)})</small></h3>{picture}{note}</figure>"
-        )
+    drawn = "".join(_plot(panel, results, axis) for panel in panels(results))
     return (
         f"<section><h2>Over the motion</h2>{_marks(results)}"
-        f"<div class='grid'>{''.join(drawn)}</div></section>\n"
+        f"<div class='grid'>{drawn}</div></section>\n"
+    )
+
+
+def _plot(panel: Panel, results: Results, axis: HorizontalAxis) -> str:
+    picture = svg_text(draw_panel(panel, results, axis), panel.name)
+    note = f"<figcaption>{escape(panel.note)}</figcaption>" if panel.note else ""
+    return (
+        f"<figure class='plot' id='figure-{panel.name}'><h3>{escape(panel.title)}"
+        f" <small>({escape(panel.unit)})</small></h3>{picture}"
+        f"<p class='readout'></p>{note}</figure>"
     )
 
 

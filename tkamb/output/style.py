@@ -3,7 +3,6 @@
 Colours: Okabe & Ito (2008), Color Universal Design. Pressure: viridis, perceptually uniform.
 """
 
-import base64
 import io
 import re
 from typing import Any
@@ -37,6 +36,7 @@ SETTINGS: Any = {
     "grid.linewidth": 0.7,
     "lines.linewidth": 1.8,
     "lines.solid_capstyle": "round",
+    "path.simplify": False,
     "xtick.color": BLACK,
     "ytick.color": BLACK,
     "xtick.major.size": 3,
@@ -62,10 +62,13 @@ def settings() -> Any:
 def svg_text(figure: Figure, name: str, dpi: int = 200) -> str:
     """Return the figure as inline SVG that scales with the page.
 
-    Every id is prefixed with `name`, so that many figures live in one page.
+    Every id is prefixed with `name`, so that many figures live in one page. `data-box` holds
+    the left, right, top and bottom of the first axes in the picture's units and `data-range`
+    the values at its left and right end, for whoever draws over it.
     """
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", dpi=dpi, metadata={"Date": None, "Creator": None})
+    with settings():
+        figure.savefig(buffer, format="svg", dpi=dpi, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
@@ -73,16 +76,20 @@ def svg_text(figure: Figure, name: str, dpi: int = 200) -> str:
     text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
     text = re.sub(r' xmlns(:xlink)?="[^"]*"', "", text)
     text = text.replace("xlink:href=", "href=")
+    text = text.replace("<svg", f"<svg {_box(figure)}", 1)
     text = re.sub(r'\bid="([^"]+)"', rf'id="{name}-\1"', text)
     text = re.sub(r'href="#([^"]+)"', rf'href="#{name}-\1"', text)
     return re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", text)
 
 
-def png_uri(figure: Figure, dpi: int = 200) -> str:
-    """Return the figure as a data URI that an <img> shows."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+def _box(figure: Figure) -> str:
+    axes = figure.axes[0]
+    width, height = 72 * figure.get_size_inches()
+    place = axes.get_position()
+    edges = (place.x0 * width, place.x1 * width, (1 - place.y1) * height, (1 - place.y0) * height)
+    box = " ".join(f"{edge:.2f}" for edge in edges)
+    low, high = axes.get_xlim()
+    return f'data-box="{box}" data-range="{low:.9g} {high:.9g}"'
 
 
 def legend_above(axes: Axes, columns: int = 4) -> None:

@@ -1,6 +1,9 @@
 """The report's tables: the motion at round places, and the frames to be read with care."""
 
+import re
+from collections.abc import Sequence
 from html import escape
+from itertools import zip_longest
 
 import numpy as np
 
@@ -10,13 +13,14 @@ from tkamb.output.metrics import (
     body_weight,
     medial_share,
     residual_share,
-    status_runs,
     tension_ratio,
 )
 from tkamb.results import Results
 
 Entry = tuple[str, str, Array, int]
 """Heading, unit, values (f,), digits."""
+
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 
 def motion_table(results: Results, axis: HorizontalAxis) -> str:
@@ -33,28 +37,68 @@ def motion_table(results: Results, axis: HorizontalAxis) -> str:
 
 
 def flags_table(results: Results, axis: HorizontalAxis) -> str:
-    """Return the HTML table of the stretches of frames that are not ok."""
-    rows = []
-    for first, last, status in status_runs(results):
-        frames = str(first) if first == last else f"{first}–{last}"
-        place = axis.at(first) if first == last else f"{axis.at(first)} to {axis.at(last)}"
-        numbers = "none" if np.isnan(results["force_total_N"][first]) else "given"
-        rows.append(
-            f"<tr><td>{frames}</td><td>{place}</td><td>{numbers}</td>"
-            f"<td>{escape(plain_words(status))}</td></tr>"
-        )
+    """Return the HTML table of what is not ok: one row per reason, and in which frames."""
+    rows = "".join(
+        f"<tr><td>{escape(reason)}</td><td>{len(frames)}</td><td>{_stretches(frames)}</td>"
+        f"<td>{_places(frames, axis)}</td></tr>"
+        for reason, frames in reasons(results.status).items()
+    )
     if not rows:
         return "<p>Every frame is ok.</p>"
     name = LABELS[axis.kind].split(" (")[0]
     return (
-        f"<table><thead><tr><th>frames</th><th>{name}</th><th>numbers</th><th>why</th></tr>"
-        f"</thead><tbody>{''.join(rows)}</tbody></table>"
+        "<p class='legend'>Frames are counted from 0. A frame that failed holds no numbers for "
+        "what failed.</p><table><thead><tr><th>why</th><th>how many</th><th>frames</th>"
+        f"<th>{name}</th></tr></thead><tbody>{rows}</tbody></table>"
     )
 
 
-def plain_words(status: str) -> str:
-    """Return a status as a reader says it."""
-    return "; ".join(word.strip().replace("_", " ") for word in status.split(";"))
+def reasons(statuses: Sequence[str]) -> dict[str, list[int]]:
+    """Return reason in plain words -> its frames, failures first.
+
+    Reasons that differ only in a number are one, with the range of the number.
+    """
+    found: dict[str, list[tuple[int, str]]] = {}
+    for frame, status in enumerate(statuses):
+        failure = status.startswith("failed")
+        for position, word in enumerate(status.removeprefix("failed:").split(";")):
+            words = word.strip().replace("_", " ")
+            if words and words != "ok":
+                words = f"failed: {words}" if failure and position == 0 else words
+                found.setdefault(NUMBER.sub("#", words), []).append((frame, words))
+    merged = {_merged([words for _, words in one]): [k for k, _ in one] for one in found.values()}
+    return dict(sorted(merged.items(), key=lambda item: not item[0].startswith("failed")))
+
+
+def _merged(variants: Sequence[str]) -> str:
+    """Return one text for texts that differ in their numbers: with the numbers' ranges."""
+    columns = zip(*(NUMBER.findall(words) for words in variants), strict=True)
+    ranges = []
+    for numbers in columns:
+        low, high = min(numbers, key=float), max(numbers, key=float)
+        ranges.append(low if low == high else f"{low}–{high}")
+    parts = NUMBER.split(variants[0])
+    return "".join(a + b for a, b in zip_longest(parts, ranges, fillvalue=""))
+
+
+def _runs(frames: Sequence[int]) -> list[tuple[int, int]]:
+    runs: list[tuple[int, int]] = []
+    for frame in frames:
+        if runs and runs[-1][1] == frame - 1:
+            runs[-1] = (runs[-1][0], frame)
+        else:
+            runs.append((frame, frame))
+    return runs
+
+
+def _stretches(frames: Sequence[int]) -> str:
+    return ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in _runs(frames))
+
+
+def _places(frames: Sequence[int], axis: HorizontalAxis) -> str:
+    return ", ".join(
+        axis.at(a) if a == b else f"{axis.at(a)} to {axis.at(b)}" for a, b in _runs(frames)
+    )
 
 
 def _entries(results: Results, axis: HorizontalAxis) -> list[Entry]:
@@ -71,7 +115,7 @@ def _entries(results: Results, axis: HorizontalAxis) -> list[Entry]:
     entries.append(("medial share", "equil.", medial_share(results, "equilibrium"), 2))
     for name, column, digits in (
         ("area", "area_mm2", 0),
-        ("peak pressure", "peak_pressure_MPa", 1),
+        ("peak", "peak_pressure_MPa", 1),
     ):
         unit = "mm²" if name == "area" else "MPa"
         for side in ("medial", "lateral"):

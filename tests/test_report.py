@@ -1,0 +1,376 @@
+"""report.html: stands by itself, shows the numbers of the run, survives runs with holes."""
+
+import json
+import re
+import shutil
+import subprocess
+import warnings
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from synthetic_run import MASS_KG, make_run
+from tkamb.errors import InputError
+from tkamb.output import metrics
+from tkamb.output.axis import horizontal_axis, round_step
+from tkamb.output.headline import cards
+from tkamb.output.panels import panels
+from tkamb.output.pressure_maps import draw_maps, map_rows, mapped_frames, top_view
+from tkamb.output.report import report_html, write_report
+from tkamb.output.tables import flags_table, motion_table, reasons
+from tkamb.results import Results
+
+VOID = {"meta", "br", "input", "img", "link", "hr"}
+
+
+@pytest.fixture(scope="module")
+def bend():
+    return make_run("bend")
+
+
+@pytest.fixture(scope="module")
+def gait():
+    return make_run("gait")
+
+
+@pytest.fixture(scope="module")
+def page(bend):
+    return report_html(bend)
+
+
+class Checker(HTMLParser):
+    """Collects what is not closed, ids that come twice, and references out of the page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.ids, self.outside, self.twice = [], set(), [], []
+        self.feed(text)
+
+    def handle_startendtag(self, tag, attributes):
+        self.look(attributes)
+
+    def handle_starttag(self, tag, attributes):
+        self.look(attributes)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open[-1] == tag, f"</{tag}> closes <{self.open[-1]}>"
+        self.open.pop()
+
+    def look(self, attributes):
+        for name, value in attributes:
+            if name == "id":
+                self.twice += [value] if value in self.ids else []
+                self.ids.add(value)
+            reference = name in ("src", "href", "xlink:href", "action", "data")
+            if reference and not value.startswith(("#", "data:")):
+                self.outside.append(value)
+
+
+@pytest.mark.parametrize("kind", ["bend", "gait"])
+def test_page_stands_by_itself(kind, request):
+    text = report_html(request.getfixturevalue(kind))
+    found = Checker(text)
+    assert found.open == []
+    assert found.outside == []
+    assert found.twice == []
+    assert "http" not in text
+    assert "@import" not in text
+    assert all(r.startswith("#") for r in re.findall(r"url\(([^)]*)\)", text))
+    assert len(text.encode()) < 5e6
+
+
+def test_references_inside_the_page_have_a_target(page):
+    found = Checker(page)
+    targets = re.findall(r'(?:href="#|url\(#)([^")]+)', page)
+    assert targets
+    assert set(targets) <= found.ids
+
+
+def curve(page, panel, line):
+    """Pixels (n, 2) of a curve and the box of its axes."""
+    picture = re.search(rf'id="figure-{panel}">.*?</svg>', page, re.DOTALL)
+    if picture is None:
+        picture = re.search(rf"id='figure-{panel}'>.*?</svg>", page, re.DOTALL)
+    text = picture.group()
+    box = [float(v) for v in re.search(r'data-box="([^"]+)"', text).group(1).split()]
+    span = [float(v) for v in re.search(r'data-range="([^"]+)"', text).group(1).split()]
+    path = re.search(rf'id="{panel}-line-{re.escape(line)}">\s*<path d="([^"]+)"', text).group(1)
+    points = re.findall(r"[ML] (\S+) (\S+)", path)
+    return np.array(points, float), box, span
+
+
+@pytest.mark.parametrize(
+    ("panel", "line", "of"),
+    [
+        ("forces", "force_total_BW", lambda r: r["force_total_BW"]),
+        ("pressures", "medial_peak_pressure_MPa", lambda r: r["medial_peak_pressure_MPa"]),
+        ("ratios", "PL/Q", lambda r: r["patellar_ligament_N"] / r["quadriceps_N"]),
+        ("condyles", "lateral_force_N", lambda r: r["lateral_force_N"] / (MASS_KG * 9.80665)),
+    ],
+)
+def test_curves_are_the_columns(bend, page, panel, line, of):
+    pixels, (left, right, top, bottom), (low, high) = curve(page, panel, line)
+    assert len(pixels) == len(bend)
+    x = low + (pixels[:, 0] - left) / (right - left) * (high - low)
+    assert np.allclose(x, bend["flexion_deg"], atol=0.01)
+    assert pixels[:, 1].min() > top
+    assert pixels[:, 1].max() < bottom
+    values = of(bend)
+    slope, offset = np.polyfit(values, pixels[:, 1], 1)
+    assert slope < 0
+    assert np.allclose(slope * values + offset, pixels[:, 1], atol=0.01)
+
+
+def test_curve_runs_in_time_order_and_breaks_where_a_frame_failed(gait):
+    by_flexion = Results(gait.columns, {**gait.summary, "axis": "flexion"}, None)
+    pixels, (left, right, *_), (low, high) = curve(
+        report_html(by_flexion), "forces", "force_total_BW"
+    )
+    x = low + (pixels[:, 0] - left) / (right - left) * (high - low)
+    computed = ~metrics.failed(gait)
+    assert computed.sum() == len(gait) - 1
+    assert np.allclose(x, gait["flexion_deg"][computed], atol=0.02)
+    assert (np.diff(x) < 0).any()
+
+
+def test_cycle_axis_is_cut_where_it_starts_anew(gait):
+    time = gait["time_s"]
+    summary = {**gait.summary, "cycle_percent_s": [time[30], time[30] + 1.1]}
+    axis = horizontal_axis(Results(gait.columns, summary, None))
+    assert axis.values[30] == 0.0
+    assert axis.values[0] == pytest.approx(70.0)
+    x, y = axis.broken(np.arange(101.0))
+    assert len(x) == len(y) == 102
+    assert np.isnan(x[30])
+    assert np.isnan(y[30])
+
+
+def test_round_steps():
+    assert [round_step(v) for v in (0.09, 10, 10.1, 17, 31, 60)] == [0.1, 10, 15, 20, 50, 100]
+    axis = horizontal_axis(make_run("bend", maps=False))
+    assert np.allclose(axis.values[axis.stops(13)], np.arange(0, 121, 10), atol=0.6)
+
+
+def test_headline_numbers_are_those_of_the_columns(bend, gait):
+    shown = {card.title: card for card in cards(bend, horizontal_axis(bend))}
+    assert shown["Peak contact force"].value == f"{bend['force_total_BW'].max():.2f} BW"
+    assert f"{bend['force_total_N'].max():.0f} N" in shown["Peak contact force"].detail
+    peak = max(bend[f"{side}_peak_pressure_MPa"].max() for side in ("medial", "lateral"))
+    assert shown["Peak contact pressure"].value == f"{peak:.1f} MPa"
+    assert shown["Medial share of the load"].value == "50–58 %"
+    assert shown["Frames computed"].value == "101 of 101"
+    shown = {card.title: card for card in cards(gait, horizontal_axis(gait))}
+    assert shown["Frames computed"].value == "100 of 101"
+    assert shown["Frames computed"].warning
+    assert "6 others" in shown["Frames computed"].detail
+
+
+def test_residuals_are_relative_to_the_superior_inferior_force(bend):
+    expected = np.hypot(bend["residual_ap_N"], bend["residual_ml_N"]) / bend["force_si_N"]
+    assert np.allclose(metrics.residual_share(bend), expected)
+    drawn = {line.name: line for p in panels(bend) if p.name == "residuals" for line in p.lines}
+    assert np.allclose(drawn["size"].values, 100 * expected)
+    sensitivity = 100 * bend["residual_sensitivity_N"] / bend["force_si_N"]
+    assert np.allclose(drawn["residual_sensitivity_N"].values, sensitivity)
+
+
+def test_moments_in_percent_of_weight_and_height(bend, gait):
+    (panel,) = (p for p in panels(bend) if p.name == "external")
+    assert panel.second[0] == pytest.approx(100 / (MASS_KG * 9.80665 * 1.75))
+    (panel,) = (p for p in panels(gait) if p.name == "external")
+    assert panel.second is None
+
+
+def test_lifted_condyle_leaves_the_whole_share_to_the_other():
+    run = make_run("bend", frames=5, maps=False)
+    run.columns["lateral_force_N"][2] = np.nan
+    run.columns["medial_force_N"][3] = run.columns["lateral_force_N"][3] = np.nan
+    share = metrics.medial_share(run, "deformation")
+    assert share[2] == 1.0
+    assert np.isnan(share[3])
+
+
+def test_table_holds_every_ten_degrees(bend):
+    rows = re.findall(r"<tr><td>(.*?)</td></tr>", motion_table(bend, horizontal_axis(bend)))
+    flexion = [float(row.split("</td><td>")[0]) for row in rows]
+    assert np.allclose(flexion, np.arange(0, 121, 10), atol=0.6)
+    last = rows[-1].split("</td><td>")
+    assert last[1] == f"{bend['force_total_BW'][-1]:.2f}"
+
+
+def test_flagged_frames_are_told_in_plain_words(gait):
+    text = flags_table(gait, horizontal_axis(gait))
+    assert "<td>singular</td><td>1</td><td>20</td><td>20 %</td>" in text
+    row = "<td>raw filtered differ</td><td>6</td><td>50–55</td><td>50 % to 55 %</td>"
+    assert row in text
+
+
+def test_reasons_that_differ_in_a_number_are_one_row():
+    statuses = [
+        "ok",
+        "normal 21 deg from vertical; lateral condyle off",
+        "normal 34 deg from vertical",
+        "failed: singular; normal 9 deg from vertical",
+    ]
+    assert list(reasons(statuses).items()) == [
+        ("failed: singular", [3]),
+        ("normal 9–34 deg from vertical", [1, 2, 3]),
+        ("lateral condyle off", [1]),
+    ]
+
+
+def test_maps_have_one_scale_to_the_largest_pressure(bend):
+    axis, view = horizontal_axis(bend), top_view(bend)
+    frames = mapped_frames(bend, axis)
+    assert len(frames) >= 4
+    figure = draw_maps(bend, view, axis, frames)
+    largest = bend.maps.pressure_Pa.max() / 1e6
+    for axes, frame in zip(figure.axes, frames, strict=False):
+        pressure = axes.collections[-1]
+        assert pressure.norm.vmin == 0
+        assert pressure.norm.vmax == pytest.approx(largest)
+        assert pressure.get_array().max() == pytest.approx(bend.maps.pressure_Pa[frame].max() / 1e6)
+
+
+@pytest.mark.parametrize(
+    ("side", "lateral_axis", "medial_is"),
+    [("right", "+z", "left"), ("left", "+z", "right"), ("left", "-z", "left")],
+)
+def test_page_right_is_the_subjects_right(side, lateral_axis, medial_is):
+    run = make_run("bend", frames=5)
+    run.summary.update(side=side, lateral_axis=lateral_axis)
+    x, y = top_view(run).place(np.array(3.0), np.array(-23.0))
+    assert y == 3.0
+    assert (x < 0) == (medial_is == "left")
+
+
+def test_failed_frames_have_no_map_and_the_nearest_one_is_shown(gait):
+    pressure = gait.maps.pressure_Pa.copy()
+    pressure[[0, 20]] = np.nan
+    arrays = {name: getattr(gait.maps, name) for name in ("points_m", "triangles", "time_s")}
+    maps = type(gait.maps)({**arrays, "pressure_Pa": pressure})
+    run = Results(gait.columns, gait.summary, maps)
+    rows = map_rows(run)
+    assert 0 not in rows
+    assert rows[1] == 1
+    assert mapped_frames(run, horizontal_axis(run))[0] == 1
+
+
+def without(run, *words):
+    """The run with every column whose name holds one of the words set to NaN."""
+    columns = dict(run.columns)
+    for name in columns:
+        if any(word in name for word in words):
+            columns[name] = np.full(len(run), np.nan)
+    return Results(columns, {**run.summary, "contact": None}, None)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("medial", "lateral", "approach", "iterations"),
+        ("quadriceps", "patell"),
+        ("ground", "external"),
+        ("_N", "_Nm", "BW", "MPa", "mm", "share", "condition", "yield", "slip", "wrap"),
+    ],
+)
+def test_what_is_not_modelled_is_not_shown(bend, words):
+    run = without(bend, *words)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        text = report_html(run)
+    assert Checker(text).open == []
+    assert "nan" not in re.sub(r"<script.*?</script>|<svg.*?</svg>", "", text, flags=re.DOTALL)
+    names = {panel.name for panel in panels(run)}
+    assert ("extensor" in names) == ("quadriceps" not in words and "_N" not in words)
+    assert ("pressures" in names) == ("medial" not in words and "MPa" not in words)
+
+
+def test_single_frame_and_still_motion_are_drawn():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        one = make_run("bend", frames=5)
+        columns = {name: values[2:3] for name, values in one.columns.items()}
+        assert Checker(report_html(Results(columns, one.summary, None))).open == []
+        still = {**one.columns, "flexion_deg": np.full(5, 90.0)}
+        assert Checker(report_html(Results(still, one.summary, one.maps))).open == []
+
+
+def test_words_of_the_user_cannot_break_the_page(bend):
+    summary = {**bend.summary, "title": "</script><b>", "notes": ["<img src=x>"]}
+    run = Results({**bend.columns, "status": ["</script>"] * len(bend)}, summary, None)
+    found = Checker(report_html(run))
+    assert found.open == []
+    assert found.outside == []
+
+
+def test_report_is_the_same_each_time(bend, page):
+    assert report_html(bend) == page
+
+
+def test_cursor_data_are_the_columns(bend, page):
+    data = json.loads(re.search(r"id='data'>(.*?)</script>", page, re.DOTALL).group(1))
+    assert np.allclose(data["x"], bend["flexion_deg"], rtol=1e-4)
+    total = data["panels"]["forces"][0]
+    assert total["label"] == "total"
+    assert np.allclose(total["values"], bend["force_total_BW"], rtol=1e-4)
+
+
+def test_missing_mass_and_unwritable_folder_are_one_line(bend, tmp_path):
+    run = Results(bend.columns, {**bend.summary, "body_mass_kg": None}, None)
+    with pytest.raises(InputError, match="body_mass_kg"):
+        report_html(run)
+    with pytest.raises(InputError, match="cannot be written"):
+        write_report(bend, tmp_path / "missing" / "report.html")
+
+
+def test_notebooks_show_headline_and_plots(bend):
+    text = bend._repr_html_()
+    assert Checker(text).open == []
+    assert "3.45 BW" in text
+    figure = bend.plot("pressures", axis="time")
+    (axes, *_) = figure.axes
+    assert np.array_equal(axes.lines[0].get_xdata(), bend["time_s"])
+    with pytest.raises(InputError, match="no plot 'presure'"):
+        bend.plot("presure")
+    with pytest.raises(InputError, match="no axis 'angle'"):
+        bend.plot(axis="angle")
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+PROBE = """<script>
+window.addEventListener("load", () => {
+  const slider = document.getElementById("frame");
+  slider.value = 50;
+  slider.dispatchEvent(new Event("input"));
+});
+</script></body>"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def test_slider_moves_the_cursor_and_the_numbers(bend, page, tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text(page.replace("</body>", PROBE), encoding="utf-8")
+    flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking"
+    command = [CHROMIUM, *flags.split(), f"--user-data-dir={tmp_path / 'user'}", "--dump-dom"]
+    done = subprocess.run(
+        [*command, "--enable-logging=stderr", path.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert "Uncaught" not in done.stderr
+    dom = done.stdout
+    assert "50: flexion 60°" in dom
+    assert f"total {bend['force_total_BW'][50]:.3g}" in dom
+    figure = re.search(r'id="figure-forces">.*?</figure>', dom, re.DOTALL).group()
+    left, right, *_ = (float(v) for v in re.search(r'data-box="([^"]+)"', figure)[1].split())
+    low, high = (float(v) for v in re.search(r'data-range="([^"]+)"', figure)[1].split())
+    cursor = re.search(r'<line class="cursor"[^>]* x1="([^"]+)"', figure)[1]
+    at = low + (float(cursor) - left) / (right - left) * (high - low)
+    assert at == pytest.approx(60.0, abs=0.01)
