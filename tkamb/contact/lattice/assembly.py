@@ -1,4 +1,4 @@
-"""Global matrices from cell matrices: one cached pattern of 3×3 node blocks."""
+"""Global matrices from those of cells or springs: one cached pattern of 3×3 node blocks."""
 
 from dataclasses import dataclass
 
@@ -13,12 +13,12 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Where each cell's node pairs go in the global matrix of 3×3 blocks.
+    """Where the node pairs of each member (cell or spring) go in the global matrix.
 
     Args:
         indptr: (n + 1,) start of each node's row.
         indices: (b,) column node of each block.
-        slot: (c, 64) block of each ordered node pair of each cell.
+        slot: (c, p²) block of each ordered node pair of each member of p nodes.
     """
 
     indptr: Indices
@@ -26,13 +26,14 @@ class Pattern:
     slot: Indices
 
     @classmethod
-    def of_cells(cls, cells: Indices, nodes: int) -> "Pattern":
-        """Return the pattern of cells (c, 8) on so many nodes."""
-        rows = np.repeat(cells, 8, axis=1).ravel().astype(np.int64)
-        columns = np.tile(cells, (1, 8)).ravel()
+    def of(cls, members: Indices, nodes: int) -> "Pattern":
+        """Return the pattern of members (c, p) on so many nodes."""
+        count = members.shape[1]
+        rows = np.repeat(members, count, axis=1).ravel().astype(np.int64)
+        columns = np.tile(members, (1, count)).ravel()
         keys, slot = np.unique(rows * nodes + columns, return_inverse=True)
         indptr = np.searchsorted(keys, np.arange(nodes + 1) * nodes)
-        return cls(indptr, keys % nodes, slot.reshape(len(cells), 64))
+        return cls(indptr, keys % nodes, slot.reshape(len(members), count**2))
 
     @property
     def nodes(self) -> int:
@@ -40,13 +41,15 @@ class Pattern:
         return len(self.indptr) - 1
 
     def assemble(self, matrices: Array, shape: Indices | None = None) -> sparse.csr_matrix:
-        """Return the sum (3n, 3n) of cell matrices.
+        """Return the sum (3n, 3n) of the members' matrices.
 
         Args:
-            matrices: (c, 24, 24), or (s, 24, 24) with `shape`.
-            shape: (c,) which matrix each cell takes.
+            matrices: (c, 3p, 3p), or (s, 3p, 3p) with `shape`.
+            shape: (c,) which matrix each member takes.
         """
-        blocks = matrices.reshape(-1, 8, 3, 8, 3).transpose(2, 4, 0, 1, 3).reshape(9, -1, 64)
+        count = matrices.shape[1] // 3
+        blocks = matrices.reshape(-1, count, 3, count, 3).transpose(2, 4, 0, 1, 3)
+        blocks = blocks.reshape(9, -1, count**2)
         data = np.empty((len(self.indices), 9))
         flat = self.slot.ravel()
         for entry in range(9):

@@ -45,6 +45,11 @@ class BbarHexahedra(Solid):
         self.dilatation = mean.reshape(-1, 24)
         self.curve = ShearCurve.of(material)
 
+    @cached_property
+    def stiffness(self) -> sparse.csr_matrix:
+        """Linear stiffness (3n, 3n), N/m."""
+        return self.pattern.assemble(self.shape_stiffness(), self.shape_of_cell)
+
     def shape_stiffness(self) -> Array:
         """Return the linear stiffness of each shape (s, 24, 24), N/m."""
         shear = np.einsum("sg,sgri,sgrj->sij", self.weights, self.shear, self.shear, optimize=True)
@@ -98,10 +103,10 @@ class BbarHexahedra(Solid):
         """Return scaled deviatoric strain (c, 8, 5) and equivalent strain (c, 8)."""
         local = self.scatter.gather(displacement)
         same, others, matrix, matrices = self._kinds
-        strain = np.empty((len(local), 40))
-        strain[same] = local[same] @ matrix.T
-        strain[others] = np.einsum("crj,cj->cr", matrices, local[others])
-        strain = strain.reshape(-1, 8, 5)
+        flat = np.empty((len(local), 40))
+        flat[same] = local[same] @ matrix.T
+        flat[others] = np.einsum("crj,cj->cr", matrices, local[others])
+        strain = flat.reshape(-1, 8, 5)
         return strain, np.sqrt(np.einsum("cgr,cgr->cg", strain, strain) / 3)
 
     def _per_cell_forces(self, stress: Array) -> Array:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tkamb.geometry.corner_normals import corner_normals
 from tkamb.geometry.frames import Array, inverse, rotate, transform
@@ -61,7 +62,7 @@ class FemoralFloor:
         normals[up] = -normals[up]
         return places, normals
 
-    def _interpolated(self, points: Array, face: Array) -> Array:
+    def _interpolated(self, points: Array, face: NDArray[np.int64]) -> Array:
         """Return unit normals (n, 3) at points on triangles `face`, femoral frame."""
         corner = self.surface.triangles[face]
         a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]

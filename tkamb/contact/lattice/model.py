@@ -190,7 +190,8 @@ class CalibratedLattice(CellContact):
 
     name: ClassVar[str] = "lattice"
     assumes: ClassVar[str] = (
-        "a spring lattice calibrated to E, nu and the stress-strain curve; small strain, no friction"
+        "a spring lattice calibrated to E, nu and the stress-strain curve; small strain, "
+        "no friction"
     )
     needs: ClassVar[str] = "a closed insert; seconds to prepare, then tenths of a second"
 

@@ -27,6 +27,11 @@ class CalibratedNetwork(Solid):
         self.deviatoric, self.dilatation, self.volume = deviatoric_matrices(self.shapes, spacing)
         self.curve = ShearCurve.of(material)
 
+    @cached_property
+    def stiffness(self) -> sparse.csr_matrix:
+        """Linear stiffness (3n, 3n), N/m."""
+        return self.pattern.assemble(self.shape_stiffness(), self.shape_of_cell)
+
     def shape_stiffness(self) -> Array:
         """Return mu K_d + K V g gᵀ of each shape (s, 24, 24), N/m."""
         return self.material.shear_modulus * self.deviatoric + self._bulk

@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from tkamb.contact.lattice.active_set import ContactForces
 from tkamb.contact.lattice.operator import prepare_operator
-from tkamb.contact.lattice.problem import ContactProblem, footing
+from tkamb.contact.lattice.problem import ContactProblem, Footing, Indices, Mask, footing
 from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve_pass, violation
 from tkamb.geometry.frames import Array
 
@@ -38,31 +39,43 @@ def solve_by_newton(
     nodes = problem.contact_nodes[start.candidates]
     points = solid.nodes[nodes]
     u = np.zeros_like(solid.nodes) if field is None else field
-    active, foot, step, last = start.active, None, 1.0, np.inf
-    for count in range(1, MOST_STEPS + 1):
-        operator = prepare_operator(solid.tangent(u), problem.index, problem.held, nodes)
-        relaxed = u - operator.solve(solid.internal_force(u))
-        unknowns = np.arange(3 * len(nodes))
-        foot = footing(problem, points + u[nodes], pose, foot)
-        forces, _ = solve_pass(
-            operator.half.compliance(unknowns), relaxed[nodes], points, foot, load, active
-        )
+    active, step, last, steps = start.active, 1.0, np.inf, 0
+    foot = footing(problem, points + u[nodes], pose, None)
+    while True:
+        steps += 1
+        u_full, forces = _step(problem, nodes, u, foot, load, active)
+        u = u + step * (u_full - u)
+        active = forces.active
         pushed = np.zeros_like(u)
         pushed[nodes] = forces.force[:, None] * foot.normals
-        u = u + step * (relaxed + operator.solve(pushed) - u)
-        active = forces.active
         size = max(float(np.linalg.norm(pushed)), 1e-300)
         balance = (solid.internal_force(u) - pushed).ravel()[free]
         residual = float(np.linalg.norm(balance)) / size
-        foot_now = footing(problem, points + u[nodes], pose, foot)
-        missed = violation(points, u[nodes], foot_now, forces)
-        if not active.any() or max(residual, missed) <= tolerance.force:
-            break
-        step = 0.5 if residual > 2 * last else 1.0
-        last = residual
-    else:
-        forces = replace(forces, converged=False)
-    lost = solid.correction(u)
-    return Solution(
-        start.candidates, forces, foot, u[nodes], u, lost, count, residual, forces.converged
-    )
+        settled = footing(problem, points + u[nodes], pose, foot)
+        missed = violation(points, u[nodes], settled, forces)
+        done = not active.any() or max(residual, missed) <= tolerance.force
+        if done or steps == MOST_STEPS:
+            forces = replace(forces, converged=done and forces.converged)
+            lost = solid.correction(u)
+            lost[~free.reshape(-1, 3)] = 0.0
+            return Solution(start.candidates, forces, foot, u[nodes], u, lost, steps, residual)
+        step, last, foot = 0.5 if residual > 2 * last else 1.0, residual, settled
+
+
+def _step(
+    problem: ContactProblem,
+    nodes: Indices,
+    u: Array,
+    foot: Footing,
+    load: float | None,
+    active: Mask,
+) -> tuple[Array, ContactForces]:
+    """Return the displacement (n, 3) and contact forces of one linearised step."""
+    solid = problem.solid
+    operator = prepare_operator(solid.tangent(u), problem.index, problem.held, nodes)
+    relaxed = u - operator.solve(solid.internal_force(u))
+    compliance = operator.half.compliance(np.arange(3 * len(nodes)))
+    forces, _ = solve_pass(compliance, relaxed[nodes], solid.nodes[nodes], foot, load, active)
+    pushed = np.zeros_like(u)
+    pushed[nodes] = forces.force[:, None] * foot.normals
+    return relaxed + operator.solve(pushed), forces

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tkamb.contact.lattice.solver import Solution
 from tkamb.contact.model import ContactResult, ContactStatus
@@ -13,6 +14,7 @@ from tkamb.geometry.frames import Array
 if TYPE_CHECKING:
     from tkamb.contact.lattice.model import LatticeState
 
+Mask = NDArray[np.bool_]
 PressureRule = Literal["tributary", "source"]
 
 STRAIN_FLAG = -0.4
@@ -96,7 +98,7 @@ def result_of(
     )
 
 
-def _areas(state: "LatticeState", gaps: Array, loaded: Array, rule: PressureRule) -> Array:
+def _areas(state: "LatticeState", gaps: Array, loaded: Mask, rule: PressureRule) -> Array:
     """Return the area (c,) that each node's force stands on, m².
 
     The source's rule: femoral area that overlaps the undeformed insert, shared evenly by the

@@ -44,16 +44,12 @@ class Solid(ABC):
     @cached_property
     def pattern(self) -> Pattern:
         """Where cell matrices go in the global one."""
-        return Pattern.of_cells(self.cells, len(self.nodes))
+        return Pattern.of(self.cells, len(self.nodes))
 
-    @cached_property
+    @property
+    @abstractmethod
     def stiffness(self) -> sparse.csr_matrix:
         """Linear stiffness (3n, 3n), N/m."""
-        return self.pattern.assemble(self.shape_stiffness(), self.shape_of_cell)
-
-    @abstractmethod
-    def shape_stiffness(self) -> Array:
-        """Return the linear stiffness of each shape (s, 24, 24), N/m."""
 
     @abstractmethod
     def correction(self, displacement: Array) -> Array:

@@ -68,8 +68,7 @@ class Solution:
         field: (n, 3) displacement of all nodes, or None (linear material).
         lost: (n, 3) h, N, or None (linear material).
         passes: how many.
-        residual: last relative out-of-balance force, or change of contact force.
-        converged: whether it fell below the tolerance.
+        residual: last relative out-of-balance force; linear: distance from the femoral surface.
     """
 
     candidates: Indices
@@ -80,7 +79,11 @@ class Solution:
     lost: Array | None
     passes: int
     residual: float
-    converged: bool
+
+    @property
+    def converged(self) -> bool:
+        """Whether forces, surface and active set all came to rest."""
+        return self.forces.converged
 
 
 def solve_pass(
@@ -119,34 +122,56 @@ def solve(
     """Return the contact at a pose under a load (N), or at approach 0 when load is None."""
     if problem.solid.material.is_linear:
         return _solve_linear(problem, pose, load, start, tolerance)
-    operator, solid = problem.operator, problem.solid
-    points = problem.surface_points[start.candidates]
-    lost = np.zeros_like(solid.nodes) if start.lost is None else start.lost
-    mixer, active, moved, foot, residual = AndersonMixer(), start.active, None, None, np.inf
-    for count in range(1, tolerance.passes + 1):
-        begun = operator.start(lost)
-        offset = operator.half.project(begun).reshape(-1, 3)[start.candidates]
-        foot = footing(problem, points + (offset if moved is None else moved), pose, foot)
+    operator, chosen = problem.operator, start.candidates
+    points = problem.surface_points[chosen]
+    lost = np.zeros_like(problem.solid.nodes) if start.lost is None else start.lost
+    mixer, active, passes = AndersonMixer(), start.active, 0
+    begun = operator.start(lost)
+    offset = operator.half.project(begun).reshape(-1, 3)[chosen]
+    foot = footing(problem, points + offset, pose, None)
+    while True:
+        passes += 1
         forces, moved = solve_pass(start.compliance, offset, points, foot, load, active)
         active = forces.active
-        pushed = np.zeros((len(problem.contact_nodes), 3))
-        pushed[start.candidates] = forces.force[:, None] * foot.normals
-        operator.half.apply(pushed.ravel(), begun)
-        field = operator.finish(begun)
-        value = solid.correction(field)
-        value[problem.held.reshape(-1, 3)] = 0.0
-        size = max(float(np.linalg.norm(pushed)), 1e-300)
-        residual = float(np.linalg.norm(value - lost)) / size
-        if residual <= tolerance.force or not active.any():
-            foot_now = footing(problem, points + moved, pose, foot)
-            if violation(points, moved, foot_now, forces) <= tolerance.force:
-                break
+        field, value, residual = _respond(problem, begun, chosen, forces, foot, lost)
+        settled = footing(problem, points + moved, pose, foot)
+        missed = violation(points, moved, settled, forces)
+        done = not active.any() or max(residual, missed) <= tolerance.force
+        if done or passes == tolerance.passes:
+            forces = replace(forces, converged=done and forces.converged)
+            return Solution(chosen, forces, foot, moved, field, lost, passes, residual)
         lost = mixer.next(lost.ravel(), value.ravel()).reshape(-1, 3)
-    else:
-        forces = replace(forces, converged=False)
-    return Solution(
-        start.candidates, forces, foot, moved, field, lost, count, residual, forces.converged
-    )
+        begun = operator.start(lost)
+        offset = operator.half.project(begun).reshape(-1, 3)[chosen]
+        foot = settled
+
+
+def _respond(
+    problem: ContactProblem,
+    begun: Array,
+    chosen: Indices,
+    forces: ContactForces,
+    foot: Footing,
+    lost: Array,
+) -> tuple[Array, Array, float]:
+    """Return all displacements (n, 3), the h they ask for and the relative imbalance.
+
+    Args:
+        problem: solid and operator.
+        begun: L⁻¹ h, becomes L⁻¹ (h + contact forces).
+        chosen: candidates.
+        forces: on them.
+        foot: femoral planes.
+        lost: (n, 3) the h that went in, N.
+    """
+    pushed = np.zeros((len(problem.contact_nodes), 3))
+    pushed[chosen] = forces.force[:, None] * foot.normals
+    problem.operator.half.apply(pushed.ravel(), begun)
+    field = problem.operator.finish(begun)
+    value = problem.solid.correction(field)
+    value[problem.held.reshape(-1, 3)] = 0.0
+    size = max(float(np.linalg.norm(pushed)), 1e-300)
+    return field, value, float(np.linalg.norm(value - lost)) / size
 
 
 def _solve_linear(
@@ -158,21 +183,19 @@ def _solve_linear(
 ) -> Solution:
     """Repeat rays and contact until the sliding nodes rest."""
     points = problem.surface_points[start.candidates]
-    nothing, moved, active = np.zeros_like(points), np.zeros_like(points), start.active
+    nothing, active, passes = np.zeros_like(points), start.active, 0
     foot = footing(problem, points, pose, None)
-    for count in range(1, tolerance.passes + 1):
+    while True:
+        passes += 1
         forces, moved = solve_pass(start.compliance, nothing, points, foot, load, active)
         active = forces.active
-        foot_now = footing(problem, points + moved, pose, foot)
-        residual = violation(points, moved, foot_now, forces)
-        if residual <= tolerance.force:
-            break
-        foot = foot_now
-    else:
-        forces = replace(forces, converged=False)
-    return Solution(
-        start.candidates, forces, foot, moved, None, None, count, residual, forces.converged
-    )
+        settled = footing(problem, points + moved, pose, foot)
+        missed = violation(points, moved, settled, forces)
+        done = missed <= tolerance.force
+        if done or passes == tolerance.passes:
+            forces = replace(forces, converged=done and forces.converged)
+            return Solution(start.candidates, forces, foot, moved, None, None, passes, missed)
+        foot = settled
 
 
 def violation(points: Array, moved: Array, foot: Footing, forces: ContactForces) -> float:

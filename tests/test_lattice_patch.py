@@ -1,0 +1,135 @@
+"""The uniform-strain patch: what every cell must get right before anything else counts."""
+
+import numpy as np
+import pytest
+import scipy.sparse.linalg as linalg
+from lattice_blocks import block, uniform_strain
+
+from tkamb.contact.lattice.bbar import BbarHexahedra
+from tkamb.contact.lattice.calibrated import (
+    body_diagonal_stiffness,
+    box_corners,
+    deviatoric_matrices,
+    spring_families,
+    spring_matrix,
+)
+from tkamb.contact.lattice.network import CalibratedNetwork
+from tkamb.contact.lattice.source import SourceNetwork, source_factor
+from tkamb.contact.materials import Material
+
+MM = 1e-3
+RATIOS = [0.0, 0.25, 0.35, 0.45, 0.49, 0.4999]
+BOXES = [(1.0, 1.0, 1.0), (1.0, 1.2, 0.9), (1.0, 1.4, 1.2), (1.4, 1.0, 1.4)]
+STRAIN = np.array([0.7, -1.1, 0.4, 0.3, -0.5, 0.6]) * 1e-3
+
+
+def material(nu):
+    return Material("m", 561.5e6, nu)
+
+
+def boundary_of(index):
+    return ((index == 0) | (index == index.max(axis=0))).any(axis=1)
+
+
+@pytest.mark.parametrize("solid", [CalibratedNetwork, BbarHexahedra])
+@pytest.mark.parametrize("nu", RATIOS)
+@pytest.mark.parametrize("edges", BOXES)
+def test_free_uniaxial_patch_is_exact_on_boxes(solid, nu, edges):
+    """sigma_yy = E eps with free sides: no force but on the two ends, and there E eps A."""
+    nodes, index, cells, _ = block((3, 2, 3), np.array(edges) * MM)
+    made = solid(nodes, cells, np.array(edges) * MM, material(nu))
+    u = uniform_strain(nodes, [-nu * 1e-3, 1e-3, -nu * 1e-3, 0, 0, 0])
+    force = (made.stiffness @ u.ravel()).reshape(-1, 3)
+    area = np.prod((np.ptp(nodes, axis=0))[[0, 2]])
+    scale = 561.5e6 * 1e-3 * area
+    top = index[:, 1] == index[:, 1].max()
+    ends = top | (index[:, 1] == 0)
+    assert abs(force[top, 1].sum() / scale - 1) < 1e-10
+    assert np.abs(force[~ends]).max() < 1e-10 * scale
+    assert np.abs(force[ends][:, [0, 2]]).max() < 1e-10 * scale
+
+
+@pytest.mark.parametrize("solid", [CalibratedNetwork, BbarHexahedra])
+@pytest.mark.parametrize("nu", RATIOS)
+@pytest.mark.parametrize("stretch", [0.0, 0.8])
+@pytest.mark.parametrize("size", [0.25, 1.0, 4.0])
+def test_patch_reproduces_any_uniform_strain(solid, nu, stretch, size):
+    """Displacements given on the boundary alone: the inside follows, also on a dish."""
+    edges = np.array([1.0, 1.1, 0.9]) * size * MM
+    nodes, index, cells, _ = block((4, 3, 4), edges, stretch)
+    made = solid(nodes, cells, edges, material(nu))
+    exact = uniform_strain(nodes, STRAIN)
+    held = np.repeat(boundary_of(index), 3)
+    k = made.stiffness
+    inner = linalg.spsolve(k[~held][:, ~held].tocsc(), -k[~held][:, held] @ exact.ravel()[held])
+    assert np.abs(inner - exact.ravel()[~held]).max() < 1e-10 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize("nu", RATIOS)
+@pytest.mark.parametrize("edges", BOXES)
+@pytest.mark.parametrize("shear", [0.0, 0.4])
+def test_cell_has_six_rigid_modes_and_no_other(nu, edges, shear):
+    """Eigenvalues: six zeros, eighteen well above them."""
+    edges = np.array(edges) * MM
+    corners = box_corners(edges)[None].copy()
+    corners[0, [2, 3, 6, 7], 1] += shear * edges[1] * np.array([1.0, 0.0, 0.6, 0.3])
+    deviatoric, g, volume = deviatoric_matrices(corners, edges)
+    m = material(nu)
+    k = m.shear_modulus * deviatoric[0] + m.bulk_modulus * volume[0] * np.outer(g[0], g[0])
+    values = np.linalg.eigvalsh(k) / (m.shear_modulus * edges.mean())
+    assert np.abs(values[:6]).max() < 1e-9
+    assert values[6] > 0.1
+
+
+@pytest.mark.parametrize("edges", BOXES)
+def test_springs_alone_make_the_isotropic_solid_with_lambda_equal_mu(edges):
+    """Closed-form families for any body diagonal; none negative at the chosen one."""
+    edges = np.array(edges)
+    chosen = body_diagonal_stiffness(edges)
+    for body in (0.0, 0.5 * chosen, chosen):
+        k = spring_matrix(box_corners(edges)[None], spring_families(edges, body))[0]
+        u = uniform_strain(box_corners(edges), STRAIN).ravel()
+        e = STRAIN
+        trace, square = e[:3].sum(), (e[:3] ** 2).sum() + 2 * (e[3:] ** 2).sum()
+        assert u @ k @ u == pytest.approx(np.prod(edges) * (trace**2 + 2 * square), rel=1e-12)
+    assert spring_families(edges, chosen).min() >= 0
+
+
+def test_projection_leaves_normal_strain_of_a_box_to_the_springs():
+    """On a box K_d is the springs less their bulk part, but for the twist that shear excites."""
+    edges = np.array([1.0, 1.2, 0.9])
+    k_b = body_diagonal_stiffness(edges)
+    deviatoric, g, volume = deviatoric_matrices(box_corners(edges)[None], edges)
+    springs = spring_matrix(box_corners(edges)[None], spring_families(edges, k_b))[0]
+    springs -= 5 / 3 * volume[0] * np.outer(g[0], g[0])
+    u = uniform_strain(box_corners(edges), [1, 2, 3, 0, 0, 0]).ravel()
+    assert deviatoric[0] @ u == pytest.approx(springs @ u, abs=1e-12)
+    u = uniform_strain(box_corners(edges), STRAIN).ravel()
+    assert u @ deviatoric[0] @ u == pytest.approx(u @ springs @ u, rel=1e-12)
+
+
+def test_source_calibration_on_a_cube():
+    """k = E a/2.7 and nu = 0.35."""
+    assert source_factor(np.full(3, 1.5 * MM)) == pytest.approx(1.5 * MM / 2.7, rel=1e-12)
+
+
+@pytest.mark.parametrize(("count", "excess"), [(2, 0.78), (4, 0.36), (8, 0.18), (12, 0.12)])
+def test_source_lattice_shows_its_known_error(count, excess):
+    """A cube between frictionless plates, free sides: too stiff, less so with more cells."""
+    nodes, index, cells, springs = block((count,) * 3, np.full(3, MM))
+    made = SourceNetwork(nodes, cells, np.full(3, MM), material(0.35), springs)
+    top, bottom = index[:, 1] == count, index[:, 1] == 0
+    held = np.zeros((len(nodes), 3), bool)
+    held[top | bottom, 1] = True
+    held[index[:, 0] * 2 == count, 0] = True
+    held[index[:, 2] * 2 == count, 2] = True
+    u = np.zeros((len(nodes), 3))
+    u[top, 1] = -1e-3 * count * MM
+    fixed = held.ravel()
+    k = made.stiffness
+    u.ravel()[~fixed] = linalg.spsolve(
+        k[~fixed][:, ~fixed].tocsc(), -k[~fixed][:, fixed] @ u.ravel()[fixed]
+    )
+    reaction = -(k @ u.ravel()).reshape(-1, 3)[top, 1].sum()
+    exact = 561.5e6 * 1e-3 * (count * MM) ** 2
+    assert reaction / exact - 1 == pytest.approx(excess, abs=0.015)
