@@ -84,7 +84,7 @@ PATELLA_CENTRE_OF_MASS = (4.0, 0.0, 0.0)
 GRAVITY = 9.80665
 ANKLE_HEIGHT_SHARE = 0.039
 """Ankle centre above the floor, of body height."""
-CENTRE_OF_PRESSURE = (18.0, 60.0)
+CENTRE_OF_PRESSURE = (18.0, 66.0)
 """In front of the ankle when standing and at the bottom."""
 LEG_SHARE = (0.5, 0.7)
 """Of body weight on the tested leg, standing and at the bottom."""
