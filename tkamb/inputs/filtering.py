@@ -9,9 +9,11 @@ with w_i the spacing of the samples. Away from the ends its frequency response i
 1 / (1 + (f / f_c)^6), that of a third-order Butterworth filter run forwards and backwards
 (one half at the cut-off f_c, no phase), but samples may be uneven and first and second
 derivatives are those of one smooth curve. Polynomials of degree two pass unchanged. Ends
-are natural: nothing is padded, and within about half a period of the cut-off of an end
-the curve and above all its acceleration are less certain. `periodic=True` closes the
-curve instead: the last sample is the first one of the next cycle, and there are no ends.
+are natural: nothing is padded. The acceleration of a 1 Hz wave through a 6 Hz cut-off errs
+(root mean square over phases, share of its amplitude) by 0.23 at an end, 0.06 a quarter of
+a period of the cut-off inside, 0.013 half a period and 0.002 a period inside; a two-pass
+Butterworth with reflected ends errs by 0.64, 0.16, 0.11 and 0.02. `periodic=True` closes
+the curve: the last sample is the first one of the next cycle, and there are no ends.
 
 `cutoff_Hz = "none"` interpolates the samples with a quintic spline.
 

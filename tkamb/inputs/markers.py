@@ -130,7 +130,7 @@ def complete_run(
     last = int(np.searchsorted(time, end - 1e-9, side="left"))
     if first < 0 or last >= len(time):
         raise InputError(
-            f"covers {time[0]:g} to {time[-1]:g} s, but {start:g} to {end:g} s is needed",
+            f"covers {time[0]:.4f} to {time[-1]:.4f} s, but {start:.4f} to {end:.4f} s is needed",
             table.path,
             "choose an interval inside the recording",
         )
@@ -140,7 +140,7 @@ def complete_run(
         frame = first + int(np.argmax(gaps[first : last + 1]))
         raise InputError(
             f"shank marker '{names[int(np.argmax(missing[frame]))]}' is missing at "
-            f"{time[frame]:g} s",
+            f"{time[frame]:.4f} s",
             table.path,
             "leave that marker out, or choose another interval",
         )

@@ -1,0 +1,157 @@
+"""Force plate: axes, centre of pressure, swing, left foot, and an unchanged wrench."""
+
+import numpy as np
+import pytest
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import MIRROR
+from tkamb.inputs.ground_reaction import load_ground_reaction
+from tkamb.scene import GroundReactionTable
+
+STAMPS = np.arange(2401) / 1200
+AT = np.linspace(0.2, 1.8, 33)
+NAMES = ["time", *(f"{what}_{k}" for what in ("force", "point", "moment") for k in (1, 2, 3))]
+
+
+def step(t):
+    """Force, centre of pressure and vertical free moment (n, 3) of one step from 0.4 to 1.4 s."""
+    on = np.clip((t - 0.4) / 1.0, 0, 1)
+    load = np.sin(np.pi * on) ** 2
+    force = np.stack([-60 * np.sin(2 * np.pi * on) * load, 700 * load, 30 * load], axis=1)
+    point = np.stack([0.3 + 0.2 * on, np.full_like(t, 0.02), 0.1 + 0.03 * on], axis=1)
+    return force, point, np.stack([0 * t, 5 * load, 0 * t], axis=1)
+
+
+def write(path, force, point, moment, stamps=STAMPS):
+    rows = np.column_stack([stamps, force, point, moment])
+    lines = [",".join(NAMES), *(",".join(f"{v:.15g}" for v in row) for row in rows)]
+    path.write_text("\n".join(lines), encoding="utf-8")
+    return path
+
+
+def plate(file, **changes):
+    return GroundReactionTable(**({"file": file, "length_unit": "m", "cutoff_Hz": 50.0} | changes))
+
+
+def about_origin(reaction):
+    return np.cross(reaction.point, reaction.force) + reaction.moment
+
+
+def test_loaded_foot_is_reproduced(tmp_path):
+    reaction = load_ground_reaction(plate(write(tmp_path / "g.csv", *step(STAMPS))), AT, "right")
+    force, point, moment = step(AT)
+    on = force[:, 1] > 100
+    assert (reaction.loaded == (force[:, 1] >= 20)).all()
+    np.testing.assert_allclose(reaction.force, force, atol=0.2)
+    np.testing.assert_allclose(reaction.point[on], point[on], atol=1e-4)
+    np.testing.assert_allclose(reaction.moment[on], moment[on], atol=0.02)
+    np.testing.assert_allclose(reaction.moment[reaction.loaded][:, [0, 2]], 0, atol=1e-9)
+
+
+def test_garbage_of_the_unloaded_plate_does_no_harm(tmp_path):
+    """Points of the swing phase mean nothing: wild, zero or missing, the result is the same."""
+    force, point, moment = step(STAMPS)
+    swing = force[:, 1] < 20
+    results = []
+    for garbage in (1e3, 0.0, np.nan):
+        wild = point.copy()
+        wild[swing] = garbage
+        table = plate(write(tmp_path / "g.csv", force, wild, moment))
+        results.append(load_ground_reaction(table, AT, "right"))
+    for result in results[1:]:
+        np.testing.assert_array_equal(result.point, results[0].point)
+        np.testing.assert_array_equal(result.moment, results[0].moment)
+    low, high = point[~swing].min(axis=0), point[~swing].max(axis=0)
+    assert (results[0].point >= low - 1e-3).all()
+    assert (results[0].point <= high + 1e-3).all()
+
+
+def test_wrench_is_filtered_about_a_fixed_point_only(tmp_path):
+    """Where the plate's origin lies changes no force, moment, nor centre of pressure."""
+    force, point, moment = step(STAMPS)
+    shift = np.array([5.0, 0.0, -3.0])
+    here, there = (
+        load_ground_reaction(
+            plate(write(tmp_path / "g.csv", force, point + s, moment), cutoff_Hz=5.0), AT, "right"
+        )
+        for s in (0.0, shift)
+    )
+    np.testing.assert_allclose(there.force, here.force, atol=1e-9)
+    np.testing.assert_allclose(there.point - shift, here.point, atol=1e-9)
+    np.testing.assert_allclose(there.moment, here.moment, atol=1e-9)
+
+
+def test_unloaded_point_is_convention_the_wrench_is_not(tmp_path):
+    file = write(tmp_path / "g.csv", *step(STAMPS))
+    low, high = (
+        load_ground_reaction(plate(file, unloaded_N=n, cutoff_Hz=5.0), AT, "right")
+        for n in (20.0, 100.0)
+    )
+    assert high.loaded.sum() < low.loaded.sum()
+    np.testing.assert_array_equal(low.force, high.force)
+    arm = np.linalg.norm(about_origin(low) - about_origin(high), axis=1)
+    assert arm.max() < 0.5  # N·m, from holding the recorded points of 20 to 100 N
+
+
+def test_laboratory_axes_and_left_foot(tmp_path):
+    force, point, moment = step(STAMPS)
+    right = load_ground_reaction(
+        plate(write(tmp_path / "r.csv", force, point, moment)), AT, "right"
+    )
+    turn = np.diag([-1.0, 1.0, -1.0])
+    file = write(tmp_path / "t.csv", force @ turn, point @ turn, moment @ turn)
+    turned = load_ground_reaction(plate(file, laboratory_axes="-x,+y,-z"), AT, "right")
+    file = write(tmp_path / "l.csv", force @ MIRROR, point @ MIRROR, -moment @ MIRROR)
+    left = load_ground_reaction(plate(file), AT, "left")
+    for other in (turned, left):
+        np.testing.assert_allclose(other.force, right.force, atol=1e-10)
+        np.testing.assert_allclose(other.point, right.point, atol=1e-12)
+        np.testing.assert_allclose(other.moment, right.moment, atol=1e-10)
+
+
+def test_millimetres_and_absent_free_moment(tmp_path):
+    force, point, moment = step(STAMPS)
+    metres = load_ground_reaction(
+        plate(write(tmp_path / "m.csv", force, point, 0 * moment)), AT, "right"
+    )
+    rows = np.column_stack([STAMPS, force, point * 1e3])
+    lines = [",".join(NAMES[:7]), *(",".join(f"{v:.15g}" for v in row) for row in rows)]
+    file = tmp_path / "mm.csv"
+    file.write_text("\n".join(lines), encoding="utf-8")
+    found = load_ground_reaction(plate(file, length_unit="mm"), AT, "right")
+    np.testing.assert_allclose(found.point, metres.point, atol=1e-12)
+    np.testing.assert_allclose(found.moment, metres.moment, atol=1e-9)
+
+
+def test_plate_that_is_never_loaded(tmp_path):
+    force, point, moment = step(STAMPS)
+    reaction = load_ground_reaction(
+        plate(write(tmp_path / "g.csv", 0.01 * force, np.nan * point, 0 * moment)), AT, "right"
+    )
+    assert not reaction.loaded.any()
+    assert np.isfinite(reaction.point).all()
+    assert np.abs(reaction.moment).max() < 1e-9
+
+
+def refused(tmp_path, message, force, point, moment, **changes):
+    file = write(tmp_path / "g.csv", force, point, moment)
+    with pytest.raises(InputError, match=message):
+        load_ground_reaction(plate(file, **changes), AT, "right")
+
+
+def test_refusals(tmp_path):
+    force, point, moment = step(STAMPS)
+    lost = point.copy()
+    lost[1000] = np.nan
+    refused(tmp_path, r"centre of pressure is missing at 0\.833333 s", force, lost, moment)
+    stairs = point + np.array([0, 1, 0]) * STAMPS[:, None]
+    refused(tmp_path, "leaves the plate's level", force, stairs, moment)
+    refused(tmp_path, "half the sampling rate", force, point, moment, cutoff_Hz=700.0)
+    refused(tmp_path, "unknown role 'fx'", force, point, moment, columns={"fx": "force_1"})
+    refused(tmp_path, "no column 'vy'", force, point, moment, columns={"force_2": "vy"})
+    gap = force.copy()
+    gap[7, 0] = np.nan
+    refused(tmp_path, "'force_1' has 1 missing", gap, point, moment)
+    file = write(tmp_path / "g.csv", force, point, moment)
+    with pytest.raises(InputError, match="covers 0 to 2 s, but"):
+        load_ground_reaction(plate(file), AT + 1, "right")

@@ -1,0 +1,114 @@
+"""Reading tables: what a file says, and one clear line when it cannot be used."""
+
+import numpy as np
+import pytest
+
+from tkamb.errors import InputError
+from tkamb.inputs.tables import read_table
+
+TRC = (
+    "PathFileType\t4\t(X/Y/Z)\tshank.trc\n"
+    "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\n"
+    "120\t120\t4\t2\tmm\n"
+    "Frame#\tTime\tSuperior\t\t\tInferior\t\t\t\n"
+    "\t\tX1\tY1\tZ1\tX2\tY2\tZ2\t\n"
+    "\n"
+    "1\t0.000\t1\t2\t3\t4\t5\t6\t\n"
+    "2\t0.008\t1\t2\t3\t-nan(ind)\t5\t6\t\n"
+    "3\t0.017\t-0\t0\t0\t4\t5\t6\t\n"
+    "4\t0.025\t1\t2\t3\t4\t\t6\t\n"
+)
+
+
+def written(folder, name, text):
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_csv_with_comments_and_spaces(tmp_path):
+    table = read_table(written(tmp_path, "a.csv", "# run 3\ntime, angle\n0,1\n\n0.5, 2e0\n"))
+    np.testing.assert_array_equal(table.time(), [0, 0.5])
+    np.testing.assert_array_equal(table.complete_column("angle"), [1, 2])
+
+
+@pytest.mark.parametrize("suffix", ["sto", "mot"])
+def test_storage_reads_header_and_columns(tmp_path, suffix):
+    text = "walk\nversion=1\ninDegrees=yes\nendheader\ntime\tknee\n0\t1\n1\t2\n"
+    table = read_table(written(tmp_path, f"a.{suffix}", text))
+    assert table.in_degrees is True
+    np.testing.assert_array_equal(table.column("knee"), [1, 2])
+
+
+def test_trc_gaps_are_nan_and_time_is_the_cameras(tmp_path):
+    table = read_table(written(tmp_path, "a.trc", TRC))
+    assert table.unit_scale(None, "length_unit") == 1e-3
+    assert np.isnan(table.column("Inferior_x")[1])
+    assert np.isnan(table.column("Inferior_y")[3])
+    assert np.isnan([table.column(f"Superior_{axis}")[2] for axis in "xyz"]).all()
+    np.testing.assert_array_equal(np.isnan(table.column("Inferior_x")), [0, 1, 0, 0])
+    np.testing.assert_allclose(np.diff(table.time()), 1 / 120, rtol=1e-12)
+    assert abs(table.time() - [0, 0.008, 0.017, 0.025]).max() < 1e-3
+
+
+def test_trc_time_that_is_not_even_stays(tmp_path):
+    table = read_table(written(tmp_path, "a.trc", TRC.replace("0.025", "0.050")))
+    np.testing.assert_array_equal(table.time(), [0, 0.008, 0.017, 0.050])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.csv", "", "is empty"),
+        ("a.csv", "time,x\n", "no data rows"),
+        ("a.csv", "time,x\n0,1\n1\n", "line 3 has 1 cells, the header 2"),
+        ("a.csv", "time,x\n0,one\n", "line 2 holds 'one'"),
+        ("a.csv", "time,time\n0,1\n", "two columns named 'time'"),
+        ("a.sto", "time\tx\n0\t1\n", "no 'endheader'"),
+        ("a.trc", "time,x\n", "not a .trc"),
+        ("a.xls", "time,x\n", "unknown table format 'xls'"),
+    ],
+)
+def test_unusable_file_is_one_clear_line(tmp_path, name, text, message):
+    path = written(tmp_path, name, text)
+    with pytest.raises(InputError, match=message) as caught:
+        read_table(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_file():
+    with pytest.raises(InputError, match="no such file"):
+        read_table("nowhere.csv")
+
+
+def test_missing_column_lists_the_nearest(tmp_path):
+    table = read_table(written(tmp_path, "a.csv", "time,knee_flexion_r,hip\n0,1,2\n"))
+    with pytest.raises(InputError, match="no column 'knee_flexion'; did you mean knee_flexion_r"):
+        table.column("knee_flexion")
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [("0 1 1", "row 2 .1. to 3 .1."), ("0 2 1", "row 2 .2. to 3 .1."), ("0 nan 1", "row 2")],
+)
+def test_time_must_rise(tmp_path, times, message):
+    rows = "\n".join(times.split())
+    table = read_table(written(tmp_path, "a.csv", f"time\n{rows}\n"))
+    with pytest.raises(InputError, match=message):
+        table.time()
+
+
+def test_gap_in_a_needed_column(tmp_path):
+    table = read_table(written(tmp_path, "a.csv", "time,x\n0,1\n1,\n2,inf\n"))
+    with pytest.raises(InputError, match=r"2 missing or non-finite.*row 2"):
+        table.complete_column("x")
+
+
+def test_units_must_be_stated_and_agree(tmp_path):
+    trc = read_table(written(tmp_path, "a.trc", TRC))
+    with pytest.raises(InputError, match="is in mm by its own header, but the scene says m"):
+        trc.unit_scale("m", "length_unit")
+    csv = read_table(written(tmp_path, "a.csv", "time\n0\n"))
+    with pytest.raises(InputError, match="no unit of length"):
+        csv.unit_scale(None, "length_unit")
