@@ -46,6 +46,18 @@ class Bed:
     triangles: NDArray[np.int64]
     resolution: float
 
+    def part(self, chosen: NDArray[np.bool_]) -> "Bed":
+        """Return the chosen points (n,) as a bed without triangles."""
+        return Bed(
+            self.points[chosen],
+            self.normals[chosen],
+            self.area[chosen],
+            self.thickness[chosen],
+            self.depth[chosen],
+            np.empty((0, 3), np.int64),
+            self.resolution,
+        )
+
 
 def sample_bed(insert: Surface, resolution: float) -> Bed:
     """Sample the upper surface of the insert by vertical rays on an x-z grid.

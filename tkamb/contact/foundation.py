@@ -15,7 +15,13 @@ from tkamb.contact.model import (
     ContactStatus,
     PreparedContact,
 )
-from tkamb.contact.pressing import approach_at, failed_result
+from tkamb.contact.pressing import (
+    LOAD_TOLERANCE,
+    approach_at,
+    failed_result,
+    pose_at_approach,
+    press_by_search,
+)
 from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import Array, inverse, rotate, transform
@@ -23,6 +29,8 @@ from tkamb.geometry.rays import RayCaster
 
 Law = Literal["nonlinear", "linear"]
 
+NEAR = 1e-3
+"""m; columns nearer than this take part in the search for a load."""
 DEEPEST_STRAIN = 0.5
 """Share of the thickness that the femoral component may penetrate."""
 THINNEST = 1e-6
@@ -142,6 +150,20 @@ class ElasticFoundation(ContactModel):
             status=ContactStatus.OK,
         )
 
+    def press(
+        self, state: FoundationState, load: float, pose: Array, guess: ContactResult | None = None
+    ) -> ContactResult:
+        """Find the approach that carries `load` (N); see `ContactModel`.
+
+        The search looks only at the columns near the femoral component; the whole bed is
+        evaluated at its end, and searched again if that finds another reaction.
+        """
+        nearby = _NearColumns(self.law, state, pose)
+        result = press_by_search(self, state, load, pose, guess, nearby.reaction)
+        if result.status is ContactStatus.OK and result.residual <= LOAD_TOLERANCE:
+            return result
+        return press_by_search(self, state, load, pose, guess)
+
 
 @dataclass(frozen=True)
 class LinearFoundation(ElasticFoundation):
@@ -153,12 +175,38 @@ class LinearFoundation(ElasticFoundation):
     law: Law = "linear"
 
 
+class _NearColumns:
+    """The reaction of the columns that lie near the femoral component."""
+
+    def __init__(self, law: Law, state: FoundationState, pose: Array) -> None:
+        self._law, self._state, self._pose = law, state, pose
+        self._reach, self._near = -np.inf, state.bed
+
+    def reaction(self, approach: float) -> float:
+        """Return the reaction (N) at an approach (m); inf where it is out of range."""
+        bed, pair = self._state.bed, self._state.pair
+        pose = pose_at_approach(pair, self._pose, approach)
+        if approach > self._reach:
+            gap = gaps_along_normals(bed, self._state.femoral_rays, pose)
+            self._near, self._reach = bed.part(gap < NEAR), approach + NEAR / 2
+        near = self._near
+        gap = gaps_along_normals(near, self._state.femoral_rays, pose)
+        strain = np.maximum(-gap, 0.0) / np.maximum(near.thickness, THINNEST)
+        if (strain >= DEEPEST_STRAIN).any():
+            return np.inf
+        pressure = layer_pressure(self._law, pair.material, strain)
+        return float((pressure * near.area) @ near.normals[:, 1])
+
+
 def layer_pressure(law: Law, material: Material, strain: Array) -> Array:
     """Return the pressure (n,), Pa, of a column compressed by `strain` = d/h in [0, 1)."""
     if law == "linear":
         return material.confined_modulus * strain
     stiffening = material.confined_modulus / material.young_modulus
-    return np.asarray(material.stress(-stiffening * np.log1p(-strain)))
+    pressure = np.zeros_like(strain)
+    loaded = strain > 0
+    pressure[loaded] = material.stress(-stiffening * np.log1p(-strain[loaded]))
+    return pressure
 
 
 def gaps_along_normals(bed: Bed, femoral_rays: RayCaster, pose: Array) -> Array:

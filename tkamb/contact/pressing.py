@@ -36,11 +36,13 @@ class LoadSearch:
         approach: m; NaN when the load cannot be reached.
         evaluations: how often the reaction was computed.
         residual: |reaction - load| / load there.
+        deepest: m, the greatest approach that was tried.
     """
 
     approach: float
     evaluations: int
     residual: float
+    deepest: float
 
 
 def first_touch_height(pair: ContactPair, pose: Array) -> float:
@@ -79,6 +81,7 @@ def press_by_search(
     load: float,
     pose: Array,
     guess: ContactResult | None = None,
+    reaction: Reaction | None = None,
 ) -> ContactResult:
     """Find the approach along -y at which `model` carries `load`.
 
@@ -91,6 +94,8 @@ def press_by_search(
         load: N, superior-inferior.
         pose: (4, 4) pose_femoral_in_insert.
         guess: an earlier result; its approach starts the search.
+        reaction: a faster way to the reaction (N) at an approach (m) than `evaluate`; inf
+            where it is out of range.
 
     Returns:
         The result at the approach found. OUT_OF_RANGE and NaN when the load cannot be
@@ -107,42 +112,59 @@ def press_by_search(
         return failed_result(state, pose, "the femoral component does not lie over the insert")
     if load == 0:
         return unloaded_result(model, state, pose)
-    last: dict[float, ContactResult] = {}
-
-    def reaction(approach: float) -> float:
-        result = model.evaluate(state, pose_at_approach(pair, pose, approach), guess)
-        last.clear()
-        last[approach] = result
-        force = -float(result.wrench_on_insert[1])
-        return force if result.status is ContactStatus.OK else math.inf
-
+    seen = _Evaluations(model, state, pose, guess)
     start = guess.approach if guess is not None else FIRST_APPROACH
-    found = search_load(reaction, load, start)
+    found = search_load(reaction or seen.reaction, load, start)
     if not math.isfinite(found.approach):
-        reasons = next(iter(last.values())).flags if last else ()
+        deepest = seen.at(found.deepest)
         return failed_result(
-            state, pose, f"a load of {load:g} N cannot be reached", *reasons, found=found
+            state, pose, f"a load of {load:g} N cannot be reached", *deepest.flags, found=found
         )
-    result = last.get(found.approach)
-    if result is None:
-        result = model.evaluate(state, pose_at_approach(pair, pose, found.approach), guess)
-    missed = found.residual > COARSE_TOLERANCE
+    result = seen.at(found.approach)
+    residual = abs(-float(result.wrench_on_insert[1]) - load) / load
+    missed = not residual <= COARSE_TOLERANCE
     return replace(
         result,
         approach=found.approach,
         iterations=found.evaluations,
-        residual=found.residual,
+        residual=residual,
         status=ContactStatus.NOT_CONVERGED if missed else result.status,
         flags=(*result.flags, "the reaction jumps over the load") if missed else result.flags,
     )
 
 
+class _Evaluations:
+    """Evaluates a model at approaches and keeps the last result."""
+
+    def __init__(
+        self, model: ContactModel, state: Any, pose: Array, guess: ContactResult | None
+    ) -> None:
+        self._model, self._state, self._pose, self._guess = model, state, pose, guess
+        self._approach = math.nan
+        self._last: ContactResult | None = None
+
+    def at(self, approach: float) -> ContactResult:
+        """Return the result at an approach (m)."""
+        if self._last is None or approach != self._approach:
+            placed = pose_at_approach(self._state.pair, self._pose, approach)
+            self._last = self._model.evaluate(self._state, placed, self._guess)
+            self._approach = approach
+        return self._last
+
+    def reaction(self, approach: float) -> float:
+        """Return the reaction (N); inf where the model is out of range."""
+        result = self.at(approach)
+        force = -float(result.wrench_on_insert[1])
+        known = result.status is ContactStatus.OK and math.isfinite(force)
+        return force if known else math.inf
+
+
 def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
     """Find the approach at which a rising reaction equals the load.
 
-    A bracket is grown from `start` by doubling, then narrowed by false position (Illinois)
-    on the square root of the reaction, which is nearly straight in the approach: reactions
-    grow with its power 1.5 to 2.
+    A bracket is grown from `start`, then narrowed by false position (Illinois) on the
+    square root of the reaction, which is nearly straight in the approach: reactions grow
+    with its power 1.5 to 2.
 
     Args:
         reaction: N at an approach in m; 0 at 0; inf where it is out of range.
@@ -152,37 +174,36 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
     target = math.sqrt(load)
     trial = start if 0 < start < DEEPEST else FIRST_APPROACH
     low, low_value, high, high_value = 0.0, -target, math.nan, math.nan
-    best, kept_side = LoadSearch(math.nan, 0, math.inf), 0
+    best, deepest, last_side = (math.inf, math.nan), 0.0, 0
     for count in range(1, MOST_EVALUATIONS + 1):
-        force = reaction(trial)
-        residual = abs(force - load) / load
-        if residual < best.residual:
-            best = LoadSearch(trial, count, residual)
+        force, deepest = reaction(trial), max(deepest, trial)
+        residual = abs(force - load) / load if math.isfinite(force) else math.inf
+        best = min(best, (residual, trial))
         if residual <= LOAD_TOLERANCE:
-            return LoadSearch(trial, count, residual)
-        value = math.sqrt(max(force, 0.0)) - target
-        if value < 0:
-            high_value *= 0.5 if kept_side == -1 else 1.0
-            low, low_value, kept_side = trial, value, -1
-        else:
-            low_value *= 0.5 if kept_side == 1 else 1.0
-            high, high_value, kept_side = trial, value, 1
-        if math.isnan(high):
-            if trial >= DEEPEST:
-                return LoadSearch(math.nan, count, best.residual)
-            trial = min(2 * trial, DEEPEST) if force == 0 else _ahead(trial, force, load)
-            continue
-        if high - low <= FINEST_TRAVEL:
             break
-        trial = _between(low, low_value, high, high_value)
-    if math.isinf(high_value) or not math.isfinite(best.approach):
-        return LoadSearch(math.nan, count, best.residual)
-    return replace(best, evaluations=count)
+        side = -1 if force < load else 1
+        if side < 0:
+            high_value *= 0.5 if last_side < 0 else 1.0
+            low, low_value = trial, math.sqrt(max(force, 0.0)) - target
+        else:
+            low_value *= 0.5 if last_side > 0 else 1.0
+            high, high_value = trial, math.sqrt(max(force, 0.0)) - target
+        last_side = side
+        if trial >= DEEPEST or high - low <= FINEST_TRAVEL:
+            break
+        trial = (
+            _ahead(trial, force, load)
+            if math.isnan(high)
+            else _between(low, low_value, high, high_value)
+        )
+    reached = best[0] <= LOAD_TOLERANCE or math.isfinite(high_value)
+    return LoadSearch(best[1] if reached else math.nan, count, best[0], deepest)
 
 
 def _ahead(trial: float, force: float, load: float) -> float:
     """Return a deeper trial: the reaction taken as quadratic, a little beyond, at most x4."""
-    return min(trial * min(1.05 * math.sqrt(load / force), 4.0) + 1e-9, DEEPEST)
+    factor = 2.0 if force <= 0 else min(1.05 * math.sqrt(load / force), 4.0)
+    return min(trial * factor + 1e-9, DEEPEST)
 
 
 def _between(low: float, low_value: float, high: float, high_value: float) -> float:

@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from tkamb.contact.model import CondyleContact
 from tkamb.geometry.frames import Array, inverse, transform
@@ -85,6 +84,7 @@ def thickness_under(place: Array, points: Array, thickness: Array) -> float:
 
     Inverse-distance weights of the four points nearest in x and z.
     """
-    away, near = cKDTree(points[:, [0, 2]]).query(place[[0, 2]], k=min(4, len(points)))
-    weight = 1.0 / np.maximum(np.atleast_1d(away), 1e-9)
-    return float(weight @ thickness[np.atleast_1d(near)] / weight.sum())
+    away = np.hypot(*(points[:, [0, 2]] - place[[0, 2]]).T)
+    near = np.argpartition(away, 3)[:4] if len(points) > 4 else np.arange(len(points))
+    weight = 1.0 / np.maximum(away[near], 1e-9)
+    return float(weight @ thickness[near] / weight.sum())
