@@ -1,4 +1,4 @@
-"""Closest and lowest points of the femoral condyles, and the gap to the insert."""
+"""Closest points of the femoral condyles and the insert, and the gap between them."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,7 @@ import fcl
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.geometry.close_region import CloseRegion
 from tkamb.geometry.condyles import condyle_faces
 from tkamb.geometry.frames import Array, transform
 from tkamb.geometry.nearest import NearestPoints
@@ -14,7 +15,7 @@ from tkamb.geometry.surface import Surface
 
 Indices = NDArray[np.int64]
 
-_ROUNDS = 4
+_ROUNDS = 3
 _KEPT = 8
 _BATCH = 64
 
@@ -28,12 +29,16 @@ class CondyleGap:
             below the insert's surface.
         point_on_femoral: (3,) m, insert frame.
         point_on_insert: (3,) m, insert frame.
-        normal: (3,) unit, insert frame, out of the insert into the femur.
+        centre: (3,) m, insert frame: centre on the insert of the region in which the gap is
+            the smallest to within 20 µm. The line of action goes through it.
+        normal: (3,) unit, insert frame, out of the insert into the femur: mean over that
+            region of the insert's vertex normals.
     """
 
     gap: float
     point_on_femoral: Array
     point_on_insert: Array
+    centre: Array
     normal: Array
 
 
@@ -54,9 +59,9 @@ class ClosestPointQuery:
     (to about 1/16 of an edge). Both are the smallest signed distance to the insert over the
     condyle, so the gap is continuous through touch.
 
-    The normal is the insert's vertex normals interpolated at the closest point, not the
-    normal of a facet nor the line between the points: it stays defined at touch and turns
-    smoothly as the contact moves, and serves as line of action.
+    The normal is the mean of the insert's interpolated vertex normals over the close region
+    (`tkamb.geometry.close_region`), not the normal of a facet nor the line between the
+    points: it is defined at touch and turns smoothly as the contact moves.
 
     Args:
         femoral: femoral component, femoral frame.
@@ -79,22 +84,26 @@ class ClosestPointQuery:
         return CondyleGaps(gaps[0], gaps[1] if len(gaps) > 1 else None)
 
     def _gap(self, condyle: "_Condyle", pose: Array) -> CondyleGap:
-        deepest = self._deepest_vertex(condyle, pose)
-        if deepest is not None:
+        gap, on_femoral, on_insert = self._closest(condyle, pose)
+        centre, normal = condyle.region.centre(self._nearest, pose, gap, on_femoral, on_insert)
+        return CondyleGap(gap, on_femoral, on_insert, centre, normal)
+
+    def _closest(self, condyle: "_Condyle", pose: Array) -> tuple[float, Array, Array]:
+        deepest = self._deepest_vertices(condyle, pose)
+        if len(deepest):
             return self._refined(condyle.around(deepest), pose)
-        apart = self._apart(condyle, pose)
-        if apart.gap > 0:
-            return apart
+        gap, on_femoral, on_insert = self._apart(condyle, pose)
+        if gap > 0:
+            return gap, on_femoral, on_insert
         return self._refined(condyle.faces[self._crossed(condyle, pose)], pose)
 
-    def _apart(self, condyle: "_Condyle", pose: Array) -> CondyleGap:
+    def _apart(self, condyle: "_Condyle", pose: Array) -> tuple[float, Array, Array]:
         request = fcl.DistanceRequest(enable_nearest_points=True)
         result = fcl.DistanceResult()
         femoral, insert = condyle.placed(pose), fcl.CollisionObject(self._insert_tree)
         distance = fcl.distance(femoral, insert, request, result)
         on_femoral, on_insert = (np.asarray(point, float) for point in result.nearest_points)
-        normal = self._nearest.normals_at(on_insert[None], np.array([result.b2]))[0]
-        return CondyleGap(float(distance), on_femoral, on_insert, normal)
+        return float(distance), on_femoral, on_insert
 
     def _crossed(self, condyle: "_Condyle", pose: Array) -> Indices:
         """Return which triangles of the condyle cut through the insert's surface."""
@@ -103,15 +112,17 @@ class ClosestPointQuery:
         fcl.collide(condyle.placed(pose), fcl.CollisionObject(self._insert_tree), request, result)
         return np.unique([contact.b1 for contact in result.contacts])
 
-    def _deepest_vertex(self, condyle: "_Condyle", pose: Array) -> Indices | None:
-        """Return the deepest few vertices inside the insert, deepest first; None if none is.
+    def _deepest_vertices(self, condyle: "_Condyle", pose: Array) -> Indices:
+        """Return the deepest few vertices inside the insert, deepest first; none if apart.
 
         The depth along y bounds the depth from above and orders the search.
         """
-        points = transform(pose, condyle.points)
         low, high = self.insert.bounds
-        near = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
-        below = self._depth_along_y(points[near])
+        near = np.flatnonzero(condyle.points @ pose[1, :3] + pose[1, 3] < high[1])
+        points = transform(pose, condyle.points[near])
+        within = ((points > low) & (points < high)).all(axis=1)
+        near, points = near[within], points[within]
+        below = self._depth_along_y(points)
         order = np.argsort(-below)
         order = order[below[order] > 0]
         depth = np.zeros(0)
@@ -119,9 +130,7 @@ class ClosestPointQuery:
             batch = order[start : start + _BATCH]
             if len(depth) and below[batch[0]] < depth.max():
                 break
-            depth = np.append(depth, self._nearest.at(points[near[batch]]).distance)
-        if len(depth) == 0:
-            return None
+            depth = np.append(depth, self._nearest.at(points[batch]).distance)
         return condyle.vertices[near[order[np.argsort(-depth)[:_KEPT]]]]
 
     def _depth_along_y(self, points: Array) -> Array:
@@ -130,23 +139,25 @@ class ClosestPointQuery:
         inside = (face >= 0) & (self.insert.face_normals[face, 1] > 0)
         return np.where(inside, distance, 0.0)
 
-    def _refined(self, faces: Indices, pose: Array) -> CondyleGap:
-        """Return the deepest point of the given triangles, cutting the best ones finer."""
-        triangles = transform(pose, self.femoral.triangles[faces].reshape(-1, 3)).reshape(-1, 3, 3)
+    def _refined(self, faces: Indices, pose: Array) -> tuple[float, Array, Array]:
+        """Return gap and points of the deepest point of triangles, cutting the best finer."""
+        corners = self.femoral.triangles[faces]
+        triangles = transform(pose, corners.reshape(-1, 3)).reshape(-1, 3, 3)
+        points = triangles.reshape(-1, 3)
         for _ in range(_ROUNDS):
             triangles = _quartered(triangles)
-            middles = triangles.mean(axis=1)
-            near = self._nearest.at(middles)
-            inside = self._depth_along_y(middles) > 0
-            depth = np.where(inside, near.distance, -near.distance)
-            triangles = triangles[np.argsort(-depth)[:_KEPT]]
-        corners = np.concatenate([triangles.reshape(-1, 3), triangles.mean(axis=1)])
-        near = self._nearest.at(corners)
-        depth = np.where(self._depth_along_y(corners) > 0, near.distance, -near.distance)
-        best = int(np.argmax(depth))
-        return CondyleGap(
-            -float(depth[best]), corners[best], near.points[best], near.normals[best]
-        )
+            near = self._nearest.at(triangles.mean(axis=1))
+            side = np.einsum("ij,ij->i", triangles.mean(axis=1) - near.points, near.normals)
+            triangles = triangles[np.argsort(np.sign(side) * near.distance)[:_KEPT]]
+        points = np.concatenate([points, triangles.reshape(-1, 3), triangles.mean(axis=1)])
+        gaps, feet = self._signed_gaps(points)
+        best = int(np.argmin(gaps))
+        return float(gaps[best]), points[best], feet[best]
+
+    def _signed_gaps(self, points: Array) -> tuple[Array, Array]:
+        near = self._nearest.at(points)
+        inside = self._depth_along_y(points) > 0
+        return np.where(inside, -near.distance, near.distance), near.points
 
 
 class _Condyle:
@@ -157,6 +168,7 @@ class _Condyle:
         self.tree = _tree(femoral, faces)
         self.vertices = np.unique(femoral.faces[faces])
         self.points = femoral.vertices[self.vertices]
+        self.region = CloseRegion(femoral, faces)
         self._corners = femoral.faces[faces]
 
     def placed(self, pose: Array) -> fcl.CollisionObject:
@@ -165,7 +177,9 @@ class _Condyle:
 
     def around(self, vertices: Indices) -> Indices:
         """Return the triangles that touch the vertices."""
-        return self.faces[np.isin(self._corners, vertices).any(axis=1)]
+        touched = np.zeros(self._corners.max() + 1, bool)
+        touched[vertices] = True
+        return self.faces[touched[self._corners].any(axis=1)]
 
 
 def closest_points(
@@ -173,21 +187,6 @@ def closest_points(
 ) -> CondyleGaps:
     """Return the gaps at one pose; `ClosestPointQuery` is the way to many."""
     return ClosestPointQuery(femoral, insert, split).at(pose_femoral_in_insert)
-
-
-def lowest_points(
-    femoral: Surface, pose_femoral_in_insert: Array, split: float | None
-) -> tuple[Array, Array | None]:
-    """Return the lowest point (3,), insert frame, of the medial and the lateral condyle.
-
-    Lowest along the insert's y. The lateral one is None without a split.
-    """
-    points = transform(pose_femoral_in_insert, femoral.vertices)
-    lowest = []
-    for faces in condyle_faces(femoral, split):
-        vertices = np.unique(femoral.faces[faces])
-        lowest.append(points[vertices[np.argmin(points[vertices, 1])]] if len(faces) else None)
-    return lowest[0], lowest[1]
 
 
 def _tree(surface: Surface, faces: Indices) -> fcl.BVHModel:

@@ -61,8 +61,7 @@ def condyle_faces(
 
 def _mean_outline(femoral: Surface) -> tuple[Array, Array]:
     """Return height (n,) of the outline above its lowest point and z (n,) of the strips, m."""
-    samples, _ = sampled(femoral, _STRIP / 2)
-    samples = np.concatenate([samples, femoral.vertices])
+    samples = np.concatenate([sampled(femoral, _STRIP / 2)[0], femoral.vertices])
     low, high = femoral.bounds[:, 2]
     count = max(int(np.ceil((high - low) / _STRIP)), 3)
     strip = np.clip(((samples[:, 2] - low) / (high - low) * count).astype(int), 0, count - 1)

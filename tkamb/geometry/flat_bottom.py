@@ -184,7 +184,7 @@ def _peaks(normals: Array, area: Array) -> list[Array]:
     cell = cell.reshape(-1)
     weight = np.bincount(cell, area, len(cells))
     mean = np.stack([np.bincount(cell, area * n, len(cells)) for n in normals.T], axis=1)
-    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+    mean = mean / np.linalg.norm(mean, axis=1, keepdims=True)
     votes = np.array([weight[mean @ m > math.cos(_CONE / 2)].sum() for m in mean])
     peaks: list[Array] = []
     for index in np.argsort(-votes):
@@ -207,7 +207,9 @@ def _grown(
     for tolerance in tolerances:
         if tolerance == 0.0:
             spread = _median(np.abs(corners @ normal - offset).max(axis=1)[chosen], weight[chosen])
-            lean = _median(np.arccos(np.clip(normals[near] @ normal, -1, 1))[chosen], weight[chosen])
+            lean = _median(
+                np.arccos(np.clip(normals[near] @ normal, -1, 1))[chosen], weight[chosen]
+            )
             tolerance = min(max(3 * spread, 1e-6), FLATNESS)
             cone = min(max(6 * lean, math.radians(0.5)), _CONE)
         apart = np.abs(corners @ normal - offset).max(axis=1)

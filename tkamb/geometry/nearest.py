@@ -44,7 +44,7 @@ class NearestPoints:
 
     def __init__(self, surface: Surface, spacing: float = 7e-4) -> None:
         self.surface = surface
-        samples, self._faces = sampled(surface, spacing)
+        samples, self._faces, _ = sampled(surface, spacing)
         self._tree = cKDTree(samples)
 
     @cached_property
@@ -75,8 +75,8 @@ class NearestPoints:
         return np.asarray(np.divide(normal, length, out=np.zeros_like(normal), where=length > 0))
 
 
-def sampled(surface: Surface, spacing: float) -> tuple[Array, Indices]:
-    """Return samples (n, 3) that cover every triangle, and the triangle (n,) of each.
+def sampled(surface: Surface, spacing: float) -> tuple[Array, Indices, Array]:
+    """Return samples (n, 3) that cover every triangle, the triangle (n,) and area (n,) of each.
 
     A triangle is cut into n² like ones so that no edge is longer than the spacing; the
     samples are their centres. The spacing grows where a surface would need more than
@@ -88,12 +88,15 @@ def sampled(surface: Surface, spacing: float) -> tuple[Array, Indices]:
     while (cuts**2).sum() > max(_MOST_SAMPLES, len(triangles)) and cuts.max() > 1:
         spacing *= 1.2
         cuts = np.maximum(np.ceil(longest / spacing).astype(int), 1)
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    area = 0.5 * np.linalg.norm(cross, axis=1) / cuts**2
     samples, faces = [], []
     for n in np.unique(cuts):
         members = np.flatnonzero(cuts == n)
         samples.append(np.einsum("sj,kjc->ksc", _centres(int(n)), triangles[members]))
         faces.append(np.repeat(members, n * n))
-    return np.concatenate([s.reshape(-1, 3) for s in samples]), np.concatenate(faces)
+    owner = np.concatenate(faces)
+    return np.concatenate([s.reshape(-1, 3) for s in samples]), owner, area[owner]
 
 
 def vertex_normals(surface: Surface) -> Array:

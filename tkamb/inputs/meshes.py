@@ -90,7 +90,9 @@ def load_surface(
     mended = repair(vertices * LENGTH[unit], faces)
     _check_surface(mended, path, name, unit)
     if closed and mended.holes:
-        raise InputError(f"{name} is not closed: {describe_holes(mended.holes, unit)}", path, _CLOSE)
+        raise InputError(
+            f"{name} is not closed: {describe_holes(mended.holes, unit)}", path, _CLOSE
+        )
     if mended.notices:
         _log.warning("%s: %s mesh repaired: %s", path, name, "; ".join(mended.notices))
     return Surface(mended.vertices @ rotation.T + 0.0, mended.faces, name)
@@ -118,9 +120,9 @@ def read_triangles(path: str | Path) -> tuple[Array, Indices]:
     except Exception as error:  # readers of many formats: each raises what it likes
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(f"cannot be read as a mesh ({reason})", path, _FORMATS) from None
-    faces = np.asarray(getattr(mesh, "faces", np.empty((0, 3))), np.int64).reshape(-1, 3)
-    if len(faces) == 0:
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError("holds no triangles", path, _FORMATS)
+    faces = np.asarray(mesh.faces, np.int64)
     vertices = np.asarray(mesh.vertices, np.float64)
     bad = ~np.isfinite(vertices[faces]).all(axis=(1, 2))
     if bad.any():
@@ -167,8 +169,10 @@ def _check_size(corners: Array, unit: str, path: str | Path, name: str) -> None:
     size = float(extents.max())
     if unit in plausible_units(size):
         return
-    fits = [f"'{other}' would make it {size * LENGTH[other] * 1e3:.4g} mm" for other in
-            plausible_units(size)]
+    fits = [
+        f"'{other}' would make it {size * LENGTH[other] * 1e3:.4g} mm"
+        for other in plausible_units(size)
+    ]
     raise InputError(
         f"{name} is {size * LENGTH[unit] * 1e3:.4g} mm long in unit '{unit}', which no part of a "
         f"knee is ({low:g} to {high:g} mm)",
@@ -181,7 +185,9 @@ def _check_surface(mended: Repair, path: str | Path, name: str, unit: str) -> No
     if mended.one_sided:
         raise InputError(f"{name} is not a surface: it has only one side", path, _REMESH)
     if len(mended.faces) < 4:
-        raise InputError(f"{name} is not a surface: {len(mended.faces)} triangles left", path, _REMESH)
+        raise InputError(
+            f"{name} is not a surface: {len(mended.faces)} triangles left", path, _REMESH
+        )
     if len(mended.forks):
         point = mended.vertices[mended.forks[0]] / LENGTH[unit]
         where = ", ".join(f"{value:.4g}" for value in point)
