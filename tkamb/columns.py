@@ -90,6 +90,10 @@ COLUMNS: tuple[Column, ...] = (
     Column("lateral_area_above_yield", "share of the lateral area above yield", _CONTACT),
     Column("medial_thickness_mm", "insert under the medial centre of pressure", _CONTACT),
     Column("lateral_thickness_mm", "insert under the lateral centre of pressure", _CONTACT),
+    Column(
+        "residual_coronal_Nm", "residual moment on the tibia about insert x, one condyle lifted"
+    ),
+    Column("residual_flexion_Nm", "residual moment on the tibia about insert z, no quadriceps"),
     Column("cycle_percent", "per cent of the cycle", "[motion] cycle_s"),
     Column("condition_number", "of the equilibrium system with scaled columns"),
     Column("body_seconds", "computing time of the rigid-body part"),

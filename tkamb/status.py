@@ -28,11 +28,19 @@ def frame_status(case: Case, k: int, body: FrameLoads, contact: "FrameContact | 
     if contact and contact.problem and not failures:
         failures.append(contact.problem)
     words = [*_motion_flags(case, k), *_flank_flags(body)]
-    words += [f"{side} condyle off the insert" for side in sorted(body.loads.lifted)]
+    words += [_lift_off(body, side) for side in sorted(body.loads.lifted)]
+    if body.loads.slack:
+        words.append("flexors needed, which are not modelled: quadriceps slack")
     words += list(contact.flags) if contact else []
     if failures:
         return FAILED + "; ".join([*failures, *words])
     return "; ".join(words) or "ok"
+
+
+def _lift_off(body: FrameLoads, side: str) -> str:
+    if side in body.geometry.lifted:
+        return f"{side} condyle off the insert as recorded"
+    return f"{side} condyle unloaded: the other one alone balances the adduction moment"
 
 
 def _flank_flags(body: FrameLoads) -> list[str]:

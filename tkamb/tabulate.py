@@ -89,6 +89,8 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
     row["residual_ap_N"] = values.get("residual_ap", NAN)
     row["residual_ml_N"] = values.get("residual_ml", NAN)
     row["residual_axial_Nm"] = values.get("residual_axial", NAN)
+    row["residual_coronal_Nm"] = values.get("residual_coronal", NAN)
+    row["residual_flexion_Nm"] = values.get("residual_flexion", NAN)
     if frame.geometry.ground:
         ground = frame.geometry.ground.forces[0]
         row |= {

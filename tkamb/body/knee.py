@@ -10,7 +10,7 @@ and three residuals. Less is asked for when less is modelled:
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from tkamb.geometry.frames import Array
 RESIDUAL_SHIFT = 0.010
 """m: how far the residuals' point is moved along y for their sensitivity."""
 
-NAN3 = np.full(3, np.nan)
+EXTENSOR = ("quadriceps", "patellar_ligament", "patellofemoral", "patellofemoral_tangential")
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +78,7 @@ class KneeLoads:
             moves by ±10 mm along y.
         condition: condition number (unit columns).
         lifted: sides that carry nothing.
+        slack: the quadriceps would have had to push, so it carries nothing.
         problems: plain words; empty when all is well.
     """
 
@@ -88,118 +89,140 @@ class KneeLoads:
     sensitivity: float
     condition: float
     lifted: frozenset[str]
+    slack: bool
     problems: tuple[str, ...]
 
 
-def unsolved(problems: Iterable[str]) -> KneeLoads:
-    """Return a frame without a number, and why."""
-    return KneeLoads({}, NAN3, np.nan, np.nan, np.nan, np.nan, frozenset(), tuple(problems))
-
-
 def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
-    """Return all loads of one frame; a condyle that would have to pull is lifted off.
+    """Return all loads of one frame.
+
+    A muscle cannot push: where the quadriceps would have to, the extensor mechanism is slack
+    and the flexion moment that flexors would have to carry becomes a residual. A condyle
+    cannot pull: it is lifted off and the coronal moment becomes a residual.
 
     Args:
         geometry: the frame.
         friction: Coulomb coefficient of the femorotibial contact.
     """
-    problems: list[str] = []
-    lifted = geometry.lifted
-    solution = _solve(geometry, friction, lifted)
-    pulling = [side for side in _touching(geometry, lifted) if _normal(solution, side) < 0]
-    if pulling and len(_touching(geometry, lifted)) == 2:
-        side = min(pulling, key=lambda name: _normal(solution, name))
-        lifted = lifted | {side}
-        solution = _solve(geometry, friction, lifted)
-        pulling = [side for side in _touching(geometry, lifted) if _normal(solution, side) < 0]
+    system = _System(geometry, friction, geometry.lifted, slack=False)
+    solution = system.solve()
+    if solution.values.get("quadriceps", 0.0) < 0:
+        system = replace(system, slack=True)
+        solution = system.solve()
+    pulling = _pulling(system, solution)
+    if pulling and len(system.touching) == 2:
+        side = min(pulling, key=lambda name: solution.values[f"{name}_normal"])
+        system = replace(system, lifted=system.lifted | {side})
+        solution = system.solve()
+        pulling = _pulling(system, solution)
+    problems = ["contact would have to pull"] if pulling else []
     if not solution.regular:
         problems.append("singular equations")
-    if pulling:
-        problems.append("contact would have to pull")
     if problems:
-        solution = Solution(dict.fromkeys(solution.values, np.nan), solution.condition, False)
-    force = _contact_force(geometry, solution, friction, lifted)
+        return replace(unsolved(problems), condition=solution.condition)
     flexion, adduction = _external_moments(geometry)
     return KneeLoads(
-        solution.values,
-        force,
+        solution.values | (dict.fromkeys(EXTENSOR, 0.0) if system.slack else {}),
+        system.contact_force(solution),
         flexion,
         adduction,
-        _sensitivity(geometry, friction, lifted, force) if solution.regular else np.nan,
+        _sensitivity(system, solution),
         solution.condition,
-        lifted,
-        tuple(problems),
+        system.lifted,
+        system.slack,
+        (),
     )
 
 
-def _touching(geometry: KneeGeometry, lifted: frozenset[str]) -> list[str]:
-    return [side for side in geometry.condyles if side not in lifted]
+def unsolved(problems: Iterable[str]) -> KneeLoads:
+    """Return a frame without a number, and why."""
+    nan = np.nan
+    return KneeLoads({}, np.full(3, nan), nan, nan, nan, nan, frozenset(), False, tuple(problems))
 
 
-def _normal(solution: Solution, side: str) -> float:
-    return solution.values[f"{side}_normal"]
+@dataclass(frozen=True, eq=False)
+class _System:
+    """The square system of one frame under given assumptions.
 
+    Args:
+        geometry: the frame.
+        friction: Coulomb coefficient.
+        lifted: sides that carry nothing.
+        slack: the extensor mechanism carries nothing.
+        shift: m, of the residuals' point along y.
+    """
 
-def _solve(
-    geometry: KneeGeometry, friction: float, lifted: frozenset[str], shift: float = 0.0
-) -> Solution:
-    found = unknowns.hip(geometry.state.point("hip", np.zeros(3)))
-    extensor = geometry.extensor
-    if extensor:
-        found += [
+    geometry: KneeGeometry
+    friction: float
+    lifted: frozenset[str]
+    slack: bool
+    shift: float = 0.0
+
+    @property
+    def touching(self) -> list[str]:
+        """Sides that carry load."""
+        return [side for side in self.geometry.condyles if side not in self.lifted]
+
+    def solve(self) -> Solution:
+        """Solve for all unknown loads."""
+        geometry = self.geometry
+        hip = unknowns.hip(geometry.state.point("hip", np.zeros(3)))
+        known = [*([geometry.ground] if geometry.ground else []), *geometry.ligaments]
+        return solve(geometry.state, [*hip, *self._extensor(), *self._knee()], known)
+
+    def contact_force(self, solution: Solution) -> Array:
+        """Return the femorotibial force on the femur (3,), insert frame, without residuals."""
+        if not self.geometry.condyles:
+            return np.array([solution.values[f"knee_force_{axis}"] for axis in unknowns.AXES])
+        forces = [
+            solution.values[f"{side}_normal"]
+            * self.geometry.condyles[side].direction(self.friction)
+            for side in self.touching
+        ]
+        return np.asarray(np.sum(forces, axis=0))
+
+    def _extensor(self) -> list[Unknown]:
+        extensor, state = self.geometry.extensor, self.geometry.state
+        if extensor is None:
+            return []
+        if self.slack:
+            return unknowns.riding_patella(extensor.contact_point, state.pose("femur")[:3, 2])
+        return [
             Unknown("quadriceps", extensor.quadriceps),
             Unknown("patellar_ligament", extensor.patellar_ligament),
             *unknowns.patellofemoral(
-                extensor.contact_point,
-                extensor.contact_normal,
-                geometry.state.pose("femur")[:3, 2],
+                extensor.contact_point, extensor.contact_normal, state.pose("femur")[:3, 2]
             ),
         ]
-    touching = _touching(geometry, lifted)
-    if geometry.condyles:
-        found += [unknowns.condyle(s, geometry.condyles[s], friction) for s in touching]
-        middle = np.mean([c.point for c in geometry.condyles.values()], axis=0)
-        middle = middle + np.array([0.0, shift, 0.0])
-        found += unknowns.residuals(middle, len(touching) < 2, extensor is not None)
-    else:
-        axes = {"axial": unknowns.AXES["si"], "coronal": unknowns.AXES["ap"]}
-        if not extensor:
-            axes["flexion"] = unknowns.AXES["ml"]
-        found += unknowns.intersegmental(geometry.state.pose("femur")[:3, 3], axes)
-    return solve(geometry.state, found, _known(geometry))
+
+    def _knee(self) -> list[Unknown]:
+        geometry = self.geometry
+        balanced = geometry.extensor is not None and not self.slack
+        if not geometry.condyles:
+            axes = {"axial": unknowns.AXES["si"], "coronal": unknowns.AXES["ap"]}
+            if not balanced:
+                axes["flexion"] = unknowns.AXES["ml"]
+            return unknowns.intersegmental(geometry.state.pose("femur")[:3, 3], axes)
+        normals = [
+            unknowns.condyle(side, geometry.condyles[side], self.friction) for side in self.touching
+        ]
+        middle = np.mean([contact.point for contact in geometry.condyles.values()], axis=0)
+        middle = middle + np.array([0.0, self.shift, 0.0])
+        return normals + unknowns.residuals(middle, len(normals) < 2, balanced)
 
 
-def _known(geometry: KneeGeometry) -> list[PointForces]:
-    return [*([geometry.ground] if geometry.ground else []), *geometry.ligaments]
+def _pulling(system: _System, solution: Solution) -> list[str]:
+    return [side for side in system.touching if solution.values[f"{side}_normal"] < 0]
 
 
-def _contact_force(
-    geometry: KneeGeometry, solution: Solution, friction: float, lifted: frozenset[str]
-) -> Array:
-    """Return the femorotibial force on the femur (3,), insert frame, without residuals."""
-    if not solution.regular:
-        return NAN3
-    if not geometry.condyles:
-        return np.array([solution.values[f"knee_force_{axis}"] for axis in unknowns.AXES])
-    return np.sum(
-        [
-            _normal(solution, side) * geometry.condyles[side].direction(friction)
-            for side in _touching(geometry, lifted)
-        ],
-        axis=0,
-    )
-
-
-def _sensitivity(
-    geometry: KneeGeometry, friction: float, lifted: frozenset[str], force: Array
-) -> float:
-    if not geometry.condyles:
+def _sensitivity(system: _System, solution: Solution) -> float:
+    if not system.geometry.condyles:
         return 0.0
+    total = np.linalg.norm(system.contact_force(solution))
     changes = []
     for shift in (-RESIDUAL_SHIFT, RESIDUAL_SHIFT):
-        moved = _solve(geometry, friction, lifted, shift)
-        other = _contact_force(geometry, moved, friction, lifted)
-        changes.append(abs(np.linalg.norm(other) - np.linalg.norm(force)))
+        moved = replace(system, shift=shift)
+        changes.append(abs(np.linalg.norm(moved.contact_force(moved.solve())) - total))
     return float(max(changes))
 
 

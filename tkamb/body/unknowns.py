@@ -109,6 +109,22 @@ def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown
     ]
 
 
+def riding_patella(point: Array, femur_ml: Array) -> list[Unknown]:
+    """Return what carries the patella's own weight when the extensor mechanism is slack.
+
+    Args:
+        point: (3,) where it rests on the femur.
+        femur_ml: (3,) the femur's ML axis, normal to the patella's plane.
+    """
+    first = np.cross(femur_ml, AXES["ap"])
+    first /= np.linalg.norm(first)
+    return [
+        Unknown("patella_rest_1", pair("patella", "femur", point, first)),
+        Unknown("patella_rest_2", pair("patella", "femur", point, np.cross(femur_ml, first))),
+        Unknown("patella_rest_moment", moment_pair("patella", "femur", femur_ml)),
+    ]
+
+
 def condyle(side: str, contact: CondylePoint, friction: float) -> Unknown:
     """Return the contact force of one condyle; its magnitude is the normal force."""
     force = contact.direction(friction)
@@ -121,7 +137,7 @@ def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
     Args:
         point: (3,) where the residual forces act: midpoint of the contact points.
         lifted: one condyle is off, a coronal moment takes the place of its force.
-        extensor: muscles are modelled; without them the flexion moment joins the residuals.
+        extensor: muscles act; without them the flexion moment joins the residuals.
     """
     found = [
         Unknown("residual_ap", pair("tibia", "femur", point, AXES["ap"])),
