@@ -77,6 +77,14 @@ def test_unusable_file_is_one_clear_line(tmp_path, name, text, message):
     assert "\n" not in str(caught.value)
 
 
+def test_words_that_only_contain_nan_are_no_gaps(tmp_path):
+    text = "time,x\n0,NaN\n1,-nan(ind)\n2,-1.#IND\n3,\n"
+    values = read_table(written(tmp_path, "a.csv", text)).column("x")
+    assert np.isnan(values).all()
+    with pytest.raises(InputError, match="holds 'banana'"):
+        read_table(written(tmp_path, "a.csv", "time,x\n0,banana\n"))
+
+
 def test_missing_file():
     with pytest.raises(InputError, match="no such file"):
         read_table("nowhere.csv")

@@ -2,6 +2,7 @@
 
 import difflib
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from tkamb.units import LENGTH
 FORMATS = ("csv", "sto", "mot", "trc")
 TRC_ROUNDING_S = 1e-3
 """Cameras write `.trc` times rounded to the millisecond; the header's rate is exact."""
+
+_NOT_A_NUMBER = re.compile(r"[+-]?(nan(\(\w*\))?|1\.#(ind|qnan)0*)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +213,7 @@ def _columns(path: Path, names: list[str], rows: list[tuple[int, list[str]]]) ->
 
 def _number(cell: str, path: Path, line: int) -> float:
     text = cell.strip()
-    if not text or "nan" in text.lower():
+    if not text or _NOT_A_NUMBER.fullmatch(text.lower()):
         return math.nan
     try:
         return float(text)
