@@ -103,7 +103,7 @@ class TabulatedLaw:
 
     The table is mirrored through the origin, scaled so that its slope there is 1, and
     multiplied by Young's modulus: changing E scales the whole curve. Beyond the last point
-    it goes on straight with the slope of that point.
+    it goes on straight with the slope of the last chord.
 
     Args:
         strain: increasing, from 0.
@@ -135,7 +135,10 @@ class TabulatedLaw:
 
     @cached_property
     def _curve(self) -> PchipInterpolator:
+        """The mirrored table; one more step of the last chord gives it that slope at its end."""
         strain, values = np.asarray(self.strain, float), np.asarray(self.values, float)
+        strain = np.append(strain, 2 * strain[-1] - strain[-2])
+        values = np.append(values, 2 * values[-1] - values[-2])
         return PchipInterpolator(
             np.concatenate([-strain[:0:-1], strain]), np.concatenate([-values[:0:-1], values])
         )

@@ -174,9 +174,9 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
     target = math.sqrt(load)
     trial = start if 0 < start < DEEPEST else FIRST_APPROACH
     low, low_value, high, high_value = 0.0, -target, math.nan, math.nan
-    best, deepest, last_side = (math.inf, math.nan), 0.0, 0
-    for count in range(1, MOST_EVALUATIONS + 1):
-        force, deepest = reaction(trial), max(deepest, trial)
+    best, deepest, last_side, count = (math.inf, math.nan), 0.0, 0, 0
+    while count < MOST_EVALUATIONS:
+        force, deepest, count = reaction(trial), max(deepest, trial), count + 1
         residual = abs(force - load) / load if math.isfinite(force) else math.inf
         best = min(best, (residual, trial))
         if residual <= LOAD_TOLERANCE:

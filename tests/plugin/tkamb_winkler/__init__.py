@@ -1,0 +1,1 @@
+"""A contact model for tkamb from another package."""

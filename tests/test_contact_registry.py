@@ -1,0 +1,143 @@
+"""Contact models by name, and the conformance of every one of them."""
+
+import sys
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tkamb.contact import registry
+from tkamb.contact.foundation import ElasticFoundation
+from tkamb.contact.registry import (
+    BUILT_IN,
+    contact_class,
+    contact_descriptions,
+    contact_model,
+    contact_names,
+)
+from tkamb.errors import InputError
+from tkamb.testing import ConformanceError, check_contact_model
+
+PLUGIN = Path(__file__).parent / "plugin"
+COARSE = 2.0
+"""mm; the volume models need no finer grid for the contract."""
+
+
+@pytest.fixture
+def plugin(monkeypatch):
+    monkeypatch.syspath_prepend(str(PLUGIN))
+    yield
+    for name in [n for n in sys.modules if n.startswith("tkamb_winkler")]:
+        del sys.modules[name]
+
+
+@pytest.mark.parametrize("name", sorted(BUILT_IN))
+def test_built_in_models_conform(name):
+    fine = name in ("hertz", "foundation", "foundation-linear")
+    check_contact_model(contact_model(name, 1.0 if fine else COARSE))
+
+
+def test_a_model_of_another_package_is_found_and_conforms(plugin):
+    assert "winkler" in contact_names()
+    model = contact_model("winkler", 1.0, modulus=1e11)
+    assert type(model).__module__ == "tkamb_winkler.model"
+    assert model.modulus == 1e11
+    check_contact_model(model)
+
+
+def test_without_the_package_its_name_is_unknown():
+    with pytest.raises(InputError, match=r"there are: .*foundation") as caught:
+        contact_model("winkler")
+    assert "hertz" in str(caught.value)
+
+
+def test_descriptions_cover_every_name_in_one_line(plugin):
+    lines = contact_descriptions()
+    assert set(lines) == set(contact_names()) >= {"hertz", "foundation", "winkler"}
+    for line in lines.values():
+        assert line.startswith("assumes ")
+        assert "; needs " in line
+        assert "\n" not in line
+
+
+@pytest.mark.parametrize("name", ["hertz", "winkler"])
+def test_a_name_clash_is_an_error(name, monkeypatch):
+    points = [
+        EntryPoint(name, "first.module:Model", "tkamb.contact"),
+        EntryPoint(name, "second.module:Model", "tkamb.contact"),
+    ]
+    monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    with pytest.raises(InputError, match=f"two contact models are called '{name}'"):
+        contact_names()
+
+
+@pytest.mark.parametrize("value", ["not_there.at_all:Model", "tkamb.units:DEGREE"])
+def test_an_offer_that_is_no_model_is_an_input_error(value, monkeypatch):
+    offer = EntryPoint("broken", value, "tkamb.contact")
+    monkeypatch.setattr(registry, "entry_points", lambda group: [offer])
+    with pytest.raises(InputError, match="contact model 'broken'"):
+        contact_class("broken")
+    assert "broken" in contact_descriptions()["broken"]
+
+
+@pytest.mark.parametrize("resolution", [0.0, -1.0, float("nan"), float("inf")])
+def test_resolution_must_be_a_length(resolution):
+    with pytest.raises(InputError, match="resolution"):
+        contact_model("foundation", resolution)
+
+
+def test_an_unknown_option_is_named():
+    with pytest.raises(InputError, match=r"no option 'stiffness'.*law"):
+        contact_model("foundation", 1.0, stiffness=1.0)
+
+
+@dataclass(frozen=True)
+class Sucking(ElasticFoundation):
+    """Pulls when apart."""
+
+    def evaluate(self, state, pose, guess=None):
+        result = super().evaluate(state, pose, guess)
+        object.__setattr__(result, "wrench_on_insert", result.wrench_on_insert + 1.0)
+        return result
+
+
+@dataclass(frozen=True)
+class Forgetful(ElasticFoundation):
+    """Reports twice the pressure that its wrench stands for."""
+
+    def evaluate(self, state, pose, guess=None):
+        result = super().evaluate(state, pose, guess)
+        object.__setattr__(result, "pressure", 2 * result.pressure)
+        return result
+
+
+@dataclass(frozen=True)
+class Suggestible(ElasticFoundation):
+    """Mixes the guess into the answer."""
+
+    def press(self, state, load, pose, guess=None):
+        result = super().press(state, load, pose, guess)
+        if guess is not None:
+            object.__setattr__(result, "approach", 0.9 * result.approach + 0.1 * guess.approach)
+        return result
+
+
+@pytest.mark.parametrize(
+    ("model", "broken"),
+    [
+        (Sucking, "no wrench when apart"),
+        (Forgetful, "integral of pressure"),
+        (Suggestible, "a guess changes no answer"),
+    ],
+)
+def test_the_conformance_test_can_fail(model, broken):
+    with pytest.raises(ConformanceError, match=broken):
+        check_contact_model(model(resolution=2e-3))
+
+
+def test_models_are_values():
+    assert contact_model("foundation", 1.5) == contact_model("foundation", 1.5)
+    assert contact_model("foundation", 1.5).resolution == pytest.approx(1.5e-3)
+    assert np.isclose(contact_model("hertz").resolution, 1e-3)
