@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import scipy.sparse.linalg as linalg
-from lattice_blocks import block, uniform_strain
 
+from lattice_blocks import block, uniform_strain
 from tkamb.contact.lattice.bbar import BbarHexahedra
 from tkamb.contact.lattice.calibrated import (
     body_diagonal_stiffness,

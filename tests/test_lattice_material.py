@@ -1,0 +1,117 @@
+"""The nonlinear cell follows the material's own curve, and its tangent is its derivative."""
+
+import numpy as np
+import pytest
+import scipy.sparse.linalg as linalg
+
+from lattice_blocks import block
+from tkamb.contact.lattice.bbar import BbarHexahedra
+from tkamb.contact.lattice.curve import ShearCurve
+from tkamb.contact.lattice.network import CalibratedNetwork
+from tkamb.contact.lattice.source import SourceNetwork
+from tkamb.contact.materials import material, tabulated_material
+
+MM = 1e-3
+SOLIDS = [CalibratedNetwork, BbarHexahedra]
+STRAINS = [-0.2, -0.1, -0.05, -0.02, -0.005, 0.005, 0.02, 0.05, 0.1, 0.2]
+TABLE = tabulated_material(
+    "table", [0, 0.01, 0.03, 0.08, 0.2, 0.4], [0, 5e6, 11e6, 17e6, 24e6, 33e6], 0.4
+)
+    "table", [0, 0.01, 0.03, 0.08, 0.2, 0.4], [0, 5e6, 11e6, 17e6, 24e6, 33e6], 0.4
+)
+
+
+def pressed_block(solid, mat, strain, confined):
+    """Return the mean axial stress of a block between frictionless plates."""
+    nodes, index, cells, _ = block((2, 3, 2), np.array([1.0, 1.1, 0.9]) * MM)
+    made = solid(nodes, cells, np.array([1.0, 1.1, 0.9]) * MM, mat)
+    held = np.zeros((len(nodes), 3), bool)
+    top = index[:, 1] == index[:, 1].max()
+    held[top | (index[:, 1] == 0), 1] = True
+    sides = (0, 2)
+    for axis in sides:
+        held[(index[:, axis] == 0) | (confined & (index[:, axis] == 2)), axis] = True
+    free = ~held.ravel()
+    u = np.zeros((len(nodes), 3))
+    u[top, 1] = strain * np.ptp(nodes[:, 1])
+    for _ in range(60):
+        force = made.internal_force(u).ravel()
+        step = linalg.spsolve(made.tangent(u)[free][:, free].tocsc(), force[free])
+        u.ravel()[free] -= step
+        if np.abs(step).max() < 1e-14:
+            break
+    area = np.ptp(nodes[:, 0]) * np.ptp(nodes[:, 2])
+    return made.internal_force(u)[top, 1].sum() / area
+
+
+@pytest.mark.parametrize("solid", SOLIDS)
+@pytest.mark.parametrize("strain", STRAINS)
+@pytest.mark.parametrize("nu", [0.0, 0.25, 0.45, 0.4999])
+def test_free_block_follows_the_curve(solid, strain, nu):
+    mat = material("polyethylene", poisson_ratio=nu)
+    assert pressed_block(solid, mat, strain, False) == pytest.approx(mat.stress(strain), rel=1e-6)
+
+
+@pytest.mark.parametrize("strain", [-0.15, -0.02, 0.06])
+def test_free_block_follows_a_table(strain):
+    stress = pressed_block(CalibratedNetwork, TABLE, strain, False)
+    assert stress == pytest.approx(TABLE.stress(strain), rel=1e-4)
+
+
+@pytest.mark.parametrize("solid", SOLIDS)
+@pytest.mark.parametrize("strain", [-0.1, -0.02, 0.02])
+@pytest.mark.parametrize("nu", [0.0, 0.45])
+def test_confined_block_follows_bulk_and_curve(solid, strain, nu):
+    """sigma = K eps + (2/3) q(2|eps|/3): the bulk stays elastic, the shear follows q(e)."""
+    mat = material("polyethylene", poisson_ratio=nu)
+    e = 2 * abs(strain) / 3
+    q = 3 * ShearCurve.of(mat).modulus(np.array([e]))[0] * e
+    exact = mat.bulk_modulus * strain + np.sign(strain) * 2 * q / 3
+    assert pressed_block(solid, mat, strain, True) == pytest.approx(exact, rel=1e-7)
+
+
+@pytest.mark.parametrize("strain", [0.003, 0.02, 0.08, 0.2, 0.4])
+def test_curve_inverts_the_split_of_strain(strain):
+    """e = eps - sigma/(9 K) and q = sigma."""
+    mat = material("polyethylene")
+    sigma = mat.stress(strain)
+    e = np.array([strain - sigma / (9 * mat.bulk_modulus)])
+    assert 3 * ShearCurve.of(mat).modulus(e)[0] * e[0] == pytest.approx(sigma, rel=1e-8)
+
+
+@pytest.mark.parametrize("solid", SOLIDS)
+@pytest.mark.parametrize("stretch", [0.0, 0.6])
+def test_tangent_is_the_derivative_of_the_forces(solid, stretch):
+    edges = np.full(3, MM)
+    nodes, _, cells, _ = block((3, 2, 2), edges, stretch)
+    made = solid(nodes, cells, edges, material("polyethylene"))
+    generator = np.random.default_rng(4)
+    u, d = generator.normal(size=(2, *nodes.shape)) * 3e-5
+    numeric = (made.internal_force(u + 1e-4 * d) - made.internal_force(u - 1e-4 * d)) / 2e-4
+    exact = (made.tangent(u) @ d.ravel()).reshape(-1, 3)
+    assert np.abs(numeric - exact).max() < 1e-6 * np.abs(exact).max()
+    tangent = made.tangent(u)
+    assert abs(tangent - tangent.T).max() < 1e-12 * abs(tangent).max()
+
+
+def test_source_springs_carry_the_curve_along_themselves():
+    """One spring stretched: f = sigma(eps) C L0, from its true length."""
+    edges = np.full(3, MM)
+    nodes, _, cells, springs = block((1, 1, 1), edges)
+    mat = material("polyethylene")
+    made = SourceNetwork(nodes, cells, edges, mat, springs[:1])
+    a, b = springs[0]
+    u = np.zeros_like(nodes)
+    u[b] = 0.07 * (nodes[b] - nodes[a])
+    force = made.internal_force(u)
+    length = np.linalg.norm(nodes[b] - nodes[a])
+    assert np.linalg.norm(force[b]) == pytest.approx(mat.stress(0.07) * made.factor * length)
+    assert force[a] == pytest.approx(-force[b])
+
+
+def test_linear_material_loses_nothing():
+    edges = np.full(3, MM)
+    nodes, _, cells, _ = block((2, 2, 2), edges)
+    for solid in SOLIDS:
+        made = solid(nodes, cells, edges, material("polyethylene-linear"))
+        assert not made.correction(np.ones_like(nodes)).any()
