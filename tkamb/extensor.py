@@ -17,6 +17,7 @@ from tkamb.body.patella import (
     solve_patella,
 )
 from tkamb.body.patellofemoral import PatellofemoralContact
+from tkamb.body.wrapping import is_inside
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.geometry.sections import sagittal_outline
@@ -49,6 +50,7 @@ class ExtensorFrames:
     def __init__(self, case: "Case", poses: Array) -> None:
         self.case = case
         self.quadriceps, self.ligament = _quadriceps(case), _ligament(case)
+        self._check_fixed_ends()
         mechanism = self._mechanism()
         if case.scene.patella is not None and case.scene.patella.motion == "recorded":
             motion = case.motion
@@ -96,6 +98,29 @@ class ExtensorFrames:
         )
         return extensor, quadriceps.wrap_angle
 
+    def _check_fixed_ends(self) -> None:
+        """Raise if the end that does not move against an outline lies within it."""
+        chain, ends = self.case.chain, []
+        if self.quadriceps.outline is not None:
+            to_femur = chain.link_in(self.quadriceps.start_link, "femur")
+            origin = transform(to_femur, self.quadriceps.start_point)
+            ends.append(("[quadriceps] origin", origin, self.quadriceps.outline, "femur"))
+        if self.ligament.outline is not None:
+            tuberosity = transform(self._tibia_in_insert(), self.ligament.end_point)
+            ends.append(("[patellar_ligament] distal", tuberosity, self.ligament.outline, "insert"))
+        for name, point, outline, bone in ends:
+            if is_inside(point, outline):
+                raise InputError(
+                    f"lies inside the outline of the {bone} that the line wraps",
+                    name,
+                    "move the point, or set wrap = false",
+                )
+
+    def _tibia_in_insert(self) -> Array:
+        """Return the pose in the insert frame of the link that holds the ligament's end."""
+        chain = self.case.chain
+        return inverse(chain.insert_in_tibia) @ chain.link_in(self.ligament.end_link, "tibia")
+
     def _mechanism(self) -> ExtensorMechanism:
         case, quadriceps, ligament = self.case, self.quadriceps, self.ligament
         assert case.femoral is not None and case.patella is not None
@@ -103,14 +128,13 @@ class ExtensorFrames:
         assert table is not None
         joint = chain.patella_joint_in_femur
         to_femur = chain.link_in(quadriceps.start_link, "femur")
-        to_tibia = chain.link_in(ligament.end_link, "tibia")
         return ExtensorMechanism(
             PatellofemoralContact(case.femoral.moved(inverse(joint)), case.patella),
             joint,
             transform(to_femur, quadriceps.start_point),
             quadriceps.end_point,
             ligament.start_point,
-            transform(inverse(chain.insert_in_tibia) @ to_tibia, ligament.end_point),
+            transform(self._tibia_in_insert(), ligament.end_point),
             (table.length_mm or np.nan) * MILLIMETRE,
             quadriceps.outline,
             ligament.outline,

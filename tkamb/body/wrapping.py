@@ -84,7 +84,7 @@ def taut_path(start: Array, end: Array, outline: Array) -> TautPath:
     """
     start, end = np.asarray(start, float), np.asarray(end, float)
     for name, point in (("start", start), ("end", end)):
-        if (_height(point[:2], outline) >= 0.0).all():
+        if is_inside(point, outline):
             raise ComputationError(f"the {name} of a wrapping line lies inside the bone's outline")
     if _passes_freely(start[:2], end[:2], outline):
         return straight_path(start, end)
@@ -95,6 +95,11 @@ def taut_path(start: Array, end: Array, outline: Array) -> TautPath:
     return TautPath(
         np.column_stack([plane, z]), float(np.hypot(along[-1], end[2] - start[2])), turn
     )
+
+
+def is_inside(point: Array, outline: Array) -> bool:
+    """Say whether a point (3,) lies within an outline (n, 2) of its own frame."""
+    return bool((_height(point[:2], outline) >= 0.0).all())
 
 
 def loads_per_unit_tension(

@@ -1,0 +1,177 @@
+"""Bad input: one line that says what, where and how to mend it, exit status 2, nothing written."""
+
+import csv
+
+import numpy as np
+import pytest
+import trimesh
+
+from scenes import MODEL, write_scene
+from tkamb.cli import main
+
+
+def refused(capfd, *arguments):
+    """Run the command line and return its one line on stderr."""
+    assert main([str(argument) for argument in arguments]) == 2
+    lines = capfd.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("tkamb: ")
+    return lines[0]
+
+
+def run_refused(capfd, path, *more):
+    out = path.parent / "results"
+    line = refused(capfd, "run", path, "--out", out, "--frames", "0:3", *more)
+    assert not list(out.glob("*")) if out.exists() else True
+    return line
+
+
+def rewrite(path, change):
+    rows = list(csv.reader(path.read_text().splitlines()))
+    change(rows)
+    path.write_text("\n".join(",".join(row) for row in rows) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"patient__urdf": "no.urdf"}, "no.urdf"),
+        ({"motion__file": "no.csv"}, "no.csv"),
+        ({"implant__insert__mesh": "no.stl"}, "no.stl"),
+        ({"patient__colour": "blue"}, "unknown key 'patient.colour'"),
+        ({"ligamnet": []}, "unknown key 'ligamnet'"),
+        ({"implant__insert__unit": None}, "missing key 'implant.insert.unit'"),
+        ({"motion__length_unit": None}, "missing key 'motion.length_unit'"),
+        ({"motion__cutoff_Hz": 5000.0}, "cut-off"),
+        ({"contact__model": "magic"}, "foundation"),
+        ({"contact__material": "cheese"}, "polyethylene"),
+        ({"contact__resolution_mm": -1.0}, "resolution_mm"),
+        ({"implant__insert__unit": "m"}, "mm"),
+        ({"implant__femoral__unit": "m"}, "mm"),
+        ({"implant__insert__axes": "+z,+y,+x"}, "axes"),
+        ({"implant__insert__axes": "+y,+z,+x"}, "bottom"),
+        ({"patient__mass_kg": 0.0}, "mass_kg"),
+        ({"quadriceps__origin__link": "fibula"}, "fibula"),
+        ({"quadriceps__origin__point_mm": [0.0, 10.0, 0.0]}, "quadriceps"),
+        ({"quadriceps": None}, "go together"),
+    ],
+)
+def test_scene_that_cannot_be_used(tmp_path, capfd, changes, words):
+    assert words in run_refused(capfd, write_scene(tmp_path, **changes))
+
+
+def test_missing_scene(tmp_path, capfd):
+    assert "no such scene" in run_refused(capfd, tmp_path / "scene.toml")
+
+
+def test_broken_toml(tmp_path, capfd):
+    path = tmp_path / "scene.toml"
+    path.write_text("[patient\n")
+    assert "not TOML" in run_refused(capfd, path)
+
+
+def test_motion_with_nan(tmp_path, capfd):
+    path = write_scene(tmp_path)
+    rewrite(tmp_path / "motion.csv", lambda rows: rows[7].__setitem__(1, "nan"))
+    line = run_refused(capfd, path)
+    assert "motion.csv" in line
+
+
+def test_motion_with_unsorted_time(tmp_path, capfd):
+    path = write_scene(tmp_path)
+
+    def swap(rows):
+        rows[5], rows[6] = rows[6], rows[5]
+
+    rewrite(tmp_path / "motion.csv", swap)
+    assert "time" in run_refused(capfd, path)
+
+
+def test_motion_shorter_than_the_filter_needs(tmp_path, capfd):
+    path = write_scene(tmp_path, motion__cutoff_Hz=3.0)
+    rewrite(tmp_path / "motion.csv", lambda rows: rows.__delitem__(slice(4, None)))
+    assert "motion.csv" in run_refused(capfd, path)
+
+
+def test_singular_inertia(tmp_path, capfd):
+    path = write_scene(tmp_path)
+    urdf = tmp_path / "patient.urdf"
+    urdf.write_text(urdf.read_text().replace('<mass value="10.620000"/>', '<mass value="0"/>'))
+    assert "singular inertia" in run_refused(capfd, path)
+
+
+def test_urdf_without_a_needed_joint(tmp_path, capfd):
+    path = write_scene(tmp_path)
+    urdf = tmp_path / "patient.urdf"
+    urdf.write_text(urdf.read_text().replace("knee_si", "knee_up"))
+    assert "no joint 'knee_si'" in run_refused(capfd, path)
+
+
+def test_a_mesh_that_is_not_a_surface(tmp_path, capfd):
+    path = write_scene(tmp_path)
+    rng = np.random.default_rng(0)
+    soup = trimesh.Trimesh(
+        rng.uniform(-40, 40, (300, 3)), np.arange(300).reshape(-1, 3), process=False
+    )
+    soup.export(tmp_path / "insert.stl")
+    assert "insert" in run_refused(capfd, path)
+
+
+def test_a_mesh_file_of_text(tmp_path, capfd):
+    path = write_scene(tmp_path)
+    (tmp_path / "insert.stl").write_text("not a mesh\n")
+    assert "insert.stl" in run_refused(capfd, path)
+
+
+def test_output_folder_that_cannot_be_written(tmp_path, capfd):
+    path = write_scene(tmp_path / "model")
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    line = refused(capfd, "run", path, "--out", blocked / "results")
+    assert "cannot be written" in line
+
+
+def test_frames_outside_the_motion(tmp_path, capfd):
+    line = refused(
+        capfd, "run", MODEL / "scene.toml", "--out", tmp_path / "r", "--frames", "90:150"
+    )
+    assert "101" in line or "100" in line
+    assert not list((tmp_path / "r").glob("*"))
+
+
+@pytest.mark.parametrize("load", ["-5", "nan", "inf"])
+def test_impossible_load(capfd, load):
+    line = refused(
+        capfd,
+        "press",
+        MODEL / "femoral_component.stl",
+        MODEL / "insert.stl",
+        f"--load={load}",
+    )
+    assert "load" in line
+
+
+def test_press_with_a_contact_that_does_not_exist(capfd):
+    line = refused(
+        capfd,
+        "press",
+        MODEL / "femoral_component.stl",
+        MODEL / "insert.stl",
+        "--load=100",
+        "--contact=magic",
+    )
+    assert "magic" in line
+    assert "hertz" in line
+
+
+def test_set_overrides_a_key_and_checks_it(tmp_path, capfd):
+    line = refused(
+        capfd,
+        "run",
+        MODEL / "scene.toml",
+        "--out",
+        tmp_path / "r",
+        "--set",
+        "contact.fricton=0.1",
+    )
+    assert "unknown key 'contact.fricton'" in line
