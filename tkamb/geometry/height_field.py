@@ -61,7 +61,8 @@ def inside_intervals(surface: Surface, axis: int, first: Array, second: Array) -
     """
     line, height, rising, sides = _crossings(surface, axis, first, second)
     shape = (len(first), len(second))
-    parts, mended = [], 0
+    parts: list[tuple[Index, Array, Array]] = []
+    mended = 0
     tied = np.zeros(shape[0] * shape[1], bool)
     tied[line[~(sides.all(axis=0) | ~sides.any(axis=0))]] = True
     for quadrant in range(4):
@@ -74,12 +75,12 @@ def inside_intervals(surface: Surface, axis: int, first: Array, second: Array) -
         else:
             lines, heights = lines[~odd[lines]], heights[~odd[lines]]
         parts.append((lines[::2], heights[::2], heights[1::2]))
-    lines, lower, upper = united(
+    line, lower, upper = united(
         np.concatenate([part[0] for part in parts]),
         np.concatenate([part[1] for part in parts]),
         np.concatenate([part[2] for part in parts]),
     )
-    return Intervals(lines // shape[1], lines % shape[1], lower, upper, mended)
+    return Intervals(line // shape[1], line % shape[1], lower, upper, mended)
 
 
 def united(line: Index, lower: Array, upper: Array) -> tuple[Index, Array, Array]:

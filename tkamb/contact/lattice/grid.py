@@ -18,7 +18,8 @@ from tkamb.contact.lattice.cells import (
     join_springs,
     scaled_jacobians,
 )
-from tkamb.contact.lattice.snapping import NodeField, settle_nodes
+from tkamb.contact.lattice.columns import NodeField, settle_columns
+from tkamb.contact.lattice.walls import inside, settle_walls
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.rays import RayCaster
@@ -32,6 +33,8 @@ INTERNAL, CONTACT, BOTTOM, OTHER = 0, 1, 2, 3
 
 MAX_EDGE_RATIO = 1.4
 """Longest over shortest edge of a grid cell."""
+FLATNESS = 5e-5
+"""m: nodes this near the plane of the flat bottom lie in it."""
 LEAST_JACOBIAN = 0.05
 """A surface cell with a smaller scaled Jacobian is left out."""
 
@@ -72,7 +75,7 @@ class Lattice:
     contact_triangles: Index
     dropped_nodes: int
     dropped_cells: int
-    mended_rays: tuple[int, int, int]
+    mended_rays: int
     closed_gaps: int
     thin_intervals: int
 
@@ -98,7 +101,8 @@ def build_grid(insert: Surface, target_size: float) -> Lattice:
         InputError: the surface is open beyond mending, or thinner than the cells.
     """
     spacing = grid_spacing(insert.bounds[1] - insert.bounds[0], target_size)
-    field = settle_nodes(insert, spacing)
+    field = settle_columns(insert, spacing)
+    settle_walls(field, insert)
     cells, dropped_cells = _sound_cells(field, insert)
     if not len(cells):
         raise InputError(
@@ -135,7 +139,7 @@ def _sound_cells(field: NodeField, insert: Surface) -> tuple[Index, int]:
     cells = cells[~_bridges_gap(field, cells)]
     points = field.points.reshape(-1, 3)
     cells = cells[scaled_jacobians(points[cells]) > LEAST_JACOBIAN]
-    cells = cells[_filled(field, cells, insert)]
+    cells = cells[inside(RayCaster(insert), points[cells].mean(axis=1))]
     cells = cells[_largest_piece(cells)]
     return cells, found - len(cells)
 
@@ -147,29 +151,10 @@ def _all_corners(member: Mask) -> Mask:
 
 
 def _bridges_gap(field: NodeField, cells: Index) -> Mask:
-    """Say which cells have an edge whose ends lie in different intervals of one grid line."""
-    bridges = np.zeros(len(cells), bool)
-    for axis in range(3):
-        number = field.interval[axis].ravel()[cells]
-        low = np.flatnonzero(CORNERS[:, axis] == 0)
-        for start in low:
-            other = CORNERS[start].copy()
-            other[axis] = 1
-            end = int((other == CORNERS).all(axis=1).argmax())
-            a, b = number[:, start], number[:, end]
-            bridges |= (a >= 0) & (b >= 0) & (a != b)
-    return bridges
-
-
-def _filled(field: NodeField, cells: Index, insert: Surface) -> Mask:
-    """Say which cells have their centre in the part; only those all on the surface are asked."""
-    filled = np.ones(len(cells), bool)
-    doubtful = np.flatnonzero(field.snapped.ravel()[cells].all(axis=1))
-    if doubtful.size:
-        centres = field.points.reshape(-1, 3)[cells[doubtful]].mean(axis=1)
-        ray, _, _ = RayCaster(insert).all(centres, (0.0, 1.0, 0.0))
-        filled[doubtful] = np.bincount(ray, minlength=doubtful.size) % 2 == 1
-    return filled
+    """Say which cells have an upright edge whose ends lie in different intervals of a line."""
+    number = field.interval.ravel()[cells]
+    low, high = number[:, [0, 1, 4, 5]], number[:, [3, 2, 7, 6]]
+    return np.asarray(((low >= 0) & (high >= 0) & (low != high)).any(axis=1))
 
 
 def _largest_piece(cells: Index) -> Mask:
@@ -194,14 +179,14 @@ def _assemble(field: NodeField, cells: Index, dropped_cells: int) -> Lattice:
     number = np.cumsum(used) - 1
     flat = np.flatnonzero(used)
     springs: Springs = join_springs(number[cells], len(flat))
-    node_class = _classes(field).ravel()[flat]
+    node_class = _classes(field, cells)[flat]
     index = np.column_stack(np.unravel_index(flat, shape))
     return Lattice(
         nodes=field.points.reshape(-1, 3)[flat],
         index=index,
         node_class=node_class,
         spacing=field.spacing,
-        origin=np.array([line[0] for line in field.lines]),
+        origin=np.array([field.lines[0][0], 0.0, field.lines[1][0]]),
         cells=number[cells],
         springs=springs.ends,
         spring_family=springs.family,
@@ -210,19 +195,20 @@ def _assemble(field: NodeField, cells: Index, dropped_cells: int) -> Lattice:
         contact_triangles=_contact_triangles(index, node_class, shape),
         dropped_nodes=int(field.member.sum() - len(flat)),
         dropped_cells=dropped_cells,
-        mended_rays=(field.mended[0], field.mended[1], field.mended[2]),
+        mended_rays=field.mended,
         closed_gaps=field.closed_gaps,
         thin_intervals=field.thin,
     )
 
 
-def _classes(field: NodeField) -> NDArray[np.int8]:
-    """Return the class of every grid node (nx, ny, nz)."""
-    result = np.full(field.member.shape, INTERNAL, np.int8)
-    result[field.snapped] = OTHER
-    result[field.top] = CONTACT
-    bottom = field.lines[1][0] + 0.01 * field.spacing[1]
-    result[field.snapped & (field.points[..., 1] <= bottom)] = BOTTOM
+def _classes(field: NodeField, cells: Index) -> NDArray[np.int8]:
+    """Return the class of every grid node (flat); a node in fewer than 8 cells is outside."""
+    outside = np.bincount(cells.ravel(), minlength=field.member.size) < 8
+    result = np.where(outside, OTHER, INTERNAL).astype(np.int8)
+    result[field.top.ravel()] = CONTACT
+    height = field.points[..., 1].ravel()
+    flat = np.abs(height) <= max(FLATNESS, 0.02 * field.spacing[1])
+    result[field.lower_end.ravel() & flat] = BOTTOM
     return result
 
 
