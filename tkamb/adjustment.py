@@ -1,0 +1,220 @@
+"""Femoral adjustment: fluoroscopy's coronal error is taken out before contact, then checked.
+
+Fluoroscopy errs by about 0.5 mm and 0.5 deg, which is more than the deformation itself.
+
+1. Gap of each condyle at the recorded pose (closest points); coronal angle = difference of
+   the gaps / distance of the contact points in the coronal plane.
+2. Below 0.5 deg the femur is turned in the coronal plane, about the midpoint of the contact
+   points, until both condyles touch together; above it is left: evidence of lift-off.
+3. It is always moved along y to first touch.
+4. After the deformation: where the femur has sunk in deeper than it was moved, or has come
+   to lie at a larger coronal angle than it was turned by, the load would have brought both
+   condyles into contact anyway: the recorded rotation is restored and pressed again.
+
+The source joins the two conditions of step 4 by "and"; `restore_when="both"` does so.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tkamb.contact.model import ContactModel, ContactResult, ContactStatus
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.closest import ClosestPointQuery, CondyleGaps
+from tkamb.geometry.first_touch import FirstTouch
+from tkamb.geometry.frames import Array, pose
+from tkamb.units import DEGREE, MILLIMETRE
+
+LARGEST_ANGLE = 0.5 * DEGREE
+"""rad: coronal angles from here on are taken as lift-off and left alone."""
+
+FARTHEST = 3.0 * MILLIMETRE
+"""m: with both condyles farther than this from the insert the pose is no recorded contact."""
+
+EQUAL = 1e-7
+"""m: difference of the condyles' clearances at which they touch together."""
+
+MOST_TURNS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Adjustment:
+    """What was done to a recorded pose before contact.
+
+    Args:
+        pose: (4, 4) adjusted pose_femoral_in_insert, at first touch.
+        recorded: (4, 4) the pose as recorded.
+        translation: m along y, at the midpoint of the contact points; negative is downwards.
+        coronal_angle: rad about the insert's x axis by which the femur was turned.
+        measured_angle: rad, coronal angle of the recorded pose that was found.
+        intercondylar_distance: m; NaN with one condyle.
+        penetration: m, how deep the femur sank in afterwards; NaN before the press.
+        final_angle: rad, difference of the penetrations / intercondylar distance.
+        restored: the recorded rotation was put back after the press; `coronal_angle` then
+            says what had been tried, and `pose` is the restored one at first touch.
+    """
+
+    pose: Array
+    recorded: Array
+    translation: float
+    coronal_angle: float
+    measured_angle: float
+    intercondylar_distance: float
+    penetration: float = math.nan
+    final_angle: float = math.nan
+    restored: bool = False
+
+
+def adjust(query: ClosestPointQuery, recorded: Array) -> Adjustment:
+    """Return the adjusted pose.
+
+    Args:
+        query: closest points of the pair.
+        recorded: (4, 4) pose_femoral_in_insert.
+
+    Raises:
+        InputError: neither condyle is near the insert.
+        ComputationError: the femoral component does not lie over the insert.
+    """
+    recorded = np.asarray(recorded, float)
+    gaps = query.at(recorded)
+    _check_near(gaps)
+    angle, distance = _coronal_angle(gaps)
+    middle = _middle(gaps)
+    turned, turn = recorded, 0.0
+    if abs(angle) < LARGEST_ANGLE and gaps.lateral is not None:
+        turn = _levelling_turn(query, recorded, middle, distance)
+        turned = _turned(recorded, middle, turn)
+    travel = _travel(query, turned)
+    return Adjustment(_moved(turned, -travel), recorded, -travel, turn, angle, distance)
+
+
+def press_adjusted(
+    model: ContactModel,
+    state: Any,
+    load: float,
+    recorded: Array,
+    query: ClosestPointQuery,
+    guess: ContactResult | None = None,
+    restore_when: Literal["either", "both"] = "either",
+) -> tuple[ContactResult, Adjustment]:
+    """Press the adjusted femur in, check the adjustment, undo its rotation if it must be.
+
+    Args:
+        model: any contact model.
+        state: what its `prepare` returned.
+        load: N, superior-inferior.
+        recorded: (4, 4) pose_femoral_in_insert.
+        query: closest points of the same pair.
+        guess: an earlier result, to save time.
+        restore_when: whether one exceeded limit of step 4 restores, or both are needed.
+
+    Raises:
+        InputError: neither condyle is near the insert.
+        ComputationError: the femoral component does not lie over the insert.
+    """
+    adjustment = adjust(query, recorded)
+    result = model.press(state, load, adjustment.pose, guess)
+    if result.status is not ContactStatus.OK or adjustment.coronal_angle == 0.0:
+        return result, replace(adjustment, penetration=float(result.approach))
+    checked = _checked(query, adjustment, result)
+    exceeded = (
+        checked.penetration > abs(checked.translation),
+        abs(checked.final_angle) > abs(checked.coronal_angle),
+    )
+    if not (any(exceeded) if restore_when == "either" else all(exceeded)):
+        return result, checked
+    travel = _travel(query, adjustment.recorded)
+    restored = _moved(adjustment.recorded, -travel)
+    result = model.press(state, load, restored, result)
+    return result, replace(checked, pose=restored, translation=-travel, restored=True)
+
+
+def _check_near(gaps: CondyleGaps) -> None:
+    found = [gap.gap for gap in (gaps.medial, gaps.lateral) if gap is not None]
+    nearest = min(found, key=abs)
+    if abs(nearest) > FARTHEST:
+        word = "above" if nearest > 0.0 else "inside"
+        raise InputError(
+            f"neither condyle is near the insert (nearest {abs(nearest) * 1e3:.1f} mm {word})",
+            "femoral adjustment",
+            "check the pose, the meshes' units and axes, or leave the adjustment off",
+        )
+
+
+def _coronal_angle(gaps: CondyleGaps) -> tuple[float, float]:
+    """Return coronal angle (rad) and intercondylar distance (m); zero and NaN for one condyle."""
+    if gaps.lateral is None:
+        return 0.0, math.nan
+    apart = gaps.lateral.point_on_femoral - gaps.medial.point_on_femoral
+    distance = math.hypot(apart[1], apart[2])
+    return (gaps.lateral.gap - gaps.medial.gap) / distance, distance
+
+
+def _middle(gaps: CondyleGaps) -> Array:
+    if gaps.lateral is None:
+        return gaps.medial.point_on_femoral
+    return np.asarray(0.5 * (gaps.medial.point_on_femoral + gaps.lateral.point_on_femoral))
+
+
+def _levelling_turn(
+    query: ClosestPointQuery, recorded: Array, middle: Array, distance: float
+) -> float:
+    """Return the turn (rad) at which both condyles touch together, by the secant method."""
+
+    def difference(turn: float) -> float:
+        medial, lateral = _touches(query, _turned(recorded, middle, turn))
+        return lateral - medial
+
+    last, error = 0.0, difference(0.0)
+    turn = error / distance
+    for _ in range(MOST_TURNS):
+        if abs(error) < EQUAL or turn == last:
+            return last
+        now = difference(turn)
+        slope = (now - error) / (turn - last)
+        last, error = turn, now
+        turn = last - error / (slope if slope != 0.0 else -distance)
+    return last
+
+
+def _checked(query: ClosestPointQuery, adjustment: Adjustment, result: ContactResult) -> Adjustment:
+    medial, lateral = _touches(query, result.pose)
+    angle = (medial - lateral) / adjustment.intercondylar_distance
+    return replace(adjustment, penetration=-min(medial, lateral), final_angle=angle)
+
+
+def _touches(query: ClosestPointQuery, at: Array) -> tuple[float, float]:
+    """Return travel (m) along -y to touch, medial and lateral; negative once inside."""
+    medial, lateral = _first_touch(query).at(at)
+    if medial is None or lateral is None:
+        raise ComputationError("a condyle does not lie over the insert", "femoral adjustment")
+    return medial.travel, lateral.travel
+
+
+def _travel(query: ClosestPointQuery, at: Array) -> float:
+    travel = _first_touch(query).travel(at)
+    if not math.isfinite(travel):
+        raise ComputationError("the femur does not lie over the insert", "femoral adjustment")
+    return travel
+
+
+def _turned(recorded: Array, middle: Array, turn: float) -> Array:
+    """Return the pose turned about the insert's x axis through a point (3,)."""
+    rotation = Rotation.from_rotvec([turn, 0.0, 0.0]).as_matrix()
+    return pose(rotation, middle - rotation @ middle) @ recorded
+
+
+def _moved(at: Array, along_y: float) -> Array:
+    moved = np.array(at)
+    moved[1, 3] += along_y
+    return moved
+
+
+@lru_cache(maxsize=4)
+def _first_touch(query: ClosestPointQuery) -> FirstTouch:
+    return FirstTouch(query.femoral, query.insert, query.split)
