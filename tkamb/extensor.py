@@ -22,7 +22,7 @@ from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.geometry.sections import sagittal_outline
 from tkamb.inputs.filtering import differentiate_coordinates
-from tkamb.inputs.meshes import load_surface, mirrored
+from tkamb.inputs.meshes import BONE_SIZE, load_surface, mirrored
 from tkamb.scene import Attachment, BoneTable
 from tkamb.units import MILLIMETRE
 
@@ -227,7 +227,7 @@ def _point(end: Attachment) -> Array:
 
 
 def _bone(case: "Case", table: BoneTable) -> "Surface":
-    surface = load_surface(table.mesh, table.unit, table.axes, name="bone")
+    surface = load_surface(table.mesh, table.unit, table.axes, name="bone", size=BONE_SIZE)
     if case.scene.patient.side == "left":
         surface = mirrored(surface)
     return surface.moved(case.chain.link_in(table.link, "femur"))

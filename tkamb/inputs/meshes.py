@@ -16,8 +16,10 @@ from tkamb.units import LENGTH, MILLIMETRE
 
 Indices = NDArray[np.int64]
 
-PLAUSIBLE_SIZE = (0.010, 0.250)
-"""m; largest extent of a part of a knee."""
+IMPLANT_SIZE = (0.010, 0.250)
+"""m; least and greatest length of a part of a knee implant."""
+BONE_SIZE = (0.010, 0.650)
+"""m; least and greatest length of a bone at the knee, whole or in part."""
 
 _log = logging.getLogger("tkamb")
 
@@ -62,6 +64,7 @@ def load_surface(
     *,
     name: str,
     closed: bool = False,
+    size: tuple[float, float] = IMPLANT_SIZE,
 ) -> Surface:
     """Read an STL, OBJ or PLY file as a surface in anatomical axes and metres.
 
@@ -74,6 +77,7 @@ def load_surface(
         axes: its axes that point anterior, superior and to the right.
         name: what to call the part in messages.
         closed: whether the surface must enclose a volume.
+        size: m, least and greatest plausible length; another one means a wrong unit.
 
     Returns:
         The surface about the mesh's own origin: x anterior, y superior, z right, m.
@@ -86,7 +90,7 @@ def load_surface(
     if unit not in LENGTH:
         raise InputError(f"unknown unit '{unit}' of {name}", path, f"one of {', '.join(LENGTH)}")
     vertices, faces = read_triangles(path)
-    _check_size(vertices[faces.reshape(-1)], unit, path, name)
+    _check_size(vertices[faces.reshape(-1)], unit, path, name, size)
     mended = repair(vertices * LENGTH[unit], faces)
     _check_surface(mended, path, name, unit)
     if closed and mended.holes:
@@ -136,10 +140,9 @@ def read_triangles(path: str | Path) -> tuple[Array, Indices]:
     return vertices, faces
 
 
-def plausible_units(size: float) -> list[str]:
-    """Return the units in which the largest extent (file units) fits a part of a knee."""
-    low, high = PLAUSIBLE_SIZE
-    return [unit for unit, metres in LENGTH.items() if low <= size * metres <= high]
+def plausible_units(extent: float, size: tuple[float, float] = IMPLANT_SIZE) -> list[str]:
+    """Return the units in which the largest extent (file units) is within `size` (m)."""
+    return [unit for unit, metres in LENGTH.items() if size[0] <= extent * metres <= size[1]]
 
 
 def describe_holes(holes: tuple[BoundaryLoop, ...], unit: str) -> str:
@@ -163,21 +166,21 @@ def _opposite(names: list[str]) -> str:
     return ",".join([*names[:2], turned])
 
 
-def _check_size(corners: Array, unit: str, path: str | Path, name: str) -> None:
-    extents = np.ptp(corners, axis=0)
-    low, high = (1e3 * limit for limit in PLAUSIBLE_SIZE)
-    size = float(extents.max())
-    if unit in plausible_units(size):
+def _check_size(
+    corners: Array, unit: str, path: str | Path, name: str, size: tuple[float, float]
+) -> None:
+    extent = float(np.ptp(corners, axis=0).max())
+    fits = plausible_units(extent, size)
+    if unit in fits:
         return
-    fits = [
-        f"'{other}' would make it {size * LENGTH[other] * 1e3:.4g} mm"
-        for other in plausible_units(size)
-    ]
+    advice = ", ".join(
+        f"'{u}' would make it {extent * LENGTH[u] / MILLIMETRE:.4g} mm" for u in fits
+    )
     raise InputError(
-        f"{name} is {size * LENGTH[unit] * 1e3:.4g} mm long in unit '{unit}', which no part of a "
-        f"knee is ({low:g} to {high:g} mm)",
+        f"{name} is {extent * LENGTH[unit] / MILLIMETRE:.4g} mm long in unit '{unit}', which no "
+        f"such part of a knee is ({size[0] / MILLIMETRE:g} to {size[1] / MILLIMETRE:g} mm)",
         path,
-        f"is the unit right? {', '.join(fits)}" if fits else "check the mesh and its unit",
+        f"is the unit right? {advice}" if fits else "check the mesh and its unit",
     )
 
 
