@@ -88,7 +88,8 @@ def united(line: Index, lower: Array, upper: Array) -> tuple[Index, Array, Array
     ranks = np.unique(np.concatenate([lower, upper]), return_inverse=True)[1].astype(np.int64)
     low, high = ranks[: len(lower)], ranks[len(lower) :]
     order = np.lexsort((low, line))
-    line, lower, upper, low, high = (v[order] for v in (line, lower, upper, low, high))
+    line, lower, upper = line[order], lower[order], upper[order]
+    low, high = low[order], high[order]
     base = line * (len(ranks) + 1)
     reach = np.maximum.accumulate(base + high)
     begins = np.ones(len(line), bool)

@@ -96,7 +96,7 @@ def _fill(field: NodeField, notch: Notch, before: Array, rays: RayCaster) -> Non
     target = np.where(is_corner[:, None], corner, middle + BULGE * (own - middle))
     if flat:
         probe = np.where(is_corner[:, None], corner, middle)
-        field.points[(*notch.node, 1)] = middle[:, 1]
+        field.points[..., 1][notch.node] = middle[:, 1]
         field.upper_end[notch.node], field.lower_end[notch.node] = upper, lower
         target[:, 1] = refired(field, notch.node, _towards(probe, across, INSET, 0.0), rays)
     reach = REACH * np.linalg.norm(field.spacing[list(notch.axes)])

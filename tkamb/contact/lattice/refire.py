@@ -26,7 +26,7 @@ def refired(field: NodeField, nodes: Nodes, target: Array, rays: RayCaster) -> A
 
     NaN where the surface is farther than REACH from where it was.
     """
-    height = field.points[(*nodes, 1)].copy()
+    height = field.points[..., 1][nodes]
     for end, facing in ((field.upper_end[nodes], 1.0), (field.lower_end[nodes], -1.0)):
         here = np.flatnonzero(end)
         base = target[here].copy()

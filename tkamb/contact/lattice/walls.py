@@ -167,11 +167,11 @@ def _pull_in(field: NodeField, before: Array, hits: list[WallHits], rays: RayCas
         outside = ~field.member[goal]
         node, goal = tuple(n[outside] for n in node), tuple(g[outside] for g in goal)
         column = 0 if axis == 0 else 1
-        move[(*goal, column)] = -sign * (spacing - hit.distance[node])
+        move[..., column][goal] = -sign * (spacing - hit.distance[node])
         upper[goal] &= field.upper_end[node]
         lower[goal] &= field.lower_end[node]
         top[goal] &= field.top[node]
-        height[goal] = before[(*node, 1)]
+        height[goal] = before[..., 1][node]
     pulled = np.nonzero((move != 0.0).any(axis=-1))
     _admit_at(field, pulled, before, move[pulled], (lower, upper, top), height, rays)
 
@@ -190,7 +190,7 @@ def _admit_at(
     target[:, [0, 2]] += _foot(move)
     field.lower_end[nodes], field.upper_end[nodes] = ends[0][nodes], ends[1][nodes]
     at_end = field.lower_end[nodes] | field.upper_end[nodes]
-    field.points[(*nodes, 1)] = np.where(at_end, height[nodes], start[:, 1])
+    field.points[..., 1][nodes] = np.where(at_end, height[nodes], start[:, 1])
     settled = refired(field, nodes, target, rays)
     good = np.isfinite(settled)
     bad = tuple(n[~good] for n in nodes)
