@@ -166,7 +166,7 @@ def test_headline_numbers_are_those_of_the_columns(bend, gait):
     shown = {card.title: card for card in cards(gait, horizontal_axis(gait))}
     assert shown["Frames computed"].value == "100 of 101"
     assert shown["Frames computed"].warning
-    assert "6 others" in shown["Frames computed"].detail
+    assert "6 to be read with care" in shown["Frames computed"].detail
 
 
 def test_residuals_are_relative_to_the_superior_inferior_force(bend):
@@ -367,7 +367,7 @@ def test_slider_moves_the_cursor_and_the_numbers(bend, page, tmp_path):
     assert "Uncaught" not in done.stderr
     dom = done.stdout
     assert "50: flexion 60°" in dom
-    assert f"total {bend['force_total_BW'][50]:.3g}" in dom
+    assert f"total {bend['force_total_BW'][50]:.2f}" in dom
     figure = re.search(r'id="figure-forces">.*?</figure>', dom, re.DOTALL).group()
     left, right, *_ = (float(v) for v in re.search(r'data-box="([^"]+)"', figure)[1].split())
     low, high = (float(v) for v in re.search(r'data-range="([^"]+)"', figure)[1].split())

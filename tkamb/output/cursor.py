@@ -11,7 +11,8 @@ import numpy as np
 
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis
-from tkamb.output.panels import Panel, centre_panel, panels
+from tkamb.output.panel import Panel
+from tkamb.output.panels import centre_panel, panels
 from tkamb.results import Results
 
 
@@ -34,15 +35,27 @@ def cursor_data(results: Results, axis: HorizontalAxis) -> dict[str, Any]:
         "x": _rounded(axis.values),
         "place": [f"{axis.label.split(' (')[0]} {axis.at(k)}" for k in range(len(results))],
         "status": results.status,
-        "panels": {panel.name: _lines(panel) for panel in drawn},
+        "panels": {panel.name: _lines(panel) for panel in drawn if panel.lines},
     }
 
 
 def _lines(panel: Panel) -> list[dict[str, Any]]:
+    digits = _digits(panel)
     return [
-        {"label": line.label, "colour": line.colour, "values": _rounded(line.values)}
+        {
+            "label": line.label,
+            "colour": line.colour,
+            "digits": digits,
+            "values": _rounded(line.values),
+        }
         for line in panel.lines
     ]
+
+
+def _digits(panel: Panel) -> int:
+    """Return how many decimals show a thousandth of the panel's largest value, at most 4."""
+    largest = max(float(np.nanmax(np.abs(line.values))) for line in panel.lines)
+    return int(np.clip(2 - np.floor(np.log10(largest)), 0, 4)) if largest > 0 else 0
 
 
 def _rounded(values: Array) -> list[float | None]:
@@ -80,13 +93,15 @@ function nearest(x) {
   });
   return best;
 }
-function written(value) {
-  return String(Number(value.toPrecision(3))).replace("-", "−");
+function written(value, digits) {
+  const text = value.toFixed(digits);
+  return Number(text) === 0 ? text.replace("-", "") : text.replace("-", "−");
 }
 function show(frame) {
   slider.value = frame;
   const status = data.status[frame] === "ok" ? "" : ", " + data.status[frame].replaceAll("_", " ");
-  document.getElementById("place").textContent = `${frame}: ${data.place[frame]}${status}`;
+  const place = document.getElementById("place");
+  place.textContent = place.title = `${frame}: ${data.place[frame]}${status}`;
   for (const plot of plots) {
     const at = plot.place(data.x[frame]);
     plot.line.setAttribute("x1", at);
@@ -94,7 +109,7 @@ function show(frame) {
     plot.readout.replaceChildren(...plot.lines.map(line => {
       const span = document.createElement("span"), value = line.values[frame];
       span.style.color = line.colour;
-      span.textContent = `${line.label} ${value === null ? "–" : written(value)}`;
+      span.textContent = `${line.label} ${value === null ? "–" : written(value, line.digits)}`;
       return span;
     }));
   }

@@ -1,5 +1,6 @@
 """What a reader learns in the first half minute: a few cards and sentences, in plain words."""
 
+import re
 from dataclasses import dataclass
 from html import escape
 
@@ -36,8 +37,15 @@ class Card:
         kind = "card warning" if self.warning else "card"
         return (
             f'<div class="{kind}"><h3>{escape(self.title)}</h3>'
-            f'<p class="value">{escape(self.value)}</p><p>{escape(self.detail)}</p></div>'
+            f'<p class="value">{escape(self.value)}</p><p>{_unbroken(self.detail)}</p></div>'
         )
+
+
+def _unbroken(text: str) -> str:
+    """Return HTML in which numbers keep their units and ranges their ends on one line."""
+    text = re.sub(r"(\d) (%|BW|N|MPa|mm)\b", "\\1\u00a0\\2", escape(text))
+    text = re.sub(r"(\d) %", "\\1\u00a0%", text)
+    return re.sub(r"([\d.]+–[\d.]+)", r'<span class="whole">\1</span>', text)
 
 
 def cards(results: Results, axis: HorizontalAxis) -> list[Card]:
@@ -68,7 +76,7 @@ def _peak_force(results: Results, axis: HorizontalAxis) -> Card | None:
     share = results["force_si_N"][found.frame] / results["force_total_N"][found.frame]
     detail = (
         f"{results['force_total_N'][found.frame]:.0f} N {_where(results, axis, found.frame)}; "
-        f"{100 * share:.0f} % of it superior–inferior"
+        f"{100 * share:.1f} % of it superior–inferior"
     )
     return Card("Peak contact force", f"{found.value:.2f} BW", detail)
 
@@ -83,6 +91,9 @@ def _shares(results: Results) -> Card | None:
         return None
     first = next(iter(texts))
     rest = [f"by {name} {text}" for name, text in texts.items() if name != first]
+    share = metrics.medial_share(results, first)
+    alone = int(((share <= 0) | (share >= 1)).sum())
+    rest += [f"one condyle carries nothing in {alone} frames"] if alone else []
     detail = "; ".join([f"by {first}, the rest lateral", *rest])
     return Card("Medial share of the load", texts[first], detail)
 
@@ -136,7 +147,9 @@ def _frames(results: Results) -> Card:
     flagged = int(metrics.flagged(results).sum())
     value = f"{len(results) - failed} of {len(results)}"
     if failed or flagged:
-        detail = f"{failed} failed (no numbers); {flagged} others to be read with care, see below"
+        words = [f"{failed} failed (no numbers)"] if failed else []
+        words += [f"{flagged} to be read with care"] if flagged else []
+        detail = "; ".join(words) + ": see the table below"
     else:
         detail = "none failed, none flagged"
     return Card("Frames computed", value, detail, bool(failed or flagged))

@@ -1,64 +1,16 @@
-"""What the report draws: one entry per plot, its lines and what they mean."""
+"""What the report draws: the plots of a run, their lines and what they mean."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from tkamb.columns import is_ligament, ligament_of
-from tkamb.geometry.frames import Array
 from tkamb.output import style
 from tkamb.output.metrics import body_weight, medial_share, residual_share, tension_ratio
+from tkamb.output.panel import Line, Panel, without_empty_lines
 from tkamb.output.style import BLACK, BLUE, GREEN, GREY, PURPLE, SIDE_COLOURS, VERMILLION
 from tkamb.results import Results
-
-
-@dataclass(frozen=True, eq=False)
-class Line:
-    """One curve.
-
-    Args:
-        name: unique in its panel; a column's name, or what was made from columns.
-        label: as the legend shows it.
-        values: (f,) in the panel's unit.
-        colour: of the line.
-        dashed: drawn dashed.
-    """
-
-    name: str
-    label: str
-    values: Array
-    colour: str
-    dashed: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Panel:
-    """One plot.
-
-    Args:
-        name: id of the plot in the page.
-        title: what it shows.
-        unit: of the vertical axis.
-        lines: its curves.
-        note: a sentence under the plot.
-        level: (value, label) of a horizontal reference line.
-        second: (factor, unit) of a second vertical axis on the right.
-        logarithmic: vertical axis.
-        from_zero: the vertical axis holds zero.
-        limits: of the vertical axis, where they are known beforehand.
-    """
-
-    name: str
-    title: str
-    unit: str
-    lines: tuple[Line, ...]
-    note: str = ""
-    level: tuple[float, str] | None = None
-    second: tuple[float, str] | None = None
-    logarithmic: bool = False
-    from_zero: bool = True
-    limits: tuple[float, float] | None = None
 
 
 def panels(results: Results) -> tuple[Panel, ...]:
@@ -68,18 +20,13 @@ def panels(results: Results) -> tuple[Panel, ...]:
         _ground, _ligaments, _residuals, _residual_moment, _hip_force, _hip_moment, _motion,
         _slip, _adjustment, _condition,
     )  # fmt: skip
-    made = (make(results) for make in makers)
-    kept = (replace(p, lines=tuple(n for n in p.lines if _has_numbers(n))) for p in made)
-    return tuple(panel for panel in kept if panel.lines)
+    made = (without_empty_lines(make(results)) for make in makers)
+    return tuple(panel for panel in made if panel.lines)
 
 
 def lateral_axis_name(results: Results) -> str:
     """Return what insert z points to: "lateral" unless the summary's `lateral_axis` is "-z"."""
     return "lateral" if results.summary.get("lateral_axis", "+z") == "+z" else "medial"
-
-
-def _has_numbers(line: Line) -> bool:
-    return bool(np.isfinite(line.values).any())
 
 
 def _line(
@@ -173,7 +120,8 @@ def centre_panel(results: Results) -> Panel:
     """Return the anterior positions of the centres of pressure over the motion."""
     lines = _both_sides(results, "cop_ap_mm")
     title = "Anterior position of the centres of pressure"
-    return Panel("centres", title, "mm", lines, "Insert x; zero is the middle of its bottom.")
+    note = "Insert x; zero is the middle of its bottom."
+    return without_empty_lines(Panel("centres", title, "mm", lines, note))
 
 
 def _pressures(results: Results) -> Panel:
@@ -212,14 +160,28 @@ def _ground(results: Results) -> Panel:
 
 def _ligaments(results: Results) -> Panel:
     names = [name for name in results.columns if is_ligament(name)]
-    count = len(style.CYCLE)
+    bundles: dict[str, list[str]] = {}
+    for name in names:
+        own = ligament_of(name)
+        bundle = own.rstrip("0123456789").rstrip("_") if len(names) > len(style.CYCLE) else own
+        bundles.setdefault(bundle or own, []).append(name)
     lines = tuple(
-        _line(
-            results, name, ligament_of(name).replace("_", " "), style.CYCLE[k % count], k >= count
-        )
-        for k, name in enumerate(names)
+        _bundle(results, bundle, strands, k) for k, (bundle, strands) in enumerate(bundles.items())
     )
-    return Panel("ligaments", "Ligament tension", "N", lines)
+    summed = len(bundles) < len(names)
+    note = f"{len(names)} strands; those that differ in a number only are summed." if summed else ""
+    return Panel("ligaments", "Ligament tension", "N", lines, note)
+
+
+def _bundle(results: Results, bundle: str, strands: Sequence[str], position: int) -> Line:
+    """Return the summed tension of strands; NaN only where all of them are."""
+    tension = np.array([results[name] for name in strands])
+    missing = np.isnan(tension).all(axis=0)
+    values = np.where(missing, np.nan, np.nansum(tension, axis=0))
+    colour = style.CYCLE[position % len(style.CYCLE)]
+    label = bundle.replace("_", " ") + (f" ({len(strands)})" if len(strands) > 1 else "")
+    name = strands[0] if len(strands) == 1 else bundle
+    return Line(name, label, values, colour, position >= len(style.CYCLE))
 
 
 def _residuals(results: Results) -> Panel:

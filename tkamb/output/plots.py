@@ -16,7 +16,8 @@ from matplotlib.ticker import (
 from tkamb.errors import InputError
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
 from tkamb.output.metrics import failed, flagged
-from tkamb.output.panels import Panel, centre_panel, panels
+from tkamb.output.panel import Panel
+from tkamb.output.panels import centre_panel, panels
 from tkamb.output.style import BLACK, GREY, ORANGE, legend_above, new_figure, settings
 from tkamb.results import Results
 

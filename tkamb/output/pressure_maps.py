@@ -13,6 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
@@ -211,4 +212,5 @@ def _label_stops(
             va="center",
             fontsize=8,
             color=colour,
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )

@@ -55,8 +55,10 @@ def sentences(summary: dict[str, Any]) -> list[str]:
 
 def _shown(value: Any) -> str:
     if isinstance(value, dict):
-        parts = (f"{escape(str(k))} {_shown(v)}" for k, v in value.items() if v is not None)
-        return ", ".join(parts)
+        kept = {str(k).replace("_", " "): v for k, v in value.items() if v not in (None, {}, [])}
+        return ", ".join(f"{escape(name)} {_shown(item)}" for name, item in kept.items())
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, list | tuple):
         return ", ".join(_shown(item) for item in value)
     if isinstance(value, float):

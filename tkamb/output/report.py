@@ -9,7 +9,8 @@ from tkamb.output.axis import HorizontalAxis, horizontal_axis
 from tkamb.output.cursor import cursor_bar
 from tkamb.output.headline import cards
 from tkamb.output.metrics import body_weight, failed, flagged
-from tkamb.output.panels import Panel, centre_panel, panels
+from tkamb.output.panel import Panel
+from tkamb.output.panels import centre_panel, panels
 from tkamb.output.plots import draw_panel
 from tkamb.output.pressure_maps import draw_maps, draw_paths, mapped_frames, top_view
 from tkamb.output.provenance import provenance_rows, sentences
@@ -59,7 +60,7 @@ def _title(summary: dict[str, Any]) -> str:
         return str(summary["title"])
     scene = Path(str(summary.get("scene", "tkamb run")))
     name = scene.parent.name if scene.stem == "scene" and scene.parent.name else scene.stem
-    return name.replace("_", " ").capitalize()
+    return name.upper() if len(name) <= 3 else name.replace("_", " ").capitalize()
 
 
 def _subtitle(results: Results) -> str:

@@ -30,11 +30,15 @@ figcaption, .legend { font-size: 12.5px; color: var(--soft); margin: 4px 0 0; }
 .live .readout { display: block; min-height: 18px; margin: 2px 0 0; font-size: 12px; }
 .readout span { display: inline-block; margin-right: 12px; font-variant-numeric: tabular-nums; }
 .cursor { stroke: #1a1a1a; stroke-width: 0.8; stroke-opacity: 0.55; }
-#bar { position: sticky; bottom: 0; margin-top: 26px; padding: 9px 12px; background: #fff;
+.whole { white-space: nowrap; }
+#bar { display: flex; align-items: center;
+  position: sticky; bottom: 0; margin-top: 26px; padding: 9px 12px; background: #fff;
   border: 1px solid var(--line); border-bottom: 0; font-size: 13px;
   box-shadow: 0 -2px 8px rgba(0, 0, 0, 0.08); }
 #bar[hidden] { display: none; }
-#frame { width: 55%; vertical-align: middle; margin: 0 12px; accent-color: var(--accent); }
+#bar label { flex: 0 0 55%; display: flex; align-items: center; }
+#frame { flex: 1; margin: 0 12px; accent-color: var(--accent); }
+#place { flex: 1; overflow: hidden; white-space: nowrap; text-overflow: ellipsis; }
 table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; }
 th, td { padding: 5px 9px; border-bottom: 1px solid var(--line); text-align: left;
   vertical-align: top; }
