@@ -1,10 +1,10 @@
 """A small leg for tests: ankle, tibia, knee, femur, patella, hip, all numbers plain."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tkamb.body.chain import Chain, ChainMotion
 from tkamb.geometry.frames import pose
-from scipy.spatial.transform import Rotation
 
 INERTIA = {
     "tibia": (4.2, "0.01 0.22 0.005", "0.06 0.008 0.061 0.001 0.0004 -0.0006"),

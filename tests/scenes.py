@@ -1,9 +1,8 @@
 """The shipped knee bend as a starting point: copies of its scene with keys changed or left out."""
 
 import shutil
-from pathlib import Path
-
 import tomllib
+from pathlib import Path
 
 MODEL = Path(__file__).parents[1] / "models" / "deep_knee_bend"
 
