@@ -20,8 +20,8 @@ Mask = NDArray[np.bool_]
 
 BULGE = 0.1
 """How far the node stays short of the line: on it the cell's corner would be flat."""
-INSET = 1e-6
-"""Share of the way inwards at which rays along y are fired."""
+INSET = 1e-3
+"""Share of the way inwards by which a node keeps inside its corner, where rays along y hit."""
 FIRE_AT = 0.1
 """Cells below a node on the top, or above one underneath, where it is asked what is inside."""
 REACH = 0.75
@@ -91,14 +91,15 @@ def _fill(field: NodeField, notch: Notch, before: Array, rays: RayCaster) -> Non
         first[:, notch.axes[1]],
     )
     within = np.where(upper, -FIRE_AT, np.where(lower, FIRE_AT, 0.0)) * field.spacing[1]
-    is_corner = inside(rays, _towards(corner, across, 1e-3, within))
+    corner = _towards(corner, across, INSET, 0.0)
+    is_corner = inside(rays, _towards(corner, across, 0.0, within))
     keep = is_corner | inside(rays, _towards(middle, across, 0.1, within))
     target = np.where(is_corner[:, None], corner, middle + BULGE * (own - middle))
     if flat:
         probe = np.where(is_corner[:, None], corner, middle)
         field.points[..., 1][notch.node] = middle[:, 1]
         field.upper_end[notch.node], field.lower_end[notch.node] = upper, lower
-        target[:, 1] = refired(field, notch.node, _towards(probe, across, INSET, 0.0), rays)
+        target[:, 1] = refired(field, notch.node, probe, rays)
     reach = REACH * np.linalg.norm(field.spacing[list(notch.axes)])
     keep &= np.linalg.norm((target - own)[:, notch.axes], axis=1) <= reach
     _settle(field, notch, target, keep, is_corner & flat)
@@ -117,4 +118,5 @@ def _settle(field: NodeField, notch: Notch, target: Array, keep: Mask, top: Mask
     field.points[chosen] = target[keep]
     field.member[chosen] = True
     both = field.top[notch.first] & field.top[notch.second] & top
+    both &= ~field.top.any(axis=1)[notch.node[0], notch.node[2]]
     field.top[chosen] = both[keep]
