@@ -1,0 +1,171 @@
+"""A cylinder that rolls, slides and spins on a plate and in a trough: arcs in closed form."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from tkamb.body.slip import (
+    CondyleSlip,
+    InsertProfile,
+    arc,
+    condyle_slip,
+    roll_slip_motion,
+    sliding_velocity,
+)
+from tkamb.geometry.frames import Array, knee_pose, knee_twist
+from tkamb.geometry.surface import Surface
+
+RADIUS, TROUGH, DEPTH = 0.02, 0.05, 0.012
+FRAMES = 61
+FLEXION = np.deg2rad(np.linspace(0.0, 60.0, FRAMES))
+
+
+def cylinder() -> Surface:
+    mesh = trimesh.creation.cylinder(RADIUS, 0.06, sections=720)
+    for _ in range(2):
+        mesh = mesh.subdivide()
+    vertices = np.array(mesh.vertices)
+    return Surface(vertices, np.asarray(mesh.faces), "cylinder")
+
+
+def bed(trough: bool) -> Surface:
+    """A block 60 x 80 mm; its top is flat at 12 mm or a trough of 50 mm radius."""
+    x, z = np.linspace(-0.03, 0.03, 241), np.array([-0.04, 0.0, 0.04])
+    top = DEPTH + (TROUGH - np.sqrt(TROUGH**2 - x**2) if trough else 0.0 * x)
+    rings = [
+        np.concatenate(
+            [
+                np.column_stack([x, top, np.full_like(x, zk)]),
+                [[x[-1], 0.0, zk], [x[0], 0.0, zk]],
+            ]
+        )
+        for zk in z
+    ]
+    n = len(rings[0])
+    vertices = np.concatenate([*rings, [[0.0, 0.0, z[0]], [0.0, 0.0, z[-1]]]])
+    k = np.arange(n)
+    ahead = (k + 1) % n
+    faces = []
+    for ring in (0, 1):
+        a, b = ring * n + k, ring * n + ahead
+        faces += [np.column_stack([a, a + n, b]), np.column_stack([b, a + n, b + n])]
+    faces.append(np.column_stack([k, ahead, np.full(n, 3 * n)]))
+    faces.append(np.column_stack([2 * n + ahead, 2 * n + k, np.full(n, 3 * n + 1)]))
+    mesh = trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
+    if mesh.volume < 0.0:
+        mesh.invert()
+    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), "bed")
+
+
+@pytest.fixture(scope="module")
+def roller() -> Surface:
+    return cylinder()
+
+
+def motion(ap: Array | float, flexion: Array | float, axial: Array | float = 0.0) -> Array:
+    zero = np.zeros(FRAMES)
+    columns = [ap + zero, DEPTH + RADIUS + zero, zero, axial + zero, zero, flexion + zero]
+    return np.column_stack(columns)
+
+
+def both(found: tuple[CondyleSlip, CondyleSlip | None]) -> tuple[CondyleSlip, CondyleSlip]:
+    assert found[1] is not None
+    return found[0], found[1]
+
+
+def test_rolling_on_a_plate_has_equal_arcs_and_no_slip(roller: Surface) -> None:
+    moved = motion(0.01 - RADIUS * FLEXION, FLEXION)
+    for side in both(condyle_slip(roller, bed(False), 0.0, moved)):
+        assert side.femoral_arc[-1] == pytest.approx(RADIUS * FLEXION[-1], rel=1e-3)
+        assert side.insert_arc[-1] == pytest.approx(RADIUS * FLEXION[-1], rel=1e-3)
+        assert np.abs(side.slip).max() < 1e-3 * side.femoral_arc[-1]
+
+
+def test_sliding_on_a_plate_is_all_slip(roller: Surface) -> None:
+    spinning = motion(0.0, FLEXION)
+    pushed = motion(0.01 - 0.02 * FLEXION, 0.0)
+    for side in both(condyle_slip(roller, bed(False), 0.0, spinning)):
+        assert side.slip[-1] == pytest.approx(RADIUS * FLEXION[-1], rel=1e-3)
+        assert np.abs(side.insert_arc).max() < 1e-5
+    for side in both(condyle_slip(roller, bed(False), 0.0, pushed)):
+        assert side.slip[-1] == pytest.approx(-0.02 * FLEXION[-1], rel=1e-3)
+
+
+def test_axial_rotation_is_taken_out(roller: Surface) -> None:
+    """Turned by 20 deg about its centre: the condyles travel apart, and none of it is slip."""
+    angle = np.deg2rad(np.linspace(0.0, 20.0, FRAMES))
+    medial, lateral = both(condyle_slip(roller, bed(False), 0.0, motion(0.0, 0.0, angle)))
+    assert lateral.insert_arc[-1] == pytest.approx(0.015 * np.sin(angle[-1]), rel=2e-3)
+    assert medial.insert_arc[-1] == pytest.approx(-0.015 * np.sin(angle[-1]), rel=2e-3)
+    for side in (medial, lateral):
+        assert side.axial_part[-1] == pytest.approx(side.insert_arc[-1], rel=1e-3)
+        assert np.abs(side.slip).max() < 1e-3 * abs(side.insert_arc[-1])
+
+
+def test_rolling_with_axial_rotation_has_no_slip(roller: Surface) -> None:
+    angle = np.deg2rad(np.linspace(0.0, 10.0, FRAMES))
+    moved = motion(
+        0.01 - RADIUS * np.cumsum(np.append(0.0, np.cos(angle[1:]) * np.diff(FLEXION))),
+        FLEXION,
+        angle,
+    )
+    for side in both(condyle_slip(roller, bed(False), 0.0, moved)):
+        assert abs(side.slip[-1]) < 1e-3 * RADIUS * FLEXION[-1]
+
+
+def test_arcs_in_a_trough(roller: Surface) -> None:
+    """The lowest point is below the axis; its projection runs on the trough's arc."""
+    ap = np.linspace(0.012, -0.014, FRAMES)
+    moved = motion(ap, FLEXION)
+    moved[:, 1] += 5e-3
+    expected = TROUGH * (np.arcsin(ap[0] / TROUGH) - np.arcsin(ap / TROUGH))
+    for side in both(condyle_slip(roller, bed(True), 0.0, moved)):
+        assert side.insert_arc[-1] == pytest.approx(expected[-1], rel=1e-3)
+        assert side.femoral_arc[-1] == pytest.approx(RADIUS * FLEXION[-1], rel=1e-3)
+        assert side.slip[-1] == pytest.approx(RADIUS * FLEXION[-1] - expected[-1], rel=3e-3)
+
+
+def test_slip_velocity_is_the_rigid_body_velocity(roller: Surface) -> None:
+    """Rolling plus slip plus axial rotation: by arcs, and by v + w x r without arcs."""
+    time = np.linspace(0.0, 1.0, FRAMES)
+    angle = np.deg2rad(8.0) * time**2
+    moved = motion(0.012 - 0.014 * time, FLEXION, angle)
+    rates = np.gradient(moved, time, axis=0)
+    velocity, spin = knee_twist(moved, rates)
+    for side, z in zip(
+        both(condyle_slip(roller, bed(False), 0.0, moved)), (-0.015, 0.015), strict=True
+    ):
+        arm = knee_pose(moved)[:, :3, :3] @ np.array([0.0, 0.0, z]) - [0.0, RADIUS, 0.0]
+        rigid = sliding_velocity(velocity, spin, arm, arm[:, 2])
+        inner = slice(2, -2)
+        by_arcs = side.slip_velocity(time)[inner]
+        assert np.abs(by_arcs - rigid[inner]).max() < 2e-3 * np.abs(rigid).max()
+
+
+def test_arc_is_exact_on_a_circle() -> None:
+    turn = np.deg2rad(np.array([0.0, 1.0, 30.0, 90.0]))
+    chord = np.column_stack([2 * RADIUS * np.sin(turn / 2), np.zeros(4)])
+    assert arc(chord, turn) == pytest.approx(RADIUS * turn, rel=1e-12)
+
+
+def test_roll_slip_motion_gives_back_the_rolling(roller: Surface) -> None:
+    given = motion(0.01, FLEXION)
+    rolled = roll_slip_motion(roller, bed(False), 0.0, given, np.zeros(FRAMES))
+    assert rolled[:, 0] == pytest.approx(0.01 - RADIUS * FLEXION, abs=2e-5)
+    assert rolled[:, 1] == pytest.approx(DEPTH + RADIUS, abs=2e-6)
+    slipped = roll_slip_motion(roller, bed(False), 0.0, given, RADIUS * FLEXION)
+    assert slipped[:, 0] == pytest.approx(0.01, abs=2e-5)
+
+
+def test_off_the_insert_is_not_a_number(roller: Surface) -> None:
+    moved = motion(np.linspace(0.0, -0.05, FRAMES), FLEXION)
+    medial, _ = both(condyle_slip(roller, bed(False), 0.0, moved))
+    assert np.isfinite(medial.slip[:30]).all()
+    assert np.isnan(medial.slip[-1])
+
+
+def test_profile_of_the_trough() -> None:
+    x = np.linspace(-0.02, 0.02, 9)
+    height, slope = InsertProfile(bed(True)).at(np.column_stack([x, x, 0.01 + 0 * x]))
+    assert height == pytest.approx(DEPTH + TROUGH - np.sqrt(TROUGH**2 - x**2), abs=1e-6)
+    assert slope == pytest.approx(np.arcsin(x / TROUGH), abs=2e-4)

@@ -1,0 +1,243 @@
+"""Rolling and slipping of the femoral condyles on the insert, by arc lengths.
+
+From frame to frame the lowest point of a condyle travels an arc a_f on the femoral surface,
+and its projection travels an arc a_i on the insert. Both are taken in the insert's sagittal
+plane and are positive when the contact moves backwards, which is how flexion moves it.
+Rolling: equal arcs. What axial rotation alone would do, about the geometric centre of the
+femoral component, is taken out of a_i:
+
+    slip = sum (a_f - (a_i - a_axial)),   a_axial = d(alpha) (z_condyle - z_centre) / cos(slope)
+
+alpha positive: femur external. Positive slip: the femur's surface slides forwards on the
+insert, so that its rate is the x velocity of the femur's contact point relative to the
+insert, without its axial part: `sliding_velocity` computes it without arcs.
+
+An arc between two points of a smooth profile whose tangent turns by d is taken as that of
+the circle through both: chord (d/2)/sin(d/2). Exact on circles; on a profile of changing
+curvature it errs by the third power of the step.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tkamb.geometry.first_touch import FirstTouch
+from tkamb.geometry.frames import Array, inverse, knee_pose, rotate, transform
+from tkamb.geometry.lowest import LowestPoints
+from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.smooth_normals import smooth_normals
+from tkamb.geometry.surface import Surface
+
+UP = np.array([0.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True, eq=False)
+class CondyleSlip:
+    """Rolling and slipping of one condyle; cumulated from the first frame, NaN where lost.
+
+    Args:
+        femoral_arc: (f,) m, on the femoral surface, positive backwards.
+        insert_arc: (f,) m, on the insert, positive backwards.
+        axial_part: (f,) m, the part of `insert_arc` that is due to axial rotation.
+        slip: (f,) m, femoral_arc - (insert_arc - axial_part).
+    """
+
+    femoral_arc: Array
+    insert_arc: Array
+    axial_part: Array
+
+    @property
+    def slip(self) -> Array:
+        """Return (f,) m, positive when the femur's surface slides forwards."""
+        return np.asarray(self.femoral_arc - (self.insert_arc - self.axial_part))
+
+    def slip_velocity(self, time: Array) -> Array:
+        """Return (f,) m/s, by central differences of the slip over time (f,) s."""
+        return np.asarray(np.gradient(self.slip, time))
+
+
+class InsertProfile:
+    """The insert's upper surface as a height over x and z.
+
+    Args:
+        insert: in the insert frame.
+    """
+
+    def __init__(self, insert: Surface) -> None:
+        self._insert, self._rays = insert, RayCaster(insert)
+        self._above = float(insert.bounds[1, 1]) + 1e-3
+
+    def at(self, points: Array) -> tuple[Array, Array]:
+        """Return height y (n,) m and sagittal slope angle (n,) rad; NaN beside the insert.
+
+        Args:
+            points: (n, 3) m, insert frame; their y does not matter.
+        """
+        start = np.array(points, float)
+        start[:, 1] = self._above
+        distance, face = self._rays.first(start, -UP)
+        hit = face >= 0
+        height, slope = np.full(len(start), np.nan), np.full(len(start), np.nan)
+        height[hit] = self._above - distance[hit]
+        feet = start[hit]
+        feet[:, 1] = height[hit]
+        normal = smooth_normals(self._insert, feet, face[hit])
+        slope[hit] = np.arctan2(-normal[:, 0], normal[:, 1])
+        return height, slope
+
+
+def condyle_slip(
+    femoral: Surface, insert: Surface, split: float | None, coordinates: Array
+) -> tuple[CondyleSlip, CondyleSlip | None]:
+    """Return rolling and slipping of the medial and the lateral condyle.
+
+    Args:
+        femoral: femoral component, femoral frame.
+        insert: insert, insert frame.
+        split: z between the condyles in the femoral frame, None for one condyle (medial).
+        coordinates: (f, 6) knee coordinates, m and rad, as recorded.
+    """
+    lowest = LowestPoints(femoral, split)
+    poses, profile = knee_pose(coordinates), InsertProfile(insert)
+    centre = transform(poses, femoral.bounds.mean(axis=0))
+    found = [lowest.at(pose) for pose in poses]
+    slips: list[CondyleSlip] = []
+    for side in (0, 1):
+        if found[0][side] is None:
+            return slips[0], None
+        points = np.array([pair[side] for pair in found])
+        slips.append(slip_of_points(points, poses, coordinates[:, 3], centre[:, 2], profile))
+    return slips[0], slips[1]
+
+
+def slip_of_points(
+    points: Array, poses: Array, axial_rotation: Array, centre_z: Array, profile: InsertProfile
+) -> CondyleSlip:
+    """Return rolling and slipping of one condyle from its lowest points.
+
+    Args:
+        points: (f, 3) m, lowest points, insert frame.
+        poses: (f, 4, 4) pose_femoral_in_insert.
+        axial_rotation: (f,) rad, positive: femur external.
+        centre_z: (f,) m, geometric centre of the component, insert frame.
+        profile: the insert's surface.
+    """
+    height, slope = profile.at(points)
+    on_insert = np.column_stack([points[:, 0], height])
+    travelled = arc(np.diff(on_insert, axis=0), np.diff(slope))
+    backwards = -np.sign(np.diff(points[:, 0]))
+    lever = _mean(points[:, 2] - centre_z) / np.cos(_mean(slope))
+    return CondyleSlip(
+        _cumulated(femoral_arcs(points, poses)),
+        _cumulated(backwards * travelled),
+        _cumulated(np.diff(axial_rotation) * lever),
+    )
+
+
+def femoral_arcs(points: Array, poses: Array) -> Array:
+    """Return the arcs (f-1,) m between successive lowest points, on the femoral surface.
+
+    There the surface's normal is the insert's -y, whatever the pose: the profile's tangent
+    turns as the femur does about its ML axis. Positive backwards; of a chord that is turned
+    axially, its part in the insert's sagittal plane.
+
+    Args:
+        points: (f, 3) m, lowest points, insert frame.
+        poses: (f, 4, 4) pose_femoral_in_insert.
+    """
+    back = inverse(poses)
+    here = transform(back, points[:, None])[:, 0]
+    normal = rotate(back, -UP)
+    angle = np.unwrap(np.arctan2(normal[:, 1], normal[:, 0]))
+    chord = np.diff(here, axis=0)
+    middle = np.einsum("fij,fj->fi", poses[1:, :3, :3] + poses[:-1, :3, :3], chord)
+    size, twice = np.linalg.norm(chord, axis=1), np.linalg.norm(middle, axis=1)
+    middle *= np.divide(size, twice, out=np.zeros_like(size), where=twice > 0.0)[:, None]
+    return np.asarray(-np.sign(middle[:, 0]) * arc(middle[:, :2], np.diff(angle)))
+
+
+def arc(chord: Array, turn: Array) -> Array:
+    """Return the length (n,) of circular arcs over chords (n, 2) whose tangent turns (n,) rad."""
+    half = 0.5 * np.abs(turn)
+    stretch = np.where(half > 1e-6, half / np.where(half > 1e-6, np.sin(half), 1.0), 1.0)
+    return np.asarray(np.linalg.norm(chord, axis=1) * stretch)
+
+
+def sliding_velocity(velocity: Array, spin: Array, arm: Array, lever: Array) -> Array:
+    """Return the forward sliding (f,) m/s of the femur's contact point, without axial rotation.
+
+    Rigid-body kinematics: (v + w x r)_x - w_y (z_condyle - z_centre).
+
+    Args:
+        velocity: (f, 3) m/s of the femoral origin relative to the insert, insert frame.
+        spin: (f, 3) rad/s of the femur relative to the insert, insert frame.
+        arm: (f, 3) m from the femoral origin to the contact point.
+        lever: (f,) m, z from the component's geometric centre to the contact point.
+    """
+    return np.asarray((velocity + np.cross(spin, arm))[:, 0] - spin[:, 1] * lever)
+
+
+def roll_slip_motion(
+    femoral: Surface,
+    insert: Surface,
+    split: float | None,
+    coordinates: Array,
+    slip: Array,
+) -> Array:
+    """Return the source's motion: rotations given, AP from rolling plus slip, SI from contact.
+
+    The mean of the condyles' contact points moves backwards by the femoral arc less the
+    slip, along the insert; the femur comes down to first touch in every frame. The first
+    frame's AP is kept.
+
+    Args:
+        femoral: femoral component, femoral frame.
+        insert: insert, insert frame.
+        split: z between the condyles in the femoral frame, None for one condyle.
+        coordinates: (f, 6) knee coordinates; rotations and ML are taken from them.
+        slip: (f,) m, cumulated, positive forwards; zero: pure rolling.
+
+    Returns:
+        (f, 6) knee coordinates; NaN from where the femur leaves the insert.
+    """
+    moved = np.array(coordinates, float)
+    lowest, profile = LowestPoints(femoral, split), InsertProfile(insert)
+    touch = FirstTouch(femoral, insert, split)
+    poses = knee_pose(moved)
+    relative = [[p for p in lowest.at(pose) if p is not None] for pose in poses]
+    arms = np.array([np.mean(pair, axis=0) for pair in relative]) - poses[:, :3, 3]
+    arcs = np.mean(
+        [
+            femoral_arcs(np.array([pair[side] for pair in relative]), poses)
+            for side in range(len(relative[0]))
+        ],
+        axis=0,
+    )
+    centre_z = transform(poses, femoral.bounds.mean(axis=0))[:, 2]
+    lever = _mean(arms[:, 2] + poses[:, 2, 3] - centre_z)
+    axial = np.diff(moved[:, 3]) * lever
+    backwards = arcs - np.diff(np.asarray(slip, float))
+    contact = moved[0, 0] + arms[0, 0]
+    moved[0, 1] -= touch.travel(knee_pose(moved[0]))
+    for k in range(1, len(moved)):
+        contact = _rolled(profile, contact, poses[k, 2, 3] + arms[k, 2], backwards[k - 1])
+        contact -= axial[k - 1]
+        moved[k, 0] = contact - arms[k, 0]
+        moved[k, 1] -= touch.travel(knee_pose(moved[k])) if np.isfinite(contact) else np.nan
+    return moved
+
+
+def _rolled(profile: InsertProfile, x: float, z: float, backwards: float) -> float:
+    """Return x after an arc backwards along the insert's surface at z (midpoint rule)."""
+    _, slope = profile.at(np.array([[x, 0.0, z]]))
+    middle = x - 0.5 * backwards * np.cos(slope[0])
+    _, slope = profile.at(np.array([[middle, 0.0, z]]))
+    return float(x - backwards * np.cos(slope[0]))
+
+
+def _mean(values: Array) -> Array:
+    return np.asarray(0.5 * (values[1:] + values[:-1]))
+
+
+def _cumulated(steps: Array) -> Array:
+    return np.concatenate([[0.0], np.cumsum(steps)])
