@@ -16,14 +16,12 @@ class Column:
         meaning: one line; vectors are in the insert frame unless it says otherwise.
         needs: scene tables without which the column is empty.
         kind: how its cells are written.
-        optional: in the file only when the run gives it; the others always stand there.
     """
 
     name: str
     meaning: str
     needs: str = ""
     kind: Kind = "number"
-    optional: bool = False
 
 
 _GROUND = "[ground_reaction]"
@@ -90,21 +88,18 @@ COLUMNS: tuple[Column, ...] = (
     Column("lateral_area_above_yield", "share of the lateral area above yield", _CONTACT),
     Column("medial_thickness_mm", "insert under the medial centre of pressure", _CONTACT),
     Column("lateral_thickness_mm", "insert under the lateral centre of pressure", _CONTACT),
-    Column(
-        "residual_coronal_Nm", "residual moment on the tibia about insert x, one condyle lifted"
-    ),
-    Column("residual_flexion_Nm", "residual moment on the tibia about insert z, no quadriceps"),
-    Column("cycle_percent", "per cent of the cycle", "[motion] cycle_s"),
     Column("condition_number", "of the equilibrium system with scaled columns"),
-    Column("body_seconds", "computing time of the rigid-body part"),
+    Column("body_seconds", "computing time of the rigid-body equations"),
+    Column("query_seconds", "computing time of the closest points on the meshes", _IMPLANT),
     Column("contact_seconds", "computing time of the contact", _CONTACT),
     Column("iterations", "of the contact solver", _CONTACT, "integer"),
     Column("status", "ok, or reason words joined by ;", kind="text"),
-    Column("residual_coronal_Nm", "residual moment about insert x, one condyle off", optional=True),
+    Column("cycle_percent", "per cent of the cycle", "[motion] cycle_s"),
+    Column("residual_coronal_Nm", "residual moment about insert x, where one condyle is off"),
+    Column("residual_flexion_Nm", "residual moment about insert z, where no quadriceps acts"),
     Column(
         "residual_sensitivity_N",
         "largest change of force_total_N when the residuals act 10 mm higher or lower",
-        optional=True,
     ),
 )
 
@@ -128,15 +123,11 @@ def ligament_of(column: str) -> str:
 
 
 def ordered_names(present: Iterable[str]) -> tuple[str, ...]:
-    """Return every fixed column in order, with what else is `present` in its place."""
-    present = list(present)
+    """Return every fixed column in order, with the ligament columns of `present` in place."""
     ligaments = [name for name in present if is_ligament(name)]
     names: list[str] = []
     for column in COLUMNS:
-        if column.name == LIGAMENT:
-            names.extend(ligaments)
-        elif not column.optional or column.name in present:
-            names.append(column.name)
+        names.extend(ligaments if column.name == LIGAMENT else [column.name])
     return tuple(names)
 
 
@@ -144,6 +135,5 @@ def columns_as_markdown() -> str:
     """Return the table of the columns for the documentation."""
     lines = ["| column | meaning | empty without |", "| --- | --- | --- |"]
     for column in COLUMNS:
-        where = "(only when it is given)" if column.optional else column.needs
-        lines.append(f"| `{column.name}` | {column.meaning} | {where} |")
+        lines.append(f"| `{column.name}` | {column.meaning} | {column.needs} |")
     return "\n".join(lines) + "\n"

@@ -207,6 +207,7 @@ def _residual_moment(results: Results) -> Panel:
     lines = (
         _line(results, "residual_axial_Nm", "axial", BLUE),
         _line(results, "residual_coronal_Nm", "coronal, one condyle off", VERMILLION),
+        _line(results, "residual_flexion_Nm", "flexion, no quadriceps", GREEN),
     )
     return Panel("residual_moment", "Residual moments", "N·m", lines)
 
