@@ -62,7 +62,7 @@ class Bed:
 def sample_bed(insert: Surface, resolution: float) -> Bed:
     """Sample the upper surface of the insert by vertical rays on an x-z grid.
 
-    One point per cell, at its centre; at the rim near the centre of what is covered. Cells lie
+    One point per cell, at its centre; at the rim at the centre of what is covered. Cells lie
     symmetrically about x = 0 and z = 0. Walls parallel to y are seen by no vertical ray and
     carry no point. The midpoint rule makes integrals over the bed second-order in the
     resolution.
@@ -117,8 +117,9 @@ def _cells(
     mean = np.einsum("ij,ijk->ik", on, rays) / np.maximum(count, 1)[:, None]
     away = np.where(on, np.linalg.norm(rays - mean[:, None], axis=2), np.inf)
     nearest = rays[np.arange(len(rim)), away.argmin(axis=1)]
+    on_mean = np.isfinite(_first(caster, mean)[0])[:, None]
     xz, share = centres.copy(), every.ravel().astype(float)
-    xz[rim], share[rim] = nearest, count / RIM_RAYS**2
+    xz[rim], share[rim] = np.where(on_mean, mean, nearest), count / RIM_RAYS**2
     cell = np.flatnonzero(share > 0)
     if not cell.size:
         raise InputError(

@@ -51,7 +51,7 @@ def osculate(
     normal (uniformly, whatever their triangles), z = c0 + c1 u + c2 v + c3 u² + c4 uv +
     c5 v² is fitted to each by least squares, and the disc is centred anew at the minimum of
     the difference, with the mean normal there, until it stays. Facets smaller than the disc
-    average out; on a sphere of radius R curvature comes out too large by about radius²/(6 R²)
+    average out; on a sphere of radius R curvature comes out too large by radius²/(4 R²),
     relative (the quartic term).
 
     Args:

@@ -98,7 +98,9 @@ class Hertz(ContactModel):
 
     Args:
         resolution: m, spacing of the map points.
-        patch_radius: m, of the discs on which curvatures are fitted.
+        patch_radius: m, of the discs on which curvatures are fitted. On a sphere of 20 mm
+            4 mm makes the force 0.5 % too small; on a real implant (relative radii 70 and
+            240 mm) 4 to 6 mm move area and peak by 8 %, below 3 mm facets dominate.
 
     Reference: Johnson, Contact Mechanics (1985), chapter 4, doi:10.1017/CBO9781139171731.
     """

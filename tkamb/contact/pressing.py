@@ -21,7 +21,7 @@ FIRST_APPROACH = 5e-5
 """m; where the search begins without a guess."""
 DEEPEST = 0.02
 """m; no insert carries a load at a greater approach."""
-FINEST_TRAVEL = 1e-13
+FINEST_TRAVEL = 1e-16
 """m; a bracket this narrow cannot be narrowed."""
 MOST_EVALUATIONS = 80
 

@@ -1,0 +1,252 @@
+"""Elastic foundation, the bed it stands on and the press, against closed forms."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
+from tkamb.contact.bed import sample_bed
+from tkamb.contact.foundation import ElasticFoundation, LinearFoundation, layer_pressure
+from tkamb.contact.materials import material
+from tkamb.contact.model import ContactPair, ContactStatus
+from tkamb.contact.pressing import first_touch_height, pose_at_approach
+from tkamb.errors import InputError
+from tkamb.geometry.frames import inverse, knee_pose, pose
+from tkamb.geometry.surface import Surface
+
+LINEAR = material("polyethylene-linear")
+M = LINEAR.confined_modulus
+RADIUS, HEIGHT = 30e-3, 10e-3
+
+
+def sphere_on_block(chosen=LINEAR):
+    return ContactPair(graded_sphere(RADIUS), flat_insert(HEIGHT), chosen)
+
+
+def lowered(depth, x=0.0, z=0.0):
+    return pose(np.eye(3), [x, HEIGHT + RADIUS - depth, z])
+
+
+def reaction(model, state, at):
+    return -model.evaluate(state, at).wrench_on_insert[1]
+
+
+def cap(depth):
+    """Return the volume of a spherical cap."""
+    return np.pi * depth**2 * (RADIUS - depth / 3)
+
+
+def test_a_sphere_presses_with_its_cap_volume():
+    """Force = M/h times the cap's volume; doubling the depth gives 3.9 to 4.0 times it."""
+    model = LinearFoundation(0.5e-3)
+    state = model.prepare(sphere_on_block())
+    depths = np.array([0.1e-3, 0.2e-3, 0.4e-3, 0.8e-3])
+    forces = np.array([reaction(model, state, lowered(d)) for d in depths])
+    assert np.allclose(forces, M / HEIGHT * cap(depths), rtol=8e-3)
+    ratio = forces[1:] / forces[:-1]
+    assert (ratio[1:] > 3.9).all()
+    assert (ratio[1:] < 4.0).all()
+
+
+def test_the_force_converges_with_second_order():
+    """RMS over positions of the grid under the sphere, 2 to 0.5 mm."""
+    errors = []
+    shifts = np.linspace(0, 1, 7)[:-1]
+    for resolution in (2e-3, 1e-3, 0.5e-3):
+        model = LinearFoundation(resolution)
+        state = model.prepare(sphere_on_block())
+        forces = [
+            reaction(model, state, lowered(0.2e-3, a * resolution, b * resolution))
+            for a in shifts
+            for b in shifts[::2]
+        ]
+        errors.append(np.sqrt(np.mean((np.array(forces) / (M / HEIGHT * cap(0.2e-3)) - 1) ** 2)))
+    slope = np.polyfit(np.log([4, 2, 1]), np.log(errors), 1)[0]
+    assert slope > 1.5, errors
+    assert errors[1] < 0.03
+
+
+def test_a_flat_punch_gives_uniform_pressure_on_the_whole_top():
+    """Tributary areas add up to the top, rim included, when the grid does not fit it."""
+    insert = flat_insert(8e-3, half_x=10.3e-3, half_z=13.7e-3)
+    punch = flat_insert(5e-3, half_x=20e-3, half_z=20e-3)
+    model = LinearFoundation(1e-3)
+    state = model.prepare(ContactPair(punch, insert, LINEAR))
+    result = model.evaluate(state, pose(np.eye(3), [0, 8e-3 - 0.1e-3, 0]))
+    assert np.allclose(result.pressure, M * 0.1 / 8, rtol=1e-9)
+    assert result.medial.area == pytest.approx(4 * 10.3e-3 * 13.7e-3, rel=5e-3)
+    assert result.medial.thickness == pytest.approx(8e-3)
+    assert result.approach == pytest.approx(0.1e-3, abs=1e-12)
+    assert np.allclose(result.medial.centre_of_pressure, [0, 8e-3, 0], atol=1e-9)
+
+
+def test_the_bed_lies_on_the_mesh_with_true_areas_normals_and_thickness():
+    radius = 25e-3
+    insert = dished_insert(lambda x, z: 32e-3 - np.sqrt(radius**2 - x**2 - z**2))
+    bed = sample_bed(insert, 1e-3)
+    outward = np.array([0, 32e-3, 0]) - bed.points
+    distance = np.linalg.norm(outward, axis=1)
+    assert np.allclose(distance, radius, atol=8e-6)
+    outward /= distance[:, None]
+    assert np.einsum("ij,ij->i", bed.normals, outward).min() > np.cos(np.radians(1.0))
+    assert np.allclose(bed.thickness, bed.points[:, 1])
+    x, z = (g.ravel() for g in np.meshgrid(*2 * [np.linspace(-15e-3, 15e-3, 601)]))
+    true = (30e-3) ** 2 * np.mean(radius / np.sqrt(radius**2 - x**2 - z**2))
+    assert bed.area.sum() == pytest.approx(true, rel=3e-3)
+    corners = bed.points[bed.triangles]
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (facing[:, 1] > 0).all()
+
+
+def test_the_bed_shows_a_post():
+    insert = dished_insert(lambda x, z: np.where(np.hypot(x, z) < 4e-3, 20e-3, 8e-3))
+    bed = sample_bed(insert, 1e-3)
+    on_post = np.hypot(bed.points[:, 0], bed.points[:, 2]) < 3.4e-3
+    assert np.allclose(bed.points[on_post, 1], 20e-3)
+    assert np.allclose(bed.thickness[on_post], 20e-3)
+
+
+def test_an_open_insert_is_refused():
+    closed = flat_insert(8e-3)
+    up = closed.face_normals[:, 1] > 0.5
+    with pytest.raises(InputError, match="closed"):
+        sample_bed(Surface(closed.vertices, closed.faces[up], "lid"), 1e-3)
+
+
+def test_pressure_laws():
+    strain = np.array([0.0, 1e-6, 0.01, 0.1, 0.4])
+    assert np.allclose(layer_pressure("linear", LINEAR, strain), M * strain)
+    assert np.allclose(layer_pressure("nonlinear", LINEAR, strain), -M * np.log1p(-strain))
+    polyethylene = material("polyethylene")
+    pressure = layer_pressure("nonlinear", polyethylene, strain)
+    assert pressure[1] == pytest.approx(M * 1e-6, rel=1e-5)
+    assert (np.diff(pressure) > 0).all()
+    assert (pressure[2:] < M * strain[2:]).all()
+    true_strain = -np.log1p(-strain[2:])
+    secant = polyethylene.secant(true_strain * M / 561.5e6)
+    assert np.allclose(pressure[2:], M / 561.5e6 * secant * true_strain)
+
+
+def test_rotated_past_a_right_angle_nothing_changes():
+    """The femoral mesh in a frame turned by 130 deg of flexion, pose turned back."""
+    pair = sphere_on_block()
+    turned = knee_pose([2e-3, 1e-3, 0, 0, 0, np.radians(130)])
+    other = ContactPair(pair.femoral.moved(turned), pair.insert, pair.material)
+    model = LinearFoundation(1e-3)
+    here = model.press(model.prepare(pair), 800.0, lowered(0))
+    there = model.press(model.prepare(other), 800.0, lowered(0) @ inverse(turned))
+    assert there.approach == pytest.approx(here.approach, rel=1e-9)
+    assert np.allclose(there.pressure, here.pressure, rtol=1e-6, atol=1.0)
+
+
+def two_spheres(gap=24e-3):
+    return joined(
+        graded_sphere(20e-3, (0, 0, -gap / 2)),
+        graded_sphere(20e-3, (0, 0, gap / 2)),
+    )
+
+
+def test_two_condyles_share_evenly_and_by_their_depths():
+    model = LinearFoundation(1e-3)
+    state = model.prepare(ContactPair(two_spheres(), flat_insert(HEIGHT, half_z=28e-3), LINEAR))
+    level = model.press(state, 1500.0, np.eye(4))
+    assert level.medial.force == pytest.approx(750, rel=1e-6)
+    assert level.lateral.force == pytest.approx(750, rel=1e-6)
+    assert level.medial.centre_of_pressure == pytest.approx([0, HEIGHT, -12e-3], abs=1e-5)
+    assert level.lateral.centre_of_pressure == pytest.approx([0, HEIGHT, 12e-3], abs=1e-5)
+    varus = model.press(state, 1500.0, knee_pose([0, 0, 0, 0, np.radians(0.3), 0]))
+    apart = 24e-3 * np.sin(np.radians(0.3))
+    deeper = (varus.medial.peak_pressure - varus.lateral.peak_pressure) * HEIGHT / M
+    assert varus.medial.force + varus.lateral.force == pytest.approx(1500, rel=1e-6)
+    assert deeper == pytest.approx(apart, rel=0.01)
+
+
+def test_varus_loads_the_medial_condyle():
+    model = ElasticFoundation(1e-3)
+    insert = flat_insert(HEIGHT, half_z=28e-3)
+    state = model.prepare(ContactPair(two_spheres(), insert, material("polyethylene")))
+    varus = model.press(state, 1000.0, knee_pose([0, 0, 0, 0, np.radians(0.3), 0]))
+    assert varus.medial.force > 1.5 * varus.lateral.force
+
+
+@pytest.mark.parametrize("load", [1e-6, 1.0, 300.0, 3000.0])
+def test_the_load_is_reached_at_any_size(load):
+    model = ElasticFoundation(0.5e-3)
+    state = model.prepare(sphere_on_block(material("polyethylene")))
+    result = model.press(state, load, lowered(0, x=0.13e-3))
+    assert result.status is ContactStatus.OK
+    assert -result.wrench_on_insert[1] == pytest.approx(load, rel=1e-6)
+    assert result.iterations < 50
+
+
+def test_zero_load_is_first_touch():
+    pair = sphere_on_block()
+    model = LinearFoundation(1e-3)
+    result = model.press(model.prepare(pair), 0.0, lowered(5e-3))
+    assert result.approach == 0
+    assert result.pose[1, 3] == pytest.approx(HEIGHT + RADIUS, abs=1e-9)
+    assert result.medial is None
+    assert not result.pressure.any()
+
+
+@pytest.mark.parametrize("load", [-1.0, float("nan"), float("inf")])
+def test_an_impossible_load_is_an_input_error(load):
+    model = LinearFoundation(1e-3)
+    with pytest.raises(InputError, match="impossible load"):
+        model.press(model.prepare(sphere_on_block()), load, lowered(0))
+
+
+def test_out_of_range_is_nan_and_says_why():
+    model = ElasticFoundation(1e-3)
+    state = model.prepare(sphere_on_block(material("polyethylene")))
+    deep = model.evaluate(state, lowered(6e-3))
+    assert deep.status is ContactStatus.OUT_OF_RANGE
+    assert np.isnan(deep.pressure).all()
+    too_much = model.press(state, 1e7, lowered(0))
+    assert too_much.status is ContactStatus.OUT_OF_RANGE
+    assert "half the insert's thickness" in " ".join(too_much.flags)
+    beside = model.press(state, 100.0, lowered(0, x=60e-3))
+    assert beside.status is ContactStatus.OUT_OF_RANGE
+    assert "does not lie over the insert" in beside.flags[0]
+    assert beside.medial is None
+
+
+def test_first_touch_of_crossed_cylinders_is_found_on_their_edges():
+    """Two prisms touch edge on edge, where neither has a vertex."""
+    ridge = dished_insert(lambda x, z: 10e-3 - 0.5 * np.abs(x), spacing=15e-3)
+    roof = dished_insert(lambda x, z: 10e-3 - 0.5 * np.abs(z), spacing=15e-3)
+    flipped = Surface(roof.vertices * [1, -1, 1], roof.faces[:, ::-1].copy(), "roof")
+    assert first_touch_height(ContactPair(flipped, ridge, LINEAR), np.eye(4)) == pytest.approx(
+        20e-3, abs=1e-12
+    )
+    shifted = pose(np.eye(3), [3.1e-3, 0, 2.3e-3])
+    pair = ContactPair(flipped, ridge, LINEAR)
+    assert first_touch_height(pair, shifted) == pytest.approx(20e-3, abs=1e-12)
+    assert pose_at_approach(pair, shifted, 1e-3)[1, 3] == pytest.approx(19e-3, abs=1e-12)
+
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the data folder shared/data is not here")
+def test_a_real_implant_is_loaded_on_both_dishes():
+    """JW's components aligned, 1500 N: even split, centres in the dishes."""
+    from tkamb.press import press_meshes
+
+    folder = DATA / "jw" / "geometry"
+    report = press_meshes(
+        folder / "femoral_component.stl",
+        folder / "tibial_insert.stl",
+        1500.0,
+        units="m",
+        axes="-x,+y,-z",
+    )
+    found = report.as_dict()
+    for name, side in (("medial", -1), ("lateral", 1)):
+        condyle = found[name]
+        assert condyle["force_N"] == pytest.approx(750, rel=0.03)
+        assert side * condyle["cop_mm"][2] == pytest.approx(22, abs=1.5)
+        assert abs(condyle["cop_mm"][0]) < 6
+        assert 12 < condyle["peak_pressure_MPa"] < 25
+        assert 45 < condyle["area_mm2"] < 90
