@@ -11,7 +11,7 @@ from tkamb.errors import InputError
 EVERY_TENTH = slice(0, 101, 10)
 
 CONTACT_COLUMNS = {column.name for column in COLUMNS if "[contact]" in column.needs}
-CLOCKS = {"body_seconds", "contact_seconds"}
+CLOCKS = {"body_seconds", "query_seconds", "contact_seconds"}
 
 
 @pytest.fixture(scope="module")

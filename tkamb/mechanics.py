@@ -39,13 +39,15 @@ class FrameLoads:
         loads: what they say.
         tensions: ligament name -> N.
         wrap: rad, by which the quadriceps wraps the femur; NaN if not modelled.
-        seconds: computing time.
+        query_seconds: computing time of the closest points on the meshes.
+        seconds: computing time of the equations, contact points given.
     """
 
     geometry: KneeGeometry
     loads: KneeLoads
     tensions: dict[str, float]
     wrap: float
+    query_seconds: float
     seconds: float
 
 
@@ -76,6 +78,8 @@ class Mechanics:
     def frame(self, k: int) -> FrameLoads:
         """Return the loads of frame k; a frame that cannot be solved holds NaN."""
         start = clock.perf_counter()
+        condyles, lifted, problems = self._condyles(k)
+        queried = clock.perf_counter()
         state = self.case.chain.at(self._chain_motion(k))
         poses = {link: state.pose(link) for link in self._attachment_links()}
         tensions: dict[str, float] = {}
@@ -83,7 +87,6 @@ class Mechanics:
         for bundle in self._ligaments:
             tensions[bundle.name], pulls = bundle.loads(poses)
             known += pulls
-        condyles, lifted, problems = self._condyles(k)
         extensor, wrap = None, NAN
         if self._extensor:
             try:
@@ -94,7 +97,8 @@ class Mechanics:
             state, self._ground(k, state), tuple(known), condyles, lifted, extensor
         )
         loads = unsolved(problems) if problems else solve_knee(geometry, self._friction)
-        return FrameLoads(geometry, loads, tensions, wrap, clock.perf_counter() - start)
+        done = clock.perf_counter()
+        return FrameLoads(geometry, loads, tensions, wrap, queried - start, done - queried)
 
     def _chain_motion(self, k: int) -> ChainMotion:
         motion, tibia = self.case.motion, self.case.tibia
@@ -132,9 +136,8 @@ class Mechanics:
     def _condyle(self, k: int, gap: "CondyleGap") -> CondylePoint:
         motion = self.case.motion
         velocity, spin = knee_twist(motion.coordinates[k], motion.velocity[k])
-        arm = gap.point_on_femoral - self.poses[k][:3, 3]
-        sliding = velocity + np.cross(spin, arm)
-        return CondylePoint(gap.point_on_insert, gap.normal, sliding, gap.gap)
+        sliding = velocity + np.cross(spin, gap.centre - self.poses[k][:3, 3])
+        return CondylePoint(gap.centre, gap.normal, sliding, gap.gap)
 
     def _lifted(self, condyles: dict[str, CondylePoint]) -> frozenset[str]:
         if len(condyles) < 2:

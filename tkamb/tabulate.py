@@ -41,6 +41,7 @@ def tabulate(
         limit = case.scene.output.yield_stress_MPa * MEGAPASCAL
         columns |= _collected([_contact_row(frame, limit) for frame in contact])
     columns["body_seconds"] = np.array([frame.seconds for frame in body])
+    columns["query_seconds"] = np.array([frame.query_seconds for frame in body])
     columns["status"] = list(statuses)
     return columns
 

@@ -4,13 +4,14 @@ The root is always free (a free-flyer), so that the measured ground reaction ent
 load; an ankle joint in the URDF is locked, its motion is the root's.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 
-from tkamb.body.load import PointForces
+from tkamb.body.load import PointForces, wrenches
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, inverse, rotate, transform
 
@@ -119,7 +120,7 @@ class ChainState:
         pin.updateFramePlacements(chain.model, self.data)
         root = self.data.oMi[chain.model.getJointId("root_joint")].homogeneous
         self.insert_in_laboratory: Array = root @ chain._insert_in_root
-        self._jacobians: dict[int, tuple[Array, Array]] = {}
+        self._jacobians: dict[int, Array] = {}
 
     @cached_property
     def laboratory_in_insert(self) -> Array:
@@ -135,13 +136,21 @@ class ChainState:
         """Return a point (3,) of a link in the insert frame."""
         return transform(self.pose(link), point)
 
-    def generalised(self, load: PointForces) -> Array:
-        """Return J^T w (nv,): the generalised force of a load given in the insert frame."""
-        jacobian, joint_in_insert = self._joint(load.link)
-        force_and_moment = load.wrench_at(joint_in_insert[:3, 3])
-        turn = joint_in_insert[:3, :3]
-        local = np.concatenate([force_and_moment[:3] @ turn, force_and_moment[3:] @ turn])
-        return np.asarray(jacobian.T @ local)
+    def generalised(self, groups: Sequence[Sequence[PointForces]]) -> Array:
+        """Return the generalised forces (nv, k) of k groups of loads: columns sum J^T w."""
+        loads = [load for group in groups for load in group]
+        column = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+        total = np.zeros((self.chain.model.nv, len(groups)))
+        if not loads:
+            return total
+        acting = wrenches(loads)
+        links = np.array([load.link for load in loads])
+        for link in np.unique(links):
+            own = links == link
+            on_link = np.zeros((len(groups), 6))
+            np.add.at(on_link, column[own], acting[own])
+            total += self._jacobian(str(link)).T @ on_link.T
+        return total
 
     def ground_reaction(self, force: Array, point: Array, moment: Array) -> PointForces:
         """Return a laboratory force (3,), its point (3,) and moment (3,) as load on the tibia."""
@@ -153,12 +162,12 @@ class ChainState:
             rotate(here, moment),
         )
 
-    def _joint(self, link: str) -> tuple[Array, Array]:
-        """Return the local Jacobian (6, nv) and pose in the insert of a link's joint."""
+    def _jacobian(self, link: str) -> Array:
+        """Return a link's Jacobian (6, nv) at the insert's origin, in the insert's axes."""
         joint = self.chain.model.frames[self.chain.frame_id(link)].parentJoint
         if joint not in self._jacobians:
             model, data = self.chain.model, self.data
-            jacobian = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL)
-            pose_in_insert = self.laboratory_in_insert @ data.oMi[joint].homogeneous
-            self._jacobians[joint] = (jacobian, pose_in_insert)
+            local = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL)
+            joint_in_insert = pin.SE3(self.laboratory_in_insert) * data.oMi[joint]
+            self._jacobians[joint] = joint_in_insert.toActionMatrix() @ local
         return self._jacobians[joint]

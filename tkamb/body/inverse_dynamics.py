@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tkamb.body.chain import ChainState
 from tkamb.body.load import PointForces
 from tkamb.geometry.frames import Array
 
@@ -50,37 +49,22 @@ class Solution:
     regular: bool
 
 
-def solve(state: ChainState, unknowns: Sequence[Unknown], known: Sequence[PointForces]) -> Solution:
-    """Solve the equations of motion at one frame for the unknown loads.
+def solve(names: Sequence[str], columns: Array, right: Array) -> Solution:
+    """Solve the equations of motion of one frame for the magnitudes of the unknown loads.
 
     Args:
-        state: chain at this frame (nv equations).
-        unknowns: exactly nv of them.
-        known: loads already known: ground reaction, ligaments.
+        names: of the k unknowns.
+        columns: (k, k) generalised force of one unit of each.
+        right: (k,) what they must add up to.
 
     Raises:
         ValueError: the system is not square.
     """
-    matrix = load_columns(state, unknowns)
-    if matrix.shape[0] != matrix.shape[1]:
-        raise ValueError(f"{matrix.shape[1]} unknown loads for {matrix.shape[0]} equations")
-    right = state.inertial - sum(
-        (state.generalised(load) for load in known), np.zeros(len(state.inertial))
-    )
-    size = np.linalg.norm(matrix, axis=0)
-    condition = float(np.linalg.cond(matrix / np.where(size > 0, size, 1.0)))
+    if columns.shape != (len(right), len(right)):
+        raise ValueError(f"{columns.shape[1]} unknown loads for {len(right)} equations")
+    size = np.linalg.norm(columns, axis=0)
+    scaled = columns / np.where(size > 0, size, 1.0)
+    condition = float(np.linalg.cond(scaled))
     regular = bool(np.isfinite(condition) and condition < LARGEST_CONDITION)
-    if regular:
-        magnitudes = np.linalg.solve(matrix / size, right) / size
-    else:
-        magnitudes = np.full(len(unknowns), np.nan)
-    names = [unknown.name for unknown in unknowns]
+    magnitudes = np.linalg.solve(scaled, right) / size if regular else np.full(len(right), np.nan)
     return Solution(dict(zip(names, magnitudes.tolist(), strict=True)), condition, regular)
-
-
-def load_columns(state: ChainState, unknowns: Sequence[Unknown]) -> Array:
-    """Return the generalised force (nv, k) of one unit of each unknown."""
-    columns = [
-        np.sum([state.generalised(load) for load in unknown.loads], axis=0) for unknown in unknowns
-    ]
-    return np.stack(columns, axis=1)

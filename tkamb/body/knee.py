@@ -105,28 +105,26 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
         friction: Coulomb coefficient of the femorotibial contact.
     """
     system = _System(geometry, friction, geometry.lifted, slack=False)
-    solution = system.solve()
-    if solution.values.get("quadriceps", 0.0) < 0:
-        system = replace(system, slack=True)
-        solution = system.solve()
-    pulling = _pulling(system, solution)
+    if system.solution.values.get("quadriceps", 0.0) < 0:
+        system = _System(geometry, friction, geometry.lifted, slack=True)
+    pulling = system.pulling
     if pulling and len(system.touching) == 2:
-        side = min(pulling, key=lambda name: solution.values[f"{name}_normal"])
-        system = replace(system, lifted=system.lifted | {side})
-        solution = system.solve()
-        pulling = _pulling(system, solution)
+        side = min(pulling, key=lambda name: system.solution.values[f"{name}_normal"])
+        system = _System(geometry, friction, system.lifted | {side}, system.slack)
+        pulling = system.pulling
+    solution = system.solution
     problems = ["contact would have to pull"] if pulling else []
     if not solution.regular:
         problems.append("singular equations")
     if problems:
         return replace(unsolved(problems), condition=solution.condition)
-    flexion, adduction = _external_moments(geometry)
+    flexion, adduction = system.external_moments()
     return KneeLoads(
         solution.values | (dict.fromkeys(EXTENSOR, 0.0) if system.slack else {}),
         system.contact_force(solution),
         flexion,
         adduction,
-        _sensitivity(system, solution),
+        system.sensitivity(),
         solution.condition,
         system.lifted,
         system.slack,
@@ -140,35 +138,43 @@ def unsolved(problems: Iterable[str]) -> KneeLoads:
     return KneeLoads({}, np.full(3, nan), nan, nan, nan, nan, frozenset(), False, tuple(problems))
 
 
-@dataclass(frozen=True, eq=False)
 class _System:
-    """The square system of one frame under given assumptions.
+    """The square system of one frame under given assumptions, solved.
 
     Args:
         geometry: the frame.
         friction: Coulomb coefficient.
         lifted: sides that carry nothing.
         slack: the extensor mechanism carries nothing.
-        shift: m, of the residuals' point along y.
     """
 
-    geometry: KneeGeometry
-    friction: float
-    lifted: frozenset[str]
-    slack: bool
-    shift: float = 0.0
+    def __init__(
+        self, geometry: KneeGeometry, friction: float, lifted: frozenset[str], slack: bool
+    ) -> None:
+        self.geometry, self.friction = geometry, friction
+        self.lifted, self.slack = lifted, slack
+        state = geometry.state
+        hip = unknowns.hip(state.point("hip", np.zeros(3)))
+        found = [*hip, *self._extensor(), *self._knee()]
+        self.names = [unknown.name for unknown in found]
+        ground = [geometry.ground] if geometry.ground else []
+        couples = [unknowns.moment_pair("tibia", "femur", unknowns.AXES[a]) for a in ("ap", "ml")]
+        groups = [*(unknown.loads for unknown in found), *couples, ground, geometry.ligaments]
+        columns = state.generalised(groups)
+        self._columns, self._couples = columns[:, :-4], columns[:, -4:-2]
+        self._without_ligaments = state.inertial - columns[:, -2]
+        self._right = self._without_ligaments - columns[:, -1]
+        self.solution = solve(self.names, self._columns, self._right)
 
     @property
     def touching(self) -> list[str]:
         """Sides that carry load."""
         return [side for side in self.geometry.condyles if side not in self.lifted]
 
-    def solve(self) -> Solution:
-        """Solve for all unknown loads."""
-        geometry = self.geometry
-        hip = unknowns.hip(geometry.state.point("hip", np.zeros(3)))
-        known = [*([geometry.ground] if geometry.ground else []), *geometry.ligaments]
-        return solve(geometry.state, [*hip, *self._extensor(), *self._knee()], known)
+    @property
+    def pulling(self) -> list[str]:
+        """Sides whose contact force would have to be tensile."""
+        return [side for side in self.touching if self.solution.values[f"{side}_normal"] < 0]
 
     def contact_force(self, solution: Solution) -> Array:
         """Return the femorotibial force on the femur (3,), insert frame, without residuals."""
@@ -180,6 +186,37 @@ class _System:
             for side in self.touching
         ]
         return np.asarray(np.sum(forces, axis=0))
+
+    def sensitivity(self) -> float:
+        """Return the largest change (N) of the total force as the residuals' point moves.
+
+        A shift s along y adds the couples s y x (x, z) = s (-z, x) to the residual forces.
+        """
+        if not self.geometry.condyles:
+            return 0.0
+        total = np.linalg.norm(self.contact_force(self.solution))
+        about_x, about_z = self._couples.T
+        changes = []
+        for shift in (-RESIDUAL_SHIFT, RESIDUAL_SHIFT):
+            columns = self._columns.copy()
+            columns[:, self.names.index("residual_ap")] -= shift * about_z
+            columns[:, self.names.index("residual_ml")] += shift * about_x
+            moved = solve(self.names, columns, self._right)
+            changes.append(abs(np.linalg.norm(self.contact_force(moved)) - total))
+        return float(max(changes))
+
+    def external_moments(self) -> tuple[float, float]:
+        """Return the external flexion and adduction moments, N·m.
+
+        The knee's generalised forces about the flexion and adduction coordinates that hip,
+        ground, gravity and inertia ask for; the external moment is their negative. The knee
+        centre is the femoral origin, where the three axes meet.
+        """
+        hip = self._columns[:, :6]
+        at_hip = np.linalg.solve(hip[:6], self._without_ligaments[:6])
+        knee = self._without_ligaments - hip @ at_hip
+        rows = self.geometry.state.chain.knee_columns()
+        return -float(knee[rows[5]]), -float(knee[rows[4]])
 
     def _extensor(self) -> list[Unknown]:
         extensor, state = self.geometry.extensor, self.geometry.state
@@ -207,44 +244,4 @@ class _System:
             unknowns.condyle(side, geometry.condyles[side], self.friction) for side in self.touching
         ]
         middle = np.mean([contact.point for contact in geometry.condyles.values()], axis=0)
-        middle = middle + np.array([0.0, self.shift, 0.0])
         return normals + unknowns.residuals(middle, len(normals) < 2, balanced)
-
-
-def _pulling(system: _System, solution: Solution) -> list[str]:
-    return [side for side in system.touching if solution.values[f"{side}_normal"] < 0]
-
-
-def _sensitivity(system: _System, solution: Solution) -> float:
-    if not system.geometry.condyles:
-        return 0.0
-    total = np.linalg.norm(system.contact_force(solution))
-    changes = []
-    for shift in (-RESIDUAL_SHIFT, RESIDUAL_SHIFT):
-        moved = replace(system, shift=shift)
-        changes.append(abs(np.linalg.norm(moved.contact_force(moved.solve())) - total))
-    return float(max(changes))
-
-
-def _external_moments(geometry: KneeGeometry) -> tuple[float, float]:
-    """Return the external flexion and adduction moments, N·m.
-
-    The knee's generalised forces about the flexion and adduction coordinates that hip,
-    ground, gravity and inertia ask for; the external moment is their negative. The knee
-    centre is the femoral origin, where the three axes meet.
-    """
-    state = geometry.state
-    external = [geometry.ground] if geometry.ground else []
-    wanted = state.inertial - sum(
-        (state.generalised(load) for load in external), np.zeros(len(state.inertial))
-    )
-    hip = np.stack(
-        [
-            state.generalised(unknown.loads[0])
-            for unknown in unknowns.hip(state.point("hip", np.zeros(3)))
-        ],
-        axis=1,
-    )
-    at_hip = np.linalg.solve(hip[:6], wanted[:6])
-    knee = (wanted - hip @ at_hip)[state.chain.knee_columns()]
-    return -float(knee[5]), -float(knee[4])

@@ -1,6 +1,6 @@
-"""Point forces, and the one place that turns them into generalised forces."""
+"""Point forces, and their wrenches about the insert's origin."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,12 +24,23 @@ class PointForces:
     forces: Array
     moment: Array = field(default_factory=lambda: np.zeros(3))
 
-    def wrench_at(self, point: Array) -> Array:
-        """Return force and moment (6,) about `point` (3,), insert frame."""
-        moments = np.cross(self.points - point, self.forces).sum(axis=0)
-        return np.concatenate([self.forces.sum(axis=0), moments + self.moment])
+
+def wrenches(loads: Sequence[PointForces]) -> Array:
+    """Return force and moment (n, 6) of each load about the insert frame's origin."""
+    points = np.concatenate([load.points for load in loads])
+    forces = np.concatenate([load.forces for load in loads])
+    owner = np.repeat(np.arange(len(loads)), [len(load.points) for load in loads])
+    x, y, z = points.T
+    fx, fy, fz = forces.T
+    terms = (fx, fy, fz, y * fz - z * fy, z * fx - x * fz, x * fy - y * fx)
+    summed = [np.bincount(owner, term, len(loads)) for term in terms]
+    result = np.stack(summed, axis=1)
+    result[:, 3:] += [load.moment for load in loads]
+    return result
 
 
-def total_wrench(loads: Iterable[PointForces], point: Array) -> Array:
+def total_wrench(loads: Sequence[PointForces], point: Array) -> Array:
     """Return the summed force and moment (6,) of several loads about `point` (3,)."""
-    return np.sum([load.wrench_at(point) for load in loads], axis=0)
+    total = wrenches(loads).sum(axis=0)
+    total[3:] -= np.cross(point, total[:3])
+    return total
