@@ -55,6 +55,18 @@ FACES = np.array(
 """Corners of the six faces: -x, +x, -y, +y, -z, +z."""
 
 
+EDGES = np.array(
+    [
+        (a, b)
+        for axis in range(3)
+        for a in range(8)
+        for b in range(8)
+        if (CORNERS[b] - CORNERS[a]).tolist() == np.eye(3, dtype=int)[axis].tolist()
+    ]
+)
+"""The 12 edges of a cell as pairs of corners: four along x, four along y, four along z."""
+
+
 @dataclass(frozen=True, eq=False)
 class Springs:
     """Every spring once, and where each cell finds its 28.
@@ -97,15 +109,6 @@ def spring_count(cells_x: int, cells_y: int, cells_z: int) -> int:
     return int(sum(np.prod(nodes - np.abs(direction)) for direction in DIRECTIONS))
 
 
-def corner_jacobians(points: Array) -> Array:
-    """Return the determinants (c, 8) of the three edges at every corner of cells (c, 8, 3)."""
-    result = np.empty(points.shape[:2])
-    for corner, offset in enumerate(CORNERS):
-        edges = _edges_at(points, corner, offset)
-        result[:, corner] = np.einsum("ci,ci->c", np.cross(edges[0], edges[1]), edges[2])
-    return result
-
-
 def scaled_jacobians(points: Array) -> Array:
     """Return the least scaled Jacobian (c,) of cells (c, 8, 3): 1 for a box, <= 0 inverted."""
     result = np.full(len(points), np.inf)
@@ -127,6 +130,12 @@ def _edges_at(points: Array, corner: int, offset: Index) -> list[Array]:
         sign = 1.0 if offset[axis] == 0 else -1.0
         edges.append(sign * (points[:, neighbour] - points[:, corner]))
     return edges
+
+
+def shortest_edges(points: Array) -> Array:
+    """Return the length (c,) of the shortest edge of cells (c, 8, 3), m."""
+    edges = points[:, EDGES[:, 1]] - points[:, EDGES[:, 0]]
+    return np.asarray(np.linalg.norm(edges, axis=2).min(axis=1))
 
 
 def cell_volumes(points: Array) -> Array:

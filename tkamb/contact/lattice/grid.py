@@ -4,6 +4,7 @@ After the source's §4.1: a grid over the bounding box, as cubic as the box perm
 its lines; nodes moved onto the surface by at most half a cell; classes; connectivity.
 """
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from tkamb.contact.lattice.cells import (
     Springs,
     join_springs,
     scaled_jacobians,
+    shortest_edges,
 )
 from tkamb.contact.lattice.columns import NodeField, settle_columns
 from tkamb.contact.lattice.walls import inside, settle_walls
@@ -24,6 +26,9 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
+from tkamb.units import MILLIMETRE
+
+_log = logging.getLogger("tkamb")
 
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -37,6 +42,8 @@ FLATNESS = 5e-5
 """m: nodes this near the plane of the flat bottom lie in it."""
 LEAST_JACOBIAN = 0.05
 """A surface cell with a smaller scaled Jacobian is left out."""
+LEAST_EDGE = 0.2
+"""A surface cell with an edge shorter than this share of the spacing is left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +87,18 @@ class Lattice:
     thin_intervals: int
 
     @property
+    def notices(self) -> tuple[str, ...]:
+        """What was mended, filled or left out, in plain words; empty when nothing was."""
+        counts = (
+            (self.mended_rays, "{} rays with an odd number of crossings mended from neighbours"),
+            (self.closed_gaps, "{} gaps narrower than a cell filled"),
+            (self.thin_intervals, "{} intervals thinner than half a cell held by one node"),
+            (self.dropped_cells, "{} cells left out: flat, inverted, across a gap, or loose"),
+            (self.dropped_nodes, "{} nodes left out that no cell holds"),
+        )
+        return tuple(phrase.format(count) for count, phrase in counts if count)
+
+    @property
     def contact_nodes(self) -> Index:
         """Numbers of the contact nodes."""
         return np.flatnonzero(self.node_class == CONTACT)
@@ -103,10 +122,12 @@ def build_grid(insert: Surface, target_size: float) -> Lattice:
     spacing = grid_spacing(insert.bounds[1] - insert.bounds[0], target_size)
     field = settle_columns(insert, spacing)
     settle_walls(field, insert)
+    if field.mended:
+        _log.warning("%s: %d rays through gaps in the mesh mended", insert.name, field.mended)
     cells, dropped_cells = _sound_cells(field, insert)
     if not len(cells):
         raise InputError(
-            f"no cell of {1e3 * target_size:g} mm fits into the part",
+            f"no cell of {target_size / MILLIMETRE:g} mm fits into the part",
             insert.name,
             "use smaller cells",
         )
@@ -120,13 +141,17 @@ def grid_spacing(extent: Array, target_size: float) -> Array:
     nearest size (by ratio) that keeps it is taken.
     """
     if target_size <= 0.0:
-        raise InputError(f"a cell size of {1e3 * target_size:g} mm", mend="give a positive size")
+        raise InputError(
+            f"a cell size of {target_size / MILLIMETRE:g} mm", mend="give a positive size"
+        )
     for percent in range(400):
         for size in (target_size / 1.01**percent, target_size * 1.01**percent):
             spacing = extent / np.maximum(np.round(extent / size), 1.0)
             if spacing.max() / spacing.min() <= MAX_EDGE_RATIO:
                 return np.asarray(spacing)
-    raise InputError(f"a box of {1e3 * extent} mm cannot be divided into near-cubic cells")
+    raise InputError(
+        f"a box of {np.round(extent / MILLIMETRE, 3)} mm cannot be divided into near-cubic cells"
+    )
 
 
 def _sound_cells(field: NodeField, insert: Surface) -> tuple[Index, int]:
@@ -139,6 +164,7 @@ def _sound_cells(field: NodeField, insert: Surface) -> tuple[Index, int]:
     cells = cells[~_bridges_gap(field, cells)]
     points = field.points.reshape(-1, 3)
     cells = cells[scaled_jacobians(points[cells]) > LEAST_JACOBIAN]
+    cells = cells[shortest_edges(points[cells]) > LEAST_EDGE * field.spacing.min()]
     cells = cells[inside(RayCaster(insert), points[cells].mean(axis=1))]
     cells = cells[_largest_piece(cells)]
     return cells, found - len(cells)
