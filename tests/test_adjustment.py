@@ -5,11 +5,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tkamb.adjustment import adjust, press_adjusted
+from tkamb.adjusted_press import press_adjusted
 from tkamb.contact.materials import material
 from tkamb.contact.model import ContactPair, ContactResult
 from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError
+from tkamb.geometry.adjustment import adjust
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import Array, pose
 from tkamb.geometry.surface import Surface
@@ -85,7 +86,8 @@ def pressed(
     model = contact_model("foundation", 1.5)
     pair = ContactPair(query.femoral, query.insert, material("polyethylene"))
     state = model.prepare(pair)
-    return press_adjusted(model, state, load, tilted(angle_deg, height), query, **options)
+    adjustment = adjust(query, tilted(angle_deg, height))
+    return press_adjusted(model, state, load, adjustment, query, **options)
 
 
 def test_adjustment_holds_when_it_exceeds_the_deformation(query: ClosestPointQuery) -> None:

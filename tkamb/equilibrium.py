@@ -10,11 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.adjusted_press import press_adjusted
 from tkamb.case import Case
 from tkamb.contact.materials import material
 from tkamb.contact.model import ContactPair, ContactResult, ContactStatus
 from tkamb.contact.registry import contact_model
 from tkamb.contact.summary import medial_points
+from tkamb.geometry.adjustment import Adjustment
+from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import Array
 from tkamb.mechanics import FrameLoads
 
@@ -28,9 +31,7 @@ class FrameContact:
     Args:
         result: the contact, None where it could not be computed.
         medial: (n,) which map points lie under the medial condyle.
-        adjust_translation: m, femoral adjustment along y; NaN when not asked for.
-        adjust_coronal: rad, femoral adjustment in the coronal plane.
-        adjust_restored: 1 when the adjustment was undone, else 0.
+        adjustment: the femoral adjustment, checked and perhaps restored; None if not asked for.
         seconds: computing time.
         problem: why there is no result, or empty.
         flags: plain words that a reader must know.
@@ -38,9 +39,7 @@ class FrameContact:
 
     result: ContactResult | None
     medial: NDArray[np.bool_]
-    adjust_translation: float
-    adjust_coronal: float
-    adjust_restored: float
+    adjustment: Adjustment | None
     seconds: float
     problem: str
     flags: tuple[str, ...]
@@ -75,12 +74,19 @@ class ContactSide:
         self.state = self.model.prepare(pair)
         self.prepare_seconds = clock.perf_counter() - start
 
-    def carry(self, body: FrameLoads, pose: Array, guess: ContactResult | None) -> FrameContact:
-        """Press in what the body asks for, at the measured rotation.
+    def carry(
+        self,
+        body: FrameLoads,
+        pose: Array,
+        query: ClosestPointQuery,
+        guess: ContactResult | None,
+    ) -> FrameContact:
+        """Press in what the body asks for, at the measured (or adjusted) rotation.
 
         Args:
             body: the body side of the frame.
             pose: (4, 4) measured pose_femoral_in_insert.
+            query: closest points of the pair, for the femoral adjustment.
             guess: the previous frame's contact, which may save time.
         """
         load = float(body.loads.contact_force[1])
@@ -89,15 +95,21 @@ class ContactSide:
         if load <= 0:
             return self._nothing("no compressive load")
         start = clock.perf_counter()
-        result = self.model.press(self.state, load, pose, guess)
+        adjustment = body.adjustment
+        if adjustment is None:
+            result = self.model.press(self.state, load, pose, guess)
+        else:
+            result, adjustment = press_adjusted(
+                self.model, self.state, load, adjustment, query, guess
+            )
         seconds = clock.perf_counter() - start
         medial = medial_points(self.state.points, result.pose, self.case.split)
         if result.status is not ContactStatus.OK:
             reason = f"contact {result.status.value.replace('_', ' ')}"
             words = "; ".join((reason, *result.flags))
-            return FrameContact(None, medial, NAN, NAN, NAN, seconds, words, ())
-        return FrameContact(result, medial, NAN, NAN, NAN, seconds, "", result.flags)
+            return FrameContact(None, medial, adjustment, seconds, words, ())
+        return FrameContact(result, medial, adjustment, seconds, "", result.flags)
 
     def _nothing(self, problem: str) -> FrameContact:
         none = np.zeros(len(self.state.points), bool)
-        return FrameContact(None, none, NAN, NAN, NAN, 0.0, problem, ())
+        return FrameContact(None, none, None, 0.0, problem, ())

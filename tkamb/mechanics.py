@@ -11,13 +11,14 @@ from tkamb.body.knee import KneeGeometry, KneeLoads, solve_knee, unsolved
 from tkamb.body.load import PointForces
 from tkamb.body.unknowns import CondylePoint
 from tkamb.case import Case
-from tkamb.errors import ComputationError
-from tkamb.geometry.frames import knee_pose, knee_twist
+from tkamb.errors import ComputationError, TkambError
+from tkamb.geometry.frames import Array, knee_pose, knee_twist
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.body.ligaments import Ligament
-    from tkamb.geometry.closest import CondyleGap
+    from tkamb.geometry.adjustment import Adjustment
+    from tkamb.geometry.closest import ClosestPointQuery, CondyleGap
 
 LIFT_OFF_ANGLE = 0.5 * DEGREE
 LIFT_OFF_GAP = 0.5 * MILLIMETRE
@@ -39,6 +40,7 @@ class FrameLoads:
         loads: what they say.
         tensions: ligament name -> N.
         wrap: rad, by which the quadriceps wraps the femur; NaN if not modelled.
+        adjustment: the femoral adjustment, if asked for and possible.
         query_seconds: computing time of the closest points on the meshes.
         seconds: computing time of the equations, contact points given.
     """
@@ -47,6 +49,7 @@ class FrameLoads:
     loads: KneeLoads
     tensions: dict[str, float]
     wrap: float
+    adjustment: "Adjustment | None"
     query_seconds: float
     seconds: float
 
@@ -62,12 +65,7 @@ class Mechanics:
         self.case = case
         self.poses = knee_pose(case.motion.coordinates)
         self._friction = case.scene.contact.friction if case.scene.contact else 0.0
-        self._query = None
-        if case.scene.contact:
-            from tkamb.geometry.closest import ClosestPointQuery
-
-            assert case.femoral is not None and case.insert is not None
-            self._query = ClosestPointQuery(case.femoral, case.insert, case.split)
+        self.query = _contact_query(case)
         self._extensor = None
         if case.scene.patella:
             from tkamb.extensor import ExtensorFrames
@@ -78,7 +76,7 @@ class Mechanics:
     def frame(self, k: int) -> FrameLoads:
         """Return the loads of frame k; a frame that cannot be solved holds NaN."""
         start = clock.perf_counter()
-        condyles, lifted, problems = self._condyles(k)
+        adjustment, condyles, lifted, problems = self._touching(k)
         queried = clock.perf_counter()
         state = self.case.chain.at(self._chain_motion(k))
         poses = {link: state.pose(link) for link in self._attachment_links()}
@@ -98,7 +96,23 @@ class Mechanics:
         )
         loads = unsolved(problems) if problems else solve_knee(geometry, self._friction)
         done = clock.perf_counter()
-        return FrameLoads(geometry, loads, tensions, wrap, queried - start, done - queried)
+        return FrameLoads(
+            geometry, loads, tensions, wrap, adjustment, queried - start, done - queried
+        )
+
+    def slips(self) -> dict[str, Array]:
+        """Return side -> slip (f,) m since the first frame; empty without the two surfaces."""
+        case = self.case
+        if self.query is None or case.femoral is None or case.insert is None:
+            return {}
+        from tkamb.body.slip import condyle_slip
+
+        found = condyle_slip(case.femoral, case.insert, case.split, case.motion.coordinates)
+        return {
+            side: slip.slip
+            for side, slip in zip(("medial", "lateral"), found, strict=True)
+            if slip is not None
+        }
 
     def _chain_motion(self, k: int) -> ChainMotion:
         motion, tibia = self.case.motion, self.case.tibia
@@ -119,11 +133,23 @@ class Mechanics:
             return state.ground_reaction(ground.force[k], tibia.pose[k][:3, 3], np.zeros(3))
         return state.ground_reaction(ground.force[k], ground.point[k], ground.moment[k])
 
-    def _condyles(self, k: int) -> tuple[dict[str, CondylePoint], frozenset[str], list[str]]:
-        """Return the contact points, the sides that are off, and what is wrong."""
-        if self._query is None:
-            return {}, frozenset(), []
-        gaps = self._query.at(self.poses[k])
+    def _touching(
+        self, k: int
+    ) -> "tuple[Adjustment | None, dict[str, CondylePoint], frozenset[str], list[str]]":
+        """Return adjustment, contact points, the sides that are off, and what is wrong."""
+        if self.query is None:
+            return None, {}, frozenset(), []
+        pose, adjustment = self.poses[k], None
+        contact = self.case.scene.contact
+        try:
+            if contact and contact.adjust:
+                from tkamb.geometry.adjustment import adjust
+
+                adjustment = adjust(self.query, pose)
+                pose = adjustment.pose
+        except TkambError as error:
+            return None, {}, frozenset(), [error.what]
+        gaps = self.query.at(pose)
         found = {"medial": gaps.medial} | ({"lateral": gaps.lateral} if gaps.lateral else {})
         condyles = {side: self._condyle(k, gap) for side, gap in found.items()}
         nearest = min(gap.gap for gap in found.values())
@@ -131,7 +157,7 @@ class Mechanics:
         if abs(nearest) > FARTHEST_GAP:
             word = "apart" if nearest > 0 else "overlapping"
             problems.append(f"condyles {word} by {abs(nearest) / MILLIMETRE:.1f} mm")
-        return condyles, self._lifted(condyles), problems
+        return adjustment, condyles, self._lifted(condyles), problems
 
     def _condyle(self, k: int, gap: "CondyleGap") -> CondylePoint:
         motion = self.case.motion
@@ -164,3 +190,12 @@ class Mechanics:
     def _attachment_links(self) -> set[str]:
         ends = [end for table in self.case.scene.ligament for end in (table.proximal, table.distal)]
         return {end.link for end in ends}
+
+
+def _contact_query(case: Case) -> "ClosestPointQuery | None":
+    if case.scene.contact is None:
+        return None
+    from tkamb.geometry.closest import ClosestPointQuery
+
+    assert case.femoral is not None and case.insert is not None
+    return ClosestPointQuery(case.femoral, case.insert, case.split)

@@ -12,10 +12,12 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tkamb.adjusted_press import press_adjusted
 from tkamb.contact import materials
 from tkamb.contact.model import (
     Bearing,
     CondyleContact,
+    ContactModel,
     ContactPair,
     ContactResult,
     ContactStatus,
@@ -23,6 +25,11 @@ from tkamb.contact.model import (
 from tkamb.contact.pressing import check_load, first_touch_height
 from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError
+from tkamb.geometry.adjustment import Adjustment, adjust_femoral
+from tkamb.geometry.adjustment import Adjustment
+from tkamb.geometry.adjustment import adjust as adjust_pose
+from tkamb.geometry.closest import ClosestPointQuery
+from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import Array, mirrored_pose
 from tkamb.geometry.frames import pose as pose_matrix
@@ -42,6 +49,7 @@ class PressReport:
         nodes: of the model (lattice, mesh), or map points where it has none.
         load: N.
         result: the contact, in the insert frame (mirrored for a left knee).
+        adjustment: what was done to the pose before contact, if anything.
         pair: the two bodies.
         side: of the knee.
         prepare_seconds: for the geometry.
@@ -54,6 +62,7 @@ class PressReport:
     nodes: int
     load: float
     result: ContactResult
+    adjustment: Adjustment | None
     pair: ContactPair
     side: Side
     prepare_seconds: float
@@ -78,6 +87,13 @@ class PressReport:
                 lines.append(
                     f"{name:8s}" + _CONDYLE.format(*found[name].pop("cop_mm"), **found[name])
                 )
+        if self.adjustment is not None:
+            done = self.adjustment
+            restored = ", recorded rotation restored" if done.restored else ""
+            lines.append(
+                f"adjusted {done.translation / MILLIMETRE:.3f} mm along y, "
+                f"{done.coronal_angle / DEGREE:.3f} deg coronal{restored}"
+            )
         lines += [f"note: {flag}" for flag in self.result.flags]
         took = f"prepared in {self.prepare_seconds:.3g} s, solved in {self.solve_seconds:.3g} s"
         return [*lines, f"{took}, {self.result.iterations} iterations"]
@@ -138,18 +154,15 @@ def press_meshes(
         material: a name of `tkamb.contact.materials`.
         axes: mesh axes that point anterior, superior and right.
         side: of the knee; a left one is mirrored.
-        adjust: femoral adjustment before contact; not offered for meshes alone.
+        adjust: femoral adjustment before contact (`tkamb.geometry.adjustment`); the pose must then
+            be a recorded one, with a condyle within 3 mm of the insert.
         options: the model's own options.
 
     Raises:
         InputError: bad file, unit, axes, name or load, or a femoral component that does not
-            lie over the insert.
+            lie over the insert, or not near it where it is to be adjusted.
     """
     check_load(load)
-    if adjust:
-        raise InputError(
-            "femoral adjustment is not offered here", "adjust", "run a scene, or leave it off"
-        )
     model = contact_model(contact, resolution_mm, **(options or {}))
     pair, placed = load_pair(femoral, insert, units, pose, bearing, material, axes, side)
     if not math.isfinite(first_touch_height(pair, placed)):
@@ -161,7 +174,7 @@ def press_meshes(
     started = time.perf_counter()
     state = model.prepare(pair)
     prepared = time.perf_counter()
-    result = model.press(state, load, placed)
+    result, adjustment = _pressed(model, state, load, placed, adjust)
     solved = time.perf_counter()
     return PressReport(
         contact=contact,
@@ -169,12 +182,23 @@ def press_meshes(
         nodes=int(getattr(state, "node_count", len(state.points))),
         load=load,
         result=result,
+        adjustment=adjustment,
         pair=pair,
         side=side,
         prepare_seconds=prepared - started,
         solve_seconds=solved - prepared,
         peak_rss_MB=_peak_rss(),
     )
+
+
+def _pressed(
+    model: ContactModel, state: Any, load: float, placed: Array, adjust: bool
+) -> tuple[ContactResult, Adjustment | None]:
+    if not adjust:
+        return model.press(state, load, placed), None
+    pair: ContactPair = state.pair
+    query = ClosestPointQuery(pair.femoral, pair.insert, condyle_split(pair.femoral))
+    return press_adjusted(model, state, load, adjust_femoral(query, placed), query)
 
 
 def load_pair(

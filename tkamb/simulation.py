@@ -64,7 +64,7 @@ def simulate(
         frame_status(case, k, frame, touched[i] if touched else None)
         for i, (k, frame) in enumerate(zip(indices, body, strict=True))
     ]
-    columns = tabulate(case, indices, body, touched, statuses)
+    columns = tabulate(case, indices, body, touched, mechanics.slips(), statuses)
     seconds["all"] = clock.perf_counter() - start
     summary = summary_of(case, columns, seconds, None if scene_path is None else Path(scene_path))
     return Results(columns, summary, maps)
@@ -83,6 +83,7 @@ def _press_all(
     from tkamb.equilibrium import ContactSide
     from tkamb.output.maps_memory import map_sink
 
+    assert mechanics.query is not None
     side = ContactSide(case)
     seconds["prepare contact"] = side.prepare_seconds
     labels = {
@@ -94,7 +95,7 @@ def _press_all(
         for k in indices:
             body.append(mechanics.frame(k))
             guess = touched[-1].result if touched else None
-            touched.append(side.carry(body[-1], mechanics.poses[k], guess))
+            touched.append(side.carry(body[-1], mechanics.poses[k], mechanics.query, guess))
             result, time = touched[-1].result, float(case.motion.time[k])
             if result is None:
                 sink.append_failed(time)

@@ -7,7 +7,7 @@ import numpy as np
 
 from tkamb.case import Case
 from tkamb.columns import ligament_column
-from tkamb.geometry.frames import KNEE_COORDINATES
+from tkamb.geometry.frames import KNEE_COORDINATES, Array
 from tkamb.mechanics import FrameLoads
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
@@ -24,6 +24,7 @@ def tabulate(
     indices: range,
     body: Sequence[FrameLoads],
     contact: "Sequence[FrameContact]",
+    slips: dict[str, Array],
     statuses: Sequence[str],
 ) -> Columns:
     """Return the columns of results.csv, one entry per frame.
@@ -33,10 +34,13 @@ def tabulate(
         indices: frames of the motion.
         body: body side of each frame.
         contact: contact side of each frame; empty when not modelled.
+        slips: side -> slip (m) since the first frame of the motion, over all its frames.
         statuses: text per frame.
     """
     columns = _motion_columns(case, indices)
     columns |= _collected([_body_row(case, frame) for frame in body])
+    for side, slip in slips.items():
+        columns[f"{side}_slip_mm"] = slip[list(indices)] / MILLIMETRE
     if contact:
         limit = case.scene.output.yield_stress_MPa * MEGAPASCAL
         columns |= _collected([_contact_row(frame, limit) for frame in contact])
@@ -47,7 +51,8 @@ def tabulate(
 
 
 def _collected(rows: Sequence[dict[str, float]]) -> Columns:
-    return {name: np.array([row[name] for row in rows], float) for name in rows[0]}
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: np.array([row.get(name, NAN) for row in rows], float) for name in names}
 
 
 def _motion_columns(case: Case, indices: range) -> Columns:
@@ -117,10 +122,11 @@ def _contact_row(frame: "FrameContact", yield_stress: float) -> dict[str, float]
         "approach_mm": result.approach / MILLIMETRE if result else NAN,
         "contact_seconds": frame.seconds,
         "iterations": result.iterations if result else NAN,
-        "adjust_translation_mm": frame.adjust_translation / MILLIMETRE,
-        "adjust_coronal_deg": frame.adjust_coronal / DEGREE,
-        "adjust_restored": frame.adjust_restored,
     }
+    if frame.adjustment:
+        row["adjust_translation_mm"] = frame.adjustment.translation / MILLIMETRE
+        row["adjust_coronal_deg"] = frame.adjustment.coronal_angle / DEGREE
+        row["adjust_restored"] = float(frame.adjustment.restored)
     for side in ("medial", "lateral"):
         row |= _condyle_row(side, frame, yield_stress)
     return row

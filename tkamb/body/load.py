@@ -33,9 +33,10 @@ def wrenches(loads: Sequence[PointForces]) -> Array:
     x, y, z = points.T
     fx, fy, fz = forces.T
     terms = (fx, fy, fz, y * fz - z * fy, z * fx - x * fz, x * fy - y * fx)
-    summed = [np.bincount(owner, term, len(loads)) for term in terms]
-    result = np.stack(summed, axis=1)
-    result[:, 3:] += [load.moment for load in loads]
+    result = np.zeros((len(loads), 6))
+    for k, term in enumerate(terms):
+        result[:, k] = np.bincount(owner, term, len(loads))
+    result[:, 3:] += np.array([load.moment for load in loads])
     return result
 
 

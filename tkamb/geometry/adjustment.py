@@ -7,22 +7,17 @@ Fluoroscopy errs by about 0.5 mm and 0.5 deg, which is more than the deformation
 2. Below 0.5 deg the femur is turned in the coronal plane, about the midpoint of the contact
    points, until both condyles touch together; above it is left: evidence of lift-off.
 3. It is always moved along y to first touch.
-4. After the deformation: where the femur has sunk in deeper than it was moved, or has come
-   to lie at a larger coronal angle than it was turned by, the load would have brought both
-   condyles into contact anyway: the recorded rotation is restored and pressed again.
 
-The source joins the two conditions of step 4 by "and"; `restore_when="both"` does so.
+`tkamb.adjusted_press` checks it after the deformation, and restores the recorded rotation.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tkamb.contact.model import ContactModel, ContactResult, ContactStatus
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.closest import ClosestPointQuery, CondyleGaps
 from tkamb.geometry.first_touch import FirstTouch
@@ -89,49 +84,8 @@ def adjust(query: ClosestPointQuery, recorded: Array) -> Adjustment:
     if abs(angle) < LARGEST_ANGLE and gaps.lateral is not None:
         turn = _levelling_turn(query, recorded, middle, distance)
         turned = _turned(recorded, middle, turn)
-    travel = _travel(query, turned)
-    return Adjustment(_moved(turned, -travel), recorded, -travel, turn, angle, distance)
-
-
-def press_adjusted(
-    model: ContactModel,
-    state: Any,
-    load: float,
-    recorded: Array,
-    query: ClosestPointQuery,
-    guess: ContactResult | None = None,
-    restore_when: Literal["either", "both"] = "either",
-) -> tuple[ContactResult, Adjustment]:
-    """Press the adjusted femur in, check the adjustment, undo its rotation if it must be.
-
-    Args:
-        model: any contact model.
-        state: what its `prepare` returned.
-        load: N, superior-inferior.
-        recorded: (4, 4) pose_femoral_in_insert.
-        query: closest points of the same pair.
-        guess: an earlier result, to save time.
-        restore_when: whether one exceeded limit of step 4 restores, or both are needed.
-
-    Raises:
-        InputError: neither condyle is near the insert.
-        ComputationError: the femoral component does not lie over the insert.
-    """
-    adjustment = adjust(query, recorded)
-    result = model.press(state, load, adjustment.pose, guess)
-    if result.status is not ContactStatus.OK or adjustment.coronal_angle == 0.0:
-        return result, replace(adjustment, penetration=float(result.approach))
-    checked = _checked(query, adjustment, result)
-    exceeded = (
-        checked.penetration > abs(checked.translation),
-        abs(checked.final_angle) > abs(checked.coronal_angle),
-    )
-    if not (any(exceeded) if restore_when == "either" else all(exceeded)):
-        return result, checked
-    travel = _travel(query, adjustment.recorded)
-    restored = _moved(adjustment.recorded, -travel)
-    result = model.press(state, load, restored, result)
-    return result, replace(checked, pose=restored, translation=-travel, restored=True)
+    travel = travel_to_touch(query, turned)
+    return Adjustment(raised(turned, -travel), recorded, -travel, turn, angle, distance)
 
 
 def _check_near(gaps: CondyleGaps) -> None:
@@ -167,7 +121,7 @@ def _levelling_turn(
     """Return the turn (rad) at which both condyles touch together, by the secant method."""
 
     def difference(turn: float) -> float:
-        medial, lateral = _touches(query, _turned(recorded, middle, turn))
+        medial, lateral = touches(query, _turned(recorded, middle, turn))
         return lateral - medial
 
     last, error = 0.0, difference(0.0)
@@ -182,13 +136,7 @@ def _levelling_turn(
     return last
 
 
-def _checked(query: ClosestPointQuery, adjustment: Adjustment, result: ContactResult) -> Adjustment:
-    medial, lateral = _touches(query, result.pose)
-    angle = (medial - lateral) / adjustment.intercondylar_distance
-    return replace(adjustment, penetration=-min(medial, lateral), final_angle=angle)
-
-
-def _touches(query: ClosestPointQuery, at: Array) -> tuple[float, float]:
+def touches(query: ClosestPointQuery, at: Array) -> tuple[float, float]:
     """Return travel (m) along -y to touch, medial and lateral; negative once inside."""
     medial, lateral = _first_touch(query).at(at)
     if medial is None or lateral is None:
@@ -196,7 +144,12 @@ def _touches(query: ClosestPointQuery, at: Array) -> tuple[float, float]:
     return medial.travel, lateral.travel
 
 
-def _travel(query: ClosestPointQuery, at: Array) -> float:
+def travel_to_touch(query: ClosestPointQuery, at: Array) -> float:
+    """Return the travel (m) along -y from a pose (4, 4) to first touch.
+
+    Raises:
+        ComputationError: the femur does not lie over the insert.
+    """
     travel = _first_touch(query).travel(at)
     if not math.isfinite(travel):
         raise ComputationError("the femur does not lie over the insert", "femoral adjustment")
@@ -209,7 +162,8 @@ def _turned(recorded: Array, middle: Array, turn: float) -> Array:
     return pose(rotation, middle - rotation @ middle) @ recorded
 
 
-def _moved(at: Array, along_y: float) -> Array:
+def raised(at: Array, along_y: float) -> Array:
+    """Return the pose (4, 4) moved by `along_y` (m) along the insert's y."""
     moved = np.array(at)
     moved[1, 3] += along_y
     return moved
