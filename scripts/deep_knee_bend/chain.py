@@ -57,7 +57,7 @@ def _tibia():
     mass = body.SHANK.mass + body.FOOT_MASS
     centre = body.SHANK.mass * height / mass
     extra = body.SHANK.mass * (height - centre) ** 2 + body.FOOT_MASS * centre**2
-    return mass, (0.0, centre, 0.0), _moments(body.SHANK) + [extra, 0.0, extra]
+    return mass, (0.0, centre, 0.0), _moments(body.SHANK) + np.array([extra, 0.0, extra])
 
 
 def _femur():

@@ -10,6 +10,15 @@ import numpy as np
 from deep_knee_bend import dimensions as d
 from deep_knee_bend import sagittal, solids
 
+ROW_SPACING = (
+    (-100.0, -15.0, 1.3),
+    (-15.0, 12.0, 0.72),
+    (12.0, 35.0, 0.64),
+    (35.0, 135.0, 0.56),
+    (135.0, 150.0, 0.9),
+)
+"""Spacing of the mesh's rows, mm, between normals in deg: fine where the insert is met."""
+
 
 def _taper(phi):
     """0 at the top of the flange, 1 from the trochlea on, smooth (rad in)."""
@@ -92,7 +101,7 @@ def _columns(phi):
     return np.concatenate(
         [
             inner + (near - inner) * np.linspace(0.0, 1.0, 13)[:-1],
-            near + (far - near) * np.linspace(0.0, 1.0, 23)[:-1],
+            near + (far - near) * np.linspace(0.0, 1.0, 24)[:-1],
             far + (rest - far) * np.linspace(0.0, 1.0, 3),
             rest + d.FEMORAL_EDGE_FILLET * turn,
         ],
@@ -102,14 +111,11 @@ def _columns(phi):
 
 def _rows():
     """Normals of the rows: fine where the insert is met, and across the notch's front."""
-    start, end = d.NOTCH_PHI
-    front = start + (end - start) * (1.0 - np.cos(np.radians(np.linspace(0, 60, 5))))
-    rows = sagittal.nodes(
-        ((-100.0, -15.0, 1.3), (-15.0, 12.0, 0.75), (12.0, 35.0, 0.65), (35.0, 135.0, 0.57))
-        + ((135.0, 150.0, 0.9),)
-    )
-    rows = rows[(np.degrees(rows) < start - 0.5) | (np.degrees(rows) > front[-1] + 0.5)]
-    return np.sort(np.concatenate([rows, np.radians(front)]))
+    start, end = np.radians(d.NOTCH_PHI)
+    front = start + (end - start) * (1.0 - np.cos(np.radians(np.linspace(0.0, 30.0, 5))))
+    rows = sagittal.nodes(ROW_SPACING)
+    apart = np.abs(rows[:, None] - front).min(axis=1) > np.radians(0.3)
+    return np.sort(np.concatenate([rows[apart], front]))
 
 
 def mesh():

@@ -47,7 +47,7 @@ def _outline(z):
 
 def _columns():
     """ML stations, closer at the rounded ends."""
-    inner = np.linspace(0.0, 33.0, 45)
+    inner = np.linspace(0.0, 33.0, 49)
     end = d.INSERT_WIDTH_HALF - 33.0
     turn = np.sin(np.radians(np.linspace(0.0, 90.0, 13)))[1:]
     half = np.concatenate([inner, 33.0 + end * turn])
@@ -66,7 +66,7 @@ def mesh():
     back, front = edges - (edges.min() + edges.max()) / 2.0
     fillet = np.minimum(d.INSERT_EDGE_FILLET, (front - back) / 4.0)
     turn = (1.0 - np.cos(np.radians(np.linspace(0.0, 90.0, 5)[:-1])))[:, None]
-    inside = np.linspace(0.0, 1.0, 65)[:, None]
+    inside = np.linspace(0.0, 1.0, 71)[:, None]
     x = np.concatenate(
         [
             back + fillet * turn,

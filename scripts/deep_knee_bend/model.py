@@ -1,6 +1,6 @@
 """All files of the model, made in order."""
 
-from deep_knee_bend import button, chain, femoral, insert, scene, solids, tables
+from deep_knee_bend import button, chain, femoral, insert, readme, scene, solids, tables
 from deep_knee_bend.extensor import patella_motion
 from deep_knee_bend.motion import knee_motion
 from deep_knee_bend.squat import squat
@@ -20,7 +20,7 @@ def make(folder):
         "ground_reaction.csv": tables.ground_reaction_csv(motion, body),
         "patient.urdf": chain.urdf(motion.coordinates[0, 1]),
         "scene.toml": scene.scene_toml(motion.coordinates),
-        "strains.md": tables.strain_table(motion.coordinates) + "\n",
+        "README.md": readme.readme(motion, patella, body),
     }
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8", newline="\n")

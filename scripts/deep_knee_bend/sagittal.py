@@ -1,5 +1,7 @@
 """The sagittal J-curve: circular arcs, tangent continuous, run through by their normal."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from deep_knee_bend import dimensions as d
@@ -39,7 +41,7 @@ def nodes(spacings):
     pieces = []
     for start, end, spacing in spacings:
         joints = [start, *[j for j in np.degrees(JOINTS) if start + 1e-9 < j < end - 1e-9], end]
-        for a, b in zip(joints[:-1], joints[1:], strict=True):
+        for a, b in pairwise(joints):
             radius = RADII[np.searchsorted(JOINTS, np.radians((a + b) / 2))]
             count = max(1, int(np.ceil(np.radians(b - a) * radius / spacing)))
             pieces.append(np.radians(np.linspace(a, b, count, endpoint=False)))

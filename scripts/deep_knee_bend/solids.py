@@ -1,5 +1,7 @@
 """Closed solids from two structured sheets, and binary STL files with fixed bytes."""
 
+from itertools import pairwise
+
 import numpy as np
 
 HEADER = b"tkamb deep knee bend, millimetres".ljust(80)
@@ -47,7 +49,7 @@ def _ids(rows, columns, fork, start):
 
 def _sheet(ids, rows, columns, middle):
     """Triangles of the grid, none between the two middle columns."""
-    pairs = [(a, b) for a, b in zip(columns[:-1], columns[1:], strict=True) if a != middle]
+    pairs = [(a, b) for a, b in pairwise(columns) if a != middle]
     left, right = np.array(pairs).T
     up, down = rows[:-1, None], rows[1:, None]
     a, b, c, e = ids[up, left], ids[down, left], ids[down, right], ids[up, right]
@@ -77,7 +79,7 @@ def _wall(top, bottom, kept, fork):
     thin = set(_loop(*kept, fork))
     stations = [i for i, node in enumerate(whole) if node in thin]
     triangles = []
-    for start, end in zip(stations[:-1], stations[1:], strict=True):
+    for start, end in pairwise(stations):
         chain = [top[node] for node in whole[start : end + 1]]
         first, second = bottom[whole[start]], bottom[whole[end]]
         half = len(chain) // 2

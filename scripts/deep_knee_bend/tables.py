@@ -2,16 +2,17 @@
 
 import numpy as np
 
-from deep_knee_bend import chain, ligaments
+from deep_knee_bend import chain
 
 
 def csv(columns):
     """Return a CSV text; columns: (name, values, decimals) in order."""
+    values = [np.round(values, decimals) + 0.0 for _, values, decimals in columns]
     lines = [",".join(name for name, _, _ in columns)]
-    for row in zip(*(values for _, values, _ in columns), strict=True):
+    for row in zip(*values, strict=True):
         fields = zip(row, columns, strict=True)
-        lines.append(",".join(f"{x + 0.0:.{decimals}f}" for x, (_, _, decimals) in fields))
-    return "\n".join([*lines, ""]).replace("-0." + "0" * 7 + ",", "0." + "0" * 7 + ",")
+        lines.append(",".join(f"{x:.{decimals}f}" for x, (_, _, decimals) in fields))
+    return "\n".join([*lines, ""])
 
 
 def motion_csv(motion, patella):
@@ -44,24 +45,6 @@ def ground_reaction_csv(motion, squat):
     columns += [(f"force_{n}_N", squat.force[:, i], 5) for i, n in enumerate(names)]
     columns += [(f"point_{n}_mm", squat.point[:, i], 5) for i, n in enumerate(names)]
     return csv(columns)
-
-
-def strain_table(coordinates, every=15):
-    """Markdown table of the bundles' strains (%) over flexion."""
-    flexion = np.degrees(coordinates[:, 5])
-    angles = np.arange(0, 121, every)
-    frames = [int(np.argmin(np.abs(flexion - angle))) for angle in angles]
-    head = " | ".join(f"{angle}" for angle in angles)
-    lines = [
-        f"| bundle | slack length, mm | {head} |",
-        "|---|---|" + "---|" * len(angles),
-    ]
-    for bundle in ligaments.BUNDLES:
-        strain = 100.0 * ligaments.strains(bundle, coordinates)[frames]
-        cells = " | ".join(f"{s + 0.0:.1f}" for s in strain)
-        slack = ligaments.slack_length(bundle, coordinates)
-        lines.append(f"| {bundle.name} | {slack:.2f} | {cells} |")
-    return "\n".join(lines)
 
 
 def in_tibia(point, si_start):
