@@ -55,9 +55,9 @@ class ClosestPointQuery:
 
     Apart, the distance of the two triangulated surfaces (python-fcl, exact). Overlapping,
     the largest distance of a point of the femoral surface inside the insert from the
-    insert's surface: vertices first, then the triangles about the deepest one, cut finer
-    (to about 1/16 of an edge). Both are the smallest signed distance to the insert over the
-    condyle, so the gap is continuous through touch.
+    insert's surface: vertices first, then the triangles about the deepest ones, cut to 1/8
+    of an edge (about 1 µm of depth on implants). Both are the smallest signed distance to
+    the insert over the condyle, so the gap is continuous through touch.
 
     The normal is the mean of the insert's interpolated vertex normals over the close region
     (`tkamb.geometry.close_region`), not the normal of a facet nor the line between the

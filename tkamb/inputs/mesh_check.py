@@ -116,7 +116,7 @@ class MeshHealth:
         if not self.units:
             return "no unit of m, cm, mm makes this a part of a knee: is it one?"
         names = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
-        return " or ".join(f"{names[unit]}? then declare unit {unit}" for unit in self.units)
+        return " or ".join(f"{names[unit]}? then pass --units {unit}" for unit in self.units)
 
     def _axis_questions(self) -> list[str]:
         if not self.flats:

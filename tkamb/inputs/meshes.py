@@ -38,7 +38,8 @@ def axes_rotation(axes: str) -> Array:
         InputError: not three different axes, or a left-handed system (a mirror image).
     """
     names = [name.strip() for name in axes.split(",")]
-    if len(names) != 3 or sorted(name.lstrip("+-") for name in names) != ["x", "y", "z"]:
+    letters = sorted(name[1:] if name[:1] in ("+", "-") else name for name in names)
+    if letters != ["x", "y", "z"]:
         raise InputError(
             f"'{axes}' does not name three different axes",
             "axes",

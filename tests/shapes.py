@@ -1,0 +1,90 @@
+"""Synthetic bodies for tests, in metres and anatomical axes."""
+
+from collections.abc import Callable
+
+import numpy as np
+import trimesh
+
+from tkamb.geometry.surface import Surface
+
+Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def block(
+    height: Height,
+    size_x: float = 0.04,
+    size_z: float = 0.06,
+    spacing: float = 1e-3,
+    name: str = "insert",
+) -> Surface:
+    """A closed block on y = 0 whose top is height(x, z), centred on x = z = 0."""
+    nx, nz = round(size_x / spacing) + 1, round(size_z / spacing) + 1
+    x, z = np.meshgrid(
+        np.linspace(-size_x / 2, size_x / 2, nx),
+        np.linspace(-size_z / 2, size_z / 2, nz),
+        indexing="ij",
+    )
+    top = np.stack([x, height(x, z), z], axis=-1).reshape(-1, 3)
+    bottom = top * [1.0, 0.0, 1.0]
+    index = np.arange(nx * nz).reshape(nx, nz)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    lid = np.concatenate(
+        [np.stack([a, c, b], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)]
+    )
+    rim = np.concatenate([index[:-1, 0], index[-1, :-1], index[:0:-1, -1], index[0, :0:-1]])
+    after, below = np.roll(rim, -1), rim + nx * nz
+    wall = np.concatenate(
+        [np.stack([rim, after, below], -1), np.stack([after, np.roll(below, -1), below], -1)]
+    )
+    faces = np.concatenate([lid, lid[:, ::-1] + nx * nz, wall])
+    return Surface(np.concatenate([top, bottom]), faces.astype(np.int64), name)
+
+
+def plate(thickness: float = 0.01, spacing: float = 2e-3) -> Surface:
+    """A flat block."""
+    return block(lambda x, z: np.full_like(x, thickness), spacing=spacing)
+
+
+def trough(radius: float, depth: float = 0.006, spacing: float = 1e-3) -> Surface:
+    """A block with a cylindrical trough along z, `depth` above the bottom at x = 0."""
+    return block(lambda x, z: depth + radius - np.sqrt(radius**2 - x**2), 0.03, 0.04, spacing)
+
+
+def two_dishes(radius: float = 0.05, apart: float = 0.044, depth: float = 0.006) -> Surface:
+    """A block with two spherical dishes, centres `apart` along z."""
+
+    def height(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+        out = np.abs(z) - apart / 2
+        return depth + radius - np.sqrt(radius**2 - x**2 - out**2)
+
+    return block(height, 0.044, 0.076)
+
+
+def sphere(radius: float, subdivisions: int = 4, centre: tuple = (0.0, 0.0, 0.0)) -> Surface:
+    """A sphere of triangles whose corners lie on it."""
+    ball = trimesh.creation.icosphere(subdivisions, radius)
+    return Surface(np.asarray(ball.vertices) + centre, np.asarray(ball.faces), "sphere")
+
+
+def joined(*parts: Surface) -> Surface:
+    """Several bodies as one surface (they may overlap)."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
+    return Surface(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
+
+
+def torus_condyle(sagittal: float, frontal: float, z: float) -> Surface:
+    """A ring in the sagittal plane: outer radius `sagittal`, `frontal` across; axis along z."""
+    ring = trimesh.creation.torus(sagittal - frontal, frontal, 64, 32)
+    return Surface(np.add(ring.vertices, [0.0, 0.0, z]), np.asarray(ring.faces), "torus")
+
+
+def bicondylar(kind: str = "sphere", apart: float = 0.044) -> Surface:
+    """Two condyles joined by a bridge in front and above (x > 0)."""
+    bridge = trimesh.creation.box((0.008, 0.02, apart))
+    anterior = Surface(np.add(bridge.vertices, [0.02, 0.015, 0.0]), np.asarray(bridge.faces))
+    if kind == "sphere":
+        parts = [sphere(0.022, 4, (0.0, 0.0, side * apart / 2)) for side in (-1, 1)]
+    else:
+        parts = [torus_condyle(0.024, 0.01, side * apart / 2) for side in (-1, 1)]
+    return joined(*parts, anterior)

@@ -1,0 +1,283 @@
+"""Mesh files into surfaces: axes, units, repairs with a notice, refusals in one line."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from shapes import plate, sphere, two_dishes
+from tkamb.errors import InputError
+from tkamb.geometry.boundary import boundary_loops
+from tkamb.geometry.repair import repair
+from tkamb.geometry.surface import Surface
+from tkamb.inputs.mesh_check import check_mesh
+from tkamb.inputs.meshes import BONE_SIZE, axes_rotation, load_surface, mirrored
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real data are not here")
+
+
+def save(path, surface, scale=1e3):
+    trimesh.Trimesh(surface.vertices * scale, surface.faces, process=False).export(path)
+    return path
+
+
+def without(surface, faces):
+    return Surface(surface.vertices, np.delete(surface.faces, faces, axis=0), surface.name)
+
+
+def refused(words, *arguments, **options):
+    with pytest.raises(InputError) as caught:
+        load_surface(*arguments, name="insert", **options)
+    message = str(caught.value)
+    assert words in message
+    assert "\n" not in message
+    return message
+
+
+def test_axes_name_the_rows_of_a_rotation():
+    assert np.array_equal(axes_rotation("-x,+y,-z"), np.diag([-1.0, 1.0, -1.0]))
+    assert np.array_equal(axes_rotation("z, x, y"), [[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    moved = axes_rotation("+y,-z,-x") @ [1.0, 2.0, 3.0]
+    assert np.array_equal(moved, [2.0, -3.0, -1.0])
+
+
+@pytest.mark.parametrize("axes", ["+x,+y", "+x,+x,+z", "+x,+y,+w", "x y z", "++x,+y,+z"])
+def test_axes_that_are_no_axes(axes):
+    with pytest.raises(InputError, match="three different axes"):
+        axes_rotation(axes)
+
+
+def test_left_handed_axes_are_refused_with_a_right_handed_way_out():
+    with pytest.raises(InputError, match="left-handed") as caught:
+        axes_rotation("-x,+y,+z")
+    assert np.linalg.det(axes_rotation(str(caught.value).split("'")[3])) == 1
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
+@pytest.mark.parametrize(("unit", "scale"), [("mm", 1e3), ("cm", 1e2), ("m", 1.0)])
+def test_loads_into_metres(tmp_path, suffix, unit, scale, caplog):
+    ball = sphere(0.02, 3)
+    path = save(tmp_path / f"ball.{suffix}", ball, scale)
+    surface = load_surface(path, unit, name="ball", closed=True)
+    assert surface.mesh.is_watertight
+    assert surface.mesh.volume == pytest.approx(ball.mesh.volume, rel=1e-5)
+    assert len(surface.vertices) == len(ball.vertices)
+    assert not caplog.records
+
+
+def test_axes_turn_the_mesh(tmp_path):
+    insert = two_dishes()
+    turn = axes_rotation("-z,+x,-y")
+    turned = Surface(insert.vertices @ turn, insert.faces)
+    path = save(tmp_path / "turned.ply", turned)
+    there = load_surface(path, "mm", "-z,+x,-y", name="insert")
+    straight = load_surface(save(tmp_path / "straight.ply", insert), "mm", name="insert")
+    assert np.array_equal(there.vertices, straight.vertices)
+    assert np.array_equal(there.faces, straight.faces)
+    assert there.content_hash == straight.content_hash
+
+
+def test_mirrored_twice_is_the_same_and_stays_outward():
+    ball = sphere(0.02, 2, (0.0, 0.01, 0.03))
+    once = mirrored(ball)
+    assert once.vertices[:, 2].mean() == pytest.approx(-0.03)
+    assert once.mesh.volume == pytest.approx(ball.mesh.volume)
+    assert np.array_equal(mirrored(once).vertices, ball.vertices)
+
+
+def test_wrong_unit_names_the_right_one(tmp_path):
+    path = save(tmp_path / "plate.stl", plate())
+    message = refused("no such part", path, "m")
+    assert "'mm' would make it 60 mm" in message
+
+
+def test_a_whole_bone_is_longer_than_an_implant(tmp_path):
+    path = save(tmp_path / "bone.stl", sphere(0.2, 3))
+    refused("400 mm", path, "mm")
+    assert load_surface(path, "mm", name="bone", size=BONE_SIZE).bounds[1, 0] == pytest.approx(0.2)
+
+
+def test_bad_files(tmp_path):
+    refused("no such mesh file", tmp_path / "none.stl", "mm")
+    text = tmp_path / "text.stl"
+    text.write_text("not a mesh at all\n")
+    refused("text.stl", text, "mm")
+    points = tmp_path / "points.ply"
+    trimesh.PointCloud(np.random.default_rng(0).normal(size=(20, 3))).export(points)
+    refused("triangles", points, "mm")
+    refused("unknown unit 'inch'", save(tmp_path / "plate.stl", plate()), "inch")
+
+
+def test_a_coordinate_that_is_not_a_number(tmp_path):
+    bad = plate()
+    bad.vertices[3, 1] = np.nan
+    refused("not a number", save(tmp_path / "bad.stl", bad), "mm")
+
+
+def test_three_sheets_on_an_edge_are_no_surface(tmp_path):
+    vertices = np.array([[0, 0, 0], [50, 0, 0], [20, 30, 0], [20, -30, 5], [20, 0, 30.0]])
+    fan = Surface(vertices, np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4], [0, 2, 4]]))
+    assert "(" in refused("three or more sheets", save(tmp_path / "fan.ply", fan, 1.0), "mm")
+
+
+def test_a_one_sided_strip_is_no_surface(tmp_path):
+    n = 40
+    angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    radial = np.stack([np.cos(angle), np.zeros(n), np.sin(angle)], axis=1)
+    across = np.cos(angle / 2)[:, None] * radial + np.sin(angle / 2)[:, None] * [0, 1, 0]
+    vertices = np.concatenate([30 * radial + 8 * across, 30 * radial - 8 * across])
+    i = np.arange(n)
+    j = (i + 1) % n
+    a, b = i, i + n
+    c, d = np.where(j == 0, n, j), np.where(j == 0, 0, j + n)
+    strip = Surface(vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([c, b, d], 1)]))
+    refused("only one side", save(tmp_path / "moebius.ply", strip, 1.0), "mm")
+
+
+def test_each_repair_restores_the_body_with_one_notice(tmp_path, caplog):
+    insert = two_dishes()
+    rng = np.random.default_rng(1)
+    chosen = rng.choice(len(insert.faces), 50, replace=False)
+    flipped = insert.faces.copy()
+    flipped[chosen] = flipped[chosen][:, ::-1]
+    shared = insert.faces[0]
+    cases = {
+        "duplicate": np.concatenate([insert.faces, insert.faces[chosen[:3]]]),
+        "degenerate": np.concatenate([insert.faces, [[5, 5, 9]]]),
+        "winding": flipped,
+        "inside-out": insert.faces[:, ::-1],
+        "small hole": np.delete(insert.faces, chosen[:20], axis=0),
+        "2 duplicate": np.concatenate([insert.faces, [shared, shared[::-1]]]),
+    }
+    for words, faces in cases.items():
+        caplog.clear()
+        path = save(tmp_path / "broken.ply", Surface(insert.vertices, faces))
+        mended = load_surface(path, "mm", name="insert", closed=True)
+        assert mended.mesh.is_watertight
+        assert mended.mesh.volume == pytest.approx(insert.mesh.volume, rel=1e-5)
+        assert len(caplog.records) == 1
+        assert caplog.records[0].levelno == logging.WARNING
+        assert words in caplog.text
+        assert "broken.ply" in caplog.text
+
+
+def test_loose_vertices_are_dropped_with_a_notice(tmp_path, caplog):
+    insert = two_dishes()
+    more = Surface(np.concatenate([insert.vertices, [[0.0, 0.5, 0.0]]]), insert.faces)
+    mended = load_surface(save(tmp_path / "loose.ply", more), "mm", name="insert", closed=True)
+    assert "1 unreferenced vertex" in caplog.text
+    assert mended.bounds[1, 1] < 0.02
+
+
+def test_a_fold_without_thickness_is_taken_out():
+    ball = sphere(0.02, 2)
+    tip = ball.vertices[ball.faces[0]].mean(axis=0) * 1.2
+    a, b, n = *ball.faces[0][:2], len(ball.vertices)
+    folded = np.concatenate([ball.faces, [[a, b, n], [n, b, a]]])
+    mended = repair(np.vstack([ball.vertices, tip]), folded)
+    assert len(mended.faces) == len(ball.faces)
+    assert mended.notices[0] == "1 duplicate face removed"
+
+
+def test_cracks_are_welded():
+    insert = two_dishes()
+    rng = np.random.default_rng(2)
+    corners = insert.triangles.reshape(-1, 3) + rng.uniform(-1e-5, 1e-5, (3 * len(insert.faces), 3))
+    mended = repair(corners, np.arange(len(corners)).reshape(-1, 3))
+    assert not mended.holes
+    assert any("welded" in notice for notice in mended.notices)
+    volume = Surface(mended.vertices, mended.faces).mesh.volume
+    assert volume == pytest.approx(insert.mesh.volume, rel=1e-3)
+
+
+def test_a_void_inside_stays_a_void():
+    shell = sphere(0.03, 3)
+    void = sphere(0.02, 3)
+    faces = np.concatenate([shell.faces, void.faces[:, ::-1] + len(shell.vertices)])
+    mended = repair(np.concatenate([shell.vertices, void.vertices]), faces)
+    assert mended.notices == ()
+    volume = Surface(mended.vertices, mended.faces).mesh.volume
+    assert volume == pytest.approx(shell.mesh.volume - void.mesh.volume)
+
+
+def test_a_wide_hole_is_refused_where_it_must_be_closed(tmp_path, caplog):
+    insert = two_dishes()
+    middle = insert.triangles.mean(axis=1)
+    hole = np.flatnonzero(np.linalg.norm(middle - [0.0, 0.007, 0.022], axis=1) < 0.004)
+    path = save(tmp_path / "holed.stl", without(insert, hole))
+    message = refused("not closed", path, "mm", closed=True)
+    assert "edges" in message
+    assert "mm wide, at (" in message
+    assert len(load_surface(path, "mm", name="insert").faces) == len(insert.faces) - len(hole)
+
+
+def test_touching_holes_are_two_loops():
+    insert = plate(spacing=5e-3)
+    vertex = int(np.argmin(np.linalg.norm(insert.vertices - [0.0, 0.01, 0.0], axis=1)))
+    around = np.flatnonzero((insert.faces == vertex).any(axis=1))
+    pair = [f for f in around[1:] if len(set(insert.faces[f]) & set(insert.faces[around[0]])) == 1]
+    holed = without(insert, [around[0], pair[0]])
+    loops = boundary_loops(holed.vertices, holed.faces)
+    assert [len(loop.vertices) for loop in loops] == [3, 3]
+    assert loops[0].width == pytest.approx(5e-3 / np.sqrt(2))
+
+
+def test_check_asks_and_applies_nothing(tmp_path):
+    path = save(tmp_path / "insert.stl", two_dishes())
+    health = check_mesh(path)
+    assert health.watertight
+    assert health.units == ("mm",)
+    assert health.flats[0].faces == "-y"
+    text = "\n".join(health.lines())
+    assert "millimetres?" in text
+    assert "bottom?" in text
+    assert "--axes ±x,+y,±z" in text
+    assert max(health.extents) == pytest.approx(76.0)
+    assert health.as_dict()["components"] == 1
+
+
+def test_check_lists_defects(tmp_path):
+    insert = two_dishes()
+    middle = insert.triangles.mean(axis=1)
+    hole = np.flatnonzero(np.linalg.norm(middle - [0.0, 0.007, 0.022], axis=1) < 0.004)
+    health = check_mesh(save(tmp_path / "holed.stl", without(insert, [*hole, 3])))
+    assert not health.watertight
+    assert len(health.holes) == 2
+    assert len(health.remaining_holes) == 1
+    assert not health.closed_after_repair
+    assert health.remaining_holes[0].width == pytest.approx(8.0, abs=2.0)
+    assert any("small hole" in phrase for phrase in health.repairs)
+
+
+@needs_data
+def test_real_parts_load(caplog):
+    for subject in ("dm", "jw"):
+        for part in ("femoral_component", "tibial_insert", "patellar_button"):
+            caplog.clear()
+            path = DATA / subject / "geometry" / f"{part}.stl"
+            surface = load_surface(path, "m", "-x,+y,-z", name=part, closed=True)
+            assert surface.mesh.is_watertight
+            assert surface.mesh.volume > 5e-6
+            expected = (subject, part) == ("jw", "femoral_component")
+            assert [r.message.split("repaired: ")[1] for r in caplog.records] == (
+                ["2 duplicate faces removed"] if expected else []
+            )
+
+
+@needs_data
+@pytest.mark.parametrize("subject", ["dm", "jw"])
+def test_real_inserts_with_lost_triangles_and_jitter(tmp_path, subject, caplog):
+    path = DATA / subject / "geometry" / "tibial_insert.stl"
+    insert = load_surface(path, "m", "-x,+y,-z", name="insert", closed=True)
+    rng = np.random.default_rng(4)
+    lost = without(insert, rng.choice(len(insert.faces), 20, replace=False))
+    mended = load_surface(save(tmp_path / "lost.stl", lost), "mm", name="insert", closed=True)
+    assert "small holes closed" in caplog.text
+    assert mended.mesh.volume == pytest.approx(insert.mesh.volume, rel=1e-5)
+    moved = insert.vertices + rng.normal(0.0, 1e-5, insert.vertices.shape)
+    noisy = Surface(moved, insert.faces)
+    rough = load_surface(save(tmp_path / "noisy.stl", noisy), "mm", name="insert", closed=True)
+    assert rough.mesh.volume == pytest.approx(insert.mesh.volume, rel=1e-3)
