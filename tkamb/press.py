@@ -25,9 +25,8 @@ from tkamb.contact.model import (
 from tkamb.contact.pressing import check_load, first_touch_height
 from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError
-from tkamb.geometry.adjustment import Adjustment, adjust_femoral
 from tkamb.geometry.adjustment import Adjustment
-from tkamb.geometry.adjustment import adjust as adjust_pose
+from tkamb.geometry.adjustment import adjust as adjusted
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.flat_bottom import insert_placement
@@ -198,7 +197,7 @@ def _pressed(
         return model.press(state, load, placed), None
     pair: ContactPair = state.pair
     query = ClosestPointQuery(pair.femoral, pair.insert, condyle_split(pair.femoral))
-    return press_adjusted(model, state, load, adjust_femoral(query, placed), query)
+    return press_adjusted(model, state, load, adjusted(query, placed), query)
 
 
 def load_pair(

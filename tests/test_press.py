@@ -1,0 +1,235 @@
+"""`tkamb press` on mesh files: what it prints, and that units, axes and side only relabel."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
+from tkamb.cli import main
+from tkamb.errors import InputError
+from tkamb.geometry.surface import Surface
+from tkamb.press import press_meshes, read_pose
+
+KEYS = [
+    "contact",
+    "resolution_mm",
+    "nodes",
+    "load_N",
+    "reaction_N",
+    "approach_mm",
+    "medial",
+    "lateral",
+    "prepare_seconds",
+    "solve_seconds",
+    "peak_rss_MB",
+    "iterations",
+    "residual",
+    "status",
+]
+CONDYLE_KEYS = ["force_N", "area_mm2", "mean_pressure_MPa", "peak_pressure_MPa", "cop_mm"]
+TURN = np.array([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]])
+"""From anatomical axes to a mesh with -x,+y,-z."""
+
+
+def two_condyles():
+    """Return condyles of different size, so that medial and lateral differ."""
+    medial = graded_sphere(22e-3, (1e-3, 0, -22e-3))
+    lateral = graded_sphere(20e-3, (0, -2e-3, 22e-3))
+    return joined(medial, lateral)
+
+
+def dishes():
+    return dished_insert(
+        lambda x, z: 8e-3 + (x**2) / (2 * 50e-3) + (np.abs(z) - 22e-3) ** 2 / (2 * 60e-3),
+        half_x=20e-3,
+        half_z=36e-3,
+        spacing=1e-3,
+    )
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory):
+    """Write the pair once; return a function that gives their paths in a unit and axes."""
+    folder = tmp_path_factory.mktemp("meshes")
+
+    def write(scale=1e3, turn=None, mirror=False):
+        paths = []
+        for name, surface in (("femoral", two_condyles()), ("insert", dishes())):
+            vertices, faces = surface.vertices * scale, surface.faces
+            if mirror:
+                vertices, faces = vertices * [1, 1, -1], faces[:, ::-1]
+            if turn is not None:
+                vertices = vertices @ turn.T
+            path = folder / f"{name}_{scale:g}_{turn is not None}_{mirror}.ply"
+            if not path.exists():
+                Surface(vertices, faces, name).mesh.export(path)
+            paths.append(path)
+        return paths
+
+    return write
+
+
+def condyles(report):
+    found = report.as_dict()
+    return np.array(
+        [[*(found[s][k] for k in CONDYLE_KEYS[:-1]), *found[s]["cop_mm"]] for s in SIDES]
+    )
+
+
+SIDES = ("medial", "lateral")
+
+
+def test_report_has_the_interface_s_keys(meshes, capsys):
+    femoral, insert = meshes()
+    arguments = ["press", str(femoral), str(insert), "--load", "900", "--json"]
+    assert main([*arguments, "--contact", "foundation", "--resolution", "1.5"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert list(found) == KEYS
+    assert list(found["medial"]) == list(found["lateral"]) == CONDYLE_KEYS
+    assert found["status"] == "ok"
+    assert found["load_N"] == 900
+    assert found["reaction_N"] == pytest.approx(900, rel=1e-6)
+    assert found["resolution_mm"] == 1.5
+    assert found["medial"]["cop_mm"][2] == pytest.approx(-22, abs=1.5)
+    assert found["lateral"]["cop_mm"][2] == pytest.approx(22, abs=1.5)
+    assert 0 < found["approach_mm"] < 1
+
+
+def test_text_names_both_condyles(meshes, capsys):
+    femoral, insert = meshes()
+    assert main(["press", str(femoral), str(insert), "--load", "900"]) == 0
+    text = capsys.readouterr().out
+    assert "medial" in text
+    assert "lateral" in text
+    assert "reaction 900 N" in text
+
+
+def test_swapping_the_model_keeps_the_load(meshes):
+    femoral, insert = meshes()
+    for contact in ("foundation", "foundation-linear", "hertz"):
+        report = press_meshes(femoral, insert, 600.0, contact=contact)
+        assert report.as_dict()["reaction_N"] == pytest.approx(600, rel=1e-6)
+        assert report.as_dict()["contact"] == contact
+
+
+def test_unit_axes_and_height_only_relabel(meshes):
+    pose = (2.0, 30.0, 0.4, 0.03, 1.0, 15.0)
+    here = condyles(press_meshes(*meshes(), 2000.0, pose=pose))
+    in_metres = (*(1e-3 * np.array(pose[:3])), *pose[3:])
+    metres = press_meshes(*meshes(scale=1.0), 2000.0, units="m", pose=in_metres)
+    assert np.allclose(condyles(metres), here, rtol=1e-5, atol=1e-5)
+    turned = TURN @ Rotation.from_euler("XYZ", pose[3:], degrees=True).as_matrix() @ TURN.T
+    angles = Rotation.from_matrix(turned).as_euler("XYZ", degrees=True)
+    other = press_meshes(
+        *meshes(turn=TURN), 2000.0, axes="-x,+y,-z", pose=(*(TURN @ pose[:3]), *angles)
+    )
+    assert np.allclose(condyles(other), here, rtol=1e-5, atol=1e-5)
+    higher = press_meshes(*meshes(), 2000.0, pose=(2.0, 55.0, 0.4, 0.03, 1.0, 15.0))
+    assert np.allclose(condyles(higher), here, rtol=1e-9, atol=1e-6)
+
+
+def test_a_left_knee_is_the_mirror_image(meshes):
+    """Same loads on the same condyles; z to the subject's right changes sign."""
+    pose = np.array([2.0, 30.0, 0.4, 0.03, 1.0, 15.0])
+    right = condyles(press_meshes(*meshes(), 2000.0, pose=pose))
+    mirrored = pose * [1, 1, -1, -1, -1, 1]
+    left = condyles(press_meshes(*meshes(mirror=True), 2000.0, pose=mirrored, side="left"))
+    assert np.allclose(left[:, :-1], right[:, :-1], rtol=1e-6, atol=1e-6)
+    assert np.allclose(left[:, -1], -right[:, -1], atol=1e-6)
+    assert right[0, -1] < 0 < right[1, -1]
+
+
+def test_the_pose_places_the_femoral_mesh_in_the_insert_s_axes(meshes):
+    """A sphere of radius r moved by s in a dish of radius R touches at s R / (R - r)."""
+    still = condyles(press_meshes(*meshes(), 2000.0))
+    moved = condyles(press_meshes(*meshes(), 2000.0, pose=(3.0, 0, 0, 0, 0, 0)))
+    expected = [3 * 50 / (50 - 22), 3 * 50 / (50 - 20)]
+    assert np.allclose((moved - still)[:, 4], expected, rtol=0.05)
+
+
+def test_adjustment_evens_out_the_condyles(meshes, capsys):
+    """0.2 deg of recorded varus is within fluoroscopy's error and is taken out."""
+    level = press_meshes(*meshes(), 2000.0).result
+    centre = level.pose[1, 3] * 1e3 + level.approach * 1e3
+    report = press_meshes(*meshes(), 2000.0, pose=(0, centre + 0.05, 0, 0.2, 0, 0), adjust=True)
+    assert report.adjustment is not None
+    assert abs(np.degrees(report.adjustment.coronal_angle)) > 0.05
+    assert any(line.startswith("adjusted") for line in report.lines())
+    with pytest.raises(InputError, match="neither condyle is near"):
+        press_meshes(*meshes(), 2000.0, pose=(0, 100, 0, 0, 0, 0), adjust=True)
+
+
+def test_single_sphere_is_medial_and_lateral_is_null(tmp_path):
+    graded_sphere(20e-3).mesh.export(tmp_path / "sphere.ply")
+    flat_insert(10e-3).mesh.export(tmp_path / "block.ply")
+    report = press_meshes(tmp_path / "sphere.ply", tmp_path / "block.ply", 500.0, units="m")
+    found = report.as_dict()
+    assert found["lateral"] is None
+    assert found["medial"]["force_N"] == pytest.approx(500, rel=1e-6)
+    assert found["medial"]["cop_mm"] == pytest.approx([0, 10, 0], abs=0.02)
+
+
+def test_zero_load_and_too_great_a_load(meshes):
+    nothing = press_meshes(*meshes(), 0.0).as_dict()
+    assert nothing["reaction_N"] == nothing["approach_mm"] == 0
+    assert nothing["medial"] is None
+    assert nothing["status"] == "ok"
+    crushed = press_meshes(*meshes(), 1e8)
+    found = crushed.as_dict()
+    assert found["status"] == "out_of_range"
+    assert found["reaction_N"] is found["approach_mm"] is found["medial"] is None
+    assert not crushed.carried
+    assert any("cannot be reached" in line for line in crushed.lines())
+    json.dumps(found, allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"load": -5.0}, "impossible load"),
+        ({"load": float("nan")}, "impossible load"),
+        ({"load": float("inf")}, "impossible load"),
+        ({"contact": "magic"}, "there are: .*foundation"),
+        ({"material": "cheese"}, "there are: polyethylene"),
+        ({"units": "inch"}, "unit"),
+        ({"units": "m"}, "unit"),
+        ({"axes": "+x,+x,+z"}, "axes"),
+        ({"axes": "+y,+z,+x"}, "bottom"),
+        ({"side": "both"}, "side"),
+        ({"bearing": "loose"}, "bearing"),
+        ({"pose": (0, 0, 0)}, "six finite numbers"),
+        ({"pose": (0, 0, 0, 0, 0, float("nan"))}, "six finite numbers"),
+        ({"pose": (300, 0, 0, 0, 0, 0)}, "neither condyle lies over the insert"),
+        ({"resolution_mm": 0.0}, "resolution"),
+        ({"resolution_mm": 1e-3}, "coarser"),
+        ({"femoral": "nowhere.stl"}, "nowhere.stl"),
+    ],
+)
+def test_bad_input_is_an_input_error(meshes, changed, words):
+    femoral, insert = meshes()
+    arguments = {"femoral": femoral, "insert": insert, "load": 500.0, **changed}
+    with pytest.raises(InputError, match=words):
+        press_meshes(**arguments)
+
+
+def test_an_open_insert_is_refused(meshes, tmp_path):
+    femoral, _ = meshes()
+    whole = dishes()
+    keep = whole.face_normals[:, 1] < 0.5
+    Surface(1e3 * whole.vertices, whole.faces[keep], "shell").mesh.export(tmp_path / "shell.ply")
+    with pytest.raises(InputError, match=r"closed|flat"):
+        press_meshes(femoral, tmp_path / "shell.ply", 500.0)
+
+
+def test_pose_file(tmp_path):
+    path = tmp_path / "pose.txt"
+    path.write_text("1.5, 2 3\n0 -5 90\n")
+    assert read_pose(path) == (1.5, 2, 3, 0, -5, 90)
+    for text in ("1 2 3", "1 2 3 4 5 six"):
+        path.write_text(text)
+        with pytest.raises(InputError, match="six numbers"):
+            read_pose(path)
+    with pytest.raises(InputError, match="six numbers"):
+        read_pose(tmp_path / "none.txt")
