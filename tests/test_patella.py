@@ -1,5 +1,7 @@
 """The solved patella against the exact three-force solution on a circular trochlea."""
 
+from pathlib import Path
+
 import fcl
 import numpy as np
 import pytest
@@ -14,8 +16,11 @@ from tkamb.body.patella import (
     solve_patella,
 )
 from tkamb.body.patellofemoral import PatellofemoralContact
+from tkamb.case import load_case
+from tkamb.extensor import ExtensorFrames
 from tkamb.geometry.frames import Array, inverse, knee_pose, transform
 from tkamb.geometry.surface import Surface
+from tkamb.scene import load_scene
 
 TROCHLEA, DOME = 0.025, 0.02
 CENTRE = np.array([0.004, 0.0, 0.0])
@@ -230,3 +235,42 @@ def test_end_of_the_femoral_mesh_is_reported(mechanism: ExtensorMechanism) -> No
     states = [solve_patella(cut, knee_at(angle)) for angle in (0.0, 40.0)]
     assert states[0].status is PatellaStatus.OK
     assert states[1].status in (PatellaStatus.EDGE, PatellaStatus.NOT_FOUND)
+
+
+@pytest.fixture(scope="module")
+def shipped() -> tuple[Array, list[PatellaState]]:
+    """Flexion (deg) and patella of every frame of the shipped deep knee bend."""
+    scene = load_scene(Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml")
+    case = load_case(scene)
+    frames = ExtensorFrames(case, knee_pose(case.motion.coordinates))
+    return np.rad2deg(case.motion.coordinates[:, 5]), frames.states
+
+
+def test_shipped_knee_has_the_published_force_ratios(
+    shipped: tuple[Array, list[PatellaState]],
+) -> None:
+    """Q/PL 0.9-1.1 near extension, 1.3-1.9 at 70-100 deg (cadaver studies); not tuned."""
+    flexion, states = shipped
+    assert all(state.status is PatellaStatus.OK for state in states)
+    ratio = np.array([1.0 / state.ligament_ratio for state in states])
+    assert ((ratio > 0.9) & (ratio < 1.1))[flexion < 20.0].all()
+    assert ((ratio > 1.3) & (ratio < 1.9))[(flexion > 70.0) & (flexion < 100.0)].all()
+
+
+def test_shipped_contact_moves_superior_until_the_quadriceps_wraps(
+    shipped: tuple[Array, list[PatellaState]],
+) -> None:
+    flexion, states = shipped
+    height = np.array([state.contact_on_patella[1] for state in states])
+    before = height[flexion < 60.0]
+    assert before[-1] - before[0] > 4e-3
+    assert np.diff(before).min() > -5e-4
+    assert height[-1] > before[0] + 4e-3
+
+
+def test_shipped_patella_moves_smoothly(shipped: tuple[Array, list[PatellaState]]) -> None:
+    """Second differences over 101 frames: only the kink where wrapping starts is above 0.1 deg."""
+    places = np.array([state.coordinates for state in shipped[1]])
+    bend = np.abs(np.diff(places, n=2, axis=0)).max(axis=0)
+    assert (bend[:2] < 2e-4).all()
+    assert bend[2] < np.deg2rad(0.4)

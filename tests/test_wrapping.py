@@ -1,5 +1,7 @@
 """Taut paths: analytic lengths, moment arms against finite differences, exact balance."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -8,7 +10,7 @@ from tkamb.body.lines import StringLine
 from tkamb.body.load import total_wrench
 from tkamb.body.wrapping import loads_per_unit_tension, taut_path
 from tkamb.errors import ComputationError, InputError
-from tkamb.geometry.frames import knee_pose
+from tkamb.geometry.frames import inverse, knee_pose, pose, transform
 from tkamb.geometry.sections import convex_outline, sagittal_outline, sagittal_section
 from tkamb.geometry.surface import Surface
 
@@ -173,3 +175,74 @@ def test_outline_stops_below_the_start() -> None:
     assert outline[:, 1].max() == pytest.approx(0.1)
     with pytest.raises(InputError, match="no surface is cut"):
         sagittal_outline([surface], [1.0])
+
+
+def shipped_lines() -> tuple[StringLine, StringLine]:
+    """Quadriceps and patellar ligament about the shipped implant; the ligament's distal end
+    lies under the insert, where no real one does, so that it wraps the insert's lip."""
+    folder = Path(__file__).parents[1] / "models" / "deep_knee_bend"
+    femoral, insert = (
+        Surface(np.asarray(mesh.vertices) * 1e-3, np.asarray(mesh.faces), name)
+        for name in ("femoral_component", "insert")
+        for mesh in [trimesh.load(folder / f"{name}.stl")]
+    )
+    planes = np.linspace(-0.005, 0.005, 5)
+    top = float(femoral.bounds[1, 1])
+    quadriceps = StringLine(
+        "quadriceps",
+        "femur",
+        np.array([float(femoral.bounds[1, 0]) - 0.012, top + 0.15, 0.004]),
+        "patella",
+        np.array([0.01, 0.02, 0.0]),
+        sagittal_outline([femoral], planes, 0.003),
+        "femur",
+    )
+    lip = float(insert.bounds[1, 0])
+    ligament = StringLine(
+        "patellar_ligament",
+        "patella",
+        np.array([0.008, -0.02, 0.0]),
+        "tibia",
+        np.array([lip - 0.02, -0.02, 0.005]),
+        sagittal_outline([insert], planes, 0.002),
+        "tibia",
+    )
+    return quadriceps, ligament
+
+
+def leg_poses(q: np.ndarray) -> dict[str, np.ndarray]:
+    """Six knee coordinates, then the patella's three, as the chain has them."""
+    femur = knee_pose(q[:6])
+    c, s = np.cos(q[8]), np.sin(q[8])
+    patella = pose([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], [q[6], q[7], 0.002])
+    return {"femur": femur, "patella": femur @ patella, "tibia": np.eye(4)}
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_moment_arms_of_both_lines_on_the_shipped_knee(which: int) -> None:
+    """Generalised force of a unit tension = -dL/dq for all nine coordinates, 0-140 deg."""
+    line, step = shipped_lines()[which], 2e-7
+    worst, wrapped = 0.0, []
+    for degrees in np.arange(0.0, 140.1, 5.0):
+        f = np.deg2rad(degrees)
+        turn = -0.65 * f
+        along = np.array([np.cos(-0.9 * f), np.sin(-0.9 * f)]) * 0.045
+        q = np.array([-2e-3 * f, 0.03, 1e-3, 0.08 * f, 0.02, f, along[0], along[1] + 0.005, turn])
+        poses = leg_poses(q)
+        path = line.path(poses)
+        wrapped.append(path.wrapped)
+        loads = line.loads(path)
+        for k in range(9):
+            moved = [q + sign * step * np.eye(9)[k] for sign in (-1.0, 1.0)]
+            ends = [leg_poses(m) for m in moved]
+            slope = (line.path(ends[1]).length - line.path(ends[0]).length) / (2 * step)
+            power = 0.0
+            for load in loads:
+                rate = (ends[1][load.link] - ends[0][load.link]) / (2 * step)
+                local = transform(inverse(poses[load.link]), load.points)
+                velocity = local @ rate[:3, :3].T + rate[:3, 3]
+                power += float((velocity * load.forces).sum())
+            scale = 1.0 if k in (0, 1, 2, 6, 7) else 0.03
+            worst = max(worst, abs(slope + power) / max(abs(slope), scale))
+    assert len(set(wrapped)) == 2
+    assert worst < 1e-5
