@@ -18,6 +18,8 @@ Indices = NDArray[np.int64]
 _ROUNDS = 3
 _KEPT = 8
 _BATCH = 64
+_TOUCHING = 1e-8
+"""m; surfaces that touch without cutting are raised by this to find their closest points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +97,13 @@ class ClosestPointQuery:
         gap, on_femoral, on_insert = self._apart(condyle, pose)
         if gap > 0:
             return gap, on_femoral, on_insert
-        return self._refined(condyle.faces[self._crossed(condyle, pose)], pose)
+        crossed = self._crossed(condyle, pose)
+        if len(crossed):
+            return self._refined(condyle.faces[crossed], pose)
+        raised = pose.copy()
+        raised[1, 3] += _TOUCHING
+        _, on_femoral, on_insert = self._apart(condyle, raised)
+        return 0.0, on_femoral, on_insert
 
     def _apart(self, condyle: "_Condyle", pose: Array) -> tuple[float, Array, Array]:
         request = fcl.DistanceRequest(enable_nearest_points=True)
@@ -110,7 +118,7 @@ class ClosestPointQuery:
         request = fcl.CollisionRequest(num_max_contacts=_BATCH, enable_contact=True)
         result = fcl.CollisionResult()
         fcl.collide(condyle.placed(pose), fcl.CollisionObject(self._insert_tree), request, result)
-        return np.unique([contact.b1 for contact in result.contacts])
+        return np.unique(np.array([contact.b1 for contact in result.contacts], np.int64))
 
     def _deepest_vertices(self, condyle: "_Condyle", pose: Array) -> Indices:
         """Return the deepest few vertices inside the insert, deepest first; none if apart.
