@@ -17,7 +17,7 @@ from tkamb.body.patella import (
     solve_patella,
 )
 from tkamb.body.patellofemoral import PatellofemoralContact
-from tkamb.body.wrapping import is_inside
+from tkamb.body.wrapping import TautPath, is_inside
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.geometry.sections import sagittal_outline
@@ -86,10 +86,7 @@ class ExtensorFrames:
         patella = self.states[k]
         if patella.status not in USABLE:
             raise ComputationError(f"patella: {patella.status.value.replace('_', ' ')}")
-        lines = (self.quadriceps, self.ligament)
-        links = {link for line in lines for link in (line.start_link, line.end_link)}
-        poses = {link: state.pose(link) for link in links | {"femur"}} | {"insert": np.eye(4)}
-        quadriceps, ligament = (line.path(poses) for line in lines)
+        quadriceps, ligament = self.paths(state)
         extensor = Extensor(
             self.quadriceps.loads(quadriceps),
             tuple(_on_tibia(load) for load in self.ligament.loads(ligament)),
@@ -97,6 +94,18 @@ class ExtensorFrames:
             patella.contact_normal,
         )
         return extensor, quadriceps.wrap_angle
+
+    def paths(self, state: ChainState) -> tuple[TautPath, TautPath]:
+        """Return quadriceps and patellar ligament as they run, in the insert frame.
+
+        Raises:
+            ComputationError: a line's end inside what it wraps.
+        """
+        lines = (self.quadriceps, self.ligament)
+        links = {link for line in lines for link in (line.start_link, line.end_link)}
+        poses = {link: state.pose(link) for link in links | {"femur"}} | {"insert": np.eye(4)}
+        quadriceps, ligament = (line.path(poses) for line in lines)
+        return quadriceps, ligament
 
     def _check_fixed_ends(self) -> None:
         """Raise if the end that does not move against an outline lies within it."""

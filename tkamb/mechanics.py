@@ -59,6 +59,11 @@ class Mechanics:
 
     Args:
         case: the scene with its files read.
+
+    Attributes:
+        poses: (f, 4, 4) recorded pose_femur_in_insert.
+        extensor: patella and lines of action of all frames; None if not modelled.
+        ligaments: the bundles, with their slack lengths.
     """
 
     def __init__(self, case: Case) -> None:
@@ -66,12 +71,12 @@ class Mechanics:
         self.poses = knee_pose(case.motion.coordinates)
         self._friction = case.scene.contact.friction if case.scene.contact else 0.0
         self.query = _contact_query(case)
-        self._extensor = None
+        self.extensor = None
         if case.scene.patella:
             from tkamb.extensor import ExtensorFrames
 
-            self._extensor = ExtensorFrames(case, self.poses)
-        self._ligaments = self._build_ligaments()
+            self.extensor = ExtensorFrames(case, self.poses)
+        self.ligaments = self._build_ligaments()
 
     def frame(self, k: int) -> FrameLoads:
         """Return the loads of frame k; a frame that cannot be solved holds NaN."""
@@ -82,13 +87,13 @@ class Mechanics:
         poses = {link: state.pose(link) for link in self._attachment_links()}
         tensions: dict[str, float] = {}
         known: list[PointForces] = []
-        for bundle in self._ligaments:
+        for bundle in self.ligaments:
             tensions[bundle.name], pulls = bundle.loads(poses)
             known += pulls
         extensor, wrap = None, NAN
-        if self._extensor:
+        if self.extensor:
             try:
-                extensor, wrap = self._extensor.at(k, state)
+                extensor, wrap = self.extensor.at(k, state)
             except ComputationError as error:
                 problems.append(str(error))
         geometry = KneeGeometry(
@@ -117,8 +122,8 @@ class Mechanics:
     def _chain_motion(self, k: int) -> ChainMotion:
         motion, tibia = self.case.motion, self.case.tibia
         joints = np.stack([motion.coordinates[k], motion.velocity[k], motion.acceleration[k]])
-        if self._extensor:
-            joints = np.hstack([joints, self._extensor.joints(k)])
+        if self.extensor:
+            joints = np.hstack([joints, self.extensor.joints(k)])
         if tibia is None:
             return ChainMotion(np.eye(4), np.zeros(6), np.zeros(6), joints)
         return ChainMotion(tibia.pose[k], tibia.velocity[k], tibia.acceleration[k], joints)
