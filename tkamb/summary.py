@@ -94,8 +94,11 @@ def assumptions(case: Case) -> list[str]:
     scene = case.scene
     said = [
         "Segments are rigid; the hip carries the force and moment of all that crosses it.",
-        f"The motion is low-passed at {scene.motion.cutoff_Hz} Hz before differentiation.",
     ]
+    if scene.motion.cutoff_Hz == "none":
+        said.append("The motion is differentiated as given, unfiltered.")
+    else:
+        said.append(f"The motion is low-passed at {scene.motion.cutoff_Hz:g} Hz.")
     if not scene.tibia:
         said.append("No [tibia]: the shank stands upright and still.")
     if scene.ground_reaction and scene.ground_reaction.applied == "ankle":

@@ -1,0 +1,80 @@
+"""The scene: overrides, what belongs together, and the page that documents it."""
+
+import json
+import runpy
+from pathlib import Path
+
+import pytest
+
+from scenes import MODEL, write_scene
+from tkamb.cli import main
+from tkamb.errors import InputError
+from tkamb.scene import load_scene
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_page_is_what_the_schema_says():
+    made = runpy.run_path(str(ROOT / "scripts" / "make_scene_page"))["page"]()
+    assert (ROOT / "docs" / "scene.md").read_text(encoding="utf-8") == made, (
+        "run scripts/make_scene_page"
+    )
+
+
+def test_schema_is_printed_as_json(capsys):
+    assert main(["scene", "--schema"]) == 0
+    schema = json.loads(capsys.readouterr().out)
+    assert set(schema["required"]) == {"patient", "motion"}
+    assert schema["additionalProperties"] is False
+
+
+def test_paths_are_relative_to_the_file(tmp_path):
+    scene = load_scene(write_scene(tmp_path))
+    assert scene.motion.file == tmp_path / "motion.csv"
+    assert scene.implant.insert.mesh == tmp_path / "insert.stl"
+
+
+def test_an_override_wins_and_may_make_a_table(tmp_path):
+    path = write_scene(tmp_path, ("contact",))
+    scene = load_scene(path, {"contact.model": "hertz", "patient.mass_kg": 80})
+    assert scene.contact.model == "hertz"
+    assert scene.patient.mass_kg == 80.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "drop", "words"),
+    [
+        ({}, ("implant",), r"\[contact\] needs"),
+        ({}, ("tibia",), r"\[ground_reaction\] needs \[tibia\]"),
+        ({"patella__motion": "solved", "patellar_ligament__length_mm": None}, (), "length_mm"),
+    ],
+)
+def test_what_belongs_together(tmp_path, changes, drop, words):
+    with pytest.raises(InputError, match=words):
+        load_scene(write_scene(tmp_path, drop, **changes))
+
+
+@pytest.mark.parametrize(
+    ("bundle", "words"),
+    [
+        ({"stiffness_N_per_strain": 2000.0}, "takes stiffness_N_per_mm"),
+        ({"law": "quadratic-toe"}, "takes stiffness_N_per_strain"),
+        ({"reference_strain": 0.02}, "either slack_length_mm or reference_strain"),
+        ({"name": "MCL anterior"}, "name"),
+    ],
+)
+def test_a_ligaments_law_and_unit_go_together(tmp_path, bundle, words):
+    import tomllib
+
+    bundles = tomllib.loads((MODEL / "scene.toml").read_text(encoding="utf-8"))["ligament"]
+    bundles[0] |= bundle
+    with pytest.raises(InputError, match=words):
+        load_scene(write_scene(tmp_path, ligament=bundles))
+
+
+def test_two_ligaments_of_one_name(tmp_path):
+    import tomllib
+
+    bundles = tomllib.loads((MODEL / "scene.toml").read_text(encoding="utf-8"))["ligament"]
+    with pytest.raises(InputError, match="same name"):
+        load_scene(write_scene(tmp_path, ligament=[bundles[0], bundles[0]]))
