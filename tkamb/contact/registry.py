@@ -25,6 +25,7 @@ BUILT_IN = {
     "foundation-linear": "tkamb.contact.foundation:LinearFoundation",
     "lattice": "tkamb.contact.lattice.model:CalibratedLattice",
     "lattice-linear": "tkamb.contact.lattice.model:LinearLattice",
+    "lattice-source": "tkamb.contact.lattice.source_model:SourceLattice",
     "fe": "tkamb.contact.fe:FiniteElements",
 }
 

@@ -15,7 +15,7 @@ from tkamb.contact.lattice.network import CalibratedNetwork
 from tkamb.contact.lattice.newton import solve_by_newton
 from tkamb.contact.lattice.operator import fixed_unknowns, prepare_operator
 from tkamb.contact.lattice.pressure_map import ContactMap, contact_map
-from tkamb.contact.lattice.problem import ContactProblem, vertical_gaps
+from tkamb.contact.lattice.problem import ContactProblem, Direction, vertical_gaps
 from tkamb.contact.lattice.report import PressureRule, result_of, untouched
 from tkamb.contact.lattice.solid import Solid
 from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve
@@ -85,6 +85,9 @@ class CellContact(ContactModel):
     pressure_rule: PressureRule = "tributary"
     newton: bool = False
 
+    direction: ClassVar[Direction] = "normal"
+    """Nodes are pressed along the femoral normal, or vertically."""
+
     @abstractmethod
     def solid(self, lattice: Lattice, material: Material) -> Solid:
         """Return the solid on a lattice."""
@@ -97,7 +100,7 @@ class CellContact(ContactModel):
         nodes, surface = contact_map(lattice, pair.insert)
         operator = prepare_operator(solid.stiffness, lattice.index, held, nodes)
         floor = FemoralFloor(pair.femoral, RayCaster(pair.femoral))
-        problem = ContactProblem(solid, operator, lattice.index, held, floor)
+        problem = ContactProblem(solid, operator, lattice.index, held, floor, self.direction)
         pool = CompliancePool(operator.half)
         return LatticeState(pair, lattice, problem, surface, condyle_split(pair.femoral), pool)
 

@@ -1,6 +1,7 @@
 """One insert under one femoral component, discretised: what every contact solver needs."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from tkamb.geometry.frames import Array
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+
+Direction = Literal["normal", "vertical"]
 
 STEEPEST = -0.05
 """Largest y of a femoral normal that a vertical press can load: 87 deg from the vertical."""
@@ -27,6 +30,7 @@ class ContactProblem:
         index: (n, 3) lattice place of each node.
         held: (3n,) unknowns held by the boundary.
         floor: the femoral component from below.
+        direction: nodes are pressed along the femoral normal, or vertically (the source).
     """
 
     solid: Solid
@@ -34,6 +38,7 @@ class ContactProblem:
     index: Indices
     held: Mask
     floor: FemoralFloor
+    direction: Direction = "normal"
 
     @property
     def contact_nodes(self) -> Indices:
@@ -87,4 +92,6 @@ def footing(
     lost = ~(normals[:, 1] < STEEPEST)
     if lost.any() and last is not None:
         places[lost], normals[lost] = last.places[lost], last.normals[lost]
+    if problem.direction == "vertical":
+        normals = np.broadcast_to([0.0, -1.0, 0.0], places.shape)
     return Footing(places, normals)

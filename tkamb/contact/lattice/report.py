@@ -72,6 +72,8 @@ def result_of(
     area = _areas(state, gaps - approach, size > 0, rule)
     gap = gaps - approach
     gap[solution.candidates] = solution.forces.gap
+    if rule == "source":
+        size = np.maximum(-np.einsum("ij,ij->i", force, state.map.normals), 0.0)
     pressure = size / area
     if not solution.converged:
         flags = (*flags, "the solver has not converged")
@@ -101,8 +103,8 @@ def result_of(
 def _areas(state: "LatticeState", gaps: Array, loaded: Mask, rule: PressureRule) -> Array:
     """Return the area (c,) that each node's force stands on, m².
 
-    The source's rule: femoral area that overlaps the undeformed insert, shared evenly by the
-    nodes in contact.
+    The source's rule: area that overlaps the undeformed insert, shared evenly by the nodes in
+    contact; the pressure is then the force along the insert's normal over it.
     """
     if rule == "tributary" or not loaded.any():
         return state.map.area
