@@ -1,8 +1,12 @@
 """Ligament laws, slack lengths from a reference strain, and equal and opposite forces."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import trimesh
 
+from tkamb.body.generic_ligaments import condylar_axis, generic_ligaments
 from tkamb.body.ligaments import (
     TOE_STRAIN,
     build_ligaments,
@@ -11,9 +15,11 @@ from tkamb.body.ligaments import (
     two_line_force,
 )
 from tkamb.body.load import total_wrench
+from tkamb.case import load_case
 from tkamb.errors import InputError
-from tkamb.geometry.frames import knee_pose
-from tkamb.scene import LigamentTable
+from tkamb.geometry.frames import inverse, knee_pose
+from tkamb.geometry.surface import Surface
+from tkamb.scene import LigamentTable, load_scene
 
 SLACK = 0.05
 FLEXION = np.deg2rad(np.arange(0.0, 101.0, 5.0))
@@ -92,3 +98,58 @@ def test_unknown_link_is_one_clear_line() -> None:
     with pytest.raises(InputError, match="fibula") as error:
         build_ligaments([table(distal={"link": "fibula", "point_mm": (0, 0, 0)})], POSES, FLEXION)
     assert "MCL_anterior" in str(error.value)
+
+
+def cylinder(radius: float, width: float) -> Surface:
+    mesh = trimesh.creation.cylinder(radius, width, sections=180)
+    mesh.apply_translation([0.004, -0.002, 0.001])
+    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), "femoral")
+
+
+def slab(width: float) -> Surface:
+    mesh = trimesh.creation.box(extents=(0.05, 0.01, width))
+    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), "insert")
+
+
+def test_condylar_axis_is_the_circles_centre() -> None:
+    axis = condylar_axis(cylinder(0.02, 0.07))
+    assert axis == pytest.approx([0.004, -0.002, 0.001], abs=5e-6)
+
+
+def test_generic_set_scales_with_the_implant() -> None:
+    """Twice the implant, twice the distances; the same strains; and it says what it is."""
+    small = generic_ligaments(cylinder(0.02, 0.07), slab(0.075), np.eye(4), ("MCL", "LCL"))
+    large = generic_ligaments(cylinder(0.04, 0.14), slab(0.15), np.eye(4), ("MCL", "LCL"))
+    assert [table.name for table in small] == [
+        "generic_MCL_anterior",
+        "generic_MCL_oblique",
+        "generic_MCL_deep",
+        "generic_LCL",
+    ]
+    axis = 1e3 * condylar_axis(cylinder(0.02, 0.07))
+    for one, two in zip(small, large, strict=True):
+        assert two.proximal.point_mm - axis == pytest.approx(
+            2 * (one.proximal.point_mm - axis), abs=0.01
+        )
+        assert np.array(two.distal.point_mm) == pytest.approx(2 * np.array(one.distal.point_mm))
+    with pytest.raises(InputError, match="ITB"):
+        generic_ligaments(cylinder(0.02, 0.07), slab(0.075), np.eye(4), ("ITB",))
+
+
+def test_generic_set_is_plausible_on_the_shipped_knee() -> None:
+    """Collaterals within 12 % of slack over 0-90 deg; the PCL tightens with flexion."""
+    case = load_case(
+        load_scene(Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml")
+    )
+    assert case.femoral is not None
+    assert case.insert is not None
+    frame = case.chain.insert_in_tibia
+    tables = generic_ligaments(case.femoral, case.insert, frame)
+    poses = {"femur": knee_pose(case.motion.coordinates), "tibia": inverse(frame)}
+    flexion = case.motion.coordinates[:, 5]
+    strains = strain_table(build_ligaments(tables, poses, flexion), poses, flexion)
+    for name, values in strains.items():
+        assert np.isfinite(values).all()
+        if "CL_" not in name or "MCL" in name:
+            assert np.abs(values).max() < 0.12
+    assert strains["generic_PCL_anterolateral"][2] > strains["generic_PCL_anterolateral"][0] + 0.1

@@ -27,6 +27,9 @@ from tkamb.geometry.frames import Array, inverse, rotate, transform
 TOLERANCE = 1e-8
 """m, of gap and ligament length."""
 
+TURN_TOLERANCE = 1e-7
+"""rad, of the rotation at which the moment vanishes."""
+
 FIRST_STEP = np.deg2rad(0.5)
 WIDEST_TURN = np.deg2rad(40.0)
 """rad: first step and end of the search about the guess."""
@@ -246,7 +249,7 @@ class _Frame:
             return settled.moment
 
         ends = (here.coordinates[2], there.coordinates[2])
-        brentq(moment, *ends, xtol=1e-9, rtol=1e-12)
+        brentq(moment, *ends, xtol=TURN_TOLERANCE, rtol=1e-12)
         return last
 
     def scan(self) -> tuple[_Balance | None, bool]:

@@ -43,8 +43,8 @@ PATCH_DEPTH = 5e-5
 SAMPLE_SPACING = 1e-3
 """m: spacing of the samples of the button, in the patella's coronal plane."""
 
-REACH = 20.0 * PATCH_DEPTH
-"""m: samples farther than this behind the nearest one weigh nothing (exp(-20))."""
+REACH = 14.0 * PATCH_DEPTH
+"""m: samples farther than this behind the nearest one weigh nothing (exp(-14) = 1e-6)."""
 
 COARSE = 60
 """Samples that a quick look takes."""
@@ -156,14 +156,13 @@ class PatellofemoralContact:
     def _measure(self, here: Array) -> None:
         """Bring the distances up to date wherever they could matter."""
         moved = np.linalg.norm(here - self._seen_at, axis=1)
-        for side in (self._left, ~self._left):
-            lower = np.where(np.isfinite(moved), self._distance - moved, -np.inf)
-            first = np.flatnonzero(side)[np.argmin(lower[side])]
-            self._look(here, np.array([first]))
-            moved[first] = 0.0
-            reach = self._distance[first] + REACH
-            stale = np.flatnonzero(side & (moved > 0.0) & (lower < reach))
-            self._look(here, stale)
+        lower = np.where(np.isfinite(moved), self._distance - moved, -np.inf)
+        sides = (self._left, ~self._left)
+        first = np.array([np.flatnonzero(side)[np.argmin(lower[side])] for side in sides])
+        self._look(here, first)
+        moved[first] = 0.0
+        reach = np.where(self._left, *(self._distance[first] + REACH))
+        self._look(here, np.flatnonzero((moved > 0.0) & (lower < reach)))
 
     def _look(self, here: Array, which: NDArray[np.int64]) -> None:
         if len(which) == 0:
