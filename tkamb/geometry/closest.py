@@ -12,6 +12,7 @@ from tkamb.geometry.frames import Array, transform
 from tkamb.geometry.nearest import NearestPoints
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
+from tkamb.units import MILLIMETRE
 
 Indices = NDArray[np.int64]
 
@@ -110,15 +111,18 @@ class ClosestPointQuery:
         result = fcl.DistanceResult()
         femoral, insert = condyle.placed(pose), fcl.CollisionObject(self._insert_tree)
         distance = fcl.distance(femoral, insert, request, result)
-        on_femoral, on_insert = (np.asarray(point, float) for point in result.nearest_points)
-        return float(distance), on_femoral, on_insert
+        on_femoral, on_insert = (np.asarray(point) * MILLIMETRE for point in result.nearest_points)
+        return float(distance) * MILLIMETRE, on_femoral, on_insert
 
-    def _crossed(self, condyle: "_Condyle", pose: Array) -> Indices:
-        """Return which triangles of the condyle cut through the insert's surface."""
+    def _touching(self, condyle: "_Condyle", pose: Array) -> Indices:
+        """Return the triangles of the condyle that cut or touch the insert's surface."""
         request = fcl.CollisionRequest(num_max_contacts=_BATCH, enable_contact=True)
         result = fcl.CollisionResult()
         fcl.collide(condyle.placed(pose), fcl.CollisionObject(self._insert_tree), request, result)
-        return np.unique(np.array([contact.b1 for contact in result.contacts], np.int64))
+        if result.contacts:
+            return condyle.faces[np.unique([contact.b1 for contact in result.contacts])]
+        distance = self._nearest.at(transform(pose, condyle.points)).distance
+        return condyle.around(condyle.vertices[[np.argmin(distance)]])
 
     def _deepest_vertices(self, condyle: "_Condyle", pose: Array) -> Indices:
         """Return the deepest few vertices inside the insert, deepest first; none if apart.
@@ -181,7 +185,8 @@ class _Condyle:
 
     def placed(self, pose: Array) -> fcl.CollisionObject:
         """Return the condyle's tree at a pose (4, 4)."""
-        return fcl.CollisionObject(self.tree, fcl.Transform(pose[:3, :3], pose[:3, 3]))
+        place = fcl.Transform(pose[:3, :3], pose[:3, 3] / MILLIMETRE)
+        return fcl.CollisionObject(self.tree, place)
 
     def around(self, vertices: Indices) -> Indices:
         """Return the triangles that touch the vertices."""
@@ -198,9 +203,14 @@ def closest_points(
 
 
 def _tree(surface: Surface, faces: Indices) -> fcl.BVHModel:
+    """Return the triangles as a tree in millimetres.
+
+    fcl compares with absolute tolerances: in metres it finds small triangles that are 30 µm
+    apart to touch.
+    """
     model = fcl.BVHModel()
     model.beginModel(len(surface.vertices), len(faces))
-    model.addSubModel(surface.vertices, surface.faces[faces])
+    model.addSubModel(surface.vertices / MILLIMETRE, surface.faces[faces])
     model.endModel()
     return model
 
