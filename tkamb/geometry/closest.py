@@ -19,8 +19,6 @@ Indices = NDArray[np.int64]
 _ROUNDS = 3
 _KEPT = 8
 _BATCH = 64
-_TOUCHING = 1e-8
-"""m; surfaces that touch without cutting are raised by this to find their closest points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,13 +96,7 @@ class ClosestPointQuery:
         gap, on_femoral, on_insert = self._apart(condyle, pose)
         if gap > 0:
             return gap, on_femoral, on_insert
-        crossed = self._crossed(condyle, pose)
-        if len(crossed):
-            return self._refined(condyle.faces[crossed], pose)
-        raised = pose.copy()
-        raised[1, 3] += _TOUCHING
-        _, on_femoral, on_insert = self._apart(condyle, raised)
-        return 0.0, on_femoral, on_insert
+        return self._refined(self._touching(condyle, pose), pose)
 
     def _apart(self, condyle: "_Condyle", pose: Array) -> tuple[float, Array, Array]:
         request = fcl.DistanceRequest(enable_nearest_points=True)
