@@ -31,7 +31,10 @@ def sphere_cap(radius, reach=6e-3, step=1e-4, sectors=96):
     faces = [np.stack([np.zeros_like(a), 1 + a, 1 + b], axis=1)]
     for ring in range(count - 1):
         low, high = 1 + ring * sectors, 1 + (ring + 1) * sectors
-        faces += [np.stack([low + a, high + a, high + b], 1), np.stack([low + a, high + b, low + b], 1)]
+        faces += [
+            np.stack([low + a, high + a, high + b], 1),
+            np.stack([low + a, high + b, low + b], 1),
+        ]
     return Surface(np.vstack([[0, -radius, 0], rim]), np.concatenate(faces), "cap")
 
 
@@ -61,7 +64,7 @@ def dished_insert(width=24e-3, depth=40e-3, height=9e-3, radius=30e-3, cells=48)
     return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64), "dished insert")
 
 
-def condyles(radius=24e-3, offset=10e-3, subdivisions=5):
+def condyles(radius=20e-3, offset=10e-3, subdivisions=5):
     """Return two spheres as a femoral component (m)."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
     parts = [ball.copy().apply_translation((0, 0, side * offset)) for side in (-1, 1)]

@@ -22,6 +22,7 @@ from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve
 from tkamb.contact.materials import LinearElastic, Material
 from tkamb.contact.model import ContactModel, ContactPair, ContactResult, PreparedContact
 from tkamb.contact.pressing import check_load, failed_result, first_touch_height, pose_at_approach
+from tkamb.errors import ComputationError
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import Array
 from tkamb.geometry.rays import RayCaster
@@ -179,7 +180,10 @@ class CellContact(ContactModel):
         solution = solve(problem, pose, load, start, tolerance)
         if solution.converged or problem.solid.material.is_linear:
             return solution
-        return solve_by_newton(problem, pose, load, start, tolerance, solution.field)
+        try:
+            return solve_by_newton(problem, pose, load, start, tolerance, solution.field)
+        except ComputationError:
+            return solution
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from tkamb.contact.lattice.active_set import ContactForces
 from tkamb.contact.lattice.operator import prepare_operator
 from tkamb.contact.lattice.problem import ContactProblem, Footing, Indices, Mask, footing
 from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve_pass, violation
+from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
 
 MOST_STEPS = 30
@@ -34,6 +35,9 @@ def solve_by_newton(
         start: candidates and first active set; its compliance is not used.
         tolerance: of force and femoral surface; its number of passes is not used.
         field: (n, 3) m, where to start; at rest by default.
+
+    Raises:
+        ComputationError: the tangent is not positive definite, or numbers overflow.
     """
     solid, free = problem.solid, ~problem.held
     nodes = problem.contact_nodes[start.candidates]
@@ -51,6 +55,8 @@ def solve_by_newton(
         size = max(float(np.linalg.norm(pushed)), 1e-300)
         balance = (solid.internal_force(u) - pushed).ravel()[free]
         residual = float(np.linalg.norm(balance)) / size
+        if not np.isfinite(residual):
+            raise ComputationError("Newton's iteration left the range of numbers")
         settled = footing(problem, points + u[nodes], pose, foot)
         missed = violation(points, u[nodes], settled, forces)
         done = not active.any() or max(residual, missed) <= tolerance.force

@@ -24,6 +24,10 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
+DIVERGED = 100.0
+"""The iteration is given up when the imbalance is this many times the smallest so far."""
+
+
 @dataclass(frozen=True)
 class Tolerance:
     """When the iteration stops.
@@ -129,6 +133,7 @@ def solve(
     begun = operator.start(lost)
     offset = operator.half.project(begun).reshape(-1, 3)[chosen]
     foot = footing(problem, points + offset, pose, None)
+    best: Solution | None = None
     while True:
         passes += 1
         forces, moved = solve_pass(start.compliance, offset, points, foot, load, active)
@@ -137,9 +142,13 @@ def solve(
         settled = footing(problem, points + moved, pose, foot)
         missed = violation(points, moved, settled, forces)
         done = not active.any() or max(residual, missed) <= tolerance.force
-        if done or passes == tolerance.passes:
-            forces = replace(forces, converged=done and forces.converged)
-            return Solution(chosen, forces, foot, moved, field, lost, passes, residual)
+        forces = replace(forces, converged=done and forces.converged)
+        now = Solution(chosen, forces, foot, moved, field, lost, passes, residual)
+        best = now if best is None or residual < best.residual else best
+        if done:
+            return now
+        if passes == tolerance.passes or not residual < DIVERGED * best.residual:
+            return replace(best, passes=passes)
         lost = mixer.next(lost.ravel(), value.ravel()).reshape(-1, 3)
         begun = operator.start(lost)
         offset = operator.half.project(begun).reshape(-1, 3)[chosen]
