@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tkamb.geometry.ceiling import Ceiling
 from tkamb.geometry.frames import Array, inverse, rotate, transform
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
@@ -17,8 +18,8 @@ EDGE_BAND = 0.03
 """Edges whose ends lie within this share of their length of the smallest clearance are tried
 against each other: the sagitta of a chord over a radius of four chords."""
 MOST_EDGES = 1500
-FIRST_LOOK = 16
-"""Every so many vertices give the bound that spares most of the others a ray."""
+FIRST_LOOK = 64
+"""So many promising vertices of each condyle give the bound that spares the others a ray."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +39,10 @@ class FirstTouch:
     """Vertical clearance between two triangulated surfaces, exact for their triangles.
 
     The clearance of two piecewise linear surfaces over x and z is smallest where a vertex of
-    one meets the other, or where two edges cross in the projection. All vertices are tried,
-    and the edges near the smallest of them. The insert is taken as seen from above, the
-    femoral component as seen from below.
+    one meets the other, or where two edges cross in the projection. Every vertex is tried
+    that a coarse bound of the insert's height does not rule out, and the edges near the
+    smallest clearance of those. The insert is taken as seen from above, the femoral
+    component as seen from below.
 
     Args:
         femoral: in the femoral frame.
@@ -54,6 +56,7 @@ class FirstTouch:
         self._femoral_edges = np.asarray(femoral.mesh.edges_unique, np.int64)
         self._insert_edges = np.asarray(insert.mesh.edges_unique, np.int64)
         self._insert_tops = _with_face_towards(insert, UP)
+        self._ceiling = Ceiling(insert)
 
     def at(self, pose: ArrayLike) -> tuple[Touch | None, Touch | None]:
         """Return the touch of the medial and of the lateral condyle.
@@ -65,10 +68,14 @@ class FirstTouch:
         """
         pose = np.asarray(pose, float)
         femoral = transform(pose, self._femoral.vertices)
-        sides = self._sides(self._femoral.vertices, transform(inverse(pose), self._insert.vertices))
+        sides = self._sides(pose)
         clearances = self._clearances(pose, femoral, sides)
+        edges = (
+            _finite_edges(self._femoral_edges, clearances[0]),
+            _finite_edges(self._insert_edges, clearances[1]),
+        )
         return tuple(  # type: ignore[return-value]
-            self._lowest(femoral, clearances, (sides[0] == side, sides[1] == side))
+            self._lowest(femoral, clearances, (sides[0] == side, sides[1] == side), edges)
             for side in (0, 1)
         )
 
@@ -77,34 +84,55 @@ class FirstTouch:
         touches = [touch.travel for touch in self.at(pose) if touch is not None]
         return min(touches, default=float("nan"))
 
-    def _sides(self, femoral: Array, insert: Array) -> tuple[Index, Index]:
-        """Return 0 (medial) or 1 (lateral) for the vertices of both, given in femoral axes."""
-        limit = np.inf if self._split is None else self._split
-        return (femoral[:, 2] >= limit).astype(int), (insert[:, 2] >= limit).astype(int)
+    def _sides(self, pose: Array) -> tuple[Index, Index]:
+        """Return 0 (medial) or 1 (lateral) for the vertices of both bodies."""
+        if self._split is None:
+            return tuple(np.zeros(len(s.vertices), int) for s in (self._femoral, self._insert))  # type: ignore[return-value]
+        insert = transform(inverse(pose), self._insert.vertices)
+        z = (self._femoral.vertices[:, 2], insert[:, 2])
+        return (z[0] >= self._split).astype(int), (z[1] >= self._split).astype(int)
 
     def _clearances(
         self, pose: Array, femoral: Array, sides: tuple[Index, Index]
     ) -> tuple[Array, Array]:
         """Return the clearance at the vertices of both; inf where there is none, or too high."""
-        low, high = self._insert.bounds
-        over = ((femoral >= low) & (femoral <= high))[:, [0, 2]].all(axis=1)
-        bottoms = np.flatnonzero(over & _with_face_towards(self._femoral, rotate(pose.T, -UP)))
+        over = _within(femoral, self._insert.bounds)
+        down = self._femoral.face_normals @ rotate(pose.T, -UP) > 0
+        bottom = np.zeros(len(femoral), bool)
+        bottom[self._femoral.faces[down].ravel()] = True
+        bottoms = np.flatnonzero(over & bottom)
+        at_least = femoral[bottoms, 1] - self._ceiling.over(femoral[bottoms])
         of_femoral = np.full(len(femoral), np.inf)
-        look = bottoms[np.argsort(femoral[bottoms, 1])[::FIRST_LOOK]]
-        of_femoral[look] = self._over_insert(femoral[look])
-        bound = max(of_femoral[sides[0] == side].min(initial=np.inf) for side in (0, 1))
-        if self._split is None or not np.isfinite(bound):
-            bound = of_femoral.min() if self._split is None else np.inf
-        rest = bottoms[femoral[bottoms, 1] - high[1] <= bound]
+        bounds = np.full(2, np.inf)
+        for side in (0, 1):
+            mine = np.flatnonzero(sides[0][bottoms] == side)
+            look = bottoms[mine[np.argsort(at_least[mine])[:FIRST_LOOK]]]
+            of_femoral[look] = self._over_insert(femoral[look])
+            bounds[side] = of_femoral[look].min(initial=np.inf)
+        bound = bounds[sides[0]]
+        rest = bottoms[(at_least <= bound[bottoms]) & ~np.isfinite(of_femoral[bottoms])]
         of_femoral[rest] = self._over_insert(femoral[rest])
-
-        vertices = self._insert.vertices
-        under = (vertices >= femoral.min(axis=0)) & (vertices <= femoral.max(axis=0))
-        near = femoral[:, 1].min() - vertices[:, 1] <= bound
-        tops = np.flatnonzero(self._insert_tops & under[:, [0, 2]].all(axis=1) & near)
-        of_insert = np.full(len(vertices), np.inf)
-        of_insert[tops] = self._under_femoral(pose, femoral, vertices[tops])
+        of_insert = np.full(len(self._insert.vertices), np.inf)
+        tops = self._near_tops(femoral, np.flatnonzero(down), bound)
+        of_insert[tops] = self._under_femoral(pose, femoral, self._insert.vertices[tops])
         return of_femoral, of_insert
+
+    def _near_tops(self, femoral: Array, down: Index, bound: Array) -> Index:
+        """Return the insert's vertices over which a femoral triangle may be low enough.
+
+        `bound` (n,) is the clearance known for the side of each femoral vertex.
+        """
+        extent = np.stack([femoral.min(axis=0), femoral.max(axis=0)])
+        tops = self._insert_tops & _within(self._insert.vertices, extent)
+        faces = self._femoral.faces[down]
+        a, b, c = (femoral[faces[:, corner]] for corner in range(3))
+        low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+        highest = np.maximum.reduce([bound[faces[:, corner]] for corner in range(3)])
+        likely = low[:, 1] - self._insert.bounds[1, 1] <= highest
+        low, high, highest = low[likely], high[likely], highest[likely]
+        near = low[:, 1] - self._ceiling.over_rectangles(low[:, ::2], high[:, ::2]) <= highest
+        tops &= self._ceiling.vertices_in_rectangles(low[near, ::2], high[near, ::2])
+        return np.flatnonzero(tops)
 
     def _over_insert(self, points: Array) -> Array:
         start = points.copy()
@@ -120,7 +148,11 @@ class FirstTouch:
         return np.asarray(start[:, 1] + distance - points[:, 1])
 
     def _lowest(
-        self, femoral: Array, clearances: tuple[Array, Array], chosen: tuple[Mask, Mask]
+        self,
+        femoral: Array,
+        clearances: tuple[Array, Array],
+        chosen: tuple[Mask, Mask],
+        edges: tuple[Index, Index],
     ) -> Touch | None:
         of_femoral = np.where(chosen[0], clearances[0], np.inf)
         of_insert = np.where(chosen[1], clearances[1], np.inf)
@@ -130,8 +162,8 @@ class FirstTouch:
         best = Touch(float(of_insert[i]), self._insert.vertices[i].copy())
         if of_femoral[f] < best.travel:
             best = Touch(float(of_femoral[f]), femoral[f] - of_femoral[f] * UP)
-        a = _near_edges(self._femoral_edges, femoral, of_femoral, best.travel)
-        b = _near_edges(self._insert_edges, self._insert.vertices, of_insert, best.travel)
+        a = _near_edges(edges[0], femoral, of_femoral, best.travel)
+        b = _near_edges(edges[1], self._insert.vertices, of_insert, best.travel)
         crossing = _crossing(femoral[a], self._insert.vertices[b])
         return best if crossing is None or crossing.travel >= best.travel else crossing
 
@@ -144,9 +176,21 @@ def _with_face_towards(surface: Surface, direction: Array) -> Mask:
     return mask
 
 
+def _within(points: Array, bounds: Array) -> Mask:
+    """Say which points (n, 3) lie within bounds (2, 3) in x and z."""
+    x, z, (low, high) = points[:, 0], points[:, 2], bounds
+    return np.asarray((x >= low[0]) & (x <= high[0]) & (z >= low[2]) & (z <= high[2]))
+
+
+def _finite_edges(edges: Index, clearance: Array) -> Index:
+    """Return the edges (k, 2) with an end whose clearance is known."""
+    known = np.isfinite(clearance)
+    return edges[known[edges[:, 0]] | known[edges[:, 1]]]
+
+
 def _near_edges(edges: Index, vertices: Array, clearance: Array, smallest: float) -> Index:
     """Return the edges (k, 2) with an end close to the smallest clearance."""
-    some = edges[np.isfinite(clearance[edges]).any(axis=1)]
+    some = _finite_edges(edges, clearance)
     length = np.linalg.norm(vertices[some[:, 0]] - vertices[some[:, 1]], axis=1)
     above = clearance[some].min(axis=1) - smallest - EDGE_BAND * length
     near = np.flatnonzero(above <= EDGE_BAND * np.median(length)) if len(some) else some[:, 0]
