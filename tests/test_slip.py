@@ -1,5 +1,7 @@
 """A cylinder that rolls, slides and spins on a plate and in a trough: arcs in closed form."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -12,8 +14,13 @@ from tkamb.body.slip import (
     roll_slip_motion,
     sliding_velocity,
 )
-from tkamb.geometry.frames import Array, knee_pose, knee_twist
+from tkamb.case import load_case
+from tkamb.geometry.arcs import arc_lengths
+from tkamb.geometry.frames import Array, inverse, knee_pose, knee_twist, transform
+from tkamb.geometry.lowest import LowestPoints
+from tkamb.geometry.profiles import condyle_profile
 from tkamb.geometry.surface import Surface
+from tkamb.scene import load_scene
 
 RADIUS, TROUGH, DEPTH = 0.02, 0.05, 0.012
 FRAMES = 61
@@ -169,3 +176,23 @@ def test_profile_of_the_trough() -> None:
     height, slope = InsertProfile(bed(True)).at(np.column_stack([x, x, 0.01 + 0 * x]))
     assert height == pytest.approx(DEPTH + TROUGH - np.sqrt(TROUGH**2 - x**2), abs=1e-6)
     assert slope == pytest.approx(np.arcsin(x / TROUGH), abs=2e-4)
+
+
+def test_arcs_agree_with_the_exact_sections() -> None:
+    """Shipped knee, 0-120 deg: circles between frames against splines along the sections."""
+    path = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
+    case = load_case(load_scene(path))
+    assert case.femoral is not None
+    assert case.insert is not None
+    coordinates = case.motion.coordinates
+    poses = knee_pose(coordinates)
+    side, _ = condyle_slip(case.femoral, case.insert, case.split, coordinates)
+    points = np.array([LowestPoints(case.femoral, case.split).at(pose)[0] for pose in poses])
+    here = transform(inverse(poses), points[:, None])[:, 0]
+    profile = condyle_profile(case.femoral, float(here[:, 2].mean()))
+    section = np.ptp(profile.locate(here[[0, -1], :2]))
+    assert side.femoral_arc[-1] == pytest.approx(section, rel=5e-3)
+    ahead = points[:-1] * [1.0, 1.0, 0.0] + points[0] * [0.0, 0.0, 1.0]
+    behind = points[1:] * [1.0, 1.0, 0.0] + points[0] * [0.0, 0.0, 1.0]
+    travelled = arc_lengths(case.insert, ahead, behind).sum()
+    assert np.abs(np.diff(side.insert_arc)).sum() == pytest.approx(travelled, rel=5e-3)

@@ -16,7 +16,7 @@ def corner_normals(surface: Surface, sharp: float = SHARP) -> Array:
 
     Each is the angle-weighted mean of the normals of those triangles at the vertex that turn
     by less than `sharp` from the triangle itself, so that a rim does not tilt the normals of
-    the surface beside it. Interpolated over a triangle they err by O(h²), a facet by O(h).
+    the surface beside it. They err by a tenth or less of what a facet does.
 
     Args:
         surface: its triangles share their vertices.

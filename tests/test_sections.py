@@ -1,0 +1,43 @@
+"""Corner normals keep rims sharp and smooth parts smooth."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from tkamb.geometry.corner_normals import corner_normals, sharp_edges
+from tkamb.geometry.surface import Surface
+
+
+def surface(mesh: trimesh.Trimesh) -> Surface:
+    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), mesh.metadata.get("name", ""))
+
+
+def test_rim_of_a_cylinder_does_not_tilt_the_wall() -> None:
+    part = surface(trimesh.creation.cylinder(0.02, 0.05, sections=180))
+    normals = corner_normals(part)
+    wall = np.abs(part.face_normals[:, 2]) < 0.5
+    corners = part.triangles[wall]
+    radial = corners * [1.0, 1.0, 0.0]
+    radial /= np.linalg.norm(radial, axis=2, keepdims=True)
+    assert normals[wall] == pytest.approx(radial, abs=1e-3)
+    flat = np.broadcast_to(part.face_normals[~wall][:, None], normals[~wall].shape)
+    assert normals[~wall] == pytest.approx(flat, abs=1e-12)
+
+
+def test_far_nearer_to_a_sphere_than_the_facets() -> None:
+    """At the corners: below a tenth of the facets' error, and falling with the edge length."""
+    errors = []
+    for level in (3, 4, 5):
+        part = surface(trimesh.creation.icosphere(level, 1.0))
+        off = np.linalg.norm(corner_normals(part) - part.triangles, axis=2)
+        facets = np.linalg.norm(part.face_normals[:, None] - part.triangles, axis=2)
+        assert off.mean() < 0.1 * facets.mean()
+        errors.append(off.mean())
+    assert errors[0] > 1.9 * errors[1] > 1.9**2 * errors[2]
+
+
+def test_sharp_and_open_edges_of_a_box() -> None:
+    box = trimesh.creation.box()
+    assert sharp_edges(surface(box)).sum() == 24
+    opened = Surface(np.asarray(box.vertices), np.asarray(box.faces[1:]), "opened")
+    assert sharp_edges(opened).sum() == 24 - 2 + 1
