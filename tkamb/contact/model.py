@@ -115,6 +115,11 @@ class PreparedContact(ABC):
     points: Array
     triangles: NDArray[np.int64]
 
+    @property
+    def node_count(self) -> int:
+        """Nodes that the model solves for; the map's points where it has no others."""
+        return len(self.points)
+
 
 class ContactModel(ABC):
     """A frozen set of parameters that answers the contract.

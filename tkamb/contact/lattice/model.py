@@ -63,6 +63,11 @@ class LatticeState(PreparedContact):
         """Map triangles (k, 3)."""
         return self.map.triangles
 
+    @property
+    def node_count(self) -> int:
+        """Nodes of the grid."""
+        return len(self.lattice.nodes)
+
 
 @dataclass(frozen=True)
 class CellContact(ContactModel):
