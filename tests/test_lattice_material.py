@@ -17,8 +17,6 @@ STRAINS = [-0.2, -0.1, -0.05, -0.02, -0.005, 0.005, 0.02, 0.05, 0.1, 0.2]
 TABLE = tabulated_material(
     "table", [0, 0.01, 0.03, 0.08, 0.2, 0.4], [0, 5e6, 11e6, 17e6, 24e6, 33e6], 0.4
 )
-    "table", [0, 0.01, 0.03, 0.08, 0.2, 0.4], [0, 5e6, 11e6, 17e6, 24e6, 33e6], 0.4
-)
 
 
 def pressed_block(solid, mat, strain, confined):
