@@ -1,0 +1,59 @@
+"""The viewer's colours: scales and palette that colour-blind readers can tell apart."""
+
+import numpy as np
+from matplotlib import colormaps
+from numpy.typing import ArrayLike, NDArray
+
+from tkamb.output.style import (
+    BLACK,
+    GREEN,
+    LATERAL,
+    MEDIAL,
+    ORANGE,
+    PRESSURE_MAP,
+    PURPLE,
+    SKY,
+)
+
+METAL, INSERT, BONE, BUTTON = "#8d99a8", "#ece8dc", "#e2d3ad", "#dcd8cc"
+TENDON, WRAPPED = "#8c3b2e", "#f0c419"
+SLACK = "#9a9a9a"
+RECORDED = SKY
+FORCE = {
+    "ground reaction": BLACK,
+    "hip": PURPLE,
+    "quadriceps": GREEN,
+    "patellar ligament": ORANGE,
+    "patellofemoral": SKY,
+    "medial condyle": MEDIAL,
+    "lateral condyle": LATERAL,
+    "knee": MEDIAL,
+}
+
+Colours = NDArray[np.uint8]
+
+
+def rgb(colour: str) -> Colours:
+    """Return (3,) 0 to 255 of "#rrggbb"."""
+    return np.frombuffer(bytes.fromhex(colour.removeprefix("#")), np.uint8)
+
+
+def pressure_scale() -> Colours:
+    """Return the 256 colours (256, 3) from no pressure to the largest of all frames."""
+    return _sampled(PRESSURE_MAP, np.linspace(0.0, 1.0, 256))
+
+
+def strain_scale() -> Colours:
+    """Return the 256 colours (256, 3) from no strain to the limit."""
+    return _sampled("YlOrRd", np.linspace(0.15, 1.0, 256))
+
+
+def strain_colours(strain: ArrayLike, limit: float) -> Colours:
+    """Return colours (..., 3) of ligament strains; slack (strain <= 0) is grey."""
+    strain = np.asarray(strain, float)
+    level = np.clip(np.nan_to_num(strain) / (limit or 1.0) * 255.0, 0.0, 255.0).astype(int)
+    return np.where((strain > 0)[..., None], strain_scale()[level], rgb(SLACK)).astype(np.uint8)
+
+
+def _sampled(name: str, at: NDArray[np.float64]) -> Colours:
+    return np.round(colormaps[name](at)[:, :3] * 255.0).astype(np.uint8)

@@ -1,0 +1,88 @@
+"""A run into a drawing: geometry of the scene, forces of results.csv, pressure of the maps."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.output.axis import horizontal_axis
+from tkamb.output.pressure_maps import map_rows
+from tkamb.results import Results
+from tkamb.units import MEGAPASCAL
+from tkamb.view.arrows import contact_markers, force_arrows
+from tkamb.view.drawing import Drawing, PressureMap
+from tkamb.view.readings import places, readings
+from tkamb.view.run import Run
+from tkamb.view.solids import solids
+from tkamb.view.strands import (
+    centre_markers,
+    centres_of_pressure,
+    extensor_strands,
+    ligament_strands,
+    path_strands,
+)
+
+Progress = Callable[[Iterable[int]], Iterable[int]]
+
+STAND_INS = "Bones are plain stand-ins between the joint centres; they carry no load."
+
+
+def draw(run: Run, progress: Progress = lambda frames: frames) -> Drawing:
+    """Return what is drawn of a run.
+
+    Args:
+        run: case, mechanics and results that belong together.
+        progress: wraps the frame indices, a progress bar for example.
+    """
+    case, mechanics, results = run.case, run.mechanics, run.results
+    geometries = [mechanics.frame(k).geometry for k in progress(run.frames)]
+    states = [one.state for one in geometries]
+    maps, found = results.maps, map_rows(results)
+    rows = [found.get(k, -1) for k in range(len(results))]
+    contact = case.scene.contact
+    bundles, limit = ligament_strands(mechanics, states)
+    strands = [*bundles, *extensor_strands(mechanics, states)]
+    markers = [*contact_markers(geometries)]
+    if maps is not None and found:
+        centres = centres_of_pressure(results, maps)
+        strands += path_strands(centres)
+        markers += centre_markers(centres)
+    axis = horizontal_axis(results)
+    return Drawing(
+        title=_title(run),
+        side=case.scene.patient.side,
+        body_weight=case.body_weight,
+        contact=contact.model if contact else "",
+        places=places(axis),
+        times=results["time_s"],
+        statuses=tuple(results.status),
+        readings=readings(results, axis),
+        solids=solids(case, states, maps, rows),
+        strands=tuple(strands),
+        arrows=force_arrows(results, geometries, contact.friction if contact else 0.0),
+        markers=tuple(markers),
+        map=_pressure_map(results, rows),
+        strain_limit=limit,
+        notes=(STAND_INS, *case.scene.output.notes),
+    )
+
+
+def _title(run: Run) -> str:
+    path = Path(str(run.results.summary.get("scene") or "scene"))
+    name = path.parent.name if path.stem == "scene" and path.parent.name else path.stem
+    name = name.upper() if len(name) <= 3 else name.replace("_", " ").capitalize()
+    contact = run.case.scene.contact
+    if contact is None:
+        return f"{name} (contact not modelled)"
+    return f"{name}, contact: {contact.model} at {contact.resolution_mm:g} mm"
+
+
+def _pressure_map(results: Results, rows: list[int]) -> PressureMap | None:
+    maps = results.maps
+    if maps is None or all(row < 0 for row in rows):
+        return None
+    stored = maps.pressure_Pa / MEGAPASCAL
+    pressure = np.stack(
+        [stored[row] if row >= 0 else np.full(len(maps.points_m), np.nan) for row in rows]
+    )
+    return PressureMap(maps.points_m, maps.triangles, pressure)

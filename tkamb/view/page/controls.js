@@ -1,0 +1,223 @@
+"use strict";
+// The page around the scene: slider, layers, cameras, numbers, colour bars, contact models.
+
+const CAMERAS = {
+  "oblique": {from: [0.36, 0.17, -0.34]},
+  "anterior": {from: [0.52, 0.06, 0]},
+  "medial": {from: [0, 0.04, -0.52]},
+  "lateral": {from: [0, 0.04, 0.52]},
+  "top of insert": {
+    from: [-0.0004, 0.24, 0], at: [0, 0.012, 0],
+    without: ["femoral component", "bones", "patella", "ligaments", "extensor lines", "forces"]},
+  "whole leg": {from: [1.55, 0.3, -1.55], at: [-0.1, 0, 0]},
+};
+const KNEE = [0, 0.03, 0];
+const element = (id) => document.getElementById(id);
+
+function made(tag, text, parent, attributes = {}) {
+  const child = document.createElement(tag);
+  child.textContent = text;
+  for (const [name, value] of Object.entries(attributes)) child.setAttribute(name, value);
+  if (parent) parent.appendChild(child);
+  return child;
+}
+
+tkamb.look = function (name) {
+  const camera = CAMERAS[name], at = camera.at || KNEE;
+  const mirrored = tkamb.views[0].side === "left" ? -1 : 1;
+  const {viewer} = tkamb;
+  viewer.controls.target.set(...at);
+  viewer.camera.position.set(
+    at[0] + camera.from[0], at[1] + camera.from[1], at[2] + mirrored * camera.from[2]);
+  for (const layer of tkamb.data.layers) {
+    const off = (camera.without || []).includes(layer) || tkamb.switchedOff.has(layer);
+    tkamb.showLayer(layer, !off);
+  }
+  tkamb.camera = name;
+  for (const button of element("cameras").children) {
+    button.setAttribute("aria-pressed", button.textContent === name);
+  }
+  showSwitches();
+};
+
+function addCameras() {
+  Object.keys(CAMERAS).forEach((name, k) => {
+    const button = made("button", name, element("cameras"), {title: `key ${k + 1}`});
+    button.addEventListener("click", () => tkamb.look(name));
+  });
+}
+
+function addLayers() {
+  tkamb.switchedOff = new Set(tkamb.data.hidden);
+  for (const layer of tkamb.data.layers) {
+    if (isEmpty(layer)) continue;
+    const label = made("label", "", element("layers"));
+    const box = made("input", "", label, {type: "checkbox", "data-layer": layer});
+    label.append(layer === "recorded pose" ? "recorded pose (ghost)" : layer);
+    box.addEventListener("change", () => {
+      tkamb.switchedOff[box.checked ? "delete" : "add"](layer);
+      tkamb.showLayer(layer, box.checked);
+    });
+  }
+}
+
+function isEmpty(layer) {
+  return tkamb.views.every((view) =>
+    Object.keys(tkamb.node(`${view.root}/${layer}`).children).length === 0);
+}
+
+function showSwitches() {
+  for (const box of document.querySelectorAll("#layers input")) {
+    box.checked = tkamb.layerShown(box.dataset.layer);
+  }
+}
+
+function addLegends() {
+  const {data, views} = tkamb;
+  const peak = data.peak_MPa;
+  element("pressure-bar").hidden = !(peak > 0);
+  element("strain-bar").hidden = !(data.strain_limit > 0);
+  colourBar("pressure-bar", data.pressure_scale, peak, 1);
+  colourBar("strain-bar", data.strain_scale, 100 * data.strain_limit, 1);
+  const known = new Set();
+  for (const view of views) {
+    for (const arrow of view.arrows) {
+      if (known.has(arrow.name)) continue;
+      known.add(arrow.name);
+      const row = made("tr", "", element("forces"), {title: arrow.meaning});
+      made("i", "", made("td", "", row)).style.background = arrow.colour;
+      made("td", `${arrow.name}, ${arrow.meaning}`, row);
+      for (const other of views) {
+        made("td", "", row, {class: "number"}).arrow = other.arrows.find(
+          (one) => one.name === arrow.name);
+      }
+    }
+  }
+  const weights = views.map((view) => `${view.body_weight.toFixed(0)} N`).join(" / ");
+  const millimetres = 1000 * data.metres_per_body_weight;
+  element("scale").textContent = `${millimetres} mm of arrow = 1 BW = ${weights}`;
+}
+
+function colourBar(id, scale, top, digits) {
+  const stops = [];
+  for (let k = 0; k < 256; k += 15) {
+    stops.push(`rgb(${scale[3 * k]},${scale[3 * k + 1]},${scale[3 * k + 2]})`);
+  }
+  const bar = element(id);
+  bar.querySelector(".stripe").style.background = `linear-gradient(to top, ${stops.join(",")})`;
+  bar.dataset.low = 0;
+  bar.dataset.high = top;
+  const ticks = bar.querySelector(".ticks");
+  for (const share of [1, 0.75, 0.5, 0.25, 0]) {
+    made("span", (share * top).toFixed(digits), ticks).style.bottom = `${100 * share}%`;
+  }
+}
+
+function addNumbers() {
+  const table = element("numbers"), {views} = tkamb;
+  element("titles").replaceChildren();
+  for (const view of views) {
+    made("div", `${view.title} · ${view.side} knee`, element("titles"));
+  }
+  if (views.length > 1) {
+    const head = made("tr", "", table);
+    made("th", "", head);
+    views.forEach((view, k) => made("th", `${k ? "right" : "left"} picture`, head));
+  }
+  const names = [...new Set(views.flatMap((view) => view.readings.map((row) => row.name)))];
+  for (const name of names) {
+    const row = made("tr", "", table);
+    made("td", name, row);
+    for (const view of views) {
+      const found = view.readings.find((one) => one.name === name);
+      made("td", "", row, {class: "number"}).values = found && found.values;
+    }
+  }
+  const notes = new Set(views.flatMap((view) => view.notes));
+  for (const note of notes) made("li", note, element("notes"));
+}
+
+function showNumbers() {
+  const frames = tkamb.views.map(tkamb.frameOf);
+  for (const row of element("numbers").rows) {
+    [...row.cells].slice(1).forEach((cell, k) => {
+      if (cell.tagName === "TD") cell.textContent = cell.values ? cell.values[frames[k]] : "–";
+    });
+  }
+  for (const row of element("forces").rows) {
+    [...row.cells].slice(2).forEach((cell, k) => {
+      cell.textContent = inBodyWeights(cell.arrow, frames[k], tkamb.views[k].body_weight);
+    });
+  }
+  const words = tkamb.views.map((view, k) => view.statuses[frames[k]]);
+  const plain = words.map((word) => (word === "ok" ? "" : word)).filter(Boolean);
+  element("status").textContent = [...new Set(plain)].join(" · ");
+  element("status").hidden = plain.length === 0;
+  element("place").textContent =
+    `frame ${tkamb.frame} of ${tkamb.frameCount() - 1}: ${tkamb.views[0].places[frames[0]]}`;
+  element("frame").value = tkamb.frame;
+}
+
+function inBodyWeights(arrow, frame, weight) {
+  if (!arrow) return "–";
+  const size = Math.hypot(...arrow.forces.subarray(3 * frame, 3 * frame + 3));
+  return Number.isFinite(size) ? `${(size / weight).toFixed(2)} BW` : "–";
+}
+
+tkamb.go = function (frame) {
+  tkamb.showFrame(frame);
+  showNumbers();
+  tkamb.live && tkamb.live.frameChanged();
+};
+
+function addPlayer() {
+  const slider = element("frame"), button = element("play");
+  slider.max = tkamb.frameCount() - 1;
+  slider.addEventListener("input", () => tkamb.go(Number(slider.value)));
+  let started = null;
+  const times = tkamb.views.reduce((a, b) => (a.times.length >= b.times.length ? a : b)).times;
+  const last = times.length - 1;
+  const step = (now) => {
+    if (started === null) return;
+    const speed = Number(element("speed").value);
+    const time = times[0] + started.from + (now - started.at) / 1000 * speed;
+    if (time > times[last]) started = {at: now, from: 0};
+    let frame = 0;
+    while (frame < last && times[frame + 1] <= time) frame++;
+    const wanted = time > times[last] ? 0 : frame;
+    if (wanted !== tkamb.frame) tkamb.go(wanted);
+    requestAnimationFrame(step);
+  };
+  const restart = () => {
+    started = {at: performance.now(), from: times[tkamb.frame] - times[0]};
+  };
+  tkamb.play = (on) => {
+    const was = started !== null;
+    if (on) restart(); else started = null;
+    button.textContent = on ? "❚❚ pause" : "▶ play";
+    if (on && !was) requestAnimationFrame(step);
+  };
+  button.addEventListener("click", () => tkamb.play(started === null));
+  element("speed").addEventListener("change", () => started && restart());
+  slider.addEventListener("pointerdown", () => tkamb.play(false));
+  tkamb.togglePlay = () => tkamb.play(started === null);
+}
+
+function addKeys() {
+  document.addEventListener("keydown", (event) => {
+    if (["INPUT", "SELECT"].includes(event.target.tagName) && event.target.type !== "checkbox") {
+      return;
+    }
+    const camera = Object.keys(CAMERAS)[Number(event.key) - 1];
+    if (event.key === " ") tkamb.togglePlay();
+    else if (event.key === "ArrowRight") tkamb.go(tkamb.frame + 1);
+    else if (event.key === "ArrowLeft") tkamb.go(tkamb.frame - 1);
+    else if (event.key === "n") element("reading").toggleAttribute("open");
+    else if (event.key === "t") {
+      const {style} = tkamb.viewer.gui.domElement;
+      style.display = style.display === "none" ? "" : "none";
+    } else if (camera) tkamb.look(camera);
+    else return;
+    event.preventDefault();
+  });
+}

@@ -1,0 +1,159 @@
+"use strict";
+// What stands in the scene: unpacks the drawings and hangs their parts into meshcat's scene tree.
+
+const tkamb = {views: [], frame: 0};
+
+const TYPES = {float32: Float32Array, uint8: Uint8Array, uint32: Uint32Array};
+const SIDES = 10;
+
+tkamb.unpack = async function (bytes) {
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const buffer = await new Response(stream).arrayBuffer();
+  const size = new DataView(buffer).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, size)));
+  return withArrays(header, buffer, 4 + size);
+};
+
+function withArrays(value, buffer, start) {
+  if (value === null || typeof value !== "object") return value;
+  if (typeof value.at === "number" && value.of in TYPES) {
+    return new TYPES[value.of](buffer, start + value.at, value.n);
+  }
+  for (const key of Object.keys(value)) value[key] = withArrays(value[key], buffer, start);
+  return value;
+}
+
+tkamb.split = (path) => path.split("/").filter((part) => part.length > 0);
+tkamb.node = (path) => tkamb.viewer.scene_tree.find(tkamb.split(path));
+
+tkamb.build = function (data) {
+  const viewer = tkamb.viewer;
+  tkamb.data = data;
+  dressScene(viewer);
+  tkamb.scale = scaleTexture(data.pressure_scale);
+  tkamb.views = data.views.map((view, number) => buildView(viewer, view, number));
+  for (const layer of data.hidden) tkamb.showLayer(layer, false);
+  renderSideBySide(viewer);
+};
+
+tkamb.showLayer = function (layer, shown) {
+  tkamb.views.forEach((view, number) => {
+    tkamb.node(`/tkamb/${number}/${layer}`).object.visible = shown;
+  });
+  tkamb.viewer.set_dirty();
+};
+
+tkamb.layerShown = (layer) => tkamb.node(`/tkamb/0/${layer}`).object.visible;
+
+function dressScene(viewer) {
+  const {THREE} = MeshCat;
+  viewer.hide_background();
+  for (const name of ["Grid", "Axes"]) viewer.set_property([name], "visible", false);
+  viewer.delete_path(["Lights"]);
+  viewer.set_object(["Lights", "around"], new THREE.HemisphereLight(0xffffff, 0xb8b8b8, 0.62));
+  const lamp = new THREE.DirectionalLight(0xffffff, 0.5);
+  lamp.position.set(0.4, 0.8, 0.6);
+  viewer.camera.add(lamp);
+  viewer.camera.add(lamp.target);
+  lamp.target.position.set(0, 0, -1);
+  viewer.camera.fov = 30;
+  viewer.camera.near = 0.005;
+  viewer.gui.domElement.style.display = "none";
+}
+
+function buildView(viewer, view, number) {
+  view.root = `/tkamb/${number}`;
+  for (const layer of tkamb.data.layers) tkamb.node(`${view.root}/${layer}`);
+  for (const command of view.commands) viewer.handle_command_bytearray(command);
+  seeThrough(tkamb.node(view.root).object);
+  view.tubes = view.strands.map((strand) => new Tube(viewer, strand));
+  view.pointers = view.arrows.map((arrow) => new Pointer(viewer, arrow));
+  for (const marker of view.markers) addMarker(viewer, marker);
+  view.runMap = view.map;
+  tkamb.showMap(view, view.map);
+  if (view.lattice) addLattice(viewer, `${view.root}/lattice/lattice`, view.lattice);
+  return view;
+}
+
+// Surfaces that let see through hide their own far side, so that they do not look muddled.
+function seeThrough(root) {
+  root.traverse((object) => {
+    if (object.material && object.material.transparent) {
+      object.material.side = MeshCat.THREE.FrontSide;
+      object.material.depthWrite = true;
+      object.renderOrder = 2;
+    }
+  });
+}
+
+function scaleTexture(colours) {
+  const {THREE} = MeshCat, rgba = new Uint8Array(4 * 256);
+  for (let k = 0; k < 256; k++) rgba.set([...colours.slice(3 * k, 3 * k + 3), 255], 4 * k);
+  const texture = new THREE.DataTexture(rgba, 256, 1, THREE.RGBAFormat);
+  texture.magFilter = texture.minFilter = THREE.LinearFilter;
+  texture.needsUpdate = true;
+  return texture;
+}
+
+// The map: a level per point, coloured in the fragment as the colour bar says, cut off where
+// nothing presses.
+tkamb.showMap = function (view, map) {
+  view.map = map;
+  if (!map) return;
+  const {THREE} = MeshCat, geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(map.points, 3));
+  geometry.setAttribute("level", new THREE.BufferAttribute(new Float32Array(map.count), 1));
+  geometry.setIndex(new THREE.BufferAttribute(map.triangles, 1));
+  const material = new THREE.ShaderMaterial({
+    uniforms: {scale: {value: tkamb.scale}},
+    vertexShader: `attribute float level; varying float shade;
+      void main() { shade = level;
+        gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
+    fragmentShader: `uniform sampler2D scale; varying float shade;
+      void main() { if (shade < 0.012) discard;
+        gl_FragColor = texture2D(scale, vec2(shade * 255.0 / 256.0 + 0.5 / 256.0, 0.5)); }`,
+    side: THREE.DoubleSide, polygonOffset: true, polygonOffsetFactor: -2, polygonOffsetUnits: -8,
+  });
+  const mesh = new THREE.Mesh(geometry, material);
+  mesh.frustumCulled = false;
+  tkamb.viewer.set_object(tkamb.split(`${view.root}/pressure map/map`), mesh);
+};
+
+function addMarker(viewer, marker) {
+  const {THREE} = MeshCat, colour = new THREE.Color(marker.colour);
+  const ball = new THREE.Mesh(
+    new THREE.SphereGeometry(marker.radius, 20, 14), new THREE.MeshPhongMaterial({color: colour}));
+  ball.renderOrder = 3;
+  ball.material.depthTest = false;
+  ball.material.transparent = true;
+  viewer.set_object(tkamb.split(marker.path), ball);
+}
+
+function addLattice(viewer, path, ends) {
+  const {THREE} = MeshCat, geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(ends, 3));
+  const material = new THREE.LineBasicMaterial({color: 0x33506b, transparent: true, opacity: 0.7});
+  viewer.set_object(tkamb.split(path), new THREE.LineSegments(geometry, material));
+}
+
+// One knee beside the other, seen by the same camera.
+function renderSideBySide(viewer) {
+  const roots = tkamb.views.map((view) => tkamb.node(view.root).object);
+  const shown = new MeshCat.THREE.Vector2();
+  viewer.render = function () {
+    this.controls.update();
+    const {x: width, y: height} = this.renderer.getSize(shown), part = width / roots.length;
+    this.camera.aspect = part / height;
+    this.camera.updateProjectionMatrix();
+    this.renderer.setScissorTest(true);
+    roots.forEach((root, number) => {
+      roots.forEach((other) => { other.visible = other === root; });
+      this.renderer.setViewport(number * part, 0, part, height);
+      this.renderer.setScissor(number * part, 0, part, height);
+      this.renderer.render(this.scene, this.camera);
+    });
+    roots.forEach((root) => { root.visible = true; });
+    this.animator.after_render();
+    this.needs_render = false;
+  };
+}

@@ -1,0 +1,80 @@
+"use strict";
+// Loads the drawings, from the page itself or from its server, and starts.
+
+tkamb.start = async function () {
+  const asked = JSON.parse(document.getElementById("asked").textContent);
+  for (const [key, value] of new URLSearchParams(location.hash.slice(1))) asked[key] = value;
+  const bytes = asked.live
+    ? new Uint8Array(await (await fetch("scene.bin")).arrayBuffer())
+    : Uint8Array.from(atob(document.getElementById("data").textContent), (c) => c.charCodeAt(0));
+  const data = await tkamb.unpack(bytes);
+  tkamb.viewer = new MeshCat.Viewer(document.getElementById("pane"));
+  tkamb.build(data);
+  addCameras();
+  addLayers();
+  addLegends();
+  addNumbers();
+  addPlayer();
+  addKeys();
+  if (asked.live) tkamb.live = new Live(asked.live);
+  document.body.classList.toggle("figure", Boolean(asked.figure));
+  tkamb.viewer.set_3d_pane_size();
+  tkamb.look(asked.view || "oblique");
+  tkamb.go(Number(asked.frame || 0));
+  tkamb.viewer.render();
+  document.body.dataset.ready = "yes";
+};
+
+// Another contact model on the frame that is shown, computed by the server.
+class Live {
+  constructor(models) {
+    this.choice = document.getElementById("contact");
+    for (const name of models) {
+      const option = made("option", name, this.choice, {value: name});
+      option.selected = name === tkamb.views[0].contact;
+    }
+    document.getElementById("contact-choice").hidden = models.length === 0;
+    this.choice.addEventListener("change", () => this.frameChanged());
+    this.asked = 0;
+  }
+
+  frameChanged() {
+    const view = tkamb.views[0], number = ++this.asked;
+    if (view.map !== view.runMap) {
+      tkamb.showMap(view, view.runMap);
+      tkamb.colourMap(view, tkamb.frameOf(view));
+      tkamb.viewer.set_dirty();
+    }
+    document.getElementById("answer").textContent = "";
+    if (!this.choice.value || this.choice.value === view.contact) return;
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => this.compute(view, number, this.choice.value), 200);
+  }
+
+  async compute(view, number, model) {
+    const answer = document.getElementById("answer"), frame = tkamb.frameOf(view);
+    answer.textContent = `computing frame ${frame} with ${model} …`;
+    const response = await fetch("contact", {
+      method: "POST",
+      headers: {"Content-Type": "application/json"},
+      body: JSON.stringify({frame, model}),
+    });
+    const packed = response.ok && new Uint8Array(await response.arrayBuffer());
+    if (number !== this.asked) return;
+    if (!packed) {
+      answer.textContent = await response.text();
+      return;
+    }
+    const found = await tkamb.unpack(packed);
+    tkamb.showMap(view, found.map);
+    tkamb.colourMap(view, 0);
+    tkamb.viewer.set_dirty();
+    answer.textContent = found.words;
+  }
+}
+
+tkamb.start().catch((error) => {
+  document.getElementById("status").hidden = false;
+  document.getElementById("status").textContent = `The scene cannot be shown: ${error.message}`;
+  console.error(error);
+});

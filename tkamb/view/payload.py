@@ -1,0 +1,207 @@
+"""Drawings as one compressed block of bytes, the same for the live window and for a file.
+
+Layout, before compression by gzip: the length of the header (uint32, little-endian), the
+header (JSON, padded to 4 bytes), the arrays one after another. In the header an array is
+{"at": byte, "of": element type, "n": elements}. What stands still is a list of meshcat
+commands, msgpack as meshcat's own viewer takes them; what moves are arrays per frame.
+"""
+
+import gzip
+import json
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import umsgpack  # type: ignore[import-untyped]
+from meshcat.commands import SetObject, SetTransform
+from meshcat.geometry import MeshPhongMaterial, TriangularMeshGeometry, pack_numpy_array
+from meshcat.path import Path as NodePath
+
+from tkamb.units import MILLIMETRE
+from tkamb.view.colours import pressure_scale, strain_scale
+from tkamb.view.drawing import HIDDEN_AT_FIRST, LAYERS, Drawing, PressureMap, Solid
+from tkamb.view.shading import Shaded, shaded
+
+METRES_PER_BODY_WEIGHT = 0.03
+"""Length of an arrow of one body weight."""
+
+TYPES = {"float32": np.float32, "uint8": np.uint8, "uint32": np.uint32}
+
+
+class Block:
+    """Collects arrays; see the module's layout."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._size = 0
+
+    def put(self, values: Any, kind: str) -> dict[str, Any]:
+        """Add an array and return where it is."""
+        array = np.ascontiguousarray(values, TYPES[kind])
+        return self._add(array.tobytes(), kind, array.size)
+
+    def put_bytes(self, text: bytes) -> dict[str, Any]:
+        """Add bytes and return where they are."""
+        return self._add(text, "uint8", len(text))
+
+    def _add(self, part: bytes, kind: str, count: int) -> dict[str, Any]:
+        place = {"at": self._size, "of": kind, "n": count}
+        padded = part + bytes(-len(part) % 4)
+        self._parts.append(padded)
+        self._size += len(padded)
+        return place
+
+    def packed(self, header: dict[str, Any]) -> bytes:
+        """Return header and arrays, compressed."""
+        text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
+        text += b" " * (-len(text) % 4)
+        return gzip.compress(
+            struct.pack("<I", len(text)) + text + b"".join(self._parts), 6, mtime=0
+        )
+
+
+def pack(drawings: Sequence[Drawing]) -> bytes:
+    """Return the drawings, shown side by side, on common colour scales."""
+    block = Block()
+    peak = max((one.map.peak for one in drawings if one.map), default=0.0)
+    limit = max(one.strain_limit for one in drawings)
+    return block.packed(
+        {
+            "layers": list(LAYERS),
+            "hidden": list(HIDDEN_AT_FIRST),
+            "metres_per_body_weight": METRES_PER_BODY_WEIGHT,
+            "peak_MPa": peak,
+            "strain_limit": limit,
+            "pressure_scale": block.put(pressure_scale(), "uint8"),
+            "strain_scale": block.put(strain_scale(), "uint8"),
+            "views": [_view(block, k, one, peak) for k, one in enumerate(drawings)],
+        }
+    )
+
+
+def packed_map(found: PressureMap, peak: float, words: str) -> bytes:
+    """Return one map alone, on the scale of a page that is open, with words about it."""
+    block = Block()
+    return block.packed({"map": _map(block, found, peak), "words": words})
+
+
+def levels(pressure: Any, peak: float) -> Any:
+    """Return 0 where nothing presses, else 1 to 255 up to the peak (f, n)."""
+    pressure = np.nan_to_num(np.asarray(pressure, float))
+    level = np.ceil(np.clip(pressure / (peak or 1.0), 0.0, 1.0) * 255.0)
+    return np.where(pressure > 0, np.maximum(level, 1), 0).astype(np.uint8)
+
+
+def _view(block: Block, number: int, drawing: Drawing, peak: float) -> dict[str, Any]:
+    root = f"/tkamb/{number}"
+    commands, moving, notes = [_placed(root, drawing.side)], [], list(drawing.notes)
+    for solid in drawing.solids:
+        shape = shaded(solid.surface)
+        if shape.error:
+            notes.append(
+                f"{solid.name.capitalize()}: drawn with fewer triangles, "
+                f"vertices moved by up to {shape.error / MILLIMETRE:.2f} mm."
+            )
+        path = _place(root, solid.layer, solid.name)
+        commands += _commands(path, solid, shape)
+        if len(solid.poses) > 1:
+            poses = block.put(np.swapaxes(solid.poses, 1, 2), "float32")
+            moving.append({"path": path, "poses": poses})
+    return {
+        "title": drawing.title,
+        "side": drawing.side,
+        "body_weight": drawing.body_weight,
+        "contact": drawing.contact,
+        "places": drawing.places,
+        "statuses": drawing.statuses,
+        "readings": [{"name": row.name, "values": row.values} for row in drawing.readings],
+        "notes": notes,
+        "times": [float(time) for time in drawing.times],
+        "commands": [block.put_bytes(umsgpack.packb(one.lower())) for one in commands],
+        "moving": moving,
+        "strands": [
+            {
+                "path": _place(root, one.layer, one.name),
+                "frames": len(one.points),
+                "count": one.points.shape[1],
+                "points": block.put(one.points, "float32"),
+                "colours": block.put(one.colours, "uint8"),
+                "radius": one.radius,
+            }
+            for one in drawing.strands
+        ],
+        "arrows": [
+            {
+                "path": _place(root, "forces", one.name),
+                "name": one.name,
+                "meaning": one.meaning,
+                "colour": one.colour,
+                "ends_there": one.ends_there,
+                "points": block.put(one.points, "float32"),
+                "forces": block.put(one.forces, "float32"),
+            }
+            for one in drawing.arrows
+        ],
+        "markers": [
+            {
+                "path": _place(root, one.layer, one.name),
+                "colour": one.colour,
+                "radius": one.radius,
+                "points": block.put(one.points, "float32"),
+            }
+            for one in drawing.markers
+        ],
+        "map": _map(block, drawing.map, peak) if drawing.map else None,
+        "lattice": block.put(drawing.lattice, "float32") if len(drawing.lattice) else None,
+    }
+
+
+def _map(block: Block, found: PressureMap, peak: float) -> dict[str, Any]:
+    return {
+        "count": len(found.points),
+        "points": block.put(found.points, "float32"),
+        "triangles": block.put(found.triangles, "uint32"),
+        "levels": block.put(levels(found.pressure, peak), "uint8"),
+    }
+
+
+def _placed(root: str, side: str) -> SetTransform:
+    """Return the insert frame (y up) in meshcat's (z up), a left knee mirrored back."""
+    turn = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+    if side == "left":
+        turn = turn @ np.diag([1.0, 1.0, -1.0, 1.0])
+    return SetTransform(turn, _node(root))
+
+
+def _commands(path: str, solid: Solid, shape: Shaded) -> list[Any]:
+    material = MeshPhongMaterial(
+        color=int(solid.colour.removeprefix("#"), 16), opacity=solid.opacity, side=2, shininess=40
+    )
+    made = [SetObject(_Mesh(shape), material, _node(path))]
+    if len(solid.poses) == 1:
+        made.append(SetTransform(solid.poses[0], _node(path)))
+    return made
+
+
+def _place(root: str, layer: str, name: str) -> str:
+    """Return a path in the scene tree; a name's own slash would divide it."""
+    return f"{root}/{layer}/{name.replace('/', '-')}"
+
+
+def _node(path: str) -> NodePath:
+    return NodePath(tuple(part for part in path.split("/") if part))
+
+
+class _Mesh(TriangularMeshGeometry):
+    """meshcat's mesh with our normals."""
+
+    def __init__(self, shape: Shaded) -> None:
+        super().__init__(shape.vertices, shape.faces)
+        self._normals = shape.normals
+
+    def lower(self, object_data: Any) -> Any:
+        """Return what three.js loads."""
+        lowered = super().lower(object_data)
+        lowered["data"]["attributes"]["normal"] = pack_numpy_array(self._normals.T)
+        return lowered

@@ -1,0 +1,135 @@
+"""What there is to see: a results folder and its scene, or a scene that is run first."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.case import Case, load_case
+from tkamb.errors import InputError
+from tkamb.mechanics import Mechanics
+from tkamb.results import SUMMARY_NAME, Results, read_results
+from tkamb.scene import Scene, load_scene
+from tkamb.simulation import simulate
+from tkamb.summary import scene_hash
+
+Progress = Callable[[Iterable[int]], Iterable[int]]
+RUN_AGAIN = "run it again: tkamb run"
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A case and the results that belong to it.
+
+    Args:
+        case: the scene with its files read.
+        mechanics: the rigid-body side, whose geometry is drawn.
+        results: the numbers.
+        frames: the motion's frame of each row of the results.
+    """
+
+    case: Case
+    mechanics: Mechanics
+    results: Results
+    frames: tuple[int, ...]
+
+
+def open_run(
+    path: str | Path,
+    *,
+    contact: str | None = None,
+    progress: Progress = lambda frames: frames,
+    announce: Callable[[str], None] = lambda line: None,
+) -> Run:
+    """Return the run behind a results folder or a scene file.
+
+    A scene whose results stand in its output folder is not run again.
+
+    Args:
+        path: a folder that `tkamb run` wrote, or a scene file.
+        contact: contact model, instead of the scene's; a scene only.
+        progress: wraps the frame indices of a run.
+        announce: takes a line for the user.
+
+    Raises:
+        InputError: nothing to see there, or the scene is no longer what was run.
+    """
+    path = Path(path)
+    if path.is_dir():
+        if contact:
+            raise InputError("has its own contact model", path, "give the scene to choose another")
+        return _from_folder(path)
+    overrides = {"contact.model": contact} if contact else {}
+    scene = load_scene(path, overrides)
+    case = load_case(scene)
+    folder = scene.output.directory or Path("out") / path.resolve().parent.name
+    if (folder / SUMMARY_NAME).exists():
+        results = read_results(folder)
+        if results.summary.get("scene_sha256") == scene_hash(case) and len(results):
+            announce(f"results of this scene found in {folder}")
+            return joined(case, results)
+    announce("running the scene (keep its results with `tkamb run`)")
+    return joined(case, simulate(scene, scene_path=path, progress=progress))
+
+
+def joined(case: Case, results: Results) -> Run:
+    """Return the run of a case and its results.
+
+    Raises:
+        InputError: results at times that the motion does not have.
+    """
+    frame_at = {float(time): k for k, time in enumerate(case.motion.time)}
+    try:
+        frames = tuple(frame_at[float(time)] for time in results["time_s"])
+    except KeyError as error:
+        raise InputError(
+            f"no frame at {error.args[0]} s in the scene's motion", "results", RUN_AGAIN
+        ) from None
+    return Run(case, Mechanics(case), results, frames)
+
+
+def run_of(results: Results) -> Run:
+    """Return the run of results, whose summary names the scene.
+
+    Raises:
+        InputError: the scene is not there, or no longer what was run.
+    """
+    case = load_case(_scene_of(results))
+    if scene_hash(case) != results.summary.get("scene_sha256"):
+        raise InputError(
+            "has changed since these results were computed, or was run with --set",
+            results.summary.get("scene"),
+            f"{RUN_AGAIN} {results.summary.get('scene')}",
+        )
+    return joined(case, results)
+
+
+def _from_folder(folder: Path) -> Run:
+    results = read_results(folder)
+    if not len(results):
+        raise InputError("holds no frame", folder, RUN_AGAIN)
+    return run_of(results)
+
+
+def _scene_of(results: Results) -> Scene:
+    """Return the scene of results, with the contact model they were run with."""
+    name = results.summary.get("scene")
+    if not name:
+        raise InputError("names no scene file", "summary", "give the scene itself to tkamb view")
+    path = Path(name)
+    if not path.exists():
+        raise InputError(
+            "the scene of these results is not there",
+            path,
+            "start tkamb view in the folder where tkamb run was started",
+        )
+    contact = results.summary.get("contact") or {}
+    kept = {f"contact.{key}": contact[key] for key in ("model", "resolution_mm") if key in contact}
+    return load_scene(path, kept)
+
+
+def same_place(run: Run, other: Run) -> np.ndarray:
+    """Return for each frame of `run` the frame of `other` at the same share of the motion."""
+    share = np.linspace(0.0, 1.0, len(run.frames))
+    return np.round(share * (len(other.frames) - 1)).astype(int)

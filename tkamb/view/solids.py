@@ -1,0 +1,129 @@
+"""The rigid parts of a drawing: implant, patella, and bones as plain solids.
+
+A scene holds no bone meshes (but one that the quadriceps may wrap), so the bones are stand-ins
+of about the right size between the joint centres: they orient the eye and carry no load.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import trimesh
+
+from tkamb.body.chain import ChainState
+from tkamb.case import Case
+from tkamb.geometry.frames import Array, inverse, pose
+from tkamb.geometry.surface import Surface
+from tkamb.output.maps_file import ContactMaps
+from tkamb.units import MILLIMETRE
+from tkamb.view.colours import BONE, BUTTON, INSERT, METAL, RECORDED
+from tkamb.view.drawing import Solid
+
+FEMUR_PROFILE = (
+    (0.015, 19.0),
+    (0.045, 21.0),
+    (0.10, 15.0),
+    (0.25, 12.5),
+    (0.80, 13.0),
+    (0.93, 17.0),
+    (1.0, 20.0),
+)
+TIBIA_PROFILE = ((0.0, 26.0), (0.05, 24.0), (0.16, 15.0), (0.50, 11.0), (0.85, 11.0), (1.0, 18.0))
+"""Share of the length from the knee, and radius in mm."""
+
+PATELLA_DEPTH, PATELLA_WIDTH = 8.0 * MILLIMETRE, 21.0 * MILLIMETRE
+
+
+def solids(
+    case: Case, states: Sequence[ChainState], maps: ContactMaps | None, rows: Sequence[int]
+) -> tuple[Solid, ...]:
+    """Return the solids of a case.
+
+    The femoral component stands where the contact model pressed it, else where it was
+    recorded.
+
+    Args:
+        case: the case.
+        states: chain at each frame.
+        maps: the run's maps, whose poses are used.
+        rows: row of the maps of each frame, -1 where there is none.
+    """
+    recorded = np.stack([state.pose("femur") for state in states])
+    still = np.eye(4)[None]
+    found = []
+    if case.insert is not None:
+        found.append(Solid("insert", "insert", case.insert, INSERT, 1.0, still))
+    if case.femoral is not None:
+        pressed = _pressed(recorded, maps, rows)
+        found.append(
+            Solid("femoral component", "femoral component", case.femoral, METAL, 0.5, pressed)
+        )
+        found.append(
+            Solid(
+                "recorded femoral component",
+                "recorded pose",
+                case.femoral,
+                RECORDED,
+                0.35,
+                recorded,
+            )
+        )
+    found += [_femur(states, recorded), _tibia(states)]
+    if case.scene.patella is not None and case.patella is not None:
+        poses = np.stack([state.pose("patella") for state in states])
+        found.append(Solid("patellar button", "patella", case.patella, BUTTON, 1.0, poses))
+        bone = _patella(case)
+        found.append(Solid("patella", "patella", bone, BONE, 0.55, poses))
+    return tuple(found)
+
+
+def _pressed(recorded: Array, maps: ContactMaps | None, rows: Sequence[int]) -> Array:
+    poses = recorded.copy()
+    if maps is not None:
+        stored = maps.femoral_pose
+        for frame, row in enumerate(rows):
+            if row >= 0 and np.isfinite(stored[row]).all():
+                poses[frame] = stored[row]
+    return poses
+
+
+def _femur(states: Sequence[ChainState], poses: Array) -> Solid:
+    hip = (inverse(poses[0]) @ np.append(states[0].point("hip", np.zeros(3)), 1.0))[:3]
+    return Solid("femur", "bones", _shaft(hip, FEMUR_PROFILE, "femur"), BONE, 0.5, poses)
+
+
+def _tibia(states: Sequence[ChainState]) -> Solid:
+    """Return the tibia below the insert's bottom, down to the ankle."""
+    ankle = states[0].point("tibia", np.zeros(3))
+    surface = _shaft(ankle, TIBIA_PROFILE, "tibia")
+    return Solid("tibia", "bones", surface, BONE, 0.5, np.eye(4)[None])
+
+
+def _shaft(end: Array, profile: tuple[tuple[float, float], ...], name: str) -> Surface:
+    """Return a body of revolution from the origin towards `end` (3,)."""
+    length = float(np.linalg.norm(end))
+    share, radius = np.array(profile).T
+    at = np.linspace(share[0], share[-1], 40)
+    radii = np.interp(at, share, radius * MILLIMETRE)
+    outline = np.column_stack(
+        [np.concatenate([[0.0], radii, [0.0]]), length * np.concatenate([at[:1], at, at[-1:]])]
+    )
+    mesh = trimesh.creation.revolve(outline, sections=40)
+    turn = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], end / length)
+    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64), name).moved(turn)
+
+
+def _patella(case: Case) -> Surface:
+    """Return an ellipsoid from the tendon's insertion to the ligament's origin."""
+    scene = case.scene
+    assert scene.quadriceps is not None and scene.patellar_ligament is not None
+    top = np.array(scene.quadriceps.insertion.point_mm) * MILLIMETRE
+    bottom = np.array(scene.patellar_ligament.proximal.point_mm) * MILLIMETRE
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    along = top - bottom
+    half = 0.5 * float(np.linalg.norm(along))
+    radii = np.array([PATELLA_DEPTH, half, PATELLA_WIDTH])
+    turn = trimesh.geometry.align_vectors([0.0, 1.0, 0.0], along / (2.0 * half))[:3, :3]
+    surface = Surface(
+        np.asarray(ball.vertices) * radii, np.asarray(ball.faces, np.int64), "patella"
+    )
+    return surface.moved(pose(turn, 0.5 * (top + bottom)))

@@ -1,0 +1,133 @@
+"""The lines of a drawing: ligament bundles, tendons, and the paths of the centres of pressure."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+
+from tkamb.body.chain import ChainState
+from tkamb.body.wrapping import TautPath
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Array
+from tkamb.mechanics import Mechanics
+from tkamb.output.maps_file import ContactMaps
+from tkamb.output.style import SIDE_COLOURS
+from tkamb.results import Results
+from tkamb.units import MILLIMETRE
+from tkamb.view.colours import TENDON, WRAPPED, Colours, rgb, strain_colours
+from tkamb.view.drawing import Marker, Strand
+
+BUNDLE, TENDON_RADIUS, PATH = 1.0 * MILLIMETRE, 1.5 * MILLIMETRE, 0.35 * MILLIMETRE
+"""m, radii; bundles are thinner where a ligament has many."""
+
+MANY_BUNDLES = 20
+
+
+def ligament_strands(
+    mechanics: Mechanics, states: Sequence[ChainState]
+) -> tuple[tuple[Strand, ...], float]:
+    """Return the bundles coloured by strain, and the upper limit of the colour scale."""
+    bundles = mechanics.ligaments
+    if not bundles:
+        return (), 0.0
+    links = {link for one in bundles for link in (one.proximal_link, one.distal_link)}
+    poses = {link: np.stack([state.pose(link) for state in states]) for link in links}
+    strains = [one.strain(one.length(poses)) for one in bundles]
+    limit = max(float(np.nanmax(strains)), 0.01)
+    radius = BUNDLE * (0.5 if len(bundles) > MANY_BUNDLES else 1.0)
+    strands = []
+    for bundle, strain in zip(bundles, strains, strict=True):
+        points = np.stack(bundle.ends(poses), axis=1)
+        colours = np.repeat(strain_colours(strain, limit)[:, None], 2, axis=1)
+        strands.append(Strand(bundle.name, "ligaments", points, colours, radius))
+    return tuple(strands), limit
+
+
+def extensor_strands(mechanics: Mechanics, states: Sequence[ChainState]) -> tuple[Strand, ...]:
+    """Return quadriceps and patellar ligament, the part that lies on the bone in another colour."""
+    extensor = mechanics.extensor
+    if extensor is None:
+        return ()
+    paths: list[tuple[TautPath | None, ...]] = []
+    for state in states:
+        try:
+            paths.append(extensor.paths(state))
+        except ComputationError:
+            paths.append((None, None))
+    quadriceps, ligament = (list(found) for found in zip(*paths, strict=True))
+    return _tendon("quadriceps", quadriceps), _tendon("patellar ligament", ligament)
+
+
+def _tendon(name: str, paths: list[TautPath | None]) -> Strand:
+    """Return the strand of a taut path; its corners are doubled where the colour changes."""
+    lines = [_coloured(path) for path in paths]
+    most = max(len(points) for points, _ in lines)
+    points = np.stack([np.pad(p, ((0, most - len(p)), (0, 0)), mode="edge") for p, _ in lines])
+    colours = np.stack([np.pad(c, ((0, most - len(c)), (0, 0)), mode="edge") for _, c in lines])
+    return Strand(name, "extensor lines", points, colours, TENDON_RADIUS)
+
+
+def _coloured(path: TautPath | None) -> tuple[Array, Colours]:
+    """Return points and colours: free, on the bone, free."""
+    free, wrapped = rgb(TENDON), rgb(WRAPPED)
+    if path is None or not np.isfinite(path.points).all():
+        return np.full((2, 3), np.nan), np.stack([free, free])
+    corners = path.points[1:-1]
+    if len(corners) < 2:
+        return path.points, np.repeat(free[None], len(path.points), axis=0)
+    points = np.concatenate([path.points[:2], corners, path.points[-2:]])
+    colours = np.repeat(wrapped[None], len(points), axis=0)
+    colours[[0, 1, -2, -1]] = free
+    return points, colours
+
+
+def centres_of_pressure(results: Results, maps: ContactMaps) -> dict[str, Array]:
+    """Return side -> (f, 3) m, on the undeformed insert."""
+    across, height = maps.points_m[:, [0, 2]], maps.points_m[:, 1]
+    inside, outside = LinearNDInterpolator(across, height), NearestNDInterpolator(across, height)
+    found = {}
+    for side in SIDE_COLOURS:
+        place = (
+            np.stack([results[f"{side}_cop_ap_mm"], results[f"{side}_cop_ml_mm"]], axis=1)
+            * MILLIMETRE
+        )
+        known = np.isfinite(place).all(axis=1)
+        points = np.full((len(place), 3), np.nan)
+        if known.any():
+            level = inside(place[known])
+            level = np.where(np.isfinite(level), level, outside(place[known]))
+            points[known] = np.column_stack([place[known, 0], level, place[known, 1]])
+        found[side] = points
+    return found
+
+
+def path_strands(centres: dict[str, Array]) -> tuple[Strand, ...]:
+    """Return the path of each centre of pressure, broken where frames have none."""
+    strands = []
+    for side, points in centres.items():
+        known = np.isfinite(points).all(axis=1)
+        ends = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
+        for number, (first, last) in enumerate(ends.reshape(-1, 2)):
+            if last - first < 2:
+                continue
+            part = points[first:last] + np.array([0.0, 2.0 * PATH, 0.0])
+            colours = np.repeat(rgb(SIDE_COLOURS[side])[None], len(part), axis=0)
+            name = f"{side} path {number}"
+            strands.append(
+                Strand(name, "centre-of-pressure paths", part[None], colours[None], PATH)
+            )
+    return tuple(strands)
+
+
+def centre_markers(centres: dict[str, Array]) -> tuple[Marker, ...]:
+    """Return a ball at each centre of pressure."""
+    return tuple(
+        Marker(
+            f"{side} centre of pressure",
+            "centre-of-pressure paths",
+            SIDE_COLOURS[side],
+            points,
+            1.1 * MILLIMETRE,
+        )
+        for side, points in centres.items()
+    )
