@@ -164,10 +164,11 @@ class CellContact(ContactModel):
             reached = solution.forces.approach * REACH - min(float(gaps.min()), 0.0)
             if covered or reached <= start.reach:
                 result = result_of(state, pose, load, gaps, solution, self.pressure_rule)
-                if solution.lost is not None:
+                if solution.lost is not None and solution.converged:
                     state.memory.keep(result, solution.lost)
                 return result
-            depth, lost = 1.1 * solution.forces.approach, solution.lost
+            depth = 1.1 * solution.forces.approach
+            lost = solution.lost if solution.converged else None
             touched = None
         return failed_result(state, pose, "the set of candidate nodes is saturated")
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from tkamb.contact.lattice.active_set import ContactForces
 from tkamb.contact.lattice.operator import prepare_operator
-from tkamb.contact.lattice.problem import ContactProblem, Footing, Indices, Mask, footing
-from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve_pass, violation
+from tkamb.contact.lattice.problem import ContactProblem, Footing, Indices, Mask
+from tkamb.contact.lattice.sliding import SlidingNodes
+from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve_pass
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
 
@@ -44,9 +45,10 @@ def solve_by_newton(
     points = solid.nodes[nodes]
     u = np.zeros_like(solid.nodes) if field is None else field
     active, step, last, steps = start.active, 1.0, np.inf, 0
-    foot = footing(problem, points + u[nodes], pose, None)
+    sliding = SlidingNodes(problem, points, u[nodes], pose)
     while True:
         steps += 1
+        foot = sliding.foot
         u_full, forces = _step(problem, nodes, u, foot, load, active)
         u = u + step * (u_full - u)
         active = forces.active
@@ -57,15 +59,16 @@ def solve_by_newton(
         residual = float(np.linalg.norm(balance)) / size
         if not np.isfinite(residual):
             raise ComputationError("Newton's iteration left the range of numbers")
-        settled = footing(problem, points + u[nodes], pose, foot)
-        missed = violation(points, u[nodes], settled, forces)
+        missed = sliding.follow(u[nodes], forces)
         done = not active.any() or max(residual, missed) <= tolerance.force
         if done or steps == MOST_STEPS:
             forces = replace(forces, converged=done and forces.converged)
             lost = solid.correction(u)
             lost[~free.reshape(-1, 3)] = 0.0
-            return Solution(start.candidates, forces, foot, u[nodes], u, lost, steps, residual)
-        step, last, foot = 0.5 if residual > 2 * last else 1.0, residual, settled
+            return Solution(
+                start.candidates, forces, foot, u[nodes], u, lost, steps, max(residual, missed)
+            )
+        step, last = 0.5 if residual > 2 * last else 1.0, residual
 
 
 def _step(

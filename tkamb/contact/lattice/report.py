@@ -62,6 +62,8 @@ def result_of(
     approach = solution.forces.approach if load is not None else 0.0
     pose = pose.copy()
     pose[1, 3] -= approach
+    if solution.field is not None and not np.isfinite(solution.field).all():
+        return failed_result(state, pose, "the solver left the range of numbers")
     flags, collapsed = _strain_flags(state, solution)
     if collapsed:
         return failed_result(state, pose, *flags)

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from tkamb.contact.lattice.active_set import ContactForces, solve_contact
 from tkamb.contact.lattice.anderson import AndersonMixer
-from tkamb.contact.lattice.problem import ContactProblem, Footing, footing
+from tkamb.contact.lattice.problem import ContactProblem, Footing
+from tkamb.contact.lattice.sliding import SlidingNodes
 from tkamb.geometry.frames import Array
 
 Indices = NDArray[np.int64]
@@ -72,7 +73,8 @@ class Solution:
         field: (n, 3) displacement of all nodes, or None (linear material).
         lost: (n, 3) h, N, or None (linear material).
         passes: how many.
-        residual: last relative out-of-balance force; linear: distance from the femoral surface.
+        residual: out-of-balance force or distance from the femoral surface, the larger one,
+            both relative.
     """
 
     candidates: Indices
@@ -132,27 +134,26 @@ def solve(
     mixer, active, passes = AndersonMixer(), start.active, 0
     begun = operator.start(lost)
     offset = operator.half.project(begun).reshape(-1, 3)[chosen]
-    foot = footing(problem, points + offset, pose, None)
+    sliding = SlidingNodes(problem, points, offset, pose)
     best: Solution | None = None
     while True:
         passes += 1
+        foot = sliding.foot
         forces, moved = solve_pass(start.compliance, offset, points, foot, load, active)
         active = forces.active
         field, value, residual = _respond(problem, begun, chosen, forces, foot, lost)
-        settled = footing(problem, points + moved, pose, foot)
-        missed = violation(points, moved, settled, forces)
+        missed = sliding.follow(moved, forces)
         done = not active.any() or max(residual, missed) <= tolerance.force
         forces = replace(forces, converged=done and forces.converged)
-        now = Solution(chosen, forces, foot, moved, field, lost, passes, residual)
-        best = now if best is None or residual < best.residual else best
+        now = Solution(chosen, forces, foot, moved, field, lost, passes, max(residual, missed))
+        best = now if best is None or now.residual < best.residual else best
         if done:
             return now
-        if passes == tolerance.passes or not residual < DIVERGED * best.residual:
+        if passes == tolerance.passes or not now.residual < DIVERGED * best.residual:
             return replace(best, passes=passes)
         lost = mixer.next(lost.ravel(), value.ravel()).reshape(-1, 3)
         begun = operator.start(lost)
         offset = operator.half.project(begun).reshape(-1, 3)[chosen]
-        foot = settled
 
 
 def _respond(
@@ -193,28 +194,14 @@ def _solve_linear(
     """Repeat rays and contact until the sliding nodes rest."""
     points = problem.surface_points[start.candidates]
     nothing, active, passes = np.zeros_like(points), start.active, 0
-    foot = footing(problem, points, pose, None)
+    sliding = SlidingNodes(problem, points, nothing, pose)
     while True:
         passes += 1
+        foot = sliding.foot
         forces, moved = solve_pass(start.compliance, nothing, points, foot, load, active)
         active = forces.active
-        settled = footing(problem, points + moved, pose, foot)
-        missed = violation(points, moved, settled, forces)
+        missed = sliding.follow(moved, forces)
         done = missed <= tolerance.force
         if done or passes == tolerance.passes:
             forces = replace(forces, converged=done and forces.converged)
             return Solution(start.candidates, forces, foot, moved, None, None, passes, missed)
-        foot = settled
-
-
-def violation(points: Array, moved: Array, foot: Footing, forces: ContactForces) -> float:
-    """Return the largest distance of an active node from the femoral surface where it now is.
-
-    Overlap of other nodes counts too. Relative to the largest displacement of an active node.
-    """
-    if not forces.active.any():
-        return 0.0
-    gap = foot.gap(points + moved) + forces.approach * foot.lean
-    miss = np.where(forces.active, np.abs(gap), np.maximum(-gap, 0))
-    size = float(np.abs(moved[forces.active]).max())
-    return float(np.nan_to_num(miss, nan=0.0).max()) / max(size, 1e-300)

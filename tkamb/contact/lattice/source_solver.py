@@ -20,8 +20,9 @@ import scipy.sparse as sparse
 
 from tkamb.contact.lattice.active_set import ContactForces
 from tkamb.contact.lattice.operator import prepare_operator
-from tkamb.contact.lattice.problem import ContactProblem, Footing, Indices, Mask, footing
-from tkamb.contact.lattice.solver import Solution, Start, Tolerance, violation
+from tkamb.contact.lattice.problem import ContactProblem, Footing, Indices, Mask
+from tkamb.contact.lattice.sliding import SlidingNodes
+from tkamb.contact.lattice.solver import Solution, Start, Tolerance
 from tkamb.geometry.frames import Array
 
 MOST_LOOPS = 60
@@ -59,23 +60,23 @@ def solve_by_source(
     """
     nodes = problem.contact_nodes[start.candidates]
     points = problem.solid.nodes[nodes]
-    foot = footing(problem, points, pose, None)
+    sliding = SlidingNodes(problem, points, np.zeros_like(points), pose)
     depth = 0.0 if load is None else FIRST_DEPTH * float(start.reach)
     field, loops = np.zeros_like(problem.solid.nodes), 0
-    active, seen = foot.gap(points) < depth, []
+    active, seen = sliding.foot.gap(points) < depth, []
     while True:
         loops += 1
+        foot = sliding.foot
         pressed = _press(problem, nodes, foot, active, depth, field, tolerance)
         field, moved = pressed.field, pressed.field[nodes]
         reaction = float(pressed.force.sum())
         missed = 0.0 if load is None else abs(reaction - load) / load
         changed = _next_active(points + moved, foot, active, pressed.force, depth)
-        foot = footing(problem, points + moved, pose, foot)
         opening = np.where(active, 0.0, foot.gap(points + moved) - depth)
         forces = ContactForces(
             np.where(active, np.maximum(pressed.force, 0), 0.0), opening, depth, active, loops, True
         )
-        settled = violation(points, moved, foot, forces) <= tolerance.force
+        settled = sliding.follow(moved, forces) <= tolerance.force
         still = bool((changed == active).all())
         done = still and settled and max(missed, pressed.residual) <= tolerance.force
         if done or loops == MOST_LOOPS:
@@ -83,7 +84,7 @@ def solve_by_source(
         if load is not None and still:
             seen.append((depth, reaction))
             depth = _next_depth(problem, seen, load, pressed.slope)
-            changed = changed | (foot.gap(points + moved) < depth) & ~active
+            changed = changed | (sliding.foot.gap(points + moved) < depth) & ~active
         active = changed
 
 
