@@ -69,6 +69,11 @@ def test_large_coronal_error_is_lift_off_and_left(
     assert gaps[1] == pytest.approx(2 * HALF * np.deg2rad(0.6), rel=0.02)
 
 
+def test_level_condyles_are_not_turned(query: ClosestPointQuery) -> None:
+    assert adjust(query, tilted(0.0)).coronal_angle == 0.0
+    assert adjust(query, tilted(0.003)).coronal_angle == 0.0
+
+
 def test_always_moved_to_first_touch(query: ClosestPointQuery) -> None:
     for height in (-1e-3, 0.0, 1e-3):
         found = adjust(query, tilted(0.0, height))

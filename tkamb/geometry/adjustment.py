@@ -30,6 +30,9 @@ LARGEST_ANGLE = 0.5 * DEGREE
 FARTHEST = 3.0 * MILLIMETRE
 """m: with both condyles farther than this from the insert the pose is no recorded contact."""
 
+LEVEL = 5e-6
+"""m: condyles whose gaps differ by less are level as far as a mesh can say; no turn."""
+
 EQUAL = 1e-7
 """m: difference of the condyles' clearances at which they touch together."""
 
@@ -81,7 +84,7 @@ def adjust(query: ClosestPointQuery, recorded: Array) -> Adjustment:
     angle, distance = _coronal_angle(gaps)
     middle = _middle(gaps)
     turned, turn = recorded, 0.0
-    if abs(angle) < LARGEST_ANGLE and gaps.lateral is not None:
+    if gaps.lateral is not None and LEVEL < abs(angle) * distance < LARGEST_ANGLE * distance:
         turn = _levelling_turn(query, recorded, middle, distance)
         turned = _turned(recorded, middle, turn)
     travel = travel_to_touch(query, turned)
