@@ -8,12 +8,15 @@ from tkamb.geometry.frames import Array, inverse, rotate, transform
 from tkamb.geometry.nearest import NearestPoints, sampled
 from tkamb.geometry.surface import Surface
 
-RESOLUTION = 2e-5
+RESOLUTION = 3e-5
 """m; gaps that differ by less are the same: facets of 1–2 mm on a condyle cut about this."""
 REACH = 1.6e-2
 """m; the region ends this far from the closest point."""
-_SPACING = 1.5e-3
-_FACING = -0.7
+_SPACING = 1e-3
+_FACING = 0.7
+"""Cosine of the angle between the surfaces, above which they face each other."""
+_DOUBT = 1e-4
+"""m; how far the quick estimate of a gap may be out on coarse meshes."""
 
 
 class CloseRegion:
@@ -40,7 +43,7 @@ class CloseRegion:
         self._tree = cKDTree(self._samples)
 
     def centre(
-        self, other: NearestPoints, pose: Array, gap: float, closest: Array, foot: Array
+        self, other: NearestPoints, pose: Array, gap: float, closest: Array
     ) -> tuple[Array, Array]:
         """Return the centre (3,) on the other body and its mean unit normal (3,) there.
 
@@ -49,25 +52,28 @@ class CloseRegion:
             pose: (4, 4) of this body in the other's frame.
             gap: m, the smallest signed gap.
             closest: (3,) m, this body's point with that gap.
-            foot: (3,) m, the other body's point with that gap.
         """
-        normal = other.at(foot[None]).normals[0]
         own = transform(inverse(pose), closest)
         near = np.array(self._tree.query_ball_point(own, REACH), dtype=int)
-        facing = rotate(pose, self._normals[near]) @ normal < _FACING
-        near = near[facing]
-        points = np.concatenate([transform(pose, self._samples[near]), closest[None]])
-        found = other.at(points)
-        side = np.einsum("ij,ij->i", points - found.points, found.normals)
-        below = (side < 0) & (-found.distance > gap - RESOLUTION)
-        gaps = np.where(below, -found.distance, found.distance)
-        gaps[-1] = gap
-        areas = np.append(self._areas[near], self._areas.mean())
-        weights = areas * np.exp(-np.maximum(gaps - gap, 0.0) / RESOLUTION)
-        weights /= weights.sum()
+        here = self._normals[self._tree.query(own)[1]]
+        near = near[self._normals[near] @ here > 0.5]
+        points = transform(pose, self._samples[near])
+        within = np.abs(other.heights(points) - gap) < _DOUBT + 5 * RESOLUTION
+        near, points = near[within], points[within]
+        found = other.at(np.concatenate([points, closest[None]]))
+        facing = -_dot(rotate(pose, self._normals[near]), found.normals[:-1])
+        above = _dot(points - found.points[:-1], found.normals[:-1])
+        excess = np.where(above < 0, -1, 1) * found.distance[:-1] - gap
+        excess = np.where(excess < -RESOLUTION, np.inf, np.maximum(excess, 0.0))
+        weights = self._areas[near] * (facing > _FACING) * np.exp(-excess / RESOLUTION)
+        weights = np.append(weights, self._areas.mean())
         mean = weights @ found.normals
-        centre = other.at((weights @ found.points)[None]).points[0]
+        centre = other.at((weights @ found.points / weights.sum())[None]).points[0]
         return centre, mean / np.linalg.norm(mean)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray(np.einsum("ij,ij->i", a, b))
 
 
 def _thinned(samples: Array, areas: Array) -> tuple[NDArray[np.int64], Array]:

@@ -31,7 +31,7 @@ class CondyleGap:
         point_on_femoral: (3,) m, insert frame.
         point_on_insert: (3,) m, insert frame.
         centre: (3,) m, insert frame: centre on the insert of the region in which the gap is
-            the smallest to within 20 µm. The line of action goes through it.
+            the smallest to within the meshes' resolution. The line of action goes through it.
         normal: (3,) unit, insert frame, out of the insert into the femur: mean over that
             region of the insert's vertex normals.
     """
@@ -86,7 +86,7 @@ class ClosestPointQuery:
 
     def _gap(self, condyle: "_Condyle", pose: Array) -> CondyleGap:
         gap, on_femoral, on_insert = self._closest(condyle, pose)
-        centre, normal = condyle.region.centre(self._nearest, pose, gap, on_femoral, on_insert)
+        centre, normal = condyle.region.centre(self._nearest, pose, gap, on_femoral)
         return CondyleGap(gap, on_femoral, on_insert, centre, normal)
 
     def _closest(self, condyle: "_Condyle", pose: Array) -> tuple[float, Array, Array]:

@@ -44,8 +44,8 @@ class NearestPoints:
 
     def __init__(self, surface: Surface, spacing: float = 7e-4) -> None:
         self.surface = surface
-        samples, self._faces, _ = sampled(surface, spacing)
-        self._tree = cKDTree(samples)
+        self._samples, self._faces, _ = sampled(surface, spacing)
+        self._tree = cKDTree(self._samples)
 
     @cached_property
     def vertex_normals(self) -> Array:
@@ -65,6 +65,19 @@ class NearestPoints:
         row, best = np.arange(len(points)), apart.argmin(axis=1)
         foot, face = feet[row, best], candidates[row, best]
         return Nearest(apart[row, best], foot, face, self.normals_at(foot, face))
+
+    def heights(self, points: Array) -> Array:
+        """Return the heights (n,) of points (n, 3) above the surface's nearest sample, m.
+
+        A quick estimate of the signed distance for points near a smooth part: the error is
+        of second order in the spacing of the samples.
+        """
+        sample = self._tree.query(points)[1]
+        return _dot(points - self._samples[sample], self._sample_normals[sample])
+
+    @cached_property
+    def _sample_normals(self) -> Array:
+        return self.normals_at(self._samples, self._faces)
 
     def normals_at(self, points: Array, faces: Indices) -> Array:
         """Return the interpolated unit normals (n, 3) at points (n, 3) of given triangles."""
