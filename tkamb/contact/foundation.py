@@ -1,7 +1,7 @@
 """Elastic foundation: a bed of independent springs under a rigid femoral component."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +90,7 @@ class ElasticFoundation(ContactModel):
 
     Limits: neighbours do not help to carry, so that pressure ends at the edge of the
     overlap and peaks at rims are too high; d >= h/2 is OUT_OF_RANGE. Walls parallel
-    to y carry nothing.
+    to y carry nothing. A mobile bearing is pressed like a fixed one.
 
     Args:
         resolution: m, spacing of the map points.
@@ -120,6 +120,8 @@ class ElasticFoundation(ContactModel):
         self, state: FoundationState, pose: Array, guess: ContactResult | None = None
     ) -> ContactResult:
         """Return the contact at a pose; see `ContactModel`."""
+        if not np.isfinite(pose).all():
+            return failed_result(state, pose, "the pose is not finite")
         bed = state.bed
         gap = gaps_along_normals(bed, state.femoral_rays, pose)
         strain = np.maximum(-gap, 0.0) / np.maximum(bed.thickness, THINNEST)
@@ -163,6 +165,12 @@ class ElasticFoundation(ContactModel):
         if result.status is ContactStatus.OK and result.residual <= LOAD_TOLERANCE:
             return result
         return press_by_search(self, state, load, pose, guess)
+
+    def probe(self, state: FoundationState, guess: ContactResult | None = None) -> Any:
+        """Return the probe with near columns and exact stiffness; see `ContactModel`."""
+        from tkamb.contact.foundation_probe import FoundationProbe
+
+        return FoundationProbe(self.law, state)
 
 
 @dataclass(frozen=True)
@@ -209,6 +217,15 @@ def layer_pressure(law: Law, material: Material, strain: Array) -> Array:
     return pressure
 
 
+def layer_slope(law: Law, material: Material, strain: Array) -> Array:
+    """Return d pressure / d strain (n,), Pa, of `layer_pressure`."""
+    if law == "linear":
+        return np.full_like(strain, material.confined_modulus)
+    stiffening = material.confined_modulus / material.young_modulus
+    tangent = material.tangent(-stiffening * np.log1p(-strain))
+    return np.asarray(tangent * stiffening / (1.0 - strain))
+
+
 def gaps_along_normals(bed: Bed, femoral_rays: RayCaster, pose: Array) -> Array:
     """Return the gap (n,) m along the insert's normals; negative = penetration.
 
@@ -216,10 +233,20 @@ def gaps_along_normals(bed: Bed, femoral_rays: RayCaster, pose: Array) -> Array:
     the normal; the first crossing counts. inf where no femoral surface lies above, -inf
     where the femoral component reaches deeper than where the rays start.
     """
+    return gaps_and_facets(bed, femoral_rays, pose)[0]
+
+
+def gaps_and_facets(bed: Bed, femoral_rays: RayCaster, pose: Array) -> tuple[Array, Array]:
+    """Return the gap (n,), see `gaps_along_normals`, and the normals (n, 3) of what is met.
+
+    The normals are those of the femoral facets, in the insert frame.
+    """
     back = inverse(pose)
     normals = rotate(back, bed.normals)
     below = DEEPEST_STRAIN * np.minimum(bed.thickness, bed.depth)
     origins = transform(back, bed.points) - below[:, None] * normals
     distance, face = femoral_rays.first(origins, normals)
-    facing = np.einsum("ij,ij->i", normals, femoral_rays.surface.face_normals[face])
-    return np.where((face >= 0) & (facing > 0), -np.inf, distance - below)
+    met = femoral_rays.surface.face_normals[face]
+    facing = np.einsum("ij,ij->i", normals, met)
+    gap = np.where((face >= 0) & (facing > 0), -np.inf, distance - below)
+    return gap, rotate(pose, met)

@@ -154,3 +154,12 @@ class ContactModel(ABC):
         from tkamb.contact.pressing import press_by_search
 
         return press_by_search(self, state, load, pose, guess)
+
+    def probe(self, state: Any, guess: ContactResult | None = None) -> Any:
+        """Return a `tkamb.contact.probe.Probe`: wrenches at many neighbouring poses.
+
+        The generic one calls `evaluate`; a model may bring a faster one, with stiffness.
+        """
+        from tkamb.contact.probe import Probe
+
+        return Probe(self, state, guess)

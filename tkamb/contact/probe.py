@@ -1,0 +1,114 @@
+"""What a search for equilibrium asks of a contact model: wrenches at neighbouring poses.
+
+A probe answers many poses in a row and may keep what it has learnt; the answers are those
+of `evaluate`. A model that knows its tangent brings a faster probe with stiffness.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tkamb.contact.model import ContactModel, ContactResult, ContactStatus
+from tkamb.contact.summary import medial_points, wrench_of
+from tkamb.geometry.condyles import condyle_split
+from tkamb.geometry.frames import Array
+
+
+@dataclass(frozen=True, eq=False)
+class CondyleWrench:
+    """What one condyle does to the insert.
+
+    Args:
+        wrench: (6,) force (N) and moment about the insert's origin (N·m), on the insert.
+        centre: (3,) m, centre of pressure.
+        stiffness: (6, 6) change of the wrench per small displacement of the femoral component
+            (of its point at the insert's origin, m, then rotation, rad); None if unknown.
+    """
+
+    wrench: Array
+    centre: Array
+    stiffness: Array | None = None
+
+    @property
+    def force(self) -> float:
+        """N, magnitude of the resultant."""
+        return float(np.linalg.norm(self.wrench[:3]))
+
+    @property
+    def normal(self) -> Array:
+        """(3,) unit, out of the insert into the femur: against the resultant on the insert."""
+        return -self.wrench[:3] / self.force
+
+    @property
+    def point(self) -> Array:
+        """(3,) m, the point on the resultant's line of action nearest to the centre.
+
+        The nodal forces of a curved contact are not parallel; about their centre of pressure
+        they leave a small moment, about this point only its part along the resultant.
+        """
+        force = self.wrench[:3]
+        left = self.wrench[3:] - np.cross(self.centre, force)
+        return np.asarray(self.centre + np.cross(force, left) / (force @ force))
+
+
+@dataclass(frozen=True, eq=False)
+class ProbedContact:
+    """The contact at one pose, condyle by condyle; a side that carries nothing is absent.
+
+    Args:
+        condyles: side -> wrench.
+        known: False where the model is out of range or has not converged.
+        result: the full result, where the probe had to compute it.
+    """
+
+    condyles: dict[str, CondyleWrench]
+    known: bool = True
+    result: ContactResult | None = None
+
+    @property
+    def wrench(self) -> Array:
+        """(6,) on the insert."""
+        return np.asarray(sum((c.wrench for c in self.condyles.values()), np.zeros(6)))
+
+
+class Probe:
+    """The probe of any model: `evaluate`, each answer the next one's guess.
+
+    Args:
+        model: any contact model.
+        state: what its `prepare` returned.
+        guess: an earlier result.
+    """
+
+    def __init__(self, model: ContactModel, state: Any, guess: ContactResult | None = None) -> None:
+        self._model, self._state, self._guess = model, state, guess
+        self._split = condyle_split(state.pair.femoral)
+
+    def at(self, pose: Array) -> ProbedContact:
+        """Return the contact at a pose_femoral_in_insert (4, 4)."""
+        result = self._model.evaluate(self._state, pose, self._guess)
+        if result.status is not ContactStatus.OK:
+            return ProbedContact({}, False, result)
+        self._guess = result
+        return ProbedContact(condyle_wrenches(result, self._split), True, result)
+
+
+def condyle_wrenches(result: ContactResult, split: float | None) -> dict[str, CondyleWrench]:
+    """Return what each condyle that carries load does to the insert.
+
+    Args:
+        result: a contact.
+        split: z (m, femoral frame) between the condyles; None: one condyle, medial.
+    """
+    magnitude = np.linalg.norm(result.nodal_force, axis=1)
+    medial = medial_points(result.points, result.pose, split)
+    found = {}
+    for side, own in (("medial", medial), ("lateral", ~medial)):
+        chosen = own & (magnitude > 0)
+        if chosen.any():
+            weight = magnitude[chosen]
+            centre = weight @ result.points[chosen] / weight.sum()
+            wrench = wrench_of(result.points[chosen], result.nodal_force[chosen])
+            found[side] = CondyleWrench(wrench, centre)
+    return found
