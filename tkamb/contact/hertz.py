@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.bed import Bed, sample_bed
+from tkamb.contact.bed import STEEPEST, Bed, sample_bed
 from tkamb.contact.curvature import OsculatingContact, osculate
 from tkamb.contact.ellipse import ContactEllipse, contact_ellipse
 from tkamb.contact.foundation import gaps_along_normals
@@ -26,12 +26,18 @@ from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import Array
 from tkamb.geometry.rays import RayCaster
 
-SUB_CELLS = 6
-"""Sub-cells per edge of a grid cell over which the pressure is averaged."""
+SHORT_AXIS_SUB_CELLS = 10
+"""Sub-cells on the ellipse's short semi-axis, over which the pressure is averaged."""
+FEWEST_SUB_CELLS, MOST_SUB_CELLS = 6, 50
+"""Bounds of the sub-cells per edge of a grid cell."""
 LEAST_ON_BED = 0.95
 """Share of the semi-ellipsoid that must lie on the insert."""
 FLATTEST = 1e-6
 """Smallest ratio of the two relative curvatures that still makes an ellipse."""
+
+
+SIDES = ("medial", "lateral")
+CONFORMING = "conforms to the insert: no ellipse (relative curvature is not positive)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +100,8 @@ class Hertz(ContactModel):
 
     OUT_OF_RANGE: a condyle that conforms to the insert (relative curvature <= 0, concave
     radius <= convex radius) or whose ellipse leaves the insert. Flag: an ellipse wider than
-    the insert is thick, where the half-space no longer holds (the layer is stiffer).
+    the insert is thick, where the half-space no longer holds (the layer is stiffer). A
+    mobile bearing is pressed like a fixed one.
 
     Args:
         resolution: m, spacing of the map points.
@@ -126,6 +133,8 @@ class Hertz(ContactModel):
         self, state: HertzState, pose: Array, guess: ContactResult | None = None
     ) -> ContactResult:
         """Return the contact at a pose; see `ContactModel`."""
+        if not np.isfinite(pose).all():
+            return failed_result(state, pose, "the pose is not finite")
         bed, material = state.bed, state.pair.material
         plane_modulus = material.young_modulus / (1 - material.poisson_ratio**2)
         pressure = np.zeros((2, len(bed.points)))
@@ -154,10 +163,6 @@ class Hertz(ContactModel):
         return _collected(state, pose, pressure, patches, tuple(flags))
 
 
-SIDES = ("medial", "lateral")
-CONFORMING = "conforms to the insert: no ellipse (relative curvature is not positive)"
-
-
 def condyle_geometry(
     state: HertzState, pose: Array, patch_radius: float
 ) -> tuple[CondyleGeometry | None, CondyleGeometry | None]:
@@ -184,30 +189,40 @@ def map_pressure(
     """Return the semi-ellipsoid on the bed (n,), Pa, and the share of it that the bed holds.
 
     Averaged over sub-cells of each grid cell, then scaled so that the vertical force on the
-    bed is the patch's force times n_y.
+    bed is the patch's force times n_y. A patch much narrower than a cell goes to the nearest
+    point.
     """
     pressure = np.zeros(len(bed.points))
-    reach = patch.long_axis + bed.resolution * 2
-    near = np.flatnonzero(np.linalg.norm(bed.points - contact.point, axis=1) <= reach)
-    if near.size == 0:
-        return pressure, 0.0
-    ticks = ((np.arange(SUB_CELLS) + 0.5) / SUB_CELLS - 0.5) * bed.resolution
+    offset = bed.points - contact.point
+    wanted = patch.force * contact.normal[1]
+    if patch.short_axis < bed.resolution / MOST_SUB_CELLS * SHORT_AXIS_SUB_CELLS:
+        nearest = int(np.einsum("ij,ij->i", offset, offset).argmin())
+        pressure[nearest] = wanted / (bed.area[nearest] * bed.normals[nearest, 1])
+        return pressure, 1.0
+    beyond = np.abs(offset @ contact.axes.T) - [patch.long_axis, patch.short_axis]
+    low = np.abs(offset @ contact.normal) < patch.long_axis + bed.resolution
+    near = np.flatnonzero((beyond.max(axis=1) < 2 * bed.resolution) & low)
+    pressure[near] = patch.peak_pressure * _cell_means(bed, near, contact, patch)
+    held = float((pressure * bed.area) @ bed.normals[:, 1])
+    return (pressure * (wanted / held), held / wanted) if held > 0 else (pressure, 0.0)
+
+
+def _cell_means(
+    bed: Bed, near: NDArray[np.int64], contact: OsculatingContact, patch: ContactEllipse
+) -> Array:
+    """Return the mean of sqrt(1 - (u/a)² - (v/b)²) over the grid cells of points (m,)."""
+    wanted = int(np.ceil(SHORT_AXIS_SUB_CELLS * bed.resolution / patch.short_axis))
+    count = min(max(wanted, FEWEST_SUB_CELLS), MOST_SUB_CELLS)
+    ticks = ((np.arange(count) + 0.5) / count - 0.5) * bed.resolution
     dx, dz = (grid.ravel() for grid in np.meshgrid(ticks, ticks))
     normals = bed.normals[near]
-    slope = -normals[:, [0, 2]] / np.maximum(normals[:, 1:2], 0.1)
-    offset = np.stack(np.broadcast_arrays(dx, slope[:, :1] * dx + slope[:, 1:] * dz, dz), axis=-1)
+    slope = -normals[:, [0, 2]] / np.maximum(normals[:, 1:2], STEEPEST)
+    rise = slope[:, :1] * dx + slope[:, 1:] * dz
+    offset = np.stack(np.broadcast_arrays(dx, rise, dz), axis=-1)
     places = (bed.points[near] - contact.point)[:, None] + offset
     u, v = np.moveaxis(places @ contact.axes.T, -1, 0)
     inside = 1 - (u / patch.long_axis) ** 2 - (v / patch.short_axis) ** 2
-    pressure[near] = patch.peak_pressure * np.sqrt(np.maximum(inside, 0.0)).mean(axis=1)
-    held = float((pressure * bed.area) @ bed.normals[:, 1])
-    wanted = patch.force * contact.normal[1]
-    if np.pi * patch.long_axis * patch.short_axis < (bed.resolution / SUB_CELLS) ** 2 * 20:
-        nearest = near[np.linalg.norm(bed.points[near] - contact.point, axis=1).argmin()]
-        pressure[:] = 0.0
-        pressure[nearest] = wanted / (bed.area[nearest] * bed.normals[nearest, 1])
-        return pressure, 1.0
-    return (pressure * (wanted / held), held / wanted) if held > 0 else (pressure, 0.0)
+    return np.asarray(np.sqrt(np.maximum(inside, 0.0)).mean(axis=1))
 
 
 def _described(bed: Bed, contact: OsculatingContact, patch: ContactEllipse) -> CondyleContact:
@@ -257,7 +272,7 @@ def _collected(
     )
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=8)
 def _geometry(
     state: HertzState, level: bytes, patch_radius: float
 ) -> tuple[CondyleGeometry | None, CondyleGeometry | None]:

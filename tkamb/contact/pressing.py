@@ -49,9 +49,12 @@ def first_touch_height(pair: ContactPair, pose: Array) -> float:
     """Return the y (m) of the femoral origin at which the bodies first touch.
 
     It depends on the rotation, x and z of pose_femoral_in_insert, not on its y; NaN if the
-    femoral component does not lie over the insert. The last few answers are kept.
+    femoral component does not lie over the insert or the pose is not finite. The last few
+    answers are kept.
     """
     level = np.array(pose, float)
+    if not np.isfinite(level).all():
+        return math.nan
     level[1, 3] = 0.0
     return _touch_height(pair, level.tobytes())
 
@@ -106,9 +109,8 @@ def press_by_search(
         InputError: the load is negative or not finite.
     """
     check_load(load)
-    pair: ContactPair = state.pair
     pose = np.array(pose, float)
-    if not math.isfinite(first_touch_height(pair, pose)):
+    if not math.isfinite(first_touch_height(state.pair, pose)):
         return failed_result(state, pose, "the femoral component does not lie over the insert")
     if load == 0:
         return unloaded_result(model, state, pose)
@@ -116,11 +118,14 @@ def press_by_search(
     start = guess.approach if guess is not None else FIRST_APPROACH
     found = search_load(reaction or seen.reaction, load, start)
     if not math.isfinite(found.approach):
-        deepest = seen.at(found.deepest)
-        return failed_result(
-            state, pose, f"a load of {load:g} N cannot be reached", *deepest.flags, found=found
-        )
-    result = seen.at(found.approach)
+        why = seen.at(found.deepest).flags
+        lost = f"a load of {load:g} N cannot be reached"
+        return failed_result(state, pose, lost, *why, found=found)
+    return _carried(seen.at(found.approach), found, load)
+
+
+def _carried(result: ContactResult, found: LoadSearch, load: float) -> ContactResult:
+    """Return the result with what the search says about it."""
     residual = abs(-float(result.wrench_on_insert[1]) - load) / load
     missed = not residual <= COARSE_TOLERANCE
     return replace(
@@ -272,6 +277,6 @@ def _touch_of(pair: ContactPair) -> FirstTouch:
     return FirstTouch(pair.femoral, pair.insert)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=8)
 def _touch_height(pair: ContactPair, level: bytes) -> float:
     return -_touch_of(pair).travel(np.frombuffer(level).reshape(4, 4))
