@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import trimesh
-from inserts import DATA, raised, real_insert
 from scipy.integrate import quad
-from shapes import torus_condyle, trough
 
+from inserts import DATA, raised, real_insert
+from shapes import torus_condyle, trough
 from tkamb.contact.lattice.grid import build_grid
 from tkamb.errors import InputError
 from tkamb.geometry.arcs import arc_lengths, draw_uv_lines

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from inserts import dished, raised
 from shapes import sphere
-
 from tkamb.geometry.height_field import inside_intervals
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
@@ -37,7 +37,7 @@ def test_first_agrees_with_all_triangles_in_double_precision(far):
     surface = sphere(0.02, 3, (far, 0.0, far))
     rng = np.random.default_rng(1)
     direction = np.array([0.3, -1.0, 0.2]) / np.linalg.norm([0.3, -1.0, 0.2])
-    origins = rng.uniform(-0.02, 0.02, (200, 3)) + [far, 0.05, far]
+    origins = rng.uniform(-0.02, 0.02, (200, 3)) + np.array([far, 0.05, far])
     distance, face = RayCaster(surface).first(origins, direction)
     expected = brute(surface, origins, direction)
     assert ((face >= 0) == np.isfinite(expected)).mean() > 0.99
@@ -76,7 +76,7 @@ def test_all_reports_every_crossing_once_and_sorted():
     xx, zz = (v.ravel() for v in np.meshgrid(x, z, indexing="ij"))
     origins = np.column_stack([xx, np.full(len(xx), 0.1), zz])
     vertical = surface.vertices[np.abs(surface.vertices[:, 1]) > 1e-6][:500] * [0.999, 0, 0.999]
-    origins = np.concatenate([origins, vertical + [0, 0.1, 0]])
+    origins = np.concatenate([origins, vertical + np.array([0, 0.1, 0])])
     ray, distance, face = RayCaster(surface).all(origins, DOWN)
     np.testing.assert_array_equal(np.bincount(ray), np.full(len(origins), 2))
     np.testing.assert_array_equal(ray, np.sort(ray))
