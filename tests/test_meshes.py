@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from shapes import plate, sphere, two_dishes
 from tkamb.errors import InputError
@@ -162,6 +164,35 @@ def test_each_repair_restores_the_body_with_one_notice(tmp_path, caplog):
         assert caplog.records[0].levelno == logging.WARNING
         assert words in caplog.text
         assert "broken.ply" in caplog.text
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    lost=st.integers(0, 25),
+    flipped=st.integers(0, 400),
+    doubled=st.integers(0, 10),
+    split=st.booleans(),
+)
+def test_any_mixture_of_small_defects_is_mended(seed, lost, flipped, doubled, split):
+    """Lost, flipped and doubled triangles, merged or not: the closed body comes back."""
+    rng = np.random.default_rng(seed)
+    ball = sphere(0.02, 3)
+    faces = np.delete(ball.faces, rng.choice(len(ball.faces), lost, replace=False), axis=0)
+    faces = np.concatenate([faces, faces[rng.choice(len(faces), doubled)]])
+    turned = rng.choice(len(faces), flipped, replace=False)
+    faces[turned] = faces[turned][:, ::-1]
+    vertices = ball.vertices
+    if split:
+        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
+    mended = repair(vertices, faces)
+    surface = Surface(mended.vertices, mended.faces)
+    wide = [hole for hole in mended.holes if len(hole.vertices) <= 3]
+    assert not wide
+    assert surface.mesh.is_winding_consistent
+    if not mended.holes:
+        assert surface.mesh.is_watertight
+        assert surface.mesh.volume == pytest.approx(ball.mesh.volume, rel=5e-3)
 
 
 def test_loose_vertices_are_dropped_with_a_notice(tmp_path, caplog):

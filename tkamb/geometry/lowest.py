@@ -15,8 +15,9 @@ class LowestPoints:
     """Lowest point of each condyle along the insert's y, prepared for many poses.
 
     y is that of the lowest vertex. x and z are the mean of the condyle's surface, weighted
-    with exp(-height / 20 µm) above that vertex, so that the point rolls with the condyle
-    and does not jump from vertex to vertex of the mesh.
+    with exp(-height / RESOLUTION) of the height above that vertex (RESOLUTION as in
+    `tkamb.geometry.close_region`), so that the point rolls with the condyle and does not jump
+    from vertex to vertex of the mesh.
 
     Args:
         femoral: femoral component, femoral frame.
