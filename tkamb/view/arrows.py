@@ -8,10 +8,13 @@ from tkamb.body.knee import KneeGeometry
 from tkamb.body.load import PointForces
 from tkamb.geometry.frames import Array
 from tkamb.results import Results
+from tkamb.units import MILLIMETRE
 from tkamb.view.colours import BLACK, FORCE
 from tkamb.view.drawing import Arrow, Marker
 
 NOTHING = np.full(3, np.nan)
+CONTACT_POINT = 0.6 * MILLIMETRE
+"""m, radius."""
 
 
 def force_arrows(
@@ -46,11 +49,16 @@ def contact_markers(geometries: Sequence[KneeGeometry]) -> tuple[Marker, ...]:
         f"{side} contact point": [_condyle_point(one, side) for one in geometries]
         for side in ("medial", "lateral")
     }
-    found["patellofemoral contact point"] = [
-        one.extensor.contact_point if one.extensor else NOTHING for one in geometries
-    ]
+    patella = "patellofemoral contact point"
+    found[patella] = [one.extensor.contact_point if one.extensor else NOTHING for one in geometries]
     return tuple(
-        Marker(name, "contact points", BLACK, np.stack(points), 0.9e-3)
+        Marker(
+            name,
+            "patella" if name == patella else "contact points",
+            BLACK,
+            np.stack(points),
+            CONTACT_POINT,
+        )
         for name, points in found.items()
         if np.isfinite(points).any()
     )

@@ -22,7 +22,7 @@ LAYERS = (
     "forces",
     "pressure map",
     "contact points",
-    "centre-of-pressure paths",
+    "load paths",
     "recorded pose",
     "lattice",
 )

@@ -64,7 +64,7 @@ class Block:
 def pack(drawings: Sequence[Drawing]) -> bytes:
     """Return the drawings, shown side by side, on common colour scales."""
     block = Block()
-    peak = max((one.map.peak for one in drawings if one.map), default=0.0)
+    peak = peak_pressure(drawings)
     limit = max(one.strain_limit for one in drawings)
     return block.packed(
         {
@@ -78,6 +78,11 @@ def pack(drawings: Sequence[Drawing]) -> bytes:
             "views": [_view(block, k, one, peak) for k, one in enumerate(drawings)],
         }
     )
+
+
+def peak_pressure(drawings: Sequence[Drawing]) -> float:
+    """Return the largest pressure (MPa) of all frames: the top of the common scale."""
+    return max((one.map.peak for one in drawings if one.map), default=0.0)
 
 
 def packed_map(found: PressureMap, peak: float, words: str) -> bytes:

@@ -113,9 +113,7 @@ def path_strands(centres: dict[str, Array]) -> tuple[Strand, ...]:
             part = points[first:last] + np.array([0.0, 2.0 * PATH, 0.0])
             colours = np.repeat(rgb(SIDE_COLOURS[side])[None], len(part), axis=0)
             name = f"{side} path {number}"
-            strands.append(
-                Strand(name, "centre-of-pressure paths", part[None], colours[None], PATH)
-            )
+            strands.append(Strand(name, "load paths", part[None], colours[None], PATH))
     return tuple(strands)
 
 
@@ -124,10 +122,10 @@ def centre_markers(centres: dict[str, Array]) -> tuple[Marker, ...]:
     return tuple(
         Marker(
             f"{side} centre of pressure",
-            "centre-of-pressure paths",
+            "load paths",
             SIDE_COLOURS[side],
             points,
-            1.1 * MILLIMETRE,
+            0.9 * MILLIMETRE,
         )
         for side, points in centres.items()
     )

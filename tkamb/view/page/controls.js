@@ -9,7 +9,7 @@ const CAMERAS = {
   "top of insert": {
     from: [-0.0004, 0.24, 0], at: [0, 0.012, 0],
     without: ["femoral component", "bones", "patella", "ligaments", "extensor lines", "forces"]},
-  "whole leg": {from: [1.55, 0.3, -1.55], at: [-0.1, 0, 0]},
+  "whole leg": {from: [1.35, 0.25, -1.35], at: [-0.06, -0.03, 0], arrows: 2.5},
 };
 const KNEE = [0, 0.03, 0];
 const element = (id) => document.getElementById(id);
@@ -34,6 +34,9 @@ tkamb.look = function (name) {
     tkamb.showLayer(layer, !off);
   }
   tkamb.camera = name;
+  tkamb.arrowLength = tkamb.data.metres_per_body_weight * (camera.arrows || 1);
+  showScale();
+  tkamb.showFrame(tkamb.frame);
   for (const button of element("cameras").children) {
     button.setAttribute("aria-pressed", button.textContent === name);
   }
@@ -93,8 +96,11 @@ function addLegends() {
       }
     }
   }
-  const weights = views.map((view) => `${view.body_weight.toFixed(0)} N`).join(" / ");
-  const millimetres = 1000 * data.metres_per_body_weight;
+}
+
+function showScale() {
+  const weights = tkamb.views.map((view) => `${view.body_weight.toFixed(0)} N`).join(" / ");
+  const millimetres = (1000 * tkamb.arrowLength).toFixed(0);
   element("scale").textContent = `${millimetres} mm of arrow = 1 BW = ${weights}`;
 }
 
@@ -156,6 +162,7 @@ function showNumbers() {
   element("place").textContent =
     `frame ${tkamb.frame} of ${tkamb.frameCount() - 1}: ${tkamb.views[0].places[frames[0]]}`;
   element("frame").value = tkamb.frame;
+  element("caption").textContent = element("place").textContent;
 }
 
 function inBodyWeights(arrow, frame, weight) {

@@ -102,14 +102,15 @@ class Pointer {
     const {Vector3} = MeshCat.THREE, {arrow, node} = this;
     const force = new Vector3().fromArray(arrow.forces, 3 * frame);
     const point = new Vector3().fromArray(arrow.points, 3 * frame);
-    const length = force.length() / bodyWeight * tkamb.data.metres_per_body_weight;
+    const length = force.length() / bodyWeight * tkamb.arrowLength;
     node.visible = Number.isFinite(length + point.length()) && length > 1e-5;
     if (!node.visible) return;
     const way = force.clone().normalize();
     node.quaternion.setFromUnitVectors(new Vector3(0, 1, 0), way);
     node.position.copy(point);
     if (arrow.ends_there) node.position.addScaledVector(way, -length);
-    const head = Math.min(0.011, 0.6 * length), width = Math.min(0.0021, 0.1 * length);
+    const size = tkamb.arrowLength / tkamb.data.metres_per_body_weight;
+    const head = Math.min(0.011 * size, 0.6 * length), width = Math.min(0.0021 * size, 0.1 * length);
     for (const mesh of this.body.children) {
       if (mesh.name.startsWith("head")) {
         mesh.scale.set(2.6 * width, head, 2.6 * width);
@@ -161,11 +162,29 @@ function placeMarker(marker, k) {
   if (node.visible) node.position.set(...point);
 }
 
+// Loaded points hold their share of the largest pressure. An unloaded point beside loaded ones
+// holds its loaded neighbours' mean with a minus, which draws the edge of the contact halfway.
 tkamb.colourMap = function (view, k) {
   const map = view.map;
   if (!map) return;
   const mesh = tkamb.node(`${view.root}/pressure map/map/<object>`).object;
-  const {level} = mesh.geometry.attributes, start = map === view.runMap ? k * map.count : 0;
-  for (let i = 0; i < map.count; i++) level.array[i] = map.levels[start + i] / 255;
+  const {level} = mesh.geometry.attributes, levels = level.array;
+  const start = map === view.runMap ? k * map.count : 0;
+  const sum = new Float32Array(map.count), beside = new Uint8Array(map.count);
+  for (let i = 0; i < map.count; i++) levels[i] = map.levels[start + i] / 255;
+  for (let t = 0; t < map.triangles.length; t += 3) {
+    const corners = map.triangles.subarray(t, t + 3);
+    const loaded = corners.filter((i) => levels[i] > 0);
+    if (loaded.length === 0 || loaded.length === 3) continue;
+    const mean = loaded.reduce((total, i) => total + levels[i], 0) / loaded.length;
+    for (const i of corners) {
+      if (levels[i] > 0) continue;
+      sum[i] += mean;
+      beside[i] += 1;
+    }
+  }
+  for (let i = 0; i < map.count; i++) {
+    if (!(levels[i] > 0)) levels[i] = beside[i] ? -sum[i] / beside[i] : -1;
+  }
   level.needsUpdate = true;
 };

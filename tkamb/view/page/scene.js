@@ -29,6 +29,7 @@ tkamb.node = (path) => tkamb.viewer.scene_tree.find(tkamb.split(path));
 tkamb.build = function (data) {
   const viewer = tkamb.viewer;
   tkamb.data = data;
+  tkamb.arrowLength = data.metres_per_body_weight;
   dressScene(viewer);
   tkamb.scale = scaleTexture(data.pressure_scale);
   tkamb.views = data.views.map((view, number) => buildView(viewer, view, number));
@@ -65,7 +66,7 @@ function buildView(viewer, view, number) {
   view.root = `/tkamb/${number}`;
   for (const layer of tkamb.data.layers) tkamb.node(`${view.root}/${layer}`);
   for (const command of view.commands) viewer.handle_command_bytearray(command);
-  seeThrough(tkamb.node(view.root).object);
+  seeThrough(view);
   view.tubes = view.strands.map((strand) => new Tube(viewer, strand));
   view.pointers = view.arrows.map((arrow) => new Pointer(viewer, arrow));
   for (const marker of view.markers) addMarker(viewer, marker);
@@ -75,13 +76,24 @@ function buildView(viewer, view, number) {
   return view;
 }
 
-// Surfaces that let see through hide their own far side, so that they do not look muddled.
-function seeThrough(root) {
-  root.traverse((object) => {
-    if (object.material && object.material.transparent) {
-      object.material.side = MeshCat.THREE.FrontSide;
-      object.material.depthWrite = true;
-      object.renderOrder = 2;
+// A surface that lets see through first writes its depth, then its colour: its own far side stays
+// hidden whatever the order of its triangles. Bones come before metal, which is seen over them.
+const SEEN_THROUGH = ["bones", "patella", "femoral component", "recorded pose"];
+
+function seeThrough(view) {
+  const {THREE} = MeshCat;
+  SEEN_THROUGH.forEach((layer, order) => {
+    const found = [];
+    tkamb.node(`${view.root}/${layer}`).object.traverse((object) => {
+      if (object.material && object.material.transparent) found.push(object);
+    });
+    for (const object of found) {
+      const depth = new THREE.MeshBasicMaterial({colorWrite: false, transparent: true});
+      const before = new THREE.Mesh(object.geometry, depth);
+      before.renderOrder = 2 + 0.1 * order;
+      object.renderOrder = before.renderOrder + 0.05;
+      object.material.side = THREE.FrontSide;
+      object.add(before);
     }
   });
 }
@@ -95,8 +107,8 @@ function scaleTexture(colours) {
   return texture;
 }
 
-// The map: a level per point, coloured in the fragment as the colour bar says, cut off where
-// nothing presses.
+// The map: a level per point (0 to 1), coloured in the fragment as the colour bar says. Where
+// nothing presses the level is negative, and the fragment is cut off.
 tkamb.showMap = function (view, map) {
   view.map = map;
   if (!map) return;
@@ -110,7 +122,7 @@ tkamb.showMap = function (view, map) {
       void main() { shade = level;
         gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
     fragmentShader: `uniform sampler2D scale; varying float shade;
-      void main() { if (shade < 0.012) discard;
+      void main() { if (shade < 0.0) discard;
         gl_FragColor = texture2D(scale, vec2(shade * 255.0 / 256.0 + 0.5 / 256.0, 0.5)); }`,
     side: THREE.DoubleSide, polygonOffset: true, polygonOffsetFactor: -2, polygonOffsetUnits: -8,
   });

@@ -17,7 +17,10 @@ tkamb.start = async function () {
   addPlayer();
   addKeys();
   if (asked.live) tkamb.live = new Live(asked.live);
-  document.body.classList.toggle("figure", Boolean(asked.figure));
+  if (asked.figure) {
+    document.body.classList.add("figure");
+    document.getElementById("stage").append(document.getElementById("force-box"));
+  }
   tkamb.viewer.set_3d_pane_size();
   tkamb.look(asked.view || "oblique");
   tkamb.go(Number(asked.frame || 0));

@@ -1,0 +1,121 @@
+"""Show runs: in a live window, as one file, as a picture."""
+
+import os
+import sys
+import tempfile
+import threading
+import webbrowser
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from tkamb.errors import InputError
+from tkamb.output.atomic import replaced_file
+from tkamb.view.browser import take_picture
+from tkamb.view.draw import draw
+from tkamb.view.drawing import Drawing
+from tkamb.view.live import ContactSwitch
+from tkamb.view.page import page_html, write_page
+from tkamb.view.payload import pack, peak_pressure
+from tkamb.view.run import Run
+from tkamb.view.server import ViewServer
+
+Progress = Callable[[Iterable[int]], Iterable[int]]
+Line = Callable[[str], None]
+
+CAMERAS = ("oblique", "anterior", "medial", "lateral", "top of insert", "whole leg")
+
+
+class Show:
+    """Runs side by side, drawn once.
+
+    Args:
+        runs: one or more.
+        frame: shown first.
+        camera: one of CAMERAS.
+        progress: wraps the frame indices while the drawings are made.
+
+    Raises:
+        InputError: no such frame or camera.
+    """
+
+    def __init__(
+        self,
+        runs: Sequence[Run],
+        *,
+        frame: int = 0,
+        camera: str = "oblique",
+        progress: Progress = lambda frames: frames,
+    ) -> None:
+        most = max(len(run.frames) for run in runs)
+        if not -most <= frame < most:
+            raise InputError(f"there is no frame {frame}", "--frame", f"0 to {most - 1}")
+        if camera not in CAMERAS:
+            raise InputError(f"no view '{camera}'", "--camera", f"there are: {', '.join(CAMERAS)}")
+        self.runs, self.frame, self.camera = tuple(runs), frame % most, camera
+        self.drawings: tuple[Drawing, ...] = tuple(draw(run, progress) for run in runs)
+        self.packed = pack(self.drawings)
+        self.title = " | ".join(drawing.title for drawing in self.drawings)
+
+    def html(self) -> str:
+        """Return the page that stands by itself."""
+        return page_html(self.title, self.packed, frame=self.frame, view=self.camera)
+
+    def write_html(self, path: str | Path) -> None:
+        """Write the page that stands by itself, whole or not at all.
+
+        Raises:
+            InputError: the folder cannot be written.
+        """
+        write_page(Path(path), self.html())
+
+    def write_png(self, path: str | Path, size: tuple[int, int] = (1400, 900)) -> None:
+        """Write a picture of the frame, with colour bars and legend but without controls.
+
+        Raises:
+            ComputationError: no browser.
+            InputError: the folder cannot be written.
+        """
+        with tempfile.TemporaryDirectory(prefix="tkamb-view-") as folder:
+            page = Path(folder) / "page.html"
+            write_page(page, self.html())
+            picture = take_picture(page, size, "figure=1")
+        with replaced_file(Path(path)) as temporary:
+            temporary.write_bytes(picture)
+
+    def server(self, port: int = 0) -> ViewServer:
+        """Return the server of the live window, not yet started.
+
+        Raises:
+            InputError: the port is taken.
+        """
+        switch = ContactSwitch(self.runs[0], peak_pressure(self.drawings))
+        html = page_html(self.title, None, frame=self.frame, view=self.camera, live=switch.models())
+        return ViewServer(html, self.packed, switch, port)
+
+    def open(self, announce: Line, port: int = 0, browse: bool = True) -> None:
+        """Serve the live window until the user interrupts.
+
+        Raises:
+            InputError: the port is taken.
+        """
+        server = self.server(port)
+        announce(f"viewer: {server.url} (this machine only; Ctrl-C ends it)")
+        if browse and not open_window(server.url):
+            announce("no browser found here: open that address yourself, or use --html FILE")
+        server.serve()
+
+
+def open_window(url: str) -> bool:
+    """Open a window of the user's browser; False where there is none or no display."""
+    if sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        return False
+    return webbrowser.open(url)
+
+
+def serve_in_background(server: ViewServer) -> threading.Thread:
+    """Start a server beside the caller, for notebooks and tests."""
+    thread = threading.Thread(target=server.serve, daemon=True)
+    thread.start()
+    return thread
