@@ -51,7 +51,7 @@ def test_a_tilt_is_turned_level_by_the_smallest_rotation(x_deg, z_deg):
 
 
 def test_a_tilt_beyond_the_limit_is_no_tilt():
-    with pytest.raises(InputError, match="faces"):
+    with pytest.raises(InputError, match="tilted by 40 deg"):
         insert_placement(tilted(two_dishes(), 40, 0))
 
 

@@ -94,14 +94,7 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
         raise InputError(f"{surface.name} has no flat bottom", None, "is it a tibial insert?")
     down = [flat for flat in flats if -flat.normal[1] >= math.cos(TILT_LIMIT)]
     if not down:
-        raise InputError(
-            f"flat bottom of {surface.name} ({_described(flats[0], rotation)}) faces "
-            f"{facing(flats[0].normal, rotation)} of the mesh; axes say that "
-            f"{facing(np.array([0.0, -1.0, 0.0]), rotation)} is inferior",
-            None,
-            "name the axes that point anterior, superior and right so that superior is "
-            f"{facing(-flats[0].normal, rotation)}",
-        )
+        raise _faces_elsewhere(surface.name, flats[0], rotation)
     if len(down) > 1 and down[1].area >= CLEAR * down[0].area:
         raise InputError(
             f"{surface.name} has two flats that could be its bottom: "
@@ -118,6 +111,24 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
             _described(flats[0], rotation),
         )
     return down[0]
+
+
+def _faces_elsewhere(name: str, flat: FlatBottom, rotation: Array) -> InputError:
+    inferior = facing(np.array([0.0, -1.0, 0.0]), rotation)
+    if facing(flat.normal, rotation) == inferior:
+        tilt = math.degrees(math.acos(min(-flat.normal[1], 1.0)))
+        return InputError(
+            f"flat bottom of {name} is tilted by {tilt:.0f} deg from {inferior} of the mesh",
+            None,
+            f"turn the mesh so that it is within {math.degrees(TILT_LIMIT):.0f} deg",
+        )
+    return InputError(
+        f"flat bottom of {name} ({_described(flat, rotation)}) faces "
+        f"{facing(flat.normal, rotation)} of the mesh; axes say that {inferior} is inferior",
+        None,
+        "name the axes that point anterior, superior and right so that superior is "
+        f"{facing(-flat.normal, rotation)}",
+    )
 
 
 def insert_placement(surface: Surface, rotation: Array | None = None) -> Array:

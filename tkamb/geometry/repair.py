@@ -53,7 +53,6 @@ def repair(vertices: Array, faces: Indices) -> Repair:
         vertices: (n, 3) m, finite.
         faces: (k, 3) indices into the vertices.
     """
-    notices: list[str] = []
     unused = len(vertices) - len(np.unique(faces))
     vertices, faces = _merged(vertices, faces)
     faces, collapsed = _without_collapsed(faces)
@@ -70,21 +69,23 @@ def repair(vertices: Array, faces: Indices) -> Repair:
     vertices, faces, filled, widest = _filled(vertices, faces)
     faces, inside_out = _outward(vertices, faces)
     vertices, faces = _referenced(vertices, faces)
-    for count, phrase in (
-        (duplicates, "duplicate face{s} removed"),
-        (collapsed, "degenerate face{s} removed"),
-        (turned, "face{s} with flipped winding turned"),
-        (inside_out, "face{s} of an inside-out body turned"),
-        (unused, "unreferenced {vertices} removed"),
-        (welded, "open {vertices} welded to a neighbour"),
-        (filled, f"small hole{{s}} closed (up to {1e3 * widest:.2g} mm wide)"),
-    ):
-        if count:
-            one = count == 1
-            words = phrase.format(s="" if one else "s", vertices="vertex" if one else "vertices")
-            notices.append(f"{count} {words}")
+    notices = (
+        _notice(duplicates, "duplicate face", "removed"),
+        _notice(collapsed, "degenerate face", "removed"),
+        _notice(turned, "face", "with flipped winding turned"),
+        _notice(inside_out, "face", "of an inside-out body turned"),
+        _notice(unused, "unreferenced vertex", "removed"),
+        _notice(welded, "open vertex", "welded to a neighbour"),
+        _notice(filled, "small hole", f"closed (up to {1e3 * widest:.2g} mm wide)"),
+    )
+    said = tuple(notice for notice in notices if notice)
     holes = tuple(boundary_loops(vertices, faces))
-    return Repair(vertices, faces, tuple(notices), holes, _forks(faces), one_sided)
+    return Repair(vertices, faces, said, holes, _forks(faces), one_sided)
+
+
+def _notice(count: int, noun: str, what: str) -> str:
+    several = noun.replace("vertex", "vertice") + "s"
+    return f"{count} {noun if count == 1 else several} {what}" if count else ""
 
 
 def _merged(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
