@@ -106,6 +106,20 @@ def _add_mesh(commands: Any) -> None:
     check.add_argument("files", type=Path, nargs="+", metavar="FILE")
     check.add_argument("--json", action="store_true")
     check.set_defaults(command=_mesh_check)
+    lattice = verbs.add_parser("lattice", help="the lattice of an insert, and how good it is")
+    lattice.add_argument("insert", type=Path, metavar="INSERT")
+    lattice.add_argument("--resolution", type=float, default=1.0, metavar="MM", help="cell size")
+    lattice.add_argument("--units", choices=("mm", "m"), default="mm", help="of the mesh")
+    lattice.add_argument(
+        "--axes",
+        default="+x,+y,+z",
+        metavar="ANT,SUP,RIGHT",
+        help="mesh axes that point anterior, superior, right; write --axes=-x,+y,-z",
+    )
+    lattice.add_argument("--side", choices=("right", "left"), default="right")
+    lattice.add_argument("--out", type=Path, metavar="F.vtu", help="for ParaView or meshio")
+    lattice.add_argument("--json", action="store_true")
+    lattice.set_defaults(command=_mesh_lattice)
 
 
 def _add_scene(commands: Any) -> None:
@@ -263,6 +277,21 @@ def _view(options: argparse.Namespace) -> int:
         show.write_png(options.png)
     if not (options.html or options.png):
         show.open(announce, options.port)
+    return 0
+
+
+def _mesh_lattice(options: argparse.Namespace) -> int:
+    from tkamb.lattice_file import lattice_of_file
+
+    report = lattice_of_file(
+        options.insert,
+        options.resolution,
+        units=options.units,
+        axes=options.axes,
+        side=options.side,
+        out=options.out,
+    )
+    print(json.dumps(report.as_dict(), indent=2) if options.json else "\n".join(report.lines()))
     return 0
 
 

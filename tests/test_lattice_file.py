@@ -1,0 +1,48 @@
+"""`tkamb mesh lattice`: report, file, and refusals in one line."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tkamb.cli import main
+from tkamb.errors import InputError
+from tkamb.lattice_file import lattice_of_file
+
+INSERT = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "insert.stl"
+
+
+def test_report_and_file(tmp_path, capsys):
+    out = tmp_path / "lattice.vtu"
+    assert main(["mesh", "lattice", str(INSERT), "--resolution", "3", "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert "nodes" in text
+    assert str(out) in text
+    assert out.stat().st_size > 10_000
+
+
+def test_json_holds_the_measures(capsys):
+    assert main(["mesh", "lattice", str(INSERT), "--resolution", "3", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert abs(report["volume_error"]) < 0.05
+    assert report["volume"] == pytest.approx(report["mesh_volume"], rel=0.05)
+    assert report["out"] is None
+
+
+def test_left_is_the_mirror_image():
+    right = lattice_of_file(INSERT, 3.0)
+    left = lattice_of_file(INSERT, 3.0, side="left")
+    assert left.quality.volume == pytest.approx(right.quality.volume, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"resolution_mm": 0.0}, "positive"),
+        ({"resolution_mm": 2.0, "side": "middle"}, "no side"),
+        ({"resolution_mm": 2.0, "out": "lattice.stl"}, "no .vtu file"),
+    ],
+)
+def test_refusals(options, message):
+    with pytest.raises(InputError, match=message):
+        lattice_of_file(INSERT, **options)

@@ -1,0 +1,78 @@
+"""`tkamb mesh lattice`: the lattice of an insert's mesh, its quality, and a .vtu file of it."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from tkamb.contact.lattice.grid import Lattice, build_grid
+from tkamb.contact.lattice.quality import LatticeQuality, measure_quality
+from tkamb.errors import InputError
+from tkamb.geometry.flat_bottom import insert_placement
+from tkamb.inputs.meshes import axes_rotation, load_surface, mirrored
+from tkamb.output.vtk import write_lattice
+from tkamb.units import MILLIMETRE
+
+
+@dataclass(frozen=True, eq=False)
+class LatticeReport:
+    """A lattice, how good it is and where it was written.
+
+    Args:
+        lattice: in the insert frame.
+        quality: its measures.
+        out: the .vtu file, None when none was asked for.
+    """
+
+    lattice: Lattice
+    quality: LatticeQuality
+    out: Path | None
+
+    def lines(self) -> list[str]:
+        """Return the report as lines of text."""
+        return [*self.quality.lines(), *([] if self.out is None else [f"written to {self.out}"])]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report for JSON; SI units, angles in rad."""
+        values = asdict(self.quality)
+        return {
+            **values,
+            "volume_error": self.quality.volume_error,
+            "out": self.out and str(self.out),
+        }
+
+
+def lattice_of_file(
+    insert: str | Path,
+    resolution_mm: float,
+    units: str = "mm",
+    axes: str = "+x,+y,+z",
+    side: str = "right",
+    out: str | Path | None = None,
+) -> LatticeReport:
+    """Build the lattice of an insert's mesh and write it as .vtu if `out` is given.
+
+    Args:
+        insert: STL, OBJ or PLY file, closed.
+        resolution_mm: wanted edge of a cell.
+        units: of the mesh: "m", "cm" or "mm".
+        axes: mesh axes that point anterior, superior and right.
+        side: of the knee; a left one is mirrored.
+        out: .vtu file (metres, insert frame).
+
+    Raises:
+        InputError: bad file, unit, axes, side or resolution, or a mesh that is open.
+    """
+    if out is not None and Path(out).suffix != ".vtu":
+        raise InputError(f"'{out}' is no .vtu file", "out", "name it like lattice.vtu")
+    surface = load_surface(insert, units, axes, name="insert", closed=True)
+    if side == "left":
+        surface = mirrored(surface)
+    elif side != "right":
+        raise InputError(f"'{side}' is no side", "side", "give right or left")
+    surface = surface.moved(insert_placement(surface, axes_rotation(axes)))
+    lattice = build_grid(surface, resolution_mm * MILLIMETRE)
+    if out is not None:
+        write_lattice(lattice, out)
+    return LatticeReport(
+        lattice, measure_quality(lattice, surface), None if out is None else Path(out)
+    )
