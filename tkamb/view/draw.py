@@ -81,8 +81,9 @@ def _pressure_map(results: Results, rows: list[int]) -> PressureMap | None:
     maps = results.maps
     if maps is None or all(row < 0 for row in rows):
         return None
-    stored = maps.pressure_Pa / MEGAPASCAL
-    pressure = np.stack(
-        [stored[row] if row >= 0 else np.full(len(maps.points_m), np.nan) for row in rows]
+    nothing = np.full(len(maps.points_m), np.nan)
+    pressure, gap = (
+        np.stack([stored[row] if row >= 0 else nothing for row in rows])
+        for stored in (maps.pressure_Pa / MEGAPASCAL, maps.gap_m)
     )
-    return PressureMap(maps.points_m, maps.triangles, pressure)
+    return PressureMap(maps.points_m, maps.triangles, pressure, gap)

@@ -119,11 +119,13 @@ class PressureMap:
         points: (n, 3) m.
         triangles: (k, 3) indices.
         pressure: (f, n) MPa, NaN where the frame failed.
+        gap: (f, n) m, positive when apart; says where between the points the contact ends.
     """
 
     points: Array
     triangles: NDArray[np.int64]
     pressure: Array
+    gap: Array
 
     @property
     def peak(self) -> float:

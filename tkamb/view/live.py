@@ -57,9 +57,9 @@ class ContactSwitch:
         points, triangles = side.state.points, side.state.triangles
         result = carried.result
         if result is None:
-            nothing = PressureMap(points, triangles, np.zeros((1, len(points))))
+            nothing = PressureMap(points, triangles, *np.zeros((2, 1, len(points))))
             return packed_map(nothing, self.peak, f"{model}: {carried.problem}")
-        found = PressureMap(points, triangles, result.pressure[None] / MEGAPASCAL)
+        found = PressureMap(points, triangles, result.pressure[None] / MEGAPASCAL, result.gap[None])
         parts = []
         for name in SIDE_COLOURS:
             condyle = getattr(result, name)

@@ -21,12 +21,13 @@ from meshcat.path import Path as NodePath
 from tkamb.units import MILLIMETRE
 from tkamb.view.colours import pressure_scale, strain_scale
 from tkamb.view.drawing import HIDDEN_AT_FIRST, LAYERS, Drawing, PressureMap, Solid
+from tkamb.view.levels import levels
 from tkamb.view.shading import Shaded, shaded
 
 METRES_PER_BODY_WEIGHT = 0.03
 """Length of an arrow of one body weight."""
 
-TYPES = {"float32": np.float32, "uint8": np.uint8, "uint32": np.uint32}
+TYPES = {"float32": np.float32, "uint8": np.uint8, "int16": np.int16, "uint32": np.uint32}
 
 
 class Block:
@@ -89,13 +90,6 @@ def packed_map(found: PressureMap, peak: float, words: str) -> bytes:
     """Return one map alone, on the scale of a page that is open, with words about it."""
     block = Block()
     return block.packed({"map": _map(block, found, peak), "words": words})
-
-
-def levels(pressure: Any, peak: float) -> Any:
-    """Return 0 where nothing presses, else 1 to 255 up to the peak (f, n)."""
-    pressure = np.nan_to_num(np.asarray(pressure, float))
-    level = np.ceil(np.clip(pressure / (peak or 1.0), 0.0, 1.0) * 255.0)
-    return np.where(pressure > 0, np.maximum(level, 1), 0).astype(np.uint8)
 
 
 def _view(block: Block, number: int, drawing: Drawing, peak: float) -> dict[str, Any]:
@@ -167,7 +161,7 @@ def _map(block: Block, found: PressureMap, peak: float) -> dict[str, Any]:
         "count": len(found.points),
         "points": block.put(found.points, "float32"),
         "triangles": block.put(found.triangles, "uint32"),
-        "levels": block.put(levels(found.pressure, peak), "uint8"),
+        "levels": block.put(levels(found, peak), "int16"),
     }
 
 

@@ -162,29 +162,12 @@ function placeMarker(marker, k) {
   if (node.visible) node.position.set(...point);
 }
 
-// Loaded points hold their share of the largest pressure. An unloaded point beside loaded ones
-// holds its loaded neighbours' mean with a minus, which draws the edge of the contact halfway.
+// A point's level is its share of the largest pressure, negative where nothing presses.
 tkamb.colourMap = function (view, k) {
   const map = view.map;
   if (!map) return;
   const mesh = tkamb.node(`${view.root}/pressure map/map/<object>`).object;
-  const {level} = mesh.geometry.attributes, levels = level.array;
-  const start = map === view.runMap ? k * map.count : 0;
-  const sum = new Float32Array(map.count), beside = new Uint8Array(map.count);
-  for (let i = 0; i < map.count; i++) levels[i] = map.levels[start + i] / 255;
-  for (let t = 0; t < map.triangles.length; t += 3) {
-    const corners = map.triangles.subarray(t, t + 3);
-    const loaded = corners.filter((i) => levels[i] > 0);
-    if (loaded.length === 0 || loaded.length === 3) continue;
-    const mean = loaded.reduce((total, i) => total + levels[i], 0) / loaded.length;
-    for (const i of corners) {
-      if (levels[i] > 0) continue;
-      sum[i] += mean;
-      beside[i] += 1;
-    }
-  }
-  for (let i = 0; i < map.count; i++) {
-    if (!(levels[i] > 0)) levels[i] = beside[i] ? -sum[i] / beside[i] : -1;
-  }
+  const {level} = mesh.geometry.attributes, start = map === view.runMap ? k * map.count : 0;
+  for (let i = 0; i < map.count; i++) level.array[i] = map.levels[start + i] / 32767;
   level.needsUpdate = true;
 };

@@ -3,7 +3,7 @@
 
 const tkamb = {views: [], frame: 0};
 
-const TYPES = {float32: Float32Array, uint8: Uint8Array, uint32: Uint32Array};
+const TYPES = {float32: Float32Array, uint8: Uint8Array, int16: Int16Array, uint32: Uint32Array};
 const SIDES = 10;
 
 tkamb.unpack = async function (bytes) {
@@ -51,8 +51,8 @@ function dressScene(viewer) {
   viewer.hide_background();
   for (const name of ["Grid", "Axes"]) viewer.set_property([name], "visible", false);
   viewer.delete_path(["Lights"]);
-  viewer.set_object(["Lights", "around"], new THREE.HemisphereLight(0xffffff, 0xb8b8b8, 0.62));
-  const lamp = new THREE.DirectionalLight(0xffffff, 0.5);
+  viewer.set_object(["Lights", "around"], new THREE.HemisphereLight(0xffffff, 0xb0b0b0, 0.58));
+  const lamp = new THREE.DirectionalLight(0xffffff, 0.42);
   lamp.position.set(0.4, 0.8, 0.6);
   viewer.camera.add(lamp);
   viewer.camera.add(lamp.target);
@@ -148,6 +148,25 @@ function addLattice(viewer, path, ends) {
   viewer.set_object(tkamb.split(path), new THREE.LineSegments(geometry, material));
 }
 
+// Names at the edges of the picture what lies there, where the camera looks along an axis.
+function nameDirections(camera) {
+  const {Vector3} = MeshCat.THREE, turn = camera.matrixWorld.elements;
+  const lateral = tkamb.views[0].side === "left" ? -1 : 1;
+  const names = [["posterior", "anterior"], ["inferior", "superior"], ["medial", "lateral"]];
+  const at = (x, y, z) => {
+    const parts = [x, y, lateral * z].map((part) => (Math.abs(part) > 0.85 ? part : 0));
+    const axis = parts.findIndex((part) => part !== 0);
+    return axis < 0 ? "" : names[axis][parts[axis] > 0 ? 1 : 0];
+  };
+  const right = new Vector3(...turn.slice(0, 3)), up = new Vector3(...turn.slice(4, 7));
+  const words = {
+    right: at(...right.toArray()), left: at(...right.negate().toArray()),
+    top: at(...up.toArray()), bottom: at(...up.negate().toArray())};
+  for (const [edge, word] of Object.entries(words)) {
+    document.getElementById(`to-${edge}`).textContent = word;
+  }
+}
+
 // One knee beside the other, seen by the same camera.
 function renderSideBySide(viewer) {
   const roots = tkamb.views.map((view) => tkamb.node(view.root).object);
@@ -167,5 +186,6 @@ function renderSideBySide(viewer) {
     roots.forEach((root) => { root.visible = true; });
     this.animator.after_render();
     this.needs_render = false;
+    nameDirections(this.camera);
   };
 }
