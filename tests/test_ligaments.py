@@ -10,6 +10,7 @@ from tkamb.body.generic_ligaments import condylar_axis, generic_ligaments
 from tkamb.body.ligaments import (
     TOE_STRAIN,
     build_ligaments,
+    ligament_loads,
     quadratic_toe_force,
     strain_table,
     two_line_force,
@@ -75,6 +76,22 @@ def test_forces_are_equal_and_opposite() -> None:
     assert tension == pytest.approx(0.5 * 9e4 * 0.04 * bundle.slack_length)
     assert np.abs(total_wrench(loads, np.array([0.3, 0.1, 0.2]))).max() < 1e-12 * tension
     assert loads[0].forces[0, 1] < 0.0  # the femur is pulled down
+
+
+def test_gathered_loads_are_those_of_the_bundles() -> None:
+    toe = {"law": "quadratic-toe", "stiffness_N_per_mm": None, "stiffness_N_per_strain": 2750.0}
+    tables = [table(), table(name="LCL", **toe), table(name="slack", reference_strain=-0.1)]
+    bundles = build_ligaments(tables, POSES, FLEXION)
+    here = {"femur": POSES["femur"][0], "tibia": np.eye(4)}
+    tension, loads = ligament_loads(bundles, here)
+    alone = [bundle.loads(here) for bundle in bundles]
+    assert tension == pytest.approx([t for t, _ in alone])
+    assert tension[2] == 0.0
+    assert len(loads) == 2
+    for load in loads:
+        own = [part for _, pair in alone for part in pair if part.link == load.link]
+        point = np.array([0.1, 0.2, 0.3])
+        assert total_wrench([load], point) == pytest.approx(total_wrench(own, point))
 
 
 def test_slack_length_is_taken_as_given() -> None:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from tkamb.body.load import PointForces
 from tkamb.errors import InputError
@@ -113,6 +113,40 @@ class Ligament:
         )
 
 
+def ligament_loads(
+    ligaments: Sequence[Ligament], poses: Mapping[str, Array]
+) -> tuple[Array, tuple[PointForces, ...]]:
+    """Return all tensions (n,) N and what they do to the links, at one frame.
+
+    The same as `Ligament.loads` of every bundle, gathered into one load per link.
+
+    Args:
+        ligaments: the bundles.
+        poses: link -> pose_link_in_insert (4, 4).
+    """
+    proximal_links = np.array([bundle.proximal_link for bundle in ligaments])
+    distal_links = np.array([bundle.distal_link for bundle in ligaments])
+    proximal = _placed(proximal_links, [b.proximal_point for b in ligaments], poses)
+    distal = _placed(distal_links, [b.distal_point for b in ligaments], poses)
+    along = distal - proximal
+    length = np.linalg.norm(along, axis=1)
+    slack = np.array([bundle.slack_length for bundle in ligaments])
+    stiffness = np.array([bundle.stiffness for bundle in ligaments])
+    two_line = np.array([bundle.law == "two-line" for bundle in ligaments], bool)
+    tension = np.where(
+        two_line,
+        two_line_force(length, slack, stiffness),
+        quadratic_toe_force(length, slack, stiffness),
+    )
+    pull = (tension / length)[:, None] * along
+    loads = []
+    for link in dict.fromkeys([*proximal_links.tolist(), *distal_links.tolist()]):
+        up, down = proximal_links == link, distal_links == link
+        points = np.concatenate([proximal[up], distal[down]])
+        loads.append(PointForces(link, points, np.concatenate([pull[up], -pull[down]])))
+    return tension, tuple(loads)
+
+
 def build_ligaments(
     tables: Sequence[LigamentTable], poses: Mapping[str, Array], flexion: Array
 ) -> tuple[Ligament, ...]:
@@ -198,6 +232,15 @@ def strain_table(
         strain = [float(bundle.strain(bundle.length(_frame(poses, k)))) for k in frames]
         table[bundle.name] = tuple(s if r else np.nan for s, r in zip(strain, reached, strict=True))
     return table
+
+
+def _placed(links: NDArray[np.str_], points: list[Array], poses: Mapping[str, Array]) -> Array:
+    """Return points (n, 3), each given in its own link, in the insert frame."""
+    placed = np.array(points, float).reshape(-1, 3)
+    for link in np.unique(links):
+        rows = links == link
+        placed[rows] = transform(poses[str(link)], placed[rows])
+    return placed
 
 
 def _metres(end: Attachment) -> Array:

@@ -83,12 +83,13 @@ def taut_path(start: Array, end: Array, outline: Array) -> TautPath:
         ComputationError: start or end lies inside the outline.
     """
     start, end = np.asarray(start, float), np.asarray(end, float)
-    for name, point in (("start", start), ("end", end)):
-        if is_inside(point, outline):
+    above, below = _height(start[:2], outline), _height(end[:2], outline)
+    for name, heights in (("start", above), ("end", below)):
+        if (heights >= 0.0).all():
             raise ComputationError(f"the {name} of a wrapping line lies inside the bone's outline")
-    if _passes_freely(start[:2], end[:2], outline):
+    if _passes_freely(start[:2], end[:2], outline, above, below):
         return straight_path(start, end)
-    corners, turn = _wrapped_corners(start[:2], end[:2], outline)
+    corners, turn = _wrapped_corners(start[:2], end[:2], outline, above, below)
     plane = np.concatenate([start[None, :2], corners, end[None, :2]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(plane, axis=0), axis=1))])
     z = start[2] + (end[2] - start[2]) * along / along[-1]
@@ -146,20 +147,29 @@ def _cross(a: Array, b: Array) -> Array:
 
 def _height(point: Array, outline: Array) -> Array:
     """Return twice the area (n,) that each edge spans with a point: negative if it is seen."""
-    return _cross(np.roll(outline, -1, axis=0) - outline, point - outline)
+    offset = point - outline
+    ahead = np.concatenate([offset[1:], offset[:1]])
+    return np.asarray(offset[:, 0] * ahead[:, 1] - offset[:, 1] * ahead[:, 0])
 
 
-def _passes_freely(start: Array, end: Array, outline: Array) -> bool:
-    """Whether the straight segment leaves the outline on its right, or never comes to it."""
+def _passes_freely(start: Array, end: Array, outline: Array, above: Array, below: Array) -> bool:
+    """Whether the straight segment leaves the outline on its right, or never comes to it.
+
+    Args:
+        start: (2,) m.
+        end: (2,) m.
+        outline: (n, 2) m.
+        above: (n,) heights of the start over the edges.
+        below: (n,) heights of the end.
+    """
     centre = outline.mean(axis=0)
     a, b = start - centre, end - centre
     clockwise_sweep = -np.arctan2(_cross(a, b), a @ b)
-    return bool(clockwise_sweep >= -0.5 * np.pi) and not _crosses(start, end, outline)
+    return bool(clockwise_sweep >= -0.5 * np.pi) and not _crosses(above, below)
 
 
-def _crosses(start: Array, end: Array, outline: Array) -> bool:
-    """Clip the segment by the outline's half planes (Cyrus-Beck)."""
-    above, below = _height(start, outline), _height(end, outline)
+def _crosses(above: Array, below: Array) -> bool:
+    """Clip the segment by the outline's half planes (Cyrus-Beck), given its ends' heights."""
     if ((above <= 0.0) & (below <= 0.0)).any():
         return False
     enters, leaves = (above < 0.0) & (below > 0.0), (above > 0.0) & (below < 0.0)
@@ -167,13 +177,15 @@ def _crosses(start: Array, end: Array, outline: Array) -> bool:
     return bool(np.max(share[enters], initial=0.0) < np.min(share[leaves], initial=1.0))
 
 
-def _wrapped_corners(start: Array, end: Array, outline: Array) -> tuple[Array, float]:
+def _wrapped_corners(
+    start: Array, end: Array, outline: Array, above: Array, below: Array
+) -> tuple[Array, float]:
     """Return the corners touched, in order, and the angle turned.
 
     The edges seen from the start begin (counter-clockwise) at the corner whose tangent has
     the outline on its right; those seen from the end stop at the corner of the other tangent.
     """
-    seen_from_start, seen_from_end = _height(start, outline) < 0.0, _height(end, outline) < 0.0
+    seen_from_start, seen_from_end = above < 0.0, below < 0.0
     first = int(np.flatnonzero(seen_from_start & ~np.roll(seen_from_start, 1))[0])
     last = int(np.flatnonzero(seen_from_end & ~np.roll(seen_from_end, -1))[0]) + 1
     corners = outline[(first - np.arange((first - last) % len(outline) + 1)) % len(outline)]
