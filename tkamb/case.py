@@ -142,7 +142,7 @@ class _Parts:
 
         table = scene.implant.insert
         assert table is not None
-        surface = load_surface(table.mesh, table.unit, table.axes, name="insert")
+        surface = load_surface(table.mesh, table.unit, table.axes, name="insert", closed=True)
         placement = insert_placement(surface, axes_rotation(table.axes))
         self.insert_mesh_in_insert = placement @ pose(axes_rotation(table.axes), np.zeros(3))
         self.insert = self._sided(surface.moved(placement))

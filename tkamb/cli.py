@@ -3,6 +3,7 @@
 import argparse
 import json
 import logging
+import os
 import sys
 import tomllib
 from collections.abc import Sequence
@@ -17,10 +18,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     logging.basicConfig(format="tkamb: %(levelname)s: %(message)s", level=logging.WARNING)
     try:
-        return int(options.command(options))
+        status = int(options.command(options))
+        sys.stdout.flush()
+        return status
     except TkambError as error:
         print(f"tkamb: {error}", file=sys.stderr)
         return error.exit_status
+    except BrokenPipeError:  # the reader of a pipe has gone, `tkamb ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except KeyboardInterrupt:
         print("tkamb: interrupted; what was finished is kept", file=sys.stderr)
         return 130
