@@ -51,7 +51,7 @@ class ExtensorFrames:
         self.case = case
         self.quadriceps, self.ligament = _quadriceps(case), _ligament(case)
         self._check_fixed_ends()
-        mechanism = self._mechanism()
+        self._mechanism = mechanism = self._as_mechanism()
         if case.scene.patella is not None and case.scene.patella.motion == "recorded":
             motion = case.motion
             if motion.patella is None:
@@ -77,13 +77,31 @@ class ExtensorFrames:
         """Return patella coordinates, rates and accelerations (3, 3) of frame k; NaN if lost."""
         return np.asarray(self._joints[k])
 
-    def at(self, k: int, state: ChainState) -> tuple[Extensor, float]:
+    def patella(self, k: int, pose: Array, guess: Array | None = None) -> PatellaState:
+        """Return the patella of frame k with the femur at another pose (4, 4).
+
+        Recorded coordinates are kept; a solved patella is found anew, from `guess` (3,) or
+        from where it was at the recorded pose.
+        """
+        found = self.states[k].coordinates if guess is None else guess
+        if self.case.scene.patella is not None and self.case.scene.patella.motion == "recorded":
+            return patella_at(self._mechanism, pose, self.states[k].coordinates)
+        return solve_patella(self._mechanism, pose, found)
+
+    def at(
+        self, k: int, state: ChainState, patella: PatellaState | None = None
+    ) -> tuple[Extensor, float]:
         """Return the loads of unit tensions, and the quadriceps' wrap (rad).
+
+        Args:
+            k: frame.
+            state: the chain there.
+            patella: where it is, if not as at the recorded pose.
 
         Raises:
             ComputationError: no patella at this frame, or a line's end inside what it wraps.
         """
-        patella = self.states[k]
+        patella = self.states[k] if patella is None else patella
         if patella.status not in USABLE:
             raise ComputationError(f"patella: {patella.status.value.replace('_', ' ')}")
         quadriceps, ligament = self.paths(state)
@@ -130,7 +148,7 @@ class ExtensorFrames:
         chain = self.case.chain
         return inverse(chain.insert_in_tibia) @ chain.link_in(self.ligament.end_link, "tibia")
 
-    def _mechanism(self) -> ExtensorMechanism:
+    def _as_mechanism(self) -> ExtensorMechanism:
         case, quadriceps, ligament = self.case, self.quadriceps, self.ligament
         assert case.femoral is not None and case.patella is not None
         chain, table = case.chain, case.scene.patellar_ligament

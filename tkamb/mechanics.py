@@ -1,7 +1,7 @@
 """The body side of a case: geometry of each frame in, loads of each frame out."""
 
 import time as clock
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +17,7 @@ from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.body.ligaments import Ligament
+    from tkamb.body.patella import PatellaState
     from tkamb.geometry.adjustment import Adjustment
     from tkamb.geometry.closest import ClosestPointQuery, CondyleGap
 
@@ -54,6 +55,25 @@ class FrameLoads:
     seconds: float
 
 
+@dataclass(frozen=True, eq=False)
+class PlacedKnee:
+    """One frame with the knee at given coordinates: all that is known before the contact.
+
+    Args:
+        coordinates: (6,) knee coordinates, m and rad.
+        geometry: what the equations work on, without contact.
+        tensions: ligament name -> N.
+        wrap: rad, by which the quadriceps wraps the femur; NaN if not modelled.
+        problems: plain words; empty when all is well.
+    """
+
+    coordinates: Array
+    geometry: KneeGeometry
+    tensions: dict[str, float]
+    wrap: float
+    problems: tuple[str, ...]
+
+
 class Mechanics:
     """The rigid-body mechanics of a case, frame by frame.
 
@@ -62,6 +82,7 @@ class Mechanics:
 
     Attributes:
         poses: (f, 4, 4) recorded pose_femur_in_insert.
+        friction: Coulomb coefficient of the femorotibial contact.
         extensor: patella and lines of action of all frames; None if not modelled.
         ligaments: the bundles, with their slack lengths.
     """
@@ -69,7 +90,7 @@ class Mechanics:
     def __init__(self, case: Case) -> None:
         self.case = case
         self.poses = knee_pose(case.motion.coordinates)
-        self._friction = case.scene.contact.friction if case.scene.contact else 0.0
+        self.friction = case.scene.contact.friction if case.scene.contact else 0.0
         self.query = _contact_query(case)
         self.extensor = None
         if case.scene.patella:
@@ -83,27 +104,56 @@ class Mechanics:
         start = clock.perf_counter()
         adjustment, condyles, lifted, problems = self._touching(k)
         queried = clock.perf_counter()
-        state = self.case.chain.at(self._chain_motion(k))
-        poses = {link: state.pose(link) for link in self._attachment_links()}
-        tensions: dict[str, float] = {}
-        known: list[PointForces] = []
-        for bundle in self.ligaments:
-            tensions[bundle.name], pulls = bundle.loads(poses)
-            known += pulls
-        extensor, wrap = None, NAN
-        if self.extensor:
-            try:
-                extensor, wrap = self.extensor.at(k, state)
-            except ComputationError as error:
-                problems.append(str(error))
-        geometry = KneeGeometry(
-            state, self._ground(k, state), tuple(known), condyles, lifted, extensor
-        )
-        loads = unsolved(problems) if problems else solve_knee(geometry, self._friction)
+        placed = self.placed(k)
+        problems += placed.problems
+        geometry = replace(placed.geometry, condyles=condyles, lifted=lifted)
+        loads = unsolved(problems) if problems else solve_knee(geometry, self.friction)
         done = clock.perf_counter()
         return FrameLoads(
-            geometry, loads, tensions, wrap, adjustment, queried - start, done - queried
+            geometry,
+            loads,
+            placed.tensions,
+            placed.wrap,
+            adjustment,
+            queried - start,
+            done - queried,
         )
+
+    def placed(
+        self, k: int, coordinates: Array | None = None, patella: "PatellaState | None" = None
+    ) -> PlacedKnee:
+        """Return frame k with the knee at other coordinates (6,) than recorded.
+
+        Rates and accelerations stay as recorded.
+
+        Args:
+            k: frame.
+            coordinates: (6,) m and rad; None: as recorded.
+            patella: where the patella is with the femur there; None: as recorded.
+        """
+        place = self.case.motion.coordinates[k] if coordinates is None else coordinates
+        state = self.case.chain.at(self._chain_motion(k, place, patella))
+        poses = {link: state.pose(link) for link in self._attachment_links()}
+        tensions, known = self._pulls(poses)
+        extensor, wrap, problems = None, NAN, []
+        if self.extensor:
+            try:
+                extensor, wrap = self.extensor.at(k, state, patella)
+            except ComputationError as error:
+                problems.append(str(error))
+        geometry = KneeGeometry(state, self._ground(k, state), known, extensor=extensor)
+        return PlacedKnee(place, geometry, tensions, wrap, tuple(problems))
+
+    def sliding(self, k: int, coordinates: Array, point: Array) -> Array:
+        """Return the velocity (3,) m/s of the femur's point relative to the insert's.
+
+        Args:
+            k: frame; the rates are the recorded ones.
+            coordinates: (6,) where the knee is.
+            point: (3,) m, insert frame.
+        """
+        velocity, spin = knee_twist(coordinates, self.case.motion.velocity[k])
+        return np.asarray(velocity + np.cross(spin, point - coordinates[:3]))
 
     def slips(self) -> dict[str, Array]:
         """Return side -> slip (f,) m since the first frame; empty without the two surfaces."""
@@ -119,11 +169,16 @@ class Mechanics:
             if slip is not None
         }
 
-    def _chain_motion(self, k: int) -> ChainMotion:
+    def _chain_motion(
+        self, k: int, coordinates: Array, patella: "PatellaState | None" = None
+    ) -> ChainMotion:
         motion, tibia = self.case.motion, self.case.tibia
-        joints = np.stack([motion.coordinates[k], motion.velocity[k], motion.acceleration[k]])
+        joints = np.stack([coordinates, motion.velocity[k], motion.acceleration[k]])
         if self.extensor:
-            joints = np.hstack([joints, self.extensor.joints(k)])
+            own = self.extensor.joints(k)
+            if patella is not None:
+                own = np.concatenate([patella.coordinates[None], own[1:]])
+            joints = np.hstack([joints, own])
         if tibia is None:
             return ChainMotion(np.eye(4), np.zeros(6), np.zeros(6), joints)
         return ChainMotion(tibia.pose[k], tibia.velocity[k], tibia.acceleration[k], joints)
@@ -165,9 +220,7 @@ class Mechanics:
         return adjustment, condyles, self._lifted(condyles), problems
 
     def _condyle(self, k: int, gap: "CondyleGap") -> CondylePoint:
-        motion = self.case.motion
-        velocity, spin = knee_twist(motion.coordinates[k], motion.velocity[k])
-        sliding = velocity + np.cross(spin, gap.centre - self.poses[k][:3, 3])
+        sliding = self.sliding(k, self.case.motion.coordinates[k], gap.centre)
         return CondylePoint(gap.centre, gap.normal, sliding, gap.gap)
 
     def _lifted(self, condyles: dict[str, CondylePoint]) -> frozenset[str]:
@@ -179,12 +232,23 @@ class Mechanics:
         tilted = abs(lateral.gap - medial.gap) > LIFT_OFF_ANGLE * width
         return frozenset({higher} if tilted and condyles[higher].gap > LIFT_OFF_GAP else ())
 
+    def _pulls(self, poses: dict[str, Array]) -> tuple[dict[str, float], tuple[PointForces, ...]]:
+        """Return the ligaments' tensions (N) by name, and what they do to the links."""
+        if not self.ligaments:
+            return {}, ()
+        from tkamb.body.ligaments import ligament_loads
+
+        tensions, loads = ligament_loads(self.ligaments, poses)
+        names = [bundle.name for bundle in self.ligaments]
+        return dict(zip(names, tensions.tolist(), strict=True)), loads
+
     def _build_ligaments(self) -> "tuple[Ligament, ...]":
         if not self.case.scene.ligament:
             return ()
         from tkamb.body.ligaments import build_ligaments
 
-        states = [self.case.chain.at(self._chain_motion(k)) for k in range(len(self.poses))]
+        recorded = self.case.motion.coordinates
+        states = [self.case.chain.at(self._chain_motion(k, x)) for k, x in enumerate(recorded)]
         poses = {
             link: np.stack([state.pose(link) for state in states])
             for link in self._attachment_links()

@@ -85,6 +85,11 @@ class Chain:
             raise InputError(f"link '{link}' is not fixed to '{base}'", "URDF")
         return inverse(frames[1].placement.homogeneous) @ frames[0].placement.homogeneous
 
+    def on_shank(self, link: str) -> bool:
+        """Return whether a link is fixed to the tibia, and not on the femur's side."""
+        ends = [self.model.frames[self.frame_id(name)].parentJoint for name in (link, "tibia")]
+        return bool(ends[0] == ends[1])
+
     def knee_columns(self) -> list[int]:
         """Rows of the generalised force that belong to the six knee coordinates."""
         return self._columns[:6]

@@ -43,7 +43,7 @@ class CondylePoint:
         """
         tangential = self.sliding - (self.sliding @ self.normal) * self.normal
         speed = np.sqrt(tangential @ tangential + STANDSTILL**2)
-        return self.normal - friction * tangential / speed
+        return np.asarray(self.normal - friction * tangential / speed)
 
 
 def pair(link: str, other: str, point: Array, force: Array) -> tuple[PointForces, ...]:

@@ -52,7 +52,7 @@ class FoundationProbe:
         gap, femoral_normal = gaps_and_facets(bed, self._state.femoral_rays, pose)
         loaded = gap < 0
         if not loaded.any():
-            return ProbedContact({})
+            return ProbedContact({}, tangent=True)
         bed, gap, femoral_normal = bed.part(loaded), gap[loaded], femoral_normal[loaded]
         thickness = np.maximum(bed.thickness, THINNEST)
         strain = -gap / thickness
@@ -73,7 +73,7 @@ class FoundationProbe:
                     force[own] @ bed.points[own] / force[own].sum(),
                     (slope[own, None] * push[own]).T @ met[own],
                 )
-        return ProbedContact(condyles)
+        return ProbedContact(condyles, tangent=True)
 
     def _covers(self, pose: Array) -> bool:
         """Return whether no femoral point has come nearer than the chosen columns reach."""

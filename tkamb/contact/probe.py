@@ -59,12 +59,12 @@ class ProbedContact:
     Args:
         condyles: side -> wrench.
         known: False where the model is out of range or has not converged.
-        result: the full result, where the probe had to compute it.
+        tangent: the condyles' stiffness is known.
     """
 
     condyles: dict[str, CondyleWrench]
     known: bool = True
-    result: ContactResult | None = None
+    tangent: bool = False
 
     @property
     def wrench(self) -> Array:
@@ -89,9 +89,9 @@ class Probe:
         """Return the contact at a pose_femoral_in_insert (4, 4)."""
         result = self._model.evaluate(self._state, pose, self._guess)
         if result.status is not ContactStatus.OK:
-            return ProbedContact({}, False, result)
+            return ProbedContact({}, known=False)
         self._guess = result
-        return ProbedContact(condyle_wrenches(result, self._split), True, result)
+        return ProbedContact(condyle_wrenches(result, self._split))
 
 
 def condyle_wrenches(result: ContactResult, split: float | None) -> dict[str, CondyleWrench]:

@@ -1,0 +1,249 @@
+"""Equilibrium of a few coordinates under forces that depend on them: Newton, in a trust region.
+
+Knows neither body nor contact. With r(q) the force that drives each coordinate and
+K = -dr/dq, a step d solves (K + lambda I) d = r, lambda the smallest that makes the step
+descend and keeps it inside the region. A step is judged by the work of the forces along it,
+by the trapezoidal rule, against what K predicts,
+
+    W = (r(q) + r(q + d)) . d / 2          W_K = r(q) . d - d . K d / 2 :
+
+forces that have a potential lower it by W, so that with W > 0 in every step the energy falls.
+A trial that overshoots into a stiff contact costs work and is taken back.
+
+Everything is in metres and newtons: rotations are scaled by a lever arm.
+
+References: Nocedal & Wright, Numerical Optimization, 2nd ed., ch. 4 (2006),
+doi:10.1007/978-0-387-40065-5.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from tkamb.geometry.frames import Array
+
+FORCE_TOLERANCE = 0.05
+"""N (moments over the lever arm): what may be left of a converged coordinate's force."""
+STEP_TOLERANCE = 2e-6
+"""m: the Newton step that is left of a converged coordinate."""
+SOFTEST = 100.0
+"""N/m: a state that gives way by more than 10 mm per newton is indeterminate."""
+FIRST_RADIUS, WIDEST_RADIUS, NARROWEST_RADIUS = 0.5e-3, 3e-3, 1e-9
+"""m: the trust region at the start, and its limits."""
+LONGEST_TRAVEL = 30e-3
+"""m: a coordinate this far from its start is held by nothing."""
+PROBE_STEP = 2e-6
+"""m: of the finite differences where the stiffness is not known."""
+MOST_STEPS = 60
+
+
+class BalanceStatus(Enum):
+    """How a search for equilibrium ended."""
+
+    OK = "ok"
+    NOT_CONVERGED = "not converged"
+    INDETERMINATE = "indeterminate: nothing holds the released coordinates where they are"
+    UNSTABLE = "unstable equilibrium"
+    RUNS_AWAY = "the released coordinates run away: nothing stops them"
+    OUT_OF_RANGE = "out of the contact model's range"
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """The forces at trial coordinates.
+
+    Args:
+        force: (n,) N, drives each coordinate along its positive direction; NaN if unknown.
+        stiffness: (n, n) N/m, -d force / d coordinates; None: by finite differences.
+    """
+
+    force: Array
+    stiffness: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """The end of a search.
+
+    Args:
+        coordinates: (n,) m.
+        force: (n,) N, what is left.
+        stiffness: (n, n) N/m.
+        status: how it ended.
+        steps: Newton steps, taken or taken back.
+        trials: how often the forces were computed.
+        softest: N/m, smallest eigenvalue of the stiffness' symmetric part.
+        stiffest: N/m, the largest.
+        work: N·m done by the forces along each step taken, all positive.
+    """
+
+    coordinates: Array
+    force: Array
+    stiffness: Array
+    status: BalanceStatus
+    steps: int
+    trials: int
+    softest: float
+    stiffest: float
+    work: tuple[float, ...]
+
+
+Forces = Callable[[Array], Trial]
+
+
+def find_balance(forces: Forces, start: Array, stiffness: Array | None = None) -> Balance:
+    """Find coordinates at which no force is left.
+
+    Args:
+        forces: the trial at coordinates (n,), m.
+        start: (n,) m.
+        stiffness: (n, n) N/m of an earlier search near by, a guess that saves trials where
+            `forces` does not bring its own.
+    """
+    return _Search(forces, np.array(start, float), stiffness).run()
+
+
+class _Search:
+    def __init__(self, forces: Forces, start: Array, stiffness: Array | None) -> None:
+        self._forces, self._start = forces, start
+        self._trials, self._steps = 0, 0
+        self._fresh, self._since = False, 0
+        self._radius = FIRST_RADIUS
+        self._work: list[float] = []
+        self.x = start
+        first = self._at(start)
+        self.force = first.force
+        self.known = bool(np.isfinite(first.force).all())
+        if self.known:
+            self._own = first.stiffness is not None
+            self.stiffness = self._first_stiffness(first, stiffness)
+        else:
+            self.stiffness = np.full((len(start), len(start)), np.nan)
+
+    def run(self) -> Balance:
+        """Return the end of the search."""
+        if not self.known:
+            return self._end(BalanceStatus.OUT_OF_RANGE)
+        while self._steps < MOST_STEPS:
+            if self._converged():
+                return self._end(self._kind())
+            if np.abs(self.x - self._start).max() > LONGEST_TRAVEL:
+                return self._end(BalanceStatus.RUNS_AWAY)
+            if self._radius < NARROWEST_RADIUS and (self._own or self._fresh):
+                break
+            if not self._own and self._since > len(self.x):
+                self._refresh()
+            self._step()
+        return self._end(BalanceStatus.NOT_CONVERGED)
+
+    def _step(self) -> None:
+        step = bounded_step(self.stiffness, self.force, self._radius)
+        trial = self._at(self.x + step)
+        self._steps, self._since = self._steps + 1, self._since + 1
+        length = float(np.linalg.norm(step))
+        predicted = float(self.force @ step - 0.5 * step @ self.stiffness @ step)
+        work = float(0.5 * (self.force + trial.force) @ step)
+        if not np.isfinite(work):
+            self._radius = 0.25 * length
+            return
+        ratio = work / predicted if predicted > 0 else -1.0
+        taken = ratio > 0.05
+        if trial.stiffness is None:
+            self._learn(step, trial.force)
+        if ratio < 0.25:
+            self._radius = 0.25 * length
+            if not (self._own or self._fresh) and ratio < 0.05:
+                self._refresh()
+        elif ratio > 0.7 and length > 0.8 * self._radius:
+            self._radius = min(2.0 * self._radius, WIDEST_RADIUS)
+        if taken:
+            self._work.append(work)
+            self.x, self.force = self.x + step, trial.force
+            self._fresh = False
+            if trial.stiffness is not None:
+                self.stiffness = trial.stiffness
+
+    def _at(self, x: Array) -> Trial:
+        self._trials += 1
+        return self._forces(x)
+
+    def _first_stiffness(self, first: Trial, guess: Array | None) -> Array:
+        if first.stiffness is not None:
+            return first.stiffness
+        return self._differences() if guess is None else guess
+
+    def _differences(self) -> Array:
+        self._fresh, self._since = True, 0
+        columns = [self._at(self.x + d).force for d in PROBE_STEP * np.eye(len(self.x))]
+        return (self.force[:, None] - np.array(columns).T) / PROBE_STEP
+
+    def _refresh(self) -> None:
+        self.stiffness = self._differences()
+        self._radius = max(self._radius, 1e-2 * FIRST_RADIUS)
+
+    def _learn(self, step: Array, force: Array) -> None:
+        """Correct the stiffness along a step (Broyden 1965, doi:10.2307/2003941)."""
+        missing = (self.force - force) - self.stiffness @ step
+        self.stiffness = self.stiffness + np.outer(missing, step) / (step @ step)
+
+    def _converged(self) -> bool:
+        if np.abs(self.force).max() > FORCE_TOLERANCE:
+            return False
+        values, vectors = np.linalg.eigh(0.5 * (self.stiffness + self.stiffness.T))
+        held = values > SOFTEST
+        left = (vectors.T @ self.force)[held] / values[held]
+        return bool((np.abs(left) < STEP_TOLERANCE).all())
+
+    def _kind(self) -> BalanceStatus:
+        if not (self._own or self._fresh) and self._extremes()[0] <= SOFTEST:
+            self._refresh()
+        softest = self._extremes()[0]
+        if softest < -SOFTEST:
+            return BalanceStatus.UNSTABLE
+        return BalanceStatus.OK if softest > SOFTEST else BalanceStatus.INDETERMINATE
+
+    def _extremes(self) -> tuple[float, float]:
+        if not np.isfinite(self.stiffness).all():
+            return np.nan, np.nan
+        values = np.linalg.eigvalsh(0.5 * (self.stiffness + self.stiffness.T))
+        return float(values[0]), float(values[-1])
+
+    def _end(self, status: BalanceStatus) -> Balance:
+        return Balance(
+            self.x,
+            self.force,
+            self.stiffness,
+            status,
+            self._steps,
+            self._trials,
+            *self._extremes(),
+            tuple(self._work),
+        )
+
+
+def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
+    """Return the Newton step (n,), or within the radius the one that descends.
+
+    Args:
+        stiffness: (n, n) N/m, need not be symmetric.
+        force: (n,) N.
+        radius: m.
+    """
+    softest = float(np.linalg.eigvalsh(0.5 * (stiffness + stiffness.T))[0])
+    identity = np.eye(len(force))
+    if softest > 0:
+        step = np.linalg.solve(stiffness, force)
+        if np.linalg.norm(step) <= radius:
+            return step
+    low = max(0.0, -softest)
+    high = low + float(np.linalg.norm(force)) / radius + 1.0
+    for _ in range(50):
+        shift = 0.5 * (low + high)
+        step = np.linalg.solve(stiffness + shift * identity, force)
+        length = float(np.linalg.norm(step))
+        if 0.9 * radius <= length <= radius:
+            return step
+        low, high = (shift, high) if length > radius else (low, shift)
+    return np.linalg.solve(stiffness + high * identity, force)
