@@ -6,6 +6,7 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.contact.lattice.memory import Remembered
 from tkamb.contact.lattice.problem import ContactProblem
 from tkamb.contact.lattice.response import HalfResponse
 from tkamb.contact.lattice.solver import Start
@@ -75,7 +76,7 @@ def choose_start(
     depth: float,
     at_pose: bool,
     touched: NDArray[np.bool_] | None,
-    lost: Array | None,
+    earlier: Remembered | None,
 ) -> Start:
     """Return candidates, their compliance and a first active set.
 
@@ -85,7 +86,7 @@ def choose_start(
         depth: m, how deep the femoral component may go below the lowest gap.
         at_pose: the femoral component stays at the pose: candidates overlap it already.
         touched: (c,) nodes in contact in a neighbouring solution, or None.
-        lost: (n, 3) N, see `Start`.
+        earlier: where a neighbouring solution ended, or None.
     """
     lowest = float(gaps.min())
     reach = lowest + (1 + MARGIN) * depth
@@ -98,4 +99,6 @@ def choose_start(
     active = gaps[nodes] < level
     if touched is not None and touched[nodes].any():
         active = touched[nodes]
-    return Start(nodes, pool.among(nodes, spare), active, lost, reach)
+    lost = None if earlier is None else earlier.lost
+    moved = None if earlier is None else earlier.moved[nodes]
+    return Start(nodes, pool.among(nodes, spare), active, lost, moved, reach)

@@ -2,12 +2,26 @@
 
 import weakref
 from collections import OrderedDict
+from dataclasses import dataclass
 from threading import Lock
-from typing import Any
 
 from tkamb.contact.model import ContactResult
+from tkamb.geometry.frames import Array
 
 MOST_KEPT = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Remembered:
+    """Where a solution ended.
+
+    Args:
+        lost: (n, 3) h, N, or None for a linear material.
+        moved: (c, 3) m, displacement of the contact nodes that were candidates, else 0.
+    """
+
+    lost: Array | None
+    moved: Array
 
 
 class Memory:
@@ -17,18 +31,18 @@ class Memory:
     """
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[int, tuple[weakref.ref[ContactResult], Any]] = OrderedDict()
+        self._kept: OrderedDict[int, tuple[weakref.ref[ContactResult], Remembered]] = OrderedDict()
         self._lock = Lock()
 
-    def keep(self, result: ContactResult, content: Any) -> None:
+    def keep(self, result: ContactResult, content: Remembered) -> None:
         """Remember the content of a result."""
         with self._lock:
             self._kept[id(result)] = (weakref.ref(result), content)
             while len(self._kept) > MOST_KEPT:
                 self._kept.popitem(last=False)
 
-    def of(self, result: ContactResult | None) -> Any:
+    def of(self, result: ContactResult | None) -> Remembered | None:
         """Return what was kept of a result, or None."""
         with self._lock:
-            reference, content = self._kept.get(id(result), (None, None))
-        return content if reference is not None and reference() is result else None
+            found = self._kept.get(id(result))
+        return found[1] if found is not None and found[0]() is result else None

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tkamb.contact.lattice.candidates import CompliancePool, choose_start, guessed_depth
 from tkamb.contact.lattice.femoral import FemoralFloor
 from tkamb.contact.lattice.grid import Lattice, build_grid
-from tkamb.contact.lattice.memory import Memory
+from tkamb.contact.lattice.memory import Memory, Remembered
 from tkamb.contact.lattice.network import CalibratedNetwork
 from tkamb.contact.lattice.newton import solve_by_newton
 from tkamb.contact.lattice.operator import fixed_unknowns, prepare_operator
@@ -155,21 +155,23 @@ class CellContact(ContactModel):
     ) -> ContactResult:
         """Solve with growing candidate sets until they cover the approach."""
         tolerance = Tolerance(self.tolerance)
-        lost = state.memory.of(guess)
+        earlier = state.memory.of(guess)
         touched = None if guess is None else guess.pressure > 0
         for _ in range(MOST_GROWTHS):
-            start = choose_start(state.pool, gaps, depth, load is None, touched, lost)
+            start = choose_start(state.pool, gaps, depth, load is None, touched, earlier)
             solution = self._solution(state.problem, pose, load, start, tolerance)
             covered = load is None or len(start.candidates) == np.isfinite(gaps).sum()
             reached = solution.forces.approach * REACH - min(float(gaps.min()), 0.0)
+            if solution.converged:
+                moved = np.zeros_like(state.map.points)
+                moved[solution.candidates] = solution.displacement
+                earlier = Remembered(solution.lost, moved)
             if covered or reached <= start.reach:
                 result = result_of(state, pose, load, gaps, solution, self.pressure_rule)
-                if solution.lost is not None and solution.converged:
-                    state.memory.keep(result, solution.lost)
+                if solution.converged and earlier is not None:
+                    state.memory.keep(result, earlier)
                 return result
-            depth = 1.1 * solution.forces.approach
-            lost = solution.lost if solution.converged else None
-            touched = None
+            depth, touched = 1.1 * solution.forces.approach, None
         return failed_result(state, pose, "the set of candidate nodes is saturated")
 
     def _solution(

@@ -29,7 +29,9 @@ class SlidingNodes:
         self._problem, self._points, self._pose = problem, points, pose
         self._fired = points + moved
         self._share, self._last = 1.0, np.inf
-        self.foot = footing(problem, self._fired, pose, None)
+        self.foot = footing(problem, points, pose, None)
+        if moved.any():
+            self.foot = footing(problem, self._fired, pose, self.foot)
 
     def follow(self, moved: Array, forces: ContactForces) -> float:
         """Renew the planes for nodes displaced by moved (m, 3).

@@ -51,6 +51,7 @@ class Start:
         compliance: (3m, 3m) m/N among them.
         active: (m,) first guess of the active set.
         lost: (n, 3) h, N, of an earlier solution, or None.
+        moved: (m, 3) m, displacement of the candidates in an earlier solution, or None.
         reach: m, every node with a smaller vertical gap is a candidate.
     """
 
@@ -58,6 +59,7 @@ class Start:
     compliance: Array
     active: Mask
     lost: Array | None = None
+    moved: Array | None = None
     reach: float = np.inf
 
 
@@ -134,7 +136,8 @@ def solve(
     mixer, active, passes = AndersonMixer(), start.active, 0
     begun = operator.start(lost)
     offset = operator.half.project(begun).reshape(-1, 3)[chosen]
-    sliding = SlidingNodes(problem, points, offset, pose)
+    first = offset if start.moved is None else start.moved
+    sliding = SlidingNodes(problem, points, first, pose)
     best: Solution | None = None
     while True:
         passes += 1
@@ -194,7 +197,8 @@ def _solve_linear(
     """Repeat rays and contact until the sliding nodes rest."""
     points = problem.surface_points[start.candidates]
     nothing, active, passes = np.zeros_like(points), start.active, 0
-    sliding = SlidingNodes(problem, points, nothing, pose)
+    first = nothing if start.moved is None else start.moved
+    sliding = SlidingNodes(problem, points, first, pose)
     while True:
         passes += 1
         foot = sliding.foot
