@@ -48,6 +48,7 @@ class RayCaster:
         self._radius = float(np.linalg.norm(upper - lower)) / 2.0
         self._corner, self._first_edge, self._second_edge = _edges(surface)
         self._normals = surface.face_normals
+        self._narrowest = _least_altitudes(surface)
         self._ring = _VertexRing(surface)
         self._scene: Any = EmbreeScene(robust=True)
         scaled = ((surface.vertices - self._centre) / self._radius).astype(np.float32)
@@ -102,14 +103,36 @@ class RayCaster:
         while live.size:
             at = start[live]
             face = self._propose(origins[live], directions[live], at)
-            ray, t, hit = self._around(origins[live], directions[live], begin[live], face)
-            found.append((live[ray], t, hit))
-            reached = self._plane_distance(origins[live], directions[live], face)
+            reached = self._crossings_at(origins, directions, begin, live, face, found)
             step[live] = np.where(face == last[live], 2.0 * step[live], NUDGE * self._radius)
             start[live] = np.maximum(at, np.where(np.isfinite(reached), reached, at)) + step[live]
             last[live] = face
             live = live[face >= 0]
         return self._merged(found, directions)
+
+    def _crossings_at(
+        self,
+        origins: Array,
+        directions: Array,
+        begin: Array,
+        live: Index,
+        face: Index,
+        found: list[tuple[Index, Array, Index]],
+    ) -> Array:
+        """Append the crossings at proposed triangles; return the distances to their planes.
+
+        A crossing farther inside its triangle than two nudges stands alone; otherwise the
+        triangles around are asked too.
+        """
+        t, least = self._intersect(origins[live], directions[live], face)
+        alone = least * self._narrowest[face] > 2.0 * NUDGE * self._radius
+        alone &= t >= begin[live]
+        found.append((live[alone], t[alone], face[alone]))
+        rest = np.flatnonzero(~alone & (face >= 0))
+        at = live[rest]
+        ray, near, hit = self._around(origins[at], directions[at], begin[at], face[rest])
+        found.append((at[ray], near, hit))
+        return self._plane_distance(origins[live], directions[live], face)
 
     def _prepared(self, origins: ArrayLike, directions: ArrayLike) -> tuple[Array, Array, Array]:
         """Return origins, unit directions and the distance at which each ray's search begins."""
@@ -243,6 +266,14 @@ class _VertexRing:
 def _edges(surface: Surface) -> tuple[Array, Array, Array]:
     corner = surface.triangles[:, 0]
     return corner, surface.triangles[:, 1] - corner, surface.triangles[:, 2] - corner
+
+
+def _least_altitudes(surface: Surface) -> Array:
+    """Return the least altitude (k,) of every triangle, m."""
+    edges = np.roll(surface.triangles, 1, axis=1) - surface.triangles
+    doubled = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    longest = np.linalg.norm(edges, axis=2).max(axis=1)
+    return np.divide(doubled, longest, out=np.zeros_like(doubled), where=longest > 0.0)
 
 
 def _normal_plane(directions: Array) -> tuple[Array, Array]:
