@@ -7,13 +7,14 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.contact.lattice.cache import cached_operator, operator_key
 from tkamb.contact.lattice.candidates import CompliancePool, choose_start, guessed_depth
 from tkamb.contact.lattice.femoral import FemoralFloor
 from tkamb.contact.lattice.grid import Lattice, build_grid
 from tkamb.contact.lattice.memory import Memory, Remembered
 from tkamb.contact.lattice.network import CalibratedNetwork
 from tkamb.contact.lattice.newton import solve_by_newton
-from tkamb.contact.lattice.operator import fixed_unknowns, prepare_operator
+from tkamb.contact.lattice.operator import ElasticOperator, fixed_unknowns, prepare_operator
 from tkamb.contact.lattice.pressure_map import ContactMap, contact_map
 from tkamb.contact.lattice.problem import ContactProblem, Direction, vertical_gaps
 from tkamb.contact.lattice.report import PressureRule, result_of, untouched
@@ -84,12 +85,14 @@ class CellContact(ContactModel):
         pressure_rule: "tributary" (force over the node's own area) or "source" (force over
             total area by number of nodes, section 4.5.6 of the source).
         newton: solve by full Newton steps (slow; the reference).
+        cache: keep prepared operators on disk, see `tkamb.contact.lattice.cache`.
     """
 
     resolution: float = 1e-3
     tolerance: float = 1e-3
     pressure_rule: PressureRule = "tributary"
     newton: bool = False
+    cache: bool = True
 
     direction: ClassVar[Direction] = "normal"
     """Nodes are pressed along the femoral normal, or vertically."""
@@ -104,11 +107,27 @@ class CellContact(ContactModel):
         solid = self.solid(lattice, pair.material)
         held = fixed_unknowns(lattice.nodes, lattice.bottom_nodes, pair.bearing)
         nodes, surface = contact_map(lattice, pair.insert)
-        operator = prepare_operator(solid.stiffness, lattice.index, held, nodes)
+        operator = self._operator(solid, lattice, held, nodes)
         floor = FemoralFloor(pair.femoral, RayCaster(pair.femoral))
         problem = ContactProblem(solid, operator, lattice.index, held, floor, self.direction)
         pool = CompliancePool(operator.half)
         return LatticeState(pair, lattice, problem, surface, condyle_split(pair.femoral), pool)
+
+    def _operator(
+        self,
+        solid: Solid,
+        lattice: Lattice,
+        held: NDArray[np.bool_],
+        nodes: NDArray[np.int64],
+    ) -> ElasticOperator:
+        """Return the operator, from disk if it was made before."""
+
+        def make() -> ElasticOperator:
+            return prepare_operator(solid.stiffness, lattice.index, held, nodes)
+
+        if not self.cache:
+            return make()
+        return cached_operator(operator_key(solid, held, nodes), make, int((~held).sum()))
 
     def evaluate(
         self, state: LatticeState, pose: Array, guess: ContactResult | None = None

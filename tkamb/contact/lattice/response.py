@@ -81,6 +81,11 @@ class HalfResponse:
         return result
 
     @property
+    def entries(self) -> int:
+        """How many numbers Z holds."""
+        return sum(block.values.size for block in self.blocks)
+
+    @property
     def columns(self) -> int:
         """How many columns Z has."""
         return int((self.rank >= 0).sum())
