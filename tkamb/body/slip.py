@@ -201,21 +201,11 @@ def roll_slip_motion(
         (f, 6) knee coordinates; NaN from where the femur leaves the insert.
     """
     moved = np.array(coordinates, float)
-    lowest, profile = LowestPoints(femoral, split), InsertProfile(insert)
+    poses, profile = knee_pose(moved), InsertProfile(insert)
     touch = FirstTouch(femoral, insert, split)
-    poses = knee_pose(moved)
-    relative = [[p for p in lowest.at(pose) if p is not None] for pose in poses]
-    arms = np.array([np.mean(pair, axis=0) for pair in relative]) - poses[:, :3, 3]
-    arcs = np.mean(
-        [
-            femoral_arcs(np.array([pair[side] for pair in relative]), poses)
-            for side in range(len(relative[0]))
-        ],
-        axis=0,
-    )
+    arms, arcs = _mean_condyle(LowestPoints(femoral, split), poses)
     centre_z = transform(poses, femoral.bounds.mean(axis=0))[:, 2]
-    lever = _mean(arms[:, 2] + poses[:, 2, 3] - centre_z)
-    axial = np.diff(moved[:, 3]) * lever
+    axial = np.diff(moved[:, 3]) * _mean(arms[:, 2] + poses[:, 2, 3] - centre_z)
     backwards = arcs - np.diff(np.asarray(slip, float))
     contact = moved[0, 0] + arms[0, 0]
     moved[0, 1] -= touch.travel(knee_pose(moved[0]))
@@ -225,6 +215,17 @@ def roll_slip_motion(
         moved[k, 0] = contact - arms[k, 0]
         moved[k, 1] -= touch.travel(knee_pose(moved[k])) if np.isfinite(contact) else np.nan
     return moved
+
+
+def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
+    """Return, as means of the condyles, the lowest point from the origin and its arcs.
+
+    Both depend on the rotations alone: arms (f, 3) m and femoral arcs (f-1,) m.
+    """
+    found = [[point for point in lowest.at(pose) if point is not None] for pose in poses]
+    points = np.array(found).swapaxes(0, 1)
+    arcs = np.mean([femoral_arcs(side, poses) for side in points], axis=0)
+    return points.mean(axis=0) - poses[:, :3, 3], np.asarray(arcs)
 
 
 def _rolled(profile: InsertProfile, x: float, z: float, backwards: float) -> float:
