@@ -1,0 +1,198 @@
+"""What is drawn of a run, and the viewer's manners at its edges; no browser is needed."""
+
+import http.client
+import json
+
+import numpy as np
+import pytest
+
+from tkamb.cli import main
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.surface import Surface
+from tkamb.view import browser as browser_module
+from tkamb.view.drawing import PressureMap
+from tkamb.view.levels import LEVELS, levels
+from tkamb.view.payload import Block
+from tkamb.view.run import open_run
+from tkamb.view.shading import shaded, thinned
+from tkamb.view.show import Show, serve_in_background
+from viewed import SCENE, copied_scene, short_results
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    short_results(folder, SCENE)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def show(folder):
+    return Show([open_run(folder)], frame=-1)
+
+
+@pytest.fixture
+def server(show):
+    server = show.server()
+    serve_in_background(server)
+    yield server
+    server.close()
+
+
+def ask(server, method, path, body=None, **headers):
+    host, port = server.url.removeprefix("http://").strip("/").split(":")
+    connection = http.client.HTTPConnection(host, int(port), timeout=60)
+    connection.request(method, path, body, {"Host": f"{host}:{port}"} | headers)
+    response = connection.getresponse()
+    return response.status, response.read()
+
+
+def sphere(rings=60):
+    import trimesh
+
+    ball = trimesh.creation.uv_sphere(radius=0.03, count=[rings, rings])
+    return Surface(np.asarray(ball.vertices), np.asarray(ball.faces, np.int64), "ball")
+
+
+def test_a_wrapped_tendon_lies_on_its_outline_and_says_so(show):
+    quadriceps = next(one for one in show.drawings[0].strands if one.name == "quadriceps")
+    wrap = show.runs[0].results["quadriceps_wrap_deg"]
+    for frame, degrees in enumerate(wrap):
+        kinds = len(np.unique(quadriceps.colours[frame], axis=0))
+        assert kinds == (2 if degrees > 1.0 else 1)
+
+
+def test_strands_are_as_long_as_their_lines(show):
+    run, drawing = show.runs[0], show.drawings[0]
+    for row, frame in enumerate(run.frames):
+        state = run.mechanics.frame(frame).geometry.state
+        for path in run.mechanics.extensor.paths(state):
+            found = [
+                np.linalg.norm(np.diff(one.points[row], axis=0), axis=1).sum()
+                for one in drawing.strands
+                if one.layer == "extensor lines"
+            ]
+            assert min(abs(length - path.length) for length in found) < 1e-9
+
+
+def test_levels_are_the_pressures_and_change_sign_at_the_rim():
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [0, 0, 1], [1, 0, 1]])
+    triangles = np.array([[0, 1, 4], [1, 2, 5], [1, 5, 4]])
+    pressure = np.array([[4.0, 2.0, 0, 0, 0, 0]])
+    gap = np.array([[0.0, 0, 3e-5, 1e-4, 1e-5, 2e-5]])
+    found = levels(PressureMap(points, triangles, pressure, gap), 4.0)[0]
+    assert list(found[:2]) == [LEVELS, round(LEVELS / 2)]
+    assert (found[2:] < 0).all()
+    assert found[2] < found[5] < found[4]
+
+
+def test_a_failed_frame_shows_no_pressure():
+    nothing = np.full((1, 3), np.nan)
+    found = levels(PressureMap(np.eye(3), np.array([[0, 1, 2]]), nothing, nothing), 10.0)
+    assert (found < 0).all()
+
+
+def test_shading_keeps_every_triangle_and_doubles_sharp_edges():
+    import trimesh
+
+    box = trimesh.creation.box((0.02, 0.02, 0.02))
+    surface = Surface(np.asarray(box.vertices), np.asarray(box.faces, np.int64), "box")
+    drawn = shaded(surface)
+    assert len(drawn.faces) == 12 and len(drawn.vertices) == 24
+    np.testing.assert_allclose(drawn.vertices[drawn.faces], surface.triangles, atol=1e-8)
+    smooth = shaded(sphere())
+    assert len(smooth.vertices) == len(sphere().vertices)
+
+
+@pytest.mark.parametrize("most", [2000, 500])
+def test_a_thinned_surface_is_within_its_stated_error(most):
+    whole = sphere()
+    fewer, moved = thinned(whole, most)
+    assert len(fewer.faces) <= most and moved > 0
+    radius = np.linalg.norm(fewer.vertices, axis=1)
+    assert (np.abs(radius - 0.03) <= moved).all()
+
+
+def test_arrays_of_the_payload_are_aligned():
+    block = Block()
+    first = block.put([1, 2, 3], "uint8")
+    second = block.put([1.5], "float32")
+    assert (first["at"], second["at"]) == (0, 4)
+
+
+def test_the_server_listens_on_loopback_only(server):
+    assert server.url.startswith("http://127.0.0.1:")
+    assert ask(server, "GET", "/")[0] == 200
+    assert ask(server, "GET", "/nothing")[0] == 404
+
+
+@pytest.mark.parametrize(
+    "headers", [{"Host": "knee.example"}, {"Origin": "http://knee.example"}, {"Origin": "null"}]
+)
+def test_other_hosts_and_sites_are_refused(server, headers):
+    assert ask(server, "GET", "/scene.bin", **headers)[0] == 403
+    body = json.dumps({"frame": 0, "model": "hertz"})
+    assert ask(server, "POST", "/contact", body, **headers)[0] == 403
+
+
+@pytest.mark.parametrize(
+    ("body", "word"),
+    [
+        (b"", "bytes"),
+        (b"[]", "object"),
+        (b"{", "Expecting"),
+        (b'{"frame": 999, "model": "hertz"}', "999"),
+        (b'{"frame": 0, "model": "none such"}', "none such"),
+    ],
+)
+def test_a_bad_question_gets_one_line(server, body, word):
+    status, answer = ask(server, "POST", "/contact", body)
+    assert status == 400 and word in answer.decode() and b"\n" not in answer
+
+
+def test_results_of_a_changed_scene_are_refused(tmp_path, capsys):
+    scene = copied_scene(tmp_path / "knee")
+    out = tmp_path / "out"
+    out.mkdir()
+    short_results(out, scene)
+    text = scene.read_text()
+    scene.write_text(text.replace("mass_kg = 75.0", "mass_kg = 76.0"))
+    assert main(["view", str(out), "--html", str(tmp_path / "x.html")]) == 2
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "has changed" in line and "tkamb run" in line
+    assert not (tmp_path / "x.html").exists()
+
+
+def test_without_a_browser_one_line_says_so(folder, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(browser_module, "find_browser", lambda: None)
+    assert main(["view", str(folder), "--png", str(tmp_path / "x.png")]) == 1
+    told = capsys.readouterr().err.strip().splitlines()
+    assert "no browser found" in told[-1] and "Traceback" not in "".join(told)
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--frame", "999"], "999"),
+        (["--camera", "behind"], "behind"),
+        (["--contact", "hertz"], "own"),
+    ],
+)
+def test_bad_options_are_one_line(folder, tmp_path, capsys, options, word):
+    assert main(["view", str(folder), "--html", str(tmp_path / "x.html"), *options]) == 2
+    assert word in capsys.readouterr().err.strip().splitlines()[-1]
+
+
+def test_a_missing_folder_is_one_line(tmp_path, capsys):
+    assert main(["view", str(tmp_path)]) == 2
+    assert "results.csv" in capsys.readouterr().err
+
+
+def test_the_browser_is_asked_for_only_when_needed(show, tmp_path, monkeypatch):
+    monkeypatch.setattr(browser_module, "find_browser", lambda: None)
+    show.write_html(tmp_path / "knee.html")
+    assert (tmp_path / "knee.html").stat().st_size < 25e6
+    with pytest.raises(ComputationError):
+        show.write_png(tmp_path / "knee.png")
+    with pytest.raises(InputError):
+        Show(show.runs, frame=77)

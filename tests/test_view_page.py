@@ -1,0 +1,238 @@
+"""The page of the viewer, driven in a headless browser and read back from its scene graph."""
+
+import numpy as np
+import pytest
+
+from tkamb.output.maps_file import read_maps
+from tkamb.view.browser import HeadlessBrowser, find_browser
+from tkamb.view.run import open_run
+from tkamb.view.show import Show, serve_in_background
+from viewed import SCENE, force, levels, matrix, move_slider, short_results
+
+pytestmark = pytest.mark.skipif(
+    find_browser() is None, reason="no chromium here (Debian: apt install chromium)"
+)
+FRAMES = (0, 2, 5)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    short_results(folder, SCENE)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def show(folder):
+    return Show([open_run(folder)])
+
+
+@pytest.fixture(scope="module")
+def browser(show, tmp_path_factory):
+    page = tmp_path_factory.mktemp("page") / "knee.html"
+    show.write_html(page)
+    with HeadlessBrowser() as browser:
+        browser.open(page.as_uri())
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def live(show):
+    server = show.server()
+    serve_in_background(server)
+    with HeadlessBrowser() as browser:
+        browser.open(server.url)
+        yield server, browser
+    server.close()
+
+
+def test_the_file_needs_nothing_but_itself(browser):
+    assert browser.problems == []
+    assert all(url.startswith(("file:", "data:", "blob:")) for url in browser.requests)
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_the_slider_moves_the_femur_as_contact_h5_says(browser, folder, frame):
+    move_slider(browser, frame)
+    drawn = matrix(browser, "/tkamb/0/femoral component/femoral component")
+    np.testing.assert_allclose(
+        drawn, read_maps(folder / "contact.h5").femoral_pose[frame], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_the_map_holds_the_pressures_of_contact_h5(browser, folder, frame):
+    move_slider(browser, frame)
+    pressure = read_maps(folder / "contact.h5").pressure_Pa
+    drawn, given = levels(browser), pressure[frame]
+    loaded = given > 0
+    assert loaded.any() and (drawn[~loaded] < 0).all()
+    np.testing.assert_allclose(
+        drawn[loaded] * pressure.max(), given[loaded], atol=1e-4 * pressure.max()
+    )
+
+
+def test_the_colour_bar_ends_where_the_data_end(browser, folder):
+    peak = read_maps(folder / "contact.h5").pressure_Pa.max() / 1e6
+    bar = "document.getElementById('pressure-bar')"
+    assert browser.evaluate(f"Number({bar}.dataset.low)") == 0
+    assert browser.evaluate(f"Number({bar}.dataset.high)") == pytest.approx(peak, rel=1e-9)
+    ticks = browser.evaluate(
+        f"[...{bar}.querySelectorAll('.ticks span')].map((s) => s.textContent)"
+    )
+    assert (ticks[0], ticks[-1]) == (f"{peak:.1f}", "0.0")
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_the_arrows_are_the_forces_of_results_csv(browser, show, frame):
+    move_slider(browser, frame)
+    results = show.runs[0].results
+
+    def vector(pattern):
+        return np.array([results[pattern.format(axis)][frame] for axis in ("ap", "si", "ml")])
+
+    def near(drawn, given):
+        assert np.linalg.norm(drawn - given) <= 1e-3 * np.linalg.norm(given)
+
+    near(force(browser, "ground reaction"), vector("ground_reaction_{}_N"))
+    near(force(browser, "hip"), vector("hip_force_{}_N"))
+    pressed = force(browser, "medial condyle") + force(browser, "lateral condyle")
+    near(pressed, vector("force_{}_N") * [1, -1, 1])
+    for name, column in (
+        ("quadriceps", "quadriceps_N"),
+        ("patellar ligament", "patellar_ligament_N"),
+    ):
+        assert np.linalg.norm(force(browser, name)) == pytest.approx(
+            results[column][frame], rel=1e-3
+        )
+    across = np.hypot(
+        results["patellofemoral_N"][frame], results["patellofemoral_tangential_N"][frame]
+    )
+    assert np.linalg.norm(force(browser, "patellofemoral")) == pytest.approx(across, rel=1e-3)
+
+
+def test_the_forces_on_the_patella_balance(browser):
+    """Tendons and contact leave only its weight and inertia: below 2 % of the contact force."""
+    move_slider(browser, 5)
+    pull = force(browser, "quadriceps")
+    press = -force(browser, "patellofemoral")
+    ligament = -force(browser, "patellar ligament")
+    assert np.linalg.norm(pull + press + ligament) < 0.02 * np.linalg.norm(press)
+
+
+@pytest.mark.parametrize("layer", ["bones", "pressure map", "forces", "recorded pose"])
+def test_layers_are_switched_by_their_boxes(browser, layer):
+    box = f"document.querySelector('input[data-layer=\"{layer}\"]')"
+    shown = f"tkamb.node('/tkamb/0/{layer}').object.visible"
+    before = browser.evaluate(shown)
+    assert browser.evaluate(f"{box}.checked") == before
+    browser.evaluate(f"{box}.click()")
+    assert browser.evaluate(shown) is not before
+    browser.evaluate(f"{box}.click()")
+    assert browser.evaluate(shown) is before
+
+
+def test_the_numbers_change_with_the_frame(browser, show):
+    row = (
+        "[...document.querySelectorAll('#numbers tr')].find((r) => r.cells[0].textContent === '{}')"
+    )
+    for frame in FRAMES:
+        move_slider(browser, frame)
+        flexion = browser.evaluate(row.format("flexion") + ".cells[1].textContent")
+        assert flexion == f"{show.runs[0].results['flexion_deg'][frame]:.1f}°"
+
+
+def test_slack_ligaments_are_grey(browser, show):
+    slack = [
+        (strand, frame)
+        for strand in show.drawings[0].strands
+        if strand.layer == "ligaments"
+        for frame in FRAMES
+        if show.runs[0].results[f"ligament_{strand.name}_N"][frame] == 0
+    ]
+    assert slack
+    for strand, frame in slack:
+        move_slider(browser, frame)
+        colour = browser.evaluate(
+            f"Array.from(tkamb.node('/tkamb/0/ligaments/{strand.name}/<object>')"
+            ".object.geometry.attributes.color.array.slice(0, 3))"
+        )
+        assert np.ptp(colour) == 0
+
+
+def test_keys_step_and_choose_the_view(browser):
+    press = "document.dispatchEvent(new KeyboardEvent('keydown', {{key: '{}'}}))"
+    move_slider(browser, 2)
+    browser.evaluate(press.format("ArrowRight"))
+    assert browser.evaluate("tkamb.frame") == 3
+    browser.evaluate(press.format("5"))
+    assert browser.evaluate("tkamb.camera") == "top of insert"
+    assert not browser.evaluate("tkamb.layerShown('femoral component')")
+    browser.evaluate(press.format("1"))
+    assert browser.evaluate("tkamb.layerShown('femoral component')")
+
+
+def test_playing_goes_on_and_pauses(browser):
+    move_slider(browser, 0)
+    browser.evaluate("tkamb.play(true)")
+    moved = browser.evaluate(
+        "new Promise((done) => { const t = setInterval(() => { if (tkamb.frame > 0) {"
+        "clearInterval(t); done(true); } }, 20); })"
+    )
+    browser.evaluate("tkamb.play(false)")
+    assert moved
+
+
+def test_no_console_error_at_the_end(browser):
+    assert browser.problems == []
+
+
+def test_the_live_window_asks_only_its_own_server(live):
+    server, browser = live
+    assert browser.problems == []
+    assert all(url.startswith((server.url, "data:", "blob:")) for url in browser.requests)
+
+
+def test_another_contact_model_on_the_frame(live):
+    _, browser = live
+    move_slider(browser, 2)
+    before = levels(browser)
+    browser.evaluate(
+        "(() => { const s = document.getElementById('contact'); s.value = 'hertz';"
+        "s.dispatchEvent(new Event('change')); })()"
+    )
+    words = browser.evaluate(
+        "new Promise((done) => { const t = setInterval(() => {"
+        "const w = document.getElementById('answer').textContent;"
+        "if (w.startsWith('hertz:')) { clearInterval(t); done(w); } }, 50); })"
+    )
+    after = levels(browser)
+    assert "peak" in words and after.shape == before.shape
+    assert (after > 0).any() and not np.array_equal(after, before)
+    browser.evaluate("document.getElementById('contact').value = 'foundation'")
+    move_slider(browser, 2)
+    assert np.array_equal(levels(browser), before)
+    assert browser.problems == []
+
+
+def test_two_contact_models_side_by_side_on_one_scale(folder, tmp_path):
+    other = tmp_path / "hertz"
+    other.mkdir()
+    short_results(other, SCENE, contact="hertz")
+    page = tmp_path / "both.html"
+    Show([open_run(folder), open_run(other)]).write_html(page)
+    peaks = [read_maps(one / "contact.h5").pressure_Pa.max() for one in (folder, other)]
+    with HeadlessBrowser() as browser:
+        browser.open(page.as_uri())
+        move_slider(browser, 5)
+        assert browser.evaluate("tkamb.data.peak_MPa") == pytest.approx(max(peaks) / 1e6)
+        for view, one in enumerate((folder, other)):
+            given = read_maps(one / "contact.h5").pressure_Pa[5]
+            drawn = levels(browser, view) * max(peaks)
+            np.testing.assert_allclose(drawn[given > 0], given[given > 0], atol=1e-4 * max(peaks))
+        assert browser.problems == []
+
+
+def test_a_picture_is_made(show, tmp_path):
+    show.write_png(tmp_path / "knee.png", (640, 480))
+    assert (tmp_path / "knee.png").read_bytes().startswith(b"\x89PNG")
