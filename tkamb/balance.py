@@ -236,7 +236,7 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
     if softest > 0:
         step = np.linalg.solve(stiffness, force)
         if np.linalg.norm(step) <= radius:
-            return step
+            return np.asarray(step)
     low = max(0.0, -softest)
     high = low + float(np.linalg.norm(force)) / radius + 1.0
     for _ in range(50):
@@ -244,6 +244,6 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
         step = np.linalg.solve(stiffness + shift * identity, force)
         length = float(np.linalg.norm(step))
         if 0.9 * radius <= length <= radius:
-            return step
+            return np.asarray(step)
         low, high = (shift, high) if length > radius else (low, shift)
-    return np.linalg.solve(stiffness + high * identity, force)
+    return np.asarray(np.linalg.solve(stiffness + high * identity, force))

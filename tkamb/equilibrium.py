@@ -1,27 +1,46 @@
 """Body and contact together: the only file that sees both.
 
-Uncoupled (`coupling = "none"`): the body's equations give the superior-inferior contact
-force, and the contact model presses that load in at the measured rotation.
+- `coupling = "none"`: the body's equations give the superior-inferior contact force, with
+  contact points from the undeformed meshes, and the contact model presses that load in at
+  the recorded rotation.
+- `coupling = "points"`: each condyle's resultant then takes the place of point and normal in
+  the equations, and so on until load and centres of pressure change no more.
+- `released = [...]`: these coordinates find their own equilibrium under contact, ligaments
+  and muscle line (`tkamb.released`); the equations then use the resultants found.
 """
 
 import time as clock
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.adjusted_press import press_adjusted
+from tkamb.balance import BalanceStatus
+from tkamb.body.knee import solve_knee, unsolved
+from tkamb.body.unknowns import CondylePoint
 from tkamb.case import Case
 from tkamb.contact.materials import material
 from tkamb.contact.model import ContactPair, ContactResult, ContactStatus
+from tkamb.contact.pressing import first_touch_height
+from tkamb.contact.probe import condyle_wrenches
 from tkamb.contact.registry import contact_model
 from tkamb.contact.summary import medial_points
 from tkamb.geometry.adjustment import Adjustment
-from tkamb.geometry.closest import ClosestPointQuery
-from tkamb.geometry.frames import Array
-from tkamb.mechanics import FrameLoads
+from tkamb.geometry.frames import Array, knee_pose
+from tkamb.mechanics import FrameLoads, Mechanics
+from tkamb.released import ReleasedKnee, SettledKnee, touching
 
 NAN = float("nan")
+
+LOAD_CHANGE = 0.1
+"""N, between the last two iterations of a coupled frame."""
+POINT_CHANGE = 1e-6
+"""m, of the centres of pressure between them."""
+MOST_ITERATIONS = 20
+FIRST_DEPTH = 5e-5
+"""m: how deep the search for released coordinates begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +54,10 @@ class FrameContact:
         seconds: computing time.
         problem: why there is no result, or empty.
         flags: plain words that a reader must know.
+        iterations: of body and contact, until they agreed; 0 if not coupled.
+        load_change: N, by the last of them.
+        point_change: m, likewise, of the centres of pressure.
+        settled: the search for the released coordinates, if there are any.
     """
 
     result: ContactResult | None
@@ -43,6 +66,10 @@ class FrameContact:
     seconds: float
     problem: str
     flags: tuple[str, ...]
+    iterations: int = 0
+    load_change: float = NAN
+    point_change: float = NAN
+    settled: SettledKnee | None = None
 
     def area_above(self, side: str, pressure: float) -> float:
         """Return the share of a condyle's contact area above a pressure (Pa)."""
@@ -56,37 +83,53 @@ class FrameContact:
 
 
 class ContactSide:
-    """The contact model of a case, prepared once.
+    """The contact model of a case, prepared once, and the body that it has to agree with.
 
     Args:
         case: a case with [contact].
+        mechanics: its body side.
     """
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: Case, mechanics: Mechanics) -> None:
         table = case.scene.contact
         insert = case.scene.implant.insert
         assert table is not None and insert is not None
         assert case.femoral is not None and case.insert is not None
-        self.case, self.table = case, table
+        self.case, self.table, self.mechanics = case, table, mechanics
         self.model = contact_model(table.model, table.resolution_mm, **table.options)
         pair = ContactPair(case.femoral, case.insert, material(table.material), insert.bearing)
         start = clock.perf_counter()
         self.state = self.model.prepare(pair)
         self.prepare_seconds = clock.perf_counter() - start
 
-    def carry(
-        self,
-        body: FrameLoads,
-        pose: Array,
-        query: ClosestPointQuery,
-        guess: ContactResult | None,
-    ) -> FrameContact:
+        self._released: ReleasedKnee | None = None
+        if table.released:
+            probe = self.model.probe(self.state)
+            self._released = ReleasedKnee(mechanics, probe, table.released)
+
+    def frame(self, k: int, before: Sequence[FrameContact] = ()) -> tuple[FrameLoads, FrameContact]:
+        """Return body and contact of frame k, as coupled as the scene asks.
+
+        Args:
+            k: frame.
+            before: the contacts of the frames before: the last is a guess that saves time,
+                and the last that were found are where released coordinates begin.
+        """
+        if self._released is not None:
+            return self._settled(self._released, k, before)
+        guess = before[-1].result if before else None
+        body = self.mechanics.frame(k)
+        contact = self.carry(body, self.mechanics.poses[k], guess)
+        if self.table.coupling == "none":
+            return body, contact
+        return self._coupled(k, body, contact)
+
+    def carry(self, body: FrameLoads, pose: Array, guess: ContactResult | None) -> FrameContact:
         """Press in what the body asks for, at the measured (or adjusted) rotation.
 
         Args:
             body: the body side of the frame.
             pose: (4, 4) measured pose_femoral_in_insert.
-            query: closest points of the pair, for the femoral adjustment.
             guess: the previous frame's contact, which may save time.
         """
         load = float(body.loads.contact_force[1])
@@ -95,14 +138,125 @@ class ContactSide:
         if load <= 0:
             return self._nothing("no compressive load")
         start = clock.perf_counter()
-        adjustment = body.adjustment
-        if adjustment is None:
+        adjustment, query = body.adjustment, self.mechanics.query
+        if adjustment is None or query is None:
             result = self.model.press(self.state, load, pose, guess)
         else:
             result, adjustment = press_adjusted(
                 self.model, self.state, load, adjustment, query, guess
             )
         seconds = clock.perf_counter() - start
+        return self._contact(result, adjustment, seconds)
+
+    def _coupled(
+        self, k: int, body: FrameLoads, contact: FrameContact
+    ) -> tuple[FrameLoads, FrameContact]:
+        """Return body and contact once the resultants of the one are the points of the other."""
+        seconds, place = contact.seconds, self.case.motion.coordinates[k]
+        for iteration in range(1, MOST_ITERATIONS + 1):
+            if contact.result is None:
+                return body, contact
+            load, points = body.loads.contact_force[1], _points(body)
+            found = self._resultants(k, place, contact.result)
+            geometry = replace(body.geometry, condyles=body.geometry.condyles | found)
+            body = replace(
+                body, geometry=geometry, loads=solve_knee(geometry, self.mechanics.friction)
+            )
+            contact = self.carry(body, self.mechanics.poses[k], contact.result)
+            seconds += contact.seconds
+            change = abs(float(body.loads.contact_force[1] - load))
+            moved = _travel(points, _points(body))
+            contact = replace(
+                contact,
+                seconds=seconds,
+                iterations=iteration,
+                load_change=change,
+                point_change=moved,
+            )
+            if change < LOAD_CHANGE and moved < POINT_CHANGE:
+                return body, contact
+        problem = "body and contact do not come to agree"
+        return replace(body, loads=unsolved([problem])), replace(
+            contact, result=None, problem=problem
+        )
+
+    def _settled(
+        self, released: ReleasedKnee, k: int, before: Sequence[FrameContact]
+    ) -> tuple[FrameLoads, FrameContact]:
+        """Return body and contact with the released coordinates at rest."""
+        start = clock.perf_counter()
+        good = [contact for contact in before if contact.settled and contact.result][-2:]
+        earlier, guess = (good[-1].settled, good[-1].result) if good else (None, None)
+        points = {} if len(released.released) == 5 else self._nearest_points(k)
+        place = self._start(k, released, [c.settled.coordinates for c in good if c.settled])
+        settled = released.settle(k, place, points, earlier)
+        if settled.balance.status in (BalanceStatus.OUT_OF_RANGE, BalanceStatus.NOT_CONVERGED):
+            raised = self._touching(place)
+            if np.isfinite(raised).all():
+                settled = released.settle(k, raised, points, earlier)
+        result, contact = None, self._nothing(settled.problem)
+        if not settled.problem:
+            result = self.model.evaluate(self.state, knee_pose(settled.coordinates), guess)
+            contact = self._contact(result, None, 0.0)
+        contact = replace(
+            contact,
+            seconds=clock.perf_counter() - start,
+            iterations=settled.passes,
+            load_change=settled.change,
+            settled=settled,
+        )
+        return self._settled_loads(k, settled, contact, points), contact
+
+    def _start(self, k: int, released: ReleasedKnee, found: list[Array]) -> Array:
+        """Return where the search begins: as the last frames went on, else as recorded."""
+        place = self.case.motion.coordinates[k].copy()
+        if not found:
+            return self._touching(place)
+        rows = list(released.released)
+        place[rows] = (2 * found[-1] - found[0] if len(found) == 2 else found[-1])[rows]
+        return place
+
+    def _touching(self, place: Array) -> Array:
+        """Return coordinates (6,) whose superior-inferior one makes the condyles just touch."""
+        height = first_touch_height(self.state.pair, knee_pose(place))
+        return np.array([place[0], height - FIRST_DEPTH, *place[2:]])
+
+    def _settled_loads(
+        self, k: int, settled: SettledKnee, contact: FrameContact, points: dict[str, Array]
+    ) -> FrameLoads:
+        start, placed = clock.perf_counter(), settled.placed
+        geometry = placed.geometry
+        if contact.result is None:
+            loads = unsolved([contact.problem])
+        else:
+            up, still = np.array([0.0, 1.0, 0.0]), np.zeros(3)
+            apart = {side: CondylePoint(point, up, still, NAN) for side, point in points.items()}
+            carrying = self._resultants(k, settled.coordinates, contact.result)
+            sides = {"medial"} if self.case.split is None else {"medial", "lateral"}
+            geometry = replace(
+                geometry, condyles=apart | carrying, lifted=frozenset(sides - set(carrying))
+            )
+            loads = solve_knee(geometry, self.mechanics.friction)
+        seconds = clock.perf_counter() - start
+        return FrameLoads(geometry, loads, placed.tensions, placed.wrap, None, 0.0, seconds)
+
+    def _resultants(self, k: int, place: Array, result: ContactResult) -> dict[str, CondylePoint]:
+        """Return the contact's resultants as the contact points of the equations."""
+        return {
+            side: touching(condyle, self.mechanics.sliding(k, place, condyle.point))
+            for side, condyle in condyle_wrenches(result, self.case.split).items()
+        }
+
+    def _nearest_points(self, k: int) -> dict[str, Array]:
+        query = self.mechanics.query
+        assert query is not None
+        gaps = query.at(self.mechanics.poses[k])
+        found = {"medial": gaps.medial.centre}
+        return found | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
+
+    def _contact(
+        self, result: ContactResult, adjustment: Adjustment | None, seconds: float
+    ) -> FrameContact:
         medial = medial_points(self.state.points, result.pose, self.case.split)
         if result.status is not ContactStatus.OK:
             reason = f"contact {result.status.value.replace('_', ' ')}"
@@ -113,3 +267,12 @@ class ContactSide:
     def _nothing(self, problem: str) -> FrameContact:
         none = np.zeros(len(self.state.points), bool)
         return FrameContact(None, none, None, 0.0, problem, ())
+
+
+def _points(body: FrameLoads) -> dict[str, Array]:
+    return {side: condyle.point for side, condyle in body.geometry.condyles.items()}
+
+
+def _travel(before: dict[str, Array], after: dict[str, Array]) -> float:
+    """Return the farthest (m) that a contact point has moved."""
+    return max(float(np.linalg.norm(after[side] - before[side])) for side in after)

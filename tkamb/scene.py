@@ -15,6 +15,7 @@ from tkamb.errors import InputError
 LengthUnit = Literal["m", "cm", "mm"]
 AngleUnit = Literal["rad", "deg"]
 Vector = tuple[float, float, float]
+KneeFreedom = Literal["ap", "si", "ml", "axial_rotation", "adduction"]
 ColumnTriple = tuple[str, str, str]
 
 
@@ -314,8 +315,28 @@ class ContactTable(_Table):
     material: str = Field("polyethylene", description="a name of `tkamb.contact.materials`")
     friction: float = Field(0.05, ge=0, le=1, description="Coulomb coefficient")
     adjust: bool = Field(False, description="femoral adjustment before contact")
-    coupling: Literal["none", "points"] = "none"
+    coupling: Literal["none", "points"] = Field(
+        "none", description="'points': the resultants of the deformed contact act in the equations"
+    )
+    released: tuple[KneeFreedom, ...] = Field(
+        (),
+        description=(
+            "knee coordinates that find their own equilibrium under contact, ligaments and "
+            "muscle line: adduction, axial_rotation, ap, si, ml (si always does)"
+        ),
+    )
     options: dict[str, Any] = Field(default_factory=dict, description="the model's own options")
+
+    @model_validator(mode="after")
+    def _released_once(self) -> Self:
+        if len(set(self.released)) != len(self.released):
+            raise ValueError("'released' names a coordinate twice")
+        if self.released and self.adjust:
+            raise ValueError(
+                "'adjust' and 'released' exclude each other: one moves the femur to "
+                "where the other lets it settle"
+            )
+        return self
 
 
 class OutputTable(_Table):

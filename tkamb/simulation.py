@@ -83,8 +83,7 @@ def _press_all(
     from tkamb.equilibrium import ContactSide
     from tkamb.output.maps_memory import map_sink
 
-    assert mechanics.query is not None
-    side = ContactSide(case)
+    side = ContactSide(case, mechanics)
     seconds["prepare contact"] = side.prepare_seconds
     labels = {
         "frame": "insert: x anterior, y superior, z lateral",
@@ -93,9 +92,9 @@ def _press_all(
     }
     with map_sink(directory, side.state.points, side.state.triangles, labels) as sink:
         for k in indices:
-            body.append(mechanics.frame(k))
-            guess = touched[-1].result if touched else None
-            touched.append(side.carry(body[-1], mechanics.poses[k], mechanics.query, guess))
+            loads, contact = side.frame(k, touched)
+            body.append(loads)
+            touched.append(contact)
             result, time = touched[-1].result, float(case.motion.time[k])
             if result is None:
                 sink.append_failed(time)

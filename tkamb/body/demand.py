@@ -20,15 +20,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tkamb.body import unknowns
 from tkamb.body.knee import KneeGeometry
 from tkamb.body.ligaments import Ligament, quadratic_toe_force, two_line_force
-from tkamb.body.load import PointForces, total_wrench
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_pose, transform
 from tkamb.geometry.knee_axes import knee_axes
-
-ORIGIN = np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +43,7 @@ class LigamentSet:
 
     on_femur: Array
     on_shank: Array
-    two_line: Array
+    two_line: NDArray[np.bool_]
     stiffness: Array
     slack_length: Array
 
@@ -65,18 +63,40 @@ class LigamentSet:
 
 
 @dataclass(frozen=True, eq=False)
+class LigamentLine:
+    """The patellar ligament where it leaves the patella: a straight line to an anchor.
+
+    Args:
+        end: (3,) m, on the patella, carried by the femur, femur frame.
+        anchor: (3,) m, the next point on the shank, tuberosity or front lip, insert frame.
+    """
+
+    end: Array
+    anchor: Array
+
+    def wrench(self, poses: Array) -> Array:
+        """Return the wrench (..., 6) of a unit tension on the insert at poses (..., 4, 4)."""
+        line = transform(poses, self.end) - self.anchor
+        line = line / np.linalg.norm(line, axis=-1, keepdims=True)
+        moment = np.cross(np.broadcast_to(self.anchor, line.shape), line)
+        return np.concatenate([line, moment], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
 class KneeDemand:
     """The equations of equilibrium of the released knee coordinates at one frame.
 
     Args:
         external: (6,) w_external on the insert, force and moment about its origin.
         ligaments: the bundles.
-        keeping: (6, 6 - n) B, one column per prescribed coordinate.
+        line: the patellar ligament, which balances flexion; None: a moment does.
+        keeping: (6, m) the other columns of B, of unit magnitude.
         released: indices of the n released coordinates.
     """
 
     external: Array
     ligaments: LigamentSet
+    line: LigamentLine | None
     keeping: Array
     released: tuple[int, ...]
 
@@ -87,34 +107,41 @@ class KneeDemand:
             coordinates: (..., 6) knee coordinates.
             contact: (6,) w_contact on the insert.
         """
-        axes, wrench = self._loaded(coordinates, contact)
-        kept = self._kept(axes, wrench)
-        left = wrench + np.einsum("ij,...j->...i", self.keeping, kept)
+        axes, columns, wrench = self._loaded(coordinates, contact)
+        kept = _magnitudes(axes[..., self._prescribed, :], columns, wrench)
+        left = wrench + np.einsum("...ij,...j->...i", columns, kept)
         return -np.einsum("...ij,...j->...i", axes[..., list(self.released), :], left)
 
     def kept(self, coordinates: Array, contact: Array) -> Array:
-        """Return y (6 - n,): magnitudes of the loads that keep the prescribed coordinates."""
-        return self._kept(*self._loaded(coordinates, contact))
+        """Return y (6 - n,): what keeps the prescribed coordinates, flexion last."""
+        axes, columns, wrench = self._loaded(coordinates, contact)
+        return _magnitudes(axes[..., self._prescribed, :], columns, wrench)
 
     def contact_gain(self, coordinates: Array) -> Array:
         """Return d r / d w_contact (n, 6) at coordinates (6,)."""
-        axes = knee_axes(coordinates)
-        rows = self._prescribed
-        through = np.linalg.solve(axes[rows] @ self.keeping, axes[rows])
-        return -axes[list(self.released)] @ (np.eye(6) - self.keeping @ through)
+        axes, columns, _ = self._loaded(coordinates, np.zeros(6))
+        rows = axes[self._prescribed]
+        through = np.eye(6) - columns @ np.linalg.solve(rows @ columns, rows)
+        return np.asarray(-axes[list(self.released)] @ through)
 
     @property
     def _prescribed(self) -> list[int]:
         return [i for i in range(6) if i not in self.released]
 
-    def _loaded(self, coordinates: Array, contact: Array) -> tuple[Array, Array]:
-        pulls = self.ligaments.wrench(knee_pose(coordinates))
-        return knee_axes(coordinates), self.external + contact + pulls
+    def _loaded(self, coordinates: Array, contact: Array) -> tuple[Array, Array, Array]:
+        """Return axes (..., 6, 6), columns B (..., 6, 6 - n) and wrench (..., 6)."""
+        poses = knee_pose(coordinates)
+        wrench = self.external + contact + self.ligaments.wrench(poses)
+        columns = np.broadcast_to(self.keeping, (*wrench.shape[:-1], *self.keeping.shape))
+        if self.line is not None:
+            columns = np.concatenate([columns, self.line.wrench(poses)[..., None]], axis=-1)
+        return knee_axes(coordinates), columns, wrench
 
-    def _kept(self, axes: Array, wrench: Array) -> Array:
-        rows = axes[..., self._prescribed, :]
-        right = np.einsum("...ij,...j->...i", rows, wrench)
-        return np.asarray(-np.linalg.solve(rows @ self.keeping, right[..., None])[..., 0])
+
+def _magnitudes(rows: Array, columns: Array, wrench: Array) -> Array:
+    """Return y with rows (columns y + wrench) = 0."""
+    right = np.einsum("...ij,...j->...i", rows, wrench)
+    return np.asarray(-np.linalg.solve(rows @ columns, right[..., None])[..., 0])
 
 
 def knee_demand(
@@ -135,17 +162,44 @@ def knee_demand(
         middle: (3,) m, where the residual forces act, insert frame.
         slack: the extensor mechanism carries nothing.
     """
-    keeping = [
-        total_wrench([load for load in loads if load.link == "tibia"], ORIGIN)
-        for i, loads in enumerate(_keepers(geometry, middle, slack))
-        if i not in released
+    line = None if slack or geometry.extensor is None else ligament_line(geometry, coordinates)
+    columns = [
+        unit_keeper(name, middle)
+        for i, name in enumerate(KNEE_COORDINATES)
+        if i not in released and not (name == "flexion" and line)
     ]
     return KneeDemand(
         external_wrench(geometry, coordinates),
         ligament_set(geometry, ligaments, coordinates),
-        np.array(keeping).T,
+        line,
+        np.array(columns).reshape(-1, 6).T,
         released,
     )
+
+
+def unit_keeper(name: str, middle: Array) -> Array:
+    """Return the wrench (6,) on the insert of the residual that keeps one knee coordinate.
+
+    As in the equations of motion: forces along the insert's axes at `middle`, moments about
+    its x (adduction), y (axial rotation) and z (flexion).
+    """
+    axis = unknowns.AXES[
+        {"adduction": "ap", "axial_rotation": "si", "flexion": "ml"}.get(name, name)
+    ]
+    if name in unknowns.AXES:
+        return np.concatenate([axis, np.cross(middle, axis)])
+    return np.concatenate([np.zeros(3), axis])
+
+
+def ligament_line(geometry: KneeGeometry, coordinates: Array) -> LigamentLine:
+    """Return the patellar ligament's first straight stretch at coordinates (6,)."""
+    extensor, chain = geometry.extensor, geometry.state.chain
+    assert extensor is not None
+    shank = [load for load in extensor.patellar_ligament if chain.on_shank(load.link)]
+    free = [load for load in extensor.patellar_ligament if not chain.on_shank(load.link)]
+    end, along = free[0].points[0], free[0].forces[0]
+    away = min(float((load.points[0] - end) @ along) for load in shank)
+    return LigamentLine(transform(inverse(knee_pose(coordinates)), end), end + away * along)
 
 
 def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
@@ -157,7 +211,7 @@ def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
     without = state.inertial - columns[:, -1]
     at_hip = np.linalg.solve(columns[:6, :6], without[:6])
     knee = (without - columns[:, :6] @ at_hip)[state.chain.knee_columns()]
-    return np.linalg.solve(knee_axes(coordinates), knee)
+    return np.asarray(np.linalg.solve(knee_axes(coordinates), knee))
 
 
 def ligament_set(
@@ -190,21 +244,3 @@ def ligament_set(
         table[:, 1],
         table[:, 2],
     )
-
-
-def _keepers(geometry: KneeGeometry, middle: Array, slack: bool) -> list[Sequence[PointForces]]:
-    """Return per knee coordinate the load of unit magnitude that may keep it in place."""
-    extensor = geometry.extensor
-    flexion = unknowns.moment_pair("tibia", "femur", unknowns.AXES["ml"])
-    moments = {"axial_rotation": "si", "adduction": "ap"}
-    keepers: list[Sequence[PointForces]] = []
-    for name in KNEE_COORDINATES:
-        if name == "flexion":
-            taut = extensor is not None and not slack
-            keepers.append(extensor.patellar_ligament if taut and extensor else flexion)
-        elif name in moments:
-            axis = unknowns.AXES[moments[name]]
-            keepers.append(unknowns.moment_pair("tibia", "femur", axis))
-        else:
-            keepers.append(unknowns.pair("tibia", "femur", middle, unknowns.AXES[name]))
-    return keepers

@@ -1,0 +1,237 @@
+"""Released knee coordinates: where contact, ligaments and muscle line leave them at rest.
+
+Flexion is as recorded. The superior-inferior position always follows from the contact;
+adduction, axial rotation, anterior-posterior and medial-lateral position do so if the scene
+releases them, else they are kept as recorded, and what keeps them is a residual of the
+equations of motion.
+
+Within one search the patellar ligament's line is held; the patella and its lines are then
+found anew at the solved pose, until that moves the knee no more. Inertia and sliding speed
+are those of the recorded rates: for the released coordinates the solution is quasi-static.
+Friction is Coulomb's, against the recorded sliding, at each condyle's line of action and of
+mu times its resultant.
+
+The contact comes as a probe; this file does not know the models.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.balance import Balance, BalanceStatus, Trial, find_balance
+from tkamb.body.demand import KneeDemand, knee_demand
+from tkamb.body.unknowns import CondylePoint
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
+from tkamb.geometry.knee_axes import knee_axes
+from tkamb.mechanics import Mechanics, PlacedKnee
+
+if TYPE_CHECKING:
+    from tkamb.body.patella import PatellaState
+    from tkamb.contact.probe import CondyleWrench, Probe, ProbedContact
+
+LEVER = 0.025
+"""m: half the usual distance of the condyles; makes rotations comparable to translations."""
+SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
+SETTLED = 2e-6
+"""m: the knee moves less than this when the patella is found anew."""
+MOST_PASSES = 8
+TINY = 1e-7
+"""m: step of the finite differences of axes and ligaments."""
+
+
+@dataclass(frozen=True, eq=False)
+class SettledKnee:
+    """One frame with its released coordinates at rest.
+
+    Args:
+        coordinates: (6,) m and rad.
+        placed: the leg there.
+        patella: where it is; None if not modelled.
+        contact: the contact there.
+        balance: the last search.
+        passes: how often patella and lines were found anew.
+        trials: how often the contact was computed.
+        change: N, what the last pass changed in the contact force.
+        problem: why this is no result, or empty.
+    """
+
+    coordinates: Array
+    placed: PlacedKnee
+    patella: "PatellaState | None"
+    contact: "ProbedContact"
+    balance: Balance
+    passes: int
+    trials: int
+    change: float
+    problem: str
+
+
+def released_indices(names: Sequence[str]) -> tuple[int, ...]:
+    """Return the indices of the released coordinates, the superior-inferior one among them."""
+    return tuple(i for i, name in enumerate(KNEE_COORDINATES) if name == "si" or name in names)
+
+
+class ReleasedKnee:
+    """Finds the released coordinates of a case, frame by frame.
+
+    Args:
+        mechanics: the body side.
+        probe: of the contact model.
+        names: the released coordinates, "si" understood.
+    """
+
+    def __init__(self, mechanics: Mechanics, probe: "Probe", names: Sequence[str]) -> None:
+        self._mechanics, self._probe = mechanics, probe
+        self.released = released_indices(names)
+        self._rows = list(self.released)
+        self._scale = SCALE[self._rows]
+
+    def settle(
+        self,
+        k: int,
+        start: Array,
+        points: dict[str, Array] | None = None,
+        before: SettledKnee | None = None,
+    ) -> SettledKnee:
+        """Return frame k at rest.
+
+        Args:
+            k: frame.
+            start: (6,) coordinates; the released ones are where the search begins.
+            points: side -> (3,) m, where a condyle that carries nothing is nearest to the
+                insert: residual forces act in the middle of both condyles' points.
+            before: the frame before, whose patella and stiffness are guesses.
+        """
+        place, slack, trials, change = np.array(start, float), False, 0, np.nan
+        patella, stiffness, middle, force = None, None, place[:3], np.full(3, np.nan)
+        if before is not None:
+            patella, stiffness = before.patella, before.balance.stiffness
+        problem = "knee and patella do not settle together"
+        passes = 0
+        while passes < MOST_PASSES:
+            passes += 1
+            patella = self._patella(k, place, patella)
+            placed = self._mechanics.placed(k, place, patella)
+            search = self._search(k, placed, middle, slack)
+            balance = find_balance(search.trial, place[self._rows] * self._scale, stiffness)
+            contact, moved = search.seen[balance.coordinates.tobytes()], search.at(balance)
+            travel = float(np.abs((moved - place) * SCALE).max())
+            change = float(np.linalg.norm(contact.wrench[:3] - force))
+            place, force, stiffness = moved, contact.wrench[:3], balance.stiffness
+            trials += balance.trials
+            if placed.problems or balance.status is not BalanceStatus.OK:
+                problem = "; ".join(placed.problems) or f"released: {balance.status.value}"
+                break
+            before_middle, middle = middle, _middle(contact, points, place)
+            shift = float(np.abs(middle - before_middle).max()) if self._keeps else 0.0
+            loose = not slack and search.pushes(balance)
+            if max(travel, shift) < SETTLED and not loose:
+                problem = ""
+                break
+            slack = slack or loose
+        return SettledKnee(
+            place, placed, patella, contact, balance, passes, trials, change, problem
+        )
+
+    @property
+    def _keeps(self) -> bool:
+        """Whether residual forces act: a translation or rotation is kept as recorded."""
+        return len(self.released) < 5
+
+    def _patella(self, k: int, place: Array, guess: "PatellaState | None") -> "PatellaState | None":
+        extensor = self._mechanics.extensor
+        if extensor is None:
+            return None
+        return extensor.patella(k, knee_pose(place), guess.coordinates if guess else None)
+
+    def _search(self, k: int, placed: PlacedKnee, middle: Array, slack: bool) -> "_Search":
+        demand = knee_demand(
+            placed.geometry,
+            self._mechanics.ligaments,
+            placed.coordinates,
+            self.released,
+            middle,
+            slack,
+        )
+        return _Search(self._mechanics, self._probe, k, placed.coordinates, demand)
+
+
+class _Search:
+    """The forces on the released coordinates at trial places, the patella held.
+
+    Attributes:
+        seen: scaled coordinates as bytes -> contact there.
+    """
+
+    def __init__(
+        self,
+        mechanics: Mechanics,
+        probe: "Probe",
+        k: int,
+        place: Array,
+        demand: KneeDemand,
+    ) -> None:
+        self._mechanics, self._probe, self._k = mechanics, probe, k
+        self._place, self._demand = place, demand
+        self._rows = list(demand.released)
+        self._scale = SCALE[self._rows]
+        self.seen: dict[bytes, ProbedContact] = {}
+
+    def trial(self, x: Array) -> Trial:
+        """Return scaled forces and stiffness at scaled coordinates (n,), m."""
+        place = self._with(x)
+        contact = self.seen[x.tobytes()] = self._probe.at(knee_pose(place))
+        if not contact.known:
+            return Trial(np.full(len(x), np.nan))
+        wrench, stiffness = self._rubbing(place, contact)
+        if stiffness is None:
+            return Trial(self._demand.imbalance(place, wrench) / self._scale)
+        steps = np.zeros((len(x) + 1, 6))
+        steps[np.arange(len(x)), self._rows] = TINY / self._scale
+        forces = self._demand.imbalance(place + steps, wrench) / self._scale
+        change = (forces[:-1] - forces[-1]).T / TINY
+        twists = knee_axes(place)[self._rows] / self._scale[:, None]
+        gain = self._demand.contact_gain(place) / self._scale[:, None]
+        return Trial(forces[-1], -(change + gain @ stiffness @ twists.T))
+
+    def at(self, balance: Balance) -> Array:
+        """Return the knee coordinates (6,) of a balance."""
+        return self._with(balance.coordinates)
+
+    def pushes(self, balance: Balance) -> bool:
+        """Return whether the patellar ligament would have to push."""
+        if self._demand.line is None:
+            return False
+        place = self.at(balance)
+        wrench, _ = self._rubbing(place, self.seen[balance.coordinates.tobytes()])
+        return bool(self._demand.kept(place, wrench)[-1] < 0)
+
+    def _with(self, x: Array) -> Array:
+        place = self._place.copy()
+        place[self._rows] = x / self._scale
+        return place
+
+    def _rubbing(self, place: Array, contact: "ProbedContact") -> tuple[Array, Array | None]:
+        """Return wrench (6,) on the insert with friction, and its stiffness (6, 6) if known."""
+        wrench, stiffness = np.zeros(6), np.zeros((6, 6))
+        for condyle in contact.condyles.values():
+            touch = touching(condyle, self._mechanics.sliding(self._k, place, condyle.point))
+            drag = touch.normal - touch.direction(self._mechanics.friction)
+            rubbing = np.concatenate([drag, np.cross(touch.point, drag)])
+            wrench += condyle.wrench + condyle.force * rubbing
+            if condyle.stiffness is not None:
+                pressed = -touch.normal @ condyle.stiffness[:3]
+                stiffness += condyle.stiffness + np.outer(rubbing, pressed)
+        return wrench, stiffness if contact.tangent else None
+
+
+def touching(condyle: "CondyleWrench", sliding: Array, gap: float = 0.0) -> CondylePoint:
+    """Return a condyle's resultant as the contact point of the equations of motion."""
+    return CondylePoint(condyle.point, condyle.normal, sliding, gap)
+
+
+def _middle(contact: "ProbedContact", points: dict[str, Array] | None, place: Array) -> Array:
+    known = (points or {}) | {side: c.point for side, c in contact.condyles.items()}
+    return np.asarray(np.mean(list(known.values()), axis=0)) if known else place[:3]
