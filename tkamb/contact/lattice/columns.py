@@ -55,6 +55,10 @@ class NodeField:
     closed_gaps: int
     thin: int
 
+    def has_top(self, nodes: tuple[Index, ...]) -> Mask:
+        """Say whether the columns of nodes (i, j, k) have a top already."""
+        return np.logical_or.reduce(self.top, axis=1)[nodes[0], nodes[2]]
+
 
 @dataclass(frozen=True, eq=False)
 class Ends:

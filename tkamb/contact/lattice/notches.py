@@ -118,5 +118,5 @@ def _settle(field: NodeField, notch: Notch, target: Array, keep: Mask, top: Mask
     field.points[chosen] = target[keep]
     field.member[chosen] = True
     both = field.top[notch.first] & field.top[notch.second] & top
-    both &= ~field.top.any(axis=1)[notch.node[0], notch.node[2]]
+    both &= ~field.has_top(notch.node)
     field.top[chosen] = both[keep]

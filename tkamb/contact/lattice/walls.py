@@ -199,7 +199,7 @@ def _admit_at(
     target[:, 1] = settled
     field.points[nodes] = target[good]
     field.member[nodes] = True
-    field.top[nodes] = ends[2][nodes] & ~field.top.any(axis=1)[nodes[0], nodes[2]]
+    field.top[nodes] = ends[2][nodes] & ~field.has_top(nodes)
 
 
 def _foot(move: Array) -> Array:
