@@ -24,6 +24,7 @@ from tkamb.contact.lattice.columns import NodeField, settle_columns
 from tkamb.contact.lattice.walls import inside, settle_walls
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
+from tkamb.geometry.post import find_post
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
@@ -112,6 +113,8 @@ class Lattice:
 def build_grid(insert: Surface, target_size: float) -> Lattice:
     """Return the lattice of a closed insert.
 
+    Mended rays and a post (cam-post contact is not modelled) are told on the logger "tkamb".
+
     Args:
         insert: closed surface in the insert frame (flat bottom in y = 0 facing -y).
         target_size: wanted edge of a cell, m.
@@ -124,6 +127,9 @@ def build_grid(insert: Surface, target_size: float) -> Lattice:
     settle_walls(field, insert)
     if field.mended:
         _log.warning("%s: %d rays through gaps in the mesh mended", insert.name, field.mended)
+    post = find_post(insert)
+    if post is not None:
+        _log.warning("%s: %s", insert.name, post.notice)
     cells, dropped_cells = _sound_cells(field, insert)
     if not len(cells):
         raise InputError(
