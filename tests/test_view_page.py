@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tkamb.output.maps_file import read_maps
+from tkamb.results import read_results
 from tkamb.view.browser import HeadlessBrowser, find_browser
 from tkamb.view.run import open_run
 from tkamb.view.show import Show, serve_in_background
@@ -236,3 +237,27 @@ def test_two_contact_models_side_by_side_on_one_scale(folder, tmp_path):
 def test_a_picture_is_made(show, tmp_path):
     show.write_png(tmp_path / "knee.png", (640, 480))
     assert (tmp_path / "knee.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_lattice_is_drawn_when_its_layer_is_switched_on(live, show):
+    _, browser = live
+    browser.evaluate("document.querySelector('input[data-layer=\"lattice\"]').click()")
+    lines = browser.evaluate(
+        "new Promise((done) => { const t = setInterval(() => {"
+        "const n = tkamb.node('/tkamb/0/lattice').children.lines;"
+        "if (n && n.children['<object>']) { clearInterval(t); done(Array.from("
+        "n.children['<object>'].object.geometry.attributes.position.array)); } }, 50); })"
+    )
+    ends = np.array(lines).reshape(-1, 2, 3)
+    low, high = show.runs[0].case.insert.bounds
+    assert (ends.min(axis=(0, 1)) > low - 1e-4).all() and (
+        ends.max(axis=(0, 1)) < high + 1e-4
+    ).all()
+    assert 0.5e-3 < np.median(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)) < 1.5e-3
+    assert browser.evaluate("tkamb.layerShown('lattice')")
+    assert browser.problems == []
+
+
+def test_results_can_be_viewed_in_a_notebook(folder):
+    text = read_results(folder).view(frame=1)._repr_html_()
+    assert text.startswith("<iframe srcdoc=") and "&lt;script" in text

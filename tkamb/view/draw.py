@@ -11,6 +11,7 @@ from tkamb.results import Results
 from tkamb.units import MEGAPASCAL
 from tkamb.view.arrows import contact_markers, force_arrows
 from tkamb.view.drawing import Drawing, PressureMap
+from tkamb.view.lattice_lines import lattice_lines
 from tkamb.view.readings import places, readings
 from tkamb.view.run import Run
 from tkamb.view.solids import solids
@@ -27,15 +28,16 @@ Progress = Callable[[Iterable[int]], Iterable[int]]
 STAND_INS = "Bones are plain stand-ins between the joint centres; they carry no load."
 
 
-def draw(run: Run, progress: Progress = lambda frames: frames) -> Drawing:
+def draw(run: Run, progress: Progress = lambda frames: frames, lattice: bool = False) -> Drawing:
     """Return what is drawn of a run.
 
     Args:
         run: case, mechanics and results that belong together.
         progress: wraps the frame indices, a progress bar for example.
+        lattice: whether the contact model's grid is drawn too.
     """
     case, mechanics, results = run.case, run.mechanics, run.results
-    geometries = [mechanics.frame(k).geometry for k in progress(run.frames)]
+    geometries = [body.geometry for body in run.bodies(progress)]
     states = [one.state for one in geometries]
     maps, found = results.maps, map_rows(results)
     rows = [found.get(k, -1) for k in range(len(results))]
@@ -57,12 +59,13 @@ def draw(run: Run, progress: Progress = lambda frames: frames) -> Drawing:
         times=results["time_s"],
         statuses=tuple(results.status),
         readings=readings(results, axis),
-        solids=solids(case, states, maps, rows),
+        solids=solids(case, mechanics.poses[list(run.frames)], states, maps, rows),
         strands=tuple(strands),
         arrows=force_arrows(results, geometries, contact.friction if contact else 0.0),
         markers=tuple(markers),
         map=_pressure_map(results, rows),
         strain_limit=limit,
+        lattice=lattice_lines(case) if lattice else np.empty((0, 2, 3)),
         notes=(STAND_INS, *case.scene.output.notes),
     )
 

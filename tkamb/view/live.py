@@ -11,7 +11,8 @@ from tkamb.errors import TkambError
 from tkamb.output.style import SIDE_COLOURS
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 from tkamb.view.drawing import PressureMap
-from tkamb.view.payload import packed_map
+from tkamb.view.lattice_lines import lattice_lines
+from tkamb.view.payload import packed_lattice, packed_map
 from tkamb.view.run import Run
 
 
@@ -47,13 +48,18 @@ class ContactSwitch:
         with self._lock:
             return self._computed(row, model)
 
+    def lattice(self) -> bytes:
+        """Return the lines of the run's lattice, packed.
+
+        Raises:
+            TkambError: the insert cannot be meshed.
+        """
+        with self._lock:
+            return packed_lattice(lattice_lines(self.run.case))
+
     def _computed(self, row: int, model: str) -> bytes:
-        run, k = self.run, self.run.frames[row]
         side = self._side(model)
-        assert run.mechanics.query is not None
-        carried = side.carry(
-            run.mechanics.frame(k), run.mechanics.poses[k], run.mechanics.query, None
-        )
+        _, carried = side.frame(self.run.frames[row])
         points, triangles = side.state.points, side.state.triangles
         result = carried.result
         if result is None:
@@ -81,5 +87,5 @@ class ContactSwitch:
             changes = {"model": model} if own else {"model": model, "options": {}}
             contact = case.scene.contact.model_copy(update=changes)
             scene = case.scene.model_copy(update={"contact": contact})
-            self._sides[model] = ContactSide(replace(case, scene=scene))
+            self._sides[model] = ContactSide(replace(case, scene=scene), self.run.mechanics)
         return self._sides[model]

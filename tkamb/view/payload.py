@@ -18,6 +18,7 @@ from meshcat.commands import SetObject, SetTransform
 from meshcat.geometry import MeshPhongMaterial, TriangularMeshGeometry, pack_numpy_array
 from meshcat.path import Path as NodePath
 
+from tkamb.geometry.frames import Array
 from tkamb.units import MILLIMETRE
 from tkamb.view.colours import pressure_scale, strain_scale
 from tkamb.view.drawing import HIDDEN_AT_FIRST, LAYERS, Drawing, PressureMap, Solid
@@ -90,6 +91,12 @@ def packed_map(found: PressureMap, peak: float, words: str) -> bytes:
     """Return one map alone, on the scale of a page that is open, with words about it."""
     block = Block()
     return block.packed({"map": _map(block, found, peak), "words": words})
+
+
+def packed_lattice(lines: Array) -> bytes:
+    """Return the lines (s, 2, 3) m of a lattice alone."""
+    block = Block()
+    return block.packed({"lattice": block.put(lines, "float32")})
 
 
 def _view(block: Block, number: int, drawing: Drawing, peak: float) -> dict[str, Any]:

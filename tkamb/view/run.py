@@ -4,11 +4,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from tkamb.case import Case, load_case
 from tkamb.errors import InputError
-from tkamb.mechanics import Mechanics
+from tkamb.mechanics import FrameLoads, Mechanics
 from tkamb.results import SUMMARY_NAME, Results, read_results
 from tkamb.scene import Scene, load_scene
 from tkamb.simulation import simulate
@@ -33,6 +31,25 @@ class Run:
     mechanics: Mechanics
     results: Results
     frames: tuple[int, ...]
+
+    def bodies(self, progress: Progress = lambda frames: frames) -> list[FrameLoads]:
+        """Return the body side of every frame, for its geometry.
+
+        Where body and contact were made to agree, both are solved again: the places where
+        forces act come from the contact.
+        """
+        contact = self.case.scene.contact
+        if contact is None or (contact.coupling == "none" and not contact.released):
+            return [self.mechanics.frame(k) for k in progress(self.frames)]
+        from tkamb.equilibrium import ContactSide, FrameContact
+
+        side, found = ContactSide(self.case, self.mechanics), []
+        touched: list[FrameContact] = []
+        for k in progress(self.frames):
+            body, carried = side.frame(k, touched)
+            found.append(body)
+            touched.append(carried)
+        return found
 
 
 def open_run(
@@ -125,11 +142,5 @@ def _scene_of(results: Results) -> Scene:
             "start tkamb view in the folder where tkamb run was started",
         )
     contact = results.summary.get("contact") or {}
-    kept = {f"contact.{key}": contact[key] for key in ("model", "resolution_mm") if key in contact}
+    kept = {f"contact.{key}": value for key, value in contact.items() if value is not None}
     return load_scene(path, kept)
-
-
-def same_place(run: Run, other: Run) -> np.ndarray:
-    """Return for each frame of `run` the frame of `other` at the same share of the motion."""
-    share = np.linspace(0.0, 1.0, len(run.frames))
-    return np.round(share * (len(other.frames) - 1)).astype(int)

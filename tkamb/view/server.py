@@ -80,14 +80,18 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.FORBIDDEN, "text/plain", b"another host or site")
             return
         try:
-            asked = self._asked()
-            if self.path != "/contact" or self.switch is None:
-                raise TkambError("no such question")
-            answer = self.switch.answer(int(asked["frame"]), str(asked["model"]))
+            answer = self._answer(self._asked())
         except (TkambError, ValueError, KeyError, TypeError) as error:
             self._send(HTTPStatus.BAD_REQUEST, "text/plain; charset=utf-8", str(error).encode())
             return
         self._send(HTTPStatus.OK, "application/octet-stream", answer)
+
+    def _answer(self, asked: dict[str, Any]) -> bytes:
+        if self.switch is not None and self.path == "/contact":
+            return self.switch.answer(int(asked["frame"]), str(asked["model"]))
+        if self.switch is not None and self.path == "/lattice":
+            return self.switch.lattice()
+        raise TkambError("no such question")
 
     def log_message(self, format: str, *args: Any) -> None:
         """Stay quiet."""

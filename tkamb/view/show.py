@@ -6,6 +6,7 @@ import tempfile
 import threading
 import webbrowser
 from collections.abc import Callable, Iterable, Sequence
+from html import escape
 from pathlib import Path
 
 from tkamb.errors import InputError
@@ -32,6 +33,8 @@ class Show:
         runs: one or more.
         frame: shown first.
         camera: one of CAMERAS.
+        lattice: whether the contact model's grid is drawn too; the live window draws it when
+            its layer is switched on.
         progress: wraps the frame indices while the drawings are made.
 
     Raises:
@@ -44,6 +47,7 @@ class Show:
         *,
         frame: int = 0,
         camera: str = "oblique",
+        lattice: bool = False,
         progress: Progress = lambda frames: frames,
     ) -> None:
         most = max(len(run.frames) for run in runs)
@@ -52,7 +56,7 @@ class Show:
         if camera not in CAMERAS:
             raise InputError(f"no view '{camera}'", "--camera", f"there are: {', '.join(CAMERAS)}")
         self.runs, self.frame, self.camera = tuple(runs), frame % most, camera
-        self.drawings: tuple[Drawing, ...] = tuple(draw(run, progress) for run in runs)
+        self.drawings: tuple[Drawing, ...] = tuple(draw(run, progress, lattice) for run in runs)
         self.packed = pack(self.drawings)
         self.title = " | ".join(drawing.title for drawing in self.drawings)
 
@@ -81,6 +85,13 @@ class Show:
             picture = take_picture(page, size, "figure=1")
         with replaced_file(Path(path)) as temporary:
             temporary.write_bytes(picture)
+
+    def _repr_html_(self) -> str:
+        """Return the page in a frame, for notebooks."""
+        return (
+            f'<iframe srcdoc="{escape(self.html())}" style="width:100%;height:640px;border:0">'
+            "</iframe>"
+        )
 
     def server(self, port: int = 0) -> ViewServer:
         """Return the server of the live window, not yet started.

@@ -34,7 +34,11 @@ PATELLA_DEPTH, PATELLA_WIDTH = 8.0 * MILLIMETRE, 21.0 * MILLIMETRE
 
 
 def solids(
-    case: Case, states: Sequence[ChainState], maps: ContactMaps | None, rows: Sequence[int]
+    case: Case,
+    recorded: Array,
+    states: Sequence[ChainState],
+    maps: ContactMaps | None,
+    rows: Sequence[int],
 ) -> tuple[Solid, ...]:
     """Return the solids of a case.
 
@@ -43,17 +47,18 @@ def solids(
 
     Args:
         case: the case.
+        recorded: (f, 4, 4) pose_femur_in_insert as measured.
         states: chain at each frame.
         maps: the run's maps, whose poses are used.
         rows: row of the maps of each frame, -1 where there is none.
     """
-    recorded = np.stack([state.pose("femur") for state in states])
+    solved = np.stack([state.pose("femur") for state in states])
     still = np.eye(4)[None]
     found = []
     if case.insert is not None:
         found.append(Solid("insert", "insert", case.insert, INSERT, 1.0, still))
     if case.femoral is not None:
-        pressed = _pressed(recorded, maps, rows)
+        pressed = _pressed(solved, maps, rows)
         found.append(
             Solid("femoral component", "femoral component", case.femoral, METAL, 0.5, pressed)
         )
@@ -67,7 +72,7 @@ def solids(
                 recorded,
             )
         )
-    found += [_femur(states, recorded), _tibia(states)]
+    found += [_femur(states, solved), _tibia(states)]
     if case.scene.patella is not None and case.patella is not None:
         poses = np.stack([state.pose("patella") for state in states])
         found.append(Solid("patellar button", "patella", case.patella, BUTTON, 1.0, poses))

@@ -50,16 +50,17 @@ function addCameras() {
   });
 }
 
-function addLayers() {
+function addLayers(canAsk) {
   tkamb.switchedOff = new Set(tkamb.data.hidden);
   for (const layer of tkamb.data.layers) {
-    if (isEmpty(layer)) continue;
+    if (isEmpty(layer) && !(layer === "lattice" && canAsk)) continue;
     const label = made("label", "", element("layers"));
     const box = made("input", "", label, {type: "checkbox", "data-layer": layer});
     label.append(layer === "recorded pose" ? "recorded pose (ghost)" : layer);
     box.addEventListener("change", () => {
       tkamb.switchedOff[box.checked ? "delete" : "add"](layer);
       tkamb.showLayer(layer, box.checked);
+      if (layer === "lattice" && tkamb.live) tkamb.live.fetchLattice();
     });
   }
 }

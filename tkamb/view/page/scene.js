@@ -72,7 +72,7 @@ function buildView(viewer, view, number) {
   for (const marker of view.markers) addMarker(viewer, marker);
   view.runMap = view.map;
   tkamb.showMap(view, view.map);
-  if (view.lattice) addLattice(viewer, `${view.root}/lattice/lattice`, view.lattice);
+  if (view.lattice) tkamb.addLattice(view);
   return view;
 }
 
@@ -141,12 +141,13 @@ function addMarker(viewer, marker) {
   viewer.set_object(tkamb.split(marker.path), ball);
 }
 
-function addLattice(viewer, path, ends) {
+tkamb.addLattice = function (view) {
   const {THREE} = MeshCat, geometry = new THREE.BufferGeometry();
-  geometry.setAttribute("position", new THREE.BufferAttribute(ends, 3));
+  geometry.setAttribute("position", new THREE.BufferAttribute(view.lattice, 3));
   const material = new THREE.LineBasicMaterial({color: 0x33506b, transparent: true, opacity: 0.7});
-  viewer.set_object(tkamb.split(path), new THREE.LineSegments(geometry, material));
-}
+  const lines = new THREE.LineSegments(geometry, material);
+  tkamb.viewer.set_object(tkamb.split(`${view.root}/lattice/lines`), lines);
+};
 
 // Names at the edges of the picture what lies there, where the camera looks along an axis.
 function nameDirections(camera) {

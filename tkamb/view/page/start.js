@@ -11,7 +11,7 @@ tkamb.start = async function () {
   tkamb.viewer = new MeshCat.Viewer(document.getElementById("pane"));
   tkamb.build(data);
   addCameras();
-  addLayers();
+  addLayers(asked.live && asked.live.length > 0);
   addLegends();
   addNumbers();
   addPlayer();
@@ -54,14 +54,31 @@ class Live {
     this.timer = setTimeout(() => this.compute(view, number, this.choice.value), 200);
   }
 
+  async fetchLattice() {
+    const view = tkamb.views[0], answer = document.getElementById("answer");
+    if (view.lattice) return;
+    answer.textContent = "building the lattice …";
+    const response = await this.ask("lattice", {});
+    if (response.ok) {
+      view.lattice = (await tkamb.unpack(new Uint8Array(await response.arrayBuffer()))).lattice;
+      tkamb.addLattice(view);
+      tkamb.viewer.set_dirty();
+    }
+    answer.textContent = response.ok ? "" : await response.text();
+  }
+
+  ask(what, question) {
+    return fetch(what, {
+      method: "POST",
+      headers: {"Content-Type": "application/json"},
+      body: JSON.stringify(question),
+    });
+  }
+
   async compute(view, number, model) {
     const answer = document.getElementById("answer"), frame = tkamb.frameOf(view);
     answer.textContent = `computing frame ${frame} with ${model} …`;
-    const response = await fetch("contact", {
-      method: "POST",
-      headers: {"Content-Type": "application/json"},
-      body: JSON.stringify({frame, model}),
-    });
+    const response = await this.ask("contact", {frame, model});
     const packed = response.ok && new Uint8Array(await response.arrayBuffer());
     if (number !== this.asked) return;
     if (!packed) {
