@@ -74,8 +74,7 @@ class Balance:
         status: how it ended.
         steps: Newton steps, taken or taken back.
         trials: how often the forces were computed.
-        softest: N/m, smallest eigenvalue of the stiffness' symmetric part.
-        stiffest: N/m, the largest.
+        softest: N/m, smallest real part of the stiffness' eigenvalues.
         work: N·m done by the forces along each step taken, all positive.
     """
 
@@ -86,7 +85,6 @@ class Balance:
     steps: int
     trials: int
     softest: float
-    stiffest: float
     work: tuple[float, ...]
 
 
@@ -148,7 +146,8 @@ class _Search:
         if not np.isfinite(work):
             self._radius = 0.25 * length
             return
-        ratio = work / predicted if predicted > 0 else -1.0
+        helps = self._halves(step, trial.force)
+        ratio = 1.0 if helps else work / predicted if predicted > 0 else -1.0
         taken = ratio > 0.05
         if trial.stiffness is None:
             self._learn(step, trial.force)
@@ -164,6 +163,18 @@ class _Search:
             self._fresh = False
             if trial.stiffness is not None:
                 self.stiffness = trial.stiffness
+
+    def _halves(self, step: Array, force: Array) -> bool:
+        """Return whether a full Newton step with a stable but indefinite stiffness helps.
+
+        Follower loads and friction make it unsymmetric; their work is no measure then.
+        """
+        symmetric, softest = smallest_eigenvalues(self.stiffness)
+        if symmetric > 0 or softest <= 0:
+            return False
+        newton = np.linalg.solve(self.stiffness, self.force)
+        full = np.allclose(step, newton, rtol=1e-9, atol=0)
+        return bool(full and np.linalg.norm(force) < 0.5 * np.linalg.norm(self.force))
 
     def _at(self, x: Array) -> Trial:
         self._trials += 1
@@ -191,24 +202,21 @@ class _Search:
     def _converged(self) -> bool:
         if np.abs(self.force).max() > FORCE_TOLERANCE:
             return False
-        values, vectors = np.linalg.eigh(0.5 * (self.stiffness + self.stiffness.T))
+        left, values, right = np.linalg.svd(self.stiffness)
         held = values > SOFTEST
-        left = (vectors.T @ self.force)[held] / values[held]
-        return bool((np.abs(left) < STEP_TOLERANCE).all())
+        step = right[held].T @ ((left.T @ self.force)[held] / values[held])
+        return bool((np.abs(step) < STEP_TOLERANCE).all())
 
     def _kind(self) -> BalanceStatus:
-        if not (self._own or self._fresh) and self._extremes()[0] <= SOFTEST:
+        if not (self._own or self._fresh) and self._softest() <= SOFTEST:
             self._refresh()
-        softest = self._extremes()[0]
+        softest = self._softest()
         if softest < -SOFTEST:
             return BalanceStatus.UNSTABLE
         return BalanceStatus.OK if softest > SOFTEST else BalanceStatus.INDETERMINATE
 
-    def _extremes(self) -> tuple[float, float]:
-        if not np.isfinite(self.stiffness).all():
-            return np.nan, np.nan
-        values = np.linalg.eigvalsh(0.5 * (self.stiffness + self.stiffness.T))
-        return float(values[0]), float(values[-1])
+    def _softest(self) -> float:
+        return smallest_eigenvalues(self.stiffness)[1] if self.known else np.nan
 
     def _end(self, status: BalanceStatus) -> Balance:
         return Balance(
@@ -218,7 +226,7 @@ class _Search:
             status,
             self._steps,
             self._trials,
-            *self._extremes(),
+            self._softest(),
             tuple(self._work),
         )
 
@@ -231,13 +239,13 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
         force: (n,) N.
         radius: m.
     """
-    softest = float(np.linalg.eigvalsh(0.5 * (stiffness + stiffness.T))[0])
+    symmetric, softest = smallest_eigenvalues(stiffness)
     identity = np.eye(len(force))
     if softest > 0:
         step = np.linalg.solve(stiffness, force)
         if np.linalg.norm(step) <= radius:
             return np.asarray(step)
-    low = max(0.0, -softest)
+    low = max(0.0, -symmetric)
     high = low + float(np.linalg.norm(force)) / radius + 1.0
     for _ in range(50):
         shift = 0.5 * (low + high)
@@ -247,3 +255,13 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
             return np.asarray(step)
         low, high = (shift, high) if length > radius else (low, shift)
     return np.asarray(np.linalg.solve(stiffness + high * identity, force))
+
+
+def smallest_eigenvalues(stiffness: Array) -> tuple[float, float]:
+    """Return the smallest eigenvalue of the symmetric part, and the smallest real part of all.
+
+    Loads that follow the motion make a stiffness unsymmetric: a state is then stable against
+    divergence as long as the second is positive.
+    """
+    symmetric = float(np.linalg.eigvalsh(0.5 * (stiffness + stiffness.T))[0])
+    return symmetric, float(np.linalg.eigvals(stiffness).real.min())

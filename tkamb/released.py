@@ -121,16 +121,17 @@ class ReleasedKnee:
             change = float(np.linalg.norm(contact.wrench[:3] - force))
             place, force, stiffness = moved, contact.wrench[:3], balance.stiffness
             trials += balance.trials
+            before_middle, middle = middle, _middle(contact, points, place)
+            shift = float(np.abs(middle - before_middle).max()) if self._keeps else 0.0
+            if not slack and contact.known and search.pushes(balance):
+                slack = True
+                continue
             if placed.problems or balance.status is not BalanceStatus.OK:
                 problem = "; ".join(placed.problems) or f"released: {balance.status.value}"
                 break
-            before_middle, middle = middle, _middle(contact, points, place)
-            shift = float(np.abs(middle - before_middle).max()) if self._keeps else 0.0
-            loose = not slack and search.pushes(balance)
-            if max(travel, shift) < SETTLED and not loose:
+            if max(travel, shift) < SETTLED:
                 problem = ""
                 break
-            slack = slack or loose
         return SettledKnee(
             place, placed, patella, contact, balance, passes, trials, change, problem
         )
