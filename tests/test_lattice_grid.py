@@ -351,7 +351,7 @@ def test_springs_of_cells_without_a_grid_around_them():
     assert (springs.owners == 1).all()
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     hole=st.none() | st.tuples(*[st.floats(-0.012, 0.012)] * 2, *[st.floats(0.0005, 0.008)] * 2),
     post=st.none()
