@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from tkamb.errors import TkambError
+from tkamb.view.command import add_view
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -27,8 +28,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of a pipe has gone, `tkamb ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except KeyboardInterrupt:
-        print("tkamb: interrupted; what was finished is kept", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        print(f"tkamb: interrupted: {interrupt or 'nothing is kept'}", file=sys.stderr)
         return 130
 
 
@@ -42,7 +43,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_contact(commands)
     _add_mesh(commands)
     _add_scene(commands)
-    _add_view(commands)
+    add_view(commands)
     return parser
 
 
@@ -61,6 +62,7 @@ def _add_run(commands: Any) -> None:
         metavar="TABLE.KEY=VALUE",
         help="override a key of the scene",
     )
+    run.add_argument("--resume", action="store_true", help="go on with an interrupted run")
     run.add_argument("--strict", action="store_true", help="exit 1 when a frame failed")
     run.add_argument("--json", action="store_true", help="print summary.json")
     run.set_defaults(command=_run)
@@ -134,30 +136,6 @@ def _add_scene(commands: Any) -> None:
     scene.set_defaults(command=_scene)
 
 
-def _add_view(commands: Any) -> None:
-    view = commands.add_parser("view", help="see a run and turn it around")
-    view.add_argument(
-        "runs",
-        type=Path,
-        nargs="+",
-        metavar="SCENE|RESULTS",
-        help="scene.toml or a folder that `tkamb run` wrote; several: side by side",
-    )
-    view.add_argument(
-        "--contact",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="contact model of a scene; several: side by side",
-    )
-    view.add_argument("--frame", type=int, default=0, metavar="K", help="shown first")
-    view.add_argument("--camera", default="oblique", metavar="NAME", help="'top of insert', ...")
-    view.add_argument("--html", type=Path, metavar="F", help="write one file instead of a window")
-    view.add_argument("--png", type=Path, metavar="F", help="write a picture of the frame")
-    view.add_argument("--port", type=int, default=0, help="of the live window; default: any free")
-    view.set_defaults(command=_view)
-
-
 def _slice(text: str) -> slice:
     parts = text.split(":")
     if not 2 <= len(parts) <= 3:
@@ -201,6 +179,7 @@ def _run(options: argparse.Namespace) -> int:
         directory=claim_directory(directory),
         scene_path=options.scene,
         progress=lambda frames: tqdm(frames, unit="frame", disable=None),
+        resume=options.resume,
     )
     write_results(results, directory)
     failed = [k for k, status in enumerate(results.status) if status.startswith(FAILED)]
@@ -256,33 +235,6 @@ def _mesh_check(options: argparse.Namespace) -> int:
         print(json.dumps([health.as_dict() for health in found], indent=2))
     else:
         print("\n".join(line for health in found for line in health.lines()))
-    return 0
-
-
-def _view(options: argparse.Namespace) -> int:
-    from tqdm import tqdm
-
-    from tkamb.view.run import open_run
-    from tkamb.view.show import Show
-
-    def progress(frames: Any) -> Any:
-        return tqdm(frames, unit="frame", disable=None)
-
-    def announce(line: str) -> None:
-        print(f"tkamb: {line}", file=sys.stderr, flush=True)
-
-    runs = [
-        open_run(path, contact=contact, progress=progress, announce=announce)
-        for path in options.runs
-        for contact in options.contact or [None]
-    ]
-    show = Show(runs, frame=options.frame, camera=options.camera, progress=progress)
-    if options.html:
-        show.write_html(options.html)
-    if options.png:
-        show.write_png(options.png)
-    if not (options.html or options.png):
-        show.open(announce, options.port)
     return 0
 
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tkamb.output.maps_file import ContactMaps
+    from tkamb.view.show import Show
 
 __all__ = ["COLUMNS", "Results", "claim_directory", "read_results", "write_results"]
 
@@ -87,6 +88,20 @@ class Results:
 
         return plot(self, names, axis)
 
+    def view(self, frame: int = 0) -> "Show":
+        """Return the run to look at and turn around, which notebooks show.
+
+        Args:
+            frame: shown first.
+
+        Raises:
+            InputError: the scene is not there, or no longer what was run.
+        """
+        from tkamb.view.run import run_of
+        from tkamb.view.show import Show
+
+        return Show([run_of(self)], frame=frame)
+
     def _repr_html_(self) -> str:
         """Return the report's headline numbers, for notebooks."""
         from tkamb.output.report import headline_html
@@ -124,19 +139,31 @@ def write_results(results: Results, directory: str | Path) -> None:
     """Write results.csv, summary.json and report.html, each whole or not at all.
 
     Maps that are in memory are written to contact.h5 too; without maps, a contact.h5 of an
-    earlier run in that folder is removed, since it would pass for this run's.
+    earlier run in that folder is removed, since it would pass for this run's. The shards of a
+    run under way (`tkamb.output.shards`) have served and go.
 
     Raises:
         InputError: the folder cannot be written.
     """
     from tkamb.output.report import write_report
+    from tkamb.output.shards import remove_shards
 
     directory = claim_directory(directory)
+    write_numbers(results, directory)
+    _settle_maps(results.maps, directory)
+    write_report(results, directory / REPORT_NAME)
+    remove_shards(directory)
+
+
+def write_numbers(results: Results, directory: Path) -> None:
+    """Write results.csv and summary.json, each whole or not at all.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
     results.write_csv(directory / CSV_NAME)
     text = json.dumps(_plain(results.summary), indent=2, ensure_ascii=False, allow_nan=False)
     write_text(directory / SUMMARY_NAME, text + "\n")
-    _settle_maps(results.maps, directory)
-    write_report(results, directory / REPORT_NAME)
 
 
 def read_csv(path: str | Path) -> dict[str, Any]:

@@ -1,24 +1,28 @@
 """The whole pipeline on one page: scene, body, contact, results."""
 
 import time as clock
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tkamb.case import Case, load_case
 from tkamb.errors import InputError
-from tkamb.mechanics import FrameLoads, Mechanics
+from tkamb.mechanics import Mechanics
+from tkamb.recorder import FolderRecorder, Recorder, finished_results
 from tkamb.results import Results
 from tkamb.scene import Scene, load_scene
 from tkamb.status import frame_status
-from tkamb.summary import scene_hash, summary_of
-from tkamb.tabulate import tabulate
+from tkamb.summary import run_identity, scene_hash, summary_of
+from tkamb.tabulate import frame_row, join_rows
 
 if TYPE_CHECKING:
-    from tkamb.equilibrium import FrameContact
-    from tkamb.output.maps_file import ContactMaps
+    from tkamb.equilibrium import ContactSide, FrameContact
 
-Progress = Callable[[Iterable[int]], Iterable[int]]
+Progress = Callable[[Sequence[int]], Iterable[int]]
+
+LAST_FRAMES = 20
+"""How many contacts are kept as guesses for the next."""
 
 
 def simulate(
@@ -30,6 +34,7 @@ def simulate(
     directory: str | Path | None = None,
     scene_path: str | Path | None = None,
     progress: Progress = lambda frames: frames,
+    resume: bool = False,
 ) -> Results:
     """Run a scene and return its results.
 
@@ -38,69 +43,123 @@ def simulate(
         contact: contact model, instead of the scene's.
         resolution_mm: spacing of the map points, instead of the scene's.
         frames: which frames; default all.
-        directory: an existing folder where contact.h5 grows frame by frame; None keeps the
-            maps in memory.
+        directory: an existing folder where the finished frames are kept, see
+            `tkamb.recorder`; None keeps them in memory.
         scene_path: where the scene came from, for the summary.
         progress: wraps the frame indices, a progress bar for example.
+        resume: go on with what an earlier, interrupted run of the same scene and frames left
+            in the folder; needs one.
 
     Raises:
-        InputError: the scene or a file that it names cannot be used.
+        InputError: the scene or a file that it names cannot be used, or the run to resume is
+            another one.
+        KeyboardInterrupt: with a folder, what was finished is written there first.
     """
     if isinstance(scene, str | Path):
         scene_path, scene = scene, load_scene(scene)
     start = clock.perf_counter()
     case = load_case(_with_contact(scene, contact, resolution_mm))
     indices = _chosen(frames, len(case.motion.time))
-    mechanics = Mechanics(case)
-    seconds = {"read": clock.perf_counter() - start}
-    body: list[FrameLoads] = []
-    touched: list[FrameContact] = []
-    maps = None
-    if case.scene.contact:
-        maps = _press_all(case, mechanics, progress(indices), body, touched, directory, seconds)
+    identity = run_identity(case, indices)
+    if directory is None and resume:
+        raise InputError("there is no folder to go on in", "resume", "give a directory")
+    if directory is None:
+        recorder = Recorder()
     else:
-        body += [mechanics.frame(k) for k in progress(indices)]
-    statuses = [
-        frame_status(case, k, frame, touched[i] if touched else None)
-        for i, (k, frame) in enumerate(zip(indices, body, strict=True))
-    ]
-    columns = tabulate(case, indices, body, touched, mechanics.slips(), statuses)
-    seconds["all"] = clock.perf_counter() - start
-    summary = summary_of(case, columns, seconds, None if scene_path is None else Path(scene_path))
-    return Results(columns, summary, maps)
+        done = finished_results(Path(directory), identity) if resume else None
+        if done is not None:
+            return done
+        recorder = FolderRecorder(Path(directory), identity, resume)
+    path = None if scene_path is None else Path(scene_path)
+    try:
+        return _Run(case, indices, identity, recorder, path, start).compute(progress)
+    finally:
+        recorder.close()
 
 
-def _press_all(
-    case: Case,
-    mechanics: Mechanics,
-    indices: Iterable[int],
-    body: "list[FrameLoads]",
-    touched: "list[FrameContact]",
-    directory: str | Path | None,
-    seconds: dict[str, float],
-) -> "ContactMaps":
-    """Solve body and contact frame by frame; the maps go to contact.h5 or to memory."""
-    from tkamb.equilibrium import ContactSide
-    from tkamb.output.maps_memory import map_sink
+@dataclass(eq=False)
+class _Run:
+    """One run: computes its frames, hands them to the recorder, and makes the results."""
 
-    side = ContactSide(case, mechanics)
-    seconds["prepare contact"] = side.prepare_seconds
-    labels = {
-        "frame": "insert: x anterior, y superior, z lateral",
-        "model": side.table.model,
-        "scene_sha256": scene_hash(case),
-    }
-    with map_sink(directory, side.state.points, side.state.triangles, labels) as sink:
-        for k in indices:
-            loads, contact = side.frame(k, touched)
-            body.append(loads)
-            touched.append(contact)
-            result, time = touched[-1].result, float(case.motion.time[k])
-            if result is None:
-                sink.append_failed(time)
-            else:
-                sink.append(time, result.pressure, result.gap, result.nodal_force, result.pose)
-    return sink.maps
+    case: Case
+    indices: range
+    identity: dict[str, Any]
+    recorder: Recorder
+    path: Path | None
+    start: float
+
+    def compute(self, progress: Progress) -> Results:
+        """Compute every frame that is not there yet and return the results."""
+        self.mechanics = Mechanics(self.case)
+        self.slips = self.mechanics.slips()
+        self.seconds = {"read": clock.perf_counter() - self.start}
+        side = self._contact_side() if self.case.scene.contact else None
+        before = self._earlier(side)
+        self.resumed = len(self.recorder.rows)
+        left = [k for k in self.indices if k not in self.recorder.rows]
+        try:
+            for k in progress(left):
+                self._frame(k, side, before)
+                if self.recorder.due() and len(self.recorder.rows) < len(self.indices):
+                    self.recorder.publish(self.results())
+        except KeyboardInterrupt:
+            if not self.recorder.keeps_files or not self.recorder.rows:
+                raise
+            self.recorder.publish(self.results())
+            done = f"{len(self.recorder.rows)} of {len(self.indices)} frames"
+            raise KeyboardInterrupt(f"{done} are kept; go on with --resume") from None
+        self.recorder.finish()
+        return self.results()
+
+    def results(self) -> Results:
+        """Return the results so far; frames that are still to do are failed ones."""
+        columns = join_rows(self.case, self.indices, self.recorder.rows)
+        self.seconds["all"] = clock.perf_counter() - self.start
+        summary = summary_of(
+            self.case, columns, self.seconds, self.path, self.mechanics.strains
+        )
+        summary["identity"] = self.identity
+        summary["resumed_frames"] = self.resumed
+        summary["unfinished_frames"] = len(self.indices) - len(self.recorder.rows)
+        return Results(columns, summary, self.recorder.maps)
+
+    def _frame(self, k: int, side: "ContactSide | None", before: "list[FrameContact]") -> None:
+        contact = arrays = None
+        if side is None:
+            body = self.mechanics.frame(k)
+        else:
+            from tkamb.recall import contact_arrays
+
+            body, contact = side.frame(k, before)
+            before.append(contact)
+            del before[:-LAST_FRAMES]
+            arrays = contact_arrays(contact)
+        status = frame_status(self.case, k, body, contact)
+        self.recorder.record(k, frame_row(self.case, k, body, contact, self.slips, status), arrays)
+
+    def _contact_side(self) -> "ContactSide":
+        """Prepare the contact and make ready for its maps."""
+        from tkamb.equilibrium import ContactSide
+
+        side = ContactSide(self.case, self.mechanics)
+        self.seconds["prepare contact"] = side.prepare_seconds
+        labels = {
+            "frame": "insert: x anterior, y superior, z lateral",
+            "model": side.table.model,
+            "scene_sha256": scene_hash(self.case),
+        }
+        self.recorder.begin_maps(side.state.points, side.state.triangles, labels)
+        return side
+
+    def _earlier(self, side: "ContactSide | None") -> "list[FrameContact]":
+        """Return the last contacts of the run that is resumed."""
+        earlier = self.recorder.take_earlier(self.indices)
+        if side is None or not earlier:
+            return []
+        from tkamb.recall import recalled
+
+        last = list(earlier.items())[-LAST_FRAMES:]
+        return [recalled(side, self.mechanics, k, arrays) for k, arrays in last]
 
 
 def _with_contact(scene: Scene, model: str | None, resolution_mm: float | None) -> Scene:

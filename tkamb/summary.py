@@ -2,6 +2,7 @@
 
 import hashlib
 import sys
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from tkamb.case import Case
+from tkamb.mechanics import STRAIN_FLEXIONS
 from tkamb.status import FAILED
 
 RESIDUALS = (
@@ -22,7 +24,11 @@ LIBRARIES = ("pin", "numpy", "scipy", "trimesh", "python-fcl")
 
 
 def summary_of(
-    case: Case, columns: dict[str, Any], seconds: dict[str, float], path: Path | None
+    case: Case,
+    columns: dict[str, Any],
+    seconds: dict[str, float],
+    path: Path | None,
+    strains: Mapping[str, Sequence[float]],
 ) -> dict[str, Any]:
     """Return the JSON-able summary of a run; `tkamb.output.provenance` lists its keys.
 
@@ -31,6 +37,7 @@ def summary_of(
         columns: of results.csv.
         seconds: part -> computing time.
         path: of the scene file, if it came from one.
+        strains: ligament bundle -> strain at each of `STRAIN_FLEXIONS`.
     """
     scene, statuses, times = case.scene, columns["status"], columns["time_s"]
     left = scene.patient.side == "left"
@@ -61,6 +68,10 @@ def summary_of(
         "assumptions": assumptions(case),
         "notes": list(scene.output.notes),
     }
+    if strains:
+        summary["ligament_strain"] = {"flexion_deg": STRAIN_FLEXIONS, "strain": strains}
+    if scene.patella:
+        summary["first_wrapping_flexion_deg"] = _first_wrapping(columns)
     if scene.contact:
         summary["contact"] = scene.contact.model_dump(mode="json")
         summary["residuals"] = RESIDUALS
@@ -75,6 +86,32 @@ def summary_of(
 def scene_hash(case: Case) -> str:
     """Return the SHA-256 of the validated scene."""
     return hashlib.sha256(case.scene.model_dump_json().encode()).hexdigest()
+
+
+def run_identity(case: Case, frames: range) -> dict[str, Any]:
+    """Return what makes two runs the same: scene, what its files hold, frames, version."""
+    return {
+        "scene": scene_hash(case),
+        "content of a file": _files_hash(case),
+        "choice of frames": [frames.start, frames.stop, frames.step],
+        "version of tkamb": version("tkamb"),
+    }
+
+
+def _files_hash(case: Case) -> str:
+    """Return the SHA-256 of all files that the scene names."""
+    digest = hashlib.sha256()
+    for path in _paths(case.scene.model_dump(exclude={"output"})):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _paths(value: Any) -> list[Path]:
+    if isinstance(value, Path):
+        return [value] if value.is_file() else []
+    if isinstance(value, dict):
+        value = list(value.values())
+    return [p for item in value for p in _paths(item)] if isinstance(value, list | tuple) else []
 
 
 def not_modelled(case: Case) -> list[str]:
@@ -99,6 +136,16 @@ def assumptions(case: Case) -> list[str]:
         said.append("The motion is differentiated as given, unfiltered.")
     else:
         said.append(f"The motion is low-passed at {scene.motion.cutoff_Hz:g} Hz.")
+    if scene.motion.motion == "roll-slip":
+        said.append(
+            "Roll-slip motion: AP from rolling plus "
+            f"{scene.motion.slip_share:g} x the recorded slip, SI from first touch."
+        )
+    if scene.generic_ligaments:
+        said.append(
+            f"{', '.join(scene.generic_ligaments.ligaments)}: a generic set scaled to the "
+            "implant, not this patient's; look at the strains."
+        )
     if not scene.tibia:
         said.append("No [tibia]: the shank stands upright and still.")
     if scene.ground_reaction and scene.ground_reaction.applied == "ankle":
@@ -113,6 +160,12 @@ def assumptions(case: Case) -> list[str]:
     if scene.patient.side == "left":
         said.append("A left knee is computed as its mirror image: z is lateral.")
     return said
+
+
+def _first_wrapping(columns: dict[str, Any]) -> float | None:
+    """Return the least flexion (deg) of the frames where the quadriceps wraps; None: never."""
+    flexion = columns["flexion_deg"][columns["quadriceps_wrap_deg"] > 0.0]
+    return float(flexion.min()) if len(flexion) else None
 
 
 def _peak(values: Any) -> float | None:

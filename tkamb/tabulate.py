@@ -1,17 +1,20 @@
-"""Frames in SI into the columns of results.csv."""
+"""Frames in SI into the rows and columns of results.csv."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tkamb.case import Case
 from tkamb.columns import ligament_column
-from tkamb.geometry.frames import KNEE_COORDINATES, Array
+from tkamb.geometry.frames import KNEE_COORDINATES, knee_coordinates
 from tkamb.mechanics import FrameLoads
+from tkamb.sliding import sliding_row
+from tkamb.status import FAILED
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 if TYPE_CHECKING:
+    from tkamb.body.slip import CondyleSlip
     from tkamb.equilibrium import FrameContact
 
 NAN = float("nan")
@@ -19,52 +22,60 @@ NAN = float("nan")
 Columns = dict[str, Any]
 
 
-def tabulate(
+def frame_row(
     case: Case,
-    indices: range,
-    body: Sequence[FrameLoads],
-    contact: "Sequence[FrameContact]",
-    slips: dict[str, Array],
-    statuses: Sequence[str],
-) -> Columns:
-    """Return the columns of results.csv, one entry per frame.
+    k: int,
+    body: FrameLoads,
+    contact: "FrameContact | None",
+    slips: "Mapping[str, CondyleSlip]",
+    status: str,
+) -> dict[str, Any]:
+    """Return the row of results.csv of frame k: column -> number, and the status.
 
     Args:
         case: the case.
-        indices: frames of the motion.
-        body: body side of each frame.
-        contact: contact side of each frame; empty when not modelled.
-        slips: side -> slip (m) since the first frame of the motion, over all its frames.
-        statuses: text per frame.
+        k: frame of the motion.
+        body: its body side.
+        contact: its contact side; None when not modelled.
+        slips: side -> slip over all frames of the motion; empty without the two surfaces.
+        status: text.
     """
-    columns = _motion_columns(case, indices)
-    columns |= _collected([_body_row(case, frame) for frame in body])
+    row = _motion_row(case, k) | _body_row(case, body)
     for side, slip in slips.items():
-        columns[f"{side}_slip_mm"] = slip[list(indices)] / MILLIMETRE
-    if contact:
-        limit = case.scene.output.yield_stress_MPa * MEGAPASCAL
-        columns |= _collected([_contact_row(frame, limit) for frame in contact])
-    columns["body_seconds"] = np.array([frame.seconds for frame in body])
-    columns["query_seconds"] = np.array([frame.query_seconds for frame in body])
-    columns["status"] = list(statuses)
-    return columns
+        row |= sliding_row(case, k, side, slip, body.geometry.condyles.get(side))
+    if contact is not None:
+        row |= _contact_row(contact, case.scene.output.yield_stress_MPa * MEGAPASCAL)
+        row |= _pose_row(contact)
+    row |= {"body_seconds": body.seconds, "query_seconds": body.query_seconds}
+    return {name: float(value) for name, value in row.items()} | {"status": status}
 
 
-def _collected(rows: Sequence[dict[str, float]]) -> Columns:
-    names = dict.fromkeys(name for row in rows for name in row)
-    return {name: np.array([row.get(name, NAN) for row in rows], float) for name in names}
+def join_rows(case: Case, frames: range, rows: Mapping[int, dict[str, Any]]) -> Columns:
+    """Return the columns of results.csv, one entry per frame.
+
+    A frame without a row holds its motion, NaN and the status "failed: not computed".
+
+    Args:
+        case: the case.
+        frames: of the motion.
+        rows: frame -> `frame_row`.
+    """
+    missing = {"status": FAILED + "not computed"}
+    full = [rows[k] if k in rows else _motion_row(case, k) | missing for k in frames]
+    names = dict.fromkeys(name for row in full for name in row if name != "status")
+    columns: Columns = {n: np.array([row.get(n, NAN) for row in full], float) for n in names}
+    return columns | {"status": [row["status"] for row in full]}
 
 
-def _motion_columns(case: Case, indices: range) -> Columns:
+def _motion_row(case: Case, k: int) -> dict[str, Any]:
     motion = case.motion
-    chosen = list(indices)
-    coordinates = dict(zip(KNEE_COORDINATES, motion.coordinates[chosen].T, strict=True))
-    columns = {"time_s": motion.time[chosen]}
+    coordinates = dict(zip(KNEE_COORDINATES, motion.coordinates[k], strict=True))
+    row = {"time_s": motion.time[k]}
     if motion.cycle_percent is not None:
-        columns["cycle_percent"] = motion.cycle_percent[chosen]
+        row["cycle_percent"] = motion.cycle_percent[k]
     for name in ("flexion", "adduction", "axial_rotation"):
-        columns[f"{name}_deg"] = coordinates[name] / DEGREE
-    return columns
+        row[f"{name}_deg"] = coordinates[name] / DEGREE
+    return row
 
 
 def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
@@ -130,6 +141,27 @@ def _contact_row(frame: "FrameContact", yield_stress: float) -> dict[str, float]
     for side in ("medial", "lateral"):
         row |= _condyle_row(side, frame, yield_stress)
     return row
+
+
+def _pose_row(frame: "FrameContact") -> dict[str, float]:
+    """Return where the contact holds, and how body and contact came to agree there."""
+    place = knee_coordinates(frame.result.pose) if frame.result else np.full(6, NAN)
+    named = dict(zip(KNEE_COORDINATES, place.tolist(), strict=True))
+    row = {f"{axis}_mm": named[axis] / MILLIMETRE for axis in ("ap", "si", "ml")}
+    if frame.iterations:
+        row["coupling_iterations"] = frame.iterations
+        row["coupling_change_N"] = frame.load_change
+    if frame.settled is None:
+        return row | {"coupling_change_mm": frame.point_change / MILLIMETRE}
+    angles = ("adduction", "axial_rotation")
+    return (
+        row
+        | {f"{angle}_deg": named[angle] / DEGREE for angle in angles}
+        | {
+            "contact_trials": frame.settled.trials,
+            "softest_N_per_mm": frame.settled.balance.softest * MILLIMETRE,
+        }
+    )
 
 
 def _condyle_row(side: str, frame: "FrameContact", limit: float) -> dict[str, float]:

@@ -83,7 +83,8 @@ def open_run(
     folder = scene.output.directory or Path("out") / path.resolve().parent.name
     if (folder / SUMMARY_NAME).exists():
         results = read_results(folder)
-        if results.summary.get("scene_sha256") == scene_hash(case) and len(results):
+        same = results.summary.get("scene_sha256") == scene_hash(case)
+        if same and len(results) and not results.summary.get("unfinished_frames"):
             announce(f"results of this scene found in {folder}")
             return joined(case, results)
     announce("running the scene (keep its results with `tkamb run`)")

@@ -1,0 +1,209 @@
+"""What takes the frames of a run as they are finished: memory, or a folder that survives a kill.
+
+In a folder every finished frame is a file of its own (`tkamb.output.shards`) before the next
+begins. contact.h5 grows beside them and is copied to its place, whole, about once a second,
+together with a results.csv that calls the other frames not computed.
+"""
+
+import shutil
+import signal
+import threading
+import time as clock
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.output.atomic import replaced_file
+from tkamb.output.shards import Row, Shard, Shards, check_same_run
+
+if TYPE_CHECKING:
+    from tkamb.output.maps_file import ContactMaps, MapWriter
+    from tkamb.output.maps_memory import MapKeeper
+    from tkamb.results import Results
+
+MAPS = ("pressure", "gap", "nodal_force", "pose")
+SHORTEST_PAUSE = 1.0
+"""s between two copies of what is finished."""
+DEAREST_SHARE = 0.05
+"""Of the computing time that the copies may take."""
+
+
+class Recorder:
+    """Keeps the frames of a run in memory.
+
+    Attributes:
+        rows: frame -> column -> value, of the finished frames.
+    """
+
+    def __init__(self) -> None:
+        self.rows: dict[int, Row] = {}
+        self._sink: MapKeeper | MapWriter | None = None
+        self._stack = ExitStack()
+
+    def begin_maps(self, points: Array, triangles: Array, labels: Mapping[str, Any]) -> None:
+        """Make ready for pressure maps on these points; not called without contact."""
+        from tkamb.output.maps_memory import map_sink
+
+        self._sink = map_sink(self._map_folder(), points, triangles, labels)
+        self._stack.enter_context(self._sink)
+
+    def record(self, frame: int, row: Row, contact: dict[str, Array] | None) -> None:
+        """Keep a finished frame.
+
+        Args:
+            frame: its number.
+            row: column of results.csv -> value.
+            contact: the contact's arrays (`tkamb.recall`); None if it failed or is not modelled.
+        """
+        self.rows[frame] = row
+        if self._sink is None:
+            return
+        if contact is None:
+            self._sink.append_failed(float(row["time_s"]))
+        else:
+            self._sink.append(float(row["time_s"]), *(contact[name] for name in MAPS))
+
+    def take_earlier(self, frames: range) -> dict[int, dict[str, Array] | None]:
+        """Take over what an earlier run finished; return frame -> the contact's arrays."""
+        return {}
+
+    keeps_files = False
+    """Whether what is finished survives the process."""
+
+    def due(self) -> bool:
+        """Say whether what is finished should be shown to the outside."""
+        return False
+
+    def publish(self, results: "Results") -> None:
+        """Show what is finished to the outside."""
+
+    def finish(self) -> None:
+        """Put the maps where they stay: every frame is there."""
+
+    @property
+    def maps(self) -> "ContactMaps | None":
+        """The pressure maps of the finished frames."""
+        return None if self._sink is None else self._sink.maps
+
+    def close(self) -> None:
+        """Nothing can be recorded after it."""
+        self._stack.close()
+
+    def _map_folder(self) -> Path | None:
+        return None
+
+
+class FolderRecorder(Recorder):
+    """Keeps the frames of a run in its output folder.
+
+    Args:
+        directory: an existing folder.
+        identity: what makes two runs the same.
+        resume: go on with the frames that an earlier run left there.
+
+    Raises:
+        InputError: the earlier run was another one, or the folder cannot be written.
+    """
+
+    def __init__(self, directory: Path, identity: Mapping[str, Any], resume: bool) -> None:
+        super().__init__()
+        self._directory = directory
+        self._shards = Shards(directory, identity, resume)
+        self._pause, self._shown = 0.0, -SHORTEST_PAUSE
+
+    def take_earlier(self, frames: range) -> dict[int, dict[str, Array] | None]:
+        """See `Recorder`; in order, up to the first gap."""
+        found = {}
+        for frame in frames:
+            shard = self._shards.get(frame)
+            if shard is None:
+                break
+            found[frame] = shard.contact
+            super().record(frame, shard.row, shard.contact)
+        return found
+
+    def record(self, frame: int, row: Row, contact: dict[str, Array] | None) -> None:
+        """See `Recorder`; an interrupt waits until the frame is written."""
+        with interrupt_later():
+            self._shards.put(frame, Shard(row, contact))
+            super().record(frame, row, contact)
+
+    keeps_files = True
+
+    def due(self) -> bool:
+        """See `Recorder`."""
+        return clock.perf_counter() - self._shown > self._pause
+
+    @property
+    def maps(self) -> "ContactMaps | None":
+        """See `Recorder`; as they stand in the output folder."""
+        from tkamb.output.maps_file import FILE_NAME, ContactMaps
+
+        return None if self._sink is None else ContactMaps(self._directory / FILE_NAME)
+
+    def finish(self) -> None:
+        """See `Recorder`."""
+        with interrupt_later():
+            self.close()
+            self._copy_maps()
+
+    def publish(self, results: "Results") -> None:
+        """Write results.csv, summary.json and contact.h5, each whole; a report goes."""
+        from tkamb.results import REPORT_NAME, write_numbers
+
+        start = clock.perf_counter()
+        with interrupt_later():
+            write_numbers(results, self._directory)
+            (self._directory / REPORT_NAME).unlink(missing_ok=True)
+            self._copy_maps()
+        self._shown = clock.perf_counter()
+        self._pause = max(SHORTEST_PAUSE, (self._shown - start) / DEAREST_SHARE)
+
+    def _copy_maps(self) -> None:
+        """Copy contact.h5 to its place; without contact an older one there goes."""
+        from tkamb.output.maps_file import FILE_NAME
+
+        place = self._directory / FILE_NAME
+        if self._sink is None:
+            place.unlink(missing_ok=True)
+            return
+        with replaced_file(place) as temporary:
+            shutil.copyfile(self._shards.folder / FILE_NAME, temporary)
+
+    def _map_folder(self) -> Path | None:
+        return self._shards.folder
+
+
+@contextmanager
+def interrupt_later() -> Iterator[None]:
+    """Hold Ctrl-C back until the block is done; only the main thread gets it at all."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[Any] = []
+    usual = signal.signal(signal.SIGINT, lambda *seen: came.append(seen))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
+    if came and callable(usual):
+        usual(*came[0])
+
+
+def finished_results(directory: Path, identity: Mapping[str, Any]) -> "Results | None":
+    """Return the results in a folder if they are all of that run's; None if not.
+
+    Raises:
+        InputError: they are another run's.
+    """
+    from tkamb.results import read_results
+
+    try:
+        results = read_results(directory)
+    except InputError:
+        return None
+    check_same_run(results.summary.get("identity"), identity, directory)
+    return None if results.summary.get("unfinished_frames", 1) else results
