@@ -14,8 +14,9 @@ mu times its resultant.
 The contact comes as a probe; this file does not know the models.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,6 +40,13 @@ SETTLED = 2e-6
 MOST_PASSES = 8
 TINY = 1e-7
 """m: step of the finite differences of axes and ligaments."""
+
+
+Sliding = Callable[[Array, Array], Array]
+
+
+def _at_rest(place: Array, point: Array) -> Array:
+    return np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +94,6 @@ class ReleasedKnee:
         self._mechanics, self._probe = mechanics, probe
         self.released = released_indices(names)
         self._rows = list(self.released)
-        self._scale = SCALE[self._rows]
 
     def settle(
         self,
@@ -114,16 +121,16 @@ class ReleasedKnee:
             passes += 1
             patella = self._patella(k, place, patella)
             placed = self._mechanics.placed(k, place, patella)
-            search = self._search(k, placed, middle, slack)
-            balance = find_balance(search.trial, place[self._rows] * self._scale, stiffness)
-            contact, moved = search.seen[balance.coordinates.tobytes()], search.at(balance)
+            forces = self._forces(k, placed, middle, slack)
+            balance = forces.balance(stiffness)
+            contact, moved = forces.contact(balance), forces.at(balance)
             travel = float(np.abs((moved - place) * SCALE).max())
             change = float(np.linalg.norm(contact.wrench[:3] - force))
             place, force, stiffness = moved, contact.wrench[:3], balance.stiffness
             trials += balance.trials
             before_middle, middle = middle, _middle(contact, points, place)
             shift = float(np.abs(middle - before_middle).max()) if self._keeps else 0.0
-            if not slack and contact.known and search.pushes(balance):
+            if not slack and contact.known and forces.pushes(balance):
                 slack = True
                 continue
             if placed.problems or balance.status is not BalanceStatus.OK:
@@ -147,20 +154,29 @@ class ReleasedKnee:
             return None
         return extensor.patella(k, knee_pose(place), guess.coordinates if guess else None)
 
-    def _search(self, k: int, placed: PlacedKnee, middle: Array, slack: bool) -> "_Search":
+    def _forces(self, k: int, placed: PlacedKnee, middle: Array, slack: bool) -> "ReleasedForces":
+        mechanics = self._mechanics
         demand = knee_demand(
             placed.geometry,
-            self._mechanics.ligaments,
+            mechanics.ligaments,
             placed.coordinates,
             self.released,
             middle,
             slack,
         )
-        return _Search(self._mechanics, self._probe, k, placed.coordinates, demand)
+        sliding = partial(mechanics.sliding, k)
+        return ReleasedForces(demand, self._probe, placed.coordinates, mechanics.friction, sliding)
 
 
-class _Search:
-    """The forces on the released coordinates at trial places, the patella held.
+class ReleasedForces:
+    """What drives the released coordinates at trial places, the patella held on the femur.
+
+    Args:
+        demand: of the body.
+        probe: of the contact model.
+        place: (6,) knee coordinates; those not released stay.
+        friction: Coulomb coefficient.
+        sliding: from coordinates (6,) and point (3,) to the femur's velocity there (3,), m/s.
 
     Attributes:
         seen: scaled coordinates as bytes -> contact there.
@@ -168,17 +184,25 @@ class _Search:
 
     def __init__(
         self,
-        mechanics: Mechanics,
-        probe: "Probe",
-        k: int,
-        place: Array,
         demand: KneeDemand,
+        probe: "Probe",
+        place: Array,
+        friction: float = 0.0,
+        sliding: Sliding = _at_rest,
     ) -> None:
-        self._mechanics, self._probe, self._k = mechanics, probe, k
-        self._place, self._demand = place, demand
+        self._demand, self._probe, self._place = demand, probe, np.array(place, float)
+        self._friction, self._sliding = friction, sliding
         self._rows = list(demand.released)
         self._scale = SCALE[self._rows]
         self.seen: dict[bytes, ProbedContact] = {}
+
+    def balance(self, stiffness: Array | None = None) -> Balance:
+        """Return where the released coordinates come to rest, from the given place."""
+        return find_balance(self.trial, self._place[self._rows] * self._scale, stiffness)
+
+    def contact(self, balance: Balance) -> "ProbedContact":
+        """Return the contact of a balance."""
+        return self.seen[balance.coordinates.tobytes()]
 
     def trial(self, x: Array) -> Trial:
         """Return scaled forces and stiffness at scaled coordinates (n,), m."""
@@ -206,7 +230,7 @@ class _Search:
         if self._demand.line is None:
             return False
         place = self.at(balance)
-        wrench, _ = self._rubbing(place, self.seen[balance.coordinates.tobytes()])
+        wrench, _ = self._rubbing(place, self.contact(balance))
         return bool(self._demand.kept(place, wrench)[-1] < 0)
 
     def _with(self, x: Array) -> Array:
@@ -218,8 +242,8 @@ class _Search:
         """Return wrench (6,) on the insert with friction, and its stiffness (6, 6) if known."""
         wrench, stiffness = np.zeros(6), np.zeros((6, 6))
         for condyle in contact.condyles.values():
-            touch = touching(condyle, self._mechanics.sliding(self._k, place, condyle.point))
-            drag = touch.normal - touch.direction(self._mechanics.friction)
+            touch = touching(condyle, self._sliding(place, condyle.point))
+            drag = touch.normal - touch.direction(self._friction)
             rubbing = np.concatenate([drag, np.cross(touch.point, drag)])
             wrench += condyle.wrench + condyle.force * rubbing
             if condyle.stiffness is not None:
