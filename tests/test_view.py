@@ -12,7 +12,7 @@ from tkamb.geometry.surface import Surface
 from tkamb.view import browser as browser_module
 from tkamb.view.drawing import PressureMap
 from tkamb.view.levels import LEVELS, levels
-from tkamb.view.payload import Block
+from tkamb.view.payload import Block, _placed
 from tkamb.view.run import open_run
 from tkamb.view.shading import shaded, thinned
 from tkamb.view.show import Show, serve_in_background
@@ -196,3 +196,31 @@ def test_the_browser_is_asked_for_only_when_needed(show, tmp_path, monkeypatch):
         show.write_png(tmp_path / "knee.png")
     with pytest.raises(InputError):
         Show(show.runs, frame=77)
+
+
+def test_a_left_knee_is_mirrored_back(show):
+    right, left = (
+        np.reshape(command.lower()["matrix"], (4, 4)).T
+        for command in (_placed("/tkamb/0", side) for side in ("right", "left"))
+    )
+    anterior, superior, lateral = np.eye(4)[:3]
+    np.testing.assert_allclose(right @ superior, [0, 0, 1, 0])
+    np.testing.assert_allclose(left @ superior, [0, 0, 1, 0])
+    np.testing.assert_allclose(left @ anterior, right @ anterior)
+    np.testing.assert_allclose(left @ lateral, -(right @ lateral))
+
+
+def test_a_coupled_run_is_drawn_where_its_forces_act(tmp_path):
+    scene = copied_scene(tmp_path / "knee")
+    text = scene.read_text().replace(
+        'model = "foundation"', 'model = "foundation"\ncoupling = "points"'
+    )
+    scene.write_text(text)
+    out = tmp_path / "out"
+    out.mkdir()
+    short_results(out, scene)
+    show = Show([open_run(out)])
+    results, arrows = show.runs[0].results, {one.name: one for one in show.drawings[0].arrows}
+    pressed = arrows["medial condyle"].forces + arrows["lateral condyle"].forces
+    given = np.stack([results["force_ap_N"], -results["force_si_N"], results["force_ml_N"]], axis=1)
+    np.testing.assert_allclose(pressed, given, atol=1e-3 * np.abs(given).max())

@@ -6,6 +6,7 @@ import tempfile
 import threading
 import webbrowser
 from collections.abc import Callable, Iterable, Sequence
+from copy import copy
 from html import escape
 from pathlib import Path
 
@@ -50,15 +51,21 @@ class Show:
         lattice: bool = False,
         progress: Progress = lambda frames: frames,
     ) -> None:
-        most = max(len(run.frames) for run in runs)
-        if not -most <= frame < most:
-            raise InputError(f"there is no frame {frame}", "--frame", f"0 to {most - 1}")
-        if camera not in CAMERAS:
-            raise InputError(f"no view '{camera}'", "--camera", f"there are: {', '.join(CAMERAS)}")
-        self.runs, self.frame, self.camera = tuple(runs), frame % most, camera
+        self.runs = tuple(runs)
+        self.frame, self.camera = self._checked(frame, camera)
         self.drawings: tuple[Drawing, ...] = tuple(draw(run, progress, lattice) for run in runs)
         self.packed = pack(self.drawings)
         self.title = " | ".join(drawing.title for drawing in self.drawings)
+
+    def at(self, frame: int, camera: str) -> "Show":
+        """Return the same show with another first frame and camera; nothing is drawn anew.
+
+        Raises:
+            InputError: no such frame or camera.
+        """
+        other = copy(self)
+        other.frame, other.camera = self._checked(frame, camera)
+        return other
 
     def html(self) -> str:
         """Return the page that stands by itself."""
@@ -92,6 +99,14 @@ class Show:
             f'<iframe srcdoc="{escape(self.html())}" style="width:100%;height:640px;border:0">'
             "</iframe>"
         )
+
+    def _checked(self, frame: int, camera: str) -> tuple[int, str]:
+        most = max(len(run.frames) for run in self.runs)
+        if not -most <= frame < most:
+            raise InputError(f"there is no frame {frame}", "--frame", f"0 to {most - 1}")
+        if camera not in CAMERAS:
+            raise InputError(f"no view '{camera}'", "--camera", f"there are: {', '.join(CAMERAS)}")
+        return frame % most, camera
 
     def server(self, port: int = 0) -> ViewServer:
         """Return the server of the live window, not yet started.

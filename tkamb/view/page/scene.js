@@ -41,6 +41,7 @@ tkamb.showLayer = function (layer, shown) {
   tkamb.views.forEach((view, number) => {
     tkamb.node(`/tkamb/${number}/${layer}`).object.visible = shown;
   });
+  document.body.classList.toggle(`without-${layer.replaceAll(" ", "-")}`, !shown);
   tkamb.viewer.set_dirty();
 };
 
@@ -153,7 +154,7 @@ tkamb.addLattice = function (view) {
 function nameDirections(camera) {
   const {Vector3} = MeshCat.THREE, turn = camera.matrixWorld.elements;
   const lateral = tkamb.views[0].side === "left" ? -1 : 1;
-  const names = [["posterior", "anterior"], ["inferior", "superior"], ["medial", "lateral"]];
+  const names = [["posterior", "anterior"], ["", ""], ["medial", "lateral"]];
   const at = (x, y, z) => {
     const parts = [x, y, lateral * z].map((part) => (Math.abs(part) > 0.85 ? part : 0));
     const axis = parts.findIndex((part) => part !== 0);
