@@ -32,7 +32,7 @@ SOFTEST = 100.0
 """N/m: a state that gives way by more than 10 mm per newton is indeterminate."""
 FIRST_RADIUS, WIDEST_RADIUS, NARROWEST_RADIUS = 0.5e-3, 3e-3, 1e-9
 """m: the trust region at the start, and its limits."""
-LONGEST_TRAVEL = 30e-3
+LONGEST_TRAVEL = 20e-3
 """m: a coordinate this far from its start is held by nothing."""
 PROBE_STEP = 2e-6
 """m: of the finite differences where the stiffness is not known."""
@@ -245,7 +245,7 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
         step = np.linalg.solve(stiffness, force)
         if np.linalg.norm(step) <= radius:
             return np.asarray(step)
-    low = max(0.0, -symmetric)
+    low = 1.0 + 1.001 * max(0.0, -symmetric)
     high = low + float(np.linalg.norm(force)) / radius + 1.0
     for _ in range(50):
         shift = 0.5 * (low + high)

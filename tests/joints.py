@@ -1,0 +1,67 @@
+"""Knees of known answer: two rigid spheres on an elastic foundation, plain or dished."""
+
+import numpy as np
+
+from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
+from tkamb.body.demand import KneeDemand, LigamentSet, unit_keeper
+from tkamb.contact.materials import material
+from tkamb.contact.model import ContactPair
+from tkamb.geometry.frames import KNEE_COORDINATES
+from tkamb.released import SCALE, ReleasedForces, released_indices
+
+BALL, HALF, HEIGHT = 25e-3, 20e-3, 10e-3
+"""Radius of the spheres, half their distance, thickness of the insert under them, m."""
+DISH = 40e-3
+LINEAR = material("polyethylene-linear")
+ALL = ("ap", "si", "ml", "axial_rotation", "adduction")
+
+
+def spheres():
+    return joined(*(graded_sphere(BALL, (0, 0, side * HALF)) for side in (-1, 1)))
+
+
+def flat_joint():
+    return ContactPair(spheres(), flat_insert(HEIGHT, 12e-3, 34e-3), LINEAR)
+
+
+def dished_joint(radius=DISH):
+    def height(x, z):
+        return HEIGHT + radius - np.sqrt(radius**2 - x**2 - (np.abs(z) - HALF) ** 2)
+
+    return ContactPair(spheres(), dished_insert(height, 16e-3, 36e-3, 0.5e-3), LINEAR)
+
+
+def bundles(ends=(), stiffness=1e5):
+    """Return two-line bundles between (femoral point, point on the shank), slack as given."""
+    femur = np.array([femoral for femoral, _, _ in ends], float).reshape(-1, 3)
+    shank = np.array([tibial for _, tibial, _ in ends], float).reshape(-1, 3)
+    slack = np.array([length for _, _, length in ends], float)
+    return LigamentSet(femur, shank, np.ones(len(ends), bool), np.full(len(ends), stiffness), slack)
+
+
+def demand(external, released=ALL, ligaments=None):
+    """Return what a body asks that pushes the shank with `external`; moments keep flexion."""
+    rows = released_indices(released)
+    keeping = [
+        unit_keeper(name, np.zeros(3)) for i, name in enumerate(KNEE_COORDINATES) if i not in rows
+    ]
+    chosen = bundles() if ligaments is None else ligaments
+    return KneeDemand(np.asarray(external, float), chosen, None, np.array(keeping).T, rows)
+
+
+def push(force, point=(0.0, 0.0, 0.0)):
+    """Return the wrench (6,) of a force on the shank at a point."""
+    return np.concatenate([force, np.cross(point, force)])
+
+
+def settle(model, state, external, start, released=ALL, ligaments=None):
+    """Return coordinates (6,), contact and balance of a joint at rest."""
+    asked = demand(external, released, ligaments)
+    forces = ReleasedForces(asked, model.probe(state), np.asarray(start, float))
+    balance = forces.balance()
+    return forces.at(balance), forces.contact(balance), balance
+
+
+def apart(one, other):
+    """Return how far apart two places are, m; rotations by their lever arm."""
+    return float(np.abs((np.asarray(one) - other) * SCALE).max())

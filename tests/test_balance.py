@@ -1,0 +1,297 @@
+"""Equilibrium of released coordinates against closed forms."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from joints import (
+    BALL,
+    DISH,
+    HALF,
+    HEIGHT,
+    LINEAR,
+    apart,
+    bundles,
+    demand,
+    dished_joint,
+    flat_joint,
+    push,
+    settle,
+)
+from tkamb.balance import BalanceStatus, Trial, find_balance
+from tkamb.contact.foundation import LinearFoundation
+from tkamb.contact.probe import Probe
+from tkamb.contact.registry import contact_model
+from tkamb.geometry.frames import knee_pose, knee_twist
+from tkamb.geometry.knee_axes import knee_axes
+from tkamb.released import SCALE, ReleasedForces
+
+LOAD = 1000.0
+TOUCH = HEIGHT + BALL - 0.05e-3
+M = LINEAR.confined_modulus
+
+
+@pytest.fixture(scope="module")
+def flat():
+    model = LinearFoundation(0.5e-3)
+    return model, model.prepare(flat_joint())
+
+
+@pytest.fixture(scope="module")
+def dished():
+    model = LinearFoundation(1e-3)
+    return model, model.prepare(dished_joint())
+
+
+def sphere_depth(force):
+    """Return how deep a sphere sinks: force = M/h pi d² (R - d/3)."""
+    return brentq(lambda d: M / HEIGHT * np.pi * d**2 * (BALL - d / 3) - force, 0, HEIGHT / 2)
+
+
+# The search itself
+
+
+def test_springs_come_to_rest_where_their_matrix_says():
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(4, 4))
+    stiffness = 1e5 * (root @ root.T + 0.1 * np.eye(4))
+    load = rng.normal(size=4) * 20
+    for given in (True, False):
+        end = find_balance(
+            lambda x, given=given: Trial(load - stiffness @ x, stiffness if given else None),
+            np.full(4, 1e-3),
+        )
+        assert end.status is BalanceStatus.OK
+        assert np.allclose(end.coordinates, np.linalg.solve(stiffness, load), atol=2e-6)
+        assert end.softest == pytest.approx(np.linalg.eigvalsh(stiffness)[0], rel=1e-3)
+
+
+def test_energy_falls_in_every_step_through_a_stiffening_contact():
+    """Potential k x^2.5 against a load, and a soft sideways spring coupled by a curved valley."""
+
+    def energy(x):
+        depth = max(0.0, -(x[0] - x[1] ** 2 / 0.05))
+        return 4e9 * depth**2.5 + LOAD * x[0] + 2e3 * x[1] ** 2
+
+    def trial(x):
+        depth = max(0.0, -(x[0] - x[1] ** 2 / 0.05))
+        push = 1e10 * depth**1.5
+        return Trial(np.array([push - LOAD, -push * 2 * x[1] / 0.05 - 4e3 * x[1]]))
+
+    seen = [np.array([2e-3, 8e-3])]
+    end = find_balance(lambda x: (seen.append(x.copy()), trial(x))[1], seen[0])
+    assert end.status is BalanceStatus.OK
+    assert np.allclose(end.coordinates, [-((LOAD / 1e10) ** (2 / 3)), 0], atol=3e-6)
+    assert min(end.work) > 0
+    assert energy(end.coordinates) < energy(seen[0])
+    lost = energy(seen[0]) - energy(end.coordinates)
+    assert sum(end.work) == pytest.approx(lost, rel=0.25)
+
+
+def test_ends_that_are_no_rest_are_named():
+    def free(x):
+        return Trial(np.array([-1e5 * x[0], 0.0]), np.diag([1e5, 0.0]))
+
+    def pushed(x):
+        return Trial(np.array([-1e5 * x[0], 1.0]), np.diag([1e5, 0.0]))
+
+    def hilltop(x):
+        return Trial(np.array([-1e5 * x[0], 1e4 * x[1]]), np.diag([1e5, -1e4]))
+
+    def unknown(x):
+        return Trial(np.full(2, np.nan))
+
+    start = np.array([1e-3, 0.0])
+    assert find_balance(free, start).status is BalanceStatus.INDETERMINATE
+    assert find_balance(pushed, start).status is BalanceStatus.RUNS_AWAY
+    assert find_balance(hilltop, start).status is BalanceStatus.UNSTABLE
+    assert find_balance(unknown, start).status is BalanceStatus.OUT_OF_RANGE
+
+
+# Its parts
+
+
+def test_axes_are_the_twists_of_the_coordinates():
+    rng = np.random.default_rng(2)
+    place = rng.uniform(-1, 1, (5, 6)) * [0.03, 0.03, 0.03, 0.5, 0.3, 2.0]
+    for coordinates, axes in zip(place, knee_axes(place), strict=True):
+        for rates, axis in zip(np.eye(6), axes, strict=True):
+            velocity, spin = knee_twist(coordinates, rates)
+            at_origin = velocity - np.cross(spin, coordinates[:3])
+            assert np.allclose(axis, np.concatenate([at_origin, spin]), atol=1e-12)
+
+
+def test_the_foundation_probe_gives_the_wrench_of_evaluate_and_its_tangent(dished):
+    model, state = dished
+    place = np.array([1e-3, TOUCH - 0.05e-3, -0.5e-3, 0.03, 0.002, 0.4])
+    probe, generic = model.probe(state), Probe(model, state)
+    here, slow = probe.at(knee_pose(place)), generic.at(knee_pose(place))
+    assert here.tangent
+    assert not slow.tangent
+    assert np.allclose(here.wrench, slow.wrench, rtol=1e-12, atol=1e-12)
+    axes = knee_axes(place)
+    tangent = sum(c.stiffness for c in here.condyles.values()) @ axes.T
+    for i, size in enumerate(np.array([1, 1, 1, 40, 40, 40]) * 1e-6):
+        step = size * np.eye(6)[i]
+        change = probe.at(knee_pose(place + step)).wrench - probe.at(knee_pose(place - step)).wrench
+        assert np.allclose(change / (2 * size), tangent[:, i], atol=0.03 * np.abs(tangent).max())
+
+
+def test_the_stiffness_of_the_released_coordinates_is_the_slope_of_their_forces(dished):
+    model, state = dished
+    external = push([30.0, LOAD, -40.0], [2e-3, 0, 5e-3])
+    strap = bundles([([0, 0, -35e-3], [0, -30e-3, -35e-3], 60e-3)])
+    place = np.array([1e-3, TOUCH - 0.05e-3, -0.5e-3, 0.03, 0.002, 0.4])
+    forces = ReleasedForces(demand(external, ligaments=strap), model.probe(state), place)
+    x = (place * SCALE)[:5]
+    stiffness = forces.trial(x).stiffness
+    for i in range(5):
+        step = 1e-6 * np.eye(5)[i]
+        slope = (forces.trial(x - step).force - forces.trial(x + step).force) / 2e-6
+        assert np.allclose(slope, stiffness[:, i], atol=0.03 * np.abs(stiffness).max())
+
+
+# A rigid two-sphere joint on an elastic foundation
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 0.9, -0.6])
+def test_split_and_tilt_follow_the_adduction_moment(flat, share):
+    """A load off the middle by e: N_lateral - N_medial = F e/b, varus = (d_m - d_l)/(2b)."""
+    offset = share * HALF
+    place, contact, balance = settle(
+        *flat, push([0, LOAD, 0], [0, 0, offset]), [0, TOUCH, 0, 0, 0, 0.3], ("adduction",)
+    )
+    assert balance.status is BalanceStatus.OK
+    lateral, medial = LOAD * (1 + share) / 2, LOAD * (1 - share) / 2
+    assert contact.condyles["medial"].force == pytest.approx(medial, abs=0.5)
+    assert contact.condyles["lateral"].force == pytest.approx(lateral, abs=0.5)
+    tilt = (sphere_depth(medial) - sphere_depth(lateral)) / (2 * HALF)
+    assert place[4] == pytest.approx(tilt, abs=0.02 * sphere_depth(LOAD) / HALF)
+    sunk = HEIGHT + BALL - place[1]
+    assert sunk == pytest.approx((sphere_depth(lateral) + sphere_depth(medial)) / 2, rel=0.03)
+
+
+def test_a_condyle_lifts_off_where_its_force_would_cross_zero_and_lands_again(flat):
+    """A medial strap holds what tips over; a ramp up and down passes the same states.
+
+    With both condyles on, N_medial = F (1 - e/b)/2 - T (b + a)/(2b) falls to zero at e = b
+    while the strap is slack; beyond, its tension is T = F (e - b)/(a + b).
+    """
+    reach = 30e-3
+    anchor = TOUCH + 30e-3
+    ends = ([0, 0, -reach], [0, TOUCH - anchor, -reach], anchor)
+    strap = bundles([ends], 2e5)
+    model, state = flat
+    up = np.concatenate([np.linspace(0.5, 1.5, 21), np.linspace(1.5, 0.5, 21)])
+    place, found = np.array([0, TOUCH, 0, 0, 0, 0.3]), []
+    for share in up:
+        external = push([0, LOAD, 0], [0, 0, share * HALF])
+        place, contact, balance = settle(model, state, external, place, ("adduction",), strap)
+        assert balance.status is BalanceStatus.OK
+        assert min(balance.work, default=1.0) > 0
+        tension = np.linalg.norm(strap.wrench(knee_pose(place))[:3])
+        carried = {side: c.wrench[1] for side, c in contact.condyles.items()}
+        assert max(carried.values()) < 0
+        found.append((share, place, "medial" in contact.condyles, tension))
+    for share, _, medial, tension in found:
+        slackened = tension < 1e-9
+        assert medial == (share < 0.999) or not slackened
+        if not medial:
+            expected = LOAD * (share * HALF - HALF) / (reach + HALF)
+            assert tension == pytest.approx(expected, rel=0.02, abs=0.5)
+    assert any(not medial for *_, medial, _ in found)
+    for (_, one, *_), (_, other, *_) in zip(found, found[::-1], strict=True):
+        assert apart(one, other) < 5e-6
+
+
+def test_a_knee_that_nothing_holds_is_indeterminate(flat):
+    external = push([0, LOAD, 0])
+    start = [0, TOUCH, 0, 0, 0, 0.3]
+    *_, balance = settle(*flat, external, start)
+    assert balance.status is BalanceStatus.INDETERMINATE
+    *_, balance = settle(*flat, push([20.0, LOAD, 0]), start)
+    assert balance.status is BalanceStatus.RUNS_AWAY
+    *_, balance = settle(*flat, push([0, LOAD, 0], [0, 0, 1.5 * HALF]), start, ("adduction",))
+    assert balance.status is not BalanceStatus.OK
+
+
+# Two spheres in two dishes
+
+
+@pytest.mark.parametrize("aside", [(0.0, 0.0), (0.2, 0.0), (0.0, 0.15)])
+def test_spheres_slide_down_their_dishes_to_where_the_load_points(dished, aside):
+    """The centre of a sphere hangs like a pendulum of length R_dish - R_ball + depth."""
+    force = np.array([aside[0] * LOAD, LOAD, aside[1] * LOAD])
+    level = np.array([0, HEIGHT + BALL, 0])
+    place, contact, balance = settle(
+        *dished, push(force, level), [0, TOUCH, 0, 0, 0, 0.3], ("ap", "ml")
+    )
+    assert balance.status is BalanceStatus.OK
+    assert min(balance.work, default=1.0) > 0
+    depth = sphere_depth(LOAD / 2)
+    hanging = -(DISH - BALL + depth) * force / np.linalg.norm(force)
+    assert np.allclose(place[[0, 2]], hanging[[0, 2]], atol=2e-4)
+    assert contact.wrench[0] == pytest.approx(-force[0], abs=0.1)
+
+
+STARTS = [
+    [5e-3, 3e-3, -5e-3, 0.0, 0.0],
+    [-5e-3, 2e-3, 5e-3, np.radians(5), np.radians(5)],
+    [3e-3, 4e-3, 5e-3, np.radians(-5), np.radians(-5)],
+]
+
+
+@pytest.mark.parametrize("away", STARTS)
+def test_starts_5_mm_and_5_deg_away_reach_the_same_rest(dished, away):
+    external = push([40.0, LOAD, -30.0], [1e-3, 0, 4e-3])
+    home = np.array([0, TOUCH, 0, 0, 0, 0.3])
+    near, _, first = settle(*dished, external, home)
+    far, contact, balance = settle(*dished, external, home + np.append(away, 0.0))
+    assert first.status is BalanceStatus.OK
+    assert balance.status is BalanceStatus.OK
+    assert apart(near, far) < 1e-5
+    assert min(balance.work) > 0
+    assert len(contact.condyles) == 2
+
+
+def test_work_depends_little_on_the_path_without_friction(dished):
+    """Round a loop of 0.5 mm sideways and 0.03 mm down the foundation gives or takes little."""
+    model, state = dished
+    probe = model.probe(state)
+    corners = np.array([[0, 0], [0.5, 0], [0.5, -0.03], [0, -0.03], [0, 0]]) * 1e-3
+    total, sides = 0.0, []
+    for one, other in pairwise(corners):
+        path = one + np.linspace(0, 1, 41)[:, None] * (other - one)
+        forces = []
+        for z, y in path:
+            place = np.array([0, TOUCH - 0.04e-3 + y, z, 0, 0, 0.3])
+            forces.append(-probe.at(knee_pose(place)).wrench[[2, 1]])
+        work = np.trapezoid(np.array(forces) @ (other - one), dx=1 / 40)
+        total += work
+        sides.append(abs(work))
+    assert abs(total) < 0.02 * max(sides)
+
+
+@pytest.mark.parametrize(
+    ("name", "resolution_mm"),
+    [
+        ("foundation", 1.0),
+        ("foundation-linear", 2.0),
+        ("hertz", 2.0),
+        pytest.param("lattice", 2.0, marks=pytest.mark.slow),
+        pytest.param("lattice-linear", 2.0, marks=pytest.mark.slow),
+        pytest.param("fe", 3.0, marks=pytest.mark.slow),
+    ],
+)
+def test_every_model_comes_to_rest_through_the_same_contract(name, resolution_mm):
+    model = contact_model(name, resolution_mm)
+    state = model.prepare(dished_joint())
+    external = push([20.0, LOAD, 0], [0, 0, 2e-3])
+    start = [0.3e-3, TOUCH, -0.3e-3, 0.01, 0, 0.3]
+    place, contact, balance = settle(model, state, external, start)
+    assert balance.status is BalanceStatus.OK
+    assert np.allclose(contact.wrench[:3], [-20, -LOAD, 0], atol=0.2)
+    assert contact.condyles["lateral"].force > contact.condyles["medial"].force
+    assert abs(place[2]) < 0.5e-3
