@@ -74,6 +74,16 @@ def load_case(scene: Scene) -> Case:
     motion = load_motion(
         scene.motion, scene.patient.side, parts.insert_mesh_in_insert, parts.femoral_mesh_in_femur
     )
+    if scene.motion.motion == "roll-slip":
+        from tkamb.rolling import rolling_motion
+
+        assert parts.femoral is not None and parts.insert is not None
+        table = scene.motion
+        motion = rolling_motion(
+            motion, parts.femoral, parts.insert, table.slip_share, table.cutoff_Hz
+        )
+    if scene.generic_ligaments:
+        scene = _with_generic_ligaments(scene, parts, chain.insert_in_tibia)
     tibia = ground = None
     if scene.tibia:
         from tkamb.inputs.tibia import load_tibia
@@ -106,12 +116,29 @@ def _with_mirrored_attachments(scene: Scene) -> Scene:
     return scene.model_copy(update={**lines, "ligament": bundles})
 
 
+def _with_generic_ligaments(scene: Scene, parts: "_Parts", pose_insert_in_tibia: Array) -> Scene:
+    """Return the scene with the generic bundles it asks for among its own."""
+    from tkamb.body.generic_ligaments import generic_ligaments
+
+    assert scene.generic_ligaments is not None
+    assert parts.femoral is not None and parts.insert is not None
+    bundles = generic_ligaments(
+        parts.femoral, parts.insert, pose_insert_in_tibia, scene.generic_ligaments.ligaments
+    )
+    return scene.model_copy(update={"ligament": scene.ligament + bundles})
+
+
 class _Parts:
     """The implant's surfaces in their own frames, and where their meshes' axes lie."""
 
     def __init__(self, scene: Scene) -> None:
         implant, self._left = scene.implant, scene.patient.side == "left"
-        wants_insert = scene.contact is not None or scene.motion.interpretation == "pose"
+        wants_insert = (
+            scene.contact is not None
+            or scene.generic_ligaments is not None
+            or scene.motion.interpretation == "pose"
+            or scene.motion.motion == "roll-slip"
+        )
         wants_femoral = wants_insert or scene.patella is not None
         self.femoral: Surface | None = None
         self.insert: Surface | None = None

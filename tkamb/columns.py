@@ -28,6 +28,9 @@ _GROUND = "[ground_reaction]"
 _IMPLANT = "[implant.femoral], [implant.insert]"
 _CONTACT = "[contact]"
 _MUSCLE = "[quadriceps], [patellar_ligament], [patella]"
+_COUPLED = "[contact] coupling or released"
+_POINTS = "[contact] coupling = 'points'"
+_FREE = "[contact] released"
 _ADJUST = "[contact] with adjust = true"
 
 LIGAMENT = "ligament_<name>_N"
@@ -36,8 +39,11 @@ LIGAMENT = "ligament_<name>_N"
 COLUMNS: tuple[Column, ...] = (
     Column("time_s", "time of the frame"),
     Column("flexion_deg", "knee flexion (Grood-Suntay)"),
-    Column("adduction_deg", "knee adduction, positive: varus"),
-    Column("axial_rotation_deg", "positive: the femur rotates externally on the tibia"),
+    Column("adduction_deg", "knee adduction, positive: varus; as solved where released"),
+    Column(
+        "axial_rotation_deg",
+        "positive: the femur rotates externally on the tibia; as solved where released",
+    ),
     Column("force_si_N", "contact force on the insert, no residuals: along -y, compression > 0"),
     Column("force_ap_N", "the same, insert x"),
     Column("force_ml_N", "the same, insert z"),
@@ -101,6 +107,23 @@ COLUMNS: tuple[Column, ...] = (
         "residual_sensitivity_N",
         "largest change of force_total_N when the residuals act 10 mm higher or lower",
     ),
+    *(
+        Column(f"{side}_{name}_velocity_mm_per_s", meaning.replace("<side>", side), needs)
+        for name, meaning, needs in (
+            ("slip", "rate of <side>_slip_mm, by arcs; positive: femur slides forwards", _IMPLANT),
+            ("sliding", "the same by rigid-body velocity at the <side> contact point", _CONTACT),
+            ("normal", "<side> contact point leaves the insert; zero: touch is kept", _CONTACT),
+        )
+        for side in ("medial", "lateral")
+    ),
+    Column("ap_mm", "femoral origin, insert x, at which the contact holds", _CONTACT),
+    Column("si_mm", "the same, insert y", _CONTACT),
+    Column("ml_mm", "the same, insert z", _CONTACT),
+    Column("coupling_iterations", "of body and contact until they agreed", _COUPLED, "integer"),
+    Column("coupling_change_N", "by the last of these, in the contact force", _COUPLED),
+    Column("coupling_change_mm", "the same, in the centres of pressure", _POINTS),
+    Column("contact_trials", "contacts computed to find the released pose", _FREE, "integer"),
+    Column("softest_N_per_mm", "smallest stiffness of the released pose (lever 25 mm)", _FREE),
 )
 
 KINDS: dict[str, Kind] = {column.name: column.kind for column in COLUMNS}

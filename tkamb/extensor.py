@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     from tkamb.case import Case
     from tkamb.geometry.surface import Surface
 
-BAND = 0.012
-"""m: the lines wrap the sections within this distance of their own sagittal plane."""
-
 USABLE = (PatellaStatus.OK, PatellaStatus.SEVERAL, PatellaStatus.EDGE)
 
 
@@ -209,7 +206,7 @@ def _quadriceps(case: "Case") -> StringLine:
             surfaces.append(_bone(case, table.bone))
         outline = sagittal_outline(
             surfaces,
-            np.linspace(-BAND, BAND, 7) + case.chain.patella_joint_in_femur[2, 3],
+            _band(table.band_mm) + case.chain.patella_joint_in_femur[2, 3],
             table.half_thickness_mm * MILLIMETRE,
             below=float(transform(case.chain.link_in(table.origin.link, "femur"), ends[0])[1]),
         )
@@ -230,7 +227,7 @@ def _ligament(case: "Case") -> StringLine:
         )
         outline = sagittal_outline(
             [case.insert],
-            np.linspace(-BAND, BAND, 7) + place[2],
+            _band(table.band_mm) + place[2],
             table.half_thickness_mm * MILLIMETRE,
         )
     return StringLine(
@@ -242,6 +239,11 @@ def _ligament(case: "Case") -> StringLine:
         outline,
         "insert",
     )
+
+
+def _band(half_width_mm: float) -> Array:
+    """Return the sagittal planes (n,) m, about the line's own, whose sections are wrapped."""
+    return np.linspace(-half_width_mm, half_width_mm, 7) * MILLIMETRE
 
 
 def _on_tibia(load: PointForces) -> PointForces:

@@ -18,6 +18,7 @@ from tkamb.units import DEGREE, MILLIMETRE
 if TYPE_CHECKING:
     from tkamb.body.ligaments import Ligament
     from tkamb.body.patella import PatellaState
+    from tkamb.body.slip import CondyleSlip
     from tkamb.geometry.adjustment import Adjustment
     from tkamb.geometry.closest import ClosestPointQuery, CondyleGap
 
@@ -28,6 +29,9 @@ what fluoroscopy errs by (the source, 4.3)."""
 
 FARTHEST_GAP = 3e-3
 """m: a femoral component farther from the insert, or deeper in it, is misplaced."""
+
+STRAIN_FLEXIONS = (0.0, 60.0, 90.0)
+"""deg: where the strains of the ligaments are shown."""
 
 NAN = float("nan")
 
@@ -85,6 +89,7 @@ class Mechanics:
         friction: Coulomb coefficient of the femorotibial contact.
         extensor: patella and lines of action of all frames; None if not modelled.
         ligaments: the bundles, with their slack lengths.
+        strains: bundle -> strain at the flexions of `STRAIN_FLEXIONS`; NaN if not recorded.
     """
 
     def __init__(self, case: Case) -> None:
@@ -97,7 +102,7 @@ class Mechanics:
             from tkamb.extensor import ExtensorFrames
 
             self.extensor = ExtensorFrames(case, self.poses)
-        self.ligaments = self._build_ligaments()
+        self.ligaments, self.strains = self._build_ligaments()
 
     def frame(self, k: int) -> FrameLoads:
         """Return the loads of frame k; a frame that cannot be solved holds NaN."""
@@ -155,8 +160,8 @@ class Mechanics:
         velocity, spin = knee_twist(coordinates, self.case.motion.velocity[k])
         return np.asarray(velocity + np.cross(spin, point - coordinates[:3]))
 
-    def slips(self) -> dict[str, Array]:
-        """Return side -> slip (f,) m since the first frame; empty without the two surfaces."""
+    def slips(self) -> "dict[str, CondyleSlip]":
+        """Return side -> rolling and slipping of all frames; empty without the two surfaces."""
         case = self.case
         if self.query is None or case.femoral is None or case.insert is None:
             return {}
@@ -164,7 +169,7 @@ class Mechanics:
 
         found = condyle_slip(case.femoral, case.insert, case.split, case.motion.coordinates)
         return {
-            side: slip.slip
+            side: slip
             for side, slip in zip(("medial", "lateral"), found, strict=True)
             if slip is not None
         }
@@ -242,10 +247,13 @@ class Mechanics:
         names = [bundle.name for bundle in self.ligaments]
         return dict(zip(names, tensions.tolist(), strict=True)), loads
 
-    def _build_ligaments(self) -> "tuple[Ligament, ...]":
+    def _build_ligaments(
+        self,
+    ) -> "tuple[tuple[Ligament, ...], dict[str, tuple[float, ...]]]":
+        """Return the bundles, and their strains so that a wrong insertion is seen."""
         if not self.case.scene.ligament:
-            return ()
-        from tkamb.body.ligaments import build_ligaments
+            return (), {}
+        from tkamb.body.ligaments import build_ligaments, strain_table
 
         recorded = self.case.motion.coordinates
         states = [self.case.chain.at(self._chain_motion(k, x)) for k, x in enumerate(recorded)]
@@ -254,7 +262,8 @@ class Mechanics:
             for link in self._attachment_links()
         }
         flexion = self.case.motion.coordinates[:, 5]
-        return build_ligaments(self.case.scene.ligament, poses, flexion)
+        bundles = build_ligaments(self.case.scene.ligament, poses, flexion)
+        return bundles, strain_table(bundles, poses, flexion, STRAIN_FLEXIONS)
 
     def _attachment_links(self) -> set[str]:
         ends = [end for table in self.case.scene.ligament for end in (table.proximal, table.distal)]

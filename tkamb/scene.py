@@ -58,6 +58,16 @@ class MotionTable(_Table):
     """
 
     file: Path
+    motion: Literal["recorded", "roll-slip"] = Field(
+        "recorded",
+        description=(
+            "'roll-slip' (the source): rotations and ML as recorded, AP from rolling plus slip, "
+            "SI from first touch; needs the implant"
+        ),
+    )
+    slip_share: float = Field(
+        1.0, ge=0, description="roll-slip: share of the recorded slip; 0 is pure rolling"
+    )
     format: Literal["csv", "sto", "mot"] | None = Field(None, description="default: the suffix")
     interpretation: Literal["coordinates", "pose"] = "coordinates"
     sequence: str | None = Field(
@@ -88,9 +98,11 @@ class MotionTable(_Table):
     )
 
     @model_validator(mode="after")
-    def _sequence_goes_with_pose(self) -> Self:
+    def _keys_go_together(self) -> Self:
         if (self.interpretation == "pose") != (self.sequence is not None):
             raise ValueError("'sequence' belongs to interpretation = 'pose', and is needed there")
+        if self.motion == "recorded" and "slip_share" in self.model_fields_set:
+            raise ValueError("'slip_share' belongs to motion = 'roll-slip'")
         return self
 
 
@@ -264,6 +276,18 @@ class LigamentTable(_Table):
         return self
 
 
+class GenericLigamentsTable(_Table):
+    """A generic set for a patient who has none of their own, scaled to the implant.
+
+    Its bundles are nobody's: they are named `generic_...` in the results, and the table of
+    strains shows whether they suit the knee.
+    """
+
+    ligaments: tuple[Literal["MCL", "LCL", "PCL", "ACL"], ...] = Field(
+        ("MCL", "LCL", "PCL"), min_length=1, description="those that the patient has"
+    )
+
+
 class BoneTable(_Table):
     """A bone's mesh, which a line may wrap beside the implant."""
 
@@ -284,6 +308,14 @@ class QuadricepsTable(_Table):
     wrap: bool = True
     bone: BoneTable | None = None
     half_thickness_mm: float = Field(3.5, ge=0, description="of the tendon, off the outline")
+    band_mm: float = Field(
+        5.0,
+        ge=0,
+        description=(
+            "wraps the sections within this distance of its sagittal plane: as far as, on "
+            "average, the fibres of a lamina 20 mm wide; wider ones ride on the flanges"
+        ),
+    )
 
 
 class PatellarLigamentTable(_Table):
@@ -299,6 +331,7 @@ class PatellarLigamentTable(_Table):
     )
     wrap: bool = True
     half_thickness_mm: float = Field(2.5, ge=0)
+    band_mm: float = Field(5.0, ge=0, description="likewise, of the insert's lip")
 
 
 class PatellaTable(_Table):
@@ -359,6 +392,7 @@ class Scene(_Table):
     ground_reaction: GroundReactionTable | None = None
     implant: ImplantTable = ImplantTable()
     ligament: tuple[LigamentTable, ...] = ()
+    generic_ligaments: GenericLigamentsTable | None = None
     quadriceps: QuadricepsTable | None = None
     patellar_ligament: PatellarLigamentTable | None = None
     patella: PatellaTable | None = None
@@ -370,6 +404,10 @@ class Scene(_Table):
         names = [ligament.name for ligament in self.ligament]
         if len(names) != len(set(names)):
             raise ValueError("two [[ligament]] tables have the same name")
+        generic = self.generic_ligaments.ligaments if self.generic_ligaments else ()
+        for name in names:
+            if name.removeprefix("generic_").startswith(generic):
+                raise ValueError(f"'{name}' is in [generic_ligaments] and in [[ligament]]")
         parts = (self.quadriceps, self.patellar_ligament, self.patella)
         if any(parts) and not all(parts):
             raise ValueError(
@@ -379,8 +417,14 @@ class Scene(_Table):
         solved = self.patella is not None and self.patella.motion == "solved"
         if solved and (ligament is None or ligament.length_mm is None):
             raise ValueError("[patella] motion = 'solved' needs [patellar_ligament] length_mm")
-        if self.contact and not (self.implant.femoral and self.implant.insert):
-            raise ValueError("[contact] needs [implant.femoral] and [implant.insert]")
+        needs_implant = {
+            "[contact]": self.contact is not None,
+            "[generic_ligaments]": bool(generic),
+            "[motion] motion = 'roll-slip'": self.motion.motion == "roll-slip",
+        }
+        for name, asked in needs_implant.items():
+            if asked and not (self.implant.femoral and self.implant.insert):
+                raise ValueError(f"{name} needs [implant.femoral] and [implant.insert]")
         if self.ground_reaction and not self.tibia:
             raise ValueError("[ground_reaction] needs [tibia]: how the shank stands in the lab")
         return self

@@ -77,7 +77,7 @@ TUBEROSITY = (38.0, -19.0, 3.0)
 """Tibial tuberosity, insert frame."""
 PATELLAR_LIGAMENT_LENGTH = 50.0
 QUADRICEPS_HALF_THICKNESS = 3.5
-QUADRICEPS_WIDTH_HALF = 12.0
+QUADRICEPS_WIDTH_HALF = 5.0
 PATELLA_CENTRE_OF_MASS = (4.0, 0.0, 0.0)
 
 # --- squat -------------------------------------------------------------------------------

@@ -30,6 +30,9 @@ from tkamb.units import DEGREE, MILLIMETRE
 TOE_STRAIN = 0.03
 """eps1: the toe region ends at twice this strain, the same for every ligament."""
 
+FARTHEST_REFERENCE = 15.0 * DEGREE
+"""rad: a recorded frame farther than this from the reference flexion is no reference pose."""
+
 Law = Literal["two-line", "quadratic-toe"]
 
 
@@ -161,7 +164,8 @@ def build_ligaments(
         flexion: (f,) rad, of the same frames.
 
     Raises:
-        InputError: unknown link, or an end that lies on the other one.
+        InputError: unknown link, an end that lies on the other one, or no recorded frame near
+            the reference flexion.
     """
     return tuple(_build(table, poses, np.asarray(flexion, float)) for table in tables)
 
@@ -186,16 +190,26 @@ def _build(table: LigamentTable, poses: Mapping[str, Array], flexion: Array) -> 
         stiffness,
         1.0,
     )
-    length = float(
-        bundle.length(_frame(poses, nearest_frame(flexion, table.reference_flexion_deg)))
-    )
+    reference = nearest_frame(flexion, table.reference_flexion_deg)
+    length = float(bundle.length(_frame(poses, reference)))
     if length == 0.0:
         raise InputError("both ends are the same point", f"ligament {table.name}")
     if table.slack_length_mm is not None:
         slack = table.slack_length_mm * MILLIMETRE
     else:
+        _check_reference(table, float(flexion[reference]))
         slack = length / (1.0 + float(table.reference_strain or 0.0))
     return Ligament(**{**vars(bundle), "slack_length": slack})
+
+
+def _check_reference(table: LigamentTable, flexion: float) -> None:
+    if abs(flexion - table.reference_flexion_deg * DEGREE) > FARTHEST_REFERENCE:
+        raise InputError(
+            f"its reference pose is at {table.reference_flexion_deg:g} deg of flexion, but the "
+            f"nearest recorded frame is at {flexion / DEGREE:.0f} deg",
+            f"ligament {table.name}",
+            "give slack_length_mm, or a reference strain at a flexion that was recorded",
+        )
 
 
 def nearest_frame(flexion: Array, flexion_deg: float) -> int:

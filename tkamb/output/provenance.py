@@ -24,6 +24,8 @@ SUMMARY_KEYS: dict[str, str] = {
     "notes": "list of sentences: assumptions, departures, what a reader must know",
     "assumptions": "list of sentences",
     "not_modelled": "list: what the scene leaves out",
+    "first_wrapping_flexion_deg": "least flexion at which the quadriceps wraps the femur; or null",
+    "ligament_strain": "flexion_deg: list; strain: bundle -> list, null where not recorded",
     "failed_frames": "list of {frame, time_s, status}",
 }
 """What `Results.summary` may hold for the report, beyond anything else that JSON can hold."""

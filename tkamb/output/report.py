@@ -16,7 +16,7 @@ from tkamb.output.pressure_maps import draw_maps, draw_paths, mapped_frames, top
 from tkamb.output.provenance import provenance_rows, sentences
 from tkamb.output.report_style import CSS, NOTEBOOK_CSS
 from tkamb.output.style import svg_text
-from tkamb.output.tables import flags_table, motion_table
+from tkamb.output.tables import flags_table, motion_table, strain_table
 from tkamb.results import Results
 
 
@@ -147,6 +147,7 @@ def _tables_section(results: Results, axis: HorizontalAxis) -> str:
         f"{motion_table(results, axis)}"
         "<p class='legend'>Recorded frames nearest to each place; nothing is interpolated. "
         "All columns of all frames are in results.csv.</p>"
+        f"{strain_table(results.summary)}"
         f"<h2>Frames to be read with care</h2>{flags_table(results, axis)}</section>\n"
     )
 

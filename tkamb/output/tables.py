@@ -1,9 +1,10 @@
 """The report's tables: the motion at round places, and the frames to be read with care."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from itertools import zip_longest
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,31 @@ def motion_table(results: Results, axis: HorizontalAxis) -> str:
         for k in axis.stops(13 if axis.kind == "flexion" else 11)
     )
     return f"<table class='numbers'><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def strain_table(summary: Mapping[str, Any]) -> str:
+    """Return the HTML table of the ligaments' strains, so that a wrong insertion is seen."""
+    found = summary.get("ligament_strain")
+    if not found:
+        return ""
+    head = "".join(f"<th>{angle:g}°</th>" for angle in found["flexion_deg"])
+    rows = "".join(
+        f"<tr><td>{escape(name)}</td>"
+        + "".join(f"<td>{_number(_percent(value), 1)}</td>" for value in strain)
+        + "</tr>"
+        for name, strain in found["strain"].items()
+    )
+    return (
+        "<details><summary>Ligament strain at three flexions, %</summary>"
+        "<p class='legend'>Negative: slack. A bundle beyond about 10 % is attached at the wrong "
+        "place or has the wrong slack length. –: no recorded frame within 10°.</p>"
+        f"<table class='numbers'><thead><tr><th>bundle</th>{head}</tr></thead>"
+        f"<tbody>{rows}</tbody></table></details>"
+    )
+
+
+def _percent(strain: float | None) -> float:
+    return float("nan") if strain is None else 100.0 * strain
 
 
 def flags_table(results: Results, axis: HorizontalAxis) -> str:
