@@ -1,0 +1,244 @@
+"""A run that is killed or interrupted: whole files, a readable part, and the same end."""
+
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scenes import MODEL, write_scene
+from tkamb.cli import main
+from tkamb.errors import InputError
+from tkamb.output.maps_file import read_maps
+from tkamb.output.shards import Shard, Shards
+from tkamb.recorder import interrupt_later
+from tkamb.results import Results, read_results
+from tkamb.simulation import simulate
+
+ROOT = Path(__file__).parents[1]
+CLOCKS = ("body_seconds", "query_seconds", "contact_seconds")
+FRAMES = ("--frames", "0:40:2")
+TOTAL = 20
+
+
+def start(scene, out, *more):
+    command = [sys.executable, "-m", "tkamb.cli", "run", str(scene), "--out", str(out)]
+    command += [*more, *FRAMES]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def wait_for_frames(process, out, count):
+    """Wait until that many frames are there or the run has ended."""
+    while process.poll() is None and len(list((out / ".frames").glob("*.frame"))) < count:
+        time.sleep(0.002)
+
+
+def kill(process):
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+
+
+def check_whole(out):
+    """Every file that stands in the folder can be read, and says what it holds."""
+    names = {path.name for path in out.iterdir() if not path.name.startswith(".")}
+    assert names <= {"results.csv", "summary.json", "contact.h5", "report.html"}
+    if "contact.h5" in names:
+        maps = read_maps(out / "contact.h5")
+        assert np.isfinite(maps.pressure_Pa).all()
+    if names >= {"results.csv", "summary.json"}:
+        results = read_results(out)
+        assert len(results) == TOTAL
+        done = [not status.startswith("failed: not computed") for status in results.status]
+        assert done == sorted(done, reverse=True)
+        assert np.isfinite(results["force_si_N"][done]).all()
+        assert np.isnan(results["force_si_N"][np.invert(done)]).all()
+
+
+def check_same(found: Results, undisturbed: Results, tolerance=0.0):
+    assert found.status == undisturbed.status
+    assert list(found.columns) == list(undisturbed.columns)
+    for name in found.columns:
+        if name != "status" and name not in CLOCKS:
+            np.testing.assert_allclose(
+                found[name], undisturbed[name], rtol=tolerance, atol=1e-12, err_msg=name
+            )
+    if undisturbed.maps is not None:
+        peak = np.nanmax(undisturbed.maps.pressure_Pa)
+        np.testing.assert_allclose(
+            found.maps.pressure_Pa, undisturbed.maps.pressure_Pa, atol=tolerance * peak
+        )
+
+
+@pytest.fixture(scope="module")
+def undisturbed():
+    return simulate(MODEL / "scene.toml", frames=slice(0, 40, 2))
+
+
+def kill_and_resume(out, waits):
+    """Kill a run once for each wait (frames, s), going on each time; return the results."""
+    for count, seconds in waits:
+        process = start(MODEL / "scene.toml", out, "--resume")
+        wait_for_frames(process, out, count)
+        time.sleep(seconds)
+        kill(process)
+        if out.exists():
+            check_whole(out)
+    process = start(MODEL / "scene.toml", out, "--resume")
+    assert process.wait(timeout=300) == 0, process.stderr.read()
+    process.communicate()
+    assert not (out / ".frames").exists()
+    return read_results(out)
+
+
+def test_killed_twice_the_run_ends_as_the_undisturbed_one(tmp_path, undisturbed):
+    found = kill_and_resume(tmp_path / "out", [(3, 0.01), (11, 0.0)])
+    check_same(found, undisturbed)
+    assert found.summary["resumed_frames"] >= 11
+
+
+@pytest.mark.slow
+def test_killed_at_twenty_random_moments_likewise(tmp_path, undisturbed):
+    chance = random.Random(7)
+    moments = [(chance.randrange(1, TOTAL + 1), chance.random() ** 2) for _ in range(20)]
+    check_same(kill_and_resume(tmp_path / "out", sorted(moments)), undisturbed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["lattice-linear", "lattice"])
+def test_a_lattice_goes_on_within_its_tolerance(tmp_path, model):
+    frames = slice(30, 50, 2)
+    options = {"contact": model, "resolution_mm": 2.0, "frames": frames}
+    whole = simulate(MODEL / "scene.toml", **options)
+    stop_after(tmp_path, 4, **options)
+    found = simulate(MODEL / "scene.toml", directory=tmp_path, resume=True, **options)
+    for name in ("approach_mm", "medial_force_N", "medial_peak_pressure_MPa"):
+        np.testing.assert_allclose(found[name], whole[name], rtol=3e-3, err_msg=name)
+
+
+@pytest.mark.slow
+def test_released_coordinates_go_on_where_they_were(tmp_path):
+    scene = write_scene(tmp_path / "scene", contact__released=["adduction"])
+    options = {"frames": slice(30, 40, 2)}
+    whole = simulate(scene, **options)
+    out = tmp_path / "out"
+    out.mkdir()
+    stop_after(out, 3, scene=scene, **options)
+    check_same(simulate(scene, directory=out, resume=True, **options), whole, tolerance=1e-6)
+
+
+def stop_after(directory, count, scene=MODEL / "scene.toml", **options):
+    """Interrupt a run after that many frames."""
+
+    def progress(indices):
+        for number, k in enumerate(indices):
+            if number == count:
+                raise KeyboardInterrupt
+            yield k
+
+    with pytest.raises(KeyboardInterrupt, match=f"{count} of "):
+        simulate(scene, directory=directory, progress=progress, **options)
+
+
+def test_an_interrupt_leaves_a_readable_part_and_says_so(tmp_path):
+    out = tmp_path / "out"
+    process = start(MODEL / "scene.toml", out)
+    wait_for_frames(process, out, 4)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    lines = said.decode().strip().splitlines()
+    done = int(re.fullmatch(r"tkamb: interrupted: (\d+) of 20 frames .*--resume", lines[-1])[1])
+    assert 4 <= done < TOTAL
+    check_whole(out)
+    results = read_results(out)
+    assert len(results.maps) == done
+    assert results.summary["unfinished_frames"] == TOTAL - done
+    assert [s.startswith("failed: not computed") for s in results.status].index(True) == done
+
+
+def test_without_contact_a_run_goes_on_too(tmp_path):
+    scene = write_scene(tmp_path / "scene", ("contact",))
+    out = tmp_path / "out"
+    out.mkdir()
+    stop_after(out, 3, scene=scene, frames=slice(0, 8))
+    assert not (out / "contact.h5").exists()
+    found = simulate(scene, frames=slice(0, 8), directory=out, resume=True)
+    check_same(found, simulate(scene, frames=slice(0, 8)))
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"frames": slice(0, 7)}, "another choice of frames"),
+        ({"contact": "hertz"}, "another scene"),
+        ({"resolution_mm": 2.0}, "another scene"),
+    ],
+)
+def test_another_run_is_not_resumed(tmp_path, change, word):
+    options = {"frames": slice(0, 8)}
+    stop_after(tmp_path, 2, **options)
+    with pytest.raises(InputError, match=word):
+        simulate(MODEL / "scene.toml", directory=tmp_path, resume=True, **(options | change))
+    assert (tmp_path / ".frames").exists()
+
+
+def test_a_changed_file_is_another_run(tmp_path, capsys):
+    scene = write_scene(tmp_path / "scene", ("contact",))
+    out = tmp_path / "out"
+    out.mkdir()
+    stop_after(out, 2, scene=scene, frames=slice(0, 8))
+    motion = scene.parent / "motion.csv"
+    motion.write_text(motion.read_text() + "\n")
+    given = ["run", str(scene), "--out", str(out), "--frames", "0:8", "--resume"]
+    assert main(given) == 2
+    said = capsys.readouterr().err
+    assert "another content of a file" in said and said.count("\n") == 1
+
+
+def test_a_finished_run_is_not_computed_again(tmp_path, capsys):
+    given = ["run", str(MODEL / "scene.toml"), "--out", str(tmp_path), "--frames", "0:3"]
+    assert main(given) == 0
+    before = (tmp_path / "results.csv").read_bytes()
+    assert main([*given, "--resume"]) == 0
+    assert (tmp_path / "results.csv").read_bytes() == before
+    assert main([*given[:-1], "0:4", "--resume"]) == 2
+    assert "another choice of frames" in capsys.readouterr().err
+
+
+def test_nothing_to_resume_begins_at_the_beginning(tmp_path):
+    found = simulate(MODEL / "scene.toml", frames=slice(0, 2), directory=tmp_path, resume=True)
+    assert len(found) == 2
+    with pytest.raises(InputError, match="no folder"):
+        simulate(MODEL / "scene.toml", frames=slice(0, 2), resume=True)
+
+
+def test_a_torn_shard_counts_as_absent(tmp_path):
+    shards = Shards(tmp_path, {"scene": "a"}, resume=False)
+    shards.put(3, Shard({"time_s": 0.1, "x": float("nan")}, {"pressure": np.arange(4.0)}))
+    found = shards.get(3)
+    assert found.row["time_s"] == 0.1 and np.isnan(found.row["x"])
+    assert np.array_equal(found.contact["pressure"], np.arange(4.0))
+    path = next((tmp_path / ".frames").glob("*.frame"))
+    whole = path.read_bytes()
+    for size in (0, 10, 40, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        assert shards.get(3) is None
+    assert shards.get(4) is None
+
+
+def test_an_interrupt_waits_until_a_frame_is_written():
+    reached = []
+
+    def write():
+        with interrupt_later():
+            signal.raise_signal(signal.SIGINT)
+            reached.append(True)
+
+    with pytest.raises(KeyboardInterrupt):
+        write()
+    assert reached
