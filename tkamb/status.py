@@ -28,7 +28,8 @@ def frame_status(case: Case, k: int, body: FrameLoads, contact: "FrameContact | 
     if contact and contact.problem and not failures:
         failures.append(contact.problem)
     words = [*_motion_flags(case, k), *_flank_flags(body)]
-    words += [_lift_off(body, side) for side in sorted(body.loads.lifted)]
+    settled = contact is not None and contact.settled is not None
+    words += [_lift_off(body, side, settled) for side in sorted(body.loads.lifted)]
     if body.loads.slack:
         words.append("flexors needed, which are not modelled: quadriceps slack")
     words += list(contact.flags) if contact else []
@@ -37,7 +38,9 @@ def frame_status(case: Case, k: int, body: FrameLoads, contact: "FrameContact | 
     return "; ".join(words) or "ok"
 
 
-def _lift_off(body: FrameLoads, side: str) -> str:
+def _lift_off(body: FrameLoads, side: str, settled: bool) -> str:
+    if settled:
+        return f"{side} condyle lifts off"
     if side in body.geometry.lifted:
         return f"{side} condyle off the insert as recorded"
     return f"{side} condyle unloaded: the other one alone balances the adduction moment"
