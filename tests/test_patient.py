@@ -1,5 +1,7 @@
 """The patient's URDF: mirror, default segments, and what is refused."""
 
+import re
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -11,6 +13,9 @@ from tkamb.geometry.frames import MIRROR, mirrored_pose
 from tkamb.inputs.patient import load_urdf
 from tkamb.inputs.segments import segment_inertia
 from tkamb.scene import PatientTable
+
+
+LOOP = '<joint name="loop" type="fixed"><parent link="femur"/><child link="tibia"/></joint>'
 
 
 def table(tmp_path, text, side="right", **more):
@@ -103,7 +108,11 @@ def test_segment_inertia_is_that_of_its_radii():
         (lambda t: t.replace('axis xyz="0 -1 0"', 'axis xyz="0 1 0"'), "knee_axial_rotation"),
         (lambda t: t.replace('mass value="10.5"', 'mass value="0"'), "singular inertia"),
         (lambda t: t.replace('ixx="0.2"', 'ixx="0.9"'), "singular inertia"),
-        (lambda t: t.replace('ixx="0.2"', 'ixx="wide"'), "not numbers"),
+        (lambda t: t.replace('ixx="0.2"', 'ixx="wide"'), "not a number"),
+        (lambda t: t.replace('<mass value="', '<mass value="1 ', 1), "not a number"),
+        (lambda t: re.sub('xyz="[^"]*"', 'xyz="1 2"', t, count=1), "not 3 numbers"),
+        (lambda t: t.replace("</robot>", '<link name="lonely"/></robot>'), "2 roots .*lonely"),
+        (lambda t: t.replace("</robot>", LOOP + "</robot>"), "'tibia' hangs on a second joint"),
         (lambda t: t[:-20], "not a readable URDF"),
     ],
 )

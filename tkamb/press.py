@@ -28,6 +28,9 @@ from tkamb.inputs.meshes import axes_rotation, load_surface, mirrored
 from tkamb.press_report import PressReport, Side
 from tkamb.units import DEGREE, LENGTH
 
+LARGEST_LOAD = 1e5
+"""N, over a hundred body weights."""
+
 
 def press_meshes(
     femoral: str | Path,
@@ -70,6 +73,9 @@ def press_meshes(
             lie over the insert, or not near it where it is to be adjusted.
     """
     check_load(load)
+    if load > LARGEST_LOAD:
+        limit = f"no knee carries more than {LARGEST_LOAD:g} N"
+        raise InputError(f"impossible load {load:g} N", mend=f"{limit}; is it in N?")
     model = contact_model(contact, resolution_mm, **(options or {}))
     pair, placed = load_pair(femoral, insert, units, pose, bearing, material, axes, side)
     if not math.isfinite(first_touch_height(pair, placed)):

@@ -114,7 +114,7 @@ def _cells(
     ticks = (np.arange(RIM_RAYS) + 0.5) / RIM_RAYS - 0.5
     offsets = resolution * np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
     rays = centres[rim, None] + offsets
-    on = np.isfinite(_first(caster, rays.reshape(-1, 2))[0]).reshape(len(rim), -1)
+    on = np.isfinite(_first(caster, rays.reshape(-1, 2))[0]).reshape(len(rim), RIM_RAYS**2)
     count = on.sum(axis=1)
     mean = np.einsum("ij,ijk->ik", on, rays) / np.maximum(count, 1)[:, None]
     away = np.where(on, np.linalg.norm(rays - mean[:, None], axis=2), np.inf)

@@ -11,13 +11,16 @@ import math
 from dataclasses import fields
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tkamb.contact.model import ContactModel
 from tkamb.errors import InputError
 from tkamb.units import MILLIMETRE
 
 ENTRY_POINT_GROUP = "tkamb.contact"
+
+COARSEST_MM = 10.0
+"""A condyle's contact is 5 to 20 mm across: a coarser map resolves nothing."""
 
 BUILT_IN = {
     "hertz": "tkamb.contact.hertz:Hertz",
@@ -68,20 +71,30 @@ def contact_model(name: str, resolution_mm: float = 1.0, **options: Any) -> Cont
         options: the model's own options, the fields of its class (SI).
 
     Raises:
-        InputError: no such name or option, or a resolution that is not positive.
+        InputError: no such name or option, an option's value that is none of its words, or
+            a resolution that is not positive or resolves no contact.
     """
-    found = contact_class(name)
-    if not (math.isfinite(resolution_mm) and resolution_mm > 0):
-        raise InputError(f"resolution {resolution_mm} mm", f"contact model '{name}'", "give > 0")
+    found, where = contact_class(name), f"contact model '{name}'"
+    if not (math.isfinite(resolution_mm) and 0 < resolution_mm <= COARSEST_MM):
+        mend = f"give more than 0, at most {COARSEST_MM:g} mm"
+        raise InputError(f"resolution {resolution_mm} mm", where, mend)
     known = [field.name for field in fields(found) if field.init]  # type: ignore[arg-type]
-    for option in options:
-        if option not in known:
-            raise InputError(
-                f"has no option '{option}'",
-                f"contact model '{name}'",
-                f"it has: {', '.join(known)}",
-            )
+    own = [option for option in known if option != "resolution"]
+    for option, value in options.items():
+        if option not in own:
+            mend = f"it has: {', '.join(own)}" if own else "it has none"
+            raise InputError(f"has no option '{option}'", where, mend)
+        words = _words(found, option)
+        if words and value not in words:
+            mend = f"one of {', '.join(map(str, words))}"
+            raise InputError(f"option '{option}' cannot be {value!r}", where, mend)
     return found(resolution=resolution_mm * MILLIMETRE, **options)  # type: ignore[call-arg]
+
+
+def _words(model: type[ContactModel], option: str) -> tuple[Any, ...]:
+    """Return the words that an option declared as Literal may be; empty for another type."""
+    kind = get_type_hints(model)[option]
+    return get_args(kind) if get_origin(kind) is Literal else ()
 
 
 def contact_descriptions() -> dict[str, str]:

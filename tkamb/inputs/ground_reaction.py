@@ -55,12 +55,14 @@ def load_ground_reaction(
         side: of the knee; a left foot is mirrored.
 
     Raises:
-        InputError: file or columns cannot be used, do not cover `time`, or a centre of
-            pressure is missing or not level while the plate is loaded.
+        InputError: file or columns cannot be used, do not cover `time`, the force is not
+            mainly upwards, or a centre of pressure is missing or not level while the plate is
+            loaded.
     """
     recorded = read_table(table.file, table.format)
     stamps = recorded.time(table.columns.get("time", "time"))
     force, point, moment = _recorded(table, recorded)
+    _check_upward(force, table, recorded)
     loaded = force[:, 1] >= table.unloaded_N
     point = _held(stamps, point, loaded, recorded)
     level = float(np.median(point[loaded, 1])) if loaded.any() else 0.0
@@ -96,6 +98,20 @@ def _recorded(table: GroundReactionTable, recorded: Table) -> tuple[Array, Array
     values = np.stack(columns, axis=1).reshape(-1, 3, 3) @ rotation.T
     scale = recorded.unit_scale(table.length_unit, "length_unit")
     return values[:, 0], values[:, 1] * scale, values[:, 2]
+
+
+def _check_upward(force: Array, table: GroundReactionTable, recorded: Table) -> None:
+    """Raise where the largest force on the foot points down or sideways."""
+    up, down = float(force[:, 1].max()), float(-force[:, 1].min())
+    aside = float(np.hypot(force[:, 0], force[:, 2]).max())
+    if max(down, aside) > max(up, table.unloaded_N):
+        word, size = ("down", down) if down > aside else ("sideways", aside)
+        raise InputError(
+            f"the ground pushes the foot up with {max(up, 0.0):.4g} N at most, but {word} with "
+            f"{size:.4g} N",
+            recorded.path,
+            "check [ground_reaction] columns and laboratory_axes; it is the force on the foot",
+        )
 
 
 def _held(stamps: Array, point: Array, loaded: np.ndarray, recorded: Table) -> Array:

@@ -118,10 +118,14 @@ def read_triangles(path: str | Path) -> tuple[Array, Indices]:
         InputError: no such file, not a mesh, no triangles, or NaN.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError("no such mesh file", path, "check the path")
     try:
+        if not path.is_file():
+            raise InputError("no such mesh file", path, "check the path")
         mesh = trimesh.load(path, force="mesh", process=False)
+    except InputError:
+        raise
+    except ImportError:  # an STL that is not binary goes to the reader of text, which is extra
+        raise InputError("cannot be read as a mesh (cut short, or text)", path, _FORMATS) from None
     except Exception as error:  # readers of many formats: each raises what it likes
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(f"cannot be read as a mesh ({reason})", path, _FORMATS) from None

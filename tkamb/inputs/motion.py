@@ -24,11 +24,15 @@ from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import angle_scale, check_roles, poses_of_columns
 from tkamb.inputs.tables import Table, read_table
 from tkamb.scene import MotionTable
-from tkamb.units import DEGREE
+from tkamb.units import DEGREE, MILLIMETRE
 
 PATELLA_COORDINATES = ("patella_ap", "patella_si", "patella_rotation")
 LIMITS_DEG = {"axial_rotation": (-90, 90), "adduction": (-45, 45), "flexion": (-45, 180)}
 """Beyond these, columns, axes or units are mistaken; adduction also stays off its gimbal."""
+FARTHEST_M = 0.2
+"""The femoral origin lies within a hand's breadth of the insert; beyond, units are mistaken."""
+SLOWEST_S = 5.0
+"""Samples farther apart than this are no record of a movement: the time is in another unit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +106,7 @@ def load_motion(
         if side == "left":
             knee[:, KNEE_COORDINATES.index("ml")] *= -1.0
     _check_angles(knee, recorded)
+    _check_places(knee, recorded)
     named = [c for c in PATELLA_COORDINATES if c in table.columns or c in recorded.columns]
     patella = _recorded_coordinates(recorded, table, PATELLA_COORDINATES) if named else None
     return _differentiated(time, knee, patella, table, recorded)
@@ -140,6 +145,28 @@ def _check_angles(knee: Array, recorded: Table) -> None:
             )
 
 
+def _check_places(knee: Array, recorded: Table) -> None:
+    for name in ("ap", "si", "ml"):
+        place = knee[:, KNEE_COORDINATES.index(name)]
+        if np.abs(place).max() > FARTHEST_M:
+            raise InputError(
+                f"{name} runs from {place.min() / MILLIMETRE:.4g} to "
+                f"{place.max() / MILLIMETRE:.4g} mm off the insert, which no knee does",
+                recorded.path,
+                "check [motion] columns, length_unit and where the meshes have their origin",
+            )
+
+
+def _check_rate(time: Array, recorded: Table) -> None:
+    spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if spacing > SLOWEST_S:
+        raise InputError(
+            f"samples are {spacing:g} s apart, too far to be a movement",
+            recorded.path,
+            "is the time in seconds?",
+        )
+
+
 def _differentiated(
     time: Array, knee: Array, patella: Array | None, table: MotionTable, recorded: Table
 ) -> KneeMotion:
@@ -147,6 +174,7 @@ def _differentiated(
     values = knee if patella is None else np.concatenate([knee, patella], axis=1)
     cycle = Cycle.of(time, knee, table, recorded) if table.cycle_s else None
     sampled = cycle.seconds(time) if cycle else time
+    _check_rate(sampled, recorded)
     at = _frames(sampled, table.frames, cycle)
     inside = cycle.wrapped(at, sampled) if cycle else at
     closed = cycle is not None and cycle.closed

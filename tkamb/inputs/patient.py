@@ -1,8 +1,9 @@
 """The patient's URDF: read, mirrored if left, completed with segment inertias, checked.
 
 Links that must exist: `tibia` (shank and foot, its origin at the ankle centre), `femur`,
-`patella`, and `hip`, a frame fixed to the femur at the hip centre. Joints: `ankle` (or the tibia as root), the six
-single-axis knee joints in the order of `KNEE_JOINTS`, and the three of `PATELLA_JOINTS`.
+`patella`, and `hip`, a frame fixed to the femur at the hip centre. Joints: `ankle` (or the
+tibia as root), the six single-axis knee joints in the order of `KNEE_JOINTS`, and the three of
+`PATELLA_JOINTS`.
 The origin of `knee_ap` is the insert frame in the tibia; the femur link's frame is that of
 the femoral component. Any other link fixed to these may carry attachment points.
 """
@@ -52,10 +53,12 @@ def load_urdf(table: PatientTable, with_patella: bool) -> str:
         InputError: missing file, link or joint, wrong axis, singular inertia.
     """
     robot = _parsed(table.urdf)
+    _check_numbers(robot, table.urdf)
     if table.side == "left":
         _mirror(robot)
     wanted = KNEE_JOINTS | (PATELLA_JOINTS if with_patella else {})
     _require_chain(robot, table, wanted, with_patella)
+    _check_tree(robot, table.urdf)
     _complete_inertias(robot, table, with_patella)
     for link in robot.findall("link"):
         _check_inertia(link, table.urdf, link.get("name") in {"tibia", "femur", "patella"})
@@ -74,12 +77,51 @@ def _parsed(path: Path) -> ElementTree.Element:
     return robot
 
 
+def _check_numbers(robot: ElementTree.Element, path: Path) -> None:
+    """Raise where a place, an axis or an inertia is not numbers; parsers drop those silently."""
+    inertia = [("inertia", key, 1) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")]
+    wanted = [("origin", "xyz", 3), ("origin", "rpy", 3), ("axis", "xyz", 3), ("mass", "value", 1)]
+    for tag, key, count in [*wanted, *inertia]:
+        for element in robot.iter(tag):
+            text = element.get(key)
+            if text is not None and not _finite(text, count):
+                numbers = "a number" if count == 1 else f"{count} numbers"
+                raise InputError(f'<{tag} {key}="{text}"> is not {numbers}', path)
+
+
+def _finite(text: str, count: int) -> bool:
+    try:
+        values = [float(part) for part in text.split()]
+    except ValueError:
+        return False
+    return len(values) == count and bool(np.isfinite(values).all())
+
+
+def _check_tree(robot: ElementTree.Element, path: Path) -> None:
+    """Raise unless the joints make one tree of all the links."""
+    links = [str(link.get("name")) for link in robot.findall("link")]
+    parents: dict[str, str] = {}
+    for joint in robot.findall("joint"):
+        ends = (joint.find("parent"), joint.find("child"))
+        parent, child = ("" if end is None else end.get("link", "") for end in ends)
+        where = f"{path}: joint '{joint.get('name')}'"
+        for end in (parent, child):
+            if end not in links:
+                raise InputError(f"names a link '{end}' that is not there", where, "add it")
+        if child in parents:
+            raise InputError(f"link '{child}' hangs on a second joint", where, "keep one")
+        parents[child] = parent
+    if repeated := sorted({name for name in links if links.count(name) > 1}):
+        raise InputError(f"has two links '{repeated[0]}'", path, "rename one")
+    roots = [name for name in links if name not in parents]
+    if len(roots) != 1:
+        found = f"{len(roots)} roots ({', '.join(roots)})" if roots else "a loop and no root"
+        raise InputError(f"has {found}", path, "a leg is one tree: docs/patient.md")
+
+
 def _numbers(element: ElementTree.Element | None, key: str, default: str = "0 0 0") -> Array:
     text = default if element is None else element.get(key, default)
-    try:
-        return np.array([float(part) for part in text.split()])
-    except ValueError:
-        raise InputError(f"'{text}' in a URDF is not numbers", f'{key}="{text}"') from None
+    return np.array([float(part) for part in text.split()])
 
 
 def _origin(element: ElementTree.Element) -> Array:
