@@ -59,47 +59,61 @@ def result_of(
         solution: what the solver found.
         rule: how a nodal force becomes a pressure.
     """
-    approach = solution.forces.approach if load is not None else 0.0
+    depth = solution.forces.approach if load is not None else 0.0
     pose = pose.copy()
-    pose[1, 3] -= approach
+    pose[1, 3] -= depth
     if solution.field is not None and not np.isfinite(solution.field).all():
         return failed_result(state, pose, "the solver left the range of numbers")
     flags, collapsed = _strain_flags(state, solution)
     if collapsed:
         return failed_result(state, pose, *flags)
-    force = np.zeros_like(state.map.points)
-    force[solution.candidates] = solution.forces.force[:, None] * solution.footing.normals
-    size = np.zeros(len(force))
-    size[solution.candidates] = solution.forces.force
-    area = _areas(state, gaps - approach, size > 0, rule)
-    gap = gaps - approach
-    gap[solution.candidates] = solution.forces.gap
-    if rule == "source":
-        size = np.maximum(-np.einsum("ij,ij->i", force, state.map.normals), 0.0)
-    pressure = size / area
     if not solution.converged:
         flags = (*flags, "the solver has not converged")
+    gap = gaps - depth
+    gap[solution.candidates] = solution.forces.gap
+    force, pressure, area = _pressures(state, gaps - depth, solution, rule)
+    surface = state.map
     medial, lateral = summarise_condyles(
-        medial_points(state.map.points, pose, state.split),
-        state.map.points, pressure, area, force, state.map.thickness,
+        medial_points(surface.points, pose, state.split),
+        surface.points, pressure, area, force, surface.thickness,
     )  # fmt: skip
     return ContactResult(
         pose=pose,
-        points=state.map.points,
-        normals=state.map.normals,
+        points=surface.points,
+        normals=surface.normals,
         pressure=pressure,
         area=area,
         gap=gap,
         nodal_force=force,
-        wrench_on_insert=wrench_of(state.map.points, force),
+        wrench_on_insert=wrench_of(surface.points, force),
         medial=medial,
         lateral=lateral,
-        approach=approach if load is not None else approach_at(state.pair, pose),
+        approach=depth if load is not None else approach_at(state.pair, pose),
         status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
         iterations=solution.passes,
         residual=solution.residual,
         flags=flags,
     )
+
+
+def _pressures(
+    state: "LatticeState", gaps: Array, solution: Solution, rule: PressureRule
+) -> tuple[Array, Array, Array]:
+    """Return nodal forces (c, 3), pressures (c,) and the areas (c,) they stand on.
+
+    Args:
+        state: prepared contact.
+        gaps: (c,) vertical gaps of the undeformed insert at the final pose, m.
+        solution: what the solver found.
+        rule: how a nodal force becomes a pressure.
+    """
+    force, size = np.zeros_like(state.map.points), np.zeros(len(gaps))
+    force[solution.candidates] = solution.forces.force[:, None] * solution.footing.normals
+    size[solution.candidates] = solution.forces.force
+    area = _areas(state, gaps, size > 0, rule)
+    if rule == "source":
+        size = np.maximum(-np.einsum("ij,ij->i", force, state.map.normals), 0.0)
+    return force, size / area, area
 
 
 def _areas(state: "LatticeState", gaps: Array, loaded: Mask, rule: PressureRule) -> Array:
