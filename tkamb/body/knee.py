@@ -9,14 +9,14 @@ and three residuals. Less is asked for when less is modelled:
   whole intersegmental wrench (without), act at the femoral origin.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from tkamb.body import unknowns
 from tkamb.body.chain import ChainState
-from tkamb.body.inverse_dynamics import Solution, Unknown, solve
+from tkamb.body.inverse_dynamics import Unknown, solve
 from tkamb.body.load import PointForces
 from tkamb.body.unknowns import CondylePoint
 from tkamb.geometry.frames import Array
@@ -121,7 +121,7 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
     flexion, adduction = system.external_moments()
     return KneeLoads(
         solution.values | (dict.fromkeys(EXTENSOR, 0.0) if system.slack else {}),
-        system.contact_force(solution),
+        system.contact_force(solution.values),
         flexion,
         adduction,
         system.sensitivity(),
@@ -176,12 +176,12 @@ class _System:
         """Sides whose contact force would have to be tensile."""
         return [side for side in self.touching if self.solution.values[f"{side}_normal"] < 0]
 
-    def contact_force(self, solution: Solution) -> Array:
+    def contact_force(self, values: Mapping[str, float]) -> Array:
         """Return the femorotibial force on the femur (3,), insert frame, without residuals."""
         if not self.geometry.condyles:
-            return np.array([solution.values[f"knee_force_{axis}"] for axis in unknowns.AXES])
+            return np.array([values[f"knee_force_{axis}"] for axis in unknowns.AXES])
         forces = [
-            solution.values[f"{side}_normal"]
+            values[f"{side}_normal"]
             * self.geometry.condyles[side].direction(self.friction)
             for side in self.touching
         ]
@@ -194,16 +194,18 @@ class _System:
         """
         if not self.geometry.condyles:
             return 0.0
-        total = np.linalg.norm(self.contact_force(self.solution))
+        total = np.linalg.norm(self.contact_force(self.solution.values))
+        shifts = np.array([-RESIDUAL_SHIFT, RESIDUAL_SHIFT])[:, None]
         about_x, about_z = self._couples.T
-        changes = []
-        for shift in (-RESIDUAL_SHIFT, RESIDUAL_SHIFT):
-            columns = self._columns.copy()
-            columns[:, self.names.index("residual_ap")] -= shift * about_z
-            columns[:, self.names.index("residual_ml")] += shift * about_x
-            moved = solve(self.names, columns, self._right)
-            changes.append(abs(np.linalg.norm(self.contact_force(moved)) - total))
-        return float(max(changes))
+        columns = np.stack([self._columns, self._columns])
+        columns[:, :, self.names.index("residual_ap")] -= shifts * about_z
+        columns[:, :, self.names.index("residual_ml")] += shifts * about_x
+        try:
+            moved = np.linalg.solve(columns, self._right[:, None])[:, :, 0]
+        except np.linalg.LinAlgError:
+            return np.inf
+        forces = [self.contact_force(dict(zip(self.names, x, strict=True))) for x in moved]
+        return float(np.abs(np.linalg.norm(forces, axis=1) - total).max())
 
     def external_moments(self) -> tuple[float, float]:
         """Return the external flexion and adduction moments, N·m.
