@@ -8,7 +8,7 @@ import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from tkamb.errors import TkambError
 from tkamb.view.command import add_view
@@ -33,10 +33,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
+class _Parser(argparse.ArgumentParser):
+    """Bad arguments are one line too, without the usage before it."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {' '.join(message.split())}; see {self.prog} --help\n")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="tkamb", description="What happens inside a total knee replacement."
-    )
+    parser = _Parser(prog="tkamb", description="What happens inside a total knee replacement.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _add_run(commands)
     _add_press(commands)
@@ -159,9 +164,10 @@ def _setting(text: str) -> tuple[str, Any]:
 def _run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
+    from tkamb.output.atomic import claimed_directory
     from tkamb.output.axis import horizontal_axis
     from tkamb.output.headline import cards
-    from tkamb.results import claim_directory, write_results
+    from tkamb.results import write_results
     from tkamb.scene import load_scene
     from tkamb.simulation import simulate
     from tkamb.status import FAILED
@@ -173,15 +179,16 @@ def _run(options: argparse.Namespace) -> int:
         overrides["contact.resolution_mm"] = options.resolution
     scene = load_scene(options.scene, overrides)
     directory = options.out or scene.output.directory or _default_directory(options.scene)
-    results = simulate(
-        scene,
-        frames=options.frames,
-        directory=claim_directory(directory),
-        scene_path=options.scene,
-        progress=lambda frames: tqdm(frames, unit="frame", disable=None),
-        resume=options.resume,
-    )
-    write_results(results, directory)
+    with claimed_directory(directory):
+        results = simulate(
+            scene,
+            frames=options.frames,
+            directory=directory,
+            scene_path=options.scene,
+            progress=lambda frames: tqdm(frames, unit="frame", disable=None),
+            resume=options.resume,
+        )
+        write_results(results, directory)
     failed = [k for k, status in enumerate(results.status) if status.startswith(FAILED)]
     for k in failed:
         print(f"tkamb: frame {k}: {results.status[k]}", file=sys.stderr)

@@ -6,7 +6,7 @@ contact model remembers privately: answers stay within the solver's tolerance.
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,8 +15,10 @@ from tkamb.contact.model import ContactResult, PreparedContact
 from tkamb.contact.probe import ProbedContact
 from tkamb.equilibrium import ContactSide, FrameContact
 from tkamb.geometry.frames import Array
-from tkamb.mechanics import Mechanics
 from tkamb.released import SettledKnee
+
+if TYPE_CHECKING:
+    from tkamb.mechanics import Mechanics
 
 RESULT_ARRAYS = ("pose", "normals", "pressure", "area", "gap", "nodal_force", "wrench_on_insert")
 
@@ -38,7 +40,7 @@ def contact_arrays(contact: FrameContact | None) -> dict[str, Array] | None:
 
 
 def recalled(
-    side: ContactSide, mechanics: Mechanics, frame: int, arrays: Mapping[str, Array] | None
+    side: ContactSide, mechanics: "Mechanics", frame: int, arrays: Mapping[str, Array] | None
 ) -> FrameContact:
     """Return a frame's contact from its arrays, as a guess for the next frame."""
     none = np.zeros(len(side.state.points), bool)
@@ -54,7 +56,7 @@ def _result(state: PreparedContact, arrays: Mapping[str, Array]) -> ContactResul
     return ContactResult(points=state.points, medial=None, lateral=None, **fields)
 
 
-def _settled(mechanics: Mechanics, frame: int, arrays: Mapping[str, Array]) -> SettledKnee:
+def _settled(mechanics: "Mechanics", frame: int, arrays: Mapping[str, Array]) -> SettledKnee:
     patella = None
     if mechanics.extensor is not None and "settled_patella" in arrays:
         state = mechanics.extensor.states[frame]

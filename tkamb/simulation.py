@@ -63,16 +63,19 @@ def simulate(
     identity = run_identity(case, indices)
     if directory is None and resume:
         raise InputError("there is no folder to go on in", "resume", "give a directory")
+    if directory is not None and resume:
+        done = finished_results(Path(directory), identity)
+        if done is not None:
+            return done
+    path = None if scene_path is None else Path(scene_path)
+    run = _Run(case, indices, identity, path, start)
+    run.prepare()  # before the folder is touched: bad input leaves it as it was
     if directory is None:
         recorder = Recorder()
     else:
-        done = finished_results(Path(directory), identity) if resume else None
-        if done is not None:
-            return done
         recorder = FolderRecorder(Path(directory), identity, resume)
-    path = None if scene_path is None else Path(scene_path)
     try:
-        return _Run(case, indices, identity, recorder, path, start).compute(progress)
+        return run.compute(recorder, progress)
     finally:
         recorder.close()
 
@@ -84,16 +87,21 @@ class _Run:
     case: Case
     indices: range
     identity: dict[str, Any]
-    recorder: Recorder
     path: Path | None
     start: float
 
-    def compute(self, progress: Progress) -> Results:
-        """Compute every frame that is not there yet and return the results."""
+    def prepare(self) -> None:
+        """Build both sides of the equilibrium; whatever is wrong with the input shows here."""
         self.mechanics = Mechanics(self.case)
         self.slips = self.mechanics.slips()
         self.seconds = {"read": clock.perf_counter() - self.start}
-        side = self._contact_side() if self.case.scene.contact else None
+        self.side = self._contact_side() if self.case.scene.contact else None
+
+    def compute(self, recorder: Recorder, progress: Progress) -> Results:
+        """Compute every frame that is not there yet and return the results."""
+        self.recorder, side = recorder, self.side
+        if side is not None:
+            self._begin_maps(side)
         before = self._earlier(side)
         self.resumed = len(self.recorder.rows)
         left = [k for k in self.indices if k not in self.recorder.rows]
@@ -115,9 +123,7 @@ class _Run:
         """Return the results so far; frames that are still to do are failed ones."""
         columns = join_rows(self.case, self.indices, self.recorder.rows)
         self.seconds["all"] = clock.perf_counter() - self.start
-        summary = summary_of(
-            self.case, columns, self.seconds, self.path, self.mechanics.strains
-        )
+        summary = summary_of(self.case, columns, self.seconds, self.path, self.mechanics.strains)
         summary["identity"] = self.identity
         summary["resumed_frames"] = self.resumed
         summary["unfinished_frames"] = len(self.indices) - len(self.recorder.rows)
@@ -138,18 +144,19 @@ class _Run:
         self.recorder.record(k, frame_row(self.case, k, body, contact, self.slips, status), arrays)
 
     def _contact_side(self) -> "ContactSide":
-        """Prepare the contact and make ready for its maps."""
         from tkamb.equilibrium import ContactSide
 
         side = ContactSide(self.case, self.mechanics)
         self.seconds["prepare contact"] = side.prepare_seconds
+        return side
+
+    def _begin_maps(self, side: "ContactSide") -> None:
         labels = {
             "frame": "insert: x anterior, y superior, z lateral",
             "model": side.table.model,
             "scene_sha256": scene_hash(self.case),
         }
         self.recorder.begin_maps(side.state.points, side.state.triangles, labels)
-        return side
 
     def _earlier(self, side: "ContactSide | None") -> "list[FrameContact]":
         """Return the last contacts of the run that is resumed."""

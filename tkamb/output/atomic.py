@@ -3,7 +3,7 @@
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tkamb.errors import InputError
@@ -63,3 +63,21 @@ def claim_directory(path: str | Path) -> Path:
             f"output folder cannot be written ({reason})", path, "choose another with --out"
         ) from None
     return path
+
+
+@contextmanager
+def claimed_directory(path: str | Path) -> Iterator[Path]:
+    """Claim the output folder; after bad input the folders made for it are gone again.
+
+    Raises:
+        InputError: as `claim_directory`, or from the block.
+    """
+    path = Path(path)
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    try:
+        yield claim_directory(path)
+    except InputError:
+        with suppress(OSError):  # not there, or no longer empty
+            for folder in made:
+                folder.rmdir()
+        raise
