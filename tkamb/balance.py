@@ -107,7 +107,7 @@ class _Search:
     def __init__(self, forces: Forces, start: Array, stiffness: Array | None) -> None:
         self._forces, self._start = forces, start
         self._trials, self._steps = 0, 0
-        self._fresh, self._since = False, 0
+        self._fresh, self._since, self._unknown = False, 0, False
         self._radius = FIRST_RADIUS
         self._work: list[float] = []
         self.x = start
@@ -134,7 +134,8 @@ class _Search:
             if not self._own and self._since > len(self.x):
                 self._refresh()
             self._step()
-        return self._end(BalanceStatus.NOT_CONVERGED)
+        lost = self._radius < NARROWEST_RADIUS and self._unknown
+        return self._end(BalanceStatus.OUT_OF_RANGE if lost else BalanceStatus.NOT_CONVERGED)
 
     def _step(self) -> None:
         step = bounded_step(self.stiffness, self.force, self._radius)
@@ -143,7 +144,8 @@ class _Search:
         length = float(np.linalg.norm(step))
         predicted = float(self.force @ step - 0.5 * step @ self.stiffness @ step)
         work = float(0.5 * (self.force + trial.force) @ step)
-        if not np.isfinite(work):
+        self._unknown = not np.isfinite(work)
+        if self._unknown:
             self._radius = 0.25 * length
             return
         helps = self._halves(step, trial.force)

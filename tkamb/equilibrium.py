@@ -102,10 +102,10 @@ class ContactSide:
         self.state = self.model.prepare(pair)
         self.prepare_seconds = clock.perf_counter() - start
 
-        self._released: ReleasedKnee | None = None
+        self.released: ReleasedKnee | None = None
         if table.released:
             probe = self.model.probe(self.state)
-            self._released = ReleasedKnee(mechanics, probe, table.released)
+            self.released = ReleasedKnee(mechanics, probe, table.released)
 
     def frame(self, k: int, before: Sequence[FrameContact] = ()) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact of frame k, as coupled as the scene asks.
@@ -115,8 +115,8 @@ class ContactSide:
             before: the contacts of the frames before: the last is a guess that saves time,
                 and the last that were found are where released coordinates begin.
         """
-        if self._released is not None:
-            return self._settled(self._released, k, before)
+        if self.released is not None:
+            return self._settled(self.released, k, before)
         guess = before[-1].result if before else None
         body = self.mechanics.frame(k)
         contact = self.carry(body, self.mechanics.poses[k], guess)
@@ -191,7 +191,7 @@ class ContactSide:
         place = self._start(k, released, [c.settled.coordinates for c in good if c.settled])
         settled = released.settle(k, place, points, earlier)
         if settled.balance.status in (BalanceStatus.OUT_OF_RANGE, BalanceStatus.NOT_CONVERGED):
-            raised = self._touching(place)
+            raised = self.on_the_insert(place)
             if np.isfinite(raised).all():
                 settled = released.settle(k, raised, points, earlier)
         result, contact = None, self._nothing(settled.problem)
@@ -211,12 +211,12 @@ class ContactSide:
         """Return where the search begins: as the last frames went on, else as recorded."""
         place = self.case.motion.coordinates[k].copy()
         if not found:
-            return self._touching(place)
+            return self.on_the_insert(place)
         rows = list(released.released)
         place[rows] = (2 * found[-1] - found[0] if len(found) == 2 else found[-1])[rows]
         return place
 
-    def _touching(self, place: Array) -> Array:
+    def on_the_insert(self, place: Array) -> Array:
         """Return coordinates (6,) whose superior-inferior one makes the condyles just touch."""
         height = first_touch_height(self.state.pair, knee_pose(place))
         return np.array([place[0], height - FIRST_DEPTH, *place[2:]])

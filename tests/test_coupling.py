@@ -1,0 +1,99 @@
+"""Body and contact agree: points coupled, adduction released, on the shipped knee bend."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tkamb.case import load_case
+from tkamb.equilibrium import LOAD_CHANGE, POINT_CHANGE, ContactSide
+from tkamb.errors import InputError
+from tkamb.mechanics import Mechanics
+from tkamb.scene import load_scene
+from tkamb.simulation import simulate
+
+SCENE = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
+FRAMES = slice(0, 101, 20)
+COARSE = {"contact.resolution_mm": 2.0}
+
+
+def run(**contact):
+    overrides = COARSE | {f"contact.{key}": value for key, value in contact.items()}
+    return simulate(load_scene(SCENE, overrides), frames=FRAMES)
+
+
+@pytest.fixture(scope="module")
+def uncoupled():
+    return run()
+
+
+@pytest.fixture(scope="module")
+def coupled():
+    return run(coupling="points")
+
+
+@pytest.fixture(scope="module")
+def tilting():
+    return run(released=["adduction"])
+
+
+def shares(results):
+    medial, lateral = results["medial_force_N"], results["lateral_force_N"]
+    return medial / (medial + lateral), results["medial_share_equilibrium"]
+
+
+def test_uncoupled_is_the_body_and_then_a_press():
+    """Bit for bit: the load of the equations, pressed in at the recorded pose."""
+    case = load_case(load_scene(SCENE, COARSE))
+    mechanics = Mechanics(case)
+    side = ContactSide(case, mechanics)
+    body, contact = side.frame(60)
+    alone = mechanics.frame(60)
+    load = alone.loads.contact_force[1]
+    pressed = side.model.press(side.state, load, mechanics.poses[60], None)
+    assert body.loads.contact_force[1] == load
+    assert np.array_equal(contact.result.pressure, pressed.pressure)
+    assert contact.iterations == 0
+
+
+def test_points_agree_within_five_iterations(uncoupled, coupled):
+    assert coupled["coupling_iterations"].max() <= 5
+    assert coupled["coupling_change_N"].max() < LOAD_CHANGE
+    assert coupled["coupling_change_mm"].max() < POINT_CHANGE * 1e3
+    assert np.isnan(uncoupled["coupling_iterations"]).all()
+    change = np.abs(coupled["force_si_N"] / uncoupled["force_si_N"] - 1)
+    assert 0 < change.max() < 0.02
+
+
+def test_the_pressed_load_is_the_load_of_the_equations(coupled):
+    """Superior-inferior: nodal forces without friction against the force with it."""
+    pressed = -coupled.maps.nodal_force_N[..., 1].sum(axis=1)
+    assert np.allclose(pressed, coupled["force_si_N"], rtol=1e-5)
+
+
+def test_released_adduction_brings_both_estimates_of_the_split_together(uncoupled, tilting):
+    deformed, balanced = shares(uncoupled)
+    assert np.abs(deformed - balanced).max() > 0.02
+    deformed, balanced = shares(tilting)
+    assert np.abs(deformed - balanced).max() < 1e-3
+    turned = tilting["adduction_deg"] - uncoupled["adduction_deg"]
+    assert 1e-3 < np.abs(turned).max() < 0.2
+    assert np.allclose(tilting["axial_rotation_deg"], uncoupled["axial_rotation_deg"])
+    for axis in ("ap", "ml"):
+        assert np.allclose(tilting[f"{axis}_mm"], uncoupled[f"{axis}_mm"], atol=1e-9)
+
+
+def test_nothing_pulls(coupled, tilting):
+    for results in (coupled, tilting):
+        assert (results.maps.pressure_Pa >= 0).all()
+        assert (results["medial_force_equilibrium_N"] >= 0).all()
+        assert (results["lateral_force_equilibrium_N"] >= 0).all()
+
+
+def test_adjusting_and_releasing_exclude_each_other():
+    with pytest.raises(InputError, match="exclude"):
+        load_scene(SCENE, {"contact.released": ["ml"], "contact.adjust": True})
+    with pytest.raises(InputError, match="twice"):
+        load_scene(SCENE, {"contact.released": ["ml", "ml"]})
+    with pytest.raises(InputError, match="released"):
+        load_scene(SCENE, {"contact.released": ["flexion"]})

@@ -1,0 +1,143 @@
+"""The five knee coordinates that nobody measured, from contact and ligaments."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tkamb.balance import BalanceStatus
+from tkamb.body.demand import external_wrench
+from tkamb.body.load import total_wrench
+from tkamb.case import load_case
+from tkamb.contact.probe import condyle_wrenches
+from tkamb.equilibrium import ContactSide
+from tkamb.geometry.frames import knee_pose
+from tkamb.mechanics import Mechanics
+from tkamb.released import SCALE
+from tkamb.scene import load_scene
+
+ROOT = Path(__file__).parents[1]
+BEND = ROOT / "models" / "deep_knee_bend" / "scene.toml"
+DM = ROOT / "models" / "dm" / "scene.toml"
+DATA = ROOT.parent / "shared" / "data" / "dm"
+ALL = ["ap", "ml", "axial_rotation", "adduction"]
+
+
+def side_of(scene, more=None, **contact):
+    overrides = (more or {}) | {"contact.resolution_mm": 2.0, "contact.released": ALL}
+    overrides |= {f"contact.{key}": value for key, value in contact.items()}
+    case = load_case(load_scene(scene, overrides))
+    return ContactSide(case, Mechanics(case))
+
+
+@pytest.fixture(scope="module")
+def bend():
+    return side_of(BEND)
+
+
+@pytest.fixture(scope="module")
+def settled(bend):
+    """Body and contact of a few frames, each from the one before."""
+    contacts, found = [], {}
+    for k in (40, 41, 42, 60, 80):
+        found[k] = bend.frame(k, contacts)
+        contacts.append(found[k][1])
+    return found
+
+
+def test_the_shank_is_in_equilibrium(bend, settled):
+    """Ground, weight and inertia, ligaments, patellar ligament and contact add up to nothing."""
+    for k, (body, contact) in settled.items():
+        placed = contact.settled.placed
+        total = external_wrench(placed.geometry, contact.settled.coordinates)
+        shank = [load for load in placed.geometry.ligaments if load.link.startswith("tibia")]
+        pull = [p for p in placed.geometry.extensor.patellar_ligament if p.link == "tibia"]
+        total = total + total_wrench(shank, np.zeros(3))
+        total = total + body.loads.values["patellar_ligament"] * total_wrench(pull, np.zeros(3))
+        for name, condyle in body.geometry.condyles.items():
+            push = -body.loads.values[f"{name}_normal"] * condyle.direction(bend.mechanics.friction)
+            total = total + np.concatenate([push, np.cross(condyle.point, push)])
+        assert np.abs(total[:3]).max() < 0.2, k
+        assert np.abs(total[3:]).max() < 0.02, k
+
+
+def test_equilibrium_and_deformation_are_one_state(settled):
+    for body, contact in settled.values():
+        for name in ("ap", "ml"):
+            assert abs(body.loads.values[f"residual_{name}"]) < 0.1
+        assert abs(body.loads.values["residual_axial"]) < 0.03
+        for side, condyle in condyle_wrenches(contact.result, 0.0).items():
+            assert body.loads.values[f"{side}_normal"] == pytest.approx(condyle.force, abs=0.1)
+        assert np.allclose(contact.result.pose, knee_pose(contact.settled.coordinates))
+
+
+def test_flexion_stays_as_recorded_and_what_is_kept_too(bend):
+    partly = side_of(BEND, released=["ml", "adduction"])
+    _, contact = partly.frame(60)
+    kept = np.abs(contact.settled.coordinates - partly.case.motion.coordinates[60])
+    assert contact.result is not None
+    assert (kept[[0, 3, 5]] == 0).all()
+    assert (kept[[2, 4]] > 0).all()
+
+
+@pytest.mark.parametrize(
+    "away",
+    [
+        [5e-3, 2e-3, 0, 0, np.radians(2)],
+        [-5e-3, 1e-3, 0, np.radians(-5), np.radians(2)],
+        [0, 3e-3, -5e-3, np.radians(5), np.radians(-5)],
+    ],
+)
+def test_starts_5_mm_and_5_deg_away_reach_the_same_rest(bend, settled, away):
+    home = settled[60][1].settled.coordinates
+    start = bend.on_the_insert(home + np.append(away, 0.0))
+    again = bend.released.settle(60, start)
+    assert again.problem == ""
+    assert np.abs((again.coordinates - home) * SCALE).max() < 2e-5
+
+
+def test_a_start_over_the_rim_says_that_it_did_not_arrive(bend, settled):
+    home = settled[60][1].settled.coordinates
+    start = bend.on_the_insert(home + np.array([-5e-3, 0, 5e-3, np.radians(-5), 0, 0]))
+    assert bend.released.settle(60, start).problem == ("released: out of the contact model's range")
+
+
+def test_friction_drags_the_knee_back(bend, settled):
+    """Without friction the same frame rests elsewhere, and every step of the search does work."""
+    smooth = side_of(BEND, friction=0.0)
+    _, contact = smooth.frame(60)
+    away = np.abs((contact.settled.coordinates - settled[60][1].settled.coordinates) * SCALE)
+    assert 1e-5 < away.max() < 5e-3
+    assert contact.settled.balance.status is BalanceStatus.OK
+
+
+def test_without_anything_that_holds_it_a_frame_fails_with_the_reason(bend):
+    """No ligaments, and the femur so far off that nothing catches it."""
+    case = load_case(
+        load_scene(BEND, {"contact.resolution_mm": 2.0, "contact.released": ALL, "ligament": []})
+    )
+    side = ContactSide(case, Mechanics(case))
+    start = case.motion.coordinates[60].copy()
+    start[0] += 60e-3
+    ended = side.released.settle(60, start)
+    assert ended.problem.startswith("released")
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="needs subject DM's files beside the project")
+def test_a_recorded_position_that_climbs_the_eminence_slides_back_into_the_dishes():
+    """DM at half the cycle: one condyle carries all on its flank, until ml and tilt are free."""
+    few = {"motion.frames": 21}
+    body, contact = side_of(DM, few, released=[]).frame(10)
+    lean = [np.degrees(np.arccos(c.normal[1])) for c in body.geometry.condyles.values()]
+    assert max(lean) > 25
+    assert contact.result.lateral is None
+    peak = contact.result.pressure.max()
+    freed = side_of(DM, few, released=["ml", "adduction"])
+    body, contact = freed.frame(10)
+    lean = [np.degrees(np.arccos(c.normal[1])) for c in body.geometry.condyles.values()]
+    assert max(lean) < 12
+    assert contact.result.medial.force > 250
+    assert contact.result.lateral.force > 250
+    assert contact.result.pressure.max() < 0.7 * peak
+    moved = contact.settled.coordinates - freed.case.motion.coordinates[10]
+    assert abs(moved[2]) < 2e-3
