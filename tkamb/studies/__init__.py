@@ -1,0 +1,1 @@
+"""Two studies of the contact models: speed against accuracy, and stability at the extremes."""

@@ -1,0 +1,143 @@
+"""What the trade-off is measured on: two bodies, a pose and a load."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.contact.materials import material
+from tkamb.contact.model import ContactPair
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, knee_pose
+from tkamb.studies.bodies import balls, block, dishes, flat
+from tkamb.units import DEGREE, MILLIMETRE
+
+SHIPPED_SCENE = Path(__file__).parents[2] / "models" / "deep_knee_bend" / "scene.toml"
+FLEXIONS_DEG = (15.0, 60.0, 105.0)
+"""Of the shipped knee, and of a user's scene where it gets there."""
+
+
+@dataclass(frozen=True, eq=False)
+class StudyCase:
+    """One contact problem.
+
+    Args:
+        name: of the case.
+        says: one line.
+        pair: the two bodies.
+        pose: (4, 4) pose_femoral_in_insert; its y does not matter.
+        load: N, along -y.
+    """
+
+    name: str
+    says: str
+    pair: ContactPair
+    pose: Array
+    load: float
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of bodies, material, pose and load."""
+        digest = hashlib.sha256()
+        pair = self.pair
+        for array in (
+            *(pair.femoral.vertices, pair.femoral.faces, pair.insert.vertices, pair.insert.faces),
+            *(self.pose, np.array(self.load)),
+        ):
+            digest.update(np.ascontiguousarray(np.round(array, 12)).tobytes())
+        digest.update(repr((pair.material, pair.bearing)).encode())
+        return digest.hexdigest()
+
+    def nearby(self, steps: float) -> Array:
+        """Return the pose some frames later: each 0.06 mm back, 0.2 deg flexed, 0.06 deg turned."""
+        turn = np.array([-0.06 * MILLIMETRE, 0, 0, 0.06 * DEGREE, 0, 0.2 * DEGREE])
+        moved = knee_pose(steps * turn)
+        pose = self.pose.copy()
+        pose[:3, :3] = moved[:3, :3] @ self.pose[:3, :3]
+        pose[0, 3] += moved[0, 3]
+        return pose
+
+
+def case_names(scene: Path | None = None) -> tuple[str, ...]:
+    """Return the names of the cases that can be made here.
+
+    Args:
+        scene: a user's scene, whose cases come last.
+    """
+    names = list(_ANALYTIC)
+    if SHIPPED_SCENE.exists():
+        names += [f"knee {flexion:g} deg" for flexion in FLEXIONS_DEG]
+    if scene is not None:
+        names += [f"scene {flexion:g} deg" for flexion in FLEXIONS_DEG]
+    return tuple(names)
+
+
+def study_case(name: str, scene: Path | None = None) -> StudyCase:
+    """Return the case of that name.
+
+    Raises:
+        InputError: no such case.
+    """
+    if name in _ANALYTIC:
+        return _ANALYTIC[name](name)
+    where, _, flexion = name.removesuffix(" deg").partition(" ")
+    path = {"knee": SHIPPED_SCENE, "scene": scene}.get(where)
+    if path is None:
+        raise InputError(f"no case '{name}'", mend=f"there are: {', '.join(case_names(scene))}")
+    return _of_scene(name, path, float(flexion))
+
+
+def _sphere(name: str) -> StudyCase:
+    insert = block(flat(10e-3), (34e-3, 34e-3), 1e-3)
+    pair = ContactPair(balls(40e-3, 0.0), insert, material("polyethylene-linear"))
+    return StudyCase(name, "sphere of 40 mm on 10 mm, linear", pair, np.eye(4), 700.0)
+
+
+def _two_condyles(name: str) -> StudyCase:
+    says = "two condyles of 22 mm in dishes of 34 mm, nonlinear"
+    return StudyCase(name, says, _bicondylar(34e-3), np.eye(4), 2000.0)
+
+
+def _conforming(name: str) -> StudyCase:
+    says = "two condyles of 22 mm in dishes of 24 mm, nonlinear"
+    return StudyCase(name, says, _bicondylar(24e-3), np.eye(4), 2000.0)
+
+
+def _varus(name: str) -> StudyCase:
+    pose = knee_pose([0, 0, 0, 0, 0.3 * DEGREE, 0])
+    says = "two condyles, 0.3 deg of varus, nonlinear"
+    return StudyCase(name, says, _bicondylar(34e-3), pose, 2000.0)
+
+
+def _bicondylar(radius: float) -> ContactPair:
+    apart = 11e-3
+    insert = block(dishes(8e-3, radius, apart), (30e-3, 46e-3))
+    return ContactPair(balls(22e-3, apart), insert, material("polyethylene"))
+
+
+_ANALYTIC = {
+    "sphere": _sphere,
+    "two condyles": _two_condyles,
+    "conforming": _conforming,
+    "varus": _varus,
+}
+
+
+def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
+    from tkamb.case import load_case
+    from tkamb.mechanics import Mechanics
+    from tkamb.scene import load_scene
+
+    case = load_case(load_scene(path))
+    table, insert = case.scene.contact, case.scene.implant.insert
+    if table is None or insert is None or case.femoral is None or case.insert is None:
+        raise InputError("has no [contact]", path, "the trade-off needs two bodies")
+    mechanics = Mechanics(case)
+    k = int(np.argmin(np.abs(case.motion.coordinates[:, 5] - flexion * DEGREE)))
+    load = float(mechanics.frame(k).loads.contact_force[1])
+    if not load > 0:
+        raise InputError(f"frame {k} has no compressive contact force", path)
+    pair = ContactPair(case.femoral, case.insert, material(table.material), insert.bearing)
+    says = f"{path.parent.name} at {case.motion.coordinates[k, 5] / DEGREE:.0f} deg, {load:.0f} N"
+    return StudyCase(name, says, pair, mechanics.poses[k], load)

@@ -1,0 +1,109 @@
+"""What two contact results are compared by, and how far they are apart."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator
+
+from tkamb.contact.model import ContactResult
+from tkamb.geometry.frames import Array
+from tkamb.units import MILLIMETRE
+
+SIDES = ("medial", "lateral")
+PARTS = ("force", "mean_pressure", "peak_pressure", "area")
+RASTER = MILLIMETRE
+"""m: spacing of the raster on which pressure maps are compared."""
+
+Quantities = dict[str, float]
+
+
+def quantities(result: ContactResult) -> Quantities:
+    """Return approach (m) and each condyle's force (N), mean and peak pressure (Pa), area (m²)."""
+    found = {"approach": result.approach}
+    for side in SIDES:
+        condyle = getattr(result, side)
+        for part in PARTS:
+            found[f"{side}_{part}"] = 0.0 if condyle is None else float(getattr(condyle, part))
+    return found
+
+
+def errors(found: Mapping[str, float], reference: Mapping[str, float]) -> dict[str, float]:
+    """Return relative errors: approach, force, mean_pressure, peak_pressure, area.
+
+    A condyle's error counts against what both carry (force, area) or against the higher one
+    (pressures), so that a condyle that hardly touches does not decide; of the two condyles
+    the larger error is given.
+    """
+    result = {"approach": _relative(found, reference, ["approach"], np.max)}
+    for part in PARTS:
+        names = [f"{side}_{part}" for side in SIDES]
+        scale = np.sum if part in ("force", "area") else np.max
+        result[part] = _relative(found, reference, names, scale)
+    return result
+
+
+def _relative(
+    found: Mapping[str, float], reference: Mapping[str, float], names: list[str], scale: object
+) -> float:
+    assert callable(scale)
+    given = np.array([found[name] for name in names])
+    true = np.array([reference[name] for name in names])
+    return float(np.abs(given - true).max() / scale(np.abs(true)))
+
+
+def raster_map(result: ContactResult) -> dict[tuple[int, int], float]:
+    """Return the pressure (Pa) on a raster of x and z, {(i, j): p} where there is any."""
+    loaded = result.pressure > 0
+    if not loaded.any():
+        return {}
+    across = result.points[:, [0, 2]]
+    low = np.floor(across[loaded].min(axis=0) / RASTER).astype(int) - 1
+    high = np.ceil(across[loaded].max(axis=0) / RASTER).astype(int) + 1
+    near = (
+        (across > (low - 3) * RASTER)
+        & (across < (high + 3) * RASTER)
+        & (result.normals[:, 1:2] > 0)
+    ).all(axis=1)
+    i, j = np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high, strict=True)))
+    value = LinearNDInterpolator(across[near], result.pressure[near])
+    p = np.nan_to_num(value(i * RASTER, j * RASTER))
+    return {
+        (int(a), int(b)): float(v)
+        for a, b, v in zip(i.ravel(), j.ravel(), p.ravel(), strict=True)
+        if v > 0
+    }
+
+
+def map_error(
+    found: Mapping[tuple[int, int], float], reference: Mapping[tuple[int, int], float]
+) -> float:
+    """Return the L2 norm of the maps' difference over that of the reference."""
+    places = sorted(set(found) | set(reference))
+    given = np.array([found.get(place, 0.0) for place in places])
+    true = np.array([reference.get(place, 0.0) for place in places])
+    return float(np.linalg.norm(given - true) / np.linalg.norm(true))
+
+
+def common_limit(h: Array, values: Array, family: Array) -> tuple[float, float]:
+    """Return the limit h -> 0 that several families of grids share, and its uncertainty.
+
+    Least squares of q0 + c_f h² over all families f (Richardson with the order of
+    trilinear cells). The uncertainty is the largest of half the spread of the families' own
+    limits and of the residuals.
+
+    Args:
+        h: (n,) m, cell sizes.
+        values: (n,).
+        family: (n,) number of the family of each.
+    """
+    kinds = np.unique(family)
+    slopes = np.where(family[:, None] == kinds, h[:, None] ** 2, 0.0)
+    matrix = np.column_stack([np.ones(len(h)), slopes])
+    solution = np.linalg.lstsq(matrix, values, rcond=None)[0]
+    left = np.abs(matrix @ solution - values).max()
+    own = []
+    for kind in kinds:
+        some = family == kind
+        line = np.column_stack([np.ones(some.sum()), h[some] ** 2])
+        own.append(np.linalg.lstsq(line, values[some], rcond=None)[0][0])
+    return float(solution[0]), float(max(left, 0.5 * (max(own) - min(own))))
