@@ -123,6 +123,7 @@ def test_without_anything_that_holds_it_a_frame_fails_with_the_reason(bend):
     assert ended.problem.startswith("released")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs subject DM's files beside the project")
 def test_a_recorded_position_that_climbs_the_eminence_slides_back_into_the_dishes():
     """DM at half the cycle: one condyle carries all on its flank, until ml and tilt are free."""
