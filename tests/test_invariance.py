@@ -1,0 +1,297 @@
+"""What must not change the answer does not: laboratory frame, units, sampling rate."""
+
+import csv
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation
+
+from scenes import MODEL, write_scene
+from tkamb.body import knee, patellofemoral, unknowns
+from tkamb.body.chain import Chain
+from tkamb.case import Case, load_case
+from tkamb.geometry import close_region, condyles
+from tkamb.geometry.frames import pose
+from tkamb.geometry.nearest import NearestPoints
+from tkamb.geometry.surface import Surface
+from tkamb.inputs.patient import load_urdf
+from tkamb.mechanics import FrameLoads, Mechanics
+from tkamb.scene import Scene, load_scene
+
+FRAMES = (0, 35, 60, 90)
+
+
+@cache
+def shipped() -> Case:
+    return load_case(load_scene(MODEL / "scene.toml"))
+
+
+@cache
+def shipped_loads() -> list[FrameLoads]:
+    mechanics = Mechanics(shipped())
+    return [mechanics.frame(k) for k in FRAMES]
+
+
+def numbers(frame: FrameLoads) -> np.ndarray:
+    """All that the equations of a frame say: forces (N), moments (N·m), tensions (N)."""
+    assert not frame.loads.problems
+    loads = frame.loads
+    return np.array(
+        [
+            *loads.values.values(),
+            *loads.contact_force,
+            loads.external_flexion,
+            loads.external_adduction,
+            loads.sensitivity,
+            *frame.tensions.values(),
+            frame.wrap,
+        ]
+    )
+
+
+def turned(case: Case, rotation: np.ndarray, shift: np.ndarray) -> Case:
+    """Return the case with what was measured in the laboratory seen from another one."""
+    move = pose(rotation, shift)
+    ground = replace(
+        case.ground,
+        force=case.ground.force @ rotation.T,
+        moment=case.ground.moment @ rotation.T,
+        point=case.ground.point @ rotation.T + shift,
+    )
+    tibia = replace(case.tibia, pose=move @ case.tibia.pose)
+    return replace(case, tibia=tibia, ground=ground)
+
+
+@pytest.mark.parametrize("angle_deg", [17.0, 201.0])
+def test_turning_the_laboratory_about_the_vertical_changes_nothing(angle_deg):
+    rotation = Rotation.from_euler("y", angle_deg, degrees=True).as_matrix()
+    mechanics = Mechanics(turned(shipped(), rotation, np.array([0.4, -0.1, 1.3])))
+    for k, before in zip(FRAMES, shipped_loads(), strict=True):
+        expected = numbers(before)
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(numbers(mechanics.frame(k)), expected, atol=1e-10 * scale)
+
+
+def test_turning_it_anyhow_changes_nothing_if_gravity_is_turned_too():
+    rotation = Rotation.from_euler("xyz", [40.0, 100.0, -75.0], degrees=True).as_matrix()
+    case = turned(load_case(load_scene(MODEL / "scene.toml")), rotation, np.zeros(3))
+    gravity = rotation @ case.chain.model.gravity.linear
+    case.chain.model.gravity = pin.Motion(gravity, np.zeros(3))
+    mechanics = Mechanics(case)
+    for k, before in zip(FRAMES, shipped_loads(), strict=True):
+        expected = numbers(before)
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(numbers(mechanics.frame(k)), expected, atol=1e-10 * scale)
+
+
+@pytest.mark.parametrize("axes", ["+y,+z,+x", "-x,+y,-z"])
+def test_a_laboratory_with_other_axes_gives_the_same(tmp_path, axes):
+    """The same measurements in files whose axes are named otherwise: `laboratory_axes`."""
+    to_laboratory = np.zeros((3, 3))
+    for row, axis in enumerate(axes.split(",")):
+        to_laboratory[row, "xyz".index(axis[1])] = -1.0 if axis[0] == "-" else 1.0
+    path = write_scene(
+        tmp_path,
+        drop=("tibia",),
+        ground_reaction__laboratory_axes=axes,
+    )
+    tibia = shipped().tibia
+    turns = Rotation.from_matrix(to_laboratory.T @ tibia.pose[:, :3, :3]).as_euler("YXZ")
+    places = tibia.pose[:, :3, 3] @ to_laboratory
+    names = [f"{kind}_{n}" for kind in ("rotation", "translation") for n in (1, 2, 3)]
+    rows = np.column_stack([shipped().motion.time, np.unwrap(turns, axis=0), places])
+    np.savetxt(
+        tmp_path / "pose.csv", rows, "%.15g", ",", header=",".join(["time", *names]), comments=""
+    )
+    with path.open("a", encoding="utf-8") as scene:
+        scene.write(
+            '[tibia]\nkind = "pose"\nfile = "pose.csv"\nsequence = "YXZ"\nangle_unit = "rad"\n'
+            f'length_unit = "m"\nlaboratory_axes = "{axes}"\n'
+        )
+    _turn_columns(tmp_path / "ground_reaction.csv", to_laboratory)
+    mechanics = Mechanics(load_case(load_scene(path)))
+    for k, before in zip(FRAMES, shipped_loads(), strict=True):
+        expected = numbers(before)
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(numbers(mechanics.frame(k)), expected, atol=1e-6 * scale)
+
+
+def _turn_columns(path, to_laboratory):
+    rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
+    table = np.array(rows[1:], float)
+    for kind in ("force", "point"):
+        unit = "N" if kind == "force" else "mm"
+        columns = [rows[0].index(f"{kind}_{axis}_{unit}") for axis in "xyz"]
+        table[:, columns] = table[:, columns] @ to_laboratory
+    np.savetxt(path, table, "%.12g", ",", header=",".join(rows[0]), comments="")
+
+
+LENGTH, MASS, TIME = 2.0, 4.0, 0.5
+"""Of the new unit system, in old units: powers of two, so that floats scale exactly."""
+FORCE = MASS * LENGTH / TIME**2
+
+
+def scaled_scene(scene: Scene) -> Scene:
+    """Return the scene with the numbers of its tables in the new units."""
+
+    def attachment(end):
+        return end.model_copy(update={"point_mm": tuple(LENGTH * x for x in end.point_mm)})
+
+    bundles = tuple(
+        bundle.model_copy(
+            update={
+                "proximal": attachment(bundle.proximal),
+                "distal": attachment(bundle.distal),
+                "stiffness_N_per_mm": bundle.stiffness_N_per_mm * FORCE / LENGTH,
+                "slack_length_mm": bundle.slack_length_mm * LENGTH,
+            }
+        )
+        for bundle in scene.ligament
+    )
+    lines = {}
+    for name in ("quadriceps", "patellar_ligament"):
+        table = getattr(scene, name)
+        keys = [key for key, _ in table if key.endswith("_mm")]
+        lengths = {key: LENGTH * getattr(table, key) for key in keys}
+        ends = {
+            key: attachment(getattr(table, key))
+            for key in ("origin", "insertion", "proximal", "distal")
+            if hasattr(table, key)
+        }
+        lines[name] = table.model_copy(update=lengths | ends)
+    return scene.model_copy(update={"ligament": bundles} | lines)
+
+
+def scaled_chain(case: Case) -> Chain:
+    """Return the chain with placements, inertias and gravity in the new units."""
+    chain = Chain(load_urdf(case.scene.patient, True), True)
+    model = chain.model
+    for joint in range(model.njoints):
+        place, inertia = model.jointPlacements[joint], model.inertias[joint]
+        model.jointPlacements[joint] = pin.SE3(place.rotation, LENGTH * place.translation)
+        model.inertias[joint] = pin.Inertia(
+            MASS * inertia.mass, LENGTH * inertia.lever, MASS * LENGTH**2 * inertia.inertia
+        )
+    for frame in model.frames:
+        frame.placement = pin.SE3(frame.placement.rotation, LENGTH * frame.placement.translation)
+    model.gravity = pin.Motion(model.gravity.linear * LENGTH / TIME**2, np.zeros(3))
+    chain._insert_in_root = scaled_pose(chain._insert_in_root)
+    chain._tibia_in_root = scaled_pose(chain._tibia_in_root)
+    return chain
+
+
+def scaled_pose(poses):
+    moved = np.array(poses)
+    moved[..., :3, 3] *= LENGTH
+    return moved
+
+
+def scaled_case(case: Case) -> Case:
+    def surface(of: Surface) -> Surface:
+        return Surface(LENGTH * of.vertices, of.faces, of.name)
+
+    units = np.array([LENGTH] * 3 + [1.0] * 3)
+    flat = np.array([LENGTH, LENGTH, 1.0])
+    motion, tibia, ground = case.motion, case.tibia, case.ground
+    return Case(
+        scaled_scene(case.scene),
+        scaled_chain(case),
+        replace(
+            motion,
+            time=motion.time * TIME,
+            coordinates=motion.coordinates * units,
+            velocity=motion.velocity * units / TIME,
+            acceleration=motion.acceleration * units / TIME**2,
+            patella=motion.patella * flat,
+            patella_velocity=motion.patella_velocity * flat / TIME,
+            patella_acceleration=motion.patella_acceleration * flat / TIME**2,
+        ),
+        replace(
+            tibia,
+            time=tibia.time * TIME,
+            pose=scaled_pose(tibia.pose),
+            velocity=tibia.velocity * units / TIME,
+            acceleration=tibia.acceleration * units / TIME**2,
+        ),
+        replace(
+            ground,
+            force=ground.force * FORCE,
+            point=ground.point * LENGTH,
+            moment=ground.moment * FORCE * LENGTH,
+        ),
+        surface(case.femoral),
+        surface(case.insert),
+        surface(case.patella),
+    )
+
+
+def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
+    """Lengths, masses and times scaled, gravity and the model's own lengths along."""
+    monkeypatch.setattr(unknowns, "STANDSTILL", unknowns.STANDSTILL * LENGTH / TIME)
+    own_lengths = {
+        knee: ("RESIDUAL_SHIFT",),
+        patellofemoral: ("PATCH_DEPTH", "SAMPLE_SPACING", "REACH"),
+        close_region: ("RESOLUTION", "REACH", "_SPACING", "_DOUBT"),
+        condyles: ("NOTCH_DEPTH", "_STRIP", "_DEEPEST"),
+    }
+    for module, names in own_lengths.items():
+        for name in names:
+            monkeypatch.setattr(module, name, getattr(module, name) * LENGTH)
+    search = NearestPoints.__init__
+    monkeypatch.setattr(search, "__defaults__", (search.__defaults__[0] * LENGTH,))
+    patella = patellofemoral.PatellofemoralContact.__init__
+    ml, lateral_yield, tilt_yield = patella.__defaults__
+    scaled = (ml, lateral_yield * LENGTH, tilt_yield / LENGTH)
+    monkeypatch.setattr(patella, "__defaults__", scaled)
+    mechanics = Mechanics(scaled_case(shipped()))
+    for k, before in zip(FRAMES, shipped_loads(), strict=True):
+        after = mechanics.frame(k)
+        assert not after.loads.problems
+        for name, value in before.loads.values.items():
+            moment = "moment" in name or name == "residual_axial"
+            expected = value * FORCE * (LENGTH if moment else 1.0)
+            assert after.loads.values[name] == pytest.approx(expected, rel=1e-8, abs=1e-6 * FORCE)
+        assert after.loads.external_flexion == pytest.approx(
+            before.loads.external_flexion * FORCE * LENGTH, rel=1e-9, abs=1e-9
+        )
+        assert after.loads.sensitivity == pytest.approx(before.loads.sensitivity * FORCE, rel=1e-6)
+        assert after.wrap == pytest.approx(before.wrap, abs=1e-9)
+        for name, tension in before.tensions.items():
+            assert after.tensions[name] == pytest.approx(tension * FORCE, rel=1e-9, abs=1e-9)
+
+
+def resampled_scene(folder, rate, cutoff, start=1.0, stop=2.0):
+    """Write the shipped bend as recorded at another rate (Hz), over a part of it."""
+    changes = {f"{table}__cutoff_Hz": cutoff for table in ("motion", "ground_reaction")}
+    path = write_scene(folder, **changes)
+    time = np.linspace(start, stop, round((stop - start) * rate) + 1)
+    for name in ("motion.csv", "tibia.csv", "ground_reaction.csv"):
+        header = (path.parent / name).read_text(encoding="utf-8").split("\n", 1)[0]
+        rows = np.loadtxt(path.parent / name, delimiter=",", skiprows=1)
+        spline = make_interp_spline(rows[:, 0], rows[:, 1:], k=5)
+        np.savetxt(
+            path.parent / name,
+            np.column_stack([time, spline(time)]),
+            "%.12g",
+            ",",
+            header=header,
+            comments="",
+        )
+    return path
+
+
+def test_slow_and_fast_recordings_of_the_same_motion_agree(tmp_path):
+    """20 Hz and 1000 Hz, the same 6 Hz cut-off, a second of the bend: within 0.2 % of BW."""
+    found = {}
+    for rate in (20, 1000):
+        case = load_case(load_scene(resampled_scene(tmp_path / str(rate), rate, 6.0)))
+        mechanics = Mechanics(case)
+        chosen = [int(np.argmin(np.abs(case.motion.time - at))) for at in (1.3, 1.5, 1.7)]
+        frames = [mechanics.frame(k) for k in chosen]
+        assert not any(frame.loads.problems for frame in frames)
+        found[rate] = np.array([frame.loads.contact_force for frame in frames])
+    assert np.abs(found[20] - found[1000]).max() < 0.002 * shipped().body_weight
