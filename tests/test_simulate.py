@@ -27,29 +27,31 @@ def test_every_frame_has_numbers(bend):
 
 
 def test_forces_go_the_way_of_the_source(bend):
-    """Rising with flexion; PL/Q from about 1 down; PF/Q from about 0.3 up to about 1.
+    """Rising with flexion, PL/Q from 1 down, PF/Q up to about 1; the README's numbers.
 
-    The source's PL/Q ends at 0.45; this knee's stays near 0.65 once the quadriceps wraps.
+    The source's PL/Q ends at 0.45, its PF/Q begins at 0.2: the README says that ours do not.
     """
     force, quadriceps = bend["force_total_BW"], bend["quadriceps_N"]
     assert (np.diff(force[:-1]) > 0).all()
     assert (np.diff(quadriceps[:-1]) > 0).all()
     ligament = bend["patellar_ligament_N"] / quadriceps
     patella = bend["patellofemoral_N"] / quadriceps
-    assert ligament[0] == pytest.approx(1.0, abs=0.1)
-    assert ligament[-1] < 0.7
+    assert force.max() == pytest.approx(3.4, abs=0.1)
+    assert force[-1] == pytest.approx(0.96 * force.max(), rel=0.01)
+    assert ligament[0] == pytest.approx(1.0, abs=0.05)
+    assert ligament[-1] == pytest.approx(0.6, abs=0.05)
     assert (np.diff(ligament[:-1]) < 0.01).all()
-    assert patella[0] < 0.4
-    assert 0.9 < patella[-1] < 1.2
+    assert patella[0] == pytest.approx(0.3, abs=0.05)
+    assert patella[-1] == pytest.approx(1.1, abs=0.05)
 
 
 def test_contact_force_is_mostly_superior_inferior(bend):
-    assert (bend["force_si_N"] / bend["force_total_N"] > 0.95).all()
+    assert (bend["force_si_N"] / bend["force_total_N"] > 0.99).all()
 
 
 def test_residuals_are_small_against_it(bend):
     residual = np.hypot(bend["residual_ap_N"], bend["residual_ml_N"])
-    assert (residual / bend["force_si_N"] < 0.2).all()
+    assert (residual / bend["force_si_N"] < 0.12).all()
 
 
 def test_the_deformed_insert_carries_the_load_that_balance_asks_for(bend):

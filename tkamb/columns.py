@@ -79,8 +79,17 @@ COLUMNS: tuple[Column, ...] = (
     Column("ground_reaction_ap_N", "ground reaction on the foot, insert x", _GROUND),
     Column("ground_reaction_si_N", "the same, insert y", _GROUND),
     Column("ground_reaction_ml_N", "the same, insert z", _GROUND),
-    Column("external_flexion_moment_Nm", "external moment that flexes the knee", _GROUND),
-    Column("external_adduction_moment_Nm", "external moment that adducts the knee", _GROUND),
+    Column(
+        "external_flexion_moment_Nm",
+        "external moment that flexes the knee, about the femoral ML axis",
+        _GROUND,
+    ),
+    Column(
+        "external_adduction_moment_Nm",
+        "external moment that adducts the knee, about the floating axis (normal to the femoral "
+        "ML and the tibial SI axis); both at the femoral origin",
+        _GROUND,
+    ),
     Column(LIGAMENT, "tension of the ligament bundle <name>", "[[ligament]]"),
     Column("medial_slip_mm", "slip of the medial condyle since the first frame", _IMPLANT),
     Column("lateral_slip_mm", "slip of the lateral condyle since the first frame", _IMPLANT),
