@@ -16,14 +16,12 @@ from tkamb.view.payload import Block, _placed
 from tkamb.view.run import open_run
 from tkamb.view.shading import shaded, thinned
 from tkamb.view.show import Show, serve_in_background
-from viewed import SCENE, copied_scene, short_results
+from viewed import copied_scene, shipped_run, short_results
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    short_results(folder, SCENE)
-    return folder
+def folder():
+    return shipped_run()
 
 
 @pytest.fixture(scope="module")

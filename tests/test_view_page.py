@@ -8,7 +8,7 @@ from tkamb.results import read_results
 from tkamb.view.browser import HeadlessBrowser, find_browser
 from tkamb.view.run import open_run
 from tkamb.view.show import Show, serve_in_background
-from viewed import SCENE, force, levels, matrix, move_slider, short_results
+from viewed import SCENE, force, levels, matrix, move_slider, shipped_run, short_results
 
 pytestmark = pytest.mark.skipif(
     find_browser() is None, reason="no chromium here (Debian: apt install chromium)"
@@ -17,10 +17,8 @@ FRAMES = (0, 2, 5)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    short_results(folder, SCENE)
-    return folder
+def folder():
+    return shipped_run()
 
 
 @pytest.fixture(scope="module")

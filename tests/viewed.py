@@ -1,6 +1,8 @@
 """A short run to look at, and what is read back from the scene graph of its page."""
 
 import shutil
+import tempfile
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,8 @@ from tkamb.simulation import simulate
 MODELS = Path(__file__).parents[1] / "models"
 SCENE = MODELS / "deep_knee_bend" / "scene.toml"
 EVERY = slice(0, 101, 20)
+HELD = []
+"""Folders that go when the tests end."""
 
 
 def copied_scene(folder):
@@ -24,6 +28,15 @@ def short_results(folder, scene, **given):
     results = simulate(scene, frames=EVERY, **given)
     write_results(results, folder)
     return results
+
+
+@cache
+def shipped_run():
+    """Return the folder of a short run of the shipped scene, the same for all tests."""
+    held = tempfile.TemporaryDirectory(prefix="tkamb-tests-")
+    short_results(Path(held.name), SCENE)
+    HELD.append(held)
+    return Path(held.name)
 
 
 def matrix(browser, path):

@@ -15,7 +15,7 @@ from tkamb.output.style import (
     SKY,
 )
 
-METAL, INSERT, BONE, BUTTON = "#8d99a8", "#e4dfd0", "#e2d3ad", "#dcd8cc"
+METAL, INSERT, BONE, BUTTON = "#8d99a8", "#e4dfd0", "#f0e8d2", "#dcd8cc"
 TENDON, WRAPPED = "#8c3b2e", "#f0c419"
 SLACK = "#9a9a9a"
 RECORDED = SKY

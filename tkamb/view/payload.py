@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import umsgpack  # type: ignore[import-untyped]
 from meshcat.commands import SetObject, SetTransform
-from meshcat.geometry import MeshPhongMaterial, TriangularMeshGeometry, pack_numpy_array
+from meshcat.geometry import MeshLambertMaterial, TriangularMeshGeometry, pack_numpy_array
 from meshcat.path import Path as NodePath
 
 from tkamb.geometry.frames import Array
@@ -27,6 +27,9 @@ from tkamb.view.shading import Shaded, shaded
 
 METRES_PER_BODY_WEIGHT = 0.03
 """Length of an arrow of one body weight."""
+
+FRONT = 0
+"""three.js: triangles are seen from outside only, which spares half of them."""
 
 TYPES = {"float32": np.float32, "uint8": np.uint8, "int16": np.int16, "uint32": np.uint32}
 
@@ -181,8 +184,8 @@ def _placed(root: str, side: str) -> SetTransform:
 
 
 def _commands(path: str, solid: Solid, shape: Shaded) -> list[Any]:
-    material = MeshPhongMaterial(
-        color=int(solid.colour.removeprefix("#"), 16), opacity=solid.opacity, side=2, shininess=40
+    material = MeshLambertMaterial(
+        color=int(solid.colour.removeprefix("#"), 16), opacity=solid.opacity, side=FRONT
     )
     made = [SetObject(_Mesh(shape), material, _node(path))]
     if len(solid.poses) == 1:

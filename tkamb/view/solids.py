@@ -93,26 +93,26 @@ def _pressed(recorded: Array, maps: ContactMaps | None, rows: Sequence[int]) -> 
 
 def _femur(states: Sequence[ChainState], poses: Array) -> Solid:
     hip = (inverse(poses[0]) @ np.append(states[0].point("hip", np.zeros(3)), 1.0))[:3]
-    return Solid("femur", "bones", _shaft(hip, FEMUR_PROFILE, "femur"), BONE, 0.5, poses)
+    return Solid("femur", "bones", _shaft(hip, FEMUR_PROFILE, "femur"), BONE, 1.0, poses)
 
 
 def _tibia(states: Sequence[ChainState]) -> Solid:
     """Return the tibia below the insert's bottom, down to the ankle."""
     ankle = states[0].point("tibia", np.zeros(3))
     surface = _shaft(ankle, TIBIA_PROFILE, "tibia")
-    return Solid("tibia", "bones", surface, BONE, 0.5, np.eye(4)[None])
+    return Solid("tibia", "bones", surface, BONE, 1.0, np.eye(4)[None])
 
 
 def _shaft(end: Array, profile: tuple[tuple[float, float], ...], name: str) -> Surface:
     """Return a body of revolution from the origin towards `end` (3,)."""
     length = float(np.linalg.norm(end))
     share, radius = np.array(profile).T
-    at = np.linspace(share[0], share[-1], 40)
+    at = np.linspace(share[0], share[-1], 24)
     radii = np.interp(at, share, radius * MILLIMETRE)
     outline = np.column_stack(
         [np.concatenate([[0.0], radii, [0.0]]), length * np.concatenate([at[:1], at, at[-1:]])]
     )
-    mesh = trimesh.creation.revolve(outline, sections=40)
+    mesh = trimesh.creation.revolve(outline, sections=28)
     turn = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], end / length)
     return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64), name).moved(turn)
 

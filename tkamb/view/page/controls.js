@@ -26,9 +26,13 @@ tkamb.look = function (name) {
   const camera = CAMERAS[name], at = camera.at || KNEE;
   const mirrored = tkamb.views[0].side === "left" ? -1 : 1;
   const {viewer} = tkamb;
+  const pane = element("pane"), shape = pane.offsetWidth / tkamb.views.length / pane.offsetHeight;
+  const farther = Math.max(1, 0.8 / shape);
   viewer.controls.target.set(...at);
   viewer.camera.position.set(
-    at[0] + camera.from[0], at[1] + camera.from[1], at[2] + mirrored * camera.from[2]);
+    at[0] + farther * camera.from[0],
+    at[1] + farther * camera.from[1],
+    at[2] + farther * mirrored * camera.from[2]);
   for (const layer of tkamb.data.layers) {
     const off = (camera.without || []).includes(layer) || tkamb.switchedOff.has(layer);
     tkamb.showLayer(layer, !off);
@@ -90,7 +94,7 @@ function addLegends() {
       known.add(arrow.name);
       const row = made("tr", "", element("forces"), {title: arrow.meaning});
       made("i", "", made("td", "", row)).style.background = arrow.colour;
-      made("td", `${arrow.name}, ${arrow.meaning}`, row);
+      made("td", views.length > 1 ? arrow.name : `${arrow.name}, ${arrow.meaning}`, row);
       for (const other of views) {
         made("td", "", row, {class: "number"}).arrow = other.arrows.find(
           (one) => one.name === arrow.name);
@@ -100,7 +104,8 @@ function addLegends() {
 }
 
 function showScale() {
-  const weights = tkamb.views.map((view) => `${view.body_weight.toFixed(0)} N`).join(" / ");
+  const found = tkamb.views.map((view) => `${view.body_weight.toFixed(0)} N`);
+  const weights = [...new Set(found)].join(" / ");
   const millimetres = (1000 * tkamb.arrowLength).toFixed(0);
   element("scale").textContent = `${millimetres} mm of arrow = 1 BW = ${weights}`;
 }
@@ -123,9 +128,8 @@ function colourBar(id, scale, top, digits) {
 function addNumbers() {
   const table = element("numbers"), {views} = tkamb;
   element("titles").replaceChildren();
-  for (const view of views) {
-    made("div", `${view.title} · ${view.side} knee`, element("titles"));
-  }
+  for (const view of views) made("div", "", element("titles"));
+  document.body.classList.toggle("several", views.length > 1);
   if (views.length > 1) {
     const head = made("tr", "", table);
     made("th", "", head);
@@ -156,6 +160,10 @@ function showNumbers() {
       cell.textContent = inBodyWeights(cell.arrow, frames[k], tkamb.views[k].body_weight);
     });
   }
+  [...element("titles").children].forEach((title, k) => {
+    const view = tkamb.views[k], place = tkamb.views.length > 1 ? ` · ${view.places[frames[k]]}` : "";
+    title.textContent = `${view.title} · ${view.side} knee${place}`;
+  });
   const words = tkamb.views.map((view, k) => view.statuses[frames[k]]);
   const plain = words.map((word) => (word === "ok" ? "" : word)).filter(Boolean);
   element("status").textContent = [...new Set(plain)].join(" · ");

@@ -19,8 +19,8 @@ class Tube {
       }
     }
     this.geometry.setIndex(index);
-    const material = new THREE.MeshPhongMaterial({
-      vertexColors: true, side: THREE.DoubleSide, shininess: 15});
+    const material = new THREE.MeshLambertMaterial({
+      vertexColors: true, side: THREE.DoubleSide});
     const mesh = new THREE.Mesh(this.geometry, material);
     mesh.frustumCulled = false;
     viewer.set_object(tkamb.split(strand.path), mesh);
@@ -83,8 +83,8 @@ class Pointer {
     this.arrow = arrow;
     const body = new THREE.Group();
     for (const faint of [true, false]) {
-      const material = new THREE.MeshPhongMaterial({
-        color: new THREE.Color(arrow.colour), shininess: 10, transparent: faint,
+      const material = new THREE.MeshLambertMaterial({
+        color: new THREE.Color(arrow.colour), transparent: faint,
         opacity: faint ? 0.4 : 1, depthTest: !faint, depthWrite: !faint});
       for (const [name, geometry] of [["shaft", unitShaft()], ["head", unitHead()]]) {
         const mesh = new THREE.Mesh(geometry, material);
@@ -132,10 +132,18 @@ function unitHead() {
 
 tkamb.frameCount = () => Math.max(...tkamb.views.map((view) => view.places.length));
 
-// The frame of a view at the page's frame: the same share of the motion.
+// The frame of a view at the page's frame: the nearest to the same share of the motion's time.
 tkamb.frameOf = function (view) {
-  const last = tkamb.frameCount() - 1, own = view.places.length - 1;
-  return last > 0 ? Math.round(tkamb.frame / last * own) : 0;
+  const longest = tkamb.views.find((one) => one.places.length === tkamb.frameCount());
+  if (view.places.length === longest.places.length) return tkamb.frame;
+  const share = (times, k) => (times[k] - times[0]) / (times[times.length - 1] - times[0] || 1);
+  const wanted = share(longest.times, tkamb.frame);
+  let nearest = 0;
+  view.times.forEach((_, k) => {
+    const nearer = Math.abs(share(view.times, k) - wanted);
+    if (nearer < Math.abs(share(view.times, nearest) - wanted)) nearest = k;
+  });
+  return nearest;
 };
 
 tkamb.showFrame = function (frame) {

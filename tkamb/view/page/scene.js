@@ -78,8 +78,8 @@ function buildView(viewer, view, number) {
 }
 
 // A surface that lets see through first writes its depth, then its colour: its own far side stays
-// hidden whatever the order of its triangles. Bones come before metal, which is seen over them.
-const SEEN_THROUGH = ["bones", "patella", "femoral component", "recorded pose"];
+// hidden whatever the order of its triangles. The patella comes before the metal behind it.
+const SEEN_THROUGH = ["patella", "femoral component", "recorded pose"];
 
 function seeThrough(view) {
   const {THREE} = MeshCat;
@@ -135,7 +135,7 @@ tkamb.showMap = function (view, map) {
 function addMarker(viewer, marker) {
   const {THREE} = MeshCat, colour = new THREE.Color(marker.colour);
   const ball = new THREE.Mesh(
-    new THREE.SphereGeometry(marker.radius, 20, 14), new THREE.MeshPhongMaterial({color: colour}));
+    new THREE.SphereGeometry(marker.radius, 14, 8), new THREE.MeshLambertMaterial({color: colour}));
   ball.renderOrder = 3;
   ball.material.depthTest = false;
   ball.material.transparent = true;
