@@ -1,0 +1,155 @@
+"""Frames at the edge of what the equations can say: status and condition number tell."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from scenes import MODEL, write_scene
+from tkamb import simulate
+from tkamb.body.inverse_dynamics import LARGEST_CONDITION
+from tkamb.body.knee import solve_knee
+from tkamb.body.load import PointForces
+from tkamb.case import load_case
+from tkamb.geometry.frames import transform
+from tkamb.mechanics import FrameLoads, Mechanics
+from tkamb.scene import load_scene
+from tkamb.status import FAILED, frame_status
+
+MIDDLE = 60
+
+
+@cache
+def mechanics(friction: float = 0.05) -> Mechanics:
+    return Mechanics(load_case(load_scene(MODEL / "scene.toml", {"contact.friction": friction})))
+
+
+@cache
+def shipped_frame() -> FrameLoads:
+    return mechanics().frame(MIDDLE)
+
+
+def contact_axis(frame: FrameLoads) -> np.ndarray:
+    """Midpoint of the condyles' contact points (3,)."""
+    return np.mean([condyle.point for condyle in frame.geometry.condyles.values()], axis=0)
+
+
+def solved_with_arm(arm: float):
+    """Solve the shipped frame with its patellar ligament turned about its proximal end.
+
+    Args:
+        arm: m, at which it then passes the contact, in front of it if positive.
+    """
+    geometry = shipped_frame().geometry
+    on_patella, on_tibia = geometry.extensor.patellar_ligament
+    to_contact = contact_axis(shipped_frame()) - on_patella.points[0]
+    distance = np.hypot(*to_contact[:2])
+    angle = np.arctan2(to_contact[1], to_contact[0]) + np.arcsin(arm / distance)
+    along = np.array([[np.cos(angle), np.sin(angle), 0.0]])
+    ligament = (
+        replace(on_patella, forces=along),
+        replace(on_tibia, points=on_patella.points, forces=-along),
+    )
+    extensor = replace(geometry.extensor, patellar_ligament=ligament)
+    return solve_knee(replace(geometry, extensor=extensor), 0.05)
+
+
+def test_condition_number_grows_as_one_over_the_moment_arm():
+    arms = np.array([0.045, 0.02, 0.01, 0.005, 0.002, 0.001])
+    condition = np.array([solved_with_arm(arm).condition for arm in arms])
+    assert ((condition * arms > 6.0) & (condition * arms < 10.0)).all()
+    assert condition[0] < 220.0
+
+
+@pytest.mark.parametrize("arm", [5e-4, 1e-5, 0.0, -1e-5])
+def test_a_ligament_through_the_contact_holds_no_number(arm):
+    loads = solved_with_arm(arm)
+    assert loads.problems == ("singular equations",)
+    assert loads.condition > LARGEST_CONDITION
+    assert loads.values == {}
+    assert np.isnan(loads.contact_force).all()
+
+
+def test_a_scene_that_comes_near_the_singularity_says_so(tmp_path):
+    """The tuberosity is put where the ligament passes through the contact at one frame."""
+    frame = shipped_frame()
+    proximal = frame.geometry.extensor.patellar_ligament[0].points[0]
+    distal = proximal + 1.3 * (contact_axis(frame) - proximal)
+    chain = mechanics().case.chain
+    in_tibia = transform(chain.insert_in_tibia, distal) * 1e3
+    path = write_scene(
+        tmp_path,
+        patellar_ligament__wrap=False,
+        patellar_ligament__distal__point_mm=in_tibia.tolist(),
+    )
+    results = simulate(path, frames=slice(MIDDLE - 20, MIDDLE + 21, 20))
+    assert results.status[1].startswith(FAILED + "singular equations")
+    for name in ("force_total_N", "quadriceps_N", "patellofemoral_N", "medial_peak_pressure_MPa"):
+        assert np.isnan(results[name][1])
+    assert results["condition_number"][1] > LARGEST_CONDITION
+    for k, status in enumerate(results.status):
+        failed = status.startswith(FAILED)
+        assert failed == np.isnan(results["force_total_N"][k])
+        assert failed == np.isnan(results["approach_mm"][k])
+        assert failed or results["condition_number"][k] < LARGEST_CONDITION
+
+
+def test_quadriceps_through_the_patellofemoral_contact_holds_no_number():
+    """Then it cannot pull on the patellar ligament, whatever its tension."""
+    geometry = shipped_frame().geometry
+    quadriceps = geometry.extensor.quadriceps
+    (on_patella,) = (load for load in quadriceps if load.link == "patella")
+    shift = geometry.extensor.contact_point - on_patella.points[0]
+    moved = tuple(PointForces(one.link, one.points + shift, one.forces) for one in quadriceps)
+    extensor = replace(geometry.extensor, quadriceps=moved)
+    loads = solve_knee(replace(geometry, extensor=extensor), 0.05)
+    assert loads.problems == ("singular equations",)
+    assert loads.values == {}
+
+
+@pytest.mark.parametrize("friction", [0.0, 1.0])
+def test_friction_at_its_ends(friction):
+    """Each condyle's force leans by atan(mu) from its normal, against the sliding."""
+    frame = mechanics(friction).frame(MIDDLE)
+    assert frame.loads.problems == ()
+    assert frame.loads.condition < 500.0
+    for side, condyle in frame.geometry.condyles.items():
+        force = condyle.direction(friction) * frame.loads.values[f"{side}_normal"]
+        normal = force @ condyle.normal
+        across = force - normal * condyle.normal
+        assert np.linalg.norm(across) == pytest.approx(friction * normal, rel=0.02, abs=1e-9)
+        assert across @ condyle.sliding <= 0.0
+    total = np.linalg.norm(frame.loads.contact_force)
+    assert total == pytest.approx(np.linalg.norm(shipped_frame().loads.contact_force), rel=0.5)
+
+
+def noisy_scene(folder):
+    """Write the shipped bend with 0.5 mm and 0.5 deg of noise (standard deviation)."""
+    cutoffs = {f"{table}__cutoff_Hz": 2.0 for table in ("motion", "tibia", "ground_reaction")}
+    path = write_scene(folder, **cutoffs)
+    file = path.parent / "motion.csv"
+    header = file.read_text(encoding="utf-8").split("\n", 1)[0]
+    rows = np.loadtxt(file, delimiter=",", skiprows=1)
+    rows[:, 1:7] += np.random.default_rng(5).normal(scale=0.5, size=(len(rows), 6))
+    np.savetxt(file, rows, "%.9g", ",", header=header, comments="")
+    return path
+
+
+def test_noise_of_fluoroscopy_is_flagged_and_never_silent(tmp_path):
+    path = noisy_scene(tmp_path)
+    noisy = Mechanics(load_case(load_scene(path, {"contact.adjust": True})))
+    changes, flagged = [], 0
+    for k in range(5, 101, 15):
+        frame = noisy.frame(k)
+        status, force = frame_status(noisy.case, k, frame, None), frame.loads.contact_force
+        assert status.startswith(FAILED) == bool(np.isnan(force).any())
+        if status.startswith(FAILED):
+            continue
+        assert frame.loads.condition < LARGEST_CONDITION
+        flagged += "filter moves the recorded pose" in status
+        clean = mechanics().frame(k).loads.contact_force
+        changes.append((np.linalg.norm(force) - np.linalg.norm(clean)) / noisy.case.body_weight)
+    assert len(changes) >= 6
+    assert flagged >= 4
+    assert np.sqrt(np.mean(np.square(changes))) < 0.4
