@@ -5,11 +5,12 @@ adduction, axial rotation, anterior-posterior and medial-lateral position do so 
 releases them, else they are kept as recorded, and what keeps them is a residual of the
 equations of motion.
 
-Within one search the patellar ligament's line is held; the patella and its lines are then
-found anew at the solved pose, until that moves the knee no more. Inertia and sliding speed
-are those of the recorded rates: for the released coordinates the solution is quasi-static.
-Friction is Coulomb's, against the recorded sliding, at each condyle's line of action and of
-mu times its resultant.
+Within one search the patella rides on the femur, and its ligament turns with it; patella and
+lines are then found anew at the solved pose, until that moves the knee no more. Inertia and
+sliding speed are those of the recorded rates: for the released coordinates all is
+quasi-static. Friction is Coulomb's, mu times each condyle's resultant against the recorded
+sliding, on the line of action of the resultant; without it nothing but follower loads keeps
+the forces from having a potential.
 
 The contact comes as a probe; this file does not know the models.
 """
