@@ -52,6 +52,7 @@ def rewrite(path, change):
         ({"motion__length_unit": "cm"}, "length_unit"),
         ({"ground_reaction__laboratory_axes": "+x,+z,-y"}, "laboratory_axes"),
         ({"ground_reaction__laboratory_axes": "-x,-y,+z"}, "laboratory_axes"),
+        ({"ground_reaction__length_unit": "m"}, "from the ankle"),
         ({"implant__insert__unit": "m"}, "mm"),
         ({"implant__femoral__unit": "m"}, "mm"),
         ({"implant__insert__axes": "+z,+y,+x"}, "axes"),

@@ -90,9 +90,11 @@ def load_case(scene: Scene) -> Case:
 
         tibia = load_tibia(scene.tibia, motion.time, scene.patient.side, scene.motion.cutoff_Hz)
     if scene.ground_reaction:
-        from tkamb.inputs.ground_reaction import load_ground_reaction
+        from tkamb.inputs.ground_reaction import check_under_foot, load_ground_reaction
 
         ground = load_ground_reaction(scene.ground_reaction, motion.time, scene.patient.side)
+        if tibia and scene.ground_reaction.applied == "cop":
+            check_under_foot(ground, tibia.pose[:, :3, 3], scene.ground_reaction.file)
     return Case(scene, chain, motion, tibia, ground, parts.femoral, parts.insert, parts.patella)
 
 

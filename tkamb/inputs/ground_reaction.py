@@ -12,6 +12,7 @@ force and moment stay exactly as measured and filtered, only their point is conv
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -25,6 +26,8 @@ from tkamb.scene import GroundReactionTable
 
 LEVEL_TOLERANCE = 0.01
 """m; a centre of pressure that rises by more than this is not on a level plate."""
+FARTHEST_FROM_ANKLE = 0.5
+"""m; a centre of pressure farther from the ankle than this is under no foot of that leg."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +82,24 @@ def load_ground_reaction(
         stamps, wrench, table.cutoff_Hz, time, name=str(recorded.path)
     )
     return _at_centre_of_pressure(filtered, level, table.unloaded_N, time, stamps, point)
+
+
+def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
+    """Raise an InputError where the loaded centre of pressure is not under the foot.
+
+    Args:
+        ground: the ground reaction.
+        ankle: (f, 3) m, ankle centre in the laboratory at the same frames.
+        path: file of the ground reaction, for the message.
+    """
+    away = (ground.point - ankle)[ground.loaded][:, [0, 2]]
+    farthest = float(np.linalg.norm(away, axis=1).max(initial=0.0))
+    if farthest > FARTHEST_FROM_ANKLE:
+        raise InputError(
+            f"the centre of pressure lies up to {farthest:.3g} m from the ankle",
+            path,
+            "check [ground_reaction] length_unit, columns and laboratory_axes, and [tibia]",
+        )
 
 
 def _recorded(table: GroundReactionTable, recorded: Table) -> tuple[Array, Array, Array]:
