@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from tkamb.errors import TkambError
+from tkamb.studies.command import add_tradeoff
 from tkamb.view.command import add_view
 
 
@@ -49,6 +50,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_mesh(commands)
     _add_scene(commands)
     add_view(commands)
+    add_tradeoff(commands)
     return parser
 
 

@@ -100,7 +100,7 @@ def press_meshes(
         side=side,
         prepare_seconds=prepared - started,
         solve_seconds=solved - prepared,
-        peak_rss_MB=_peak_rss(),
+        peak_rss_MB=peak_rss(),
     )
 
 
@@ -184,7 +184,7 @@ def read_pose(path: str | Path) -> tuple[float, ...]:
 _SIX = "give a text file of six numbers: x y z (mesh units) rx ry rz (deg)"
 
 
-def _peak_rss() -> float:
+def peak_rss() -> float:
     """Return the largest resident memory so far, MB (1e6 bytes)."""
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6

@@ -51,8 +51,17 @@ def _relative(
     return float(np.abs(given - true).max() / scale(np.abs(true)))
 
 
-def raster_map(result: ContactResult) -> dict[tuple[int, int], float]:
-    """Return the pressure (Pa) on a raster of x and z, {(i, j): p} where there is any."""
+Raster = dict[tuple[int, int], float]
+"""Raster place (i along x, j along z) -> pressure (Pa), where there is any."""
+
+
+def raster_of(stored: Mapping[str, float]) -> Raster:
+    """Return a raster stored as "i j" -> Pa."""
+    return {(int(i), int(j)): p for (i, j), p in ((k.split(), p) for k, p in stored.items())}
+
+
+def raster_map(result: ContactResult) -> Raster:
+    """Return the pressure map on the raster."""
     loaded = result.pressure > 0
     if not loaded.any():
         return {}
@@ -74,9 +83,7 @@ def raster_map(result: ContactResult) -> dict[tuple[int, int], float]:
     }
 
 
-def map_error(
-    found: Mapping[tuple[int, int], float], reference: Mapping[tuple[int, int], float]
-) -> float:
+def map_error(found: Raster, reference: Raster) -> float:
     """Return the L2 norm of the maps' difference over that of the reference."""
     places = sorted(set(found) | set(reference))
     given = np.array([found.get(place, 0.0) for place in places])

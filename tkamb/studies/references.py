@@ -17,12 +17,22 @@ from tkamb.contact.registry import contact_model
 from tkamb.errors import ComputationError, InputError
 from tkamb.output.atomic import write_text
 from tkamb.studies.cases import StudyCase
-from tkamb.studies.quantities import Quantities, common_limit, quantities, raster_map
+from tkamb.studies.quantities import (
+    Quantities,
+    Raster,
+    common_limit,
+    quantities,
+    raster_map,
+    raster_of,
+)
 from tkamb.units import MILLIMETRE
 
 STORED = Path(__file__).with_name("references.json")
 FAMILIES = ("fe", "lattice")
 GRIDS_MM = (1.5, 1.25, 1.0, 0.8)
+LARGE_GRIDS_MM = (2.0, 1.5, 1.25, 1.0)
+LARGE = 2e-5
+"""m³: of an insert's bounding box from which on the coarser grids must do."""
 TOLERANCE = 1e-6
 
 
@@ -47,21 +57,24 @@ class Reference:
     map: dict[str, float]
 
     @property
-    def raster(self) -> dict[tuple[int, int], float]:
+    def raster(self) -> Raster:
         """The map by raster place."""
-        return {(int(a), int(b)): p for a, b, p in _split(self.map)}
+        return raster_of(self.map)
 
 
-def _split(stored: dict[str, float]) -> list[tuple[str, str, float]]:
-    return [(*place.split(), p) for place, p in stored.items()]  # type: ignore[misc]
-
-
-def compute_reference(case: StudyCase, grids_mm: tuple[float, ...] = GRIDS_MM) -> Reference:
+def compute_reference(case: StudyCase, grids_mm: tuple[float, ...] | None = None) -> Reference:
     """Solve a case on refined grids and return their common limit.
+
+    Args:
+        case: the case.
+        grids_mm: cell sizes; default by the size of the insert.
 
     Raises:
         ComputationError: a grid did not converge.
     """
+    if grids_mm is None:
+        large = float(np.prod(np.ptp(case.pair.insert.vertices, axis=0))) > LARGE
+        grids_mm = LARGE_GRIDS_MM if large else GRIDS_MM
     solved: dict[str, Quantities] = {}
     finest: dict[str, float] = {}
     for family in FAMILIES:

@@ -1,0 +1,58 @@
+"""`tkamb tradeoff` and `tkamb stability`: arguments in, exit status out."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+
+def add_tradeoff(commands: Any) -> None:
+    """Add `tradeoff` to the command line."""
+    tradeoff = commands.add_parser("tradeoff", help="speed against accuracy of the contact models")
+    tradeoff.add_argument(
+        "scene", type=Path, nargs="?", metavar="SCENE", help="measure on your own scene too"
+    )
+    tradeoff.add_argument("--quick", action="store_true", help="two cases, 2 mm, within a minute")
+    tradeoff.add_argument("--peer", choices=("calculix",), help="another program, side by side")
+    tradeoff.add_argument("--recompute", action="store_true", help="the references too (slow)")
+    tradeoff.add_argument("--out", type=Path, default=Path("out/tradeoff"), metavar="DIR")
+    tradeoff.add_argument("--json", action="store_true")
+    tradeoff.set_defaults(command=_tradeoff)
+
+
+def _tradeoff(options: argparse.Namespace) -> int:
+    from tkamb.output.atomic import claim_directory, replaced_file, write_text
+    from tkamb.studies import tradeoff as study
+    from tkamb.studies.tradeoff_report import picture, recommendations, table
+
+    jobs = study.jobs(options.quick, options.scene)
+    directory = claim_directory(options.out)
+    cases = study.cases_of(jobs)
+    references = study.references_for(cases, options.recompute, _announce)
+    rows = study.run_tradeoff(jobs, references, _progress("model"))
+    if options.peer:
+        from tkamb.studies.calculix import peer_rows
+
+        rows = study.with_fronts([*rows, *peer_rows(cases, references)])
+    text = study.as_json(rows)
+    lines = [*table(rows, references), "", *recommendations(rows)]
+    write_text(directory / "tradeoff.json", text + "\n")
+    write_text(directory / "tradeoff.txt", "\n".join(lines) + "\n")
+    with replaced_file(directory / "tradeoff.png") as temporary:
+        picture(rows).savefig(temporary, format="png", dpi=150)
+    print(text if options.json else "\n".join([*lines, f"picture: {directory / 'tradeoff.png'}"]))
+    return 0 if any(row.errors for row in rows) else 1
+
+
+def _progress(unit: str) -> Any:
+    from tqdm import tqdm
+
+    def wrapped(items: Sequence[Any]) -> Any:
+        return tqdm(items, unit=unit, disable=None)
+
+    return wrapped
+
+
+def _announce(line: str) -> None:
+    print(f"tkamb: {line}", file=sys.stderr, flush=True)

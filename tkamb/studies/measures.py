@@ -1,0 +1,170 @@
+"""One row of the trade-off: a model on a case, timed, in a process of its own.
+
+`python -m tkamb.studies.measures` reads a `Job` as JSON from standard input and prints the
+measure as JSON, so that its peak memory is its own and a crash or a hang is a row too.
+"""
+
+import json
+import subprocess
+import sys
+import time as clock
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from tkamb.contact.model import ContactModel, ContactResult, ContactStatus
+from tkamb.contact.registry import contact_class, contact_model
+from tkamb.errors import TkambError
+from tkamb.studies.cases import StudyCase, study_case
+from tkamb.studies.quantities import Quantities, quantities, raster_map
+
+LONGEST_SECONDS = 600.0
+"""A job that takes longer is stopped and says so."""
+REPEATS = 5
+ENOUGH_SECONDS = 8.0
+"""No more repeats once this much was measured."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to measure.
+
+    Args:
+        case: name of the case.
+        contact: name of the model.
+        resolution_mm: spacing of its map points.
+        options: of the model.
+        scene: a user's scene for the cases that need it.
+    """
+
+    case: str
+    contact: str
+    resolution_mm: float
+    options: dict[str, Any] = field(default_factory=dict)
+    scene: str | None = None
+
+    @property
+    def label(self) -> str:
+        """The model with its options: "lattice[tolerance=0.01]"."""
+        given = ",".join(f"{key}={value}" for key, value in self.options.items())
+        return f"{self.contact}[{given}]" if given else self.contact
+
+
+@dataclass(frozen=True)
+class Measure:
+    """What was measured.
+
+    Args:
+        status: "ok" or why not.
+        prepare_seconds: from bodies to a state, nothing taken from disk; median.
+        cold_seconds: first press after it; median.
+        warm_seconds: press at the next pose, the last result as guess; median.
+        peak_rss_MB: of the process.
+        iterations: of the first press.
+        nodes: that the model solves for.
+        values: approach, forces, pressures, areas.
+        map: "i j" -> Pa on a raster of 1 mm.
+    """
+
+    status: str
+    prepare_seconds: float = float("nan")
+    cold_seconds: float = float("nan")
+    warm_seconds: float = float("nan")
+    peak_rss_MB: float = float("nan")
+    iterations: int = 0
+    nodes: int = 0
+    values: Quantities = field(default_factory=dict)
+    map: dict[str, float] = field(default_factory=dict)
+
+
+def measure_apart(job: Job, longest: float = LONGEST_SECONDS) -> Measure:
+    """Measure in a new process."""
+    command = [sys.executable, "-m", "tkamb.studies.measures"]
+    try:
+        ran = subprocess.run(
+            command,
+            input=json.dumps(asdict(job)),
+            capture_output=True,
+            text=True,
+            timeout=longest,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return Measure(f"stopped after {longest:g} s")
+    if ran.returncode:
+        return Measure(f"failed: {(ran.stderr.strip().splitlines() or ['no message'])[-1]}")
+    return Measure(**json.loads(ran.stdout))
+
+
+def measure(job: Job) -> Measure:
+    """Measure in this process."""
+    from tkamb.press import peak_rss
+
+    case = study_case(job.case, Path(job.scene) if job.scene else None)
+    model = _model(job)
+    (prepare, cold), (state, result) = _first(model, case)
+    if result.status is not ContactStatus.OK:
+        return Measure(f"{result.status.value}: {'; '.join(result.flags)}", prepare, cold)
+    return Measure(
+        "ok",
+        prepare,
+        cold,
+        _warm(model, state, case, result),
+        peak_rss(),
+        result.iterations,
+        state.node_count,
+        quantities(result),
+        {f"{i} {j}": p for (i, j), p in raster_map(result).items()},
+    )
+
+
+def _model(job: Job) -> ContactModel:
+    options = dict(job.options)
+    if "cache" in getattr(contact_class(job.contact), "__dataclass_fields__", {}):
+        options.setdefault("cache", False)
+    return contact_model(job.contact, job.resolution_mm, **options)
+
+
+def _first(
+    model: ContactModel, case: StudyCase
+) -> tuple[tuple[float, float], tuple[Any, ContactResult]]:
+    """Return the median seconds of prepare and first press, and the last of both."""
+    prepares: list[float] = []
+    colds: list[float] = []
+    while True:
+        prepare, state = _timed(model.prepare, case.pair)
+        cold, result = _timed(model.press, state, case.load, case.pose)
+        prepares.append(prepare)
+        colds.append(cold)
+        if len(colds) == REPEATS or sum(prepares) + sum(colds) > ENOUGH_SECONDS / 2:
+            return (median(prepares), median(colds)), (state, result)
+
+
+def _warm(model: ContactModel, state: Any, case: StudyCase, guess: ContactResult) -> float:
+    seconds: list[float] = []
+    while len(seconds) < 2 * REPEATS and sum(seconds) < ENOUGH_SECONDS:
+        pose = case.nearby(len(seconds) + 1)
+        spent, guess = _timed(model.press, state, case.load, pose, guess)
+        seconds.append(spent)
+    return median(seconds)
+
+
+def _timed(call: Callable[..., Any], *given: Any) -> tuple[float, Any]:
+    start = clock.perf_counter()
+    found = call(*given)
+    return clock.perf_counter() - start, found
+
+
+def _main() -> int:
+    try:
+        print(json.dumps(asdict(measure(Job(**json.load(sys.stdin))))))
+    except TkambError as error:
+        print(error, file=sys.stderr)
+        return error.exit_status
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(_main())
