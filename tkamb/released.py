@@ -16,7 +16,7 @@ The contact comes as a probe; this file does not know the models.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -112,37 +112,47 @@ class ReleasedKnee:
                 insert: residual forces act in the middle of both condyles' points.
             before: the frame before, whose patella and stiffness are guesses.
         """
-        place, slack, trials, change = np.array(start, float), False, 0, np.nan
-        patella, stiffness, middle, force = None, None, place[:3], np.full(3, np.nan)
-        if before is not None:
-            patella, stiffness = before.patella, before.balance.stiffness
-        problem = "knee and patella do not settle together"
-        passes = 0
+        place, middle, force = np.array(start, float), np.array(start[:3]), np.full(3, np.nan)
+        knee, slack, trials, passes = before, False, 0, 0
         while passes < MOST_PASSES:
-            passes += 1
-            patella = self._patella(k, place, patella)
-            placed = self._mechanics.placed(k, place, patella)
-            forces = self._forces(k, placed, middle, slack)
-            balance = forces.balance(stiffness)
-            contact, moved = forces.contact(balance), forces.at(balance)
-            travel = float(np.abs((moved - place) * SCALE).max())
-            change = float(np.linalg.norm(contact.wrench[:3] - force))
-            place, force, stiffness = moved, contact.wrench[:3], balance.stiffness
-            trials += balance.trials
-            before_middle, middle = middle, _middle(contact, points, place)
-            shift = float(np.abs(middle - before_middle).max()) if self._keeps else 0.0
-            if not slack and contact.known and forces.pushes(balance):
+            knee, pushes = self._pass(k, place, middle, slack, knee)
+            passes, trials = passes + 1, trials + knee.balance.trials
+            change = float(np.linalg.norm(knee.contact.wrench[:3] - force))
+            knee = replace(knee, passes=passes, trials=trials, change=change)
+            moved = np.abs((knee.coordinates - place) * SCALE).max()
+            place, force, last = knee.coordinates, knee.contact.wrench[:3], middle
+            middle = _middle(knee.contact, points, place)
+            shift = np.abs(middle - last).max() if self._keeps else 0.0
+            if pushes:
                 slack = True
-                continue
-            if placed.problems or balance.status is not BalanceStatus.OK:
-                problem = "; ".join(placed.problems) or f"released: {balance.status.value}"
-                break
-            if max(travel, shift) < SETTLED:
-                problem = ""
-                break
-        return SettledKnee(
-            place, placed, patella, contact, balance, passes, trials, change, problem
+            elif knee.problem or max(moved, shift) < SETTLED:
+                return knee
+        assert knee is not None
+        return replace(knee, problem="knee and patella do not settle together")
+
+    def _pass(
+        self, k: int, place: Array, middle: Array, slack: bool, before: SettledKnee | None
+    ) -> tuple[SettledKnee, bool]:
+        """Return the knee at rest with the patella as at `place`, and whether it would push."""
+        patella = self._patella(k, place, before.patella if before else None)
+        placed = self._mechanics.placed(k, place, patella)
+        forces = self._forces(k, placed, middle, slack)
+        balance = forces.balance(before.balance.stiffness if before else None)
+        contact, problem = forces.contact(balance), "; ".join(placed.problems)
+        if balance.status is not BalanceStatus.OK:
+            problem = problem or f"released: {balance.status.value}"
+        knee = SettledKnee(
+            forces.at(balance),
+            placed,
+            patella,
+            contact,
+            balance,
+            1,
+            balance.trials,
+            np.nan,
+            problem,
         )
+        return knee, contact.known and forces.pushes(balance)
 
     @property
     def _keeps(self) -> bool:
@@ -227,7 +237,7 @@ class ReleasedForces:
         return self._with(balance.coordinates)
 
     def pushes(self, balance: Balance) -> bool:
-        """Return whether the patellar ligament would have to push."""
+        """Return whether the patellar ligament, where it is taut, would have to push."""
         if self._demand.line is None:
             return False
         place = self.at(balance)
