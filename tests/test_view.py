@@ -152,7 +152,7 @@ def test_results_of_a_changed_scene_are_refused(tmp_path, capsys):
     scene = copied_scene(tmp_path / "knee")
     out = tmp_path / "out"
     out.mkdir()
-    short_results(out, scene)
+    short_results(out, scene, every=100)
     text = scene.read_text()
     scene.write_text(text.replace("mass_kg = 75.0", "mass_kg = 76.0"))
     assert main(["view", str(out), "--html", str(tmp_path / "x.html")]) == 2
@@ -216,7 +216,7 @@ def test_a_coupled_run_is_drawn_where_its_forces_act(tmp_path):
     scene.write_text(text)
     out = tmp_path / "out"
     out.mkdir()
-    short_results(out, scene)
+    short_results(out, scene, every=50)
     show = Show([open_run(out)])
     results, arrows = show.runs[0].results, {one.name: one for one in show.drawings[0].arrows}
     pressed = arrows["medial condyle"].forces + arrows["lateral condyle"].forces

@@ -217,7 +217,7 @@ def test_another_contact_model_on_the_frame(live):
 def test_two_contact_models_side_by_side_on_one_scale(folder, tmp_path):
     other = tmp_path / "hertz"
     other.mkdir()
-    short_results(other, SCENE, contact="hertz")
+    short_results(other, SCENE, every=50, contact="hertz")
     page = tmp_path / "both.html"
     Show([open_run(folder), open_run(other)]).write_html(page)
     peaks = [read_maps(one / "contact.h5").pressure_Pa.max() for one in (folder, other)]
@@ -226,7 +226,7 @@ def test_two_contact_models_side_by_side_on_one_scale(folder, tmp_path):
         move_slider(browser, 5)
         assert browser.evaluate("tkamb.data.peak_MPa") == pytest.approx(max(peaks) / 1e6)
         for view, one in enumerate((folder, other)):
-            given = read_maps(one / "contact.h5").pressure_Pa[5]
+            given = read_maps(one / "contact.h5").pressure_Pa[-1]
             drawn = levels(browser, view) * max(peaks)
             np.testing.assert_allclose(drawn[given > 0], given[given > 0], atol=1e-4 * max(peaks))
         assert browser.problems == []

@@ -12,7 +12,6 @@ from tkamb.simulation import simulate
 
 MODELS = Path(__file__).parents[1] / "models"
 SCENE = MODELS / "deep_knee_bend" / "scene.toml"
-EVERY = slice(0, 101, 20)
 HELD = []
 """Folders that go when the tests end."""
 
@@ -23,9 +22,9 @@ def copied_scene(folder):
     return folder / "scene.toml"
 
 
-def short_results(folder, scene, **given):
-    """Run every twentieth frame and write the results."""
-    results = simulate(scene, frames=EVERY, **given)
+def short_results(folder, scene, every=20, **given):
+    """Run some frames and write the results."""
+    results = simulate(scene, frames=slice(0, 101, every), **given)
     write_results(results, folder)
     return results
 

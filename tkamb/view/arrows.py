@@ -72,7 +72,7 @@ def _arrow(
     meaning: str,
 ) -> Arrow:
     points = np.stack([point(one) for one in geometries])
-    return Arrow(name, FORCE[name], points, forces, False, meaning)
+    return Arrow(name, FORCE[name], points, forces, name == "hip", meaning)
 
 
 def _ground(geometry: KneeGeometry) -> Array:
