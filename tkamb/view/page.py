@@ -75,7 +75,7 @@ def _filled(template: str, **parts: str) -> str:
 
 
 def _own(name: str) -> str:
-    return files("tkamb.view").joinpath("page", name).read_text(encoding="utf-8")
+    return files("tkamb.view").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def _meshcat() -> str:
