@@ -12,6 +12,7 @@
 import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,9 @@ from tkamb.contact.summary import medial_points
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.mechanics import FrameLoads, Mechanics
-from tkamb.released import ReleasedKnee, SettledKnee, touching
+
+if TYPE_CHECKING:
+    from tkamb.released import ReleasedKnee, SettledKnee
 
 NAN = float("nan")
 
@@ -69,7 +72,7 @@ class FrameContact:
     iterations: int = 0
     load_change: float = NAN
     point_change: float = NAN
-    settled: SettledKnee | None = None
+    settled: "SettledKnee | None" = None
 
     def area_above(self, side: str, pressure: float) -> float:
         """Return the share of a condyle's contact area above a pressure (Pa)."""
@@ -102,10 +105,11 @@ class ContactSide:
         self.state = self.model.prepare(pair)
         self.prepare_seconds = clock.perf_counter() - start
 
-        self.released: ReleasedKnee | None = None
+        self.released = None
         if table.released:
-            probe = self.model.probe(self.state)
-            self.released = ReleasedKnee(mechanics, probe, table.released)
+            from tkamb.released import ReleasedKnee
+
+            self.released = ReleasedKnee(mechanics, self.model.probe(self.state), table.released)
 
     def frame(self, k: int, before: Sequence[FrameContact] = ()) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact of frame k, as coupled as the scene asks.
@@ -181,7 +185,7 @@ class ContactSide:
         )
 
     def _settled(
-        self, released: ReleasedKnee, k: int, before: Sequence[FrameContact]
+        self, released: "ReleasedKnee", k: int, before: Sequence[FrameContact]
     ) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact with the released coordinates at rest."""
         start = clock.perf_counter()
@@ -207,7 +211,7 @@ class ContactSide:
         )
         return self._settled_loads(k, settled, contact, points), contact
 
-    def _start(self, k: int, released: ReleasedKnee, found: list[Array]) -> Array:
+    def _start(self, k: int, released: "ReleasedKnee", found: list[Array]) -> Array:
         """Return where the search begins: as the last frames went on, else as recorded."""
         place = self.case.motion.coordinates[k].copy()
         if not found:
@@ -222,7 +226,7 @@ class ContactSide:
         return np.array([place[0], height - FIRST_DEPTH, *place[2:]])
 
     def _settled_loads(
-        self, k: int, settled: SettledKnee, contact: FrameContact, points: dict[str, Array]
+        self, k: int, settled: "SettledKnee", contact: FrameContact, points: dict[str, Array]
     ) -> FrameLoads:
         start, placed = clock.perf_counter(), settled.placed
         geometry = placed.geometry
@@ -243,7 +247,9 @@ class ContactSide:
     def _resultants(self, k: int, place: Array, result: ContactResult) -> dict[str, CondylePoint]:
         """Return the contact's resultants as the contact points of the equations."""
         return {
-            side: touching(condyle, self.mechanics.sliding(k, place, condyle.point))
+            side: CondylePoint(
+                condyle.point, condyle.normal, self.mechanics.sliding(k, place, condyle.point), 0.0
+            )
             for side, condyle in condyle_wrenches(result, self.case.split).items()
         }
 

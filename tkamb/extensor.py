@@ -128,7 +128,11 @@ class ExtensorFrames:
         if self.quadriceps.outline is not None:
             to_femur = chain.link_in(self.quadriceps.start_link, "femur")
             origin = transform(to_femur, self.quadriceps.start_point)
-            ends.append(("[quadriceps] origin", origin, self.quadriceps.outline, "femur"))
+            femoral = self.case.femoral
+            assert femoral is not None
+            low, high = femoral.bounds[:, 2]
+            whole = sagittal_outline([femoral], 0.95 * np.linspace(low, high, 15))
+            ends.append(("[quadriceps] origin", origin, whole, "femur"))
         if self.ligament.outline is not None:
             tuberosity = transform(self._tibia_in_insert(), self.ligament.end_point)
             ends.append(("[patellar_ligament] distal", tuberosity, self.ligament.outline, "insert"))

@@ -31,7 +31,7 @@ from tkamb.mechanics import Mechanics, PlacedKnee
 
 if TYPE_CHECKING:
     from tkamb.body.patella import PatellaState
-    from tkamb.contact.probe import CondyleWrench, Probe, ProbedContact
+    from tkamb.contact.probe import Probe, ProbedContact
 
 LEVER = 0.025
 """m: half the usual distance of the condyles; makes rotations comparable to translations."""
@@ -253,7 +253,8 @@ class ReleasedForces:
         """Return wrench (6,) on the insert with friction, and its stiffness (6, 6) if known."""
         wrench, stiffness = np.zeros(6), np.zeros((6, 6))
         for condyle in contact.condyles.values():
-            touch = touching(condyle, self._sliding(place, condyle.point))
+            sliding = self._sliding(place, condyle.point)
+            touch = CondylePoint(condyle.point, condyle.normal, sliding, 0.0)
             drag = touch.normal - touch.direction(self._friction)
             rubbing = np.concatenate([drag, np.cross(touch.point, drag)])
             wrench += condyle.wrench + condyle.force * rubbing
@@ -261,11 +262,6 @@ class ReleasedForces:
                 pressed = -touch.normal @ condyle.stiffness[:3]
                 stiffness += condyle.stiffness + np.outer(rubbing, pressed)
         return wrench, stiffness if contact.tangent else None
-
-
-def touching(condyle: "CondyleWrench", sliding: Array, gap: float = 0.0) -> CondylePoint:
-    """Return a condyle's resultant as the contact point of the equations of motion."""
-    return CondylePoint(condyle.point, condyle.normal, sliding, gap)
 
 
 def _middle(contact: "ProbedContact", points: dict[str, Array] | None, place: Array) -> Array:

@@ -99,9 +99,10 @@ def run_identity(case: Case, frames: range) -> dict[str, Any]:
 
 
 def _files_hash(case: Case) -> str:
-    """Return the SHA-256 of all files that the scene names."""
+    """Return the SHA-256 of the files that the run reads: no mesh that nothing asks for."""
     digest = hashlib.sha256()
-    for path in _paths(case.scene.model_dump(exclude={"output"})):
+    unread = {"output"} | ({"implant"} if case.femoral is None else set())
+    for path in _paths(case.scene.model_dump(exclude=unread)):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 

@@ -9,7 +9,6 @@ from tkamb.case import Case
 from tkamb.columns import ligament_column
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_coordinates
 from tkamb.mechanics import FrameLoads
-from tkamb.sliding import sliding_row
 from tkamb.status import FAILED
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
@@ -42,6 +41,8 @@ def frame_row(
     """
     row = _motion_row(case, k) | _body_row(case, body)
     for side, slip in slips.items():
+        from tkamb.sliding import sliding_row
+
         row |= sliding_row(case, k, side, slip, body.geometry.condyles.get(side))
     if contact is not None:
         row |= _contact_row(contact, case.scene.output.yield_stress_MPa * MEGAPASCAL)

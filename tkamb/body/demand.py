@@ -18,15 +18,18 @@ J of `knee_axes`: zero at equilibrium, and along +q_i where the femur wants to g
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.body import unknowns
 from tkamb.body.knee import KneeGeometry
-from tkamb.body.ligaments import Ligament, quadratic_toe_force, two_line_force
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_pose, transform
 from tkamb.geometry.knee_axes import knee_axes
+
+if TYPE_CHECKING:
+    from tkamb.body.ligaments import Ligament
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +52,10 @@ class LigamentSet:
 
     def wrench(self, poses: Array) -> Array:
         """Return the wrench (..., 6) on the insert at poses (..., 4, 4) of the femur."""
+        if len(self.stiffness) == 0:
+            return np.zeros((*poses.shape[:-2], 6))
+        from tkamb.body.ligaments import quadratic_toe_force, two_line_force
+
         femur = np.einsum("...ij,mj->...mi", poses[..., :3, :3], self.on_femur)
         femur = femur + poses[..., None, :3, 3]
         line = femur - self.on_shank
@@ -146,7 +153,7 @@ def _magnitudes(rows: Array, columns: Array, wrench: Array) -> Array:
 
 def knee_demand(
     geometry: KneeGeometry,
-    ligaments: Sequence[Ligament],
+    ligaments: "Sequence[Ligament]",
     coordinates: Array,
     released: tuple[int, ...],
     middle: Array,
@@ -215,7 +222,7 @@ def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
 
 
 def ligament_set(
-    geometry: KneeGeometry, ligaments: Sequence[Ligament], coordinates: Array
+    geometry: KneeGeometry, ligaments: "Sequence[Ligament]", coordinates: Array
 ) -> LigamentSet:
     """Return the bundles that cross the knee, their ends in the femur and insert frames.
 
