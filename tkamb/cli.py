@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from tkamb.errors import TkambError
-from tkamb.studies.command import add_tradeoff
+from tkamb.studies.command import add_stability, add_tradeoff
 from tkamb.view.command import add_view
 
 
@@ -51,6 +51,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_scene(commands)
     add_view(commands)
     add_tradeoff(commands)
+    add_stability(commands)
     return parser
 
 

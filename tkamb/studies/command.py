@@ -1,6 +1,7 @@
 """`tkamb tradeoff` and `tkamb stability`: arguments in, exit status out."""
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -43,6 +44,37 @@ def _tradeoff(options: argparse.Namespace) -> int:
         picture(rows).savefig(temporary, format="png", dpi=150)
     print(text if options.json else "\n".join([*lines, f"picture: {directory / 'tradeoff.png'}"]))
     return 0 if any(row.errors for row in rows) else 1
+
+
+def add_stability(commands: Any) -> None:
+    """Add `stability` to the command line."""
+    stability = commands.add_parser("stability", help="the contact models at the extremes")
+    stability.add_argument("--quick", action="store_true", help="a tenth of the contact cases")
+    stability.add_argument("--out", type=Path, default=Path("out/stability"), metavar="DIR")
+    stability.add_argument("--json", action="store_true")
+    stability.set_defaults(command=_stability)
+
+
+def _stability(options: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from tkamb.output.atomic import claim_directory, replaced_file, write_text
+    from tkamb.studies import stability as study
+    from tkamb.studies.stability_report import picture, table
+
+    directory = claim_directory(options.out)
+    verdicts = study.run_stability(
+        study.stability_cases(options.quick),
+        lambda found, total: tqdm(found, total=total, unit="case", disable=None),
+    )
+    text = json.dumps(study.summary(verdicts), indent=1, allow_nan=False)
+    lines = table(verdicts)
+    write_text(directory / "stability.json", text + "\n")
+    write_text(directory / "stability.txt", "\n".join(lines) + "\n")
+    with replaced_file(directory / "stability.png") as temporary:
+        picture(verdicts).savefig(temporary, format="png", dpi=150)
+    print(text if options.json else "\n".join([*lines, f"picture: {directory / 'stability.png'}"]))
+    return 1 if any(v.kind in study.FAILED_KINDS for v in verdicts) else 0
 
 
 def _progress(unit: str) -> Any:

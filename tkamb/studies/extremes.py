@@ -1,0 +1,191 @@
+"""The extremes on which stability is tried: a base case with one or two things driven far out."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from tkamb.contact.materials import material
+from tkamb.contact.model import Bearing, ContactPair
+from tkamb.geometry.frames import Array, knee_pose
+from tkamb.geometry.surface import Surface
+from tkamb.studies.bodies import balls, block, dishes, flat
+from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
+
+FLAT = float("inf")
+
+
+@dataclass(frozen=True)
+class Extreme:
+    """A contact problem in numbers.
+
+    Args:
+        load_N: along -y.
+        thickness_mm: under the lowest points of the dishes.
+        resolution_mm: cell size.
+        aspect: length of the insert along x over the base case's.
+        nu: Poisson's ratio.
+        modulus_MPa: of the insert.
+        linear: Hooke's law instead of Ramberg-Osgood.
+        radius_mm: of the condyles, sagittal.
+        waist: frontal radius of the condyles over the sagittal one.
+        conformity: radius of the condyles over that of the dishes; 0: a flat insert.
+        apart_mm: half the distance of the condyles; 0: a single one.
+        ap_mm: how far forward the femoral component stands.
+        ml_mm: how far lateral.
+        varus_deg: adduction.
+        flexion_deg: flexion.
+        axial_deg: axial rotation.
+        bearing: "fixed" or "mobile".
+        rough_mm: noise on the femoral vertices.
+        facet_deg: distance of the rings of femoral vertices.
+        model: contact model.
+    """
+
+    load_N: float = 1500.0
+    thickness_mm: float = 8.0
+    resolution_mm: float = 2.0
+    aspect: float = 1.0
+    nu: float = 0.45
+    modulus_MPa: float = 561.5
+    linear: bool = False
+    radius_mm: float = 22.0
+    waist: float = 1.0
+    conformity: float = 0.65
+    apart_mm: float = 11.0
+    ap_mm: float = 0.0
+    ml_mm: float = 0.0
+    varus_deg: float = 0.0
+    flexion_deg: float = 0.0
+    axial_deg: float = 0.0
+    bearing: Bearing = "fixed"
+    rough_mm: float = 0.0
+    facet_deg: float = 0.6
+    model: str = "lattice"
+
+    @property
+    def pair(self) -> ContactPair:
+        """The two bodies."""
+        apart, radius = self.apart_mm * MILLIMETRE, self.radius_mm * MILLIMETRE
+        thick = self.thickness_mm * MILLIMETRE
+        height = flat(thick)
+        if self.conformity > 0:
+            height = dishes(thick, radius / self.conformity, apart)
+        size = (26e-3 * self.aspect, 46e-3 if apart else 26e-3)
+        insert = block(height, size, 1e-3)
+        femoral = _roughened(balls(radius, apart, self.waist, self.facet_deg), self.rough_mm)
+        name = "polyethylene-linear" if self.linear else "polyethylene"
+        chosen = material(name, young_modulus=self.modulus_MPa * MEGAPASCAL, poisson_ratio=self.nu)
+        return ContactPair(femoral, insert, chosen, self.bearing)
+
+    @property
+    def pose(self) -> Array:
+        """(4, 4) pose_femoral_in_insert."""
+        angles = np.array([self.varus_deg, self.axial_deg, self.flexion_deg]) * DEGREE
+        return knee_pose([self.ap_mm * MILLIMETRE, 0.0, self.ml_mm * MILLIMETRE, *angles])
+
+    @property
+    def says(self) -> str:
+        """What differs from the base case: "load_N=1, nu=0.499"."""
+        base, own = vars(replace(Extreme(), model=self.model)), vars(self)
+        return ", ".join(f"{k}={v}" for k, v in own.items() if v != base[k]) or "base case"
+
+
+def _roughened(surface: Surface, noise_mm: float) -> Surface:
+    if noise_mm == 0:
+        return surface
+    rng = np.random.default_rng(2008)
+    moved = surface.vertices + rng.normal(0.0, noise_mm * MILLIMETRE, surface.vertices.shape)
+    return Surface(moved, surface.faces, surface.name)
+
+
+ALONE: dict[str, tuple[object, ...]] = {
+    "load_N": (0.01, 1.0, 10.0, 100.0, 500.0, 3000.0, 5000.0, 8000.0, 15000.0, 50000.0),
+    "thickness_mm": (2.1, 3.0, 4.0, 6.0, 12.0, 20.0, 30.0),
+    "resolution_mm": (0.9, 1.3, 1.7, 2.5, 3.0, 4.0, 6.0, 9.0),
+    "aspect": (0.4, 0.6, 1.5, 2.5, 4.0),
+    "nu": (0.0, 0.1, 0.3, 0.4, 0.48, 0.49, 0.495, 0.499),
+    "modulus_MPa": (0.1, 1.0, 10.0, 100.0, 2000.0, 2e4, 2e5),
+    "linear": (True,),
+    "radius_mm": (3.0, 6.0, 12.0, 40.0, 80.0, 300.0),
+    "waist": (0.05, 0.2, 0.5, 2.0),
+    "conformity": (0.0, 0.2, 0.4, 0.9, 0.95, 0.99, 0.999),
+    "apart_mm": (0.0,),
+    "ap_mm": (-14.0, -12.5, -10.0, -6.0, 6.0, 10.0, 12.0, 13.0, 16.0),
+    "ml_mm": (-12.0, -8.0, -4.0, 4.0, 8.0, 11.5, 14.0),
+    "varus_deg": (-10.0, -5.0, -2.0, -0.5, 0.1, 0.3, 1.0, 3.0, 8.0, 15.0),
+    "flexion_deg": (-30.0, 30.0, 60.0, 90.0, 120.0, 160.0),
+    "axial_deg": (-40.0, -15.0, 15.0, 40.0, 89.0),
+    "bearing": ("mobile",),
+    "rough_mm": (0.001, 0.01, 0.05, 0.1),
+    "facet_deg": (0.2, 2.0, 5.0, 11.0),
+}
+"""One thing at a time; `TOGETHER`: two at a time."""
+
+TOGETHER: tuple[tuple[str, tuple[object, ...], str, tuple[object, ...]], ...] = (
+    ("load_N", (10.0, 6000.0, 20000.0), "thickness_mm", (2.1, 4.0, 20.0)),
+    ("load_N", (10.0, 6000.0, 20000.0), "conformity", (0.0, 0.9, 0.99, 0.999)),
+    ("load_N", (10.0, 6000.0, 20000.0), "varus_deg", (0.3, 2.0, 8.0)),
+    ("load_N", (10.0, 6000.0, 20000.0), "nu", (0.0, 0.3, 0.49)),
+    ("load_N", (10.0, 6000.0, 20000.0), "ap_mm", (-12.5, 11.0, 13.0)),
+    ("load_N", (10.0, 6000.0, 20000.0), "radius_mm", (6.0, 80.0)),
+    ("load_N", (10.0, 6000.0, 20000.0), "bearing", ("mobile",)),
+    ("load_N", (10.0, 6000.0, 20000.0), "rough_mm", (0.01, 0.1)),
+    ("load_N", (10.0, 6000.0, 20000.0), "modulus_MPa", (10.0, 2e4)),
+    ("load_N", (10.0, 6000.0), "apart_mm", (0.0,)),
+    ("thickness_mm", (3.0, 20.0), "conformity", (0.0, 0.95)),
+    ("thickness_mm", (3.0, 20.0), "nu", (0.0, 0.49)),
+    ("thickness_mm", (3.0, 20.0), "bearing", ("mobile",)),
+    ("conformity", (0.0, 0.95, 0.99), "varus_deg", (0.3, 2.0)),
+    ("conformity", (0.0, 0.95, 0.99), "nu", (0.0, 0.49)),
+    ("conformity", (0.0, 0.95), "rough_mm", (0.02, 0.1)),
+    ("ap_mm", (-11.0, 11.0), "ml_mm", (-8.0, 8.0)),
+    ("flexion_deg", (90.0, 160.0), "waist", (0.2, 0.5)),
+    ("flexion_deg", (90.0, 160.0), "varus_deg", (-3.0, 3.0)),
+    ("apart_mm", (0.0,), "ap_mm", (8.0, 12.0)),
+    ("apart_mm", (0.0,), "conformity", (0.0, 0.99)),
+    ("resolution_mm", (1.3, 3.0, 4.0), "thickness_mm", (3.0, 20.0)),
+    ("resolution_mm", (1.3, 3.0, 4.0), "conformity", (0.0, 0.99)),
+)
+
+OTHER_MODELS = ("hertz", "foundation", "foundation-linear", "lattice-linear", "fe")
+HARDEST: tuple[dict[str, object], ...] = (
+    {},
+    {"load_N": 0.01},
+    {"load_N": 20000.0},
+    {"thickness_mm": 2.1},
+    {"nu": 0.499},
+    {"nu": 0.0},
+    {"conformity": 0.0},
+    {"conformity": 0.999},
+    {"varus_deg": 8.0},
+    {"ap_mm": 13.0},
+    {"apart_mm": 0.0},
+    {"flexion_deg": 160.0},
+    {"rough_mm": 0.1},
+    {"bearing": "mobile"},
+)
+"""On which the other models are tried."""
+
+
+def extremes() -> Iterator[Extreme]:
+    """Return all of them, each once."""
+    seen = set()
+    for extreme in _all():
+        if extreme not in seen:
+            seen.add(extreme)
+            yield extreme
+
+
+def _all() -> Iterator[Extreme]:
+    base = Extreme()
+    yield base
+    for name, values in ALONE.items():
+        for value in values:
+            yield replace(base, **{name: value})  # type: ignore[arg-type]
+    for one, firsts, other, seconds in TOGETHER:
+        for first, second in product(firsts, seconds):
+            yield replace(base, **{one: first, other: second})  # type: ignore[arg-type]
+    for model, changes in product(OTHER_MODELS, HARDEST):
+        yield replace(base, model=model, **changes)  # type: ignore[arg-type]

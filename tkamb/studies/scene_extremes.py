@@ -1,0 +1,188 @@
+"""Extremes of a whole run: time steps, noise, friction, moment arms, meshes, flexion.
+
+The shipped knee bend is run on a few frames with one thing driven far out. What it must obey
+is known without a second solver:
+
+- time: forces are F_rest + F_inertia / scale² where the same motion takes `scale` times as long;
+- always: the deformed insert carries the superior-inferior force that balance asks for;
+- meshes: a damaged mesh is refused in one line, or gives the intact one's answer.
+"""
+
+import csv
+import math
+import shutil
+import tempfile
+import time as clock
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from tkamb.errors import TkambError
+from tkamb.results import Results
+from tkamb.status import FAILED
+from tkamb.studies.cases import SHIPPED_SCENE
+from tkamb.studies.verdict import WRONG, Verdict
+
+FRAMES = slice(20, 101, 40)
+TIME_SCALES = (1e-2, 0.1, 0.3, 10.0, 1e4)
+REST = 1e6
+NOISES = (1e-3, 1e-2, 0.1, 1.0)
+FRICTIONS = (0.0, 0.2, 0.6, 1.0)
+ARMS_MM = (-20.0, -30.0, -38.0, -45.0, -80.0)
+"""How far back the patellar ligament's insertion is moved: past the line of no moment arm."""
+DEFECTS = ("hole", "flipped", "doubled", "sliver", "nan", "empty", "tiny")
+
+Check = Callable[[Results, Path], float]
+
+
+@dataclass(frozen=True)
+class SceneExtreme:
+    """One extreme of a run.
+
+    Args:
+        kind: "time", "noise", "friction", "arm" or a mesh: "femoral", "insert".
+        value: how far, or the defect.
+    """
+
+    kind: str
+    value: Any
+
+    @property
+    def says(self) -> str:
+        """The case in words."""
+        return f"run: {self.kind} {self.value}"
+
+
+def scene_extremes() -> Iterator[SceneExtreme]:
+    """Return all of them; none where the shipped knee bend is not there."""
+    if not SHIPPED_SCENE.exists():
+        return
+    series = {"time": TIME_SCALES, "noise": NOISES, "friction": FRICTIONS, "arm": ARMS_MM}
+    for kind, values in series.items():
+        yield from (SceneExtreme(kind, value) for value in values)
+    for part in ("femoral", "insert"):
+        yield from (SceneExtreme(part, defect) for defect in DEFECTS)
+
+
+def judge_scene(extreme: SceneExtreme) -> Verdict:
+    """Run an extreme and check what it must obey."""
+    start = clock.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        scene = Path(folder) / "scene.toml"
+        shutil.copytree(SHIPPED_SCENE.parent, folder, dirs_exist_ok=True)
+        try:
+            overrides = _drive(extreme, Path(folder))
+            results = _run(scene, overrides)
+            seconds = clock.perf_counter() - start
+            apart = _apart(extreme, results, Path(folder))
+        except TkambError as error:
+            seconds = clock.perf_counter() - start
+            return Verdict(extreme.says, "run", "flagged", str(error), seconds=seconds)
+    words = sorted({status for status in results.status if status != "ok"})
+    flags = "; ".join(words)
+    if any(status.startswith(FAILED) for status in results.status):
+        return Verdict(extreme.says, "run", "flagged", flags, seconds=seconds)
+    right = math.isfinite(apart) and apart <= WRONG
+    kind = "converged" if right else "flagged" if flags else "unflagged_wrong"
+    reason = flags if right or flags else f"{100 * apart:.3g} % from what it must be"
+    known = apart if math.isfinite(apart) else None
+    return Verdict(extreme.says, "run", kind, reason, known, seconds)
+
+
+def _run(scene: Path, overrides: dict[str, Any]) -> Results:
+    from tkamb.scene import load_scene
+    from tkamb.simulation import simulate
+
+    return simulate(load_scene(scene, {"contact.resolution_mm": 2.0} | overrides), frames=FRAMES)
+
+
+def _drive(extreme: SceneExtreme, folder: Path) -> dict[str, Any]:
+    """Change the copied scene's files; return the keys to override."""
+    if extreme.kind == "time":
+        _stretch_time(folder, extreme.value)
+    elif extreme.kind == "noise":
+        _shake(folder, extreme.value)
+    elif extreme.kind == "friction":
+        return {"contact.friction": extreme.value}
+    elif extreme.kind == "arm":
+        content = tomllib.loads(SHIPPED_SCENE.read_text(encoding="utf-8"))
+        x, y, z = content["patellar_ligament"]["distal"]["point_mm"]
+        moved = {"link": "tibia", "point_mm": [x + extreme.value, y, z]}
+        return {"patellar_ligament.distal": moved}
+    else:
+        name = "femoral_component" if extreme.kind == "femoral" else "insert"
+        _damage(folder / f"{name}.stl", extreme.value)
+    return {}
+
+
+def _apart(extreme: SceneExtreme, results: Results, folder: Path) -> float:
+    """Return how far (relative) the results are from what they must be."""
+    assert results.maps is not None
+    demanded = results["force_si_N"]
+    carried = -results.maps.nodal_force_N[:, :, 1].sum(axis=1)
+    apart = float(np.max(np.abs(carried - demanded) / np.abs(demanded)))
+    if extreme.kind == "time":
+        once = _run(SHIPPED_SCENE, {})["force_si_N"]
+        _stretch_time(folder, REST / extreme.value)
+        rest = _run(folder / "scene.toml", {})["force_si_N"]
+        law = rest + (once - rest) / extreme.value**2
+        return max(apart, float(np.max(np.abs(demanded - law) / np.abs(law))))
+    if extreme.kind in ("femoral", "insert"):
+        whole = _run(SHIPPED_SCENE, {})
+        peak = [np.maximum(r["medial_peak_pressure_MPa"], 0) for r in (results, whole)]
+        return max(apart, float(np.max(np.abs(peak[0] - peak[1]) / peak[1])))
+    return apart
+
+
+def _stretch_time(folder: Path, scale: float) -> None:
+    for name in ("motion.csv", "tibia.csv", "ground_reaction.csv"):
+        head, rows = _table(folder / name)
+        rows[:, head.index("time_s")] *= scale
+        _write_table(folder / name, head, rows)
+
+
+def _shake(folder: Path, noise: float) -> None:
+    """Add noise of that many mm and deg to the knee's coordinates."""
+    head, rows = _table(folder / "motion.csv")
+    rng = np.random.default_rng(160)
+    knee = [head.index(name) for name in head if name.startswith(("flex", "add", "ax", "ap", "ml"))]
+    rows[:, knee] += rng.normal(0.0, noise, (len(rows), len(knee)))
+    _write_table(folder / "motion.csv", head, rows)
+
+
+def _table(path: Path) -> tuple[list[str], Any]:
+    with open(path, encoding="utf-8", newline="") as file:
+        lines = list(csv.reader(file))
+    return lines[0], np.array(lines[1:], float)
+
+
+def _write_table(path: Path, head: list[str], rows: Any) -> None:
+    with open(path, "w", encoding="utf-8", newline="") as file:
+        csv.writer(file).writerows([head, *([repr(float(v)) for v in row] for row in rows)])
+
+
+def _damage(path: Path, defect: str) -> None:
+    """Write a mesh back with a defect."""
+    mesh = trimesh.load_mesh(path)
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    if defect == "hole":
+        faces = np.delete(faces, slice(len(faces) // 2, len(faces) // 2 + 3), axis=0)
+    elif defect == "flipped":
+        faces = faces[:, ::-1]
+    elif defect == "doubled":
+        faces = np.concatenate([faces, faces[::7]])
+    elif defect == "sliver":
+        faces = np.concatenate([faces, faces[:5, [0, 1, 1]]])
+    elif defect == "nan":
+        vertices[len(vertices) // 3] = np.nan
+    elif defect == "tiny":
+        vertices = vertices * 1e-3
+    elif defect == "empty":
+        faces = faces[:0]
+    broken = trimesh.Trimesh(vertices, faces, process=False)
+    path.write_bytes(trimesh.exchange.stl.export_stl(broken))
