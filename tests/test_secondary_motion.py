@@ -1,5 +1,6 @@
 """The five knee coordinates that nobody measured, from contact and ligaments."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -142,3 +143,14 @@ def test_a_recorded_position_that_climbs_the_eminence_slides_back_into_the_dishe
     assert contact.result.pressure.max() < 0.7 * peak
     moved = contact.settled.coordinates - freed.case.motion.coordinates[10]
     assert abs(moved[2]) < 2e-3
+
+
+def test_a_femur_beside_the_insert_fails_with_the_reason(bend):
+    """The recorded pose far off: no start to search from."""
+    motion = bend.case.motion
+    away = motion.coordinates + np.array([0.2, 0, 0, 0, 0, 0])
+    side = ContactSide(replace(bend.case, motion=replace(motion, coordinates=away)), bend.mechanics)
+    body, contact = side.frame(60)
+    assert contact.result is None
+    assert "over the insert" in contact.problem
+    assert body.loads.problems == (contact.problem,)

@@ -10,7 +10,7 @@
 """
 
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -42,6 +42,8 @@ LOAD_CHANGE = 0.1
 POINT_CHANGE = 1e-6
 """m, of the centres of pressure between them."""
 MOST_ITERATIONS = 20
+ASTRAY = (BalanceStatus.OUT_OF_RANGE, BalanceStatus.NOT_CONVERGED)
+"""Ends of a search that another start may mend."""
 FIRST_DEPTH = 5e-5
 """m: how deep the search for released coordinates begins."""
 
@@ -192,12 +194,16 @@ class ContactSide:
         good = [contact for contact in before if contact.settled and contact.result][-2:]
         earlier, guess = (good[-1].settled, good[-1].result) if good else (None, None)
         points = {} if len(released.released) == 5 else self._nearest_points(k)
-        place = self._start(k, released, [c.settled.coordinates for c in good if c.settled])
-        settled = released.settle(k, place, points, earlier)
-        if settled.balance.status in (BalanceStatus.OUT_OF_RANGE, BalanceStatus.NOT_CONVERGED):
-            raised = self.on_the_insert(place)
-            if np.isfinite(raised).all():
-                settled = released.settle(k, raised, points, earlier)
+        settled = None
+        for place in self._starts(k, [c.settled.coordinates for c in good if c.settled]):
+            if np.isfinite(place).all():
+                settled = released.settle(k, place, points, earlier)
+                if settled.balance.status not in ASTRAY:
+                    break
+        if settled is None:
+            contact = self._nothing("the femoral component does not lie over the insert")
+            body = self.mechanics.frame(k)
+            return replace(body, loads=unsolved([contact.problem])), contact
         result, contact = None, self._nothing(settled.problem)
         if not settled.problem:
             result = self.model.evaluate(self.state, knee_pose(settled.coordinates), guess)
@@ -211,14 +217,18 @@ class ContactSide:
         )
         return self._settled_loads(k, settled, contact, points), contact
 
-    def _start(self, k: int, released: "ReleasedKnee", found: list[Array]) -> Array:
-        """Return where the search begins: as the last frames went on, else as recorded."""
-        place = self.case.motion.coordinates[k].copy()
-        if not found:
-            return self.on_the_insert(place)
-        rows = list(released.released)
-        place[rows] = (2 * found[-1] - found[0] if len(found) == 2 else found[-1])[rows]
-        return place
+    def _starts(self, k: int, found: list[Array]) -> Iterator[Array]:
+        """Yield where a search may begin: as the last frames went on, as the last, as recorded.
+
+        The first keeps its height, the others just touch.
+        """
+        assert self.released is not None
+        recorded, rows = self.case.motion.coordinates[k], list(self.released.released)
+        for number, place in enumerate([2 * found[-1] - found[0], found[-1]] if found else []):
+            start = recorded.copy()
+            start[rows] = place[rows]
+            yield start if number == 0 else self.on_the_insert(start)
+        yield self.on_the_insert(recorded)
 
     def on_the_insert(self, place: Array) -> Array:
         """Return coordinates (6,) whose superior-inferior one makes the condyles just touch."""
