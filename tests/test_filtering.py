@@ -186,3 +186,11 @@ def test_never_outside_the_record():
     t = np.linspace(0, 2, 50)
     with pytest.raises(InputError, match=r"covers 0 to 2 s, but 2\.1 s is needed"):
         differentiate_coordinates(t, np.zeros(50), 6.0, at=np.array([1.0, 2.1]))
+
+
+@pytest.mark.parametrize("cutoff", np.arange(1.0, 12.5, 0.5))
+def test_no_cutoff_falls_off_the_last_knot(cutoff):
+    """The last knot is the last sample to within rounding only (4 s at 25 Hz and 10 Hz)."""
+    time = np.linspace(0.0, 4.0, 101)
+    x, _, _ = differentiate_coordinates(time, np.column_stack([time, time**2]), cutoff)
+    np.testing.assert_allclose(x[:, 0], time, atol=1e-9)

@@ -192,7 +192,8 @@ def _smoothing_spline(time: Array, values: Array, cutoff_Hz: float, periodic: bo
     spans = max(DEGREE + 1, min(2 * len(time), wanted))
     step = (end - start) / spans
     knots = start + step * np.arange(-DEGREE, spans + DEGREE + 1)
-    design = BSpline.design_matrix(np.clip(time / unit, start, end), knots, DEGREE)
+    inside = np.clip(time / unit, knots[DEGREE], knots[-DEGREE - 1])  # end by rounding
+    design = BSpline.design_matrix(inside, knots, DEGREE)
     weights = np.gradient(time / unit)
     if periodic:
         weights[[0, -1]] *= 0.5  # both are the sample at phase zero
