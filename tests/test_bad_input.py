@@ -61,6 +61,8 @@ def rewrite(path, change):
         ({"quadriceps__origin__link": "fibula"}, "fibula"),
         ({"quadriceps__origin__point_mm": [0.0, 10.0, 0.0]}, "quadriceps"),
         ({"quadriceps": None}, "go together"),
+        ({"implant__insert__mesh": "femoral_component.stl"}, "insert"),
+        ({"implant__femoral__position_mm": [0.0, 40.0, 0.0]}, "neither condyle is near"),
     ],
 )
 def test_scene_that_cannot_be_used(tmp_path, capfd, changes, words):

@@ -6,6 +6,7 @@ from typing import Any
 
 from tkamb.contact.lattice.grid import Lattice, build_grid
 from tkamb.contact.lattice.quality import LatticeQuality, measure_quality
+from tkamb.contact.registry import COARSEST_MM
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.inputs.meshes import axes_rotation, load_surface, mirrored
@@ -64,6 +65,9 @@ def lattice_of_file(
     """
     if out is not None and Path(out).suffix != ".vtu":
         raise InputError(f"'{out}' is no .vtu file", "out", "name it like lattice.vtu")
+    if not 0 < resolution_mm <= COARSEST_MM:
+        mend = f"give more than 0, at most {COARSEST_MM:g} mm"
+        raise InputError(f"resolution {resolution_mm} mm", "mesh lattice", mend)
     surface = load_surface(insert, units, axes, name="insert", closed=True)
     if side == "left":
         surface = mirrored(surface)

@@ -11,7 +11,7 @@ from tkamb.body.knee import KneeGeometry, KneeLoads, solve_knee, unsolved
 from tkamb.body.load import PointForces
 from tkamb.body.unknowns import CondylePoint
 from tkamb.case import Case
-from tkamb.errors import ComputationError, TkambError
+from tkamb.errors import ComputationError, InputError, TkambError
 from tkamb.geometry.frames import Array, knee_pose, knee_twist
 from tkamb.units import DEGREE, MILLIMETRE
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from tkamb.body.patella import PatellaState
     from tkamb.body.slip import CondyleSlip
     from tkamb.geometry.adjustment import Adjustment
-    from tkamb.geometry.closest import ClosestPointQuery, CondyleGap
+    from tkamb.geometry.closest import ClosestPointQuery, CondyleGap, CondyleGaps
 
 LIFT_OFF_ANGLE = 0.5 * DEGREE
 LIFT_OFF_GAP = 0.5 * MILLIMETRE
@@ -97,12 +97,29 @@ class Mechanics:
         self.poses = knee_pose(case.motion.coordinates)
         self.friction = case.scene.contact.friction if case.scene.contact else 0.0
         self.query = _contact_query(case)
+        self._check_near()
         self.extensor = None
         if case.scene.patella:
             from tkamb.extensor import ExtensorFrames
 
             self.extensor = ExtensorFrames(case, self.poses)
         self.ligaments, self.strains = self._build_ligaments()
+
+    def _check_near(self) -> None:
+        """Raise where the condyles are nowhere near the insert, whatever the frame."""
+        contact = self.case.scene.contact
+        if self.query is None or contact is None or contact.released:
+            return
+        middle, last = len(self.poses) // 2, len(self.poses) - 1
+        nearest = [_nearest_gap(self.query.at(self.poses[k])) for k in (0, middle, last)]
+        if all(abs(gap) > FARTHEST_GAP for gap in nearest):
+            gap = min(nearest, key=abs)
+            raise InputError(
+                f"neither condyle is near the insert (nearest {abs(gap) / MILLIMETRE:.0f} mm "
+                f"{'apart' if gap > 0 else 'inside'})",
+                "[motion] with [implant.femoral] and [implant.insert]",
+                "check which mesh is which, their units, axes and places, and the motion's",
+            )
 
     def frame(self, k: int) -> FrameLoads:
         """Return the loads of frame k; a frame that cannot be solved holds NaN."""
@@ -217,7 +234,7 @@ class Mechanics:
         gaps = self.query.at(pose)
         found = {"medial": gaps.medial} | ({"lateral": gaps.lateral} if gaps.lateral else {})
         condyles = {side: self._condyle(k, gap) for side, gap in found.items()}
-        nearest = min(gap.gap for gap in found.values())
+        nearest = _nearest_gap(gaps)
         problems = []
         if abs(nearest) > FARTHEST_GAP:
             word = "apart" if nearest > 0 else "overlapping"
@@ -268,6 +285,11 @@ class Mechanics:
     def _attachment_links(self) -> set[str]:
         ends = [end for table in self.case.scene.ligament for end in (table.proximal, table.distal)]
         return {end.link for end in ends}
+
+
+def _nearest_gap(gaps: "CondyleGaps") -> float:
+    """Return the smallest gap (m) of the condyles."""
+    return min(gap.gap for gap in (gaps.medial, gaps.lateral) if gap is not None)
 
 
 def _contact_query(case: Case) -> "ClosestPointQuery | None":

@@ -42,7 +42,7 @@ def summary_of(
     scene, statuses, times = case.scene, columns["status"], columns["time_s"]
     left = scene.patient.side == "left"
     summary: dict[str, Any] = {
-        "scene": None if path is None else str(path),
+        "scene": None if path is None else str(path.absolute()),
         "scene_sha256": scene_hash(case),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": " ".join(["tkamb", *sys.argv[1:]]),

@@ -140,7 +140,7 @@ def _scene_of(results: Results) -> Scene:
         raise InputError(
             "the scene of these results is not there",
             path,
-            "start tkamb view in the folder where tkamb run was started",
+            "put it back, or run it again",
         )
     contact = results.summary.get("contact") or {}
     kept = {f"contact.{key}": value for key, value in contact.items() if value is not None}
