@@ -38,7 +38,7 @@ def test_left_is_the_mirror_image():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"resolution_mm": 0.0}, "positive"),
+        ({"resolution_mm": 0.0}, "resolution"),
         ({"resolution_mm": 2.0, "side": "middle"}, "no side"),
         ({"resolution_mm": 2.0, "out": "lattice.stl"}, "no .vtu file"),
     ],
