@@ -14,7 +14,6 @@ from tkamb.inputs.patient import load_urdf
 from tkamb.inputs.segments import segment_inertia
 from tkamb.scene import PatientTable
 
-
 LOOP = '<joint name="loop" type="fixed"><parent link="femur"/><child link="tibia"/></joint>'
 
 

@@ -23,8 +23,9 @@ def rolling_motion(
 ) -> KneeMotion:
     """Return the motion with its AP and SI coordinates replaced by those of roll and slip.
 
-    SI brings the femur down to first touch, of one condyle; rotations and ML stay. The two new coordinates are differentiated like
-    recorded ones; they are no closed cycle even where the recorded ones are.
+    SI brings the femur down to first touch, of one condyle; rotations and ML stay. The two
+    new coordinates are differentiated like recorded ones; they are no closed cycle even
+    where the recorded ones are.
 
     Args:
         motion: as recorded and filtered.

@@ -181,8 +181,7 @@ class _System:
         if not self.geometry.condyles:
             return np.array([values[f"knee_force_{axis}"] for axis in unknowns.AXES])
         forces = [
-            values[f"{side}_normal"]
-            * self.geometry.condyles[side].direction(self.friction)
+            values[f"{side}_normal"] * self.geometry.condyles[side].direction(self.friction)
             for side in self.touching
         ]
         return np.asarray(np.sum(forces, axis=0))
