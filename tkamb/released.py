@@ -38,6 +38,8 @@ LEVER = 0.025
 SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
 SETTLED = 2e-6
 """m: the knee moves less than this when the patella is found anew."""
+SETTLED_FORCE = 0.1
+"""N: neither does the contact force."""
 MOST_PASSES = 8
 TINY = 1e-7
 """m: step of the finite differences of axes and ligaments."""
@@ -125,7 +127,7 @@ class ReleasedKnee:
             shift = np.abs(middle - last).max() if self._keeps else 0.0
             if pushes:
                 slack = True
-            elif knee.problem or max(moved, shift) < SETTLED:
+            elif knee.problem or (max(moved, shift) < SETTLED and change < SETTLED_FORCE):
                 return knee
         assert knee is not None
         return replace(knee, problem="knee and patella do not settle together")
