@@ -82,7 +82,7 @@ class Extreme:
     @property
     def pose(self) -> Array:
         """(4, 4) pose_femoral_in_insert."""
-        angles = np.array([self.varus_deg, self.axial_deg, self.flexion_deg]) * DEGREE
+        angles = np.array([self.axial_deg, self.varus_deg, self.flexion_deg]) * DEGREE
         return knee_pose([self.ap_mm * MILLIMETRE, 0.0, self.ml_mm * MILLIMETRE, *angles])
 
     @property
