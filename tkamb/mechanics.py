@@ -185,11 +185,8 @@ class Mechanics:
         from tkamb.body.slip import condyle_slip
 
         found = condyle_slip(case.femoral, case.insert, case.split, case.motion.coordinates)
-        return {
-            side: slip
-            for side, slip in zip(("medial", "lateral"), found, strict=True)
-            if slip is not None
-        }
+        sides = zip(("medial", "lateral"), found, strict=True)
+        return {side: slip for side, slip in sides if slip is not None}
 
     def _chain_motion(
         self, k: int, coordinates: Array, patella: "PatellaState | None" = None

@@ -47,6 +47,8 @@ thead th { border-bottom: 2px solid var(--ink); }
 .numbers th, .numbers td { text-align: right; padding: 5px 6px; }
 .numbers th { font-size: 11.5px; vertical-align: bottom; }
 small { font-weight: normal; color: var(--soft); }
+details { margin-top: 18px; }
+summary { cursor: pointer; margin-bottom: 6px; }
 .keys td { overflow-wrap: anywhere; }
 .keys th { white-space: nowrap; font-weight: normal; color: var(--soft); }
 @media screen and (max-width: 760px) { .cards, .grid { grid-template-columns: 1fr; }

@@ -51,9 +51,9 @@ def strain_table(summary: Mapping[str, Any]) -> str:
     )
     return (
         "<details><summary>Ligament strain at three flexions, %</summary>"
-        "<p class='legend'>Negative: slack. A bundle beyond about 10 % is attached at the wrong "
+        "<p class='legend'>Negative: slack. A bundle above about 10 % is attached at the wrong "
         "place or has the wrong slack length. –: no recorded frame within 10°.</p>"
-        f"<table class='numbers'><thead><tr><th>bundle</th>{head}</tr></thead>"
+        f"<table><thead><tr><th>bundle</th>{head}</tr></thead>"
         f"<tbody>{rows}</tbody></table></details>"
     )
 
