@@ -1,6 +1,7 @@
 """What the trade-off is measured on: two bodies, a pose and a load."""
 
 import hashlib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +15,17 @@ from tkamb.studies.bodies import balls, block, dishes, flat
 from tkamb.units import DEGREE, MILLIMETRE
 
 SHIPPED_SCENE = Path(__file__).parents[2] / "models" / "deep_knee_bend" / "scene.toml"
+KNEE_CASES = Path(__file__).with_name("knee_cases.json")
 FLEXIONS_DEG = (15.0, 60.0, 105.0)
 """Of the shipped knee, and of a user's scene where it gets there."""
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere on a flat layer: radius and thickness, m."""
+
+    radius: float
+    thickness: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +38,7 @@ class StudyCase:
         pair: the two bodies.
         pose: (4, 4) pose_femoral_in_insert; its y does not matter.
         load: N, along -y.
+        sphere: the case as a sphere on a linear layer, if it is one.
     """
 
     name: str
@@ -35,6 +46,7 @@ class StudyCase:
     pair: ContactPair
     pose: Array
     load: float
+    sphere: Sphere | None = None
 
     @property
     def hash(self) -> str:
@@ -81,17 +93,18 @@ def study_case(name: str, scene: Path | None = None) -> StudyCase:
     """
     if name in _ANALYTIC:
         return _ANALYTIC[name](name)
-    where, _, flexion = name.removesuffix(" deg").partition(" ")
-    path = {"knee": SHIPPED_SCENE, "scene": scene}.get(where)
-    if path is None:
+    if name not in case_names(scene):
         raise InputError(f"no case '{name}'", mend=f"there are: {', '.join(case_names(scene))}")
-    return _of_scene(name, path, float(flexion))
+    if name.startswith("knee") or scene is None:
+        return _shipped(name)
+    return _of_scene(name, scene, float(name.split()[1]))
 
 
 def _sphere(name: str) -> StudyCase:
-    insert = block(flat(10e-3), (34e-3, 34e-3), 1e-3)
-    pair = ContactPair(balls(40e-3, 0.0), insert, material("polyethylene-linear"))
-    return StudyCase(name, "sphere of 40 mm on 10 mm, linear", pair, np.eye(4), 700.0)
+    sphere = Sphere(40e-3, 10e-3)
+    insert = block(flat(sphere.thickness), (34e-3, 34e-3), 1e-3)
+    pair = ContactPair(balls(sphere.radius, 0.0), insert, material("polyethylene-linear"))
+    return StudyCase(name, "sphere of 40 mm on 10 mm, linear", pair, np.eye(4), 700.0, sphere)
 
 
 def _two_condyles(name: str) -> StudyCase:
@@ -122,6 +135,24 @@ _ANALYTIC = {
     "conforming": _conforming,
     "varus": _varus,
 }
+
+
+def _shipped(name: str) -> StudyCase:
+    """Return a case of the shipped knee's meshes at a stored pose and load.
+
+    They are what the knee bend had when its references were computed; they stay when its
+    motion or muscles are changed.
+    """
+    from tkamb.geometry.flat_bottom import insert_placement
+    from tkamb.inputs.meshes import load_surface
+
+    stored = json.loads(KNEE_CASES.read_text(encoding="utf-8"))[name]
+    folder = SHIPPED_SCENE.parent
+    femoral = load_surface(folder / "femoral_component.stl", "mm", name="femoral component")
+    insert = load_surface(folder / "insert.stl", "mm", name="insert", closed=True)
+    insert = insert.moved(insert_placement(insert))
+    pair = ContactPair(femoral, insert, material(stored["material"]), stored["bearing"])
+    return StudyCase(name, stored["says"], pair, np.array(stored["pose"]), stored["load_N"])
 
 
 def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:

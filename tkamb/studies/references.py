@@ -1,9 +1,11 @@
 """Converged references: the limit of refined grids, stored with the case's hash.
 
-Finite elements and the lattice are solved to a tolerance of 1e-6 on ever finer grids; their
-common limit is the reference, and where they disagree is its uncertainty. Areas jump from
-node to node without order: theirs, and mean pressures, are the average of the two finest
-grids. On the linear sphere the limit is checked against the elastic layer's solution.
+A sphere on a linear layer has the elastic layer's solution. Elsewhere finite elements and the
+lattice are solved to a tolerance of 1e-6 on ever finer grids. Approach and forces are their
+common limit (Richardson); peak pressures and areas jump from node to node without order: theirs
+are the average of the two finest grids. The uncertainty is the largest of what the fit leaves,
+of the families' disagreement, and of the distance between limit and finest grids (half of it
+where the finest grids are the reference).
 """
 
 import json
@@ -16,7 +18,8 @@ from tkamb.contact.model import ContactStatus
 from tkamb.contact.registry import contact_model
 from tkamb.errors import ComputationError, InputError
 from tkamb.output.atomic import write_text
-from tkamb.studies.cases import StudyCase
+from tkamb.studies.cases import Sphere, StudyCase
+from tkamb.studies.elastic_layer import sphere_on_layer
 from tkamb.studies.quantities import (
     Quantities,
     Raster,
@@ -34,6 +37,8 @@ LARGE_GRIDS_MM = (2.0, 1.5, 1.25, 1.0)
 LARGE = 2e-5
 """m³: of an insert's bounding box from which on the coarser grids must do."""
 TOLERANCE = 1e-6
+WIDTH_EFFECT = 0.005
+"""Relative: a block 3.4 times as wide as high against an endless layer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,22 +92,51 @@ def compute_reference(case: StudyCase, grids_mm: tuple[float, ...] | None = None
             solved[f"{family} {grid:g} mm"] = quantities(result)
             if family == "fe" and grid == min(grids_mm):
                 finest = {f"{i} {j}": round(p, -2) for (i, j), p in raster_map(result).items()}
-    values, uncertainty = _limits(solved)
+    values, uncertainty = _by_layer(case, case.sphere) if case.sphere else limits(solved)
     return Reference(case.hash, values, uncertainty, grids_mm, solved, finest)
 
 
-def _limits(solved: dict[str, Quantities]) -> tuple[Quantities, Quantities]:
+def limits(solved: dict[str, Quantities]) -> tuple[Quantities, Quantities]:
+    """Return values and uncertainties from what the grids gave; see the module.
+
+    Args:
+        solved: "fe 1 mm" -> values.
+    """
     h = np.array([float(name.split()[1]) for name in solved]) * MILLIMETRE
     family = np.array([FAMILIES.index(name.split()[0]) for name in solved])
     values, uncertainty = {}, {}
     for name in next(iter(solved.values())):
         series = np.array([row[name] for row in solved.values()])
-        if name.endswith(("area", "mean_pressure")):
-            fine = series[h <= np.unique(h)[:2].max()]
-            values[name], uncertainty[name] = float(fine.mean()), float(np.ptp(fine) / 2)
+        finest = series[h <= np.unique(h)[:2].max()]
+        limit, left = common_limit(h, series, family)
+        middle = float(finest.mean())
+        if name == "approach" or name.endswith("force"):
+            values[name], uncertainty[name] = limit, max(left, abs(limit - middle))
         else:
-            values[name], uncertainty[name] = common_limit(h, series, family)
+            spread = float(np.ptp(finest) / 2)
+            values[name], uncertainty[name] = middle, max(spread, abs(limit - middle) / 2)
     return values, uncertainty
+
+
+def _by_layer(case: StudyCase, sphere: Sphere) -> tuple[Quantities, Quantities]:
+    """Return the elastic layer's solution; the block's finite width is its uncertainty."""
+    layer = sphere_on_layer(
+        sphere.radius,
+        sphere.thickness,
+        case.load,
+        case.pair.material.young_modulus,
+        case.pair.material.poisson_ratio,
+    )
+    area = float(np.pi * layer.contact_radius**2)
+    values = {
+        "approach": layer.approach,
+        "medial_force": case.load,
+        "medial_mean_pressure": case.load / area,
+        "medial_peak_pressure": float(layer.pressure.max()),
+        "medial_area": area,
+    }
+    values |= {name.replace("medial", "lateral"): 0.0 for name in list(values) if "medial" in name}
+    return values, {name: WIDTH_EFFECT * value for name, value in values.items()}
 
 
 def read_references(path: Path = STORED) -> dict[str, Reference]:
@@ -119,7 +153,7 @@ def read_references(path: Path = STORED) -> dict[str, Reference]:
             name: Reference(**{**entry, "grids_mm": tuple(entry["grids_mm"])})
             for name, entry in stored.items()
         }
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError(f"is no file of references ({error})", path, "use --recompute") from None
 
 

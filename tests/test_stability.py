@@ -1,0 +1,119 @@
+"""The study of extremes: its verdicts, its processes, and a tenth of it."""
+
+import json
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tkamb.cli import main
+from tkamb.contact.model import ContactStatus
+from tkamb.contact.registry import contact_model
+from tkamb.studies.extremes import Extreme, extremes
+from tkamb.studies.scene_extremes import SceneExtreme, judge_scene, scene_extremes
+from tkamb.studies.stability import (
+    FAILED_KINDS,
+    QUICK_SHARE,
+    judge_safely,
+    run_stability,
+    stability_cases,
+    summary,
+)
+from tkamb.studies.stability_report import picture, table
+from tkamb.studies.verdict import KINDS, Verdict, compared, judge
+
+SMALL = Extreme(resolution_mm=3.0)
+
+
+def test_the_matrix_is_wide_enough():
+    cases = list(extremes())
+    assert len(cases) >= 300 and len(set(cases)) == len(cases)
+    driven = {
+        name for case in cases for name in vars(case) if vars(case)[name] != vars(Extreme())[name]
+    }
+    assert driven == set(vars(Extreme()))
+    assert 10 * len(stability_cases(quick=True)) >= len(cases)
+
+
+def test_a_good_case_converges_to_newton():
+    verdict = judge(SMALL)
+    assert (verdict.kind, verdict.reason) == ("converged", "")
+    assert verdict.error < 2e-3
+
+
+def test_a_load_that_cannot_be_carried_is_flagged_with_a_reason():
+    verdict = judge(replace(SMALL, load_N=1e5))
+    assert verdict.kind == "flagged" and len(verdict.reason) > 20
+
+
+def test_a_femur_beside_the_insert_is_flagged():
+    verdict = judge(replace(SMALL, ml_mm=300.0))
+    assert verdict.kind == "flagged" and "does not lie over" in verdict.reason
+
+
+def test_an_impossible_material_is_flagged():
+    assert judge(replace(SMALL, nu=0.7)).kind == "flagged"
+
+
+@pytest.mark.parametrize(("share", "flags", "kind"), [
+    (1.0, (), "converged"),
+    (1.03, (), "unflagged_wrong"),
+    (1.03, ("a reason",), "flagged"),
+    (np.nan, (), "unflagged_wrong"),
+])  # fmt: skip
+def test_what_is_wrong_without_a_flag_is_called_so(share, flags, kind):
+    model = contact_model("foundation", 3.0)
+    result = model.press(model.prepare(SMALL.pair), 100.0, SMALL.pose)
+    assert result.status is ContactStatus.OK
+    other = replace(result, approach=share * result.approach, flags=flags)
+    assert compared(SMALL, other, result, 0.0).kind == kind
+
+
+def test_an_exception_is_a_verdict():
+    verdict = judge_safely(replace(SMALL, model="no such model"))
+    assert verdict.kind == "flagged"
+    verdict = judge_safely(replace(SMALL, facet_deg=0.0))
+    assert verdict.kind == "exception" and "Error" in verdict.reason
+
+
+def test_a_hang_is_stopped_and_the_next_case_judged():
+    slow, quick = replace(SMALL, resolution_mm=0.5), replace(SMALL, model="nothing")
+    verdicts = run_stability([slow, quick], longest=4.0)
+    assert [v.kind for v in verdicts] == ["hang", "flagged"]
+
+
+def test_counts_add_up_and_failures_are_listed():
+    verdicts = [Verdict(f"load_N={k}", "lattice", kind, "why", 0.1) for k, kind in enumerate(KINDS)]
+    found = summary(verdicts)
+    kinds = ("converged", "flagged", "unflagged_wrong", "unverified", "exceptions", "hangs")
+    assert [found[kind] for kind in kinds] == [1] * 6
+    assert found["cases"] == len(found["rows"]) == 6
+    text = "\n".join(table(verdicts))
+    assert all(kind in text for kind in FAILED_KINDS)
+    assert picture(verdicts).axes
+
+
+def test_a_tenth_of_the_matrix_has_no_failure():
+    verdicts = run_stability(stability_cases(quick=True)[::2])
+    failed = [v for v in verdicts if v.kind in FAILED_KINDS]
+    assert not failed
+    assert all(v.reason for v in verdicts if v.kind == "flagged")
+    assert Counter(v.kind for v in verdicts)["converged"] > 0.7 * len(verdicts)
+
+
+def test_a_run_in_slow_motion_obeys_the_law_of_inertia():
+    assert judge_scene(SceneExtreme("time", 3.0)).kind == "converged"
+
+
+@pytest.mark.slow
+def test_the_whole_matrix(tmp_path, capsys):
+    status = main(["stability", "--json", "--out", str(tmp_path)])
+    found = json.loads(capsys.readouterr().out)
+    assert found["cases"] >= 300
+    for kind in ("unflagged_wrong", "exceptions", "hangs"):
+        assert found[kind] == 0, [row for row in found["rows"] if row["kind"] not in KINDS[:2]]
+    assert status == (1 if found["unverified"] else 0)
+    assert all(row["reason"] for row in found["rows"] if row["kind"] == "flagged")
+    assert (tmp_path / "stability.png").stat().st_size > 10_000
+    assert QUICK_SHARE == 10 and len(list(scene_extremes())) > 20

@@ -1,0 +1,207 @@
+"""The trade-off: references, errors, front, rows, table and picture."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenes import write_scene
+from tkamb.cli import main
+from tkamb.contact.registry import contact_model, contact_names
+from tkamb.errors import InputError
+from tkamb.studies import tradeoff
+from tkamb.studies.cases import case_names, study_case
+from tkamb.studies.elastic_layer import sphere_on_layer
+from tkamb.studies.front import NOISE, on_front
+from tkamb.studies.measures import Job, Measure, measure, measure_apart
+from tkamb.studies.quantities import common_limit, errors, map_error, quantities, raster_map
+from tkamb.studies.references import (
+    compute_reference,
+    limits,
+    read_references,
+    reference_of,
+    write_references,
+)
+from tkamb.studies.tradeoff_report import picture, recommendations, table
+
+KEYS = {
+    "case", "contact", "resolution_mm", "prepare_seconds", "cold_seconds", "warm_seconds",
+    "peak_rss_MB", "error_approach", "error_force", "error_mean_pressure",
+    "error_peak_pressure", "error_area", "on_front",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def stored():
+    return read_references()
+
+
+def test_every_case_has_a_reference_of_its_own(stored):
+    for name in case_names():
+        reference = reference_of(study_case(name), stored)
+        assert reference.values["approach"] > 0
+        for part in ("approach", "medial_force", "lateral_force", "medial_peak_pressure"):
+            scale = max(reference.values[part], 1e-3 * reference.values["medial_force"])
+            assert reference.uncertainty[part] < 0.05 * scale, (name, part)
+
+
+def test_refined_grids_go_to_the_elastic_layer_s_solution(stored):
+    """The sphere's reference is analytic; the grids' own limit must agree with it."""
+    found = stored["sphere"]
+    values, uncertainty = limits(found.solved)
+    for name in ("approach", "medial_peak_pressure"):
+        known = uncertainty[name] + found.uncertainty[name]
+        assert values[name] == pytest.approx(found.values[name], abs=known), name
+
+
+def test_the_elastic_layer_is_hertz_when_thick_and_flattens_when_thin():
+    thick = sphere_on_layer(20e-3, 2.0, 100.0, 5e8, 0.45)
+    modulus = 5e8 / (1 - 0.45**2)
+    radius = (3 * 100.0 * 20e-3 / (4 * modulus)) ** (1 / 3)
+    assert thick.contact_radius == pytest.approx(radius, rel=3e-3)
+    assert thick.pressure.max() == pytest.approx(1.5 * 100.0 / (np.pi * radius**2), rel=5e-3)
+    thin = sphere_on_layer(20e-3, 2e-3, 100.0, 5e8, 0.45)
+    assert thin.approach < 0.8 * thick.approach
+
+
+def test_condyles_in_balance_share_the_load(stored):
+    for name in ("two condyles", "conforming"):
+        values = stored[name].values
+        assert values["medial_force"] == pytest.approx(values["lateral_force"], rel=1e-3)
+        total = values["medial_force"] + values["lateral_force"]
+        assert total == pytest.approx(study_case(name).load, rel=0.02)
+
+
+def test_a_changed_case_or_a_missing_reference_is_refused(stored, tmp_path):
+    case = study_case("sphere")
+    with pytest.raises(InputError, match="earlier version"):
+        reference_of(replace(case, load=701.0), stored)
+    with pytest.raises(InputError, match="missing"):
+        reference_of(case, {})
+    path = tmp_path / "references.json"
+    write_references(stored, path)
+    again = read_references(path)
+    assert again["sphere"].values == stored["sphere"].values
+    path.write_text("[1]")
+    with pytest.raises(InputError, match="recompute"):
+        read_references(path)
+
+
+def test_a_reference_can_be_computed_again(stored):
+    case = study_case("sphere")
+    coarse = compute_reference(case, (2.5, 2.0))
+    assert coarse.hash == stored["sphere"].hash
+    assert coarse.values["approach"] == pytest.approx(stored["sphere"].values["approach"], rel=0.1)
+
+
+def test_the_common_limit_of_two_families():
+    h = np.array([3.0, 2.0, 1.0, 3.0, 2.0, 1.0])
+    family = np.array([0, 0, 0, 1, 1, 1])
+    values = 5.0 + np.where(family == 0, 0.3, -0.7) * h**2
+    limit, uncertainty = common_limit(h, values, family)
+    assert limit == pytest.approx(5.0) and uncertainty < 1e-9
+    disturbed = values + 0.1 * (family == 1)
+    limit, uncertainty = common_limit(h, disturbed, family)
+    assert 5.0 < limit < 5.1 and uncertainty == pytest.approx(0.05, abs=0.02)
+
+
+def test_errors_and_map_errors_vanish_between_equals():
+    case = study_case("sphere")
+    model = contact_model("foundation", 2.0)
+    result = model.press(model.prepare(case.pair), case.load, case.pose)
+    found, raster = quantities(result), raster_map(result)
+    assert set(errors(found, found).values()) == {0.0}
+    assert map_error(raster, raster) == 0.0
+    assert map_error({}, raster) == 1.0
+    assert map_error({place: 1.1 * p for place, p in raster.items()}, raster) == pytest.approx(0.1)
+    scaled = {name: 1.05 * value for name, value in found.items()}
+    assert errors(scaled, found)["peak_pressure"] == pytest.approx(0.05)
+
+
+def test_the_front_is_blind_to_noise_in_time():
+    rng = np.random.default_rng(3)
+    points = [(10.0**a, 10.0**b) for a, b in rng.uniform(-3, 0, (40, 2))]
+    front = on_front(points)
+    assert 0 < sum(front) < 40
+    best = min(points, key=lambda point: point[1])
+    assert front[points.index(best)]
+    for point, mark in zip(points, front, strict=True):
+        if mark:
+            assert not any(t * NOISE < point[0] and e <= point[1] for t, e in points)
+    again = on_front(
+        [(t * f, e) for (t, e), f in zip(points, rng.uniform(1, 1.05, 40), strict=True)]
+    )
+    changed = [p for p, a, b in zip(points, front, again, strict=True) if a != b]
+    for point in changed:
+        near = [t for t, e in points if (t, e) != point and 1 / 1.3 < t / point[0] < 1.3]
+        assert near, "only pairs within the noise may change places"
+
+
+def test_a_measure_in_a_process_of_its_own():
+    found = measure_apart(Job("sphere", "foundation", 2.0))
+    assert found.status == "ok" and found.warm_seconds > 0 and found.prepare_seconds > 0
+    assert 30 < found.peak_rss_MB < 4000
+    here = measure(Job("sphere", "foundation", 2.0))
+    assert found.values == pytest.approx(here.values)
+
+
+def test_what_cannot_be_measured_is_a_row_too():
+    assert measure_apart(Job("sphere", "foundation", -1.0)).status.startswith("failed: ")
+    assert measure_apart(Job("sphere", "lattice", 0.7), longest=1.0).status == "stopped after 1 s"
+
+
+def made_up_rows():
+    settings = [("hertz", 1.0, 1e-3, 0.2), ("foundation", 1.0, 1e-2, 0.3), ("fe", 1.0, 1.0, 0.001)]
+    rows = []
+    for case in ("sphere", "two condyles"):
+        for contact, grid, seconds, error in settings:
+            found = Measure("ok", 1.0, seconds, seconds, 100.0, 1, 1, {}, {})
+            compared = dict.fromkeys((*tradeoff.KEYS, "map"), error)
+            rows.append(tradeoff.Row(Job(case, contact, grid), found, compared, 0.005))
+        rows.append(tradeoff.Row(Job(case, "lattice", 1.0), Measure("out of range"), {}, 0.005))
+    return tradeoff.with_fronts(rows)
+
+
+def test_rows_table_and_advice(stored):
+    rows = made_up_rows()
+    assert [row.on_front for row in rows[:4]] == [True, False, True, False]
+    content = json.loads(tradeoff.as_json(rows))
+    assert all(set(row) == KEYS for row in content)
+    assert content[3]["error_approach"] is None
+    text = "\n".join(table(rows, stored))
+    assert "out of range" in text and "*hertz" in text
+    advice = recommendations(rows)
+    assert any("5 % in peak pressure" in line and "fe at 1 mm" in line for line in advice)
+    assert picture(rows).axes
+
+
+def test_every_model_takes_part_in_the_full_study():
+    wanted = tradeoff.jobs(quick=False)
+    assert {job.contact for job in wanted} >= set(contact_names()) - {"gap-pressure"}
+    assert {job.case for job in wanted} == set(case_names())
+    labels = {job.label for job in wanted}
+    assert {"lattice[tolerance=0.01]", "fe[newton=True]"} <= labels
+
+
+def test_the_quick_study(tmp_path, capsys):
+    assert main(["tradeoff", "--quick", "--json", "--out", str(tmp_path)]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert rows == json.loads((tmp_path / "tradeoff.json").read_text())
+    assert all(set(row) == KEYS for row in rows)
+    by_name = {(row["case"], row["contact"]): row for row in rows}
+    lattice, fe = by_name["two condyles", "lattice"], by_name["two condyles", "fe"]
+    assert lattice["error_approach"] < 0.05 and fe["error_approach"] < 0.06
+    assert lattice["error_force"] < 0.03
+    assert any(row["on_front"] for row in rows)
+    assert "fastest" in (tmp_path / "tradeoff.txt").read_text()
+    assert (tmp_path / "tradeoff.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_a_user_s_scene_is_a_case(tmp_path):
+    path = write_scene(tmp_path)
+    names = [name for name in case_names(path) if name.startswith("scene")]
+    assert len(names) == 3
+    shipped, own = study_case("knee 60 deg"), study_case("scene 60 deg", path)
+    assert own.load == pytest.approx(shipped.load)
