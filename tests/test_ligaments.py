@@ -20,7 +20,8 @@ from tkamb.case import load_case
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, knee_pose
 from tkamb.geometry.surface import Surface
-from tkamb.scene import LigamentTable, load_scene
+from tkamb.scene import load_scene
+from tkamb.scene_tables import LigamentTable
 
 SLACK = 0.05
 FLEXION = np.deg2rad(np.arange(0.0, 101.0, 5.0))

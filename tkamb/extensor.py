@@ -23,7 +23,7 @@ from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.geometry.sections import sagittal_outline
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.meshes import BONE_SIZE, load_surface, mirrored
-from tkamb.scene import Attachment, BoneTable
+from tkamb.scene_tables import Attachment, BoneTable
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:

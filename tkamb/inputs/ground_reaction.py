@@ -22,7 +22,7 @@ from tkamb.geometry.frames import MIRROR, Array
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import check_roles, laboratory_rotation
 from tkamb.inputs.tables import Table, read_table
-from tkamb.scene import GroundReactionTable
+from tkamb.scene_tables import GroundReactionTable
 
 LEVEL_TOLERANCE = 0.01
 """m; a centre of pressure that rises by more than this is not on a level plate."""

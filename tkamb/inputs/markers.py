@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, pose, transform
 from tkamb.inputs.tables import Table
-from tkamb.scene import TibiaTable
+from tkamb.scene_tables import TibiaTable
 from tkamb.units import MILLIMETRE
 
 WRONG_MARKERS = 0.05

@@ -23,7 +23,7 @@ from tkamb.geometry.frames import (
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import angle_scale, check_roles, poses_of_columns
 from tkamb.inputs.tables import Table, read_table
-from tkamb.scene import MotionTable
+from tkamb.scene_tables import MotionTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 PATELLA_COORDINATES = ("patella_ap", "patella_si", "patella_rotation")

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, pose
 from tkamb.inputs.segments import RigidInertia, Sex, combined, segment_inertia
-from tkamb.scene import PatientTable
+from tkamb.scene_tables import PatientTable
 
 KNEE_JOINTS = {
     "knee_ap": ("prismatic", (1, 0, 0)),

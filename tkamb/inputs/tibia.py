@@ -20,7 +20,7 @@ from tkamb.inputs.laboratory import (
 )
 from tkamb.inputs.markers import check_fit, complete_run, fit_rigid, shank_points
 from tkamb.inputs.tables import Table, read_table
-from tkamb.scene import TibiaTable
+from tkamb.scene_tables import TibiaTable
 from tkamb.units import MILLIMETRE
 
 

@@ -1,0 +1,378 @@
+"""The tables of the scene file: what each key means, its unit and its limits.
+
+Units are in the key names; unknown keys are errors; every table is frozen.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+LengthUnit = Literal["m", "cm", "mm"]
+AngleUnit = Literal["rad", "deg"]
+Vector = tuple[float, float, float]
+KneeFreedom = Literal["ap", "si", "ml", "axial_rotation", "adduction"]
+
+
+def _axes(text: str) -> str:
+    names = [part.strip() for part in text.split(",")]
+    if len(names) != 3 or sorted(n.lstrip("+-") for n in names) != ["x", "y", "z"]:
+        raise ValueError(
+            "must name three different axes for anterior, superior and right, e.g. '-x,+y,-z'"
+        )
+    return ",".join(n if n[0] in "+-" else f"+{n}" for n in names)
+
+
+Axes = Annotated[str, AfterValidator(_axes)]
+
+
+class SceneTable(BaseModel):
+    """A table of the scene file: frozen, and unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class PatientTable(SceneTable):
+    """Who it is. The URDF holds the chain ankle-tibia-femur-patella."""
+
+    urdf: Path
+    side: Literal["right", "left"] = Field(description="the knee that is modelled")
+    mass_kg: float = Field(gt=0, description="body mass; forces in BW are relative to it")
+    sex: Literal["male", "female"] | None = Field(
+        None, description="only for segments without <inertial>: picks the de Leva table"
+    )
+    height_mm: float | None = Field(None, gt=0)
+
+
+class MotionTable(SceneTable):
+    """The knee's recorded motion.
+
+    `interpretation = "coordinates"`: columns are the six knee coordinates (Grood-Suntay) of
+    the femoral component in the insert frame. `"pose"`: columns are a rotation sequence and
+    a translation that place the femoral mesh in the insert mesh's own axes.
+    """
+
+    file: Path
+    motion: Literal["recorded", "roll-slip"] = Field(
+        "recorded",
+        description=(
+            "'roll-slip' (the source): rotations and ML as recorded, AP from rolling plus slip, "
+            "SI from first touch; needs the implant"
+        ),
+    )
+    slip_share: float = Field(
+        1.0, ge=0, description="roll-slip: share of the recorded slip; 0 is pure rolling"
+    )
+    format: Literal["csv", "sto", "mot"] | None = Field(None, description="default: the suffix")
+    interpretation: Literal["coordinates", "pose"] = "coordinates"
+    sequence: str | None = Field(
+        None,
+        pattern="^([xyz]{3}|[XYZ]{3})$",
+        description="pose only: upper case = intrinsic, as in scipy ('XYZ' is Rx Ry Rz)",
+    )
+    columns: dict[str, str] = Field(
+        default_factory=dict,
+        description=(
+            "role -> column name, where it differs from the role. Roles: time, flexion, "
+            "adduction, axial_rotation, ap, si, ml (coordinates); time, rotation_1..3, "
+            "translation_1..3 (pose); patella_ap, patella_si, patella_rotation"
+        ),
+    )
+    angle_unit: AngleUnit
+    length_unit: LengthUnit
+    cutoff_Hz: float | Literal["none"] = Field(
+        description="low-pass cut-off of the differentiation; 'none' trusts the samples"
+    )
+    cycle_s: tuple[float, float] | None = Field(
+        None,
+        description="the motion's time column is per cent of a cycle, which lies on this interval",
+    )
+    cycle_offset_percent: float = Field(0.0, description="per cent of the cycle at cycle_s[0]")
+    frames: int | None = Field(
+        None, ge=2, description="resample to so many frames; default: as recorded"
+    )
+
+    @model_validator(mode="after")
+    def _keys_go_together(self) -> Self:
+        if (self.interpretation == "pose") != (self.sequence is not None):
+            raise ValueError("'sequence' belongs to interpretation = 'pose', and is needed there")
+        if self.motion == "recorded" and "slip_share" in self.model_fields_set:
+            raise ValueError("'slip_share' belongs to motion = 'roll-slip'")
+        return self
+
+
+class JointCentreTable(SceneTable):
+    """A joint centre known from the neighbouring segment's markers: one more shank marker.
+
+    For shanks with fewer than three markers: the ankle centre is carried by the markers of
+    the foot, the knee centre by those of the thigh.
+    """
+
+    name: str
+    markers_mm: dict[str, Vector] = Field(
+        description="the neighbour's markers: name -> position in the neighbour's own frame"
+    )
+    centre_mm: Vector = Field(description="the joint centre in the neighbour's own frame")
+    tibia_mm: Vector = Field(description="the joint centre in the tibia link")
+
+
+class TibiaTable(SceneTable):
+    """How the shank stands in the laboratory (x forward, y up, z right).
+
+    One of: `sagittal` (a forward lean about z over a fixed ankle), `pose` (columns of a
+    file that place the tibia link), `markers` (rigid fit of shank markers).
+    """
+
+    kind: Literal["sagittal", "pose", "markers"]
+    file: Path
+    columns: dict[str, str] = Field(
+        default_factory=dict,
+        description=(
+            "role -> column: time, angle (sagittal; forward lean is positive) | "
+            "time, rotation_1..3, translation_1..3 (pose)"
+        ),
+    )
+    sequence: str | None = Field(
+        None,
+        pattern="^([xyz]{3}|[XYZ]{3})$",
+        description="pose only: upper case = intrinsic, as in scipy",
+    )
+    angle_unit: AngleUnit = "deg"
+    length_unit: LengthUnit | None = Field(
+        None, description="of the file; needed for pose, and for markers unless the file says"
+    )
+    cutoff_Hz: float | Literal["none"] | None = Field(
+        None, description="low-pass cut-off; default: the motion's"
+    )
+    ankle_mm: Vector = Field((0.0, 0.0, 0.0), description="sagittal: the fixed ankle in the lab")
+    markers_mm: dict[str, Vector] = Field(
+        default_factory=dict, description="markers: name -> position in the tibia link"
+    )
+    joint_centre: tuple[JointCentreTable, ...] = Field(
+        (), description="markers: joint centres that neighbouring segments carry"
+    )
+    laboratory_axes: Axes = Field(
+        "+x,+y,+z", description="axes of the file that point forward, up and right"
+    )
+
+    @model_validator(mode="after")
+    def _kind_is_complete(self) -> Self:
+        if (self.kind == "pose") != (self.sequence is not None):
+            raise ValueError("'sequence' belongs to kind = 'pose', and is needed there")
+        if self.kind == "pose" and self.length_unit is None:
+            raise ValueError("kind = 'pose' needs 'length_unit'")
+        if (self.kind == "markers") != bool(self.markers_mm or self.joint_centre):
+            raise ValueError("'markers_mm' belongs to kind = 'markers', and is needed there")
+        return self
+
+
+class GroundReactionTable(SceneTable):
+    """The force that the ground exerts on the foot, measured on one level plate."""
+
+    file: Path
+    format: Literal["csv", "sto", "mot"] | None = None
+    columns: dict[str, str] = Field(
+        default_factory=dict,
+        description=(
+            "role -> column: time, force_1..3 (N, along the file's x, y, z), "
+            "point_1..3 (centre of pressure), moment_1..3 (N·m, free moment at that point; "
+            "those not named and not in the file are zero)"
+        ),
+    )
+    length_unit: LengthUnit
+    laboratory_axes: Axes = Field(
+        "+x,+y,+z", description="axes of the file that point forward, up and right"
+    )
+    applied: Literal["cop", "ankle"] = Field(
+        "cop", description="'ankle' applies the force alone at the ankle centre (the source)"
+    )
+    cutoff_Hz: float | Literal["none"]
+    unloaded_N: float = Field(
+        20.0, gt=0, description="below this vertical force the centre of pressure is held"
+    )
+
+
+class FemoralImplantTable(SceneTable):
+    """Femoral component: its mesh and where it sits on the femur link."""
+
+    mesh: Path
+    unit: LengthUnit
+    axes: Axes = "+x,+y,+z"
+    position_mm: Vector = Field(
+        (0.0, 0.0, 0.0), description="mesh origin in the femur link, anatomical axes"
+    )
+    rotation_deg: Vector = Field((0.0, 0.0, 0.0), description="intrinsic x-y-z, after axes")
+
+
+class InsertImplantTable(SceneTable):
+    """Insert: its mesh gives the insert frame (centre of the flat bottom's rectangle)."""
+
+    mesh: Path
+    unit: LengthUnit
+    axes: Axes = "+x,+y,+z"
+    bearing: Literal["fixed", "mobile"] = "fixed"
+
+
+class PatellarImplantTable(SceneTable):
+    """Patellar button: its mesh and where it sits on the patella link."""
+
+    mesh: Path
+    unit: LengthUnit
+    axes: Axes = "+x,+y,+z"
+    position_mm: Vector = (0.0, 0.0, 0.0)
+    rotation_deg: Vector = (0.0, 0.0, 0.0)
+
+
+class ImplantTable(SceneTable):
+    """The parts of the implant."""
+
+    femoral: FemoralImplantTable | None = None
+    insert: InsertImplantTable | None = None
+    patella: PatellarImplantTable | None = None
+
+
+class Attachment(SceneTable):
+    """A point fixed to a link of the URDF."""
+
+    link: str
+    point_mm: Vector
+
+
+class LigamentTable(SceneTable):
+    """One bundle: tension only, on a straight line.
+
+    `law = "two-line"` (Shin 2007, the source) takes `stiffness_N_per_mm`;
+    `law = "quadratic-toe"` (Blankevoort 1991) takes `stiffness_N_per_strain`.
+    """
+
+    name: str = Field(pattern="^[A-Za-z0-9_]+$")
+    proximal: Attachment
+    distal: Attachment
+    law: Literal["two-line", "quadratic-toe"]
+    stiffness_N_per_mm: float | None = Field(None, gt=0)
+    stiffness_N_per_strain: float | None = Field(None, gt=0)
+    slack_length_mm: float | None = Field(None, gt=0)
+    reference_strain: float | None = Field(
+        None, gt=-1, description="instead of slack_length_mm: strain at the reference pose"
+    )
+    reference_flexion_deg: float = Field(
+        0.0, description="the recorded frame nearest to this flexion is the reference pose"
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        wanted = self.stiffness_N_per_mm if self.law == "two-line" else self.stiffness_N_per_strain
+        other = self.stiffness_N_per_strain if self.law == "two-line" else self.stiffness_N_per_mm
+        if wanted is None or other is not None:
+            unit = "N_per_mm" if self.law == "two-line" else "N_per_strain"
+            raise ValueError(f"law '{self.law}' takes stiffness_{unit}, and only that")
+        if (self.slack_length_mm is None) == (self.reference_strain is None):
+            raise ValueError("give either slack_length_mm or reference_strain")
+        return self
+
+
+class GenericLigamentsTable(SceneTable):
+    """A generic set for a patient who has none of their own, scaled to the implant.
+
+    Its bundles are nobody's: they are named `generic_...` in the results, and the table of
+    strains shows whether they suit the knee.
+    """
+
+    ligaments: tuple[Literal["MCL", "LCL", "PCL", "ACL"], ...] = Field(
+        ("MCL", "LCL", "PCL"), min_length=1, description="those that the patient has"
+    )
+
+
+class BoneTable(SceneTable):
+    """A bone's mesh, which a line may wrap beside the implant."""
+
+    mesh: Path
+    unit: LengthUnit
+    axes: Axes = "+x,+y,+z"
+    link: str = Field(description="link in whose frame the mesh stands")
+
+
+class QuadricepsTable(SceneTable):
+    """Quadriceps line: from the vastus intermedius origin to the patella.
+
+    It wraps the sagittal outline of the femoral component, and of `bone` if given.
+    """
+
+    origin: Attachment
+    insertion: Attachment
+    wrap: bool = True
+    bone: BoneTable | None = None
+    half_thickness_mm: float = Field(3.5, ge=0, description="of the tendon, off the outline")
+    band_mm: float = Field(
+        5.0,
+        ge=0,
+        description=(
+            "wraps the sections within this distance of its sagittal plane: as far as, on "
+            "average, the fibres of a lamina 20 mm wide; wider ones ride on the flanges"
+        ),
+    )
+
+
+class PatellarLigamentTable(SceneTable):
+    """Patellar ligament line: from the patella to the tibial tuberosity.
+
+    It wraps the insert's front lip when the insert is there.
+    """
+
+    proximal: Attachment
+    distal: Attachment
+    length_mm: float | None = Field(
+        None, gt=0, description="its constant length; needed where the patella is solved"
+    )
+    wrap: bool = True
+    half_thickness_mm: float = Field(2.5, ge=0)
+    band_mm: float = Field(5.0, ge=0, description="likewise, of the insert's lip")
+
+
+class PatellaTable(SceneTable):
+    """Whether the patella's sagittal motion was recorded or is to be found."""
+
+    motion: Literal["recorded", "solved"]
+
+
+class ContactTable(SceneTable):
+    """The femorotibial contact."""
+
+    model: str = Field(description="a name of `tkamb contact list`")
+    resolution_mm: float = Field(1.0, gt=0)
+    material: str = Field("polyethylene", description="a name of `tkamb.contact.materials`")
+    friction: float = Field(0.05, ge=0, le=1, description="Coulomb coefficient")
+    adjust: bool = Field(False, description="femoral adjustment before contact")
+    coupling: Literal["none", "points"] = Field(
+        "none", description="'points': the resultants of the deformed contact act in the equations"
+    )
+    released: tuple[KneeFreedom, ...] = Field(
+        (),
+        description=(
+            "knee coordinates that find their own equilibrium under contact, ligaments and "
+            "muscle line: adduction, axial_rotation, ap, si, ml (si always does)"
+        ),
+    )
+    options: dict[str, Any] = Field(default_factory=dict, description="the model's own options")
+
+    @model_validator(mode="after")
+    def _released_once(self) -> Self:
+        if len(set(self.released)) != len(self.released):
+            raise ValueError("'released' names a coordinate twice")
+        if self.released and self.adjust:
+            raise ValueError(
+                "'adjust' and 'released' exclude each other: one moves the femur to "
+                "where the other lets it settle"
+            )
+        return self
+
+
+class OutputTable(SceneTable):
+    """What is written and how it is read."""
+
+    directory: Path | None = None
+    yield_stress_MPa: float = Field(21.0, gt=0)
+    axis: Literal["flexion", "cycle", "time"] = Field(
+        "flexion", description="the report's horizontal axis"
+    )
+    notes: list[str] = Field(default_factory=list, description="printed in the report")
