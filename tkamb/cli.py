@@ -71,6 +71,7 @@ def _add_run(commands: Any) -> None:
         help="override a key of the scene",
     )
     run.add_argument("--resume", action="store_true", help="go on with an interrupted run")
+    run.add_argument("--profile", action="store_true", help="what was touched, and time per part")
     run.add_argument("--strict", action="store_true", help="exit 1 when a frame failed")
     run.add_argument("--json", action="store_true", help="print summary.json")
     run.set_defaults(command=_run)
@@ -167,6 +168,9 @@ def _setting(text: str) -> tuple[str, Any]:
 def _run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
+    from tkamb.profiling import Profile, profile_lines
+
+    profile = Profile() if options.profile else None
     from tkamb.output.atomic import claimed_directory
     from tkamb.output.axis import horizontal_axis
     from tkamb.output.headline import cards
@@ -191,6 +195,8 @@ def _run(options: argparse.Namespace) -> int:
             progress=lambda frames: tqdm(frames, unit="frame", disable=None),
             resume=options.resume,
         )
+        if profile:
+            results.summary["profile"] = profile.report(results, options.scene)
         write_results(results, directory)
     failed = [k for k, status in enumerate(results.status) if status.startswith(FAILED)]
     for k in failed:
@@ -200,6 +206,8 @@ def _run(options: argparse.Namespace) -> int:
     else:
         found = cards(results, horizontal_axis(results))
         print("\n".join([*(card.line() for card in found), f"report: {directory / 'report.html'}"]))
+    if profile and not options.json:
+        print("\n".join(profile_lines(results.summary["profile"])))
     return 1 if failed and (options.strict or len(failed) == len(results)) else 0
 
 

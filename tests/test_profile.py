@@ -1,0 +1,46 @@
+"""`tkamb run --profile`: what a run touched, and only that."""
+
+import json
+
+from scenes import write_scene
+from tkamb.cli import main
+from tkamb.profiling import Profile
+
+
+def profiled(folder, drop, capsys):
+    scene = write_scene(folder / "scene", drop)
+    out = folder / "out"
+    status = main(
+        ["run", str(scene), "--out", str(out), "--frames", "0:101:50", "--profile", "--json"]
+    )
+    assert status == 0
+    return json.loads(capsys.readouterr().out)["profile"]
+
+
+def test_a_run_says_what_it_touched(tmp_path, capsys):
+    found = profiled(tmp_path, (), capsys)
+    names = {path.rsplit("/", 1)[-1] for path in found["files"]}
+    assert {"scene.toml", "patient.urdf", "motion.csv", "insert.stl"} <= names
+    assert found["frames"] == 3 and found["not_modelled"] == []
+    parts = {name: seconds for name, seconds in found["seconds"].items() if name != "all"}
+    assert {"read", "contact", "equations of motion"} <= set(parts)
+    assert abs(sum(parts.values()) - found["seconds"]["all"]) < 1e-6
+
+
+def test_a_minimal_scene_touches_nothing_more(tmp_path, capsys):
+    muscles = ("quadriceps", "patellar_ligament", "patella")
+    drop = ("contact", "implant", "ligament", "tibia", "ground_reaction", *muscles)
+    found = profiled(tmp_path, drop, capsys)
+    names = {path.rsplit("/", 1)[-1] for path in found["files"]}
+    assert names == {"scene.toml", "patient.urdf", "motion.csv"}
+    assert "contact" not in found["seconds"] and "prepare contact" not in found["seconds"]
+    assert "femorotibial contact" in found["not_modelled"]
+
+
+def test_only_files_that_are_read_count(tmp_path):
+    profile = Profile()
+    (tmp_path / "written").write_text("x")
+    (tmp_path / "read").write_text("x")
+    (tmp_path / "read").read_text()
+    own = [path for path in profile.opened if path.parent == tmp_path]
+    assert own == [tmp_path / "read"]

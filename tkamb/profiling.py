@@ -1,0 +1,90 @@
+"""What a run touched: parts built, files read, modules imported, frames evaluated, time per part.
+
+`tkamb run --profile`. Only what the scene requires should appear here.
+"""
+
+import math
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
+
+HEAVY = ("pinocchio", "trimesh", "scipy", "fcl", "embreex", "h5py", "matplotlib", "pydantic")
+"""Libraries worth naming."""
+CLOCKS = {
+    "closest points": "query_seconds",
+    "equations of motion": "body_seconds",
+    "contact": "contact_seconds",
+}
+
+
+@dataclass(eq=False)
+class Profile:
+    """Watches a run from the moment it is made.
+
+    Attributes:
+        opened: files that were opened for reading, in order.
+    """
+
+    opened: list[Path] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._before = set(sys.modules)
+        sys.addaudithook(self._hear)
+
+    def report(self, results: "Results", scene: Path) -> dict[str, Any]:
+        """Return what was touched, JSON-able.
+
+        Args:
+            results: of the run.
+            scene: its file; files beside or below it count as the scene's.
+        """
+        seconds = dict(results.summary["seconds"])
+        whole = seconds.pop("all")
+        for name, column in CLOCKS.items():
+            known = [float(value) for value in results[column] if math.isfinite(value)]
+            if known:
+                seconds[name] = sum(known)
+        seconds["all else"] = max(0.0, whole - sum(seconds.values()))
+        modules = sorted(set(sys.modules) - self._before)
+        return {
+            "seconds": seconds | {"all": whole},
+            "frames": len(results),
+            "not_modelled": results.summary["not_modelled"],
+            "files": [str(path) for path in self._of_scene(scene)],
+            "modules": [name for name in modules if name.startswith("tkamb")],
+            "libraries": [name for name in HEAVY if name in sys.modules],
+        }
+
+    def _of_scene(self, scene: Path) -> list[Path]:
+        folder = scene.resolve().parent
+        inside = [path for path in self.opened if path.resolve().is_relative_to(folder)]
+        return list(dict.fromkeys(path for path in inside if path.is_file()))
+
+    def _hear(self, event: str, given: tuple[Any, ...]) -> None:
+        if event == "open" and isinstance(given[0], str):
+            mode = given[1] if isinstance(given[1], str) else "r"
+            if not set("wax+") & set(mode):
+                self.opened.append(Path(given[0]))
+
+
+def profile_lines(report: dict[str, Any]) -> list[str]:
+    """Return a report as lines to read."""
+    whole, frames = report["seconds"]["all"], report["frames"]
+    lines = ["part                       seconds   share  ms per frame"]
+    for name, seconds in report["seconds"].items():
+        share = f"{100 * seconds / whole:5.1f} %"
+        lines.append(f"{name:24s} {seconds:9.3f} {share} {1e3 * seconds / frames:13.2f}")
+    parts = "; ".join(report["not_modelled"]) or "none"
+    lines.append(f"parts left out: {parts}")
+    lines.append(f"files read ({len(report['files'])}): " + _names(report["files"]))
+    modules = [name.removeprefix("tkamb.") for name in report["modules"]]
+    lines.append(f"modules imported ({len(modules)}): " + ", ".join(modules))
+    return [*lines, "libraries imported: " + ", ".join(report["libraries"])]
+
+
+def _names(files: list[str]) -> str:
+    return ", ".join(Path(name).name for name in files)
