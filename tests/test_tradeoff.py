@@ -11,6 +11,7 @@ from tkamb.cli import main
 from tkamb.contact.registry import contact_model, contact_names
 from tkamb.errors import InputError
 from tkamb.studies import tradeoff
+from tkamb.studies.body_trade import body_table, run_body_trade
 from tkamb.studies.cases import case_names, study_case
 from tkamb.studies.elastic_layer import sphere_on_layer
 from tkamb.studies.front import NOISE, on_front
@@ -205,3 +206,14 @@ def test_a_user_s_scene_is_a_case(tmp_path):
     assert len(names) == 3
     shipped, own = study_case("knee 60 deg"), study_case("scene 60 deg", path)
     assert own.load == pytest.approx(shipped.load)
+
+
+@pytest.mark.slow
+def test_the_body_s_trade_says_what_each_part_changes():
+    rows = {row.name: row for row in run_body_trade()}
+    assert set(rows["as shipped"].changed.values()) == {0.0}
+    assert all(row.status == "ok" and row.frame_seconds > 0 for row in rows.values())
+    assert 0 < rows["filtered at 6 Hz"].changed["force_total_N"] < 0.01
+    assert rows["coupled: points"].changed["force_total_N"] < 0.02
+    assert rows["released: adduction"].changed["medial_force_N"] > 0.05
+    assert len(body_table(list(rows.values()))) == len(rows) + 2

@@ -4,6 +4,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,8 @@ def add_tradeoff(commands: Any) -> None:
 def _tradeoff(options: argparse.Namespace) -> int:
     from tkamb.output.atomic import claim_directory, replaced_file, write_text
     from tkamb.studies import tradeoff as study
+    from tkamb.studies.body_trade import body_table, run_body_trade
+    from tkamb.studies.cases import SHIPPED_SCENE
     from tkamb.studies.tradeoff_report import picture, recommendations, table
 
     jobs = study.jobs(options.quick, options.scene)
@@ -38,6 +41,10 @@ def _tradeoff(options: argparse.Namespace) -> int:
         rows = study.with_fronts([*rows, *peer_rows(cases, references)])
     text = study.as_json(rows)
     lines = [*table(rows, references), "", *recommendations(rows)]
+    if not options.quick and SHIPPED_SCENE.exists():
+        body = run_body_trade(progress=_progress("run"))
+        lines += ["", *body_table(body)]
+        write_text(directory / "body.json", json.dumps([asdict(row) for row in body], indent=1))
     write_text(directory / "tradeoff.json", text + "\n")
     write_text(directory / "tradeoff.txt", "\n".join(lines) + "\n")
     with replaced_file(directory / "tradeoff.png") as temporary:

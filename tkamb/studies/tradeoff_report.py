@@ -86,7 +86,7 @@ def picture(rows: Sequence[Row]) -> Figure:
     columns = min(4, len(cases))
     lines = -(-len(cases) // columns)
     with settings():
-        figure = new_figure(3.2 * columns, 2.9 * lines + 0.7)
+        figure = new_figure(3.4 * columns, 2.8 * lines + 0.3 + 0.9 * len(labels) / (2 * columns))
         axes = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
         for axis, case in zip(axes.ravel(), cases, strict=False):
             _panel(axis, [row for row in rows if row.job.case == case and row.errors], labels)
@@ -100,7 +100,14 @@ def picture(rows: Sequence[Row]) -> Figure:
                 axis.set_xlabel("time per warm press, ms")
                 axis.tick_params(labelbottom=True)
         found = {text: line for axis in axes.ravel() for line, text in _legend(axis)}
-        figure.legend(list(found.values()), list(found), loc="outside upper left", ncols=5)
+        figure.legend(
+            list(found.values()),
+            list(found),
+            loc="outside upper left",
+            ncols=2 * columns,
+            title="numbers at the points: cell size, mm",
+            alignment="left",
+        )
     return figure
 
 
