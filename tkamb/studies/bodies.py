@@ -9,12 +9,16 @@ from numpy.typing import NDArray
 from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface
 
-SECTORS = 96
-
 Height = Callable[[Array, Array], Array]
 
 
-def balls(radius: float, apart: float, waist: float = 1.0, finest_deg: float = 0.3) -> Surface:
+def balls(
+    radius: float,
+    apart: float,
+    waist: float = 1.0,
+    finest_deg: float = 0.3,
+    sectors: int = 96,
+) -> Surface:
     """Return one or two spheroids whose lowest points are at y = -radius.
 
     Args:
@@ -22,8 +26,9 @@ def balls(radius: float, apart: float, waist: float = 1.0, finest_deg: float = 0
         apart: m, z of the lateral one, the medial one at -apart; 0: a single one.
         waist: radius along z over `radius`.
         finest_deg: distance of the rings of vertices near the lowest point.
+        sectors: vertices of a ring.
     """
-    one = _ball(radius, waist, finest_deg)
+    one = _ball(radius, waist, finest_deg, sectors)
     if apart == 0:
         return Surface(*one, "ball")
     vertices, faces = one
@@ -86,22 +91,22 @@ def _ball(radius: float, waist: float, finest_deg: float) -> tuple[Array, NDArra
     polar = np.radians(
         np.concatenate([np.arange(finest_deg, 24, finest_deg), np.linspace(24, 180, 50)[:-1]])
     )
-    around = np.arange(SECTORS) * 2 * np.pi / SECTORS
+    around = np.arange(sectors) * 2 * np.pi / sectors
     rings = np.stack(
         [
             np.outer(np.sin(polar), np.cos(around)),
-            -np.outer(np.cos(polar), np.ones(SECTORS)),
+            -np.outer(np.cos(polar), np.ones(sectors)),
             np.sqrt(waist) * np.outer(np.sin(polar), np.sin(around)),
         ],
         axis=-1,
     ).reshape(-1, 3)
     vertices = radius * np.concatenate([[[0, -1, 0]], rings, [[0, 1, 0]]])
-    here = np.arange(SECTORS)
-    there = (here + 1) % SECTORS
+    here = np.arange(sectors)
+    there = (here + 1) % sectors
     parts = [_corners(np.zeros_like(here), 1 + here, 1 + there)]
     for row in range(len(polar) - 1):
-        a, b = 1 + row * SECTORS, 1 + (row + 1) * SECTORS
+        a, b = 1 + row * sectors, 1 + (row + 1) * sectors
         parts += [_corners(a + here, b + here, b + there), _corners(a + here, b + there, a + there)]
-    last = 1 + (len(polar) - 1) * SECTORS
+    last = 1 + (len(polar) - 1) * sectors
     parts.append(_corners(last + here, np.full_like(here, len(vertices) - 1), last + there))
     return vertices, np.concatenate(parts)

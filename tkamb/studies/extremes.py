@@ -13,7 +13,8 @@ from tkamb.geometry.surface import Surface
 from tkamb.studies.bodies import balls, block, dishes, flat
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
-FLAT = float("inf")
+SECTORS = 48
+"""Of the condyles' rings: what is compared is on one mesh."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,9 @@ class Extreme:
             height = dishes(thick, radius / self.conformity, apart)
         size = (26e-3 * self.aspect, 46e-3 if apart else 26e-3)
         insert = block(height, size, 1e-3)
-        femoral = _roughened(balls(radius, apart, self.waist, self.facet_deg), self.rough_mm)
+        femoral = _roughened(
+            balls(radius, apart, self.waist, self.facet_deg, SECTORS), self.rough_mm
+        )
         name = "polyethylene-linear" if self.linear else "polyethylene"
         chosen = material(name, young_modulus=self.modulus_MPa * MEGAPASCAL, poisson_ratio=self.nu)
         return ContactPair(femoral, insert, chosen, self.bearing)
