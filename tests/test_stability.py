@@ -94,6 +94,7 @@ def test_counts_add_up_and_failures_are_listed():
     assert picture(verdicts).axes
 
 
+@pytest.mark.slow
 def test_a_tenth_of_the_matrix_has_no_failure():
     verdicts = run_stability(stability_cases(quick=True)[::2])
     failed = [v for v in verdicts if v.kind in FAILED_KINDS]

@@ -185,6 +185,7 @@ def test_every_model_takes_part_in_the_full_study():
     assert {"lattice[tolerance=0.01]", "fe[newton=True]"} <= labels
 
 
+@pytest.mark.slow
 def test_the_quick_study(tmp_path, capsys):
     assert main(["tradeoff", "--quick", "--json", "--out", str(tmp_path)]) == 0
     rows = json.loads(capsys.readouterr().out)
