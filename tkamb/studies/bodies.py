@@ -87,7 +87,9 @@ def _corners(*numbers: NDArray[Any]) -> NDArray[np.int64]:
     return np.stack([n.ravel() for n in numbers], axis=1).astype(np.int64)
 
 
-def _ball(radius: float, waist: float, finest_deg: float) -> tuple[Array, NDArray[np.int64]]:
+def _ball(
+    radius: float, waist: float, finest_deg: float, sectors: int
+) -> tuple[Array, NDArray[np.int64]]:
     polar = np.radians(
         np.concatenate([np.arange(finest_deg, 24, finest_deg), np.linspace(24, 180, 50)[:-1]])
     )
