@@ -1,6 +1,7 @@
 """`tkamb press` on mesh files: what it prints, and that units, axes and side only relabel."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -234,3 +235,23 @@ def test_pose_file(tmp_path):
             read_pose(path)
     with pytest.raises(InputError, match="six numbers"):
         read_pose(tmp_path / "none.txt")
+
+
+def test_subject_dm_in_stance_has_both_condyles_in_their_dishes():
+    """30 % of the fluoroscopic cycle, adjusted: the pose of models/dm/README.md."""
+    geometry = Path(__file__).parents[2] / "shared" / "data" / "dm" / "geometry"
+    if not geometry.is_dir():
+        pytest.skip("subject DM's data are not beside the project")
+    found = press_meshes(
+        geometry / "femoral_component.stl",
+        geometry / "tibial_insert.stl",
+        1500.0,
+        units="m",
+        axes="-x,+y,-z",
+        pose=(-0.0065, 0.041674, 0.00014, -0.2406, 2.9164, -9.9867),
+        adjust=True,
+    ).as_dict()
+    for side, sign in (("medial", -1), ("lateral", 1)):
+        assert found[side]["force_N"] > 600.0
+        assert 18.0 < sign * found[side]["cop_mm"][2] < 32.0
+        assert abs(found[side]["cop_mm"][0]) < 8.0

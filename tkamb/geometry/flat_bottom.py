@@ -20,6 +20,8 @@ COMPARABLE = 0.5
 """Flats whose area is at least this share of the largest compete with it."""
 CLEAR = 0.9
 """Between two flats that face down, the larger wins below this ratio of areas."""
+UNEVEN = 1e-6
+"""m; a bottom that is rougher than this gets a notice: noise, or no flat at all."""
 _LEVEL = 1e-6
 """rad; a smaller tilt is rounding and stays as it is."""
 _CONE = math.radians(15.0)
@@ -101,6 +103,12 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
             f"{_described(down[0], rotation)}, and {_described(down[1], rotation)}",
             None,
             "remove one, or give the part without its underside",
+        )
+    if down[0].noise > UNEVEN:
+        _log.warning(
+            "%s: the flat bottom is uneven by %.0f µm (root mean square)",
+            surface.name,
+            1e6 * down[0].noise,
         )
     if down[0].area < CLEAR * flats[0].area:
         _log.warning(
