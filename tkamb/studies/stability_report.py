@@ -47,8 +47,9 @@ def picture(verdicts: Sequence[Verdict]) -> Figure:
                 label=f"{kind.replace('_', ' ')} ({len(some)})",
             )
         axis.axvline(WRONG, color=GREY, lw=1, ls="--")
-        axis.text(WRONG, len(groups) - 0.3, " wrong beyond 2 %", color=GREY, fontsize=7.5)
-        axis.text(1.0, len(groups) - 0.3, "no answer", color=GREY, fontsize=7.5, ha="center")
+        top = len(groups) - 0.3
+        axis.text(WRONG, top, "wrong beyond 2 % ", color=GREY, fontsize=7.5, ha="right")
+        axis.text(1.0, top, "no answer", color=GREY, fontsize=7.5, ha="center")
         axis.set(xscale="log", xlim=(1e-9, 3.0), xlabel="largest distance from the reference")
         axis.set_yticks(range(len(groups)), groups, fontsize=7.5)
         axis.set_ylim(-0.7, len(groups) + 0.4)
