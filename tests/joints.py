@@ -6,8 +6,8 @@ from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
 from tkamb.body.demand import KneeDemand, LigamentSet, unit_keeper
 from tkamb.contact.materials import material
 from tkamb.contact.model import ContactPair
+from tkamb.equilibrium.released import SCALE, ReleasedForces, released_indices
 from tkamb.geometry.frames import KNEE_COORDINATES
-from tkamb.released import SCALE, ReleasedForces, released_indices
 
 BALL, HALF, HEIGHT = 25e-3, 20e-3, 10e-3
 """Radius of the spheres, half their distance, thickness of the insert under them, m."""

@@ -5,10 +5,10 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tkamb.adjusted_press import press_adjusted
 from tkamb.contact.materials import material
 from tkamb.contact.model import ContactPair, ContactResult
 from tkamb.contact.registry import contact_model
+from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.errors import InputError
 from tkamb.geometry.adjustment import adjust
 from tkamb.geometry.closest import ClosestPointQuery

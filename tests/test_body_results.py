@@ -9,7 +9,7 @@ from tkamb.case import load_case
 from tkamb.errors import InputError
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import knee_pose
-from tkamb.mechanics import Mechanics
+from tkamb.mechanics.mechanics import Mechanics
 from tkamb.output.tables import strain_table
 
 FEW = {"motion.frames": 26}

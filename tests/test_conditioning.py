@@ -13,9 +13,9 @@ from tkamb.body.knee import solve_knee
 from tkamb.body.load import PointForces
 from tkamb.case import load_case
 from tkamb.geometry.frames import transform
-from tkamb.mechanics import FrameLoads, Mechanics
+from tkamb.mechanics.mechanics import FrameLoads, Mechanics
+from tkamb.run.status import FAILED, frame_status
 from tkamb.scene import load_scene
-from tkamb.status import FAILED, frame_status
 
 MIDDLE = 60
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tkamb.case import load_case
-from tkamb.equilibrium import LOAD_CHANGE, POINT_CHANGE, ContactSide
+from tkamb.equilibrium.contact_side import LOAD_CHANGE, POINT_CHANGE, ContactSide
 from tkamb.errors import InputError
-from tkamb.mechanics import Mechanics
+from tkamb.mechanics.mechanics import Mechanics
 from tkamb.scene import load_scene
 from tkamb.simulation import simulate
 

@@ -19,7 +19,7 @@ from tkamb.geometry.frames import pose
 from tkamb.geometry.nearest import NearestPoints
 from tkamb.geometry.surface import Surface
 from tkamb.inputs.patient import load_urdf
-from tkamb.mechanics import FrameLoads, Mechanics
+from tkamb.mechanics.mechanics import FrameLoads, Mechanics
 from tkamb.scene import Scene, load_scene
 
 FEW = 26

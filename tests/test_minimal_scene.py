@@ -42,7 +42,11 @@ def test_patient_and_motion_alone_touch_nothing_else(tmp_path):
     assert names == {"scene.toml", "patient.urdf", "motion.csv"}
     for module in seen["modules"]:
         assert not module.startswith(("tkamb.contact", "tkamb.output.maps"))
-        assert module not in ("tkamb.body.ligaments", "tkamb.extensor", "tkamb.inputs.meshes")
+        assert module not in (
+            "tkamb.body.ligaments",
+            "tkamb.mechanics.extensor",
+            "tkamb.inputs.meshes",
+        )
     assert seen["others"] == []
     assert seen["status"] == ["ok"] * 3
 

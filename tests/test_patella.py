@@ -17,9 +17,9 @@ from tkamb.body.patella import (
 )
 from tkamb.body.patellofemoral import PatellofemoralContact
 from tkamb.case import load_case
-from tkamb.extensor import ExtensorFrames
 from tkamb.geometry.frames import Array, inverse, knee_pose, transform
 from tkamb.geometry.surface import Surface
+from tkamb.mechanics.extensor import ExtensorFrames
 from tkamb.scene import load_scene
 
 TROCHLEA, DOME = 0.025, 0.02

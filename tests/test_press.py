@@ -11,7 +11,7 @@ from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.surface import Surface
-from tkamb.press import press_meshes, read_pose
+from tkamb.press.press import press_meshes, read_pose
 
 KEYS = [
     "contact",

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from synthetic_run import make_run
-from tkamb.columns import COLUMNS, columns_as_markdown, is_ligament, ligament_of
 from tkamb.errors import InputError
 from tkamb.output.maps_file import ContactMaps, MapWriter, read_maps, write_maps
 from tkamb.results import Results, claim_directory, read_results, write_results
+from tkamb.run.columns import COLUMNS, columns_as_markdown, is_ligament, ligament_of
 
 ROOT = Path(__file__).parents[1]
 

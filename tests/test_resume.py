@@ -16,8 +16,8 @@ from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.output.maps_file import read_maps
 from tkamb.output.shards import Shard, Shards
-from tkamb.recorder import interrupt_later
 from tkamb.results import Results, read_results
+from tkamb.run.recorder import interrupt_later
 from tkamb.simulation import simulate
 
 ROOT = Path(__file__).parents[1]

@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tkamb.balance import BalanceStatus
 from tkamb.body.demand import external_wrench
 from tkamb.body.load import total_wrench
 from tkamb.case import load_case
 from tkamb.contact.probe import condyle_wrenches
-from tkamb.equilibrium import ContactSide
+from tkamb.equilibrium.balance import BalanceStatus
+from tkamb.equilibrium.contact_side import ContactSide
+from tkamb.equilibrium.released import SCALE
 from tkamb.geometry.frames import knee_pose
-from tkamb.mechanics import Mechanics
-from tkamb.released import SCALE
+from tkamb.mechanics.mechanics import Mechanics
 from tkamb.scene import load_scene
 
 ROOT = Path(__file__).parents[1]

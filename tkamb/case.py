@@ -76,7 +76,7 @@ def load_case(scene: Scene) -> Case:
         scene.motion, scene.patient.side, parts.insert_mesh_in_insert, parts.femoral_mesh_in_femur
     )
     if scene.motion.motion == "roll-slip":
-        from tkamb.rolling import rolling_motion
+        from tkamb.mechanics.rolling import rolling_motion
 
         assert parts.femoral is not None and parts.insert is not None
         table = scene.motion

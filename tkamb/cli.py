@@ -168,16 +168,16 @@ def _setting(text: str) -> tuple[str, Any]:
 def _run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
-    from tkamb.profiling import Profile, profile_lines
+    from tkamb.run.profiling import Profile, profile_lines
 
     profile = Profile() if options.profile else None
     from tkamb.output.atomic import claimed_directory
     from tkamb.output.axis import horizontal_axis
     from tkamb.output.headline import cards
     from tkamb.results import write_results
+    from tkamb.run.status import FAILED
     from tkamb.scene import load_scene
     from tkamb.simulation import simulate
-    from tkamb.status import FAILED
 
     overrides = dict(options.set)
     if options.contact:
@@ -216,7 +216,7 @@ def _default_directory(scene: Path) -> Path:
 
 
 def _press(options: argparse.Namespace) -> int:
-    from tkamb.press import press_meshes, read_pose
+    from tkamb.press.press import press_meshes, read_pose
 
     pose = read_pose(options.pose_file) if options.pose_file else options.pose
     report = press_meshes(

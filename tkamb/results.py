@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.columns import COLUMNS, KINDS, is_ligament, ordered_names
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.output.atomic import claim_directory, write_text
+from tkamb.run.columns import COLUMNS, KINDS, is_ligament, ordered_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

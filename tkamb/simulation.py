@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 from tkamb.case import Case, load_case
 from tkamb.errors import InputError
-from tkamb.mechanics import Mechanics
-from tkamb.recorder import FolderRecorder, Recorder, finished_results
+from tkamb.mechanics.mechanics import Mechanics
 from tkamb.results import Results
+from tkamb.run.recorder import FolderRecorder, Recorder, finished_results
+from tkamb.run.status import frame_status
+from tkamb.run.summary import run_identity, scene_hash, summary_of
+from tkamb.run.tabulate import frame_row, join_rows
 from tkamb.scene import Scene, load_scene
-from tkamb.status import frame_status
-from tkamb.summary import run_identity, scene_hash, summary_of
-from tkamb.tabulate import frame_row, join_rows
 
 if TYPE_CHECKING:
-    from tkamb.equilibrium import ContactSide, FrameContact
+    from tkamb.equilibrium.contact_side import ContactSide, FrameContact
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
 
@@ -44,7 +44,7 @@ def simulate(
         resolution_mm: spacing of the map points, instead of the scene's.
         frames: which frames; default all.
         directory: an existing folder where the finished frames are kept, see
-            `tkamb.recorder`; None keeps them in memory.
+            `tkamb.run.recorder`; None keeps them in memory.
         scene_path: where the scene came from, for the summary.
         progress: wraps the frame indices, a progress bar for example.
         resume: go on with what an earlier, interrupted run of the same scene and frames left
@@ -134,7 +134,7 @@ class _Run:
         if side is None:
             body = self.mechanics.frame(k)
         else:
-            from tkamb.recall import contact_arrays
+            from tkamb.run.recall import contact_arrays
 
             body, contact = side.frame(k, before)
             before.append(contact)
@@ -144,7 +144,7 @@ class _Run:
         self.recorder.record(k, frame_row(self.case, k, body, contact, self.slips, status), arrays)
 
     def _contact_side(self) -> "ContactSide":
-        from tkamb.equilibrium import ContactSide
+        from tkamb.equilibrium.contact_side import ContactSide
 
         side = ContactSide(self.case, self.mechanics)
         self.seconds["prepare contact"] = side.prepare_seconds
@@ -163,7 +163,7 @@ class _Run:
         earlier = self.recorder.take_earlier(self.indices)
         if side is None or not earlier:
             return []
-        from tkamb.recall import recalled
+        from tkamb.run.recall import recalled
 
         last = list(earlier.items())[-LAST_FRAMES:]
         return [recalled(side, self.mechanics, k, arrays) for k, arrays in last]

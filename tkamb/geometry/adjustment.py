@@ -8,7 +8,8 @@ Fluoroscopy errs by about 0.5 mm and 0.5 deg, which is more than the deformation
    points, until both condyles touch together; above it is left: evidence of lift-off.
 3. It is always moved along y to first touch.
 
-`tkamb.adjusted_press` checks it after the deformation, and restores the recorded rotation.
+`tkamb.equilibrium.adjusted_press` checks it after the deformation, and restores the recorded
+rotation.
 """
 
 import math

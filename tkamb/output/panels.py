@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from tkamb.columns import is_ligament, ligament_of
 from tkamb.output import style
 from tkamb.output.metrics import body_weight, medial_share, residual_share, tension_ratio
 from tkamb.output.panel import Line, Panel, without_empty_lines
 from tkamb.output.style import BLACK, BLUE, GREEN, GREY, PURPLE, SIDE_COLOURS, VERMILLION
 from tkamb.results import Results
+from tkamb.run.columns import is_ligament, ligament_of
 
 
 def panels(results: Results) -> tuple[Panel, ...]:

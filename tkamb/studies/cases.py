@@ -157,7 +157,7 @@ def _shipped(name: str) -> StudyCase:
 
 def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
     from tkamb.case import load_case
-    from tkamb.mechanics import Mechanics
+    from tkamb.mechanics.mechanics import Mechanics
     from tkamb.scene import load_scene
 
     case = load_case(load_scene(path))

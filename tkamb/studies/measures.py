@@ -100,7 +100,7 @@ def measure_apart(job: Job, longest: float = LONGEST_SECONDS) -> Measure:
 
 def measure(job: Job) -> Measure:
     """Measure in this process."""
-    from tkamb.press import peak_rss
+    from tkamb.press.press import peak_rss
 
     case = study_case(job.case, Path(job.scene) if job.scene else None)
     model = _model(job)

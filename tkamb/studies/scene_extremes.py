@@ -24,7 +24,7 @@ import trimesh
 
 from tkamb.errors import TkambError
 from tkamb.results import Results
-from tkamb.status import FAILED
+from tkamb.run.status import FAILED
 from tkamb.studies.cases import SHIPPED_SCENE
 from tkamb.studies.verdict import WRONG, Verdict
 

@@ -6,7 +6,7 @@ from threading import Lock
 import numpy as np
 
 from tkamb.contact.registry import contact_names
-from tkamb.equilibrium import ContactSide
+from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.errors import TkambError
 from tkamb.output.style import SIDE_COLOURS
 from tkamb.units import MEGAPASCAL, MILLIMETRE

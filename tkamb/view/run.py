@@ -6,11 +6,11 @@ from pathlib import Path
 
 from tkamb.case import Case, load_case
 from tkamb.errors import InputError
-from tkamb.mechanics import FrameLoads, Mechanics
+from tkamb.mechanics.mechanics import FrameLoads, Mechanics
 from tkamb.results import SUMMARY_NAME, Results, read_results
+from tkamb.run.summary import scene_hash
 from tkamb.scene import Scene, load_scene
 from tkamb.simulation import simulate
-from tkamb.summary import scene_hash
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 RUN_AGAIN = "run it again: tkamb run"
@@ -41,7 +41,7 @@ class Run:
         contact = self.case.scene.contact
         if contact is None or (contact.coupling == "none" and not contact.released):
             return [self.mechanics.frame(k) for k in progress(self.frames)]
-        from tkamb.equilibrium import ContactSide, FrameContact
+        from tkamb.equilibrium.contact_side import ContactSide, FrameContact
 
         side, found = ContactSide(self.case, self.mechanics), []
         touched: list[FrameContact] = []

@@ -9,7 +9,7 @@ from tkamb.body.chain import ChainState
 from tkamb.body.wrapping import TautPath
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
-from tkamb.mechanics import Mechanics
+from tkamb.mechanics.mechanics import Mechanics
 from tkamb.output.maps_file import ContactMaps
 from tkamb.output.style import SIDE_COLOURS
 from tkamb.results import Results

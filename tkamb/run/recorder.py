@@ -56,7 +56,8 @@ class Recorder:
         Args:
             frame: its number.
             row: column of results.csv -> value.
-            contact: the contact's arrays (`tkamb.recall`); None if it failed or is not modelled.
+            contact: the contact's arrays (`tkamb.run.recall`); None if it failed or is not
+                modelled.
         """
         self.rows[frame] = row
         if self._sink is None:

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tkamb.case import Case
-from tkamb.mechanics import FrameLoads
+from tkamb.mechanics.mechanics import FrameLoads
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
-    from tkamb.equilibrium import FrameContact
+    from tkamb.equilibrium.contact_side import FrameContact
 
 FILTER_TRANSLATION = 0.5 * MILLIMETRE
 FILTER_ROTATION = 0.5 * DEGREE

@@ -6,7 +6,7 @@
 - `coupling = "points"`: each condyle's resultant then takes the place of point and normal in
   the equations, and so on until load and centres of pressure change no more.
 - `released = [...]`: these coordinates find their own equilibrium under contact, ligaments
-  and muscle line (`tkamb.released`); the equations then use the resultants found.
+  and muscle line (`tkamb.equilibrium.released`); the equations then use the resultants found.
 """
 
 import time as clock
@@ -17,8 +17,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.adjusted_press import press_adjusted
-from tkamb.balance import BalanceStatus
 from tkamb.body.knee import solve_knee, unsolved
 from tkamb.body.unknowns import CondylePoint
 from tkamb.case import Case
@@ -28,12 +26,14 @@ from tkamb.contact.pressing import first_touch_height
 from tkamb.contact.probe import condyle_wrenches
 from tkamb.contact.registry import contact_model
 from tkamb.contact.summary import medial_points
+from tkamb.equilibrium.adjusted_press import press_adjusted
+from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import Array, knee_pose
-from tkamb.mechanics import FrameLoads, Mechanics
+from tkamb.mechanics.mechanics import FrameLoads, Mechanics
 
 if TYPE_CHECKING:
-    from tkamb.released import ReleasedKnee, SettledKnee
+    from tkamb.equilibrium.released import ReleasedKnee, SettledKnee
 
 NAN = float("nan")
 
@@ -109,7 +109,7 @@ class ContactSide:
 
         self.released = None
         if table.released:
-            from tkamb.released import ReleasedKnee
+            from tkamb.equilibrium.released import ReleasedKnee
 
             self.released = ReleasedKnee(mechanics, self.model.probe(self.state), table.released)
 

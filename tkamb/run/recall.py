@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.balance import Balance, BalanceStatus
 from tkamb.contact.model import ContactResult, PreparedContact
 from tkamb.contact.probe import ProbedContact
-from tkamb.equilibrium import ContactSide, FrameContact
+from tkamb.equilibrium.balance import Balance, BalanceStatus
+from tkamb.equilibrium.contact_side import ContactSide, FrameContact
+from tkamb.equilibrium.released import SettledKnee
 from tkamb.geometry.frames import Array
-from tkamb.released import SettledKnee
 
 if TYPE_CHECKING:
-    from tkamb.mechanics import Mechanics
+    from tkamb.mechanics.mechanics import Mechanics
 
 RESULT_ARRAYS = ("pose", "normals", "pressure", "area", "gap", "nodal_force", "wrench_on_insert")
 

@@ -100,7 +100,7 @@ class Mechanics:
         self._check_near()
         self.extensor = None
         if case.scene.patella:
-            from tkamb.extensor import ExtensorFrames
+            from tkamb.mechanics.extensor import ExtensorFrames
 
             self.extensor = ExtensorFrames(case, self.poses)
         self.ligaments, self.strains = self._build_ligaments()

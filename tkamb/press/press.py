@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tkamb.adjusted_press import press_adjusted
 from tkamb.contact import materials
 from tkamb.contact.model import Bearing, ContactModel, ContactPair, ContactResult
 from tkamb.contact.pressing import check_load, first_touch_height
 from tkamb.contact.registry import contact_model
+from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.errors import InputError
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.adjustment import adjust as adjusted
@@ -25,7 +25,7 @@ from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import Array, mirrored_pose
 from tkamb.geometry.frames import pose as pose_matrix
 from tkamb.inputs.meshes import axes_rotation, load_surface, mirrored
-from tkamb.press_report import PressReport, Side
+from tkamb.press.press_report import PressReport, Side
 from tkamb.units import DEGREE, LENGTH
 
 LARGEST_LOAD = 1e5

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from tkamb.case import Case
-from tkamb.mechanics import STRAIN_FLEXIONS
-from tkamb.status import FAILED
+from tkamb.mechanics.mechanics import STRAIN_FLEXIONS
+from tkamb.run.status import FAILED
 
 RESIDUALS = (
     "Residuals are the AP and ML force and the axial moment on the tibia that balance still "

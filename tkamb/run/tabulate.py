@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.case import Case
-from tkamb.columns import ligament_column
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_coordinates
-from tkamb.mechanics import FrameLoads
-from tkamb.status import FAILED
+from tkamb.mechanics.mechanics import FrameLoads
+from tkamb.run.columns import ligament_column
+from tkamb.run.status import FAILED
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.body.slip import CondyleSlip
-    from tkamb.equilibrium import FrameContact
+    from tkamb.equilibrium.contact_side import FrameContact
 
 NAN = float("nan")
 
@@ -41,7 +41,7 @@ def frame_row(
     """
     row = _motion_row(case, k) | _body_row(case, body)
     for side, slip in slips.items():
-        from tkamb.sliding import sliding_row
+        from tkamb.mechanics.sliding import sliding_row
 
         row |= sliding_row(case, k, side, slip, body.geometry.condyles.get(side))
     if contact is not None:

@@ -1,0 +1,1 @@
+"""Contact alone: two meshes, a pose, a load."""
