@@ -48,6 +48,15 @@ def test_loaded_foot_is_reproduced(tmp_path):
     np.testing.assert_allclose(reaction.moment[reaction.loaded][:, [0, 2]], 0, atol=1e-9)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_an_infinite_cell_is_refused_before_anything_is_computed(tmp_path, which):
+    measured = [values.copy() for values in step(STAMPS)]
+    measured[which][7, 0] = np.inf
+    with pytest.raises(InputError, match="line 9 holds 'inf', which is not finite"):
+        load_ground_reaction(plate(write(tmp_path / "g.csv", *measured)), AT, "right")
+
+
 def test_garbage_of_the_unloaded_plate_does_no_harm(tmp_path):
     """Points of the swing phase mean nothing: wild, zero or missing, the result is the same."""
     force, point, moment = step(STAMPS)

@@ -108,9 +108,15 @@ def test_time_must_rise(tmp_path, times, message):
 
 
 def test_gap_in_a_needed_column(tmp_path):
-    table = read_table(written(tmp_path, "a.csv", "time,x\n0,1\n1,\n2,inf\n"))
+    table = read_table(written(tmp_path, "a.csv", "time,x\n0,1\n1,\n2,nan\n"))
     with pytest.raises(InputError, match=r"2 missing or non-finite.*row 2"):
         table.complete_column("x")
+
+
+@pytest.mark.parametrize("cell", ["inf", "-Infinity", "1e400"])
+def test_an_infinite_cell_is_refused(tmp_path, cell):
+    with pytest.raises(InputError, match=rf"line 3 holds '{cell}', which is not finite"):
+        read_table(written(tmp_path, "a.csv", f"time,x\n0,1\n1,{cell}\n"))
 
 
 def test_units_must_be_stated_and_agree(tmp_path):

@@ -110,7 +110,8 @@ def read_table(path: Path, format: str | None = None) -> Table:
         format: "csv", "sto", "mot" or "trc"; by default the suffix.
 
     Raises:
-        InputError: missing or unreadable file, unknown format, a malformed header or row.
+        InputError: missing or unreadable file, unknown format, a malformed header or row, an
+            infinite number.
     """
     path = Path(path)
     kind = format or path.suffix.lower().lstrip(".")
@@ -216,9 +217,13 @@ def _number(cell: str, path: Path, line: int) -> float:
     if not text or _NOT_A_NUMBER.fullmatch(text.lower()):
         return math.nan
     try:
-        return float(text)
+        number = float(text)
     except ValueError:
         raise InputError(f"line {line} holds '{text}', which is no number", path) from None
+    if math.isinf(number):
+        mend = "leave the cell empty where nothing was measured"
+        raise InputError(f"line {line} holds '{text}', which is not finite", path, mend)
+    return number
 
 
 def _near(name: str, columns: dict[str, Array]) -> str:
