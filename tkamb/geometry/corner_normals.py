@@ -22,17 +22,33 @@ def corner_normals(surface: Surface, sharp: float = SHARP) -> Array:
         surface: its triangles share their vertices.
         sharp: rad.
     """
-    mesh = surface.mesh
-    neighbours = mesh.vertex_faces[surface.faces]
-    there = neighbours >= 0
+    here, there = _corners_that_meet(surface.faces)
     normals = surface.face_normals
-    turn = np.einsum("kcnj,kj->kcn", normals[neighbours], normals)
-    at = surface.faces[neighbours] == surface.faces[:, :, None, None]
-    angle = (mesh.face_angles[neighbours] * at).sum(axis=-1)
-    weight = np.where(there & (turn > np.cos(sharp)), angle, 0.0)
-    mean = np.einsum("kcn,kcnj->kcj", weight, normals[neighbours])
-    length = np.linalg.norm(mean, axis=-1, keepdims=True)
-    return np.asarray(np.where(length > 0.0, mean / np.where(length > 0, length, 1.0), 0.0))
+    turn = np.einsum("pj,pj->p", normals[here // 3], normals[there // 3])
+    angle = surface.mesh.face_angles.ravel()
+    weight = np.where(turn > np.cos(sharp), angle[there], 0.0)
+    mean = np.stack(
+        [
+            np.bincount(here, weight * column[there // 3], surface.faces.size)
+            for column in normals.T
+        ],
+        axis=1,
+    )
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    unit = np.where(length > 0.0, mean / np.where(length > 0, length, 1.0), 0.0)
+    return np.asarray(unit.reshape(-1, 3, 3))
+
+
+def _corners_that_meet(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the pairs of corners (3 face + corner) that share a vertex, each with itself too."""
+    vertex = faces.ravel()
+    order = np.argsort(vertex, kind="stable")
+    count = np.bincount(vertex)
+    first = np.cumsum(count) - count
+    here = np.repeat(np.arange(len(vertex)), count[vertex])
+    begins = np.cumsum(count[vertex]) - count[vertex]
+    within = np.arange(len(here)) - np.repeat(begins, count[vertex])
+    return here, order[first[vertex[here]] + within]
 
 
 def sharp_edges(surface: Surface, sharp: float = SHARP) -> NDArray[np.bool_]:
