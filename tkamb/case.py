@@ -72,9 +72,19 @@ def load_case(scene: Scene) -> Case:
     with_patella = scene.patella is not None
     chain = Chain(load_urdf(scene.patient, with_patella), with_patella)
     parts = _Parts(scene)
+    released = scene.contact.released if scene.contact else ()
     motion = load_motion(
-        scene.motion, scene.patient.side, parts.insert_mesh_in_insert, parts.femoral_mesh_in_femur
+        scene.motion,
+        scene.patient.side,
+        parts.insert_mesh_in_insert,
+        parts.femoral_mesh_in_femur,
+        (*released, "si") if released else (),
     )
+    if motion.unrecorded:
+        from tkamb.mechanics.seat import seated_motion
+
+        assert parts.femoral is not None and parts.insert is not None
+        motion = seated_motion(motion, parts.femoral, parts.insert, scene.motion.cutoff_Hz)
     if scene.motion.motion == "roll-slip":
         from tkamb.mechanics.rolling import rolling_motion
 

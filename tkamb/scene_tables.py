@@ -75,7 +75,8 @@ class MotionTable(SceneTable):
         description=(
             "role -> column name, where it differs from the role. Roles: time, flexion, "
             "adduction, axial_rotation, ap, si, ml (coordinates); time, rotation_1..3, "
-            "translation_1..3 (pose); patella_ap, patella_si, patella_rotation"
+            "translation_1..3 (pose); patella_ap, patella_si, patella_rotation. Coordinates that "
+            "[contact] releases need no column"
         ),
     )
     angle_unit: AngleUnit

@@ -5,9 +5,8 @@ are nearly isometric; distal ends about the insert's flat bottom. The proportion
 of an average knee in units of half the mediolateral width of the part (femoral component,
 insert). They are nobody's: look at the strain table before believing any force.
 
-Stiffness: Abdel-Rahman & Hefzy, Med Eng Phys 20:276 (1998),
-doi:10.1016/S1350-4533(98)00023-6; reference strains at extension: Blankevoort & Huiskes,
-J Biomech Eng 113:263 (1991), doi:10.1115/1.2894883.
+Stiffness: Abdel-Rahman & Hefzy, Med Eng Phys 20:276 (1998); reference strains at
+extension: Blankevoort & Huiskes, J Biomech Eng 113:263 (1991), doi:10.1115/1.2894883.
 """
 
 from collections.abc import Sequence

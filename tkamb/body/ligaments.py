@@ -9,9 +9,8 @@ With slack length L0 and strain eps = (L - L0)/L0, eps1 = 0.03:
 
 Both are continuous; the first has a kink at 2 eps1, the second has none.
 
-References: Abdel-Rahman & Hefzy, Med Eng Phys 20:276 (1998),
-doi:10.1016/S1350-4533(98)00023-6; Blankevoort & Huiskes, J Biomech Eng 113:263 (1991),
-doi:10.1115/1.2894883.
+References: Abdel-Rahman & Hefzy, Med Eng Phys 20:276 (1998); Blankevoort & Huiskes,
+J Biomech Eng 113:263 (1991), doi:10.1115/1.2894883.
 """
 
 from collections.abc import Mapping, Sequence

@@ -5,7 +5,8 @@ rotation matrix. A left knee is mirrored here: medial-lateral translation change
 the clinical angles and the patella's sagittal coordinates keep theirs.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -53,6 +54,7 @@ class KneeMotion:
         patella_acceleration: (f, 3) its second derivative.
         cycle_percent: (f,) per cent of the cycle, if the motion is one.
         closed_cycle: the cycle's ends agree, so it was filtered as periodic.
+        unrecorded: coordinates without a column, held at zero here.
     """
 
     time: Array
@@ -67,6 +69,7 @@ class KneeMotion:
     patella_acceleration: Array | None = None
     cycle_percent: Array | None = None
     closed_cycle: bool = False
+    unrecorded: tuple[str, ...] = ()
 
 
 def load_motion(
@@ -74,6 +77,7 @@ def load_motion(
     side: Literal["right", "left"],
     pose_insert_mesh_in_insert: Array,
     pose_femoral_mesh_in_femur: Array,
+    released: Sequence[str] = (),
 ) -> KneeMotion:
     """Read the recorded motion of the scene.
 
@@ -86,12 +90,14 @@ def load_motion(
         pose_insert_mesh_in_insert: (4, 4) m; the file's axes into the insert frame, whose
             z points to the subject's right on both sides (not mirrored).
         pose_femoral_mesh_in_femur: (4, 4) m; likewise for the femur link.
+        released: knee coordinates that will be solved for: they need no column.
 
     Raises:
         InputError: file, columns, times, filter or cycle cannot be used.
     """
     recorded = read_table(table.file, table.format)
     _check_roles(table, recorded)
+    unrecorded: tuple[str, ...] = ()
     time = recorded.time(table.columns.get("time", "time"))
     if table.interpretation == "pose":
         assert table.sequence is not None
@@ -101,7 +107,8 @@ def load_motion(
         poses = pose_insert_mesh_in_insert @ mesh @ inverse(pose_femoral_mesh_in_femur)
         knee = knee_coordinates(mirrored_pose(poses) if side == "left" else poses)
     else:
-        knee = _recorded_coordinates(recorded, table, KNEE_COORDINATES)
+        unrecorded = _unrecorded(recorded, table, released)
+        knee = _recorded_coordinates(recorded, table, KNEE_COORDINATES, unrecorded)
         knee[:, 3:] = np.unwrap(knee[:, 3:], axis=0)
         if side == "left":
             knee[:, KNEE_COORDINATES.index("ml")] *= -1.0
@@ -109,19 +116,42 @@ def load_motion(
     _check_places(knee, recorded)
     named = [c for c in PATELLA_COORDINATES if c in table.columns or c in recorded.columns]
     patella = _recorded_coordinates(recorded, table, PATELLA_COORDINATES) if named else None
-    return _differentiated(time, knee, patella, table, recorded)
+    motion = _differentiated(time, knee, patella, table, recorded)
+    return replace(motion, unrecorded=unrecorded)
 
 
-def _recorded_coordinates(recorded: Table, table: MotionTable, roles: tuple[str, ...]) -> Array:
+def _unrecorded(recorded: Table, table: MotionTable, released: Sequence[str]) -> tuple[str, ...]:
+    """Return the coordinates without a column, all of which must be released."""
+    missing = [
+        role
+        for role in KNEE_COORDINATES
+        if role not in table.columns and role not in recorded.columns
+    ]
+    needed = [role for role in missing if role not in released]
+    if needed:
+        more = "" if needed == ["flexion"] else ", or let the knee find it: [contact] released"
+        raise InputError(
+            f"has no column for {', '.join(needed)} (it has {', '.join(recorded.columns)})",
+            recorded.path,
+            f"name it in [motion] columns{more}",
+        )
+    return tuple(missing)
+
+
+def _recorded_coordinates(
+    recorded: Table, table: MotionTable, roles: tuple[str, ...], unrecorded: tuple[str, ...] = ()
+) -> Array:
     length = recorded.unit_scale(table.length_unit, "length_unit")
     angle = angle_scale(recorded, table.angle_unit)
     units = {
         role: length if role.rsplit("_")[-1] in ("ap", "si", "ml") else angle for role in roles
     }
-    columns = [
-        recorded.complete_column(table.columns.get(role, role)) * units[role] for role in roles
-    ]
-    return np.stack(columns, axis=1)
+    values = np.zeros((recorded.rows, len(roles)))
+    for i, role in enumerate(roles):
+        if role not in unrecorded:
+            name = table.columns.get(role, role)
+            values[:, i] = recorded.complete_column(name) * units[role]
+    return values
 
 
 def _check_roles(table: MotionTable, recorded: Table) -> None:

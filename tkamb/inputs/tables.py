@@ -35,6 +35,11 @@ class Table:
     length_unit: str | None = None
     in_degrees: bool | None = None
 
+    @property
+    def rows(self) -> int:
+        """Number of data rows."""
+        return len(next(iter(self.columns.values())))
+
     def column(self, name: str) -> Array:
         """Return one column.
 

@@ -13,6 +13,7 @@ import numpy as np
 from tkamb.case import Case
 from tkamb.mechanics.mechanics import STRAIN_FLEXIONS
 from tkamb.run.status import FAILED
+from tkamb.scene_tables import ContactTable
 
 RESIDUALS = (
     "Residuals are the AP and ML force and the axial moment on the tibia that balance still "
@@ -137,6 +138,11 @@ def assumptions(case: Case) -> list[str]:
         said.append("The motion is differentiated as given, unfiltered.")
     else:
         said.append(f"The motion is low-passed at {scene.motion.cutoff_Hz:g} Hz.")
+    if case.motion.unrecorded:
+        said.append(
+            f"Nobody recorded {', '.join(case.motion.unrecorded)}: they are found, and the rates "
+            "that enter inertia and the direction of sliding are those of a first guess."
+        )
     if scene.motion.motion == "roll-slip":
         said.append(
             "Roll-slip motion: AP from rolling plus "
@@ -154,13 +160,21 @@ def assumptions(case: Case) -> list[str]:
     if not scene.patella:
         said.append("No muscles: the knee's flexion moment is carried by nothing (a residual).")
     if scene.contact:
-        said.append(
-            "The contact model presses in the superior-inferior force at the measured rotation; "
-            "it does not feed back into the body."
-        )
+        said.append(_agreement(scene.contact))
     if scene.patient.side == "left":
         said.append("A left knee is computed as its mirror image: z is lateral.")
     return said
+
+
+def _agreement(table: ContactTable) -> str:
+    """Return how body and contact were brought together."""
+    if table.released:
+        names = ", ".join(sorted({*table.released, "si"}))
+        return f"{names} are not the recorded ones: body and contact are at rest in them."
+    said = "The contact model presses in the superior-inferior force at the measured rotation; "
+    if table.coupling == "points":
+        return said + "the deformed contact's resultants act in the body's equations."
+    return said + "it does not feed back into the body."
 
 
 def _first_wrapping(columns: dict[str, Any]) -> float | None:
