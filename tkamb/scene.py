@@ -4,6 +4,7 @@ A scene is a TOML file. Units are in the key names, paths are relative to the fi
 unknown key is an error. `load_scene` reads and validates it; nothing else is opened.
 """
 
+import os
 import tomllib
 from pathlib import Path
 from typing import Any, Self
@@ -140,7 +141,7 @@ def _resolved(model: Any, folder: Path) -> Any:
     for name in type(model).model_fields:
         value = getattr(model, name)
         if isinstance(value, Path):
-            changed[name] = (folder / value).absolute()
+            changed[name] = Path(os.path.abspath(folder / value))
         elif isinstance(value, SceneTable):
             changed[name] = _resolved(value, folder)
     return model.model_copy(update=changed) if changed else model
