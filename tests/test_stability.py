@@ -79,7 +79,7 @@ def test_an_exception_is_a_verdict():
 
 def test_a_hang_is_stopped_and_the_next_case_judged():
     slow, quick = replace(SMALL, resolution_mm=0.5), replace(SMALL, model="nothing")
-    verdicts = run_stability([slow, quick], longest=4.0)
+    verdicts = list(run_stability([slow, quick], longest=4.0))
     assert [v.kind for v in verdicts] == ["hang", "flagged"]
 
 

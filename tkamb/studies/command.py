@@ -3,10 +3,12 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 
 def add_tradeoff(commands: Any) -> None:
@@ -57,31 +59,66 @@ def add_stability(commands: Any) -> None:
     """Add `stability` to the command line."""
     stability = commands.add_parser("stability", help="the contact models at the extremes")
     stability.add_argument("--quick", action="store_true", help="a tenth of the contact cases")
+    stability.add_argument("--resume", action="store_true", help="go on with a stopped study")
+    stability.add_argument("--workers", type=int, default=2, metavar="N", help="cases at a time")
     stability.add_argument("--out", type=Path, default=Path("out/stability"), metavar="DIR")
     stability.add_argument("--json", action="store_true")
     stability.set_defaults(command=_stability)
 
 
 def _stability(options: argparse.Namespace) -> int:
-    from tqdm import tqdm
-
     from tkamb.output.atomic import claim_directory, replaced_file, write_text
     from tkamb.studies import stability as study
+    from tkamb.studies.kept_rows import KeptRows
     from tkamb.studies.stability_report import picture, table
 
     directory = claim_directory(options.out)
-    verdicts = study.run_stability(
-        study.stability_cases(options.quick),
-        lambda found, total: tqdm(found, total=total, unit="case", disable=None),
+    cases = study.stability_cases(options.quick)
+    kept = KeptRows(directory, options.resume)
+    verdicts, whole = gather(
+        study.run_stability(cases, kept=kept, workers=max(1, options.workers)), len(cases), "case"
     )
     text = json.dumps(study.summary(verdicts), indent=1, allow_nan=False)
-    lines = table(verdicts)
+    lines = [*unfinished(len(verdicts), len(cases)), *table(verdicts)]
     write_text(directory / "stability.json", text + "\n")
     write_text(directory / "stability.txt", "\n".join(lines) + "\n")
     with replaced_file(directory / "stability.png") as temporary:
         picture(verdicts).savefig(temporary, format="png", dpi=150)
     print(text if options.json else "\n".join([*lines, f"picture: {directory / 'stability.png'}"]))
+    if not whole:
+        raise KeyboardInterrupt(_goes_on(len(verdicts), len(cases), directory))
     return 1 if any(v.kind in study.FAILED_KINDS for v in verdicts) else 0
+
+
+def gather(found: Iterable[T], total: int, unit: str) -> tuple[list[T], bool]:
+    """Collect rows under a progress bar with the time left.
+
+    Args:
+        found: the rows as they come.
+        total: how many there will be.
+        unit: what a row is called.
+
+    Returns:
+        The rows, and whether they are all: Ctrl-C ends the collecting, not the command.
+    """
+    from tqdm import tqdm
+
+    rows: list[T] = []
+    try:
+        for row in tqdm(found, total=total, unit=unit, disable=None):
+            rows.append(row)
+    except KeyboardInterrupt:
+        return rows, False
+    return rows, True
+
+
+def unfinished(count: int, total: int) -> list[str]:
+    """Return the line that heads the table of a study that was stopped; none of a whole one."""
+    return [] if count == total else [f"stopped: {count} of {total} rows", ""]
+
+
+def _goes_on(count: int, total: int, directory: Path) -> str:
+    return f"{count} of {total} rows are in {directory}; --resume goes on from there"
 
 
 def _progress(unit: str) -> Any:

@@ -152,7 +152,10 @@ TOGETHER: tuple[tuple[str, tuple[object, ...], str, tuple[object, ...]], ...] = 
     ("resolution_mm", (1.3, 3.0, 4.0), "conformity", (0.0, 0.99)),
 )
 
-OTHER_MODELS = ("hertz", "foundation", "foundation-linear", "lattice-linear", "fe")
+OTHER_MODELS = (
+    *("hertz", "foundation", "foundation-linear"),
+    *("lattice-linear", "lattice-source", "fe"),
+)
 HARDEST: tuple[dict[str, object], ...] = (
     {},
     {"load_N": 0.01},

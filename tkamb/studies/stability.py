@@ -5,62 +5,92 @@ import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
-from tkamb.errors import TkambError
+from tkamb.errors import ComputationError, TkambError
 from tkamb.studies.extremes import Extreme, extremes
+from tkamb.studies.kept_rows import KeptRows, row_key
 from tkamb.studies.scene_extremes import SceneExtreme, judge_scene, scene_extremes
 from tkamb.studies.verdict import KINDS, Verdict, judge
 
 Case = Extreme | SceneExtreme
-Progress = Callable[[Iterable[Verdict], int], Iterable[Verdict]]
 
 LONGEST_SECONDS = 120.0
 """A case that takes longer hangs."""
 WORKERS = 2
 QUICK_SHARE = 10
-"""The quick study takes one contact case in so many, and no runs."""
+QUICK_GRID_MM = 3.0
+"""The quick study takes one contact case in so many, no finer than this, and no runs."""
 FAILED_KINDS = ("unflagged_wrong", "unverified", "exception", "hang")
 
 
 def stability_cases(quick: bool) -> list[Case]:
     """Return the cases of the study."""
-    pressed: list[Case] = list(extremes())
-    return pressed[::QUICK_SHARE] if quick else [*pressed, *scene_extremes()]
+    pressed = list(extremes())
+    if not quick:
+        return [*pressed, *scene_extremes()]
+    coarse = [replace(c, resolution_mm=max(c.resolution_mm, QUICK_GRID_MM)) for c in pressed]
+    return list(dict.fromkeys(coarse))[::QUICK_SHARE]
 
 
 def run_stability(
     cases: Sequence[Case],
-    progress: Progress = lambda verdicts, total: verdicts,
     longest: float = LONGEST_SECONDS,
-) -> list[Verdict]:
-    """Judge all cases, in order.
+    kept: KeptRows | None = None,
+    workers: int = WORKERS,
+) -> Iterator[Verdict]:
+    """Judge all cases; yield their verdicts in order.
 
     Args:
         cases: the cases.
-        progress: wraps the verdicts as they come; is told how many.
         longest: s, after which a case counts as hanging.
+        kept: rows of an earlier study that are taken as they are; new ones are added.
+        workers: cases at a time.
     """
-    local = threading.local()
-    workers: list[_Worker] = []
+    asked = _Asked(longest, kept)
+    pool = ThreadPoolExecutor(workers)
+    try:
+        yield from pool.map(asked.verdict, cases)
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        asked.stop()
+        pool.shutdown()
 
-    def ask(case: Case) -> Verdict:
-        if not hasattr(local, "worker"):
-            local.worker = _Worker(longest)
-            workers.append(local.worker)
-        found: Verdict = local.worker.ask(case)
+
+class _Asked:
+    """Cases put to the processes that judge, one process for each thread."""
+
+    def __init__(self, longest: float, kept: KeptRows | None) -> None:
+        self._longest, self._kept = longest, kept
+        self._local = threading.local()
+        self._workers: list[_Worker] = []
+
+    def verdict(self, case: Case) -> Verdict:
+        """Return the verdict on a case, kept or new."""
+        if self._kept is None:
+            return self._worker().ask(case)
+        key = row_key(type(case).__name__, asdict(case), self._longest)
+        row = self._kept.get(key)
+        if row is not None:
+            return Verdict(**row)
+        found = self._worker().ask(case)
+        self._kept.put(key, found.as_dict())
         return found
 
-    with ThreadPoolExecutor(WORKERS) as pool:
-        try:
-            return list(progress(pool.map(ask, cases), len(cases)))
-        finally:
-            pool.shutdown(cancel_futures=True)
-            for worker in workers:
-                worker.stop()
+    def stop(self) -> None:
+        """End the processes."""
+        for worker in self._workers:
+            worker.stop()
+
+    def _worker(self) -> "_Worker":
+        if not hasattr(self._local, "worker"):
+            self._local.worker = _Worker(self._longest)
+            self._workers.append(self._local.worker)
+        found: _Worker = self._local.worker
+        return found
 
 
 class _Worker:
@@ -70,9 +100,14 @@ class _Worker:
         self._longest = longest
         self._process: subprocess.Popen[str] | None = None
         self._lines: queue.Queue[str] = queue.Queue()
+        self._stopped = False
 
     def ask(self, case: Case) -> Verdict:
-        """Return the verdict on a case."""
+        """Return the verdict on a case.
+
+        Raises:
+            ComputationError: the study was stopped meanwhile.
+        """
         process = self._process or self._started()
         assert process.stdin is not None
         process.stdin.write(json.dumps([type(case).__name__, asdict(case)]) + "\n")
@@ -80,16 +115,24 @@ class _Worker:
         try:
             line = self._lines.get(timeout=self._longest)
         except queue.Empty:
-            self.stop()
+            self._end()
             return _ended(case, "hang", f"no answer in {self._longest:g} s")
+        if self._stopped:
+            raise ComputationError("was stopped", case.says)
         if not line:
             status = process.wait()
-            self.stop()
+            self._end()
             return _ended(case, "exception", f"the process ended with status {status}")
         return Verdict(**json.loads(line))
 
     def stop(self) -> None:
-        """End the process."""
+        """End the process for good; a case that is being judged gets no verdict."""
+        self._stopped = True
+        if self._process is not None:
+            self._process.kill()
+
+    def _end(self) -> None:
+        """End the process; the next case gets a new one."""
         if self._process is not None:
             self._process.kill()
             self._process.communicate()
@@ -98,7 +141,9 @@ class _Worker:
     def _started(self) -> "subprocess.Popen[str]":
         command = [sys.executable, "-m", "tkamb.studies.stability"]
         pipe = subprocess.PIPE
-        process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
+        process = subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, text=True, start_new_session=True
+        )
         lines: queue.Queue[str] = queue.Queue()
         self._process, self._lines = process, lines
 

@@ -1,0 +1,95 @@
+"""Rows of a study, kept one by one as they are measured, so that it can be stopped and go on.
+
+Each row is one line of JSON, appended and flushed at once: {"key": ..., "row": ...}. The key is
+the SHA-256 of what was measured and of the code that measured it; a line cut short by a kill
+counts as absent.
+"""
+
+import hashlib
+import json
+import threading
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from tkamb.errors import InputError
+from tkamb.output.atomic import write_text
+
+FILE_NAME = "rows.jsonl"
+PACKAGE = Path(__file__).parents[1]
+NO_NUMBERS = ("output", "view")
+"""Subpackages that change how results look, not what they are."""
+
+Row = dict[str, Any]
+
+
+class KeptRows:
+    """The rows in a study's folder.
+
+    Args:
+        directory: of the study.
+        resume: keep what an earlier study left there; else it is removed.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+
+    def __init__(self, directory: Path, resume: bool) -> None:
+        self.path = directory / FILE_NAME
+        self._rows = _whole_rows(self.path) if resume else {}
+        self._lock = threading.Lock()
+        write_text(self.path, "".join(_line(key, row) for key, row in self._rows.items()))
+
+    def get(self, key: str) -> Row | None:
+        """Return the row of that key; None if there is none."""
+        return self._rows.get(key)
+
+    def put(self, key: str, row: Row) -> None:
+        """Keep a row."""
+        with self._lock:
+            self._rows[key] = row
+            try:
+                with open(self.path, "a", encoding="utf-8") as file:
+                    file.write(_line(key, row))
+            except OSError as error:
+                raise InputError(f"cannot be written ({error.strerror})", self.path) from None
+
+
+def _line(key: str, row: Row) -> str:
+    return json.dumps({"key": key, "row": row}) + "\n"
+
+
+def _whole_rows(path: Path) -> dict[str, Row]:
+    """Return key -> row of the lines that are whole."""
+    if not path.exists():
+        return {}
+    found: dict[str, Row] = {}
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            content = json.loads(line)
+            found[str(content["key"])] = dict(content["row"])
+        except (ValueError, KeyError, TypeError):
+            continue
+    return found
+
+
+def row_key(*what: Any) -> str:
+    """Return the key of a row: the hash of what was measured and of the code.
+
+    Args:
+        what: anything that JSON can hold.
+    """
+    text = json.dumps([code_identity(), *what], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@lru_cache(maxsize=1)
+def code_identity() -> str:
+    """Return the SHA-256 of the package's source, but for what only shows results."""
+    digest = hashlib.sha256()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = path.relative_to(PACKAGE)
+        shows = name.parts[0] in NO_NUMBERS or name.stem in ("cli", "command")
+        if not shows and not name.stem.endswith("_report"):
+            digest.update(name.as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()
