@@ -1,9 +1,13 @@
 """What the femoral adjustment does to the forces of the shipped knee."""
 
 import numpy as np
+import pytest
 
 from scenes import write_scene
 from tkamb import load_scene, simulate
+from tkamb.case import load_case
+from tkamb.equilibrium.contact_side import ContactSide
+from tkamb.mechanics.mechanics import Mechanics
 
 FRAMES = slice(3, 26, 10)
 
@@ -41,13 +45,48 @@ def test_the_adjustment_leaves_the_shipped_total_alone(tmp_path):
     np.testing.assert_allclose(split(adjusted), split(recorded), atol=1e-4)
 
 
-def test_the_adjustment_mends_the_split_of_a_coronal_error(tmp_path):
-    """0.4 deg and 0.4 mm of error: the contact moves, and the total with it by 0.5 %."""
+@pytest.mark.parametrize("degrees", [0.4, -0.4])
+def test_the_adjustment_mends_the_split_of_a_coronal_error(tmp_path, degrees):
+    """0.4 deg and 0.4 mm of error: the split is mended, the total changes by 0.006 BW."""
     right = next(with_and_without(wrong_scene(tmp_path / "right", 0.0, 0.0)))
-    adjusted, recorded = with_and_without(wrong_scene(tmp_path / "wrong", 0.4, 0.4))
+    adjusted, recorded = with_and_without(wrong_scene(tmp_path / "wrong", degrees, 0.4))
     change = adjusted["force_total_BW"] - recorded["force_total_BW"]
-    assert np.abs(change).max() < 0.02
+    assert 1e-6 < np.abs(change).max() < 0.01
+    np.testing.assert_allclose(adjusted["adjust_force_change_BW"], change, rtol=1e-9)
+    share = adjusted["medial_share_equilibrium"] - recorded["medial_share_equilibrium"]
+    np.testing.assert_allclose(adjusted["adjust_share_change"], share, rtol=1e-9)
+    assert adjusted.status == recorded.status
     assert (np.abs(adjusted["adjust_coronal_deg"]) > 0.3).all()
     kept = adjusted["adjust_restored"] == 0
     error = [np.abs(split(results) - split(right))[kept].max() for results in (adjusted, recorded)]
     assert error[0] < 0.2 * error[1]
+
+
+def test_a_total_that_hangs_on_the_adjustment_is_flagged(tmp_path):
+    """One condyle 0.6 mm too high is lift-off once the other has been brought to touch."""
+    path = wrong_scene(tmp_path, 0.9, -0.2)
+    adjusted, recorded = with_and_without(path)
+    change = adjusted["force_total_BW"] - recorded["force_total_BW"]
+    np.testing.assert_allclose(adjusted["adjust_force_change_BW"], change, rtol=1e-9)
+    assert (np.abs(change) > 0.01).any()
+    for status, one in zip(adjusted.status, change, strict=True):
+        told = "femoral adjustment changes the total" in status
+        assert told == (abs(one) > 0.01)
+
+
+def test_a_restored_frame_is_the_recorded_rotation_for_the_body_too(tmp_path):
+    """The load pressed in is that of the points at the restored pose."""
+    path = wrong_scene(tmp_path, 0.3, 0.0)
+    case = load_case(load_scene(path, {"contact.adjust": True, "motion.frames": 26}))
+    side = ContactSide(case, Mechanics(case))
+    restored = 0
+    for k in (12, 23):
+        body, contact = side.frame(k)
+        if not contact.adjustment.restored:
+            continue
+        restored += 1
+        there = side.mechanics.query.at(contact.adjustment.pose)
+        for name, point in body.geometry.condyles.items():
+            np.testing.assert_array_equal(point.point, getattr(there, name).centre)
+        np.testing.assert_array_equal(contact.result.pose[:3, :3], side.mechanics.poses[k][:3, :3])
+    assert restored

@@ -39,7 +39,8 @@ def press_adjusted(
         ComputationError: the femoral component does not lie over the insert.
     """
     result = model.press(state, load, adjustment.pose, guess)
-    if result.status is not ContactStatus.OK or adjustment.coronal_angle == 0.0:
+    settled = adjustment.coronal_angle == 0.0 or adjustment.restored
+    if result.status is not ContactStatus.OK or settled:
         return result, replace(adjustment, penetration=float(result.approach))
     checked = _checked(query, adjustment, result)
     exceeded = (

@@ -126,6 +126,9 @@ class ContactSide:
         guess = before[-1].result if before else None
         body = self.mechanics.frame(k)
         contact = self.carry(body, self.mechanics.poses[k], guess)
+        if contact.adjustment and contact.adjustment.restored:
+            body = self.mechanics.frame(k, contact.adjustment)
+            contact = self.carry(body, self.mechanics.poses[k], contact.result)
         if self.table.coupling == "none":
             return body, contact
         return self._coupled(k, body, contact)

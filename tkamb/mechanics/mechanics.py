@@ -9,26 +9,19 @@ import numpy as np
 from tkamb.body.chain import ChainMotion, ChainState
 from tkamb.body.knee import KneeGeometry, KneeLoads, solve_knee, unsolved
 from tkamb.body.load import PointForces
-from tkamb.body.unknowns import CondylePoint
 from tkamb.case import Case
 from tkamb.errors import ComputationError, InputError, TkambError
 from tkamb.geometry.frames import Array, knee_pose, knee_twist
-from tkamb.units import DEGREE, MILLIMETRE
+from tkamb.mechanics.touching import FARTHEST_GAP, NOWHERE, Touching, nearest_gap, touching
+from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.body.ligaments import Ligament
     from tkamb.body.patella import PatellaState
     from tkamb.body.slip import CondyleSlip
     from tkamb.geometry.adjustment import Adjustment
-    from tkamb.geometry.closest import ClosestPointQuery, CondyleGap, CondyleGaps
-
-LIFT_OFF_ANGLE = 0.5 * DEGREE
-LIFT_OFF_GAP = 0.5 * MILLIMETRE
-"""A condyle is off the insert where both its gap and the coronal angle of the two gaps exceed
-what fluoroscopy errs by (the source, 4.3)."""
-
-FARTHEST_GAP = 3e-3
-"""m: a femoral component farther from the insert, or deeper in it, is misplaced."""
+    from tkamb.geometry.closest import ClosestPointQuery
+    from tkamb.mechanics.adjustment_effect import AdjustmentEffect
 
 STRAIN_FLEXIONS = (0.0, 60.0, 90.0)
 """deg: where the strains of the ligaments are shown."""
@@ -48,6 +41,8 @@ class FrameLoads:
         adjustment: the femoral adjustment, if asked for and possible.
         query_seconds: computing time of the closest points on the meshes.
         seconds: computing time of the equations, contact points given.
+        effect: what the adjustment does to the forces; None without one, or where the recorded
+            pose has no solution.
     """
 
     geometry: KneeGeometry
@@ -57,6 +52,7 @@ class FrameLoads:
     adjustment: "Adjustment | None"
     query_seconds: float
     seconds: float
+    effect: "AdjustmentEffect | None" = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +107,7 @@ class Mechanics:
         if self.query is None or contact is None or contact.released:
             return
         middle, last = len(self.poses) // 2, len(self.poses) - 1
-        nearest = [_nearest_gap(self.query.at(self.poses[k])) for k in (0, middle, last)]
+        nearest = [nearest_gap(self.query.at(self.poses[k])) for k in (0, middle, last)]
         if all(abs(gap) > FARTHEST_GAP for gap in nearest):
             gap = min(nearest, key=abs)
             raise InputError(
@@ -121,14 +117,25 @@ class Mechanics:
                 "check which mesh is which, their units, axes and places, and the motion's",
             )
 
-    def frame(self, k: int) -> FrameLoads:
-        """Return the loads of frame k; a frame that cannot be solved holds NaN."""
+    def frame(self, k: int, adjustment: "Adjustment | None" = None) -> FrameLoads:
+        """Return the loads of frame k; a frame that cannot be solved holds NaN.
+
+        Args:
+            k: frame.
+            adjustment: the femoral adjustment, if it is decided; None: as the scene asks.
+        """
         start = clock.perf_counter()
-        adjustment, condyles, lifted, problems = self._touching(k)
+        if adjustment is None:
+            adjustment, problems = self._adjusted(k)
+        else:
+            problems = ()
+        pose = adjustment.pose if adjustment else self.poses[k]
+        touch = NOWHERE if problems else self._touching(k, pose)
+        recorded = self._touching(k, self.poses[k]) if adjustment else None
         queried = clock.perf_counter()
         placed = self.placed(k)
-        problems += placed.problems
-        geometry = replace(placed.geometry, condyles=condyles, lifted=lifted)
+        problems += touch.problems + placed.problems
+        geometry = replace(placed.geometry, condyles=touch.condyles, lifted=touch.lifted)
         loads = unsolved(problems) if problems else solve_knee(geometry, self.friction)
         done = clock.perf_counter()
         return FrameLoads(
@@ -139,6 +146,7 @@ class Mechanics:
             adjustment,
             queried - start,
             done - queried,
+            self._effect(geometry, loads, recorded) if recorded else None,
         )
 
     def placed(
@@ -212,44 +220,38 @@ class Mechanics:
             return state.ground_reaction(ground.force[k], tibia.pose[k][:3, 3], np.zeros(3))
         return state.ground_reaction(ground.force[k], ground.point[k], ground.moment[k])
 
-    def _touching(
-        self, k: int
-    ) -> "tuple[Adjustment | None, dict[str, CondylePoint], frozenset[str], list[str]]":
-        """Return adjustment, contact points, the sides that are off, and what is wrong."""
-        if self.query is None:
-            return None, {}, frozenset(), []
-        pose, adjustment = self.poses[k], None
+    def _adjusted(self, k: int) -> "tuple[Adjustment | None, tuple[str, ...]]":
+        """Return the femoral adjustment, if asked for, and why it is not possible."""
         contact = self.case.scene.contact
+        if self.query is None or contact is None or not contact.adjust:
+            return None, ()
+        from tkamb.geometry.adjustment import adjust
+
         try:
-            if contact and contact.adjust:
-                from tkamb.geometry.adjustment import adjust
-
-                adjustment = adjust(self.query, pose)
-                pose = adjustment.pose
+            return adjust(self.query, self.poses[k]), ()
         except TkambError as error:
-            return None, {}, frozenset(), [error.what]
-        gaps = self.query.at(pose)
-        found = {"medial": gaps.medial} | ({"lateral": gaps.lateral} if gaps.lateral else {})
-        condyles = {side: self._condyle(k, gap) for side, gap in found.items()}
-        nearest = _nearest_gap(gaps)
-        problems = []
-        if abs(nearest) > FARTHEST_GAP:
-            word = "apart" if nearest > 0 else "overlapping"
-            problems.append(f"condyles {word} by {abs(nearest) / MILLIMETRE:.1f} mm")
-        return adjustment, condyles, self._lifted(condyles), problems
+            return None, (error.what,)
 
-    def _condyle(self, k: int, gap: "CondyleGap") -> CondylePoint:
-        sliding = self.sliding(k, self.case.motion.coordinates[k], gap.centre)
-        return CondylePoint(gap.centre, gap.normal, sliding, gap.gap)
+    def _touching(self, k: int, pose: Array) -> Touching:
+        """Return where the condyles touch at a pose (4, 4), with the rates of frame k."""
+        if self.query is None:
+            return NOWHERE
+        place = self.case.motion.coordinates[k]
+        return touching(self.query, pose, lambda point: self.sliding(k, place, point))
 
-    def _lifted(self, condyles: dict[str, CondylePoint]) -> frozenset[str]:
-        if len(condyles) < 2:
-            return frozenset()
-        medial, lateral = condyles["medial"], condyles["lateral"]
-        width = abs(lateral.point[2] - medial.point[2])
-        higher = "lateral" if lateral.gap > medial.gap else "medial"
-        tilted = abs(lateral.gap - medial.gap) > LIFT_OFF_ANGLE * width
-        return frozenset({higher} if tilted and condyles[higher].gap > LIFT_OFF_GAP else ())
+    def _effect(
+        self, geometry: KneeGeometry, loads: KneeLoads, recorded: Touching
+    ) -> "AdjustmentEffect | None":
+        """Return what the adjustment changed; None where either pose has no solution."""
+        if loads.problems or recorded.problems:
+            return None
+        from tkamb.mechanics.adjustment_effect import adjustment_effect
+
+        there = replace(geometry, condyles=recorded.condyles, lifted=recorded.lifted)
+        before = solve_knee(there, self.friction)
+        if before.problems:
+            return None
+        return adjustment_effect(loads, before, geometry.condyles, recorded.condyles)
 
     def _pulls(self, poses: dict[str, Array]) -> tuple[dict[str, float], tuple[PointForces, ...]]:
         """Return the ligaments' tensions (N) by name, and what they do to the links."""
@@ -282,11 +284,6 @@ class Mechanics:
     def _attachment_links(self) -> set[str]:
         ends = [end for table in self.case.scene.ligament for end in (table.proximal, table.distal)]
         return {end.link for end in ends}
-
-
-def _nearest_gap(gaps: "CondyleGaps") -> float:
-    """Return the smallest gap (m) of the condyles."""
-    return min(gap.gap for gap in (gaps.medial, gaps.lateral) if gap is not None)
 
 
 def _contact_query(case: Case) -> "ClosestPointQuery | None":

@@ -18,7 +18,7 @@ def panels(results: Results) -> tuple[Panel, ...]:
     makers: tuple[Callable[[Results], Panel], ...] = (
         _total, _condyles, _share, _extensor, _ratios, _areas, _pressures, _yield, _external,
         _ground, _ligaments, _residuals, _residual_moment, _hip_force, _hip_moment, _motion,
-        _slip, _adjustment, _condition,
+        _slip, _adjustment, _adjustment_effect, _condition,
     )  # fmt: skip
     made = (without_empty_lines(make(results)) for make in makers)
     return tuple(panel for panel in made if panel.lines)
@@ -244,6 +244,15 @@ def _adjustment(results: Results) -> Panel:
         _line(results, "adjust_coronal_deg", "coronal angle, deg", VERMILLION),
     )
     return Panel("adjustment", "Femoral adjustment before contact", "mm or deg", lines)
+
+
+def _adjustment_effect(results: Results) -> Panel:
+    lines = (
+        _line(results, "adjust_force_change_BW", "total force, BW", BLACK),
+        _line(results, "adjust_share_change", "medial share (by equilibrium)", PURPLE, True),
+    )
+    note = "Adjusted less recorded pose. Frames whose total changes by over 0.01 BW are flagged."
+    return Panel("adjustment_effect", "What the adjustment changes", "BW or share", lines, note)
 
 
 def _condition(results: Results) -> Panel:

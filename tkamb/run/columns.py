@@ -133,6 +133,12 @@ COLUMNS: tuple[Column, ...] = (
     Column("coupling_change_mm", "the same, in the centres of pressure", _POINTS),
     Column("contact_trials", "contacts computed to find the released pose", _FREE, "integer"),
     Column("softest_N_per_mm", "smallest stiffness of the released pose (lever 25 mm)", _FREE),
+    Column(
+        "adjust_force_change_BW",
+        "force_total_BW less what the equations give at the recorded pose",
+        _ADJUST,
+    ),
+    Column("adjust_share_change", "the same, of medial_share_equilibrium", _ADJUST),
 )
 
 KINDS: dict[str, Kind] = {column.name: column.kind for column in COLUMNS}

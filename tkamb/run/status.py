@@ -19,6 +19,9 @@ FLANK = 20.0 * DEGREE
 """A condyle whose contact normal leans by more than this runs against eminence or lip: the
 recorded position, the ML one above all, deserves a look."""
 
+ADJUSTED_TOTAL = 0.01
+"""BW: a femoral adjustment that changes the total force by more decides more than the split."""
+
 FAILED = "failed: "
 
 
@@ -27,7 +30,7 @@ def frame_status(case: Case, k: int, body: FrameLoads, contact: "FrameContact | 
     failures = list(body.loads.problems)
     if contact and contact.problem and not failures:
         failures.append(contact.problem)
-    words = [*_motion_flags(case, k), *_flank_flags(body)]
+    words = [*_motion_flags(case, k), *_flank_flags(body), *_adjustment_flags(case, body)]
     settled = contact is not None and contact.settled is not None
     words += [_lift_off(body, side, settled) for side in sorted(body.loads.lifted)]
     if body.loads.slack:
@@ -54,6 +57,15 @@ def _flank_flags(body: FrameLoads) -> list[str]:
         if lean > FLANK and side not in body.loads.lifted:
             found.append(f"{side} contact on a flank, normal {lean / DEGREE:.0f} deg from vertical")
     return found
+
+
+def _adjustment_flags(case: Case, body: FrameLoads) -> list[str]:
+    if body.effect is None or body.loads.problems:
+        return []
+    change = abs(body.effect.force) / case.body_weight
+    if change <= ADJUSTED_TOTAL:
+        return []
+    return [f"femoral adjustment changes the total force by {change:.2f} BW: {body.effect.cause}"]
 
 
 def _motion_flags(case: Case, k: int) -> list[str]:

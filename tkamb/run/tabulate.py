@@ -99,6 +99,9 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
         "residual_sensitivity_N": loads.sensitivity,
         "condition_number": loads.condition,
     }
+    if frame.effect is not None:
+        row["adjust_force_change_BW"] = frame.effect.force / case.body_weight
+        row["adjust_share_change"] = frame.effect.share
     for name in ("quadriceps", "patellar_ligament", "patellofemoral", "patellofemoral_tangential"):
         row[f"{name}_N"] = values.get(name, NAN)
     for axis in ("ap", "si", "ml"):
