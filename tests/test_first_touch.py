@@ -7,6 +7,7 @@ from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
 from tkamb.geometry.ceiling import Ceiling
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import knee_pose, pose, transform
+from tkamb.geometry.patches import Patches
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
@@ -85,10 +86,43 @@ def test_travel_moves_with_the_pose_and_not_with_the_femoral_frame():
 
 def test_the_ceiling_is_above_the_surface_everywhere():
     _, insert = bodies()
-    ceiling = Ceiling(insert)
+    lift = np.random.default_rng(0).uniform(0, 1e-3, len(insert.vertices))
+    ceiling = Ceiling(insert, lift)
     points = insert.triangles.mean(axis=1)
-    assert (ceiling.over(points) >= points[:, 1] - 1e-15).all()
-    box = np.array([[-5e-3, -3e-3]]), np.array([[4e-3, 12e-3]])
-    inside = ((insert.vertices[:, ::2] >= box[0]) & (insert.vertices[:, ::2] <= box[1])).all(1)
-    assert ceiling.over_rectangles(*box)[0] >= insert.vertices[inside, 1].max()
-    assert ceiling.vertices_in_rectangles(*box)[inside].all()
+    above = ceiling.over(points) - points[:, 1]
+    assert (above >= -1e-15).all()
+    assert np.median(above[insert.face_normals[:, 1] > 0.5]) < 0.2e-3
+    rng = np.random.default_rng(1)
+    low = rng.uniform(-30e-3, 25e-3, (60, 2))
+    high = low + rng.uniform(0, 20e-3, (60, 2))
+    marked = ceiling.vertices_in_rectangles(low, high)
+    top = np.zeros(len(insert.vertices), bool)
+    top[insert.faces[insert.face_normals[:, 1] > 0]] = True
+    for a, b, plane in zip(low, high, ceiling.planes(low, high), strict=True):
+        xz = insert.vertices[:, ::2]
+        inside = ((xz >= a) & (xz <= b)).all(axis=1)
+        assert np.isin(np.flatnonzero(inside), marked).all()
+        inside &= top
+        height = insert.vertices[inside, 1] - xz[inside] @ plane[:2]
+        assert (height <= plane[2] + 1e-15).all()
+        assert (height + lift[inside] <= plane[3] + 1e-15).all()
+
+
+def test_patches_stay_in_their_boxes():
+    femoral, _ = bodies()
+    reach = np.linspace(0, 1, len(femoral.vertices))
+    patches = Patches(femoral, reach)
+    at = knee_pose([1e-3, 5e-3, 0.5e-3, 0.3, 0.1, 1.2])
+    low, high = patches.extent(at)
+    directions = np.random.default_rng(2).normal(size=low.shape)
+    least = patches.least(at, np.arange(len(low)), directions)
+    seen = []
+    for patch in range(len(low)):
+        faces = patches.faces(np.array([patch]))
+        corners = femoral.faces[faces].ravel()
+        points = transform(at, femoral.vertices[corners])
+        assert (points >= low[patch] - 1e-15).all() and (points <= high[patch] + 1e-15).all()
+        assert (points @ directions[patch]).min() >= least[patch] - 1e-15
+        assert patches.reach[patch] == reach[corners].max()
+        seen.append(faces)
+    assert np.array_equal(np.sort(np.concatenate(seen)), np.arange(len(femoral.faces)))

@@ -1,4 +1,4 @@
-"""A coarse upper bound of a surface's height over x and z, for sparing rays."""
+"""An upper bound of a surface's height over x and z, for sparing rays."""
 
 from collections.abc import Iterator
 
@@ -9,55 +9,125 @@ from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface
 
 Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
-CELL = 2e-3
+CELL = 1e-3
 """m; edge of the cells."""
+MOST_CELLS = 400
+"""Cells along an edge of the grid; a larger surface gets larger ones."""
 WIDEST = 4
-"""Cells along an edge; larger rectangles are dealt with one by one."""
+"""Cells along an edge; larger triangles are dealt with one by one."""
+STEEPEST = 3.0
+"""Largest slope of a plane."""
 
 
 class Ceiling:
-    """The largest y of the triangles over each cell of an x-z grid.
+    """Planes over the cells of an x-z grid that the surface, seen from above, stays under.
 
-    Rectangles are given by their corners `low` and `high` (n, 2), m, as x and z.
+        y <= c + g . (x, z)      for every upward triangle over the cell
+
+    g is the mean slope over the cell, so that the plane lies closer than the cell's largest
+    height where the surface slopes. Such planes are kept for all windows of 1, 2, 4, 8 ...
+    cells a side, so that a rectangle of any size is looked up at once.
 
     Args:
         surface: any surface; its x and z span the grid.
+        lift: (n,) m, margin above each vertex that the lifted planes keep; none by default.
     """
 
-    def __init__(self, surface: Surface) -> None:
+    def __init__(self, surface: Surface, lift: Array | None = None) -> None:
         low, high = surface.bounds[:, [0, 2]]
         self._origin = low
-        self._shape = (int((high - low)[0] // CELL) + 1, int((high - low)[1] // CELL) + 1)
-        self._height = np.full(self._shape, -np.inf)
-        flat = surface.triangles[:, :, [0, 2]]
-        tops = surface.triangles[:, :, 1].max(axis=1)
-        for chosen, cells in self._covered(flat.min(axis=1), flat.max(axis=1)):
-            np.maximum.at(self._height, cells, tops[chosen])
-        self._cell = self._place(surface.vertices[:, [0, 2]])
+        self._edge = max(CELL, float((high - low).max()) / MOST_CELLS)
+        self._last = ((high - low) // self._edge).astype(np.int64)
+        self._planes = np.stack(self._all_planes(surface, lift))
+        self._level = np.ceil(np.log2(np.arange(1, self._last.max() + 2))).astype(np.int64)
+        number = np.ravel_multi_index(
+            tuple(self._place(surface.vertices[:, [0, 2]]).T), tuple(self._last + 1)
+        )
+        self._vertices = np.argsort(number, kind="stable")
+        count = int(np.prod(self._last + 1))
+        self._first = np.searchsorted(number[self._vertices], np.arange(count + 1))
 
     def over(self, points: Array) -> Array:
         """Return a height (n,), m, that the surface over the points (n, 3) does not exceed."""
-        return np.asarray(self._height[tuple(self._place(points[:, [0, 2]]).T)])
+        xz = points[:, [0, 2]]
+        plane = self._planes[0][tuple(self._place(xz).T)]
+        return np.asarray(np.einsum("ij,ij->i", plane[:, :2], xz) + plane[:, 2])
 
-    def over_rectangles(self, low: Array, high: Array) -> Array:
-        """Return a height (n,), m, that the surface over each rectangle does not exceed."""
-        heights = np.full(len(low), -np.inf)
-        for chosen, cells in self._covered(low, high):
-            np.maximum.at(heights, chosen, self._height[cells])
-        return heights
+    def planes(self, low: Array, high: Array) -> Array:
+        """Return planes g, c, c' (n, 4) that the surface over rectangles stays under, m.
 
-    def vertices_in_rectangles(self, low: Array, high: Array) -> Mask:
-        """Say which vertices of the surface may lie in any of the rectangles."""
-        marked = np.zeros(self._shape, bool)
-        for _, cells in self._covered(low, high):
-            marked[cells] = True
-        return np.asarray(marked[tuple(self._cell.T)])
+        c' is that of the lifted surface. -inf where there is none.
+
+        Args:
+            low: (n, 2) m, smallest x and z of each rectangle.
+            high: (n, 2) m, largest.
+        """
+        first, last = self._place(low), self._place(high)
+        size = np.maximum(last[:, 0] - first[:, 0], last[:, 1] - first[:, 1])
+        found = self._planes[self._level[size], first[:, 0], first[:, 1]]
+        (x, z), (end_x, end_z) = self._origin, self._origin + (self._last + 1) * self._edge
+        outside = (high[:, 0] < x) | (high[:, 1] < z) | (low[:, 0] > end_x) | (low[:, 1] > end_z)
+        found[outside] = [0.0, 0.0, -np.inf, -np.inf]
+        return np.asarray(found)
+
+    def vertices_in_rectangles(self, low: Array, high: Array) -> Index:
+        """Return the vertices of the surface that may lie in any of the rectangles."""
+        first, last = self._place(low), self._place(high) + 1
+        count = np.zeros(tuple(self._last + 2), np.int64)
+        for i, j, sign in (
+            (first, first, 1),
+            (last, last, 1),
+            (first, last, -1),
+            (last, first, -1),
+        ):
+            np.add.at(count, (i[:, 0], j[:, 1]), sign)
+        marked = count.cumsum(axis=0).cumsum(axis=1)[:-1, :-1].ravel() > 0
+        return rows_of(self._first, self._vertices, np.flatnonzero(marked))
 
     def _place(self, xz: Array) -> Index:
-        index = np.floor((xz - self._origin) / CELL).astype(np.int64)
-        return np.clip(index, 0, np.array(self._shape) - 1)
+        index = np.floor((xz - self._origin) / self._edge).astype(np.int64)
+        return np.clip(index, 0, self._last)
+
+    def _all_planes(self, surface: Surface, lift: Array | None) -> list[Array]:
+        """Return the planes (i, j, 4) of windows of 2^k cells from each cell on."""
+        faces = surface.faces[surface.face_normals[:, 1] > 0]
+        triangles = surface.vertices[faces]
+        a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+        area, xz, heights = np.cross(b - a, c - a), triangles[:, :, [0, 2]], triangles[:, :, 1]
+        lifted = heights if lift is None else heights + lift[faces]
+        covered = list(self._covered(xz.min(axis=1), xz.max(axis=1)))
+        total = np.zeros((*(self._last + 1), 3))
+        for chosen, cells in covered:
+            np.add.at(total, cells, area[chosen])
+        planes = np.full((*total.shape[:2], 4), -np.inf)
+        planes[..., :2] = _slopes(total)
+        for chosen, cells in covered:
+            rise = (planes[cells][:, None, :2] * xz[chosen]).sum(axis=2)
+            np.maximum.at(planes[..., 2], cells, (heights[chosen] - rise).max(axis=1))
+            np.maximum.at(planes[..., 3], cells, (lifted[chosen] - rise).max(axis=1))
+        return self._windows(planes, total)
+
+    def _windows(self, planes: Array, area: Array) -> list[Array]:
+        """Join four windows to one of twice the edge, until one covers all."""
+        all_planes, size = [planes], 1
+        corner = np.stack(np.meshgrid(*(np.arange(n + 1) for n in self._last), indexing="ij"), -1)
+        low = self._origin + corner * self._edge
+        places = [(i, j) for i in (0, 1) for j in (0, 1)]
+        while size <= self._last.max():
+            steps = [(size * i, size * j) for i, j in places]
+            area = np.sum([_shifted(area, *step, 0.0) for step in steps], axis=0)
+            joined = np.full_like(planes, -np.inf)
+            joined[..., :2] = _slopes(area)
+            for step in steps:
+                plane = _shifted(all_planes[-1], *step, -np.inf)
+                for i, j in places:
+                    there = low + self._edge * (np.array(step) + size * np.array([i, j]))
+                    rise = ((plane[..., :2] - joined[..., :2]) * there).sum(axis=-1)
+                    joined[..., 2:] = np.maximum(joined[..., 2:], plane[..., 2:] + rise[..., None])
+            all_planes.append(joined)
+            size *= 2
+        return all_planes
 
     def _covered(self, low: Array, high: Array) -> Iterator[tuple[Index, tuple[Index, Index]]]:
         """Yield rectangles (m,) and one cell (m,), (m,) that each of them covers."""
@@ -73,3 +143,25 @@ class Ceiling:
             for j in range(WIDEST):
                 inside = (first[:, 0] + i <= last[:, 0]) & (first[:, 1] + j <= last[:, 1])
                 yield small[inside], (first[inside, 0] + i, first[inside, 1] + j)
+
+
+def rows_of(first: Index, items: Index, chosen: Index) -> Index:
+    """Return the items of the chosen rows, row r being items[first[r] : first[r + 1]]."""
+    count = first[chosen + 1] - first[chosen]
+    begin = np.repeat(first[chosen] - np.cumsum(count) + count, count)
+    return np.asarray(items[begin + np.arange(count.sum())])
+
+
+def _slopes(area: Array) -> Array:
+    """Return the slopes (..., 2) along x and z of a mean area vector (..., 3)."""
+    upward = np.maximum(area[..., 1:2], 1e-300)
+    return np.clip(-area[..., ::2] / upward, -STEEPEST, STEEPEST)
+
+
+def _shifted(grid: Array, i: int, j: int, beyond: float) -> Array:
+    """Return the grid (m, n, d) read from (i, j) cells further on; `beyond` where it ends."""
+    result = np.full_like(grid, beyond)
+    result[..., :2] = 0.0
+    rows, columns = max(grid.shape[0] - i, 0), max(grid.shape[1] - j, 0)
+    result[:rows, :columns] = grid[i:, j:]
+    return result
