@@ -23,7 +23,7 @@ from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.geometry.sections import sagittal_outline
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.meshes import BONE_SIZE, load_surface, mirrored
-from tkamb.scene_tables import Attachment, BoneTable
+from tkamb.scene_tables import Attachment
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
@@ -206,8 +206,9 @@ def _quadriceps(case: "Case") -> StringLine:
     ends = (_point(table.origin), _point(table.insertion))
     if table.wrap:
         surfaces = [case.femoral]
-        if table.bone:
-            surfaces.append(_bone(case, table.bone))
+        bone = quadriceps_bone(case)
+        if bone is not None:
+            surfaces.append(bone)
         outline = sagittal_outline(
             surfaces,
             _band(table.band_mm) + case.chain.patella_joint_in_femur[2, 3],
@@ -259,7 +260,15 @@ def _point(end: Attachment) -> Array:
     return np.array(end.point_mm) * MILLIMETRE
 
 
-def _bone(case: "Case", table: BoneTable) -> "Surface":
+def quadriceps_bone(case: "Case") -> "Surface | None":
+    """Return the bone that the quadriceps may wrap, in the femur's frame; None without one.
+
+    Raises:
+        InputError: the mesh cannot be read.
+    """
+    table = case.scene.quadriceps.bone if case.scene.quadriceps else None
+    if table is None:
+        return None
     surface = load_surface(table.mesh, table.unit, table.axes, name="bone", size=BONE_SIZE)
     if case.scene.patient.side == "left":
         surface = mirrored(surface)

@@ -45,7 +45,8 @@ def _lift_off(body: FrameLoads, side: str, settled: bool) -> str:
     if settled:
         return f"{side} condyle lifts off"
     if side in body.geometry.lifted:
-        return f"{side} condyle off the insert as recorded"
+        where = "where the other one touches" if body.adjustment else "as recorded"
+        return f"{side} condyle off the insert {where}"
     return f"{side} condyle unloaded: the other one alone balances the adduction moment"
 
 
