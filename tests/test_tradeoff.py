@@ -2,21 +2,27 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from scenes import write_scene
+from tkamb.case import load_case
 from tkamb.cli import main
-from tkamb.contact.registry import contact_model, contact_names
+from tkamb.contact.registry import BUILT_IN, contact_model
 from tkamb.errors import InputError
-from tkamb.studies import tradeoff
-from tkamb.studies.body_trade import body_table, run_body_trade
+from tkamb.scene import load_scene
+from tkamb.studies import matrix, tradeoff
+from tkamb.studies.advice import comparison, recommendations
+from tkamb.studies.body_trade import CHANGES, body_table, run_body_trade
 from tkamb.studies.cases import case_names, study_case
 from tkamb.studies.elastic_layer import sphere_on_layer
 from tkamb.studies.front import NOISE, on_front
+from tkamb.studies.kept_rows import KeptRows
 from tkamb.studies.measures import Job, Measure, measure, measure_apart
 from tkamb.studies.quantities import common_limit, errors, map_error, quantities, raster_map
+from tkamb.studies.recordings import copied_scene, thin_out
 from tkamb.studies.references import (
     compute_reference,
     limits,
@@ -24,12 +30,15 @@ from tkamb.studies.references import (
     reference_of,
     write_references,
 )
-from tkamb.studies.tradeoff_report import picture, recommendations, table
+from tkamb.studies.tradeoff_block import BEGIN, END, block, with_block
+from tkamb.studies.tradeoff_report import picture, table
 
+ROOT = Path(__file__).parents[1]
 KEYS = {
     "case", "contact", "resolution_mm", "prepare_seconds", "cold_seconds", "warm_seconds",
     "peak_rss_MB", "error_approach", "error_force", "error_mean_pressure",
-    "error_peak_pressure", "error_area", "on_front",
+    "error_peak_pressure", "error_area", "error_map", "on_front", "status", "reference_known",
+    "values",
 }  # fmt: skip
 
 
@@ -153,12 +162,14 @@ def test_what_cannot_be_measured_is_a_row_too():
 
 
 def made_up_rows():
-    settings = [("hertz", 1.0, 1e-3, 0.2), ("foundation", 1.0, 1e-2, 0.3), ("fe", 1.0, 1.0, 0.001)]
+    settings = [("hertz", 2.0, 1e-3, 0.2), ("foundation", 2.0, 1e-2, 0.3)]
+    settings += [("lattice", 2.0, 1e-2, 0.01), ("fe", 2.0, 1.0, 0.001)]
     rows = []
     for case in ("sphere", "two condyles"):
         for contact, grid, seconds, error in settings:
-            found = Measure("ok", 1.0, seconds, seconds, 100.0, 1, 1, {}, {})
-            compared = dict.fromkeys((*tradeoff.KEYS, "map"), error)
+            values = dict.fromkeys(read_references()[case].values, 1.0 + error)
+            found = Measure("ok", 1.0, seconds, seconds, 100.0, values=values)
+            compared = dict.fromkeys(tradeoff.KEYS, error)
             rows.append(tradeoff.Row(Job(case, contact, grid), found, compared, 0.005))
         rows.append(tradeoff.Row(Job(case, "lattice", 1.0), Measure("out of range"), {}, 0.005))
     return tradeoff.with_fronts(rows)
@@ -166,31 +177,92 @@ def made_up_rows():
 
 def test_rows_table_and_advice(stored):
     rows = made_up_rows()
-    assert [row.on_front for row in rows[:4]] == [True, False, True, False]
+    assert [row.on_front for row in rows[:5]] == [True, False, True, True, False]
     content = json.loads(tradeoff.as_json(rows))
     assert all(set(row) == KEYS for row in content)
-    assert content[3]["error_approach"] is None
+    assert content[4]["error_approach"] is None
     text = "\n".join(table(rows, stored))
     assert "out of range" in text and "*hertz" in text
     advice = recommendations(rows)
-    assert any("5 % in peak pressure" in line and "fe at 1 mm" in line for line in advice)
+    for key in ("approach", "condyle force", "mean pressure", "peak pressure", "area", "map"):
+        assert any(f" in {key}" in line or f"{key} (L2)" in line for line in advice), key
+    assert any("5 % in peak pressure" in line and "lattice at 2 mm" in line for line in advice)
     assert picture(rows).axes
 
 
-def test_every_model_takes_part_in_the_full_study():
-    wanted = tradeoff.jobs(quick=False)
-    assert {job.contact for job in wanted} >= set(contact_names()) - {"gap-pressure"}
+def test_a_limit_that_nothing_keeps_names_the_nearest():
+    rows = [row for row in made_up_rows() if row.job.contact in ("hertz", "foundation")]
+    assert all(
+        "no setting: the nearest is hertz at 2 mm with 20 %" in r for r in recommendations(rows)
+    )
+
+
+def test_the_comparison_says_what_was_measured_and_what_was_wanted():
+    said = comparison(made_up_rows())
+    assert "10 ms" in said[0] and "is on the front" in said[0]
+    assert "fe: 1e+03 ms, 100 times as long (wanted: 20, reached)" in said[1]
+    rows = [replace(row, measure=replace(row.measure, warm_seconds=0.02)) for row in made_up_rows()]
+    assert "not reached" in comparison(rows)[1]
+    peer = replace(rows[8], job=Job("two condyles", "calculix C3D8I", 2.0))
+    assert "0.9 % in approach" in comparison([*rows, peer])[-1]
+
+
+def test_rows_survive_their_json(tmp_path):
+    path = tmp_path / "tradeoff.json"
+    path.write_text(tradeoff.as_json(made_up_rows()))
+    again = tradeoff.read_rows(path)
+    assert tradeoff.as_json(again) == path.read_text()
+    assert block(again) == block(made_up_rows())
+    path.write_text('[{"case": 1}]')
+    with pytest.raises(InputError, match="no table of a trade-off"):
+        tradeoff.read_rows(path)
+
+
+def test_a_block_goes_between_its_markers_and_nowhere_else():
+    page = f"before\n{BEGIN}\nold\n{END}\nafter\n"
+    filled = with_block(page, ["| a |", "| b |"])
+    assert filled == f"before\n{BEGIN}\n\n| a |\n| b |\n\n{END}\nafter\n"
+    assert with_block(filled, ["| a |", "| b |"]) == filled
+    with pytest.raises(InputError, match="once each"):
+        with_block("no markers", [])
+
+
+def test_the_default_matrix_leaves_out_only_repeats():
+    wanted, everything = matrix.jobs(), matrix.jobs(full=True)
+    assert {job.contact for job in wanted} >= set(BUILT_IN)
     assert {job.case for job in wanted} == set(case_names())
     labels = {job.label for job in wanted}
     assert {"lattice[tolerance=0.01]", "fe[newton=True]"} <= labels
+    keys = [(job.case, job.label, job.resolution_mm) for job in wanted]
+    assert len(set(keys)) == len(keys)
+    every = {(job.case, job.label, job.resolution_mm) for job in everything}
+    assert set(keys) < every and {k[1:] for k in keys} == {k[1:] for k in every}
+    seconds = matrix.expected_seconds(wanted, tradeoff.cases_of(wanted))
+    assert len(seconds) == len(wanted) and sum(seconds) < 900
 
 
-@pytest.mark.slow
-def test_the_quick_study(tmp_path, capsys):
-    assert main(["tradeoff", "--quick", "--json", "--out", str(tmp_path)]) == 0
+def test_the_quick_study_is_stopped_and_goes_on(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(matrix, "QUICK_MODELS", ("foundation", "lattice", "fe"))
+    asked = []
+
+    def stopped_at_the_third(job):
+        asked.append(job)
+        if len(asked) == 3:
+            raise KeyboardInterrupt
+        return measure_apart(job)
+
+    monkeypatch.setattr(tradeoff, "measure_apart", stopped_at_the_third)
+    arguments = ["tradeoff", "--quick", "--json", "--out", str(tmp_path)]
+    assert main(arguments) == 130
+    told = capsys.readouterr()
+    assert len(json.loads(told.out)) == 2 and "--resume goes on" in told.err
+    assert (tmp_path / "tradeoff.txt").read_text().startswith("stopped: 2 of 6 rows")
+    assert (tmp_path / "tradeoff.png").exists()
+    assert main([*arguments, "--resume"]) == 0
+    assert len(asked) == 3 + 4
     rows = json.loads(capsys.readouterr().out)
     assert rows == json.loads((tmp_path / "tradeoff.json").read_text())
-    assert all(set(row) == KEYS for row in rows)
+    assert len(rows) == 6 and all(set(row) == KEYS for row in rows)
     by_name = {(row["case"], row["contact"]): row for row in rows}
     lattice, fe = by_name["two condyles", "lattice"], by_name["two condyles", "fe"]
     assert lattice["error_approach"] < 0.05 and fe["error_approach"] < 0.06
@@ -210,11 +282,26 @@ def test_a_user_s_scene_is_a_case(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_body_s_trade_says_what_each_part_changes():
-    rows = {row.name: row for row in run_body_trade()}
+def test_the_body_s_trade_says_what_each_part_changes(tmp_path):
+    kept = KeptRows(tmp_path, resume=False)
+    rows = {row.name: row for row in run_body_trade(kept)}
     assert set(rows["as shipped"].changed.values()) == {0.0}
     assert all(row.status == "ok" and row.frame_seconds > 0 for row in rows.values())
     assert 0 < rows["filtered at 6 Hz"].changed["force_total_N"] < 0.01
     assert rows["coupled: points"].changed["force_total_N"] < 0.02
     assert rows["released: adduction"].changed["medial_force_N"] > 0.05
+    assert rows["no wrapping"].changed["quadriceps_N"] > 0.05
+    slower = [rows[f"every {n} frame"].changed["velocity"] for n in ("2nd", "5th", "10th")]
+    assert slower == sorted(slower) and 0 < slower[0] < 0.01 < slower[2]
     assert len(body_table(list(rows.values()))) == len(rows) + 2
+    assert [row.name for row in run_body_trade(kept)] == list(CHANGES)
+
+
+def test_thinned_recordings_keep_the_instants_that_are_left(tmp_path):
+    scene = load_scene(copied_scene(tmp_path))
+    whole = load_case(scene).motion
+    thin_out(tmp_path, 5)
+    thin = load_case(scene).motion
+    np.testing.assert_allclose(thin.time, whole.time[::5], atol=1e-12)
+    np.testing.assert_allclose(thin.coordinates, whole.coordinates[::5], atol=1e-12)
+    assert np.abs(thin.velocity - whole.velocity[::5]).max() > 0

@@ -1,37 +1,74 @@
-"""The body's own trade: what coupling, filtering, patella and wrapping cost and change.
+"""The body's own trade: what coupling, filtering, frame rate, patella and wrapping cost and change.
 
-The shipped knee bend is run with one thing changed at a time, against the run as shipped.
+The shipped knee bend is run with one thing changed at a time, against the run as shipped, on
+the same instants. Fewer frames per second are fewer rows of the recordings themselves: motion,
+shank and ground reaction, so that derivatives come from what is left.
 """
 
+import json
+import tempfile
 import time as clock
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tkamb.case import load_case
 from tkamb.errors import TkambError
+from tkamb.geometry.frames import Array
 from tkamb.results import Results
 from tkamb.scene import load_scene
 from tkamb.simulation import simulate
-from tkamb.studies.cases import SHIPPED_SCENE
+from tkamb.studies.kept_rows import KeptRows, row_key
+from tkamb.studies.recordings import copied_scene, thin_out
 
-FRAMES = slice(0, 101, 10)
-CHANGES: dict[str, dict[str, Any]] = {
-    "as shipped": {},
-    "coupled: points": {"contact.coupling": "points"},
-    "released: adduction": {"contact.released": ["adduction"]},
-    "filtered at 6 Hz": {"motion.cutoff_Hz": 6.0},
-    "filtered at 2 Hz": {"motion.cutoff_Hz": 2.0},
-    "patella solved": {"patella.motion": "solved"},
-    "no friction": {"contact.friction": 0.0},
-    "femoral adjustment": {"contact.adjust": True},
+RECORDED = 101
+STEP = 10
+"""Every so many of the recorded frames are compared: those that all frame rates have."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """One thing done otherwise than shipped.
+
+    Args:
+        keys: of the scene, overridden.
+        every: only every so many recorded frames are there.
+    """
+
+    keys: dict[str, Any] = field(default_factory=dict)
+    every: int = 1
+
+
+CHANGES: dict[str, Change] = {
+    "as shipped": Change(),
+    "coupled: points": Change({"contact.coupling": "points"}),
+    "released: adduction": Change({"contact.released": ["adduction"]}),
+    "filtered at 6 Hz": Change({"motion.cutoff_Hz": 6.0}),
+    "filtered at 2 Hz": Change({"motion.cutoff_Hz": 2.0}),
+    "filtered at 1 Hz": Change({"motion.cutoff_Hz": 1.0}),
+    "every 2nd frame": Change(every=2),
+    "every 5th frame": Change(every=5),
+    "every 10th frame": Change(every=10),
+    "patella solved": Change({"patella.motion": "solved"}),
+    "no wrapping": Change({"quadriceps.wrap": False, "patellar_ligament.wrap": False}),
+    "no friction": Change({"contact.friction": 0.0}),
+    "femoral adjustment": Change({"contact.adjust": True}),
 }
 COMPARED = ("force_total_N", "quadriceps_N", "medial_force_N", "medial_peak_pressure_MPa")
+DERIVATIVES = ("velocity", "acceleration")
+HEADS = {
+    "force_total_N": "force",
+    "peak_force": "peak force",
+    "quadriceps_N": "quadriceps",
+    "medial_force_N": "medial",
+    "medial_peak_pressure_MPa": "peak p",
+    "velocity": "flexion rate",
+    "acceleration": "its rate",
+}
 CLOCKS = ("query_seconds", "body_seconds", "contact_seconds")
-
-Progress = Callable[[Sequence[str]], Iterable[str]]
 
 
 @dataclass(frozen=True)
@@ -43,7 +80,8 @@ class BodyRow:
         status: "ok", or why there is nothing.
         prepare_seconds: of the whole run outside the frames.
         frame_seconds: per frame, median.
-        changed: column -> largest change, relative to the largest value as shipped.
+        changed: column, "peak_force", or derivative of flexion -> largest change over the
+            frames, relative to the largest value as shipped.
     """
 
     name: str
@@ -53,55 +91,94 @@ class BodyRow:
     changed: dict[str, float] | None = None
 
 
-def run_body_trade(
-    scene: Path = SHIPPED_SCENE, progress: Progress = lambda names: names
-) -> list[BodyRow]:
-    """Run a scene with one thing changed at a time.
+def run_body_trade(kept: KeptRows | None = None) -> Iterator[BodyRow]:
+    """Run the shipped knee bend with one thing changed at a time; yield the rows.
 
     Args:
-        scene: a scene with contact, muscles and patella.
-        progress: wraps the names of the changes.
+        kept: rows of an earlier study that are taken as they are; new ones are added.
     """
-    rows: list[BodyRow] = []
-    base: Results | None = None
-    for name in progress(list(CHANGES)):
-        try:
-            start = clock.perf_counter()
-            found = simulate(load_scene(scene, CHANGES[name]), frames=FRAMES)
-            whole = clock.perf_counter() - start
-        except TkambError as error:
-            rows.append(BodyRow(name, str(error)))
-            continue
-        base = base or found
-        rows.append(_row(name, found, base, whole))
-    return rows
+    base: _Run | None = None
+    for name, change in CHANGES.items():
+        key = row_key("body", name, asdict(change))
+        found = kept.get(key) if kept else None
+        if found is None:
+            base = base or _run(CHANGES["as shipped"])
+            found = asdict(_row(name, change, base))
+            if kept:
+                kept.put(key, found)
+        yield BodyRow(**found)
 
 
-def _row(name: str, found: Results, base: Results, whole: float) -> BodyRow:
-    seconds = sum(np.nan_to_num(found[column]) for column in CLOCKS)
+@dataclass(frozen=True, eq=False)
+class _Run:
+    results: Results
+    derivatives: dict[str, Array]
+    seconds: float
+
+
+def _run(change: Change) -> _Run:
+    with tempfile.TemporaryDirectory() as folder:
+        path = copied_scene(Path(folder))
+        if change.every > 1:
+            thin_out(Path(folder), change.every)
+        frames = slice(0, None, STEP // change.every)
+        start = clock.perf_counter()
+        scene = load_scene(path, change.keys)
+        results = simulate(scene, frames=frames)
+        seconds = clock.perf_counter() - start
+        motion = load_case(scene).motion
+        derivatives = {name: getattr(motion, name)[frames, 5] for name in DERIVATIVES}
+    return _Run(results, derivatives, seconds)
+
+
+def _row(name: str, change: Change, base: _Run) -> BodyRow:
+    try:
+        run = base if change == Change() else _run(change)
+    except TkambError as error:
+        return BodyRow(name, str(error))
+    found = run.results
+    spent = sum(np.nan_to_num(found[column]) for column in CLOCKS)
     failed = sum(status.startswith("failed") for status in found.status)
-    changed = {column: _change(found[column], base[column]) for column in COMPARED}
     status = f"{failed} of {len(found)} frames failed" if failed else "ok"
-    spent = float(np.sum(seconds))
-    return BodyRow(name, status, whole - spent, float(np.median(seconds)), changed)
+    outside = run.seconds - float(np.sum(spent))
+    return BodyRow(name, status, outside, float(np.median(spent)), _changed(run, base))
 
 
-def _change(found: Any, base: Any) -> float:
+def _changed(run: _Run, base: _Run) -> dict[str, float]:
+    found, before = run.results, base.results
+    changed = {column: _change(found[column], before[column]) for column in COMPARED}
+    peaks = [float(np.nanmax(results["force_total_N"])) for results in (found, before)]
+    changed["peak_force"] = abs(peaks[0] / peaks[1] - 1)
+    for name in DERIVATIVES:
+        changed[name] = _change(run.derivatives[name], base.derivatives[name])
+    return changed
+
+
+def _change(found: Array, base: Array) -> float:
     known = np.isfinite(found) & np.isfinite(base)
     if not known.any():
         return float("nan")
     return float(np.abs(found - base)[known].max() / np.abs(base[known]).max())
 
 
+def body_json(rows: Sequence[BodyRow]) -> str:
+    """Return the rows as JSON text."""
+    return json.dumps([asdict(row) for row in rows], indent=1) + "\n"
+
+
 def body_table(rows: Sequence[BodyRow]) -> list[str]:
     """Return the table's lines."""
-    head = " ".join(f"{name.rsplit('_', 1)[0].replace('_', ' '):>20s}" for name in COMPARED)
-    lines = [f"{'knee bend with':22s} {'ms per frame':>12s} {'prepare s':>9s} {head}"]
+    head = " ".join(f"{text:>12s}" for text in HEADS.values())
+    lines = [f"{'knee bend':20s} {'ms per frame':>12s} {'else s':>6s} {head}"]
     for row in rows:
-        start = f"{row.name:22s} {1e3 * row.frame_seconds:12.1f} {row.prepare_seconds:9.2f}"
+        start = f"{row.name:20s} {1e3 * row.frame_seconds:12.1f} {row.prepare_seconds:6.2f}"
         if row.changed is None:
-            lines.append(f"{row.name:22s} {row.status}")
+            lines.append(f"{row.name:20s} {row.status}")
             continue
-        shares = " ".join(f"{100 * row.changed[name]:18.2f} %" for name in COMPARED)
+        shares = " ".join(f"{100 * row.changed[name]:10.2f} %" for name in HEADS)
         lines.append(f"{start} {shares}" + ("" if row.status == "ok" else f"  {row.status}"))
-    return [*lines, "largest change over the frames, of the largest value as shipped"]
+    return [
+        *lines,
+        "largest change over the frames, of the largest value as shipped; flexion rate and its "
+        "rate: its first and second derivative",
+    ]

@@ -4,7 +4,6 @@ import argparse
 import json
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,41 +16,54 @@ def add_tradeoff(commands: Any) -> None:
     tradeoff.add_argument(
         "scene", type=Path, nargs="?", metavar="SCENE", help="measure on your own scene too"
     )
-    tradeoff.add_argument("--quick", action="store_true", help="two cases, 2 mm, within a minute")
+    size = tradeoff.add_mutually_exclusive_group()
+    size.add_argument("--quick", action="store_true", help="two cases, 2 mm, within a minute")
+    size.add_argument("--full", action="store_true", help="every setting on every case")
     tradeoff.add_argument("--peer", choices=("calculix",), help="another program, side by side")
     tradeoff.add_argument("--recompute", action="store_true", help="the references too (slow)")
+    tradeoff.add_argument("--resume", action="store_true", help="go on with a stopped study")
     tradeoff.add_argument("--out", type=Path, default=Path("out/tradeoff"), metavar="DIR")
     tradeoff.add_argument("--json", action="store_true")
     tradeoff.set_defaults(command=_tradeoff)
 
 
 def _tradeoff(options: argparse.Namespace) -> int:
-    from tkamb.output.atomic import claim_directory, replaced_file, write_text
+    from tkamb.output.atomic import claim_directory, write_text
     from tkamb.studies import tradeoff as study
-    from tkamb.studies.body_trade import body_table, run_body_trade
-    from tkamb.studies.cases import SHIPPED_SCENE
-    from tkamb.studies.tradeoff_report import picture, recommendations, table
+    from tkamb.studies.advice import comparison, recommendations
+    from tkamb.studies.body_trade import CHANGES, BodyRow, body_json, body_table, run_body_trade
+    from tkamb.studies.kept_rows import KeptRows
+    from tkamb.studies.matrix import expected_seconds, jobs
+    from tkamb.studies.tradeoff_report import picture, table
 
-    jobs = study.jobs(options.quick, options.scene)
+    wanted = jobs(options.quick, options.scene, options.full)
     directory = claim_directory(options.out)
-    cases = study.cases_of(jobs)
+    cases = study.cases_of(wanted)
     references = study.references_for(cases, options.recompute, _announce)
-    rows = study.run_tradeoff(jobs, references, _progress("model"))
-    if options.peer:
-        from tkamb.studies.calculix import peer_rows
-
-        rows = study.with_fronts([*rows, *peer_rows(cases, references)])
-    text = study.as_json(rows)
-    lines = [*table(rows, references), "", *recommendations(rows)]
-    if not options.quick and SHIPPED_SCENE.exists():
-        body = run_body_trade(progress=_progress("run"))
+    kept = KeptRows(directory, options.resume)
+    rows, whole = gather(
+        study.run_tradeoff(wanted, references, kept), expected_seconds(wanted, cases)
+    )
+    found = len(rows)
+    if whole and options.peer:
+        more, whole = gather(study.run_peer(cases, references, kept), [1.0] * len(cases))
+        rows += more
+    body: list[BodyRow] = []
+    planned = 0
+    if whole and not options.quick:
+        planned = len(CHANGES)
+        body, whole = gather(run_body_trade(kept), [1.0] * planned)
+    rows = study.with_fronts(rows)
+    lines = [*unfinished(found + len(body), len(wanted) + planned), *table(rows, references)]
+    lines += ["", *comparison(rows), "", *recommendations(rows)]
+    if body:
         lines += ["", *body_table(body)]
-        write_text(directory / "body.json", json.dumps([asdict(row) for row in body], indent=1))
-    write_text(directory / "tradeoff.json", text + "\n")
-    write_text(directory / "tradeoff.txt", "\n".join(lines) + "\n")
-    with replaced_file(directory / "tradeoff.png") as temporary:
-        picture(rows).savefig(temporary, format="png", dpi=150)
+        write_text(directory / "body.json", body_json(body))
+    text = study.as_json(rows)
+    _write(directory, "tradeoff", text, lines, picture(rows) if rows else None)
     print(text if options.json else "\n".join([*lines, f"picture: {directory / 'tradeoff.png'}"]))
+    if not whole:
+        raise KeyboardInterrupt(_goes_on(directory))
     return 0 if any(row.errors for row in rows) else 1
 
 
@@ -67,7 +79,7 @@ def add_stability(commands: Any) -> None:
 
 
 def _stability(options: argparse.Namespace) -> int:
-    from tkamb.output.atomic import claim_directory, replaced_file, write_text
+    from tkamb.output.atomic import claim_directory
     from tkamb.studies import stability as study
     from tkamb.studies.kept_rows import KeptRows
     from tkamb.studies.stability_report import picture, table
@@ -75,28 +87,23 @@ def _stability(options: argparse.Namespace) -> int:
     directory = claim_directory(options.out)
     cases = study.stability_cases(options.quick)
     kept = KeptRows(directory, options.resume)
-    verdicts, whole = gather(
-        study.run_stability(cases, kept=kept, workers=max(1, options.workers)), len(cases), "case"
-    )
+    judged = study.run_stability(cases, kept=kept, workers=max(1, options.workers))
+    verdicts, whole = gather(judged, [1.0] * len(cases))
     text = json.dumps(study.summary(verdicts), indent=1, allow_nan=False)
     lines = [*unfinished(len(verdicts), len(cases)), *table(verdicts)]
-    write_text(directory / "stability.json", text + "\n")
-    write_text(directory / "stability.txt", "\n".join(lines) + "\n")
-    with replaced_file(directory / "stability.png") as temporary:
-        picture(verdicts).savefig(temporary, format="png", dpi=150)
+    _write(directory, "stability", text, lines, picture(verdicts) if verdicts else None)
     print(text if options.json else "\n".join([*lines, f"picture: {directory / 'stability.png'}"]))
     if not whole:
-        raise KeyboardInterrupt(_goes_on(len(verdicts), len(cases), directory))
+        raise KeyboardInterrupt(_goes_on(directory))
     return 1 if any(v.kind in study.FAILED_KINDS for v in verdicts) else 0
 
 
-def gather(found: Iterable[T], total: int, unit: str) -> tuple[list[T], bool]:
+def gather(found: Iterable[T], costs: Sequence[float]) -> tuple[list[T], bool]:
     """Collect rows under a progress bar with the time left.
 
     Args:
         found: the rows as they come.
-        total: how many there will be.
-        unit: what a row is called.
+        costs: how long each is expected to take, in any unit.
 
     Returns:
         The rows, and whether they are all: Ctrl-C ends the collecting, not the command.
@@ -104,11 +111,16 @@ def gather(found: Iterable[T], total: int, unit: str) -> tuple[list[T], bool]:
     from tqdm import tqdm
 
     rows: list[T] = []
-    try:
-        for row in tqdm(found, total=total, unit=unit, disable=None):
-            rows.append(row)
-    except KeyboardInterrupt:
-        return rows, False
+    look = "{desc} {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
+    with tqdm(total=sum(costs), bar_format=look, smoothing=0.05, disable=None) as bar:
+        bar.set_description_str(f"0 of {len(costs)} rows")
+        try:
+            for row, cost in zip(found, costs, strict=False):
+                rows.append(row)
+                bar.set_description_str(f"{len(rows)} of {len(costs)} rows", refresh=False)
+                bar.update(cost)
+        except KeyboardInterrupt:
+            return rows, False
     return rows, True
 
 
@@ -117,17 +129,19 @@ def unfinished(count: int, total: int) -> list[str]:
     return [] if count == total else [f"stopped: {count} of {total} rows", ""]
 
 
-def _goes_on(count: int, total: int, directory: Path) -> str:
-    return f"{count} of {total} rows are in {directory}; --resume goes on from there"
+def _goes_on(directory: Path) -> str:
+    return f"what was finished is in {directory}; --resume goes on from there"
 
 
-def _progress(unit: str) -> Any:
-    from tqdm import tqdm
+def _write(directory: Path, name: str, text: str, lines: list[str], figure: Any) -> None:
+    """Write a study's JSON, table and picture, each whole or not at all."""
+    from tkamb.output.atomic import replaced_file, write_text
 
-    def wrapped(items: Sequence[Any]) -> Any:
-        return tqdm(items, unit=unit, disable=None)
-
-    return wrapped
+    write_text(directory / f"{name}.json", text + "\n")
+    write_text(directory / f"{name}.txt", "\n".join(lines) + "\n")
+    if figure is not None:
+        with replaced_file(directory / f"{name}.png") as temporary:
+            figure.savefig(temporary, format="png", dpi=150)
 
 
 def _announce(line: str) -> None:

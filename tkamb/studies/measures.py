@@ -1,10 +1,12 @@
 """One row of the trade-off: a model on a case, timed, in a process of its own.
 
 `python -m tkamb.studies.measures` reads a `Job` as JSON from standard input and prints the
-measure as JSON, so that its peak memory is its own and a crash or a hang is a row too.
+measure as JSON, so that its peak memory is its own and a crash or a hang is a row too. The
+process computes with one thread: timings repeat, and are those of a worker among others.
 """
 
 import json
+import os
 import subprocess
 import sys
 import time as clock
@@ -20,11 +22,14 @@ from tkamb.errors import TkambError
 from tkamb.studies.cases import StudyCase, study_case
 from tkamb.studies.quantities import Quantities, quantities, raster_map
 
-LONGEST_SECONDS = 600.0
+LONGEST_SECONDS = 300.0
 """A job that takes longer is stopped and says so."""
-REPEATS = 5
-ENOUGH_SECONDS = 8.0
-"""No more repeats once this much was measured."""
+REPEATS = 3
+"""Of preparing and pressing for the first time; of warm presses at least."""
+WARM_PRESSES = 7
+ENOUGH_SECONDS = 3.0
+"""No more repeats once this much was measured; warm presses: `REPEATS` in any case."""
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
@@ -90,6 +95,8 @@ def measure_apart(job: Job, longest: float = LONGEST_SECONDS) -> Measure:
             text=True,
             timeout=longest,
             check=False,
+            env=os.environ | ONE_THREAD,
+            start_new_session=True,
         )
     except subprocess.TimeoutExpired:
         return Measure(f"stopped after {longest:g} s")
@@ -102,9 +109,8 @@ def measure(job: Job) -> Measure:
     """Measure in this process."""
     from tkamb.press.press import peak_rss
 
-    case = study_case(job.case, Path(job.scene) if job.scene else None)
     model = _model(job)
-    (prepare, cold), (state, result) = _first(model, case)
+    (prepare, cold), (case, state, result) = _first(model, job)
     if result.status is not ContactStatus.OK:
         return Measure(f"{result.status.value}: {'; '.join(result.flags)}", prepare, cold)
     return Measure(
@@ -128,23 +134,29 @@ def _model(job: Job) -> ContactModel:
 
 
 def _first(
-    model: ContactModel, case: StudyCase
-) -> tuple[tuple[float, float], tuple[Any, ContactResult]]:
-    """Return the median seconds of prepare and first press, and the last of both."""
+    model: ContactModel, job: Job
+) -> tuple[tuple[float, float], tuple[StudyCase, Any, ContactResult]]:
+    """Return the median seconds of prepare and first press, and the last of both.
+
+    The bodies are made anew each time: nothing that is remembered of them makes it faster.
+    """
     prepares: list[float] = []
     colds: list[float] = []
+    state: Any
     while True:
+        state = None
+        case = study_case(job.case, Path(job.scene) if job.scene else None)
         prepare, state = _timed(model.prepare, case.pair)
         cold, result = _timed(model.press, state, case.load, case.pose)
         prepares.append(prepare)
         colds.append(cold)
-        if len(colds) == REPEATS or sum(prepares) + sum(colds) > ENOUGH_SECONDS / 2:
-            return (median(prepares), median(colds)), (state, result)
+        if len(colds) == REPEATS or sum(prepares) + sum(colds) > ENOUGH_SECONDS:
+            return (median(prepares), median(colds)), (case, state, result)
 
 
 def _warm(model: ContactModel, state: Any, case: StudyCase, guess: ContactResult) -> float:
     seconds: list[float] = []
-    while len(seconds) < 2 * REPEATS and sum(seconds) < ENOUGH_SECONDS:
+    while len(seconds) < REPEATS or (len(seconds) < WARM_PRESSES and sum(seconds) < ENOUGH_SECONDS):
         pose = case.nearby(len(seconds) + 1)
         spent, guess = _timed(model.press, state, case.load, pose, guess)
         seconds.append(spent)

@@ -8,9 +8,7 @@ is known without a second solver:
 - meshes: a damaged mesh is refused in one line, or gives the intact one's answer.
 """
 
-import csv
 import math
-import shutil
 import tempfile
 import time as clock
 import tomllib
@@ -23,9 +21,11 @@ import numpy as np
 import trimesh
 
 from tkamb.errors import TkambError
+from tkamb.geometry.frames import Array
 from tkamb.results import Results
 from tkamb.run.status import FAILED
 from tkamb.studies.cases import SHIPPED_SCENE
+from tkamb.studies.recordings import change_recording, copied_scene, stretch_time
 from tkamb.studies.verdict import WRONG, Verdict
 
 FRAMES = slice(20, 101, 40)
@@ -74,8 +74,7 @@ def judge_scene(extreme: SceneExtreme) -> Verdict:
     """Run an extreme and check what it must obey."""
     start = clock.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        scene = Path(folder) / "scene.toml"
-        shutil.copytree(SHIPPED_SCENE.parent, folder, dirs_exist_ok=True)
+        scene = copied_scene(Path(folder))
         try:
             overrides = _drive(extreme, Path(folder))
             results = _run(scene, overrides)
@@ -105,7 +104,7 @@ def _run(scene: Path, overrides: dict[str, Any]) -> Results:
 def _drive(extreme: SceneExtreme, folder: Path) -> dict[str, Any]:
     """Change the copied scene's files; return the keys to override."""
     if extreme.kind == "time":
-        _stretch_time(folder, extreme.value)
+        stretch_time(folder, extreme.value)
     elif extreme.kind == "noise":
         _shake(folder, extreme.value)
     elif extreme.kind == "friction":
@@ -129,7 +128,7 @@ def _apart(extreme: SceneExtreme, results: Results, folder: Path) -> float:
     apart = float(np.max(np.abs(carried - demanded) / np.abs(demanded)))
     if extreme.kind == "time":
         once = _run(SHIPPED_SCENE, {})["force_si_N"]
-        _stretch_time(folder, SLOW / extreme.value)
+        stretch_time(folder, SLOW / extreme.value)
         slow = _run(folder / "scene.toml", {})["force_si_N"]
         inertia = (once - slow) / (1.0 - 1.0 / SLOW**2)
         law = once - inertia + inertia / extreme.value**2
@@ -141,31 +140,17 @@ def _apart(extreme: SceneExtreme, results: Results, folder: Path) -> float:
     return apart
 
 
-def _stretch_time(folder: Path, scale: float) -> None:
-    for name in ("motion.csv", "tibia.csv", "ground_reaction.csv"):
-        head, rows = _table(folder / name)
-        rows[:, head.index("time_s")] *= scale
-        _write_table(folder / name, head, rows)
-
-
 def _shake(folder: Path, noise: float) -> None:
     """Add noise of that many mm and deg to the knee's coordinates."""
-    head, rows = _table(folder / "motion.csv")
-    rng = np.random.default_rng(160)
-    knee = [head.index(name) for name in head if name.startswith(("flex", "add", "ax", "ap", "ml"))]
-    rows[:, knee] += rng.normal(0.0, noise, (len(rows), len(knee)))
-    _write_table(folder / "motion.csv", head, rows)
 
+    def shaken(head: list[str], rows: Array) -> Array:
+        rng = np.random.default_rng(160)
+        starts = ("flex", "add", "ax", "ap", "ml")
+        knee = [head.index(name) for name in head if name.startswith(starts)]
+        rows[:, knee] += rng.normal(0.0, noise, (len(rows), len(knee)))
+        return rows
 
-def _table(path: Path) -> tuple[list[str], Any]:
-    with open(path, encoding="utf-8", newline="") as file:
-        lines = list(csv.reader(file))
-    return lines[0], np.array(lines[1:], float)
-
-
-def _write_table(path: Path, head: list[str], rows: Any) -> None:
-    with open(path, "w", encoding="utf-8", newline="") as file:
-        csv.writer(file).writerows([head, *([repr(float(v)) for v in row] for row in rows)])
+    change_recording(folder / "motion.csv", shaken)
 
 
 def _damage(path: Path, defect: str) -> None:

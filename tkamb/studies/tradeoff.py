@@ -1,14 +1,16 @@
 """Speed against accuracy: every contact model on every case, against converged references."""
 
 import json
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tkamb.contact.registry import contact_names
-from tkamb.studies.cases import StudyCase, case_names, study_case
+from tkamb.errors import ComputationError, InputError
+from tkamb.studies.cases import StudyCase, study_case
 from tkamb.studies.front import on_front
+from tkamb.studies.kept_rows import KeptRows, row_key
 from tkamb.studies.measures import Job, Measure, measure_apart
 from tkamb.studies.quantities import errors, map_error, raster_of
 from tkamb.studies.references import (
@@ -20,20 +22,10 @@ from tkamb.studies.references import (
     write_references,
 )
 
-QUICK_CASES = ("sphere", "two condyles")
-FULL_GRIDS_MM = {"hertz": (1.0,), "lattice-source": (2.0,)}
-GRIDS_MM = (2.0, 1.0)
-QUICK_GRIDS_MM = (2.0,)
-VARIANTS: dict[str, tuple[dict[str, Any], ...]] = {
-    "lattice": ({}, {"tolerance": 1e-2}, {"tolerance": 1e-5}),
-    "fe": ({}, {"newton": True}),
-}
-"""Options beside the default ones; the slow ones on the coarsest grid only."""
 FRONT_ERRORS = ("approach", "force", "peak_pressure")
 """The largest of these errors is the one of the front."""
-KEYS = ("approach", "force", "mean_pressure", "peak_pressure", "area")
-
-Progress = Callable[[Sequence[Job]], Iterable[Job]]
+KEYS = ("approach", "force", "mean_pressure", "peak_pressure", "area", "map")
+TIMES = ("prepare_seconds", "cold_seconds", "warm_seconds", "peak_rss_MB")
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +35,7 @@ class Row:
     Args:
         job: what was measured.
         measure: times, memory, values.
-        errors: relative, against the reference: `KEYS` and "map"; empty if it failed.
+        errors: relative, against the reference: `KEYS`; empty if it failed.
         floor: largest relative uncertainty of the reference among `FRONT_ERRORS`.
         on_front: no other model of the case beats it.
     """
@@ -69,43 +61,47 @@ class Row:
             "contact": self.job.label,
             "resolution_mm": self.job.resolution_mm,
         }
-        for key in ("prepare_seconds", "cold_seconds", "warm_seconds", "peak_rss_MB"):
+        for key in TIMES:
             value = getattr(measure, key)
-            row[key] = value if value == value else None
-        row |= {f"error_{key}": self.errors.get(key) for key in KEYS}
-        return row | {"on_front": self.on_front}
+            row[key] = value if math.isfinite(value) else None
+        for key in KEYS:
+            value = self.errors.get(key, math.nan)
+            row[f"error_{key}"] = value if math.isfinite(value) else None
+        row |= {"on_front": self.on_front, "status": measure.status, "reference_known": self.floor}
+        return row | {"values": measure.values}
 
 
-def jobs(quick: bool, scene: Path | None = None) -> list[Job]:
-    """Return what is measured, case by case."""
-    cases = QUICK_CASES if quick else case_names(scene)
-    given = None if scene is None else str(scene)
-    found = []
-    for case in cases:
-        for contact in contact_names():
-            grids = QUICK_GRIDS_MM if quick else FULL_GRIDS_MM.get(contact, GRIDS_MM)
-            if quick and contact == "lattice-source":
-                continue
-            for grid in grids:
-                for options in VARIANTS.get(contact, ({},)):
-                    if not options or (grid == max(GRIDS_MM) and not quick):
-                        found.append(Job(case, contact, grid, options, given))
-    return found
+def row_of(content: dict[str, Any]) -> Row:
+    """Return the row that `as_dict` made."""
+
+    def number(key: str) -> float:
+        return math.nan if content[key] is None else float(content[key])
+
+    job = Job(content["case"], content["contact"], content["resolution_mm"])
+    prepare, cold, warm, memory = map(number, TIMES)
+    measure = Measure(content["status"], prepare, cold, warm, memory, values=content["values"])
+    errors = {} if measure.status != "ok" else {key: number(f"error_{key}") for key in KEYS}
+    return Row(job, measure, errors, content["reference_known"], content["on_front"])
 
 
 def run_tradeoff(
-    wanted: Sequence[Job],
-    references: dict[str, Reference],
-    progress: Progress = lambda jobs: jobs,
-) -> list[Row]:
-    """Measure and compare.
+    wanted: Sequence[Job], references: dict[str, Reference], kept: KeptRows | None = None
+) -> Iterator[Row]:
+    """Measure and compare; yield the rows as they come, no front marked yet.
 
     Args:
         wanted: what to measure.
         references: case name -> converged answer.
-        progress: wraps the jobs, a progress bar for example.
+        kept: rows of an earlier study that are taken as they are; new ones are added.
     """
-    return with_fronts([_row(job, references[job.case]) for job in progress(wanted)])
+    for job in wanted:
+        reference = references[job.case]
+        key = row_key("tradeoff", asdict(job), reference.hash, reference.values)
+        found = kept.get(key) if kept else None
+        measured = Measure(**found) if found else measure_apart(job)
+        if kept and not found:
+            kept.put(key, asdict(measured))
+        yield compared(job, measured, reference)
 
 
 def with_fronts(rows: Sequence[Row]) -> list[Row]:
@@ -119,14 +115,39 @@ def with_fronts(rows: Sequence[Row]) -> list[Row]:
     return marked
 
 
-def _row(job: Job, reference: Reference) -> Row:
-    found = measure_apart(job)
+def run_peer(
+    cases: Iterable[StudyCase], references: dict[str, Reference], kept: KeptRows | None = None
+) -> Iterator[Row]:
+    """Yield CalculiX's rows on the cases that it can do; one that fails is a row too.
+
+    Raises:
+        InputError: CalculiX is not installed.
+    """
+    from tkamb.studies.calculix import peer_rows
+
+    for case in cases:
+        reference = references[case.name]
+        key = row_key("calculix", case.hash, reference.values)
+        found = kept.get(key) if kept else None
+        if found is None:
+            try:
+                rows = peer_rows([case], references)
+            except ComputationError as error:
+                rows = [Row(Job(case.name, "calculix", 2.0), Measure(str(error)), {}, 0.0)]
+            found = {"rows": [[asdict(row.job), asdict(row.measure)] for row in rows]}
+            if kept:
+                kept.put(key, found)
+        for job, measured in found["rows"]:
+            yield compared(Job(**job), Measure(**measured), reference)
+
+
+def compared(job: Job, found: Measure, reference: Reference) -> Row:
+    """Return the row of what was measured, with its errors."""
     floor = floor_of(reference)
     if found.status != "ok":
         return Row(job, found, {}, floor)
-    compared = errors(found.values, reference.values)
-    apart = map_error(raster_of(found.map), reference.raster)
-    return Row(job, found, compared | {"map": apart}, floor)
+    apart = map_error(raster_of(found.map), reference.raster) if found.map else math.nan
+    return Row(job, found, errors(found.values, reference.values) | {"map": apart}, floor)
 
 
 def floor_of(reference: Reference) -> float:
@@ -171,3 +192,15 @@ def cases_of(wanted: Sequence[Job]) -> list[StudyCase]:
 def as_json(rows: Sequence[Row]) -> str:
     """Return the rows as the JSON text of `tkamb tradeoff --json`."""
     return json.dumps([row.as_dict() for row in rows], indent=1, allow_nan=False)
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Return the rows of a tradeoff.json.
+
+    Raises:
+        InputError: there is none, or it is something else.
+    """
+    try:
+        return [row_of(content) for content in json.loads(path.read_text(encoding="utf-8"))]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"is no table of a trade-off ({error})", path) from None

@@ -1,18 +1,16 @@
-"""The trade-off for a reader: table, recommendation, picture."""
+"""The trade-off for a reader: table and picture."""
 
 from collections.abc import Sequence
-from statistics import median
 
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tkamb.output.style import CYCLE, GREY, new_figure, settings
+from tkamb.studies.front import NOISE
 from tkamb.studies.references import Reference
-from tkamb.studies.tradeoff import FRONT_ERRORS, Row
+from tkamb.studies.tradeoff import FRONT_ERRORS, KEYS, Row
 
-LIMITS = {"peak_pressure": (0.02, 0.05, 0.10), "approach": (0.05,), "force": (0.03,)}
-"""Errors for which the fastest model is named."""
 MARKERS = "osD^vPX*<>"
 
 
@@ -31,7 +29,8 @@ def table(rows: Sequence[Row], references: dict[str, Reference]) -> list[str]:
         lines.append("")
     names = ", ".join(name.replace("_", " ") for name in FRONT_ERRORS)
     lines.append("* on the Pareto front of warm time against the largest of the errors in")
-    return [*lines, f"  {names}; medians of time within 20 % count as equal."]
+    tie = f"medians of time within {100 * (NOISE - 1):.0f} % count as equal"
+    return [*lines, f"  {names}; {tie}. One thread."]
 
 
 def _line(row: Row) -> str:
@@ -42,8 +41,7 @@ def _line(row: Row) -> str:
     times = (
         f"{measure.prepare_seconds:9.3f} {measure.cold_seconds:8.4f} {measure.warm_seconds:8.4f}"
     )
-    keys = ("approach", "force", "mean_pressure", "peak_pressure", "area", "map")
-    shares = [f"{100 * row.errors[key]:6.2f}%" for key in keys]
+    shares = [f"{100 * row.errors[key]:6.2f}%" for key in KEYS]
     return f"{start} {times} {measure.peak_rss_MB:6.0f} {shares[0]:>9s} {' '.join(shares[1:])}"
 
 
@@ -55,28 +53,6 @@ def _uncertainty(reference: Reference) -> str:
         worst = max(reference.uncertainty[name] for name in names)
         found.append(f"{key.replace('_', ' ')} {100 * worst / scale:.1f} %")
     return ", ".join(found)
-
-
-def recommendations(rows: Sequence[Row]) -> list[str]:
-    """Return a sentence for each limit: the fastest model that keeps it in every case."""
-    lines = []
-    for key, limits in LIMITS.items():
-        for limit in limits:
-            what = f"for at most {100 * limit:g} % in {key.replace('_', ' ')}"
-            lines.append(f"{what}, the fastest is {_fastest(rows, key, limit)}")
-    return lines
-
-
-def _fastest(rows: Sequence[Row], key: str, limit: float) -> str:
-    cases = {row.job.case for row in rows}
-    found = []
-    for setting in dict.fromkeys((row.job.label, row.job.resolution_mm) for row in rows):
-        some = [r for r in rows if (r.job.label, r.job.resolution_mm) == setting and r.errors]
-        kept = {row.job.case for row in some if row.errors[key] <= limit}
-        if kept == cases:
-            warm = median(row.measure.warm_seconds for row in some)
-            found.append((warm, f"{setting[0]} at {setting[1]:g} mm ({1e3 * warm:.3g} ms warm)"))
-    return min(found)[1] if found else "none of these: no setting keeps it in every case"
 
 
 def picture(rows: Sequence[Row]) -> Figure:
