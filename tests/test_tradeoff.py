@@ -18,7 +18,7 @@ from tkamb.studies.advice import comparison, recommendations
 from tkamb.studies.body_trade import CHANGES, body_table, run_body_trade
 from tkamb.studies.cases import case_names, study_case
 from tkamb.studies.elastic_layer import sphere_on_layer
-from tkamb.studies.front import NOISE, on_front
+from tkamb.studies.front import NOISE, moved, on_front
 from tkamb.studies.kept_rows import KeptRows
 from tkamb.studies.measures import Job, Measure, measure, measure_apart
 from tkamb.studies.quantities import common_limit, errors, map_error, quantities, raster_map
@@ -146,6 +146,14 @@ def test_the_front_is_blind_to_noise_in_time():
     for point in changed:
         near = [t for t, e in points if (t, e) != point and 1 / 1.3 < t / point[0] < 1.3]
         assert near, "only pairs within the noise may change places"
+
+
+def test_a_move_on_the_front_is_excused_by_a_tie_alone():
+    points = [(1.0, 0.1), (1.3, 0.05), (9.0, 0.01)]
+    assert on_front(points) == [True, True, True]
+    assert moved(points, [(1.0, 0.1), (1.1, 0.05), (9.0, 0.01)]) == []
+    assert moved(points, [(1.0, 0.1), (0.5, 0.05), (9.0, 0.01)]) == [0]
+    assert moved(points, [(1.0, 0.1), (1.4, 0.05), (7.0, 0.01)]) == []
 
 
 def test_a_measure_in_a_process_of_its_own():

@@ -105,9 +105,15 @@ def comparison(rows: Sequence[Row]) -> list[str]:
         return []
     own = by_label[DEFAULT]
     where = "is" if own.on_front else "is not"
+    front = [
+        f"{row.job.resolution_mm:g}"
+        for row in rows
+        if row.job.case == COMPARED_ON and row.job.label == DEFAULT and row.on_front
+    ]
     lines = [
         f"{COMPARED_ON}, 2000 N, nonlinear, {COMPARED_AT_MM:g} mm: {DEFAULT} takes "
-        f"{1e3 * own.measure.warm_seconds:.3g} ms a position (warm) and {where} on the front"
+        f"{1e3 * own.measure.warm_seconds:.3g} ms a position (warm) and {where} on the front; "
+        f"its cell sizes on the front: {', '.join(front) or 'none'} mm"
     ]
     for label, row in by_label.items():
         if label.startswith(("fe", "calculix")):

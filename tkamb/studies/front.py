@@ -15,6 +15,31 @@ def on_front(points: Sequence[tuple[float, float]]) -> list[bool]:
     return [not any(_beats(other, point) for other in points) for point in points]
 
 
+def moved(first: Sequence[tuple[float, float]], second: Sequence[tuple[float, float]]) -> list[int]:
+    """Return which points changed between on and off the front though no tie explains it.
+
+    A tie explains it when the two points of every pair that decides lie within the noise of each
+    other in one of the two measurements.
+
+    Args:
+        first: (seconds, error) of each point.
+        second: the same points, measured again.
+    """
+    found = []
+    marks = on_front(first), on_front(second)
+    for i, (before, after) in enumerate(zip(*marks, strict=True)):
+        points = first if after else second
+        deciding = [j for j in range(len(points)) if _beats(points[j], points[i])]
+        tied = all(_tied(first[i], first[j]) or _tied(second[i], second[j]) for j in deciding)
+        if before != after and not tied:
+            found.append(i)
+    return found
+
+
+def _tied(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    return max(one[0], other[0]) <= NOISE * min(one[0], other[0])
+
+
 def _beats(one: tuple[float, float], other: tuple[float, float]) -> bool:
     faster = one[0] * NOISE < other[0]
     not_slower = one[0] <= other[0] * NOISE
