@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from tkamb.case import load_case
-from tkamb.errors import TkambError
+from tkamb.errors import InputError, TkambError
 from tkamb.geometry.frames import Array
 from tkamb.results import Results
 from tkamb.scene import load_scene
@@ -65,8 +65,8 @@ HEADS = {
     "quadriceps_N": "quadriceps",
     "medial_force_N": "medial",
     "medial_peak_pressure_MPa": "peak p",
-    "velocity": "flexion rate",
-    "acceleration": "its rate",
+    "velocity": "velocity",
+    "acceleration": "acceleration",
 }
 CLOCKS = ("query_seconds", "body_seconds", "contact_seconds")
 
@@ -179,6 +179,18 @@ def body_table(rows: Sequence[BodyRow]) -> list[str]:
         lines.append(f"{start} {shares}" + ("" if row.status == "ok" else f"  {row.status}"))
     return [
         *lines,
-        "largest change over the frames, of the largest value as shipped; flexion rate and its "
-        "rate: its first and second derivative",
+        "largest change over the frames, of the largest value as shipped; of flexion:"
+        " velocity and acceleration",
     ]
+
+
+def read_body_rows(path: Path) -> list[BodyRow]:
+    """Return the rows of a body.json.
+
+    Raises:
+        InputError: there is none, or it is something else.
+    """
+    try:
+        return [BodyRow(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"is no table of a body's trade ({error})", path) from None

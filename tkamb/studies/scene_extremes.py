@@ -34,8 +34,9 @@ SLOW = 10.0
 """Times as slow as recorded: against it and the recorded motion, inertia is known."""
 NOISES = (1e-3, 1e-2, 0.1, 1.0)
 FRICTIONS = (0.0, 0.2, 0.6, 1.0)
-ARMS_MM = (-20.0, -30.0, -38.0, -45.0, -80.0)
-"""How far back the patellar ligament's insertion is moved: past the line of no moment arm."""
+ARMS_MM = (-20.0, -60.0, -90.0, -98.0, -101.0, -104.0, -108.0, -120.0)
+"""How far back the patellar ligament's insertion is moved, its line straight: to no moment arm (at
+-98 to -108, by flexion) and past it."""
 DEFECTS = ("hole", "flipped", "doubled", "sliver", "nan", "empty", "tiny")
 
 Check = Callable[[Results, Path], float]
@@ -82,7 +83,8 @@ def judge_scene(extreme: SceneExtreme) -> Verdict:
             apart = _apart(extreme, results, Path(folder))
         except TkambError as error:
             seconds = clock.perf_counter() - start
-            return Verdict(extreme.says, "run", "flagged", str(error), seconds=seconds)
+            reason = str(error).replace(f"{folder}/", "")
+            return Verdict(extreme.says, "run", "flagged", reason, seconds=seconds)
     words = sorted({status for status in results.status if status != "ok"})
     flags = "; ".join(words)
     if any(status.startswith(FAILED) for status in results.status):
@@ -113,7 +115,7 @@ def _drive(extreme: SceneExtreme, folder: Path) -> dict[str, Any]:
         content = tomllib.loads(SHIPPED_SCENE.read_text(encoding="utf-8"))
         x, y, z = content["patellar_ligament"]["distal"]["point_mm"]
         moved = {"link": "tibia", "point_mm": [x + extreme.value, y, z]}
-        return {"patellar_ligament.distal": moved}
+        return {"patellar_ligament.distal": moved, "patellar_ligament.wrap": False}
     else:
         name = "femoral_component" if extreme.kind == "femoral" else "insert"
         _damage(folder / f"{name}.stl", extreme.value)

@@ -1,4 +1,4 @@
-"""The trade-off as a block of Markdown between two markers, made from the study's JSON alone."""
+"""The trade-off as blocks of Markdown between two markers, made from the study's JSON alone."""
 
 from collections.abc import Sequence
 from statistics import median
@@ -12,9 +12,11 @@ from tkamb.studies.advice import (
     setting_of,
     warm_by_bodies,
 )
+from tkamb.studies.body_trade import HEADS as BODY_HEADS
+from tkamb.studies.body_trade import BodyRow
 from tkamb.studies.tradeoff import KEYS, Row
 
-BEGIN, END = "<!-- tradeoff:begin -->", "<!-- tradeoff:end -->"
+MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
 HEADS = ("approach", "condyle force", "mean p", "peak p", "area", "map L2")
 
 
@@ -70,14 +72,37 @@ def _percent(errors: Sequence[float]) -> str:
     return f"{100 * worst:.2g}" if worst == worst else "–"
 
 
-def with_block(text: str, lines: Sequence[str]) -> str:
+def body_block(rows: Sequence[BodyRow]) -> list[str]:
+    """Return the table of the body's trade."""
+    heads = " | ".join(f"{head} %" for head in BODY_HEADS.values())
+    lines = [
+        f"| knee bend | ms per frame | before the frames s | {heads} |",
+        "| --- |" + " ---: |" * (2 + len(BODY_HEADS)),
+    ]
+    for row in rows:
+        if row.changed is None:
+            lines.append(f"| {row.name} | {row.status} |" + " |" * (1 + len(BODY_HEADS)))
+            continue
+        shares = " | ".join(f"{100 * row.changed[key]:.2g}" for key in BODY_HEADS)
+        start = f"| {row.name} | {1e3 * row.frame_seconds:.3g} | {row.prepare_seconds:.2g}"
+        lines.append(f"{start} | {shares} |")
+    return lines
+
+
+def with_block(text: str, lines: Sequence[str], name: str = "tradeoff") -> str:
     """Return a page's text with the lines between its markers.
+
+    Args:
+        text: of the page.
+        lines: of the block.
+        name: of the markers, `<!-- name:begin -->` and `<!-- name:end -->`.
 
     Raises:
         InputError: the page does not hold both markers, in order and once.
     """
-    if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
-        raise InputError(f"does not hold {BEGIN} and {END} once each", "the page")
-    before, rest = text.split(BEGIN)
-    after = rest.split(END)[1]
-    return "\n".join([before + BEGIN, "", *lines, "", END + after])
+    begin, end = (marker.format(name) for marker in MARKERS)
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise InputError(f"does not hold {begin} and {end} once each", "the page")
+    before, rest = text.split(begin)
+    after = rest.split(end)[1]
+    return "\n".join([before + begin, "", *lines, "", end + after])
