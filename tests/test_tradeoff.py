@@ -15,7 +15,7 @@ from tkamb.errors import InputError
 from tkamb.scene import load_scene
 from tkamb.studies import matrix, tradeoff
 from tkamb.studies.advice import comparison, recommendations
-from tkamb.studies.body_trade import CHANGES, body_table, run_body_trade
+from tkamb.studies.body_trade import CHANGES, body_table, read_body_rows, run_body_trade
 from tkamb.studies.cases import case_names, study_case
 from tkamb.studies.elastic_layer import sphere_on_layer
 from tkamb.studies.front import NOISE, moved, on_front
@@ -30,7 +30,7 @@ from tkamb.studies.references import (
     reference_of,
     write_references,
 )
-from tkamb.studies.tradeoff_block import BEGIN, END, block, with_block
+from tkamb.studies.tradeoff_block import MARKERS, block, body_block, with_block
 from tkamb.studies.tradeoff_report import picture, table
 
 ROOT = Path(__file__).parents[1]
@@ -208,7 +208,7 @@ def test_a_limit_that_nothing_keeps_names_the_nearest():
 def test_the_comparison_says_what_was_measured_and_what_was_wanted():
     said = comparison(made_up_rows())
     assert "10 ms" in said[0] and "is on the front" in said[0]
-    assert "fe: 1e+03 ms, 100 times as long (wanted: 20, reached)" in said[1]
+    assert "fe: 1000 ms, 100 times as long (wanted: 20, reached)" in said[1]
     rows = [replace(row, measure=replace(row.measure, warm_seconds=0.02)) for row in made_up_rows()]
     assert "not reached" in comparison(rows)[1]
     peer = replace(rows[8], job=Job("two condyles", "calculix C3D8I", 2.0))
@@ -227,12 +227,22 @@ def test_rows_survive_their_json(tmp_path):
 
 
 def test_a_block_goes_between_its_markers_and_nowhere_else():
-    page = f"before\n{BEGIN}\nold\n{END}\nafter\n"
+    begin, end = (marker.format("tradeoff") for marker in MARKERS)
+    page = f"before\n{begin}\nold\n{end}\nafter\n"
     filled = with_block(page, ["| a |", "| b |"])
-    assert filled == f"before\n{BEGIN}\n\n| a |\n| b |\n\n{END}\nafter\n"
+    assert filled == f"before\n{begin}\n\n| a |\n| b |\n\n{end}\nafter\n"
     assert with_block(filled, ["| a |", "| b |"]) == filled
     with pytest.raises(InputError, match="once each"):
         with_block("no markers", [])
+
+
+def test_the_pages_tables_are_the_study_s():
+    for page, lines, name in (
+        ("README.md", block(tradeoff.read_rows(ROOT / "docs" / "tradeoff.json")), "tradeoff"),
+        ("docs/studies.md", body_block(read_body_rows(ROOT / "docs" / "body.json")), "body"),
+    ):
+        text = (ROOT / page).read_text(encoding="utf-8")
+        assert with_block(text, lines, name) == text, f"{page}: run scripts/make_tradeoff_table"
 
 
 def test_the_default_matrix_leaves_out_only_repeats():

@@ -34,8 +34,10 @@ def setting_of(row: Row) -> Setting:
 
 
 def bodies_of(case: str) -> str:
-    """Return the name of a case's bodies: poses of one knee share them."""
-    return case.split()[0] if case.endswith(" deg") else case
+    """Return the name of a case's bodies: poses of one knee share them, varus is a pose too."""
+    if case.endswith(" deg"):
+        return case.split()[0]
+    return {"varus": "two condyles"}.get(case, case)
 
 
 def recommendations(rows: Sequence[Row]) -> list[str]:
@@ -73,7 +75,7 @@ def _fastest(settings: dict[Setting, list[Row]], key: str, limit: float) -> str:
     kept = [setting for setting, error in worst.items() if error <= limit]
     if kept:
         best = min(kept, key=lambda setting: times[setting])
-        return f"the fastest is {_named(best)} ({1e3 * times[best]:.3g} ms warm)"
+        return f"the fastest is {_named(best)} ({milliseconds(times[best])} ms warm)"
     if not worst:
         return "nothing can be said: no setting was tried on all bodies"
     nearest = min(worst, key=lambda setting: worst[setting])
@@ -87,6 +89,12 @@ def warm_by_bodies(rows: Sequence[Row]) -> list[float]:
         median(row.measure.warm_seconds for row in rows if bodies_of(row.job.case) == body)
         for body in bodies
     ]
+
+
+def milliseconds(seconds: float) -> str:
+    """Return a time in ms with three digits."""
+    value = 1e3 * seconds
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def _named(setting: Setting) -> str:
@@ -112,7 +120,7 @@ def comparison(rows: Sequence[Row]) -> list[str]:
     ]
     lines = [
         f"{COMPARED_ON}, 2000 N, nonlinear, {COMPARED_AT_MM:g} mm: {DEFAULT} takes "
-        f"{1e3 * own.measure.warm_seconds:.3g} ms a position (warm) and {where} on the front; "
+        f"{milliseconds(own.measure.warm_seconds)} ms a position (warm) and {where} on the front; "
         f"its cell sizes on the front: {', '.join(front) or 'none'} mm"
     ]
     for label, row in by_label.items():
@@ -125,7 +133,7 @@ def _against(label: str, row: Row, own: Row) -> str:
     times = row.measure.warm_seconds / own.measure.warm_seconds
     wanted = WANTED_OF_PEER if label.startswith("calculix") else WANTED_OF_FE
     reached = "reached" if times >= wanted else "not reached"
-    line = f"{label}: {1e3 * row.measure.warm_seconds:.3g} ms, {times:.3g} times as long"
+    line = f"{label}: {milliseconds(row.measure.warm_seconds)} ms, {times:.3g} times as long"
     line += f" (wanted: {wanted:g}, {reached})"
     if label == "fe":
         line += "; it shares the lattice's stored response and solver"

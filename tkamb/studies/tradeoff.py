@@ -62,13 +62,17 @@ class Row:
             "resolution_mm": self.job.resolution_mm,
         }
         for key in TIMES:
-            value = getattr(measure, key)
-            row[key] = value if math.isfinite(value) else None
+            row[key] = _rounded(getattr(measure, key))
         for key in KEYS:
-            value = self.errors.get(key, math.nan)
-            row[f"error_{key}"] = value if math.isfinite(value) else None
-        row |= {"on_front": self.on_front, "status": measure.status, "reference_known": self.floor}
-        return row | {"values": measure.values}
+            row[f"error_{key}"] = _rounded(self.errors.get(key, math.nan))
+        row |= {"on_front": self.on_front, "status": measure.status}
+        row["reference_known"] = _rounded(self.floor)
+        return row | {"values": {key: _rounded(value) for key, value in measure.values.items()}}
+
+
+def _rounded(value: float) -> float | None:
+    """Return a number to six digits for JSON, None for what is none."""
+    return float(f"{value:.6g}") if math.isfinite(value) else None
 
 
 def row_of(content: dict[str, Any]) -> Row:

@@ -8,6 +8,7 @@ from tkamb.studies.advice import (
     Setting,
     bodies_of,
     comparison,
+    milliseconds,
     recommendations,
     setting_of,
     warm_by_bodies,
@@ -28,9 +29,7 @@ def block(rows: Sequence[Row]) -> list[str]:
     """
     bodies = len({bodies_of(row.job.case) for row in rows})
     cases = len({row.job.case for row in rows})
-    settings: dict[Setting, list[Row]] = {}
-    for row in rows:
-        settings.setdefault(setting_of(row), []).append(row)
+    settings = _settings(rows)
     errors = " | ".join(f"{head} %" for head in HEADS)
     lines = [
         f"| contact | mm | prepare s | cold ms | warm ms | MB | {errors} | cases | on the front |",
@@ -49,6 +48,16 @@ def block(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
+def _settings(rows: Sequence[Row]) -> dict[Setting, list[Row]]:
+    """Return the rows of each setting: a model's variants beside it, coarse ones first."""
+    found: dict[Setting, list[Row]] = {}
+    for row in rows:
+        found.setdefault(setting_of(row), []).append(row)
+    models = list(dict.fromkeys(label.split("[")[0] for label, _ in found))
+    place = {s: (models.index(s[0].split("[")[0]), "[" in s[0], s[0], -s[1]) for s in found}
+    return {setting: found[setting] for setting in sorted(found, key=lambda s: place[s])}
+
+
 def _line(setting: Setting, rows: Sequence[Row]) -> str:
     found = [row for row in rows if row.errors]
     start = f"| {setting[0]} | {setting[1]:g} |"
@@ -57,8 +66,8 @@ def _line(setting: Setting, rows: Sequence[Row]) -> str:
     measures = [row.measure for row in found]
     times = (
         f"{median(m.prepare_seconds for m in measures):.2g}",
-        f"{1e3 * median(m.cold_seconds for m in measures):.3g}",
-        f"{1e3 * median(warm_by_bodies(found)):.3g}",
+        milliseconds(median(m.cold_seconds for m in measures)),
+        milliseconds(median(warm_by_bodies(found))),
         f"{median(m.peak_rss_MB for m in measures):.0f}",
     )
     worst = [_percent([row.errors[key] for row in found]) for key in KEYS]
@@ -83,7 +92,7 @@ def body_block(rows: Sequence[BodyRow]) -> list[str]:
         if row.changed is None:
             lines.append(f"| {row.name} | {row.status} |" + " |" * (1 + len(BODY_HEADS)))
             continue
-        shares = " | ".join(f"{100 * row.changed[key]:.2g}" for key in BODY_HEADS)
+        shares = " | ".join(f"{100 * row.changed[key]:.2f}" for key in BODY_HEADS)
         start = f"| {row.name} | {1e3 * row.frame_seconds:.3g} | {row.prepare_seconds:.2g}"
         lines.append(f"{start} | {shares} |")
     return lines

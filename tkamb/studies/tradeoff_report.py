@@ -12,6 +12,8 @@ from tkamb.studies.references import Reference
 from tkamb.studies.tradeoff import FRONT_ERRORS, KEYS, Row
 
 MARKERS = "osD^vPX*<>"
+UNLABELLED_MM = 2.0
+"""The cell size at which most points lie."""
 
 
 def table(rows: Sequence[Row], references: dict[str, Reference]) -> list[str]:
@@ -41,7 +43,8 @@ def _line(row: Row) -> str:
     times = (
         f"{measure.prepare_seconds:9.3f} {measure.cold_seconds:8.4f} {measure.warm_seconds:8.4f}"
     )
-    shares = [f"{100 * row.errors[key]:6.2f}%" for key in KEYS]
+    known = [row.errors[key] for key in KEYS]
+    shares = [f"{100 * error:6.2f}%" if error == error else f"{'–':>7s}" for error in known]
     return f"{start} {times} {measure.peak_rss_MB:6.0f} {shares[0]:>9s} {' '.join(shares[1:])}"
 
 
@@ -62,7 +65,7 @@ def picture(rows: Sequence[Row]) -> Figure:
     columns = min(4, len(cases))
     lines = -(-len(cases) // columns)
     with settings():
-        figure = new_figure(3.4 * columns, 2.8 * lines + 0.3 + 0.9 * len(labels) / (2 * columns))
+        figure = new_figure(3.4 * columns, 3.1 * lines + 0.3 + 0.9 * len(labels) / (2 * columns))
         axes = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
         for axis, case in zip(axes.ravel(), cases, strict=False):
             _panel(axis, [row for row in rows if row.job.case == case and row.errors], labels)
@@ -81,7 +84,7 @@ def picture(rows: Sequence[Row]) -> Figure:
             list(found),
             loc="outside upper left",
             ncols=2 * columns,
-            title="numbers at the points: cell size, mm",
+            title=f"numbers at the points: cell size, mm; {UNLABELLED_MM:g} mm where there is none",
             alignment="left",
         )
     return figure
@@ -104,6 +107,8 @@ def _panel(axis: Axes, rows: Sequence[Row], labels: Sequence[str]) -> None:
             label=label,
         )
         for row in some:
+            if row.job.resolution_mm == UNLABELLED_MM:
+                continue
             axis.annotate(
                 f"{row.job.resolution_mm:g}",
                 (row.measure.warm_seconds * 1e3, row.worst * 100),
