@@ -1,245 +1,271 @@
 #!/usr/bin/env python3
-"""Compare the lattice with CalculiX on the same hexahedra of a two-condyle insert.
+"""Compare the lattice and `fe` with CalculiX on the same hexahedra of a two-condyle insert.
 
-CalculiX (Debian package calculix-ccx) solves it with C3D8 or C3D8I elements and node-to-surface
-penalty contact of 1e5 N/mm³ against the rigid femoral triangles; the femoral component moves
-along y only, pushed by the load at a reference node. CalculiX's C3D8 is fully integrated (its
-stiffness equals the plain 2×2×2 one to seven digits) and locks at nu = 0.45; C3D8I does not.
-Its Ramberg-Osgood (*DEFORMATION PLASTICITY) needs NLGEOM, so the nonlinear comparison is one of
-small strain (tkamb) with finite strain (CalculiX).
+    scripts/peer_calculix.py --out out/peer_calculix --resume
+    scripts/peer_calculix.py --page
 
-    scripts/peer_calculix.py --resolution 1 --load 2500 --out FOLDER
+The first line presses every case with every model, each in a process of its own, and writes
+peer_calculix.json, .md and .png; finished rows are kept, and --resume goes on from them. With
+--page the JSON is kept in docs/ as well and docs/peer_calculix.md and its picture are made from
+it; alone, --page makes them from docs/peer_calculix.json as it is.
 """
 
 import argparse
 import json
-import resource
-import shutil
 import subprocess
-import tempfile
+import sys
 import time
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 
-from lattice_cases import two_condyles
-from tkamb.contact.materials import material
-from tkamb.contact.model import ContactPair
-from tkamb.contact.pressing import pose_at_approach
-from tkamb.contact.registry import contact_model
-from tkamb.geometry.surface import Surface
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
 
-PENALTY = 1e5
-UPWARDS = np.array([0, 1e-3, 0])
-REACH = 2.5e-3
-"""m: femoral triangles within this height of the lowest point take part."""
+from lattice_cases import two_condyles  # noqa: E402
+from tkamb.contact.materials import material  # noqa: E402
+from tkamb.contact.model import ContactPair  # noqa: E402
+from tkamb.contact.registry import contact_model  # noqa: E402
+from tkamb.output.atomic import claim_directory, write_text  # noqa: E402
+from tkamb.press.press import peak_rss  # noqa: E402
+from tkamb.studies.calculix import press_by_calculix  # noqa: E402
+from tkamb.studies.calculix_run import find_program  # noqa: E402
+from tkamb.studies.cases import StudyCase  # noqa: E402
+from tkamb.studies.kept_rows import KeptRows, row_key  # noqa: E402
+from tkamb.studies.measures import ONE_THREAD  # noqa: E402
+from tkamb.studies.tradeoff_block import with_block  # noqa: E402
+
+PEER = "CalculiX C3D8I"
+MODELS = ("lattice", "fe", PEER, "CalculiX C3D8")
+LAWS = ("linear", "nonlinear")
+LOADS_N = (1000.0, 2500.0)
+VARUS_DEG = (0.0, 0.3)
+LEAST_PRESSURE = 0.1e6
+"""Pa: a node with less does not count to the area."""
+WARM_PRESSES = 5
+LIMITS = {
+    ("lattice", "linear"): {"approach": 2.0, "force": 2.0, "peak": 4.0, "area": 5.0},
+    ("fe", "linear"): {"approach": 1.5, "peak": 2.0},
+    ("lattice", "nonlinear"): {"approach": 5.0},
+}
+"""Per cent off `PEER`: what was asked for."""
+DOCS = ROOT / "docs"
 
 
-def femoral_patch(femoral, pose):
-    """Return the lower triangles of the femoral component in the insert frame (m)."""
-    placed = femoral.moved(pose)
-    low = placed.triangles[..., 1].min(axis=1) < placed.vertices[:, 1].min() + REACH
-    keep = low & (placed.face_normals[:, 1] < -0.3)
-    used, faces = np.unique(placed.faces[keep], return_inverse=True)
-    return Surface(placed.vertices[used], faces.reshape(-1, 3), "patch")
+def study_case(job):
+    """Return a case of two condyles over two dishes."""
+    femoral, insert, pose = two_condyles(job["varus_deg"])
+    mat = material("polyethylene" if job["law"] == "nonlinear" else "polyethylene-linear")
+    return StudyCase("two condyles", "", ContactPair(femoral, insert, mat), pose, job["load_N"])
 
 
-def deck(lattice, patch, mat, load, nonlinear, depth, element):
-    """Return the CalculiX input, mm, N, MPa. The femoral patch is a rigid layer of wedges.
+def measure(job):
+    """Press one case with one model; return its row."""
+    case = study_case(job)
+    if job["model"].startswith("CalculiX"):
+        element = job["model"].split()[1]
+        answer = press_by_calculix(case.pair, case.load, case.pose, job["resolution_mm"], element)
+        took = (answer.prepare_seconds, answer.run.seconds, answer.run.seconds)
+        return took_row(job, answer.nodes, *took, answer.run.peak_rss_MB) | found(answer.result)
+    model = contact_model(job["model"], job["resolution_mm"], cache=False)
+    prepare, state = timed(model.prepare, case.pair)
+    cold, result = timed(model.press, state, case.load, case.pose)
+    warm, guess = [], result
+    for step in range(1, WARM_PRESSES + 1):
+        seconds, guess = timed(model.press, state, case.load, case.nearby(step), guess)
+        warm.append(seconds)
+    took = (prepare, cold, median(warm))
+    return took_row(job, state.node_count, *took, peak_rss()) | found(result)
 
-    The first step moves it down by `depth` (m) to establish contact, the second lets it go
-    under the load.
+
+def timed(call, *given):
+    start = time.perf_counter()
+    answer = call(*given)
+    return time.perf_counter() - start, answer
+
+
+def took_row(job, nodes, prepare, cold, warm, memory):
+    return job | {"nodes": nodes, "prepare_s": prepare, "cold_s": cold, "warm_s": warm,
+                  "peak_rss_MB": memory}  # fmt: skip
+
+
+def found(result):
+    """Return what is compared of a result, by one definition for every model.
+
+    The effective area (sum F)²/sum(F p) is that of an even pressure with the same force and
+    the same work: no node that hardly touches decides it.
     """
-    n, m = len(lattice.nodes), len(patch.vertices)
-    places = np.concatenate([lattice.nodes, patch.vertices, patch.vertices + UPWARDS]) * 1e3
-    reference = len(places) + 1
-    lines = ["*NODE, NSET=NALL"]
-    lines += [f"{i},{x:.9e},{y:.9e},{z:.9e}" for i, (x, y, z) in enumerate(places, 1)]
-    lines += [f"{reference},0.,30.,0.", f"{reference + 1},0.,30.,0."]
-    first = len(lattice.cells) + 1
-    wedges = patch.faces[:, [0, 2, 1]] + n
-    wedges = np.concatenate([wedges, wedges + m], axis=1)
-    lines.append(f"*ELEMENT, TYPE={element}, ELSET=INSERT")
-    lines += _numbered(1, lattice.cells)
-    lines.append("*ELEMENT, TYPE=C3D6, ELSET=FEMUR")
-    lines += _numbered(first, wedges)
-    lines += _set("NBOTTOM", lattice.bottom_nodes) + _set("NREF", [reference - 1])
-    lines += _set("NSLAVE", np.unique(lattice.contact_triangles))
-    lines += _set("NFEMUR", np.arange(n, n + 2 * m)) + _set("NINSERT", np.arange(n))
-    lines += ["*SURFACE, NAME=SLAVE, TYPE=NODE", "NSLAVE", "*SURFACE, NAME=MASTER"]
-    lines += [f"{first + e},S1" for e in range(len(wedges))]
-    e, nu, law = mat.young_modulus / 1e6, mat.poisson_ratio, mat.law
-    lines.append("*MATERIAL, NAME=PE")
-    if nonlinear:
-        lines.append("*DEFORMATION PLASTICITY")
-        lines.append(f"{e},{nu},{law.reference_stress / 1e6},{law.exponent},{law.alpha}")
-    else:
-        lines += ["*ELASTIC", f"{e},{nu}"]
-    lines += ["*MATERIAL, NAME=STEEL", "*ELASTIC", "2.1E5,0.3"]
-    lines += ["*SOLID SECTION, ELSET=INSERT, MATERIAL=PE"]
-    lines += ["*SOLID SECTION, ELSET=FEMUR, MATERIAL=STEEL"]
-    lines += [f"*RIGID BODY, NSET=NFEMUR, REF NODE={reference}, ROT NODE={reference + 1}"]
-    lines += ["*SURFACE INTERACTION, NAME=SI", "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR"]
-    lines += [f"{PENALTY},0.001"]
-    lines += ["*CONTACT PAIR, INTERACTION=SI, TYPE=NODE TO SURFACE", "SLAVE,MASTER"]
-    held = ["NBOTTOM,1,3", f"{reference},1,1", f"{reference},3,3", f"{reference + 1},1,3"]
-    step = "*STEP, INC=300" + (", NLGEOM" if nonlinear else "")
-    lines += ["*BOUNDARY", *held, step, "*STATIC", "0.1,1.,1e-7,0.25"]
-    lines += ["*BOUNDARY", f"{reference},2,2,{-1e3 * depth}", "*END STEP"]
-    lines += [step, "*STATIC", "0.5,1.,1e-7,1.", "*BOUNDARY, OP=NEW", *held]
-    lines += ["*CLOAD", f"{reference},2,{-load}"]
-    lines += ["*NODE PRINT, NSET=NREF, FREQUENCY=1000", "U"]
-    lines += ["*NODE PRINT, NSET=NINSERT, FREQUENCY=1000", "U"]
-    lines += ["*NODE PRINT, NSET=NBOTTOM, FREQUENCY=1000, TOTALS=ONLY", "RF"]
-    lines += ["*CONTACT PRINT, FREQUENCY=1000", "CSTR", "*END STEP", ""]
-    return "\n".join(lines)
-
-
-def _numbered(first, members):
-    return [f"{i},{','.join(str(v + 1) for v in row)}" for i, row in enumerate(members, first)]
-
-
-def _set(name, nodes):
-    return [f"*NSET, NSET={name}"] + [str(v + 1) for v in nodes]
-
-
-def run_calculix(text, folder):
-    """Run the deck; return seconds, peak memory (MB) and the .dat file's blocks."""
-    (folder / "peer.inp").write_text(text)
-    begun = time.perf_counter()
-    subprocess.run(["ccx", "-i", "peer"], cwd=folder, check=True, capture_output=True, text=True)
-    seconds = time.perf_counter() - begun
-    memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3
-    blocks, rows = {}, None
-    for line in (folder / "peer.dat").read_text().splitlines():
-        words = line.split()
-        if not words:
-            continue
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            rows = blocks.setdefault(" ".join(words).split(" for set ")[0] + _which(words), [])
-            rows.clear()
-            continue
-        rows.append(values)
-    return seconds, memory, {key: np.array(rows) for key, rows in blocks.items() if rows}
-
-
-def _which(words):
-    return f" {words[words.index('set') + 1]}" if "set" in words else ""
-
-
-def peer_row(blocks, state, area):
-    """Return approach, condyle forces, peak and area from CalculiX's output."""
-    surface, top = state.map, state.problem.contact_nodes
-    stress = next(v for k, v in blocks.items() if k.startswith("contact stress"))
-    place = np.searchsorted(top, stress[:, 0].astype(int) - 1)
-    pressure = np.zeros(len(top))
-    pressure[place] = np.maximum(stress[:, 1], 0.0) * 1e6
-    vertical = pressure * area * surface.normals[:, 1]
-    medial = surface.points[:, 2] < 0
-    return {
-        "approach_mm": -float(blocks["displacements (vx,vy,vz) NREF"][-1, 2]),
-        "medial_N": float(vertical[medial].sum()),
-        "lateral_N": float(vertical[~medial].sum()),
-        "peak_MPa": float(pressure.max()) / 1e6,
-        "area_mm2": float(area[pressure > 0.1e6].sum()) * 1e6,
-        "reaction_N": float(blocks["total force (fx,fy,fz) NBOTTOM"][-1, 1]),
-    }
-
-
-def own_row(result):
-    """Return the same of a tkamb result; forces along y."""
-    vertical = -result.nodal_force[:, 1]
-    medial = result.points[:, 2] < 0
+    size = np.linalg.norm(result.nodal_force, axis=1)
     return {
         "approach_mm": result.approach * 1e3,
-        "medial_N": float(vertical[medial].sum()),
-        "lateral_N": float(vertical[~medial].sum()),
+        "medial_N": result.medial.force,
+        "lateral_N": result.lateral.force,
         "peak_MPa": float(result.pressure.max()) / 1e6,
-        "area_mm2": float(result.area[result.pressure > 0.1e6].sum()) * 1e6,
-        "reaction_N": float(vertical.sum()),
+        "area_mm2": float(result.area[result.pressure > LEAST_PRESSURE].sum()) * 1e6,
+        "effective_area_mm2": float(size.sum() ** 2 / (size @ result.pressure)) * 1e6,
+        "carried": -float(result.wrench_on_insert[1]),
+        "iterations": result.iterations,
     }
 
 
-def compare(options, nonlinear):
-    """Return rows of all models on one grid."""
-    femoral, insert, pose = two_condyles(options.varus)
-    mat = material("polyethylene" if nonlinear else "polyethylene-linear")
-    pair, rows = ContactPair(femoral, insert, mat), []
-    for name in ("lattice", "fe"):
-        model = contact_model(name, options.resolution, cache=False)
-        begun = time.perf_counter()
-        state = model.prepare(pair)
-        middle = time.perf_counter()
-        result = model.press(state, options.load, pose)
-        seconds = time.perf_counter() - middle
-        rows.append({"model": name, "prepare_s": middle - begun, "solve_s": seconds,
-                     "rss_MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
-                     **own_row(result)})  # fmt: skip
-    patch = femoral_patch(femoral, pose_at_approach(pair, pose, 0.0))
-    for element in options.elements:
-        with tempfile.TemporaryDirectory() as folder:
-            text = deck(
-                state.lattice, patch, mat, options.load, nonlinear, 0.8 * result.approach, element
-            )
-            seconds, memory, blocks = run_calculix(text, Path(folder))
-        rows.append({"model": f"CalculiX {element}", "prepare_s": 0.0, "solve_s": seconds,
-                     "rss_MB": memory, **peer_row(blocks, state, state.map.area)})  # fmt: skip
+def same_case(row):
+    return row["law"], row["load_N"], row["varus_deg"]
+
+
+def differences(row, peer):
+    """Return how far a row is off the peer's, in per cent; force: the condyle that is further."""
+    forces = [row[side] / peer[side] - 1 for side in ("medial_N", "lateral_N")]
+    apart = {
+        "approach": row["approach_mm"] / peer["approach_mm"] - 1,
+        "force": max(forces, key=abs),
+        "peak": row["peak_MPa"] / peer["peak_MPa"] - 1,
+        "area": row["area_mm2"] / peer["area_mm2"] - 1,
+        "effective": row["effective_area_mm2"] / peer["effective_area_mm2"] - 1,
+    }
+    return {key: 100 * value for key, value in apart.items()}
+
+
+def block(rows):
+    """Return the page's tables: every case, what was asked for, time and memory."""
+    peers = {same_case(row): row for row in rows if row["model"] == PEER}
+    lines = [
+        "| law | N | varus ° | model | approach mm | off % | medial / lateral N | off % "
+        "| peak MPa | off % | area mm² | off % | effective area off % | carried N |",
+        "| --- | ---: | ---: | --- |" + " ---: |" * 10,
+    ]
     for row in rows:
-        row.update(nonlinear=nonlinear, resolution_mm=options.resolution, varus_deg=options.varus)
-        row.update(load_N=options.load, nodes=len(state.lattice.nodes))
-    return rows
+        off = differences(row, peers[same_case(row)])
+        shown = dict.fromkeys(off, "") if row["model"] == PEER else {
+            key: f"{value:+.1f}" for key, value in off.items()
+        }  # fmt: skip
+        lines.append(
+            f"| {row['law']} | {row['load_N']:.0f} | {row['varus_deg']:g} | {row['model']} "
+            f"| {row['approach_mm']:.4f} | {shown['approach']} "
+            f"| {row['medial_N']:.0f} / {row['lateral_N']:.0f} | {shown['force']} "
+            f"| {row['peak_MPa']:.2f} | {shown['peak']} | {row['area_mm2']:.1f} | {shown['area']} "
+            f"| {shown['effective']} | {row['carried']:.1f} |"
+        )
+    return [*lines, "", *asked_for(rows, peers), "", *costs(rows)]
 
 
-def picture(rows, path):
-    """Draw approach and peak pressure of every model beside each other."""
+def asked_for(rows, peers):
+    lines = ["| | limit % | largest % | |", "| --- | ---: | ---: | --- |"]
+    for (model, law), limits in LIMITS.items():
+        some = [row for row in rows if (row["model"], row["law"]) == (model, law)]
+        for key, limit in limits.items() if some else ():
+            worst = max(abs(differences(row, peers[same_case(row)])[key]) for row in some)
+            verdict = "holds" if worst <= limit else "does not hold"
+            lines.append(f"| `{model}`, {law}: {key} | {limit:g} | {worst:.2g} | {verdict} |")
+    return lines
+
+
+def costs(rows):
+    """Return time and memory of each model, medians over the cases."""
+    lines = [
+        "| model | law | prepare s | first press s | next press s | MB | iterations |",
+        "| --- | --- |" + " ---: |" * 5,
+    ]
+    for model in MODELS:
+        for law in LAWS:
+            some = [row for row in rows if (row["model"], row["law"]) == (model, law)]
+            if some:
+                keys = ("prepare_s", "cold_s", "warm_s", "peak_rss_MB", "iterations")
+                middle = " | ".join(f"{median(row[key] for row in some):.3g}" for key in keys)
+                lines.append(f"| {model} | {law} | {middle} |")
+    return lines
+
+
+def picture(rows):
+    """Return the figure: every model's distance from the peer, case by case."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
-    for axis, key, title in zip(
-        axes, ("approach_mm", "peak_MPa"), ("approach, mm", "peak pressure, MPa"), strict=True
-    ):
-        for shift, nonlinear in enumerate((False, True)):
-            some = [row for row in rows if row["nonlinear"] is nonlinear]
-            place = np.arange(len(some)) + 0.4 * shift - 0.2
-            axis.bar(place, [row[key] for row in some], 0.38,
-                     label="nonlinear" if nonlinear else "linear")  # fmt: skip
-            axis.set_xticks(range(len(some)), [row["model"] for row in some], fontsize=8)
+    peers = {same_case(row): row for row in rows if row["model"] == PEER}
+    places = {case: place for place, case in enumerate(reversed(list(peers)))}
+    figure, axes = plt.subplots(1, 4, figsize=(11, 3.4), sharey=True, layout="constrained")
+    titles = {"approach": "approach", "force": "condyle force",
+              "peak": "peak pressure", "area": "area"}  # fmt: skip
+    looks = {"lattice": ("o", "#d1495b"), "fe": ("s", "#30638e"), "CalculiX C3D8": ("x", "#888888")}
+    for axis, (key, title) in zip(axes, titles.items(), strict=True):
+        for law in LAWS:
+            limit = LIMITS["lattice", law].get(key)
+            rung = [place for case, place in places.items() if case[0] == law]
+            if limit and rung:
+                axis.fill_betweenx([min(rung) - 0.5, max(rung) + 0.5], -limit, limit,
+                                   color="#d1495b", alpha=0.12, lw=0)  # fmt: skip
+        for model, (marker, colour) in looks.items():
+            some = [row for row in rows if row["model"] == model]
+            off = [differences(row, peers[same_case(row)])[key] for row in some]
+            at = [places[same_case(row)] for row in some]
+            axis.scatter(off, at, 30, marker=marker, color=colour, label=model, zorder=3)
+        axis.axvline(0, color="k", lw=0.8)
         axis.set_title(title, fontsize=10)
+        axis.set_xlabel(f"% off {PEER}", fontsize=9)
         axis.spines[["top", "right"]].set_visible(False)
-    axes[0].legend(frameon=False, fontsize=8)
-    figure.savefig(path, dpi=150)
+    names = [f"{law}, {load:.0f} N, {varus:g}°" for law, load, varus in places]
+    axes[0].set_yticks(list(places.values()), names, fontsize=8)
+    axes[0].set_ylim(-0.6, len(places) - 0.4)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3,
+                  frameon=False, fontsize=9)  # fmt: skip
+    return figure
+
+
+def measured_rows(options):
+    """Return the rows of all jobs, kept ones first come."""
+    find_program()
+    kept = KeptRows(claim_directory(options.out), options.resume)
+    rows = []
+    for law in options.laws:
+        for load in options.loads:
+            for varus in options.varus:
+                for model in MODELS:
+                    job = {"model": model, "law": law, "load_N": load, "varus_deg": varus,
+                           "resolution_mm": options.resolution}  # fmt: skip
+                    key = row_key("peer_calculix", job)
+                    row = kept.get(key) or apart(job)
+                    kept.put(key, row)
+                    rows.append(row)
+                    print(json.dumps(row), flush=True)
+    return rows
+
+
+def apart(job):
+    """Measure in a process of its own, with one thread."""
+    import os
+
+    command = [sys.executable, __file__, "--one", json.dumps(job)]
+    return json.loads(subprocess.check_output(command, text=True, env=os.environ | ONE_THREAD))
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--resolution", type=float, default=2.0, help="mm")
-    parser.add_argument("--load", type=float, default=2500.0, help="N")
-    parser.add_argument("--varus", type=float, default=0.0, help="degrees")
-    parser.add_argument("--elements", nargs="+", default=["C3D8", "C3D8I"])
-    parser.add_argument("--laws", nargs="+", default=["linear", "nonlinear"])
-    parser.add_argument("--out", type=Path, default=Path("peer_calculix"))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--resolution", type=float, default=1.0, metavar="MM")
+    parser.add_argument("--loads", type=float, nargs="+", default=LOADS_N, metavar="N")
+    parser.add_argument("--varus", type=float, nargs="+", default=VARUS_DEG, metavar="DEG")
+    parser.add_argument("--laws", nargs="+", choices=LAWS, default=LAWS)
+    parser.add_argument("--out", type=Path, metavar="FOLDER")
+    parser.add_argument("--resume", action="store_true", help="keep the rows that are there")
+    parser.add_argument("--page", action="store_true", help="make the page in docs/")
+    parser.add_argument("--one", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if shutil.which("ccx") is None:
-        raise SystemExit("CalculiX is not installed: apt-get install calculix-ccx")
-    rows = []
-    for law in options.laws:
-        rows += compare(options, law == "nonlinear")
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "peer_calculix.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
-    keys = ["model", "nonlinear", "approach_mm", "medial_N", "lateral_N", "peak_MPa", "area_mm2",
-            "reaction_N", "prepare_s", "solve_s", "rss_MB"]  # fmt: skip
-    print(" | ".join(keys))
-    for row in rows:
-        words = (
-            row[key] if isinstance(row[key], str | bool) else f"{row[key]:.4g}" for key in keys
-        )
-        print(" | ".join(str(word) for word in words))
-    picture(rows, options.out / "peer_calculix.png")
+    if options.one:
+        print(json.dumps(measure(json.loads(options.one))))
+        return
+    kept = DOCS / "peer_calculix.json"
+    rows = measured_rows(options) if options.out else json.loads(kept.read_text(encoding="utf-8"))
+    text = json.dumps(rows, indent=1) + "\n"
+    if options.out:
+        write_text(options.out / "peer_calculix.json", text)
+        write_text(options.out / "peer_calculix.md", "\n".join(block(rows)) + "\n")
+        picture(rows).savefig(options.out / "peer_calculix.png", dpi=110)
+    if options.page:
+        page = DOCS / "peer_calculix.md"
+        write_text(kept, text)
+        write_text(page, with_block(page.read_text(encoding="utf-8"), block(rows), "peer"))
+        picture(rows).savefig(DOCS / "pictures" / "peer_calculix.png", dpi=110)
 
 
 if __name__ == "__main__":

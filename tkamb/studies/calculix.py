@@ -1,209 +1,251 @@
-"""CalculiX beside the built-in models: the same hexahedra, the same load, one row per element.
+"""CalculiX beside the built-in models: the same hexahedra, pose and load, another program.
 
-Node-to-surface penalty contact against the rigid femoral triangles; the femoral component
-moves along y only, pushed by the load at a reference node. C3D8 is fully integrated and locks
-at nu = 0.45; C3D8I does not. CalculiX has the Ramberg-Osgood law only with finite strain
-(*DEFORMATION PLASTICITY wants NLGEOM), the built-in models have small strain: a nonlinear
-comparison is one of the two strain measures as well.
+CalculiX starts without any answer of the lattice's: the femoral component begins where an
+elastic foundation would carry the load. Each position begins anew, so that its cold and warm
+times are the same. Its pressures act on the deformed faces; here they become nodal forces,
+and those, over the undeformed tributary areas, pressures as the built-in models define them.
 
-A press of CalculiX begins anew each time: its cold and warm times are the same.
+Strain: linear cases have small strain on both sides. CalculiX's Ramberg-Osgood law wants finite
+strain (true stress over the Eulerian strain of the deformed shape), the built-in models keep
+small strain: a nonlinear comparison is one of the two measures as well.
 """
 
-import json
-import resource
-import shutil
-import subprocess
-import tempfile
 import time as clock
 from collections.abc import Iterable
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from tkamb.contact.lattice.model import LatticeState
-from tkamb.contact.materials import LinearElastic, RambergOsgood
+from tkamb.contact.lattice.femoral import FemoralFloor
+from tkamb.contact.lattice.grid import Lattice, build_grid
+from tkamb.contact.lattice.pressure_map import ContactMap, Indices, contact_map
+from tkamb.contact.model import ContactPair, ContactResult
 from tkamb.contact.pressing import pose_at_approach
 from tkamb.contact.registry import contact_model
-from tkamb.contact.summary import medial_points
-from tkamb.errors import ComputationError, InputError
+from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
+from tkamb.errors import ComputationError
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import Array
+from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
+from tkamb.studies.calculix_deck import Deck
+from tkamb.studies.calculix_run import LONGEST_SECONDS, PeerRun, find_program, run_calculix
 from tkamb.studies.cases import StudyCase
 from tkamb.studies.measures import Job, Measure
-from tkamb.studies.quantities import Quantities, errors
+from tkamb.studies.quantities import quantities, raster_map
 from tkamb.studies.references import Reference
-from tkamb.studies.tradeoff import Row, floor_of
+from tkamb.studies.tradeoff import Row, compared
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
-PROGRAM = "ccx"
+Mask = NDArray[np.bool_]
+
 CASES = ("sphere", "two condyles")
-ELEMENTS = ("C3D8I",)
-PENALTY = 1e5
-"""N/mm³: contact gives way by 0.2 µm at 20 MPa."""
-REACH = 2.5e-3
-"""m: femoral triangles within this height of the lowest point take part."""
-LEAST_PRESSURE = 0.1e6
-"""Pa: a node below it does not count as touched."""
-THICKNESS = np.array([0.0, 1e-3, 0.0])
-"""m: of the layer of wedges that stands for the rigid femoral component."""
+ELEMENT = "C3D8I"
+COARSE_MM = 2.0
+REACH = 3.0
+"""Nodes whose gap at first touch is within this many times the guessed depth can be touched."""
+LEAST_LEAN = -0.3
+"""Largest y of a femoral normal that takes part."""
+UNEVEN = 0.01
+"""Largest difference of the summed contact forces from the load, over the load."""
+
+
+@dataclass(frozen=True, eq=False)
+class PeerAnswer:
+    """What CalculiX found.
+
+    Args:
+        result: on the contact nodes of the lattice's grid, by the contract's definitions.
+        run: its times, memory and iterations.
+        prepare_seconds: for the grid, the guess and the input.
+        nodes: of the insert.
+        balance: vertical contact forces over the load.
+    """
+
+    result: ContactResult
+    run: PeerRun
+    prepare_seconds: float
+    nodes: int
+    balance: float
 
 
 def peer_rows(
-    cases: Iterable[StudyCase], references: dict[str, Reference], grid_mm: float = 2.0
+    cases: Iterable[StudyCase], references: dict[str, Reference], grid_mm: float = COARSE_MM
 ) -> list[Row]:
-    """Return a row for each case that CalculiX can do.
+    """Return a row for each case of `CASES`, with the reason in its status where it failed.
 
     Raises:
         InputError: CalculiX is not installed.
-        ComputationError: it failed.
     """
-    if shutil.which(PROGRAM) is None:
-        raise InputError("is not installed", "CalculiX", "apt-get install calculix-ccx")
+    find_program()
     rows = []
     for case in cases:
-        for element in ELEMENTS if case.name in CASES else ():
-            found = press_by_calculix(case, grid_mm, element)
-            reference = references[case.name]
-            compared = errors(found.values, reference.values) | {"map": float("nan")}
-            job = Job(case.name, f"calculix {element}", grid_mm)
-            rows.append(Row(job, found, compared, floor_of(reference)))
+        if case.name in CASES:
+            job = Job(case.name, f"calculix {ELEMENT}", grid_mm)
+            rows.append(compared(job, measure_by_calculix(case, grid_mm), references[case.name]))
     return rows
 
 
-def press_by_calculix(case: StudyCase, grid_mm: float, element: str) -> Measure:
-    """Press a case by CalculiX on the lattice's grid; a timed measure with its answer."""
-    model = contact_model("fe", grid_mm, cache=False)
-    start = clock.perf_counter()
-    state = model.prepare(case.pair)
-    own = model.press(state, case.load, case.pose)
-    patch = _patch(case.pair.femoral, pose_at_approach(case.pair, case.pose, 0.0))
-    text = _deck(state, patch, case, 0.8 * own.approach, element)
-    prepared = clock.perf_counter()
-    blocks = _run(text)
-    seconds = clock.perf_counter() - prepared
-    memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024 / 1e6
-    values = _values(blocks, state, own.pose)
-    nodes = state.node_count
-    return Measure("ok", prepared - start, seconds, seconds, memory, 0, nodes, values)
+def measure_by_calculix(
+    case: StudyCase, grid_mm: float, longest: float = LONGEST_SECONDS
+) -> Measure:
+    """Return CalculiX's measure of a case; its status says why there is none.
 
-
-def _patch(femoral: Surface, pose: Array) -> Surface:
-    """Return the lower triangles of the femoral component in the insert frame."""
-    placed = femoral.moved(pose)
-    low = placed.triangles[..., 1].min(axis=1) < placed.vertices[:, 1].min() + REACH
-    used, faces = np.unique(
-        placed.faces[low & (placed.face_normals[:, 1] < -0.3)], return_inverse=True
+    Args:
+        case: what to press.
+        grid_mm: edge of the hexahedra.
+        longest: s, after which it is stopped.
+    """
+    try:
+        answer = press_by_calculix(case.pair, case.load, case.pose, grid_mm, longest=longest)
+    except ComputationError as error:
+        return Measure(str(error))
+    seconds = answer.run.seconds
+    return Measure(
+        "ok",
+        answer.prepare_seconds,
+        seconds,
+        seconds,
+        answer.run.peak_rss_MB,
+        answer.run.iterations,
+        answer.nodes,
+        quantities(answer.result),
+        {f"{i} {j}": p for (i, j), p in raster_map(answer.result).items()},
     )
-    return Surface(placed.vertices[used], faces.reshape(-1, 3), "patch")
 
 
-def _deck(state: LatticeState, patch: Surface, case: StudyCase, depth: float, element: str) -> str:
-    """Return the input, mm, N, MPa: a step that moves down by `depth` (m), one under load."""
-    lattice, n, m = state.lattice, len(state.lattice.nodes), len(patch.vertices)
-    places = np.concatenate([lattice.nodes, patch.vertices, patch.vertices + THICKNESS])
-    centre, first = len(places) + 1, len(lattice.cells) + 1
-    wedges = patch.faces[:, [0, 2, 1]] + n
-    nonlinear = not case.pair.material.is_linear
-    lines = ["*NODE, NSET=NALL"]
-    lines += [f"{i},{x:.9e},{y:.9e},{z:.9e}" for i, (x, y, z) in enumerate(places / MILLIMETRE, 1)]
-    lines += [f"{centre},0.,30.,0.", f"{centre + 1},0.,30.,0."]
-    lines += [f"*ELEMENT, TYPE={element}, ELSET=INSERT", *_numbered(1, lattice.cells)]
-    lines.append("*ELEMENT, TYPE=C3D6, ELSET=FEMUR")
-    lines += _numbered(first, np.concatenate([wedges, wedges + m], axis=1))
-    lines += _set("NBOTTOM", lattice.bottom_nodes) + _set("NREF", np.array([centre - 1]))
-    lines += _set("NSLAVE", np.unique(lattice.contact_triangles)) + _set("NINSERT", np.arange(n))
-    lines += _set("NFEMUR", np.arange(n, n + 2 * m))
-    lines += ["*SURFACE, NAME=SLAVE, TYPE=NODE", "NSLAVE", "*SURFACE, NAME=MASTER"]
-    lines += [f"{first + e},S1" for e in range(len(wedges))]
-    lines += _material(case.pair.material)
-    lines.append(f"*RIGID BODY, NSET=NFEMUR, REF NODE={centre}, ROT NODE={centre + 1}")
-    lines += ["*SURFACE INTERACTION, NAME=SI", "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR"]
-    lines += [f"{PENALTY},0.001", "*CONTACT PAIR, INTERACTION=SI, TYPE=NODE TO SURFACE"]
-    lines.append("SLAVE,MASTER")
-    held = ["NBOTTOM,1,3", f"{centre},1,1", f"{centre},3,3", f"{centre + 1},1,3"]
-    step = "*STEP, INC=300" + (", NLGEOM" if nonlinear else "")
-    lines += ["*BOUNDARY", *held, step, "*STATIC", "0.1,1.,1e-7,0.25"]
-    lines += ["*BOUNDARY", f"{centre},2,2,{-depth / MILLIMETRE}", "*END STEP"]
-    lines += [step, "*STATIC", "0.5,1.,1e-7,1.", "*BOUNDARY, OP=NEW", *held]
-    lines += ["*CLOAD", f"{centre},2,{-case.load}"]
-    lines += ["*NODE PRINT, NSET=NREF, FREQUENCY=1000", "U"]
-    return "\n".join([*lines, "*CONTACT PRINT, FREQUENCY=1000", "CSTR", "*END STEP", ""])
+def press_by_calculix(
+    pair: ContactPair,
+    load: float,
+    pose: Array,
+    grid_mm: float,
+    element: str = ELEMENT,
+    longest: float = LONGEST_SECONDS,
+) -> PeerAnswer:
+    """Press a femoral component on an insert by CalculiX.
+
+    Args:
+        pair: the two bodies.
+        load: N, along -y.
+        pose: (4, 4) pose_femoral_in_insert; its y does not matter.
+        grid_mm: edge of the hexahedra.
+        element: "C3D8I" or "C3D8".
+        longest: s, after which CalculiX is stopped.
+
+    Raises:
+        InputError: CalculiX is not installed, or has no such material or bearing.
+        ComputationError: it failed, or what it found does not carry the load.
+    """
+    start = clock.perf_counter()
+    problem = _problem(pair, load, pose, grid_mm)
+    deck = Deck(problem.lattice, problem.patch, pair.material, pair.bearing, load, element)
+    text = deck.text
+    prepared = clock.perf_counter() - start
+    run = run_calculix(text, longest)
+    result, balance = _result(problem, load, run)
+    return PeerAnswer(result, run, prepared, len(problem.lattice.nodes), balance)
 
 
-def _material(insert: Any) -> list[str]:
-    modulus, law = insert.young_modulus / MEGAPASCAL, insert.law
-    lines = ["*MATERIAL, NAME=PE"]
-    if isinstance(law, RambergOsgood):
-        stress = law.reference_stress / MEGAPASCAL
-        lines.append("*DEFORMATION PLASTICITY")
-        lines.append(f"{modulus},{insert.poisson_ratio},{stress},{law.exponent},{law.alpha}")
-    elif isinstance(law, LinearElastic):
-        lines += ["*ELASTIC", f"{modulus},{insert.poisson_ratio}"]
-    else:
-        raise InputError("has no law that CalculiX knows", f"material '{insert.name}'")
-    lines += ["*MATERIAL, NAME=STEEL", "*ELASTIC", "2.1E5,0.3"]
-    lines.append("*SOLID SECTION, ELSET=INSERT, MATERIAL=PE")
-    return [*lines, "*SOLID SECTION, ELSET=FEMUR, MATERIAL=STEEL"]
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The grid, and the femoral component where CalculiX begins.
+
+    Args:
+        pair: the two bodies.
+        lattice: grid of the insert.
+        nodes: (c,) contact nodes.
+        map: contact surface.
+        floor: femoral component from below.
+        pose: (4, 4) at the guessed depth.
+        depth: m, guessed.
+        touchable: (c,) contact nodes over which `patch` lies.
+        patch: femoral triangles, insert frame.
+    """
+
+    pair: ContactPair
+    lattice: Lattice
+    nodes: Indices
+    map: ContactMap
+    floor: FemoralFloor
+    pose: Array
+    depth: float
+    touchable: Mask
+    patch: Surface
 
 
-def _numbered(first: int, members: NDArray[np.int64]) -> list[str]:
-    return [f"{i},{','.join(str(v + 1) for v in row)}" for i, row in enumerate(members, first)]
+def _problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -> _Problem:
+    lattice = build_grid(pair.insert, grid_mm * MILLIMETRE)
+    nodes, surface = contact_map(lattice, pair.insert)
+    floor = FemoralFloor(pair.femoral, RayCaster(pair.femoral))
+    guess = contact_model("foundation", grid_mm)
+    depth = guess.press(guess.prepare(pair), load, pose).approach
+    if not depth > 0:
+        raise ComputationError("needs a load that presses the bodies together", "CalculiX")
+    touching = pose_at_approach(pair, pose, 0.0)
+    places, _ = floor.over(surface.points, touching)
+    near = places[:, 1] - surface.points[:, 1] < REACH * depth
+    placed = pose_at_approach(pair, pose, depth)
+    patch = _patch(pair.femoral.moved(placed), surface.points[near], grid_mm * MILLIMETRE)
+    return _Problem(pair, lattice, nodes, surface, floor, placed, depth, near, patch)
 
 
-def _set(name: str, nodes: NDArray[np.int64]) -> list[str]:
-    return [f"*NSET, NSET={name}", *(str(v + 1) for v in nodes)]
+def _patch(femoral: Surface, points: Array, spacing: float) -> Surface:
+    """Return the downward triangles that lie within a cell of points, seen from above."""
+    down = np.flatnonzero(femoral.face_normals[:, 1] < LEAST_LEAN)
+    middle = femoral.triangles[down].mean(axis=1)[:, ::2]
+    away, _ = cKDTree(points[:, ::2]).query(middle, distance_upper_bound=1.5 * spacing)
+    used, faces = np.unique(femoral.faces[down[np.isfinite(away)]], return_inverse=True)
+    return Surface(femoral.vertices[used], faces.reshape(-1, 3).astype(np.int64), "patch")
 
 
-def _run(text: str) -> dict[str, Array]:
-    """Run a deck; return the blocks of numbers in its .dat file, the last of each kind."""
-    with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder)
-        (place / "peer.inp").write_text(text, encoding="utf-8")
-        command = [PROGRAM, "-i", "peer"]
-        ran = subprocess.run(command, cwd=place, capture_output=True, text=True, check=False)
-        found = place / "peer.dat"
-        if ran.returncode or not found.exists():
-            said = json.dumps((ran.stdout + ran.stderr).strip().splitlines()[-1:])
-            raise ComputationError(f"stopped: {said}", "CalculiX")
-        return _blocks(found.read_text(encoding="utf-8").splitlines())
-
-
-def _blocks(lines: Iterable[str]) -> dict[str, Array]:
-    blocks: dict[str, list[list[float]]] = {}
-    rows: list[list[float]] = []
-    for line in lines:
-        words = line.split()
-        try:
-            numbers = [float(word) for word in words]
-        except ValueError:
-            rows = blocks[words[0]] = []
-            continue
-        if numbers:
-            rows.append(numbers)
-    return {name: np.array(rows) for name, rows in blocks.items() if rows}
-
-
-def _values(blocks: dict[str, Array], state: LatticeState, pose: Array) -> Quantities:
-    """Return what CalculiX found, its pressures spread over the lattice's areas."""
-    if not {"displacements", "contact"} <= blocks.keys():
+def _result(problem: _Problem, load: float, run: PeerRun) -> tuple[ContactResult, float]:
+    """Return what CalculiX found by the contract's definitions, and its forces over the load."""
+    if not {"NREF", "NINSERT", "contact"} <= run.blocks.keys():
         raise ComputationError("gave no contact stress", "CalculiX")
-    stress, area = blocks["contact"], state.map.area
-    pressure = np.zeros(len(area))
-    place = np.searchsorted(state.problem.contact_nodes, stress[:, 0].astype(int) - 1)
+    approach = problem.depth - float(run.blocks["NREF"][-1, 2]) * MILLIMETRE
+    pose = pose_at_approach(problem.pair, problem.pose, approach)
+    force = _nodal_forces(problem, pose, run)
+    balance = -float(force[:, 1].sum()) / load
+    if not abs(balance - 1) <= UNEVEN:
+        raise ComputationError(f"gave pressures that sum to {balance:.4f} of the load", "CalculiX")
+    surface = problem.map
+    pressure = np.linalg.norm(force, axis=1) / surface.area
+    medial, lateral = summarise_condyles(
+        medial_points(surface.points, pose, condyle_split(problem.pair.femoral)),
+        surface.points, pressure, surface.area, force, surface.thickness,
+    )  # fmt: skip
+    above, _ = problem.floor.over(surface.points, pose)
+    return ContactResult(
+        pose=pose,
+        points=surface.points,
+        normals=surface.normals,
+        pressure=pressure,
+        area=surface.area,
+        gap=above[:, 1] - surface.points[:, 1],
+        nodal_force=force,
+        wrench_on_insert=wrench_of(surface.points, force),
+        medial=medial,
+        lateral=lateral,
+        approach=approach,
+        iterations=run.iterations,
+        residual=abs(balance - 1),
+    ), balance
+
+
+def _nodal_forces(problem: _Problem, pose: Array, run: PeerRun) -> Array:
+    """Return the forces (c, 3) on the contact nodes, N: pressure times deformed area."""
+    moved = run.blocks["NINSERT"]
+    moved = moved[np.argsort(moved[:, 0]), 1:] * MILLIMETRE
+    deformed = replace(problem.lattice, nodes=problem.lattice.nodes + moved)
+    _, bent = contact_map(deformed, problem.pair.insert)
+    stress = run.blocks["contact"]
+    pressure = np.zeros(len(bent.points))
+    place = np.searchsorted(problem.nodes, stress[:, 0].astype(np.int64) - 1)
     pressure[place] = np.maximum(stress[:, 1], 0.0) * MEGAPASCAL
-    values = {"approach": -float(blocks["displacements"][-1, 2]) * MILLIMETRE}
-    medial = medial_points(state.points, pose, condyle_split(state.pair.femoral))
-    for side, own in (("medial", medial), ("lateral", ~medial)):
-        normal = (pressure * area)[own, None] * state.map.normals[own]
-        force = float(np.linalg.norm(normal.sum(axis=0)))
-        touched = float(area[own & (pressure > LEAST_PRESSURE)].sum())
-        values |= {
-            f"{side}_force": force,
-            f"{side}_area": touched,
-            f"{side}_mean_pressure": force / touched if touched else 0.0,
-            f"{side}_peak_pressure": float(pressure[own].max(initial=0.0)),
-        }
-    return values
+    loaded = pressure > 0
+    if not problem.touchable[loaded].all():
+        raise ComputationError("touches beyond the femoral patch it was given", "CalculiX")
+    _, normals = problem.floor.over(bent.points, pose)
+    return np.where(loaded[:, None], (pressure * bent.area)[:, None] * normals, 0.0)

@@ -1,0 +1,141 @@
+"""CalculiX as a process: time, memory and iterations of its own, a limit, its printed numbers."""
+
+import math
+import shutil
+import subprocess
+import tempfile
+import time as clock
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.frames import Array
+
+PROGRAM = "ccx"
+LONGEST_SECONDS = 900.0
+"""A run that takes longer is stopped and says so."""
+SAID = "said"
+LOOK_SECONDS = 0.05
+"""Between two looks at the process's memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class PeerRun:
+    """What one run of CalculiX gave and took.
+
+    Args:
+        blocks: the last block of numbers of each kind in its .dat file, by the first word.
+        seconds: of the process.
+        peak_rss_MB: of the process (1e6 bytes).
+        iterations: equilibrium iterations, one factorisation each.
+    """
+
+    blocks: dict[str, Array]
+    seconds: float
+    peak_rss_MB: float
+    iterations: int
+
+
+def find_program() -> str:
+    """Return where CalculiX is.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    found = shutil.which(PROGRAM)
+    if found is None:
+        raise InputError("is not installed", "CalculiX", "apt-get install calculix-ccx")
+    return found
+
+
+def run_calculix(text: str, longest: float = LONGEST_SECONDS) -> PeerRun:
+    """Run a deck.
+
+    Args:
+        text: the input.
+        longest: s, after which it is stopped.
+
+    Raises:
+        InputError: CalculiX is not installed.
+        ComputationError: it stopped with an error, or was stopped.
+    """
+    program = find_program()
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        (place / "peer.inp").write_text(text, encoding="utf-8")
+        start = clock.perf_counter()
+        memory = _wait([program, "-i", "peer"], place, longest)
+        seconds = clock.perf_counter() - start
+        if not (place / "peer.dat").exists():
+            raise ComputationError(f"gave no output: {_last_words(place / SAID)}", "CalculiX")
+        blocks = _blocks((place / "peer.dat").read_text(encoding="utf-8").splitlines())
+        iterations = _iterations((place / "peer.cvg").read_text(encoding="utf-8"))
+        return PeerRun(blocks, seconds, memory, iterations)
+
+
+def _wait(command: list[str], place: Path, longest: float) -> float:
+    """Run a command to its end; return its peak memory, MB."""
+    memory, start = math.nan, clock.perf_counter()
+    with (
+        open(place / SAID, "wb") as said,
+        subprocess.Popen(command, cwd=place, stdout=said, stderr=subprocess.STDOUT) as process,
+    ):
+        try:
+            while process.poll() is None:
+                memory = _peak_rss(process.pid, memory)
+                if clock.perf_counter() - start > longest:
+                    raise ComputationError(f"stopped after {longest:g} s", "CalculiX")
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(LOOK_SECONDS)
+        finally:
+            process.kill()
+    if process.returncode:
+        raise ComputationError(f"stopped: {_last_words(place / SAID)}", "CalculiX")
+    return memory
+
+
+def _peak_rss(number: int, known: float) -> float:
+    """Return the peak resident memory (MB) of a process; `known` where the system does not say.
+
+    The usage that a finished child leaves behind starts from its parent's memory, and is not
+    its own.
+    """
+    with suppress(OSError):
+        for line in Path(f"/proc/{number}/status").read_text().splitlines():
+            if line.startswith("VmHWM"):
+                return float(line.split()[1]) * 1024 / 1e6
+    return known
+
+
+def _last_words(path: Path) -> str:
+    """Return the line that says what went wrong, or the last one."""
+    lines = [line.strip(" *") for line in path.read_text(errors="replace").splitlines()]
+    lines = [line for line in lines if line]
+    wrong = [line for line in lines if line.lower().startswith("error")]
+    return (wrong or lines or ["it said nothing"])[-1]
+
+
+def _iterations(text: str) -> int:
+    """Count the lines of a .cvg file that belong to an iteration: step, increment, ..."""
+    return sum(line.split()[:1] != [] and line.split()[0].isdigit() for line in text.splitlines())
+
+
+def _blocks(lines: Iterable[str]) -> dict[str, Array]:
+    """Return the blocks of numbers; a title's first word, and its set, name one."""
+    blocks: dict[str, list[list[float]]] = {}
+    rows: list[list[float]] = []
+    for line in lines:
+        words = line.split()
+        try:
+            numbers = [float(word) for word in words]
+        except ValueError:
+            named = words[words.index("set") + 1] if "set" in words else words[0]
+            rows = blocks[named] = []
+            continue
+        if numbers:
+            rows.append(numbers)
+    return {name: np.array(rows) for name, rows in blocks.items() if rows}
