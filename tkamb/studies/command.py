@@ -36,6 +36,10 @@ def _tradeoff(options: argparse.Namespace) -> int:
     from tkamb.studies.matrix import expected_seconds, jobs
     from tkamb.studies.tradeoff_report import picture, table
 
+    if options.peer:
+        from tkamb.studies.calculix_run import find_program
+
+        find_program()
     wanted = jobs(options.quick, options.scene, options.full)
     directory = claim_directory(options.out)
     cases = study.cases_of(wanted)
