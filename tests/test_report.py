@@ -15,8 +15,9 @@ from tkamb.errors import InputError
 from tkamb.output import metrics
 from tkamb.output.axis import horizontal_axis, round_step
 from tkamb.output.headline import cards
+from tkamb.output.metrics import map_rows
 from tkamb.output.panels import panels
-from tkamb.output.pressure_maps import draw_maps, map_rows, mapped_frames, top_view
+from tkamb.output.pressure_maps import draw_maps, mapped_frames, top_view
 from tkamb.output.report import report_html, write_report
 from tkamb.output.tables import flags_table, motion_table, reasons
 from tkamb.results import Results

@@ -97,3 +97,13 @@ def flagged(results: Results) -> NDArray[np.bool_]:
 
 def _clean(results: Results) -> NDArray[np.bool_]:
     return np.array([status == "ok" for status in results.status], bool)
+
+
+def map_rows(results: Results) -> dict[int, int]:
+    """Return frame -> row of the maps of the same time, for every frame that has a map."""
+    if results.maps is None:
+        return {}
+    whole = np.atleast_1d(np.isfinite(results.maps.pressure_Pa).all(axis=1))
+    row_at = {float(t): row for row, t in enumerate(results.maps.time_s) if whole[row]}
+    times = [float(time) for time in results["time_s"]]
+    return {frame: row_at[time] for frame, time in enumerate(times) if time in row_at}

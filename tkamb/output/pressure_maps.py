@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis
 from tkamb.output.maps_file import ContactMaps
+from tkamb.output.metrics import map_rows
 from tkamb.output.panels import lateral_axis_name
 from tkamb.output.style import BLACK, GREY, PRESSURE_MAP, SIDE_COLOURS, new_figure, settings
 from tkamb.results import Results
@@ -86,16 +87,6 @@ def top_view(results: Results) -> TopView | None:
         return None
     side = str(results.summary.get("side", "right"))
     return TopView(results.maps, side, lateral_axis_name(results))
-
-
-def map_rows(results: Results) -> dict[int, int]:
-    """Return frame -> row of the maps of the same time, for every frame that has a map."""
-    if results.maps is None:
-        return {}
-    whole = np.atleast_1d(np.isfinite(results.maps.pressure_Pa).all(axis=1))
-    row_at = {float(t): row for row, t in enumerate(results.maps.time_s) if whole[row]}
-    times = [float(time) for time in results["time_s"]]
-    return {frame: row_at[time] for frame, time in enumerate(times) if time in row_at}
 
 
 def mapped_frames(results: Results, axis: HorizontalAxis, count: int = 8) -> list[int]:
@@ -197,6 +188,8 @@ def _label_stops(
     axes: Axes, x: Array, y: Array, axis: HorizontalAxis, frames: Sequence[int], colour: str
 ) -> None:
     """Write where the motion is beside the path's dots, as far as they have room."""
+    if not np.isfinite(x).any():
+        return
     outward = 1.0 if np.nanmean(x) > 0 else -1.0
     written: list[float] = []
     for frame in frames:

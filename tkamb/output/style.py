@@ -5,11 +5,11 @@ Colours: Okabe & Ito (2008), Color Universal Design. Pressure: viridis, perceptu
 
 import io
 import re
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 BLACK, GREY = "#1a1a1a", "#767676"
 BLUE, SKY = "#0072B2", "#56B4E9"
@@ -49,17 +49,21 @@ SETTINGS: Any = {
 }
 
 
-def new_figure(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float) -> "Figure":
     """Return an empty figure (inches) that needs no display."""
+    from matplotlib.figure import Figure
+
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def settings() -> Any:
     """Return the context in which figures are made and written."""
+    import matplotlib as mpl
+
     return mpl.rc_context(SETTINGS)
 
 
-def svg_text(figure: Figure, name: str, dpi: int = 200) -> str:
+def svg_text(figure: "Figure", name: str, dpi: int = 200) -> str:
     """Return the figure as inline SVG that scales with the page.
 
     Every id is prefixed with `name`, so that many figures live in one page. `data-box` holds
@@ -82,7 +86,7 @@ def svg_text(figure: Figure, name: str, dpi: int = 200) -> str:
     return re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", text)
 
 
-def _box(figure: Figure) -> str:
+def _box(figure: "Figure") -> str:
     axes = figure.axes[0]
     width, height = 72 * figure.get_size_inches()
     place = axes.get_position()
@@ -92,7 +96,7 @@ def _box(figure: Figure) -> str:
     return f'data-box="{box}" data-range="{low:.9g} {high:.9g}"'
 
 
-def legend_above(axes: Axes, columns: int = 4) -> None:
+def legend_above(axes: "Axes", columns: int = 4) -> None:
     """Put the legend over the plot, left-aligned, where it covers no line."""
     axes.legend(
         loc="lower left",

@@ -93,13 +93,13 @@ def run_identity(case: Case, frames: range) -> dict[str, Any]:
     """Return what makes two runs the same: scene, what its files hold, frames, version."""
     return {
         "scene": scene_hash(case),
-        "content of a file": _files_hash(case),
+        "content of a file": files_hash(case),
         "choice of frames": [frames.start, frames.stop, frames.step],
         "version of tkamb": version("tkamb"),
     }
 
 
-def _files_hash(case: Case) -> str:
+def files_hash(case: Case) -> str:
     """Return the SHA-256 of the files that the run reads: no mesh that nothing asks for."""
     digest = hashlib.sha256()
     unread = {"output"} | ({"implant"} if case.femoral is None else set())

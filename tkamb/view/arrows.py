@@ -35,7 +35,13 @@ def force_arrows(
         "hip": _vector(results, "hip_force_{}_N"),
     }
     found = [
-        _arrow("ground reaction", geometries, _ground, columns["ground reaction"], "on the foot"),
+        _arrow(
+            "ground reaction",
+            geometries,
+            centre_of_pressure,
+            columns["ground reaction"],
+            "on the foot",
+        ),
         _arrow("hip", geometries, _hip, columns["hip"], "on the femur, at the hip"),
         *_extensor(results, geometries),
         *_condyles(results, geometries, friction),
@@ -75,7 +81,8 @@ def _arrow(
     return Arrow(name, FORCE[name], points, forces, name == "hip", meaning)
 
 
-def _ground(geometry: KneeGeometry) -> Array:
+def centre_of_pressure(geometry: KneeGeometry) -> Array:
+    """Return where the ground reaction acts (3,) m; NaN without one."""
     return geometry.ground.points[0] if geometry.ground else NOTHING
 
 

@@ -16,6 +16,7 @@ from tkamb.output.style import (
 )
 
 METAL, INSERT, BONE, BUTTON = "#8d99a8", "#e4dfd0", "#f0e8d2", "#dcd8cc"
+FLOOR = "#b9c4c9"
 TENDON, WRAPPED = "#8c3b2e", "#f0c419"
 SLACK = "#9a9a9a"
 RECORDED = SKY

@@ -33,16 +33,17 @@ def add_view(commands: Any) -> None:
 
 
 def _view(options: argparse.Namespace) -> int:
+    def announce(line: str) -> None:
+        print(f"tkamb: {line}", file=sys.stderr, flush=True)
+
+    announce(f"reading {', '.join(map(str, options.runs))}")
     from tqdm import tqdm
 
     from tkamb.view.run import open_run
     from tkamb.view.show import Show
 
     def progress(frames: Any) -> Any:
-        return tqdm(frames, unit="frame", disable=None)
-
-    def announce(line: str) -> None:
-        print(f"tkamb: {line}", file=sys.stderr, flush=True)
+        return tqdm(frames, "drawing", unit="frame", disable=None)
 
     runs = [
         open_run(path, contact=contact, progress=progress, announce=announce)

@@ -5,12 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
+from tkamb.case import Case
 from tkamb.output.axis import horizontal_axis
-from tkamb.output.pressure_maps import map_rows
+from tkamb.output.metrics import map_rows
 from tkamb.results import Results
 from tkamb.units import MEGAPASCAL
 from tkamb.view.arrows import contact_markers, force_arrows
 from tkamb.view.drawing import Drawing, PressureMap
+from tkamb.view.foot import standing
 from tkamb.view.lattice_lines import lattice_lines
 from tkamb.view.readings import places, readings
 from tkamb.view.run import Run
@@ -25,7 +27,8 @@ from tkamb.view.strands import (
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 
-STAND_INS = "Bones are plain stand-ins between the joint centres; they carry no load."
+STAND_INS = "{} plain stand-ins between the joint centres; they carry no load."
+FOOT = "The foot is a stand-in too, drawn level with the floor whatever it did."
 
 
 def draw(run: Run, progress: Progress = lambda frames: frames, lattice: bool = False) -> Drawing:
@@ -42,11 +45,13 @@ def draw(run: Run, progress: Progress = lambda frames: frames, lattice: bool = F
     maps, found = results.maps, map_rows(results)
     rows = [found.get(k, -1) for k in range(len(results))]
     contact = case.scene.contact
+    base, pressed = standing(case, geometries, run.frames)
     bundles, limit = ligament_strands(mechanics, states)
     strands = [*bundles, *extensor_strands(mechanics, states)]
-    markers = [*contact_markers(geometries)]
+    markers = [*contact_markers(geometries), *pressed]
     if maps is not None and found:
-        centres = centres_of_pressure(results, maps)
+        assert case.insert is not None
+        centres = centres_of_pressure(results, case.insert)
         strands += path_strands(centres)
         markers += centre_markers(centres)
     axis = horizontal_axis(results)
@@ -59,15 +64,21 @@ def draw(run: Run, progress: Progress = lambda frames: frames, lattice: bool = F
         times=results["time_s"],
         statuses=tuple(results.status),
         readings=readings(results, axis),
-        solids=solids(case, mechanics.poses[list(run.frames)], states, maps, rows),
+        solids=solids(case, mechanics.poses[list(run.frames)], states, maps, rows) + base,
         strands=tuple(strands),
         arrows=force_arrows(results, geometries, contact.friction if contact else 0.0),
         markers=tuple(markers),
         map=_pressure_map(results, rows),
         strain_limit=limit,
         lattice=lattice_lines(case) if lattice else np.empty((0, 2, 3)),
-        notes=(STAND_INS, *case.scene.output.notes),
+        notes=(*_stand_ins(case, bool(base)), *case.scene.output.notes),
     )
+
+
+def _stand_ins(case: Case, foot: bool) -> tuple[str, ...]:
+    meshed = case.scene.quadriceps is not None and case.scene.quadriceps.bone is not None
+    words = STAND_INS.format("Tibia and patella are" if meshed else "Bones are")
+    return (words, FOOT) if foot else (words,)
 
 
 def _title(run: Run) -> str:

@@ -17,6 +17,7 @@ LAYERS = (
     "insert",
     "patella",
     "bones",
+    "floor",
     "ligaments",
     "extensor lines",
     "forces",

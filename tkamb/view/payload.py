@@ -109,8 +109,9 @@ def _view(block: Block, number: int, drawing: Drawing, peak: float) -> dict[str,
         shape = shaded(solid.surface)
         if shape.error:
             notes.append(
-                f"{solid.name.capitalize()}: drawn with fewer triangles, "
-                f"vertices moved by up to {shape.error / MILLIMETRE:.2f} mm."
+                f"{solid.name.capitalize()}: drawn with {len(shape.faces)} of "
+                f"{len(solid.surface.faces)} triangles, at most {shape.error / MILLIMETRE:.2f} mm "
+                "from the true surface."
             )
         path = _place(root, solid.layer, solid.name)
         commands += _commands(path, solid, shape)

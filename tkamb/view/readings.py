@@ -76,7 +76,7 @@ def _both(
     return Reading(
         name,
         tuple(
-            f"M {_text(m, '', digits)} · L {_text(x, unit, digits)}"
+            f"M {_text(m, '', digits)} · L {_text(x, '', digits)}{unit}"
             if np.isfinite(m) or np.isfinite(x)
             else "–"
             for m, x in zip(medial, lateral, strict=True)

@@ -8,7 +8,7 @@ from tkamb.case import Case, load_case
 from tkamb.errors import InputError
 from tkamb.mechanics.mechanics import FrameLoads, Mechanics
 from tkamb.results import SUMMARY_NAME, Results, read_results
-from tkamb.run.summary import scene_hash
+from tkamb.run.summary import files_hash, scene_hash
 from tkamb.scene import Scene, load_scene
 from tkamb.simulation import simulate
 
@@ -84,6 +84,7 @@ def open_run(
     if (folder / SUMMARY_NAME).exists():
         results = read_results(folder)
         same = results.summary.get("scene_sha256") == scene_hash(case)
+        same = same and _same_files(case, results)
         if same and len(results) and not results.summary.get("unfinished_frames"):
             announce(f"results of this scene found in {folder}")
             return joined(case, results)
@@ -114,13 +115,21 @@ def run_of(results: Results) -> Run:
         InputError: the scene is not there, or no longer what was run.
     """
     case = load_case(_scene_of(results))
+    scene = results.summary.get("scene")
     if scene_hash(case) != results.summary.get("scene_sha256"):
-        raise InputError(
-            "has changed since these results were computed, or was run with --set",
-            results.summary.get("scene"),
-            f"{RUN_AGAIN} {results.summary.get('scene')}",
-        )
+        what = "has changed since these results were computed, or was run with --set"
+        raise InputError(what, scene, f"{RUN_AGAIN} {scene}")
+    if not _same_files(case, results):
+        what = "a mesh or table that it names has changed since these results were computed"
+        raise InputError(what, scene, f"{RUN_AGAIN} {scene}")
     return joined(case, results)
+
+
+def _same_files(case: Case, results: Results) -> bool:
+    """Say whether meshes and tables hold what the run read; a run without a record counts."""
+    identity = results.summary.get("identity") or {}
+    found = identity.get("content of a file")
+    return found is None or found == files_hash(case)
 
 
 def _from_folder(folder: Path) -> Run:

@@ -1,7 +1,8 @@
 """The rigid parts of a drawing: implant, patella, and bones as plain solids.
 
-A scene holds no bone meshes (but one that the quadriceps may wrap), so the bones are stand-ins
-of about the right size between the joint centres: they orient the eye and carry no load.
+A scene holds no bone meshes but one that the quadriceps may wrap, which is drawn; the other
+bones are stand-ins of about the right size between the joint centres: they orient the eye and
+carry no load.
 """
 
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from tkamb.body.chain import ChainState
 from tkamb.case import Case
 from tkamb.geometry.frames import Array, inverse, pose
 from tkamb.geometry.surface import Surface
+from tkamb.mechanics.extensor import quadriceps_bone
 from tkamb.output.maps_file import ContactMaps
 from tkamb.units import MILLIMETRE
 from tkamb.view.colours import BONE, BUTTON, INSERT, METAL, RECORDED
@@ -72,7 +74,7 @@ def solids(
                 recorded,
             )
         )
-    found += [_femur(states, solved), _tibia(states)]
+    found += [_femur(case, states, solved), _tibia(states)]
     if case.scene.patella is not None and case.patella is not None:
         poses = np.stack([state.pose("patella") for state in states])
         found.append(Solid("patellar button", "patella", case.patella, BUTTON, 1.0, poses))
@@ -91,7 +93,11 @@ def _pressed(recorded: Array, maps: ContactMaps | None, rows: Sequence[int]) -> 
     return poses
 
 
-def _femur(states: Sequence[ChainState], poses: Array) -> Solid:
+def _femur(case: Case, states: Sequence[ChainState], poses: Array) -> Solid:
+    """Return the bone that the quadriceps may wrap, else a stand-in up to the hip."""
+    bone = quadriceps_bone(case)
+    if bone is not None:
+        return Solid("femur", "bones", bone, BONE, 1.0, poses)
     hip = (inverse(poses[0]) @ np.append(states[0].point("hip", np.zeros(3)), 1.0))[:3]
     return Solid("femur", "bones", _shaft(hip, FEMUR_PROFILE, "femur"), BONE, 1.0, poses)
 

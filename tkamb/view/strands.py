@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from tkamb.body.chain import ChainState
 from tkamb.body.wrapping import TautPath
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
+from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.surface import Surface
 from tkamb.mechanics.mechanics import Mechanics
-from tkamb.output.maps_file import ContactMaps
 from tkamb.output.style import SIDE_COLOURS
 from tkamb.results import Results
 from tkamb.units import MILLIMETRE
@@ -21,6 +21,9 @@ BUNDLE, TENDON_RADIUS, PATH = 1.0 * MILLIMETRE, 1.5 * MILLIMETRE, 0.35 * MILLIME
 """m, radii; bundles are thinner where a ligament has many."""
 
 MANY_BUNDLES = 20
+
+JUMP = 8.0 * MILLIMETRE
+"""m: a centre of pressure that moves farther from one frame to the next has not travelled."""
 
 
 def ligament_strands(
@@ -81,36 +84,30 @@ def _coloured(path: TautPath | None) -> tuple[Array, Colours]:
     return points, colours
 
 
-def centres_of_pressure(results: Results, maps: ContactMaps) -> dict[str, Array]:
-    """Return side -> (f, 3) m, on the undeformed insert."""
-    across, height = maps.points_m[:, [0, 2]], maps.points_m[:, 1]
-    inside, outside = LinearNDInterpolator(across, height), NearestNDInterpolator(across, height)
+def centres_of_pressure(results: Results, insert: Surface) -> dict[str, Array]:
+    """Return side -> (f, 3) m, on the undeformed insert; NaN beside it."""
+    rays, top = RayCaster(insert), float(insert.bounds[1, 1]) + MILLIMETRE
     found = {}
     for side in SIDE_COLOURS:
-        place = (
-            np.stack([results[f"{side}_cop_ap_mm"], results[f"{side}_cop_ml_mm"]], axis=1)
-            * MILLIMETRE
-        )
-        known = np.isfinite(place).all(axis=1)
-        points = np.full((len(place), 3), np.nan)
-        if known.any():
-            level = inside(place[known])
-            level = np.where(np.isfinite(level), level, outside(place[known]))
-            points[known] = np.column_stack([place[known, 0], level, place[known, 1]])
+        x, z = (results[f"{side}_cop_{axis}_mm"] * MILLIMETRE for axis in ("ap", "ml"))
+        points = np.column_stack([x, np.full(len(x), top), z])
+        known = np.isfinite(points).all(axis=1)
+        points[~known] = np.nan
+        down, _ = rays.first(points[known], np.array([0.0, -1.0, 0.0]))
+        points[known, 1] -= np.where(np.isfinite(down), down, np.nan)
         found[side] = points
     return found
 
 
 def path_strands(centres: dict[str, Array]) -> tuple[Strand, ...]:
-    """Return the path of each centre of pressure, broken where frames have none."""
+    """Return the path of each centre of pressure, broken where it is missing or jumps."""
     strands = []
     for side, points in centres.items():
-        known = np.isfinite(points).all(axis=1)
-        ends = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
+        step = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        near = np.concatenate([[False], step <= JUMP, [False]])
+        ends = np.flatnonzero(np.diff(near.astype(int)))
         for number, (first, last) in enumerate(ends.reshape(-1, 2)):
-            if last - first < 2:
-                continue
-            part = points[first:last] + np.array([0.0, 2.0 * PATH, 0.0])
+            part = points[first : last + 1] + np.array([0.0, 2.0 * PATH, 0.0])
             colours = np.repeat(rgb(SIDE_COLOURS[side])[None], len(part), axis=0)
             name = f"{side} path {number}"
             strands.append(Strand(name, "load paths", part[None], colours[None], PATH))

@@ -8,8 +8,8 @@ const CAMERAS = {
   "lateral": {from: [0, 0.04, 0.52]},
   "top of insert": {
     from: [-0.0004, 0.21, 0], at: [0, 0.012, 0],
-    without: ["femoral component", "bones", "patella", "ligaments", "extensor lines", "forces"]},
-  "whole leg": {from: [1.35, 0.25, -1.35], at: [-0.06, -0.03, 0], arrows: 2.5},
+    without: ["femoral component", "bones", "floor", "patella", "ligaments", "extensor lines", "forces"]},
+  "whole leg": {from: [1.6, 0.35, -1.6], at: [-0.04, -0.01, 0], arrows: 2.5},
 };
 const KNEE = [0, 0.03, 0];
 const element = (id) => document.getElementById(id);

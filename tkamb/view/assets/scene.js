@@ -109,7 +109,8 @@ function scaleTexture(colours) {
 }
 
 // The map: a level per point (0 to 1), coloured in the fragment as the colour bar says. Where
-// nothing presses the level is negative, and the fragment is cut off.
+// nothing presses the level is negative, and the fragment is cut off. It is drawn 0.1 mm above the
+// insert, whose drawn surface is that close to the true one.
 tkamb.showMap = function (view, map) {
   view.map = map;
   if (!map) return;
@@ -121,7 +122,8 @@ tkamb.showMap = function (view, map) {
     uniforms: {scale: {value: tkamb.scale}},
     vertexShader: `attribute float level; varying float shade;
       void main() { shade = level;
-        gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
+        vec3 lifted = position + vec3(0.0, 1e-4, 0.0);
+        gl_Position = projectionMatrix * modelViewMatrix * vec4(lifted, 1.0); }`,
     fragmentShader: `uniform sampler2D scale; varying float shade;
       void main() { if (shade < 0.0) discard;
         gl_FragColor = texture2D(scale, vec2(shade * 255.0 / 256.0 + 0.5 / 256.0, 0.5)); }`,

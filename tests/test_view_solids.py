@@ -1,0 +1,151 @@
+"""The solids of the viewer: thinned surfaces, the foot on its floor, bones, load paths."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from tkamb.case import load_case
+from tkamb.geometry.frames import inverse, transform
+from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.surface import Surface
+from tkamb.mechanics.mechanics import Mechanics
+from tkamb.scene import load_scene
+from tkamb.view.draw import draw
+from tkamb.view.foot import standing
+from tkamb.view.run import open_run
+from tkamb.view.shading import MOST_TRIANGLES, shaded
+from tkamb.view.solids import solids
+from tkamb.view.strands import JUMP, path_strands
+from tkamb.view.thinning import thinned
+from viewed import MODELS, shipped_run
+
+DM = MODELS / "dm" / "scene.toml"
+
+
+@pytest.fixture(scope="module")
+def run():
+    return open_run(shipped_run())
+
+
+@pytest.fixture(scope="module")
+def drawing(run):
+    return draw(run)
+
+
+def surface(mesh):
+    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64), "body")
+
+
+def ball(rings=60):
+    return surface(trimesh.creation.uv_sphere(radius=0.03, count=[rings, rings]))
+
+
+def distances(points, whole, spacing=1e-4):
+    """Return distances (n,) to a surface by samples of it, apart by about the spacing."""
+    mesh = trimesh.Trimesh(whole.vertices, whole.faces)
+    samples = trimesh.sample.sample_surface(mesh, int(mesh.area / spacing**2), seed=1)[0]
+    return cKDTree(np.concatenate([samples, whole.vertices])).query(points)[0]
+
+
+@pytest.mark.parametrize(("most", "largest"), [(6000, 1e-4), (2000, 5e-4), (500, 2e-3)])
+def test_a_thinned_surface_is_within_its_stated_error(most, largest):
+    whole = ball()
+    fewer, error = thinned(whole, most)
+    assert 0 < len(fewer.faces) <= most and 0 < error < largest
+    for one, other in ((fewer, whole), (whole, fewer)):
+        assert distances(one.vertices, other).max() < error + 2e-4
+
+
+def test_a_thinned_surface_faces_outwards_and_encloses_as_much():
+    whole = ball()
+    fewer, error = thinned(whole, 1500)
+    outwards = np.einsum("ij,ij->i", fewer.face_normals, fewer.triangles.mean(axis=1))
+    assert (outwards > 0).all()
+    volume = [trimesh.Trimesh(one.vertices, one.faces).volume for one in (fewer, whole)]
+    assert abs(volume[0] - volume[1]) < error * 4 * np.pi * 0.03**2
+
+
+def test_flat_faces_and_sharp_edges_survive_thinning():
+    box = trimesh.creation.box((0.02, 0.03, 0.04))
+    for _ in range(5):
+        box = box.subdivide()
+    fewer, error = thinned(surface(box), 3000)
+    assert len(fewer.faces) <= 3000 and error < 1e-8
+    assert trimesh.Trimesh(fewer.vertices, fewer.faces).volume == pytest.approx(24e-6, rel=1e-6)
+
+
+def test_a_small_surface_is_left_alone():
+    whole = ball(20)
+    fewer, error = thinned(whole, len(whole.faces))
+    assert fewer is whole and error == 0.0
+
+
+def test_the_shipped_implant_is_drawn_within_a_third_of_a_millimetre(drawing):
+    for solid in drawing.solids:
+        drawn = shaded(solid.surface)
+        assert len(drawn.faces) <= MOST_TRIANGLES
+        assert drawn.error < 0.35e-3
+
+
+def test_the_ground_reaction_acts_on_the_floor_that_is_drawn(run, drawing):
+    floor = next(one for one in drawing.solids if one.name == "floor")
+    arrow = next(one for one in drawing.arrows if one.name == "ground reaction")
+    for row, k in enumerate(run.frames):
+        local = transform(inverse(floor.poses[row]), arrow.points[row])
+        assert abs(local[1]) < 1e-9
+        up = run.case.ground.force[k] @ [0.0, 1.0, 0.0]
+        assert floor.poses[row][:3, 1] @ arrow.forces[row] == pytest.approx(up, rel=1e-9)
+    marker = next(one for one in drawing.markers if one.name == "centre of pressure")
+    np.testing.assert_array_equal(marker.points, arrow.points)
+
+
+def test_the_foot_stands_on_the_floor_and_holds_the_ankle(run, drawing):
+    foot = next(one for one in drawing.solids if one.name == "foot")
+    floor = next(one for one in drawing.solids if one.name == "floor")
+    for row, k in enumerate(run.frames):
+        ankle = run.mechanics.placed(k).geometry.state.point("tibia", np.zeros(3))
+        sole = transform(inverse(floor.poses[row]) @ foot.poses[row], foot.surface.vertices)
+        assert abs(sole[:, 1].min()) < 1e-3
+        local = transform(inverse(foot.poses[row]), ankle)
+        low, high = foot.surface.bounds
+        assert (local > low).all() and (local < high).all()
+
+
+def test_no_floor_where_the_reaction_is_put_at_the_ankle():
+    scene = load_scene(
+        MODELS / "deep_knee_bend" / "scene.toml", {"ground_reaction.applied": "ankle"}
+    )
+    assert standing(load_case(scene), (), ()) == ((), ())
+
+
+def test_centres_of_pressure_lie_on_the_insert(run, drawing):
+    rays = RayCaster(run.case.insert)
+    found = [one for one in drawing.markers if "centre of pressure" in one.name][-2:]
+    for marker in found:
+        assert np.isfinite(marker.points).all()
+        down, _ = rays.first(marker.points + np.array([0.0, 1e-3, 0.0]), np.array([0.0, -1.0, 0.0]))
+        np.testing.assert_allclose(down, 1e-3, atol=1e-9)
+
+
+def test_a_load_path_is_broken_where_it_jumps():
+    x = np.array([0.0, 1e-3, 2e-3, 2e-3 + 1.5 * JUMP, 3e-3 + 1.5 * JUMP, np.nan, 0.0])
+    points = np.column_stack([x, np.zeros(7), np.zeros(7)])
+    strands = path_strands({"medial": points})
+    assert [strand.points.shape[1] for strand in strands] == [3, 2]
+
+
+def test_the_bone_that_the_scene_names_is_drawn():
+    data = Path(__file__).parents[2] / "shared" / "data" / "dm"
+    if not data.is_dir():
+        pytest.skip("subject DM's data are not beside the project")
+    mechanics = Mechanics(load_case(load_scene(DM, {"motion.frames": 11})))
+    states = [mechanics.placed(k).geometry.state for k in range(2)]
+    made = solids(mechanics.case, mechanics.poses[:2], states, None, [-1] * 2)
+    femur = next(one for one in made if one.name == "femur")
+    given = trimesh.load(data / "geometry" / "bone_femur.stl")
+    assert len(femur.surface.faces) == len(given.faces)
+    hip = np.linalg.norm(femur.surface.vertices, axis=1).max()
+    assert 0.3 < hip < 0.6
