@@ -1,5 +1,7 @@
 """The factorisation and the stored response against scipy's own solver."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.sparse.linalg as linalg
@@ -7,6 +9,7 @@ import scipy.sparse.linalg as linalg
 from lattice_blocks import block
 from tkamb.contact.lattice.network import CalibratedNetwork
 from tkamb.contact.lattice.operator import fixed_unknowns, prepare_operator
+from tkamb.contact.lattice.response import unknowns_of
 from tkamb.contact.materials import material
 
 MM = 1e-3
@@ -41,15 +44,72 @@ def test_stored_response_is_the_solve(bearing):
     force[top] = np.random.default_rng(2).normal(size=(len(top), 3))
     u = operator.solve(force)
     scale = np.abs(u).max()
-    compliance = operator.half.compliance(np.arange(3 * len(top)))
+    compliance = operator.half.compliance()
     assert np.abs(compliance @ force[top].ravel() - u[top].ravel()).max() < 1e-11 * scale
     y = np.zeros_like(operator.start(force))
     operator.half.apply(force[top].ravel(), y)
-    assert np.abs(operator.finish(y) - u).max() < 1e-11 * scale
+    operator.factor.backward(y)
+    assert np.abs(operator.nodal(y) - u).max() < 1e-11 * scale
     projected = operator.half.project(operator.start(force))
     assert np.abs(projected - u[top].ravel()).max() < 1e-11 * scale
-    some = np.array([3, 10, 11, 40, 7])
-    assert operator.half.compliance(some) == pytest.approx(compliance[np.ix_(some, some)])
+
+
+@pytest.mark.parametrize("bearing", ["fixed", "mobile"])
+def test_response_of_some_nodes_is_part_of_the_whole(bearing):
+    _, _, operator, top = prepared(bearing)
+    whole = operator.half.compliance()
+    some = unknowns_of(np.array([3, 10, 11, 40, 7]))
+    part = operator.half.among(some)
+    assert part.compliance() == pytest.approx(whole[np.ix_(some, some)])
+    rows = np.array([4, 0, 9])
+    assert part.compliance(rows) == pytest.approx(whole[np.ix_(some[rows], some)])
+    force = np.random.default_rng(3).normal(size=len(some))
+    full, y = np.zeros(3 * len(top)), np.zeros(len(operator.factor.order))
+    full[some] = force
+    z = y.copy()
+    operator.half.apply(full, y)
+    part.apply(force, z)
+    assert z == pytest.approx(y, rel=1e-12, abs=1e-12 * np.abs(y).max())
+    assert part.project(y) == pytest.approx(operator.half.project(y)[some])
+
+
+def test_few_nodes_need_few_members():
+    """Forces on, and displacements of, some nodes: the members above them are enough."""
+    solid, held, operator, top = prepared("fixed")
+    some = top[:4]
+    members = operator.members_of(some)
+    assert len(members) < len(operator.factor.fronts)
+    force = np.zeros_like(solid.nodes)
+    force[some] = np.random.default_rng(4).normal(size=(4, 3))
+    y = operator.start(force, members)
+    assert y == pytest.approx(operator.start(force), rel=1e-12, abs=1e-12 * np.abs(y).max())
+    u = operator.solve(force)
+    operator.factor.backward(y, members)
+    assert operator.nodal(y)[some] == pytest.approx(u[some])
+    rest = np.setdiff1d(np.arange(len(operator.factor.fronts)), members)
+    operator.factor.backward(y, rest)
+    assert operator.nodal(y) == pytest.approx(u)
+    assert len(operator.members_of(np.flatnonzero(held.reshape(-1, 3).all(axis=1)))) == 0
+
+
+def test_single_precision_keeps_displacements_to_a_few_parts_in_a_million():
+    edges = np.full(3, MM)
+    nodes, index, cells, _ = block((20, 8, 20), edges, 0.5)
+    nearly = replace(material("polyethylene"), poisson_ratio=0.4999)
+    for kind in (material("polyethylene"), nearly):
+        solid = CalibratedNetwork(nodes, cells, edges, kind)
+        held = fixed_unknowns(nodes, np.flatnonzero(index[:, 1] == 0), "fixed")
+        top = np.flatnonzero(index[:, 1] == 8)
+        exact, kept = (
+            prepare_operator(solid.stiffness, index, held, top, precision)
+            for precision in (np.float64, np.float32)
+        )
+        force = np.zeros_like(nodes)
+        force[top[150:200], 1] = -1.0
+        u = exact.solve(force)
+        assert np.abs(kept.solve(force) - u).max() < 5e-6 * np.abs(u).max()
+        compliance = exact.half.compliance()
+        assert np.abs(kept.half.compliance() - compliance).max() < 1e-6 * compliance.max()
 
 
 def test_mobile_bearing_holds_no_more_than_it_must():

@@ -112,9 +112,10 @@ class ElasticFoundation(ContactModel):
     law: Law = "nonlinear"
 
     def prepare(self, pair: ContactPair) -> FoundationState:
-        """Sample the articular surface and build the femoral ray caster."""
+        """Sample the articular surface, build the ray casters and what finds first touch."""
         bed = sample_bed(pair.insert, self.resolution)
-        return FoundationState(pair, bed, RayCaster(pair.femoral), condyle_split(pair.femoral))
+        pair.first_touch.travel(np.eye(4))
+        return FoundationState(pair, bed, pair.femoral_rays, condyle_split(pair.femoral))
 
     def evaluate(
         self, state: FoundationState, pose: Array, guess: ContactResult | None = None

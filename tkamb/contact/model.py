@@ -6,15 +6,19 @@ frame (x anterior, y superior, z to the subject's right), SI units.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.contact.materials import Material
+from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import Array
+from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
 Bearing = Literal["fixed", "mobile"]
@@ -44,6 +48,21 @@ class ContactPair:
     material: Material
     bearing: Bearing = "fixed"
 
+    @cached_property
+    def femoral_rays(self) -> RayCaster:
+        """Rays against the femoral component, in its own frame."""
+        return RayCaster(self.femoral)
+
+    @cached_property
+    def insert_rays(self) -> RayCaster:
+        """Rays against the insert."""
+        return RayCaster(self.insert)
+
+    @cached_property
+    def first_touch(self) -> FirstTouch:
+        """How far the femoral component travels until either condyle touches."""
+        return FirstTouch(self.femoral, self.insert, rays=(self.femoral_rays, self.insert_rays))
+
 
 @dataclass(frozen=True, eq=False)
 class CondyleContact:
@@ -66,6 +85,24 @@ class CondyleContact:
     thickness: float
 
 
+class _WhenRead:
+    """A field that may be given as a function, which is called when the field is first read."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = f"_{name}"
+
+    def __get__(self, instance: Any, owner: type) -> float:
+        if instance is None:
+            raise AttributeError("no default")
+        value = instance.__dict__[self._name]
+        if callable(value):
+            value = instance.__dict__[self._name] = float(value())
+        return float(value)
+
+    def __set__(self, instance: Any, value: float | Callable[[], float]) -> None:
+        instance.__dict__[self._name] = value
+
+
 @dataclass(frozen=True, eq=False)
 class ContactResult:
     """Pressure map and wrench at one pose.
@@ -84,7 +121,8 @@ class ContactResult:
         wrench_on_insert: (6,) force (N) and moment about the insert origin (N·m).
         medial: what the medial condyle (or the only one) carries; None when nothing.
         lateral: what the lateral condyle carries; None when nothing, or no such condyle.
-        approach: m, travel along -y since first touch; 0 when apart.
+        approach: m, travel along -y since first touch; 0 when apart. A model that does not
+            need it may give a function of no argument, called when it is first read.
         status: how the evaluation ended.
         iterations: of the model's own solver.
         residual: relative residual of that solver.
@@ -101,7 +139,7 @@ class ContactResult:
     wrench_on_insert: Array
     medial: CondyleContact | None
     lateral: CondyleContact | None
-    approach: float
+    approach: float = _WhenRead()  # type: ignore[assignment]
     status: ContactStatus = ContactStatus.OK
     iterations: int = 0
     residual: float = 0.0

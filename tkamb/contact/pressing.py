@@ -10,7 +10,6 @@ import numpy as np
 
 from tkamb.contact.model import ContactModel, ContactPair, ContactResult, ContactStatus
 from tkamb.errors import InputError
-from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import Array
 
 LOAD_TOLERANCE = 1e-6
@@ -272,11 +271,6 @@ def failed_result(
     )
 
 
-@lru_cache(maxsize=4)
-def _touch_of(pair: ContactPair) -> FirstTouch:
-    return FirstTouch(pair.femoral, pair.insert)
-
-
 @lru_cache(maxsize=8)
 def _touch_height(pair: ContactPair, level: bytes) -> float:
-    return -_touch_of(pair).travel(np.frombuffer(level).reshape(4, 4))
+    return -pair.first_touch.travel(np.frombuffer(level).reshape(4, 4))

@@ -61,22 +61,27 @@ class Pattern:
 
 
 @dataclass(frozen=True, eq=False)
-class CellScatter:
-    """Sums per-cell nodal vectors into global ones.
+class Scatter:
+    """Sums the members' nodal vectors into global ones.
 
     Args:
-        cells: (c, 8) nodes of each cell.
+        members: (c, p) nodes of each member (cell or spring).
         nodes: how many nodes.
     """
 
-    cells: Indices
+    members: Indices
     nodes: int
 
-    def gather(self, displacement: Array) -> Array:
-        """Return (c, 24) from nodal (n, 3)."""
-        return displacement[self.cells].reshape(len(self.cells), 24)
+    def gather(self, displacement: Array, chosen: Indices | None = None) -> Array:
+        """Return (k, 3p) of the chosen members, by default of all, from nodal (n, 3)."""
+        members = self.members if chosen is None else self.members[chosen]
+        return displacement[members].reshape(len(members), 3 * members.shape[1])
 
-    def sum(self, forces: Array) -> Array:
-        """Return nodal (n, 3) from per-cell (c, 24)."""
-        flat, parts = self.cells.ravel(), forces.reshape(-1, 3)
-        return np.stack([np.bincount(flat, parts[:, d], self.nodes) for d in range(3)], axis=1)
+    def sum(self, forces: Array, chosen: Indices | None = None) -> Array:
+        """Return nodal (n, 3) from (k, 3p) of the chosen members, by default of all."""
+        flat = (self.members if chosen is None else self.members[chosen]).ravel()
+        parts = forces.reshape(-1, 3)
+        total = np.zeros((self.nodes, 3))
+        for axis in range(3) if len(flat) else ():
+            total[:, axis] = np.bincount(flat, parts[:, axis], self.nodes)
+        return total

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tkamb.contact.lattice.calibrated import DEVIATORIC, strain_matrix
 from tkamb.contact.lattice.curve import ShearCurve
 from tkamb.contact.lattice.hexahedron import gauss_gradients, mean_gradient
-from tkamb.contact.lattice.solid import Solid
+from tkamb.contact.lattice.solid import Indices, Solid
 from tkamb.contact.materials import Material
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
@@ -55,14 +55,13 @@ class BbarHexahedra(Solid):
         shear = np.einsum("sg,sgri,sgrj->sij", self.weights, self.shear, self.shear, optimize=True)
         return self.material.shear_modulus * shear + self._bulk
 
-    def correction(self, displacement: Array) -> Array:
-        """Return the sum over Gauss points of (mu - mu_s) times their unit shear forces, N."""
-        if self.curve.spline is None:
-            return np.zeros_like(displacement)
-        strain, equivalent = self._state(displacement)
+    def lost(self, displacement: Array, chosen: Indices | None = None) -> Array:
+        """Return the Gauss points' (mu - mu_s) times unit shear forces, N, (k, 24)."""
+        strain, equivalent = self._state(displacement, chosen)
         lost = self.material.shear_modulus - self.curve.modulus(equivalent)
-        strain *= (lost * self.weights[self.shape_of_cell])[..., None]
-        return self.scatter.sum(self._per_cell_forces(strain))
+        cells = slice(None) if chosen is None else chosen
+        strain *= (lost * self.weights[self.shape_of_cell[cells]])[..., None]
+        return self._per_cell_forces(strain, chosen)
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n), N/m."""
@@ -91,29 +90,37 @@ class BbarHexahedra(Solid):
         return np.asarray(scale[:, None, None] * g[:, :, None] * g[:, None, :])
 
     @cached_property
-    def _kinds(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
-        """Cells of the most frequent shape, the others, and their (40, 24) shear matrices."""
-        common = int(np.bincount(self.shape_of_cell).argmax())
-        same = np.flatnonzero(self.shape_of_cell == common)
-        others = np.flatnonzero(self.shape_of_cell != common)
-        flat = self.shear.reshape(-1, 40, 24)
-        return same, others, flat[common], flat[self.shape_of_cell[others]]
+    def _others(self) -> tuple[Array, Array, Indices]:
+        """Shear matrices (40, 24) of the commonest shape and of other cells, and their places.
 
-    def _state(self, displacement: Array) -> tuple[Array, Array]:
-        """Return scaled deviatoric strain (c, 8, 5) and equivalent strain (c, 8)."""
-        local = self.scatter.gather(displacement)
-        same, others, matrix, matrices = self._kinds
-        flat = np.empty((len(local), 40))
-        flat[same] = local[same] @ matrix.T
+        Of the latter, -1 for a cell of the commonest shape.
+        """
+        common, others = self.kinds
+        place = np.full(len(self.cells), -1)
+        place[others] = np.arange(len(others))
+        flat = self.shear.reshape(-1, 40, 24)
+        return flat[common], flat[self.shape_of_cell[others]], place
+
+    def _sorted(self, chosen: Indices | None) -> tuple[Array, Indices, Array]:
+        """Return the common matrix, which of the chosen cells are others, and their matrices."""
+        matrix, matrices, place = self._others
+        place = place if chosen is None else place[chosen]
+        others = np.flatnonzero(place >= 0)
+        return matrix, others, matrices if chosen is None else matrices[place[others]]
+
+    def _state(self, displacement: Array, chosen: Indices | None = None) -> tuple[Array, Array]:
+        """Return scaled deviatoric strain (k, 8, 5) and equivalent strain (k, 8)."""
+        local = self.scatter.gather(displacement, chosen)
+        matrix, others, matrices = self._sorted(chosen)
+        flat = local @ matrix.T
         flat[others] = np.einsum("crj,cj->cr", matrices, local[others])
         strain = flat.reshape(-1, 8, 5)
         return strain, np.sqrt(np.einsum("cgr,cgr->cg", strain, strain) / 3)
 
-    def _per_cell_forces(self, stress: Array) -> Array:
-        """Return (c, 24) from weighted scaled stresses (c, 8, 5)."""
-        same, others, matrix, matrices = self._kinds
+    def _per_cell_forces(self, stress: Array, chosen: Indices | None) -> Array:
+        """Return (k, 24) from weighted scaled stresses (k, 8, 5)."""
         flat = stress.reshape(-1, 40)
-        force = np.empty((len(flat), 24))
-        force[same] = flat[same] @ matrix
+        matrix, others, matrices = self._sorted(chosen)
+        force = flat @ matrix
         force[others] = np.einsum("crj,cr->cj", matrices, flat[others])
-        return force
+        return np.asarray(force)

@@ -26,7 +26,7 @@ from tkamb.contact.lattice.response import Block, HalfResponse
 from tkamb.contact.lattice.solid import Solid
 from tkamb.geometry.frames import Array
 
-FORMAT = 1
+FORMAT = 2
 """Counted up when an operator's content or the meaning of a key changes."""
 LEAST_UNKNOWNS = 20_000
 """Smaller operators are not kept."""
@@ -73,7 +73,7 @@ def cached_operator(
     if found is not None:
         return found
     made = make()
-    if 8 * (made.factor.entries + made.half.entries) <= limit:
+    if sum(block.nbytes for block in _floats(made)) <= limit:
         try:
             _write(path, made)
             _prune(path.parent, limit)
@@ -110,6 +110,7 @@ def _integers(operator: ElasticOperator) -> list[NDArray[Any]]:
         np.concatenate([np.zeros(0, np.int64), *(f.boundary for f in fronts)]),
         operator.half.rank,
         np.array(rows, np.int64).reshape(-1, 4),
+        np.zeros(0, fronts[0].block.dtype),
     ]
 
 
@@ -121,12 +122,12 @@ def _read(path: Path) -> ElasticOperator | None:
     """Return the operator in a file, or None if there is no whole one."""
     try:
         with path.open("rb") as file:
-            parts = [np.load(file, allow_pickle=False) for _ in range(7)]
-            numbers = np.fromfile(file, np.float64)
+            parts = [np.load(file, allow_pickle=False) for _ in range(8)]
+            numbers = np.fromfile(file, parts[-1].dtype)
         os.utime(path)
     except (OSError, ValueError, EOFError):
         return None
-    free, contact_nodes, order, sizes, boundaries, rank, rows = parts
+    free, contact_nodes, order, sizes, boundaries, rank, rows, _ = parts
     own = sizes[:, 1] - sizes[:, 0]
     wanted = int(((own + sizes[:, 3]) * own).sum())
     wanted += int(((rows[:, 1] - rows[:, 0]) * (rows[:, 3] - rows[:, 2])).sum())

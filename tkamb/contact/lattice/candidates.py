@@ -1,4 +1,4 @@
-"""Which contact nodes can be touched at a pose, and their compliance, kept while it serves."""
+"""Which contact nodes can be touched at a pose, and their response, kept while it serves."""
 
 from dataclasses import dataclass, field
 from threading import Lock
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tkamb.contact.lattice.memory import Remembered
 from tkamb.contact.lattice.problem import ContactProblem
-from tkamb.contact.lattice.response import HalfResponse
+from tkamb.contact.lattice.response import ContactResponse, HalfResponse, unknowns_of
 from tkamb.contact.lattice.solver import Start
 from tkamb.geometry.frames import Array
 
@@ -17,36 +17,58 @@ Indices = NDArray[np.int64]
 MARGIN = 0.25
 """Nodes count as candidates this share of the depth beyond first touch."""
 SPARE = 1.6
-"""The stored compliance covers nodes down to this many times the depth asked for."""
+"""The stored response covers nodes down to this many times the depth asked for."""
 MOST_STORED = 1500
-"""Nodes of the stored compliance: 160 MB."""
+"""Nodes of the stored response: 160 MB of compliance."""
 
 
 @dataclass
-class CompliancePool:
-    """The compliance (3m, 3m) of the nodes asked for last; a cache that changes no answer."""
+class ResponsePool:
+    """The response of the nodes asked for last; a cache that changes no answer.
 
-    half: HalfResponse
+    Args:
+        whole: response of all contact nodes.
+        nodes: (p,) contact nodes at hand, increasing.
+        half: their response alone.
+        matrix: (3p, 3p) m/N, their compliance.
+    """
+
+    whole: HalfResponse
     nodes: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
+    half: HalfResponse | None = None
     matrix: Array = field(default_factory=lambda: np.zeros((0, 0)))
     _lock: Lock = field(default_factory=Lock)
 
-    def among(self, wanted: Indices, spare: Indices) -> Array:
-        """Return the compliance (3m, 3m), m/N, among contact nodes.
+    def among(self, wanted: Indices, spare: Indices) -> ContactResponse:
+        """Return the response among contact nodes.
 
         Args:
             wanted: (m,) increasing positions among the contact nodes.
             spare: a superset that is worked out when `wanted` is not at hand, if not too many.
         """
         with self._lock:
-            nodes, matrix = self.nodes, self.matrix
-            if not np.isin(wanted, nodes, assume_unique=True).all():
-                nodes = spare if len(spare) <= MOST_STORED else wanted
-                matrix = self.half.compliance((3 * nodes[:, None] + np.arange(3)).ravel())
-                self.nodes, self.matrix = nodes, matrix
+            if self.half is None or not np.isin(wanted, self.nodes, assume_unique=True).all():
+                self._take(spare if len(spare) <= MOST_STORED else wanted)
+            nodes, half, matrix = self.nodes, self.half, self.matrix
+        assert half is not None
         place = np.searchsorted(nodes, wanted)
-        unknowns = (3 * place[:, None] + np.arange(3)).ravel()
-        return matrix if len(wanted) == len(nodes) else matrix[np.ix_(unknowns, unknowns)]
+        own = unknowns_of(place)
+        if len(wanted) < len(nodes):
+            matrix = matrix[own][:, own]
+        return ContactResponse(half, place, matrix)
+
+    def _take(self, nodes: Indices) -> None:
+        """Take nodes, with what is known of their compliance already."""
+        half = self.whole.among(unknowns_of(nodes))
+        _, here, there = np.intersect1d(nodes, self.nodes, True, True)
+        new = np.setdiff1d(np.arange(len(nodes)), here, assume_unique=True)
+        matrix = np.empty((3 * len(nodes), 3 * len(nodes)))
+        known, had, rows = unknowns_of(here), unknowns_of(there), unknowns_of(new)
+        matrix[np.ix_(known, known)] = self.matrix[np.ix_(had, had)]
+        if len(new):
+            matrix[rows] = half.compliance(rows)
+            matrix[:, rows] = matrix[rows].T
+        self.nodes, self.half, self.matrix = nodes, half, matrix
 
 
 def guessed_depth(problem: ContactProblem, gaps: Array, areas: Array, load: float) -> float:
@@ -71,17 +93,17 @@ def guessed_depth(problem: ContactProblem, gaps: Array, areas: Array, load: floa
 
 
 def choose_start(
-    pool: CompliancePool,
+    pool: ResponsePool,
     gaps: Array,
     depth: float,
     at_pose: bool,
     touched: NDArray[np.bool_] | None,
     earlier: Remembered | None,
 ) -> Start:
-    """Return candidates, their compliance and a first active set.
+    """Return candidates, their response and a first active set.
 
     Args:
-        pool: where compliances come from.
+        pool: where responses come from.
         gaps: (c,) vertical gaps, m.
         depth: m, how deep the femoral component may go below the lowest gap.
         at_pose: the femoral component stays at the pose: candidates overlap it already.
@@ -99,6 +121,8 @@ def choose_start(
     active = gaps[nodes] < level
     if touched is not None and touched[nodes].any():
         active = touched[nodes]
-    lost = None if earlier is None else earlier.lost
-    moved = None if earlier is None else earlier.moved[nodes]
-    return Start(nodes, pool.among(nodes, spare), active, lost, moved, reach)
+    response = pool.among(nodes, spare)
+    if earlier is None:
+        return Start(nodes, response, active, reach=reach)
+    moved, region = earlier.moved[nodes], earlier.region
+    return Start(nodes, response, active, earlier.lost, moved, reach, region)

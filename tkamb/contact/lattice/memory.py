@@ -5,6 +5,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from threading import Lock
 
+from tkamb.contact.lattice.region import Region
 from tkamb.contact.model import ContactResult
 from tkamb.geometry.frames import Array
 
@@ -18,10 +19,14 @@ class Remembered:
     Args:
         lost: (n, 3) h, N, or None for a linear material.
         moved: (c, 3) m, displacement of the contact nodes that were candidates, else 0.
+        depth: m, how far the femoral component went below the lowest contact node.
+        region: outside of which `lost` is zero, or None.
     """
 
     lost: Array | None
     moved: Array
+    depth: float
+    region: Region | None
 
 
 class Memory:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.contact.lattice.cache import cached_operator, operator_key
-from tkamb.contact.lattice.candidates import CompliancePool, choose_start, guessed_depth
+from tkamb.contact.lattice.candidates import ResponsePool, choose_start, guessed_depth
 from tkamb.contact.lattice.femoral import FemoralFloor
 from tkamb.contact.lattice.grid import Lattice, build_grid
 from tkamb.contact.lattice.memory import Memory, Remembered
@@ -22,11 +22,10 @@ from tkamb.contact.lattice.solid import Solid
 from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve
 from tkamb.contact.materials import LinearElastic, Material
 from tkamb.contact.model import ContactModel, ContactPair, ContactResult, PreparedContact
-from tkamb.contact.pressing import check_load, failed_result, first_touch_height, pose_at_approach
+from tkamb.contact.pressing import check_load, failed_result, pose_at_approach
 from tkamb.errors import ComputationError
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import Array
-from tkamb.geometry.rays import RayCaster
 
 MOST_GROWTHS = 8
 """How often the candidate set may grow before it counts as saturated."""
@@ -51,7 +50,7 @@ class LatticeState(PreparedContact):
     problem: ContactProblem
     map: ContactMap
     split: float | None
-    pool: CompliancePool
+    pool: ResponsePool
     memory: Memory = field(default_factory=Memory)
 
     @property
@@ -102,15 +101,20 @@ class CellContact(ContactModel):
         """Return the solid on a lattice."""
 
     def prepare(self, pair: ContactPair) -> LatticeState:
-        """Build the grid, factorise its stiffness, store the contact nodes' response."""
+        """Build the grid, factorise its stiffness, store the contact nodes' response.
+
+        The first rays build the femoral component's trees and normals: they are fired here.
+        """
         lattice = build_grid(pair.insert, self.resolution)
         solid = self.solid(lattice, pair.material)
         held = fixed_unknowns(lattice.nodes, lattice.bottom_nodes, pair.bearing)
         nodes, surface = contact_map(lattice, pair.insert)
         operator = self._operator(solid, lattice, held, nodes)
-        floor = FemoralFloor(pair.femoral, RayCaster(pair.femoral))
+        floor = FemoralFloor(pair.femoral, pair.femoral_rays)
         problem = ContactProblem(solid, operator, lattice.index, held, floor, self.direction)
-        pool = CompliancePool(operator.half)
+        vertical_gaps(problem, np.eye(4))
+        pair.first_touch.travel(np.eye(4))
+        pool = ResponsePool(operator.half)
         return LatticeState(pair, lattice, problem, surface, condyle_split(pair.femoral), pool)
 
     def _operator(
@@ -123,7 +127,7 @@ class CellContact(ContactModel):
         """Return the operator, from disk if it was made before."""
 
         def make() -> ElasticOperator:
-            return prepare_operator(solid.stiffness, lattice.index, held, nodes)
+            return prepare_operator(solid.stiffness, lattice.index, held, nodes, np.float32)
 
         if not self.cache:
             return make()
@@ -148,19 +152,24 @@ class CellContact(ContactModel):
         """Find the approach that carries `load` (N); see `ContactModel`."""
         check_load(load)
         pose = np.array(pose, float)
-        if not np.isfinite(first_touch_height(state.pair, pose)):
-            return failed_result(state, pose, "the femoral component does not lie over the insert")
-        pose = pose_at_approach(state.pair, pose, 0.0)
+        if not np.isfinite(pose).all():
+            return failed_result(state, pose, "the pose is not finite")
         gaps = vertical_gaps(state.problem, pose)
+        lowest = float(gaps.min())
+        if not np.isfinite(lowest):
+            return failed_result(state, pose, "the femoral component does not lie over the insert")
         if load == 0:
-            return untouched(state, pose, gaps)
-        if not np.isfinite(gaps).any():
-            return failed_result(
-                state, pose, "no node of the insert lies under the femoral component"
-            )
-        depth = guessed_depth(state.problem, gaps, state.map.area, load)
-        if guess is not None and guess.approach > 0:
+            pose = pose_at_approach(state.pair, pose, 0.0)
+            return untouched(state, pose, vertical_gaps(state.problem, pose))
+        pose[1, 3] -= lowest
+        gaps -= lowest
+        earlier = state.memory.of(guess)
+        if earlier is not None:
+            depth = earlier.depth
+        elif guess is not None and guess.approach > 0:
             depth = guess.approach
+        else:
+            depth = guessed_depth(state.problem, gaps, state.map.area, load)
         return self._solved(state, pose, load, gaps, depth, guess)
 
     def _solved(
@@ -180,11 +189,13 @@ class CellContact(ContactModel):
             start = choose_start(state.pool, gaps, depth, load is None, touched, earlier)
             solution = self._solution(state.problem, pose, load, start, tolerance)
             covered = load is None or len(start.candidates) == np.isfinite(gaps).sum()
-            reached = solution.forces.approach * REACH - min(float(gaps.min()), 0.0)
+            below = -min(float(gaps.min()), 0.0)
+            reached = solution.forces.approach * REACH + below
             if solution.converged:
                 moved = np.zeros_like(state.map.points)
                 moved[solution.candidates] = solution.displacement
-                earlier = Remembered(solution.lost, moved)
+                below += solution.forces.approach
+                earlier = Remembered(solution.lost, moved, below, solution.region)
             if covered or reached <= start.reach:
                 result = result_of(state, pose, load, gaps, solution, self.pressure_rule)
                 if solution.converged and earlier is not None:

@@ -3,10 +3,14 @@
 Each tree member gathers its rows and its children's updates into a dense front, eliminates
 its own unknowns and hands the rest up (Duff & Reid, ACM TOMS 9:302, 1983,
 doi:10.1145/356044.356047). The factor keeps, per member, W = [L11⁻¹; L21 L11⁻¹], so that
-either half of a solve is one product per member.
+either half of a solve is one product per member. Forces on few members need only the members
+above them, and so do displacements of few.
+
+The products of a solve read every W once: memory is what they wait for. `einsum` reads faster
+than BLAS here and starts no threads, which would wait for each other on a busy machine.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -30,7 +34,7 @@ class Front:
         stop: one past the last own unknown.
         boundary: (m,) later unknowns that it touches, increasing.
         parent: member above, -1 at a root.
-        block: (k + m, k) W = [L11⁻¹; L21 L11⁻¹].
+        block: (k + m, k) W = [L11⁻¹; L21 L11⁻¹], float64 or float32.
     """
 
     start: int
@@ -58,32 +62,48 @@ class CholeskyFactor:
         return sum(front.block.size for front in self.fronts)
 
     def solve(self, right: Array) -> Array:
-        """Return x of A x = right, (n,) or (n, r)."""
-        x = np.array(right[self.order], order="F")
+        """Return x (n,) of A x = right."""
+        x = right[self.order].astype(np.float64)
         self.forward(x)
         self.backward(x)
         result = np.empty_like(x)
         result[self.order] = x
         return result
 
-    def forward(self, x: Array) -> None:
-        """Turn x into L⁻¹ x in place, in elimination order."""
-        for front in self.fronts:
-            k = front.stop - front.start
-            y = front.block @ x[front.start : front.stop]
-            x[front.start : front.stop] = y[:k]
-            x[front.boundary] -= y[k:]
+    def forward(self, x: Array, members: Indices | None = None) -> None:
+        """Turn x (n,) into L⁻¹ x in place, in elimination order.
 
-    def backward(self, x: Array) -> None:
-        """Turn x into L⁻ᵀ x in place, in elimination order."""
-        for front in reversed(self.fronts):
-            k = front.stop - front.start
-            own = front.block[:k].T @ x[front.start : front.stop]
-            x[front.start : front.stop] = own - front.block[k:].T @ x[front.boundary]
+        Args:
+            x: zero but on the members.
+            members: increasing, with everything above each of them; all by default.
+        """
+        for front in self._chosen(members):
+            own = x[front.start : front.stop].astype(front.block.dtype)
+            y = np.einsum("ij,j->i", front.block, own)
+            x[front.start : front.stop] = y[: len(own)]
+            x[front.boundary] -= y[len(own) :]
+
+    def backward(self, x: Array, members: Indices | None = None) -> None:
+        """Turn x (n,) into L⁻ᵀ x in place, in elimination order.
+
+        Args:
+            x: L⁻ᵀ x already on what lies above the members and is none of them.
+            members: increasing; all by default.
+        """
+        for front in reversed(self._chosen(members)):
+            own = np.concatenate([x[front.start : front.stop], -x[front.boundary]])
+            own = own.astype(front.block.dtype)
+            x[front.start : front.stop] = np.einsum("ij,i->j", front.block, own)
+
+    def _chosen(self, members: Indices | None) -> list[Front]:
+        return self.fronts if members is None else [self.fronts[m] for m in members.tolist()]
 
 
 def factorise(
-    matrix: sparse.csr_matrix, tree: Dissection, unknowns: list[Indices]
+    matrix: sparse.csr_matrix,
+    tree: Dissection,
+    unknowns: list[Indices],
+    precision: type[np.floating] = np.float64,
 ) -> CholeskyFactor:
     """Return the Cholesky factor.
 
@@ -91,6 +111,7 @@ def factorise(
         matrix: (n, n) symmetric positive definite.
         tree: dissection; used for its parents.
         unknowns: unknowns that each tree member eliminates.
+        precision: in which the factor is kept; it is worked out in float64.
 
     Raises:
         ComputationError: the matrix is not positive definite.
@@ -107,7 +128,8 @@ def factorise(
         front, update = _eliminate(
             permuted, start, stop, updates.pop(member, []), place, tree.parent[member]
         )
-        fronts.append(front)
+        block = np.ascontiguousarray(front.block, dtype=precision)
+        fronts.append(replace(front, block=block))
         if len(front.boundary):
             updates.setdefault(front.parent, []).append((front.boundary, update))
         start = stop

@@ -36,13 +36,11 @@ class CalibratedNetwork(Solid):
         """Return mu K_d + K V g gᵀ of each shape (s, 24, 24), N/m."""
         return self.material.shear_modulus * self.deviatoric + self._bulk
 
-    def correction(self, displacement: Array) -> Array:
-        """Return the sum over cells of (mu - mu_s) K_d u, N, (n, 3)."""
-        if self.curve.spline is None:
-            return np.zeros_like(displacement)
-        force, equivalent = self._state(displacement)
+    def lost(self, displacement: Array, chosen: NDArray[np.int64] | None = None) -> Array:
+        """Return (mu - mu_s) K_d u of the cells, N, (k, 24); see `Solid`."""
+        force, equivalent = self._state(displacement, chosen)
         lost = self.material.shear_modulus - self.curve.modulus(equivalent)
-        return self.scatter.sum(lost[:, None] * force)
+        return lost[:, None] * force
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n): mu_s K_d + mu_s'/(3 V e) (K_d u)(K_d u)ᵀ + bulk."""
@@ -65,17 +63,25 @@ class CalibratedNetwork(Solid):
         return np.asarray(scale[:, None, None] * g[:, :, None] * g[:, None, :])
 
     @cached_property
-    def _kinds(self) -> tuple[int, NDArray[np.int64], Array]:
-        """Most frequent shape, the cells of other shapes and their K_d."""
-        common = int(np.bincount(self.shape_of_cell).argmax())
-        others = np.flatnonzero(self.shape_of_cell != common)
-        return common, others, self.deviatoric[self.shape_of_cell[others]]
+    def _others(self) -> tuple[Array, NDArray[np.int64]]:
+        """K_d of the cells that are not of the commonest shape, and where each cell's is; -1."""
+        others = self.kinds[1]
+        place = np.full(len(self.cells), -1)
+        place[others] = np.arange(len(others))
+        return self.deviatoric[self.shape_of_cell[others]], place
 
-    def _state(self, displacement: Array) -> tuple[Array, Array]:
-        """Return K_d u (c, 24) and the equivalent strain e (c,)."""
-        local = self.scatter.gather(displacement)
-        common, others, matrices = self._kinds
-        force = local @ self.deviatoric[common]
+    def _state(
+        self, displacement: Array, chosen: NDArray[np.int64] | None = None
+    ) -> tuple[Array, Array]:
+        """Return K_d u (k, 24) and the equivalent strain e (k,) of the chosen cells."""
+        local = self.scatter.gather(displacement, chosen)
+        cells = slice(None) if chosen is None else chosen
+        matrices, place = self._others
+        place = place[cells]
+        force = local @ self.deviatoric[self.kinds[0]]
+        others = np.flatnonzero(place >= 0)
+        matrices = matrices if chosen is None else matrices[place[others]]
         force[others] = np.einsum("cij,cj->ci", matrices, local[others])
         energy = np.einsum("ci,ci->c", local, force)
-        return force, np.sqrt(np.maximum(energy, 0) / (3 * self.volume[self.shape_of_cell]))
+        volume = self.volume[self.shape_of_cell[cells]]
+        return force, np.sqrt(np.maximum(energy, 0) / (3 * volume))

@@ -1,6 +1,7 @@
 """The linear operator of one insert: factor, boundary conditions, response of contact nodes."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
@@ -33,23 +34,48 @@ class ElasticOperator:
 
     def solve(self, force: Array) -> Array:
         """Return the displacement (n, 3), m, under nodal forces (n, 3), N."""
-        return self.finish(self.start(force))
+        y = self.start(force)
+        self.factor.backward(y)
+        return self.nodal(y)
 
-    def start(self, force: Array) -> Array:
-        """Return y = L⁻¹ f in elimination order, for nodal forces (n, 3)."""
+    def start(self, force: Array, members: Indices | None = None) -> Array:
+        """Return y = L⁻¹ f in elimination order, for nodal forces (n, 3).
+
+        Args:
+            force: N; zero but on the nodes that the members are for.
+            members: from `members_of`; all by default.
+        """
         y = force.ravel()[self.free][self.factor.order]
-        self.factor.forward(y)
+        self.factor.forward(y, members)
         return np.asarray(y)
 
-    def finish(self, y: Array) -> Array:
-        """Return nodal displacements (n, 3) = L⁻ᵀ y."""
-        x = y.copy()
-        self.factor.backward(x)
+    def nodal(self, x: Array) -> Array:
+        """Return nodal values (n, 3) of a vector in elimination order, 0 where held."""
         inner = np.empty_like(x)
         inner[self.factor.order] = x
         result = np.zeros(len(self.free))
         result[self.free] = inner
         return result.reshape(-1, 3)
+
+    def members_of(self, nodes: Indices) -> Indices:
+        """Return the members of the factor that eliminate the nodes, and all above them."""
+        fronts = self.factor.fronts
+        needed = np.zeros(len(fronts) + 1, bool)
+        needed[self._member_of_node[nodes]] = True
+        for member, front in enumerate(fronts):
+            if needed[member]:
+                needed[front.parent] = True
+        return np.flatnonzero(needed[:-1])
+
+    @cached_property
+    def _member_of_node(self) -> Indices:
+        """Member (n,) that eliminates each node; -1 for a node that is held."""
+        fronts = self.factor.fronts
+        member = np.repeat(np.arange(len(fronts)), [f.stop - f.start for f in fronts])
+        unknown = np.flatnonzero(self.free)[self.factor.order]
+        result = np.full(len(self.free) // 3, -1)
+        result[unknown // 3] = member
+        return result
 
 
 def fixed_unknowns(nodes: Array, bottom: Indices, bearing: Bearing) -> NDArray[np.bool_]:
@@ -72,7 +98,11 @@ def fixed_unknowns(nodes: Array, bottom: Indices, bearing: Bearing) -> NDArray[n
 
 
 def prepare_operator(
-    stiffness: sparse.csr_matrix, index: Indices, held: NDArray[np.bool_], contact_nodes: Indices
+    stiffness: sparse.csr_matrix,
+    index: Indices,
+    held: NDArray[np.bool_],
+    contact_nodes: Indices,
+    precision: type[np.floating] = np.float64,
 ) -> ElasticOperator:
     """Factorise a stiffness matrix (3n, 3n) and work out the contact nodes' half response.
 
@@ -81,6 +111,7 @@ def prepare_operator(
         index: (n, 3) place of each node in the lattice.
         held: (3n,) unknowns that are zero.
         contact_nodes: (c,).
+        precision: in which the numbers are kept; they are worked out in float64.
     """
     free = ~held
     number = np.cumsum(free) - 1
@@ -95,8 +126,8 @@ def prepare_operator(
     for own in tree.own:
         wanted = (3 * some[own][:, None] + np.arange(3)).ravel()
         unknowns.append(number[wanted[free[wanted]]])
-    factor = factorise(stiffness[free][:, free], tree, unknowns)
+    factor = factorise(stiffness[free][:, free], tree, unknowns, precision)
     place = np.full(len(free), -1)
     place[np.flatnonzero(free)[factor.order]] = np.arange(len(factor.order))
     wanted = place[(3 * contact_nodes[:, None] + np.arange(3)).ravel()]
-    return ElasticOperator(free, factor, contact_nodes, half_response(factor, wanted))
+    return ElasticOperator(free, factor, contact_nodes, half_response(factor, wanted, precision))

@@ -1,5 +1,6 @@
 """From a solution of the lattice to the contract's result: pressures, sums, flags."""
 
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -88,7 +89,7 @@ def result_of(
         wrench_on_insert=wrench_of(surface.points, force),
         medial=medial,
         lateral=lateral,
-        approach=depth if load is not None else approach_at(state.pair, pose),
+        approach=partial(approach_at, state.pair, pose),  # type: ignore[arg-type]
         status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
         iterations=solution.passes,
         residual=solution.residual,
@@ -131,7 +132,7 @@ def _areas(state: "LatticeState", gaps: Array, loaded: Mask, rule: PressureRule)
 def _strain_flags(state: "LatticeState", solution: Solution) -> tuple[tuple[str, ...], bool]:
     """Return the flags and whether the insert is compressed to nothing."""
     if solution.field is not None:
-        least, _ = state.problem.solid.principal_strain_range(solution.field)
+        least = state.problem.solid.least_principal_strain(solution.field)
         kind = "principal strain"
     else:
         sunk = solution.displacement[:, 1] / state.map.thickness[solution.candidates]

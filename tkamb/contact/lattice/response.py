@@ -26,7 +26,7 @@ class Block:
         stop: one past the last row.
         first: first column.
         last: one past the last column.
-        values: (stop - start, last - first).
+        values: (stop - start, last - first), float64 or float32.
     """
 
     start: int
@@ -53,31 +53,47 @@ class HalfResponse:
         ordered = np.zeros(self.columns)
         ordered[self.rank[self.rank >= 0]] = force[self.rank >= 0]
         for block in self.blocks:
-            part = ordered[block.first : block.last]
+            part = ordered[block.first : block.last].astype(block.values.dtype)
             if part.any():
-                y[block.start : block.stop] += block.values @ part
+                y[block.start : block.stop] += np.einsum("ij,j->i", block.values, part)
 
     def project(self, y: Array) -> Array:
         """Return Zᵀ y (q,): displacement of the unknowns under the load whose L⁻¹ f is y."""
         ordered = np.zeros(self.columns)
         for block in self.blocks:
-            ordered[block.first : block.last] += y[block.start : block.stop] @ block.values
+            part = y[block.start : block.stop].astype(block.values.dtype)
+            if part.any():
+                ordered[block.first : block.last] += np.einsum("ij,i->j", block.values, part)
         return np.where(self.rank >= 0, ordered[np.maximum(self.rank, 0)], 0.0)
 
-    def compliance(self, unknowns: Indices) -> Array:
-        """Return the compliance (u, u), m/N, among some of the unknowns."""
+    def among(self, unknowns: Indices) -> "HalfResponse":
+        """Return the response of some of the unknowns (u,) alone."""
         wanted = self.rank[unknowns]
         live = np.flatnonzero(wanted >= 0)
         order = live[np.argsort(wanted[live])]
-        columns = wanted[order]
-        inner = np.zeros((len(order), len(order)))
+        rank = np.full(len(unknowns), -1)
+        rank[order] = np.arange(len(order))
+        blocks, columns = [], wanted[order]
         for block in self.blocks:
-            a, b = np.searchsorted(columns, [block.first, block.last])
+            a, b = (int(n) for n in np.searchsorted(columns, [block.first, block.last]))
             if b > a:
-                part = block.values[:, columns[a:b] - block.first]
-                inner[a:b, a:b] += part.T @ part
-        result = np.zeros((len(unknowns), len(unknowns)))
-        result[np.ix_(order, order)] = inner
+                values = np.take(block.values, columns[a:b] - block.first, axis=1)
+                blocks.append(Block(block.start, block.stop, a, b, values))
+        return HalfResponse(rank, blocks)
+
+    def compliance(self, some: Indices | None = None) -> Array:
+        """Return the compliance (s, q), m/N, of some unknowns, by default all, to all."""
+        rank = self.rank if some is None else self.rank[some]
+        rows, live = np.unique(rank[rank >= 0]), self.rank >= 0
+        inner = np.zeros((len(rows), self.columns))
+        for block in self.blocks:
+            a, b = np.searchsorted(rows, [block.first, block.last])
+            if b > a:
+                part = block.values.astype(np.float64)
+                inner[a:b, block.first : block.last] += part[:, rows[a:b] - block.first].T @ part
+        result = np.zeros((len(rank), len(self.rank)))
+        place = np.searchsorted(rows, rank[rank >= 0])
+        result[np.ix_(rank >= 0, live)] = inner[np.ix_(place, self.rank[live])]
         return result
 
     @property
@@ -91,10 +107,43 @@ class HalfResponse:
         return int((self.rank >= 0).sum())
 
 
-def half_response(factor: CholeskyFactor, unknowns: Indices) -> HalfResponse:
+@dataclass(frozen=True, eq=False)
+class ContactResponse:
+    """What forces on candidate nodes do.
+
+    Args:
+        half: response of the candidates and perhaps of more nodes.
+        place: (m,) of the candidates among these.
+        compliance: (3m, 3m) m/N among the candidates.
+    """
+
+    half: HalfResponse
+    place: Indices
+    compliance: Array
+
+    def push(self, force: Array, y: Array) -> None:
+        """Add L⁻¹ of forces (m, 3), N, to y (in elimination order)."""
+        whole = np.zeros((len(self.half.rank) // 3, 3))
+        whole[self.place] = force
+        self.half.apply(whole.ravel(), y)
+
+    def displacement(self, y: Array) -> Array:
+        """Return the candidates' displacement (m, 3), m, under the load whose L⁻¹ f is y."""
+        return np.asarray(self.half.project(y).reshape(-1, 3)[self.place])
+
+
+def unknowns_of(nodes: Indices) -> Indices:
+    """Return the three unknowns of each node (n,), one node after the other (3n,)."""
+    return np.asarray((3 * nodes[:, None] + np.arange(3)).ravel())
+
+
+def half_response(
+    factor: CholeskyFactor, unknowns: Indices, precision: type[np.floating] = np.float64
+) -> HalfResponse:
     """Return L⁻¹ of unit forces on unknowns given in elimination order (q,), -1 = held.
 
-    Work and memory go along the paths to the root only.
+    Work and memory go along the paths to the root only. It is worked out in float64 and kept
+    in `precision`.
     """
     live = np.flatnonzero(unknowns >= 0)
     order = live[np.argsort(unknowns[live])]
@@ -114,7 +163,7 @@ def half_response(factor: CholeskyFactor, unknowns: Indices) -> HalfResponse:
         right[rows[a:b] - front.start, np.arange(a, b) - first] += 1.0
         product = front.block @ right
         _pass_up(factor, values, spans, member, product[front.stop - front.start :])
-        done = np.ascontiguousarray(product[: front.stop - front.start])
+        done = np.ascontiguousarray(product[: front.stop - front.start], dtype=precision)
         blocks.append(Block(front.start, front.stop, first, last, done))
         values[member] = done
     return HalfResponse(rank, blocks)

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.assembly import CellScatter, Pattern
+from tkamb.contact.lattice.assembly import Pattern, Scatter
 from tkamb.contact.lattice.hexahedron import group_shapes, mean_gradient
 from tkamb.contact.materials import Material
 from tkamb.errors import InputError
@@ -39,7 +39,7 @@ class Solid(ABC):
                 "lattice",
                 "take a finer resolution",
             )
-        self.scatter = CellScatter(cells, len(nodes))
+        self.scatter = Scatter(cells, len(nodes))
 
     @cached_property
     def pattern(self) -> Pattern:
@@ -52,8 +52,19 @@ class Solid(ABC):
         """Linear stiffness (3n, 3n), N/m."""
 
     @abstractmethod
+    def lost(self, displacement: Array, chosen: Indices | None = None) -> Array:
+        """Return linear forces minus the material's own, N, of members of `scatter` (k, 3p).
+
+        Args:
+            displacement: (n, 3) m; only the chosen members' nodes are looked at.
+            chosen: (k,) members; all by default.
+        """
+
     def correction(self, displacement: Array) -> Array:
         """Return h = K u - f(u), N, (n, 3): linear forces minus the material's own."""
+        if self.material.is_linear:
+            return np.zeros_like(displacement)
+        return self.scatter.sum(self.lost(displacement))
 
     @abstractmethod
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
@@ -68,9 +79,33 @@ class Solid(ABC):
         linear = (self.stiffness @ displacement.ravel()).reshape(-1, 3)
         return np.asarray(linear - self.correction(displacement))
 
-    def principal_strain_range(self, displacement: Array) -> tuple[float, float]:
-        """Return the smallest and largest principal strain of the cells' mean gradients."""
-        gradients = mean_gradient(self.shapes)[0][self.shape_of_cell]
-        gradient = np.einsum("cna,cnb->cab", displacement[self.cells], gradients)
-        principal = np.linalg.eigvalsh((gradient + np.swapaxes(gradient, 1, 2)) / 2)
-        return float(principal[:, 0].min()), float(principal[:, 2].max())
+    def least_principal_strain(self, displacement: Array) -> float:
+        """Return the smallest principal strain of the cells' mean gradients.
+
+        It is no smaller than minus the norm of its tensor: where the cell of largest norm is
+        compressed, only cells whose norm exceeds that compression are looked at.
+        """
+        strain = self.strain(displacement)
+        norm = np.linalg.norm(strain, axis=(1, 2))
+        first = float(np.linalg.eigvalsh(strain[norm.argmax()])[0])
+        return float(np.linalg.eigvalsh(strain[norm >= -first])[:, 0].min())
+
+    def strain(self, displacement: Array) -> Array:
+        """Return each cell's mean strain (c, 3, 3)."""
+        common, others, gradients = self._mean_gradients
+        corners = displacement[self.cells]
+        gradient = np.einsum("cna,nb->cab", corners, common)
+        gradient[others] = np.einsum("cna,cnb->cab", corners[others], gradients)
+        return np.asarray((gradient + np.swapaxes(gradient, 1, 2)) / 2)
+
+    @cached_property
+    def _mean_gradients(self) -> tuple[Array, Indices, Array]:
+        """Mean gradients (8, 3) of the commonest shape, the other cells, and theirs."""
+        gradients, (common, others) = mean_gradient(self.shapes)[0], self.kinds
+        return gradients[common], others, gradients[self.shape_of_cell[others]]
+
+    @cached_property
+    def kinds(self) -> tuple[int, Indices]:
+        """The commonest shape, and the cells (k,) of all others."""
+        common = int(np.bincount(self.shape_of_cell).argmax())
+        return common, np.flatnonzero(self.shape_of_cell != common)

@@ -6,8 +6,8 @@ all nodes, and replaces the forces h that the material has lost against the line
 
     K u = f_contact + h,    h = K u - f_internal(u)
 
-h is accelerated by Anderson's method; its change is the out-of-balance force. For a linear
-material h = 0 and the pass is repeated only until the sliding nodes rest.
+(`tkamb.contact.lattice.lost_balance`). For a linear material h = 0 and the pass is repeated
+only until the sliding nodes rest.
 """
 
 from dataclasses import dataclass, replace
@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.contact.lattice.active_set import ContactForces, solve_contact
-from tkamb.contact.lattice.anderson import AndersonMixer
+from tkamb.contact.lattice.lost_balance import LostBalance
 from tkamb.contact.lattice.problem import ContactProblem, Footing
+from tkamb.contact.lattice.region import Region
+from tkamb.contact.lattice.response import ContactResponse
 from tkamb.contact.lattice.sliding import SlidingNodes
 from tkamb.geometry.frames import Array
 
@@ -48,19 +50,21 @@ class Start:
 
     Args:
         candidates: (m,) positions among the contact nodes.
-        compliance: (3m, 3m) m/N among them.
+        response: of the candidates to forces on them.
         active: (m,) first guess of the active set.
         lost: (n, 3) h, N, of an earlier solution, or None.
         moved: (m, 3) m, displacement of the candidates in an earlier solution, or None.
         reach: m, every node with a smaller vertical gap is a candidate.
+        region: outside of which `lost` is zero, or None.
     """
 
     candidates: Indices
-    compliance: Array
+    response: ContactResponse
     active: Mask
     lost: Array | None = None
     moved: Array | None = None
     reach: float = np.inf
+    region: Region | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,10 +77,11 @@ class Solution:
         footing: femoral points and normals of the candidates.
         displacement: (m, 3) of the candidates, m.
         field: (n, 3) displacement of all nodes, or None (linear material).
-        lost: (n, 3) h, N, or None (linear material).
+        lost: (n, 3) h, N, where another pass would start, or None (linear material).
         passes: how many.
         residual: out-of-balance force or distance from the femoral surface, the larger one,
             both relative.
+        region: outside of which `lost` is zero, or None.
     """
 
     candidates: Indices
@@ -87,6 +92,7 @@ class Solution:
     lost: Array | None
     passes: int
     residual: float
+    region: Region | None = None
 
     @property
     def converged(self) -> bool:
@@ -130,61 +136,41 @@ def solve(
     """Return the contact at a pose under a load (N), or at approach 0 when load is None."""
     if problem.solid.material.is_linear:
         return _solve_linear(problem, pose, load, start, tolerance)
-    operator, chosen = problem.operator, start.candidates
+    chosen, active, passes = start.candidates, start.active, 0
+    balance = LostBalance(problem, start.response, tolerance.force, start.lost, start.region)
     points = problem.surface_points[chosen]
-    lost = np.zeros_like(problem.solid.nodes) if start.lost is None else start.lost
-    mixer, active, passes = AndersonMixer(), start.active, 0
-    begun = operator.start(lost)
-    offset = operator.half.project(begun).reshape(-1, 3)[chosen]
-    first = offset if start.moved is None else start.moved
+    first = balance.offset if start.moved is None else start.moved
     sliding = SlidingNodes(problem, points, first, pose)
     best: Solution | None = None
     while True:
         passes += 1
-        foot = sliding.foot
-        forces, moved = solve_pass(start.compliance, offset, points, foot, load, active)
+        foot, compliance = sliding.foot, start.response.compliance
+        forces, moved = solve_pass(compliance, balance.offset, points, foot, load, active)
         active = forces.active
-        field, value, residual = _respond(problem, begun, chosen, forces, foot, lost)
+        balance.respond(forces.force[:, None] * foot.normals)
         missed = sliding.follow(moved, forces)
-        done = not active.any() or max(residual, missed) <= tolerance.force
+        if not active.any() or max(balance.residual, missed) <= tolerance.force:
+            balance.look_everywhere()
+        residual = max(balance.residual, missed)
+        done = not active.any() or residual <= tolerance.force
         forces = replace(forces, converged=done and forces.converged)
-        now = Solution(chosen, forces, foot, moved, field, lost, passes, max(residual, missed))
-        best = now if best is None or now.residual < best.residual else best
+        field, lost, region = balance.field, balance.lost, balance.region
+        now = Solution(chosen, forces, foot, moved, field, lost, passes, residual, region)
         if done:
             return now
-        if passes == tolerance.passes or not now.residual < DIVERGED * best.residual:
-            return replace(best, passes=passes)
-        lost = mixer.next(lost.ravel(), value.ravel()).reshape(-1, 3)
-        begun = operator.start(lost)
-        offset = operator.half.project(begun).reshape(-1, 3)[chosen]
+        best = now if best is None or residual < best.residual else best
+        if passes == tolerance.passes or not residual < DIVERGED * best.residual:
+            return _given_up(problem, best, passes)
+        balance.advance()
 
 
-def _respond(
-    problem: ContactProblem,
-    begun: Array,
-    chosen: Indices,
-    forces: ContactForces,
-    foot: Footing,
-    lost: Array,
-) -> tuple[Array, Array, float]:
-    """Return all displacements (n, 3), the h they ask for and the relative imbalance.
-
-    Args:
-        problem: solid and operator.
-        begun: L⁻¹ h, becomes L⁻¹ (h + contact forces).
-        chosen: candidates.
-        forces: on them.
-        foot: femoral planes.
-        lost: (n, 3) the h that went in, N.
-    """
-    pushed = np.zeros((len(problem.contact_nodes), 3))
-    pushed[chosen] = forces.force[:, None] * foot.normals
-    problem.operator.half.apply(pushed.ravel(), begun)
-    field = problem.operator.finish(begun)
-    value = problem.solid.correction(field)
-    value[problem.held.reshape(-1, 3)] = 0.0
-    size = max(float(np.linalg.norm(pushed)), 1e-300)
-    return field, value, float(np.linalg.norm(value - lost)) / size
+def _given_up(problem: ContactProblem, best: Solution, passes: int) -> Solution:
+    """Return the best pass with the displacements of the whole solid."""
+    applied = np.zeros_like(problem.solid.nodes) if best.lost is None else best.lost.copy()
+    applied[problem.contact_nodes[best.candidates]] += (
+        best.forces.force[:, None] * best.footing.normals
+    )
+    return replace(best, field=problem.operator.solve(applied), passes=passes)
 
 
 def _solve_linear(
@@ -202,7 +188,7 @@ def _solve_linear(
     while True:
         passes += 1
         foot = sliding.foot
-        forces, moved = solve_pass(start.compliance, nothing, points, foot, load, active)
+        forces, moved = solve_pass(start.response.compliance, nothing, points, foot, load, active)
         active = forces.active
         missed = sliding.follow(moved, forces)
         done = missed <= tolerance.force

@@ -19,7 +19,7 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.assembly import Pattern
+from tkamb.contact.lattice.assembly import Pattern, Scatter
 from tkamb.contact.lattice.cells import DIRECTIONS
 from tkamb.contact.lattice.solid import Solid
 from tkamb.contact.materials import Material
@@ -60,6 +60,7 @@ class SourceNetwork(Solid):
     ) -> None:
         super().__init__(nodes, cells, spacing, material)
         self.springs = springs
+        self.scatter = Scatter(springs, len(nodes))
         self.factor = source_factor(spacing)
         self.lines = nodes[springs[:, 1]] - nodes[springs[:, 0]]
         self.lengths = np.linalg.norm(self.lines, axis=1)
@@ -70,14 +71,17 @@ class SourceNetwork(Solid):
         k = np.full(len(self.springs), self.material.young_modulus * self.factor)
         return self._assembled(k, self.lines / self.lengths[:, None])
 
-    def correction(self, displacement: Array) -> Array:
-        """Return linear forces minus those of the springs as they lie, N, (n, 3)."""
-        if self.material.is_linear:
-            return np.zeros_like(displacement)
-        strain, direction = self._state(displacement)
-        force = self.material.stress(strain) * self.factor * self.lengths
-        ends = self._summed(force[:, None] * direction)
-        return np.asarray((self.stiffness @ displacement.ravel()).reshape(-1, 3) - ends)
+    def lost(self, displacement: Array, chosen: NDArray[np.int64] | None = None) -> Array:
+        """Return linear forces minus those of the springs as they lie, N, (k, 6)."""
+        springs = slice(None) if chosen is None else chosen
+        strain, direction = self._state(displacement, springs)
+        a, b = self.springs[springs].T
+        straight = self.lines[springs] / self.lengths[springs, None]
+        longer = np.einsum("sd,sd->s", straight, displacement[b] - displacement[a])
+        linear = self.material.young_modulus * longer[:, None] * straight
+        now = (self.material.stress(strain) * self.lengths[springs])[:, None] * direction
+        lost = self.factor * (linear - now)
+        return np.hstack([-lost, lost])
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return the springs' (d sigma/d eps) C n nᵀ, assembled as in the source (3n, 3n).
@@ -105,18 +109,11 @@ class SourceNetwork(Solid):
         matrices = np.block([[block, -block], [-block, block]])
         return self._spring_pattern.assemble(matrices)
 
-    def _state(self, displacement: Array) -> tuple[Array, Array]:
-        """Return strain (s,) and unit direction (s, 3) of the springs as they lie."""
-        a, b = self.springs.T
-        lines = self.lines + displacement[b] - displacement[a]
+    def _state(
+        self, displacement: Array, springs: NDArray[np.int64] | slice = slice(None)
+    ) -> tuple[Array, Array]:
+        """Return strain (k,) and unit direction (k, 3) of springs as they lie."""
+        a, b = self.springs[springs].T
+        lines = self.lines[springs] + displacement[b] - displacement[a]
         length = np.linalg.norm(lines, axis=1)
-        return length / self.lengths - 1, lines / length[:, None]
-
-    def _summed(self, force: Array) -> Array:
-        """Return nodal internal forces (n, 3) of spring forces (s, 3)."""
-        a, b = self.springs.T
-        n = len(self.nodes)
-        return np.stack(
-            [np.bincount(b, force[:, d], n) - np.bincount(a, force[:, d], n) for d in range(3)],
-            axis=1,
-        )
+        return length / self.lengths[springs] - 1, lines / length[:, None]
