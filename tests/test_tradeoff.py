@@ -105,6 +105,22 @@ def test_a_reference_can_be_computed_again(stored):
     assert coarse.values["approach"] == pytest.approx(stored["sphere"].values["approach"], rel=0.1)
 
 
+def test_a_scene_s_reference_is_kept_with_the_rows(tmp_path, monkeypatch, stored):
+    made = []
+
+    def computed(case):
+        made.append(case.name)
+        return replace(stored["sphere"], hash=case.hash)
+
+    monkeypatch.setattr(tradeoff, "compute_reference", computed)
+    cases = [replace(study_case("sphere"), name="scene 60 deg")]
+    for resume in (False, True, False):
+        kept = KeptRows(tmp_path, resume)
+        found = tradeoff.references_for(cases, False, lambda line: None, kept)["scene 60 deg"]
+        assert found.values == stored["sphere"].values
+    assert made == ["scene 60 deg"] * 2
+
+
 def test_the_common_limit_of_two_families():
     h = np.array([3.0, 2.0, 1.0, 3.0, 2.0, 1.0])
     family = np.array([0, 0, 0, 1, 1, 1])

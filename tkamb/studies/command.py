@@ -43,8 +43,8 @@ def _tradeoff(options: argparse.Namespace) -> int:
     wanted = jobs(options.quick, options.scene, options.full)
     directory = claim_directory(options.out)
     cases = study.cases_of(wanted)
-    references = study.references_for(cases, options.recompute, _announce)
     kept = KeptRows(directory, options.resume)
+    references = study.references_for(cases, options.recompute, _announce, kept)
     rows, whole = gather(
         study.run_tradeoff(wanted, references, kept), expected_seconds(wanted, cases)
     )

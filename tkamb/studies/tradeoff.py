@@ -162,11 +162,14 @@ def floor_of(reference: Reference) -> float:
 
 
 def references_for(
-    cases: Iterable[StudyCase], recompute: bool, announce: Callable[[str], None]
+    cases: Iterable[StudyCase],
+    recompute: bool,
+    announce: Callable[[str], None],
+    kept: KeptRows | None = None,
 ) -> dict[str, Reference]:
     """Return the references of the cases: stored, or computed and stored where asked for.
 
-    References of a user's own scene are always computed.
+    References of a user's own scene are computed, and kept with the study's rows.
 
     Raises:
         InputError: one is missing, or belongs to an earlier version of its case.
@@ -175,15 +178,28 @@ def references_for(
     stored = read_references(STORED)
     found: dict[str, Reference] = {}
     for case in cases:
-        own = case.name.startswith("scene")
-        if own or recompute:
+        if case.name.startswith("scene"):
+            found[case.name] = _own_reference(case, announce, kept)
+        elif recompute:
             announce(f"reference of case '{case.name}': {case.says}")
-            found[case.name] = compute_reference(case)
-            if not own:
-                write_references(stored | {case.name: found[case.name]}, STORED)
-                stored[case.name] = found[case.name]
+            stored[case.name] = found[case.name] = compute_reference(case)
+            write_references(stored, STORED)
         else:
             found[case.name] = reference_of(case, stored)
+    return found
+
+
+def _own_reference(
+    case: StudyCase, announce: Callable[[str], None], kept: KeptRows | None
+) -> Reference:
+    key = row_key("reference", case.hash)
+    row = kept.get(key) if kept else None
+    if row is not None:
+        return Reference(**row | {"grids_mm": tuple(row["grids_mm"])})
+    announce(f"reference of case '{case.name}': {case.says}")
+    found = compute_reference(case)
+    if kept:
+        kept.put(key, asdict(found))
     return found
 
 
