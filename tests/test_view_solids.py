@@ -141,7 +141,7 @@ def test_the_bone_that_the_scene_names_is_drawn():
     data = Path(__file__).parents[2] / "shared" / "data" / "dm"
     if not data.is_dir():
         pytest.skip("subject DM's data are not beside the project")
-    mechanics = Mechanics(load_case(load_scene(DM, {"motion.frames": 11})))
+    mechanics = Mechanics(load_case(load_scene(DM, {"motion.frames": 26})))
     states = [mechanics.placed(k).geometry.state for k in range(2)]
     made = solids(mechanics.case, mechanics.poses[:2], states, None, [-1] * 2)
     femur = next(one for one in made if one.name == "femur")
