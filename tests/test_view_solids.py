@@ -12,13 +12,14 @@ from tkamb.geometry.frames import inverse, transform
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 from tkamb.mechanics.mechanics import Mechanics
+from tkamb.output.metrics import JUMP
 from tkamb.scene import load_scene
 from tkamb.view.draw import draw
 from tkamb.view.foot import standing
 from tkamb.view.run import open_run
 from tkamb.view.shading import MOST_TRIANGLES, shaded
 from tkamb.view.solids import solids
-from tkamb.view.strands import JUMP, path_strands
+from tkamb.view.strands import path_strands
 from tkamb.view.thinning import thinned
 from viewed import MODELS, shipped_run
 
@@ -135,6 +136,12 @@ def test_a_load_path_is_broken_where_it_jumps():
     points = np.column_stack([x, np.zeros(7), np.zeros(7)])
     strands = path_strands({"medial": points})
     assert [strand.points.shape[1] for strand in strands] == [3, 2]
+
+
+def test_a_path_of_few_frames_is_not_broken():
+    x = np.array([0.0, 0.9, 2.1, 3.2]) * 2 * JUMP
+    points = np.column_stack([x, np.zeros(4), np.zeros(4)])
+    assert [strand.points.shape[1] for strand in path_strands({"lateral": points})] == [4]
 
 
 def test_the_bone_that_the_scene_names_is_drawn():

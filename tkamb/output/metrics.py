@@ -8,9 +8,13 @@ from numpy.typing import NDArray
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.results import Results
-from tkamb.units import STANDARD_GRAVITY
+from tkamb.units import MILLIMETRE, STANDARD_GRAVITY
 
 SIDES = ("medial", "lateral")
+JUMP = 8.0 * MILLIMETRE
+MANY_STEPS = 5.0
+"""A centre of pressure that moves by more than JUMP, and by many median steps, from one frame to
+the next has not travelled there."""
 SMALLEST_TENSION = 1.0
 """N: below this quadriceps tension its ratios are not shown."""
 
@@ -107,3 +111,13 @@ def map_rows(results: Results) -> dict[int, int]:
     row_at = {float(t): row for row, t in enumerate(results.maps.time_s) if whole[row]}
     times = [float(time) for time in results["time_s"]]
     return {frame: row_at[time] for frame, time in enumerate(times) if time in row_at}
+
+
+def stretches(points: Array) -> list[slice]:
+    """Return the parts, of two points or more, of a path (n, k) m that neither lacks nor jumps."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    known = steps[np.isfinite(steps)]
+    longest = max(JUMP, MANY_STEPS * float(np.median(known))) if len(known) else 0.0
+    near = np.concatenate([[False], steps <= longest, [False]])
+    ends = np.flatnonzero(np.diff(near.astype(int))).reshape(-1, 2)
+    return [slice(int(first), int(last) + 1) for first, last in ends]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis
 from tkamb.output.maps_file import ContactMaps
-from tkamb.output.metrics import map_rows
+from tkamb.output.metrics import map_rows, stretches
 from tkamb.output.panels import lateral_axis_name
 from tkamb.output.style import BLACK, GREY, PRESSURE_MAP, SIDE_COLOURS, new_figure, settings
 from tkamb.results import Results
@@ -138,7 +138,13 @@ def draw_paths(
         view.draw_insert(axes)
         for side, colour in SIDE_COLOURS.items():
             x, y = view.place(results[f"{side}_cop_ap_mm"], results[f"{side}_cop_ml_mm"])
-            axes.plot(x, y, color=colour, linewidth=1.6, gid=f"path-{side}")
+            parts = stretches(np.column_stack([x, y]) * MILLIMETRE)
+            apart = np.full(len(x), np.nan)
+            for number, part in enumerate(parts):
+                line = apart.copy()
+                line[part] = x[part]
+                name = f"path-{side}" + (f"-{number}" if number else "")
+                axes.plot(line, y, color=colour, linewidth=1.6, gid=name)
             axes.plot(x[list(frames)], y[list(frames)], "o", color=colour, ms=4, mec="white")
             _label_stops(axes, x, y, axis, frames, colour)
         view.draw_labels(axes)

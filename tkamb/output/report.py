@@ -109,7 +109,8 @@ def _maps_section(results: Results, axis: HorizontalAxis) -> str:
         "</figcaption></figure>"
         "<div class='grid'>"
         f"<figure id='figure-paths'><h3>Paths of the centres of pressure</h3>{paths}"
-        "<figcaption>Blue: medial, red: lateral. Dots: the frames above.</figcaption></figure>"
+        "<figcaption>Blue: medial, red: lateral; broken where a centre jumps. Dots: the frames "
+        "above.</figcaption></figure>"
         f"{centres}</div></section>\n"
     )
 

@@ -11,6 +11,7 @@ from tkamb.geometry.frames import Array
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 from tkamb.mechanics.mechanics import Mechanics
+from tkamb.output.metrics import stretches
 from tkamb.output.style import SIDE_COLOURS
 from tkamb.results import Results
 from tkamb.units import MILLIMETRE
@@ -21,9 +22,6 @@ BUNDLE, TENDON_RADIUS, PATH = 1.0 * MILLIMETRE, 1.5 * MILLIMETRE, 0.35 * MILLIME
 """m, radii; bundles are thinner where a ligament has many."""
 
 MANY_BUNDLES = 20
-
-JUMP = 8.0 * MILLIMETRE
-"""m: a centre of pressure that moves farther from one frame to the next has not travelled."""
 
 
 def ligament_strands(
@@ -103,11 +101,8 @@ def path_strands(centres: dict[str, Array]) -> tuple[Strand, ...]:
     """Return the path of each centre of pressure, broken where it is missing or jumps."""
     strands = []
     for side, points in centres.items():
-        step = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        near = np.concatenate([[False], step <= JUMP, [False]])
-        ends = np.flatnonzero(np.diff(near.astype(int)))
-        for number, (first, last) in enumerate(ends.reshape(-1, 2)):
-            part = points[first : last + 1] + np.array([0.0, 2.0 * PATH, 0.0])
+        for number, stretch in enumerate(stretches(points)):
+            part = points[stretch] + np.array([0.0, 2.0 * PATH, 0.0])
             colours = np.repeat(rgb(SIDE_COLOURS[side])[None], len(part), axis=0)
             name = f"{side} path {number}"
             strands.append(Strand(name, "load paths", part[None], colours[None], PATH))

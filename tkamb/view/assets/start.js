@@ -21,8 +21,8 @@ tkamb.start = async function () {
     document.body.classList.add("figure");
     document.getElementById("stage").append(document.getElementById("force-box"));
   }
-  tkamb.viewer.set_3d_pane_size();
   tkamb.look(asked.view || "oblique");
+  tkamb.viewer.set_3d_pane_size();
   tkamb.go(Number(asked.frame || 0));
   tkamb.viewer.render();
   document.body.dataset.ready = "yes";
