@@ -14,13 +14,12 @@ from tkamb.contact.registry import BUILT_IN, contact_model
 from tkamb.errors import InputError
 from tkamb.scene import load_scene
 from tkamb.studies import matrix, tradeoff
-from tkamb.studies.advice import comparison, recommendations
-from tkamb.studies.body_trade import CHANGES, body_table, read_body_rows, run_body_trade
+from tkamb.studies.body_trade import CHANGES, body_table, run_body_trade
 from tkamb.studies.cases import case_names, study_case
 from tkamb.studies.elastic_layer import sphere_on_layer
 from tkamb.studies.front import NOISE, moved, on_front
 from tkamb.studies.kept_rows import KeptRows
-from tkamb.studies.measures import Job, Measure, measure, measure_apart
+from tkamb.studies.measures import Job, measure, measure_apart
 from tkamb.studies.quantities import common_limit, errors, map_error, quantities, raster_map
 from tkamb.studies.recordings import copied_scene, thin_out
 from tkamb.studies.references import (
@@ -30,8 +29,6 @@ from tkamb.studies.references import (
     reference_of,
     write_references,
 )
-from tkamb.studies.tradeoff_block import MARKERS, block, body_block, with_block
-from tkamb.studies.tradeoff_report import picture, table
 
 ROOT = Path(__file__).parents[1]
 KEYS = {
@@ -183,82 +180,6 @@ def test_a_measure_in_a_process_of_its_own():
 def test_what_cannot_be_measured_is_a_row_too():
     assert measure_apart(Job("sphere", "foundation", -1.0)).status.startswith("failed: ")
     assert measure_apart(Job("sphere", "lattice", 0.7), longest=1.0).status == "stopped after 1 s"
-
-
-def made_up_rows():
-    settings = [("hertz", 2.0, 1e-3, 0.2), ("foundation", 2.0, 1e-2, 0.3)]
-    settings += [("lattice", 2.0, 1e-2, 0.01), ("fe", 2.0, 1.0, 0.001)]
-    rows = []
-    for case in ("sphere", "two condyles"):
-        for contact, grid, seconds, error in settings:
-            values = dict.fromkeys(read_references()[case].values, 1.0 + error)
-            found = Measure("ok", 1.0, seconds, seconds, 100.0, values=values)
-            compared = dict.fromkeys(tradeoff.KEYS, error)
-            rows.append(tradeoff.Row(Job(case, contact, grid), found, compared, 0.005))
-        rows.append(tradeoff.Row(Job(case, "lattice", 1.0), Measure("out of range"), {}, 0.005))
-    return tradeoff.with_fronts(rows)
-
-
-def test_rows_table_and_advice(stored):
-    rows = made_up_rows()
-    assert [row.on_front for row in rows[:5]] == [True, False, True, True, False]
-    content = json.loads(tradeoff.as_json(rows))
-    assert all(set(row) == KEYS for row in content)
-    assert content[4]["error_approach"] is None
-    text = "\n".join(table(rows, stored))
-    assert "out of range" in text and "*hertz" in text
-    advice = recommendations(rows)
-    for key in ("approach", "condyle force", "mean pressure", "peak pressure", "area", "map"):
-        assert any(f" in {key}" in line or f"{key} (L2)" in line for line in advice), key
-    assert any("5 % in peak pressure" in line and "lattice at 2 mm" in line for line in advice)
-    assert picture(rows).axes
-
-
-def test_a_limit_that_nothing_keeps_names_the_nearest():
-    rows = [row for row in made_up_rows() if row.job.contact in ("hertz", "foundation")]
-    assert all(
-        "no setting: the nearest is hertz at 2 mm with 20 %" in r for r in recommendations(rows)
-    )
-
-
-def test_the_comparison_says_what_was_measured_and_what_was_wanted():
-    said = comparison(made_up_rows())
-    assert "10 ms" in said[0] and "is on the front" in said[0]
-    assert "fe: 1000 ms, 100 times as long (wanted: 20, reached)" in said[1]
-    rows = [replace(row, measure=replace(row.measure, warm_seconds=0.02)) for row in made_up_rows()]
-    assert "not reached" in comparison(rows)[1]
-    peer = replace(rows[8], job=Job("two condyles", "calculix C3D8I", 2.0))
-    assert "0.9 % in approach" in comparison([*rows, peer])[-1]
-
-
-def test_rows_survive_their_json(tmp_path):
-    path = tmp_path / "tradeoff.json"
-    path.write_text(tradeoff.as_json(made_up_rows()))
-    again = tradeoff.read_rows(path)
-    assert tradeoff.as_json(again) == path.read_text()
-    assert block(again) == block(made_up_rows())
-    path.write_text('[{"case": 1}]')
-    with pytest.raises(InputError, match="no table of a trade-off"):
-        tradeoff.read_rows(path)
-
-
-def test_a_block_goes_between_its_markers_and_nowhere_else():
-    begin, end = (marker.format("tradeoff") for marker in MARKERS)
-    page = f"before\n{begin}\nold\n{end}\nafter\n"
-    filled = with_block(page, ["| a |", "| b |"])
-    assert filled == f"before\n{begin}\n\n| a |\n| b |\n\n{end}\nafter\n"
-    assert with_block(filled, ["| a |", "| b |"]) == filled
-    with pytest.raises(InputError, match="once each"):
-        with_block("no markers", [])
-
-
-def test_the_pages_tables_are_the_study_s():
-    for page, lines, name in (
-        ("README.md", block(tradeoff.read_rows(ROOT / "docs" / "tradeoff.json")), "tradeoff"),
-        ("docs/studies.md", body_block(read_body_rows(ROOT / "docs" / "body.json")), "body"),
-    ):
-        text = (ROOT / page).read_text(encoding="utf-8")
-        assert with_block(text, lines, name) == text, f"{page}: run scripts/make_tradeoff_table"
 
 
 def test_the_default_matrix_leaves_out_only_repeats():
