@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.geometry.corner_normals import corner_normals
+from tkamb.geometry.curved import CurvedSurface
 from tkamb.geometry.frames import Array, inverse, rotate, transform
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
@@ -18,6 +17,9 @@ UP = np.array([0.0, 1.0, 0.0])
 class FemoralFloor:
     """The lowest femoral surface over any x and z of the insert.
 
+    Rays meet the triangles; from there they go on to the curved patches over them
+    (`CurvedSurface`), so that facets leave no pattern in the pressure.
+
     Args:
         surface: femoral component, femoral frame.
         rays: its ray caster.
@@ -27,8 +29,12 @@ class FemoralFloor:
     rays: RayCaster
 
     @cached_property
-    def _corner_normals(self) -> Array:
-        return corner_normals(self.surface)
+    def _patches(self) -> CurvedSurface:
+        return CurvedSurface.of(self.surface)
+
+    def prepare(self) -> None:
+        """Work the patches out now, not at the first ray."""
+        _ = self._patches
 
     def over(self, points: Array, pose: Array) -> tuple[Array, Array]:
         """Return the lowest femoral points (n, 3) above or below points, and their normals.
@@ -50,26 +56,16 @@ class FemoralFloor:
         origins = transform(
             back, np.column_stack([points[:, 0], np.full(len(points), start), points[:, 2]])
         )
-        distance, face = self.rays.first(origins, rotate(back, UP))
+        up = rotate(back, UP)
+        distance, face = self.rays.first(origins, up)
         hit = face >= 0
         places = np.full((len(points), 3), np.nan)
         normals = np.full((len(points), 3), np.nan)
-        local = origins[hit] + distance[hit, None] * rotate(back, UP)
-        places[hit] = transform(pose, local)
+        local = origins[hit] + distance[hit, None] * up
+        shift, outward = self._patches.shift(local, face[hit], up)
+        places[hit] = transform(pose, local + shift[:, None] * up)
         places[hit, 0], places[hit, 2] = points[hit, 0], points[hit, 2]
-        normals[hit] = rotate(pose, self._interpolated(local, face[hit]))
-        up = normals[:, 1] > 0
-        normals[up] = -normals[up]
+        normals[hit] = rotate(pose, outward)
+        inward = normals[:, 1] > 0
+        normals[inward] = -normals[inward]
         return places, normals
-
-    def _interpolated(self, points: Array, face: NDArray[np.int64]) -> Array:
-        """Return unit normals (n, 3) at points on triangles `face`, femoral frame."""
-        corner = self.surface.triangles[face]
-        a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-        cross, offset = np.cross(a, b), points - corner[:, 0]
-        square = np.einsum("ij,ij->i", cross, cross)
-        v = np.einsum("ij,ij->i", np.cross(offset, b), cross) / square
-        w = np.einsum("ij,ij->i", np.cross(a, offset), cross) / square
-        weights = np.clip(np.stack([1 - v - w, v, w], axis=1), 0, 1)
-        normals = np.einsum("ij,ijk->ik", weights, self._corner_normals[face])
-        return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))

@@ -27,6 +27,8 @@ MAX_EDGE_RATIO = 1.4
 """Longest over shortest edge of a cell, before its nodes are moved onto the surface."""
 MAX_SLOPE = 1.0
 """Steepest slope that the layers follow."""
+LOW_STEPS = 0.01
+"""Largest share of the columns that may be too low for the layers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +84,15 @@ def follow_top(top: Array, lowest: float, spacing: Array) -> Levels:
 
 
 def _reference_layers(top: Array, thinnest: float, thickest: float, spacing: float) -> int:
-    """Return the number of layers that can follow the largest part of the top."""
+    """Return the number of layers that can follow the largest part of the top.
+
+    Where the top is more than half a layer too low for them, the layers end in a step, whose
+    edge has a cell on one side only and half the support: no number is taken that puts such
+    steps into the dishes. On a step higher up no condyle stands.
+    """
     candidates = np.arange(1, int(np.ceil(top.max() / thinnest)) + 1)
+    stepped = np.array([np.mean(top < (n - 0.5) * thinnest) for n in candidates])
+    candidates = candidates[stepped <= max(LOW_STEPS, stepped.min())]
     covered = [np.mean((top >= n * thinnest) & (top <= n * thickest)) for n in candidates]
     best = candidates[np.isclose(covered, np.max(covered), atol=1e-3)]
     return int(best[np.argmin(np.abs(best - np.median(top) / spacing))])

@@ -11,6 +11,7 @@ import numpy as np
 from tkamb.contact.lattice.active_set import ContactForces
 from tkamb.contact.lattice.operator import prepare_operator
 from tkamb.contact.lattice.problem import ContactProblem, Footing, Indices, Mask
+from tkamb.contact.lattice.response import ContactResponse
 from tkamb.contact.lattice.sliding import SlidingNodes
 from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve_pass
 from tkamb.errors import ComputationError
@@ -42,14 +43,14 @@ def solve_by_newton(
     """
     solid, free = problem.solid, ~problem.held
     nodes = problem.contact_nodes[start.candidates]
-    points = solid.nodes[nodes]
+    points = problem.surface_points[start.candidates]
     u = np.zeros_like(solid.nodes) if field is None else field
     active, step, last, steps = start.active, 1.0, np.inf, 0
     sliding = SlidingNodes(problem, points, u[nodes], pose)
     while True:
         steps += 1
         foot = sliding.foot
-        u_full, forces = _step(problem, nodes, u, foot, load, active)
+        u_full, forces = _step(problem, nodes, points, u, foot, load, active)
         u = u + step * (u_full - u)
         active = forces.active
         pushed = np.zeros_like(u)
@@ -74,6 +75,7 @@ def solve_by_newton(
 def _step(
     problem: ContactProblem,
     nodes: Indices,
+    points: Array,
     u: Array,
     foot: Footing,
     load: float | None,
@@ -83,8 +85,8 @@ def _step(
     solid = problem.solid
     operator = prepare_operator(solid.tangent(u), problem.index, problem.held, nodes)
     relaxed = u - operator.solve(solid.internal_force(u))
-    compliance = operator.half.compliance(np.arange(3 * len(nodes)))
-    forces, _ = solve_pass(compliance, relaxed[nodes], solid.nodes[nodes], foot, load, active)
+    response = ContactResponse.of(operator.half)
+    forces, _ = solve_pass(response, relaxed[nodes], points, foot, load, active)
     pushed = np.zeros_like(u)
     pushed[nodes] = forces.force[:, None] * foot.normals
     return relaxed + operator.solve(pushed), forces

@@ -6,11 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.contact.lattice.grid import Lattice
+from tkamb.geometry.curved import CurvedSurface
 from tkamb.geometry.frames import Array
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
 Indices = NDArray[np.int64]
+
+ABOVE = 1e-4
+"""m: rays that ask which triangle a node lies on start so far above it."""
+ON_MESH = 1e-6
+"""m: a node this near to a triangle lies on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +28,8 @@ class ContactMap:
         normals: (c, 3) outward unit normals, area-weighted over the triangles.
         area: (c,) m², tributary: a third of each triangle at the node.
         thickness: (c,) m, insert below the node along y.
+        lift: (c,) m along y, from the node on the mesh to the smooth surface that the mesh
+            stands for; the contact sees the node there.
         triangles: (k, 3) positions among the contact nodes.
     """
 
@@ -29,6 +37,7 @@ class ContactMap:
     normals: Array
     area: Array
     thickness: Array
+    lift: Array
     triangles: Indices
 
 
@@ -44,14 +53,24 @@ def contact_map(lattice: Lattice, insert: Surface) -> tuple[Indices, ContactMap]
         np.add.at(area, triangles[:, corner], np.linalg.norm(cross, axis=1) / 6)
         np.add.at(normals, triangles[:, corner], cross)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    return nodes.astype(np.int64), ContactMap(
-        points, normals, area, _thickness(points, insert, lattice.spacing), triangles
-    )
+    rays = RayCaster(insert)
+    thickness, lift = _thickness(points, rays, lattice.spacing), _lift(points, rays)
+    return nodes.astype(np.int64), ContactMap(points, normals, area, thickness, lift, triangles)
 
 
-def _thickness(points: Array, insert: Surface, spacing: Array) -> Array:
+def _thickness(points: Array, rays: RayCaster, spacing: Array) -> Array:
     """Return how far down from each point the insert goes, m."""
     inside = points - [0.0, 1e-3 * spacing[1], 0.0]
-    distance, _ = RayCaster(insert).first(inside, (0.0, -1.0, 0.0))
-    whole = points[:, 1] - insert.bounds[0, 1]
+    distance, _ = rays.first(inside, (0.0, -1.0, 0.0))
+    whole = points[:, 1] - rays.surface.bounds[0, 1]
     return np.where(np.isfinite(distance), distance + 1e-3 * spacing[1], whole)
+
+
+def _lift(points: Array, rays: RayCaster) -> Array:
+    """Return how far the smooth surface is above the points, m; 0 for one not on the mesh."""
+    up = np.array([0.0, 1.0, 0.0])
+    distance, face = rays.first(points + ABOVE * up, -up)
+    on = np.abs(distance - ABOVE) < ON_MESH
+    lift = np.zeros(len(points))
+    lift[on], _ = CurvedSurface.of(rays.surface).shift(points[on], face[on], up)
+    return lift

@@ -31,6 +31,8 @@ class ContactProblem:
         held: (3n,) unknowns held by the boundary.
         floor: the femoral component from below.
         direction: nodes are pressed along the femoral normal, or vertically (the source).
+        lift: (c,) m along y, from the contact nodes to the smooth surface that their mesh
+            stands for; 0: they are taken where they are.
     """
 
     solid: Solid
@@ -39,6 +41,7 @@ class ContactProblem:
     held: Mask
     floor: FemoralFloor
     direction: Direction = "normal"
+    lift: Array | float = 0.0
 
     @property
     def contact_nodes(self) -> Indices:
@@ -47,8 +50,10 @@ class ContactProblem:
 
     @property
     def surface_points(self) -> Array:
-        """Undeformed contact nodes (c, 3), m."""
-        return self.solid.nodes[self.operator.contact_nodes]
+        """Undeformed contact nodes (c, 3), m, on the smooth surface of the insert."""
+        points = self.solid.nodes[self.operator.contact_nodes]
+        points[:, 1] += self.lift
+        return points
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,7 +59,7 @@ def solve_by_source(
         tolerance: of reaction, balance and femoral surface.
     """
     nodes = problem.contact_nodes[start.candidates]
-    points = problem.solid.nodes[nodes]
+    points = problem.surface_points[start.candidates]
     sliding = SlidingNodes(problem, points, np.zeros_like(points), pose)
     depth = 0.0 if load is None else FIRST_DEPTH * float(start.reach)
     field, loops = np.zeros_like(problem.solid.nodes), 0
@@ -67,7 +67,7 @@ def solve_by_source(
     while True:
         loops += 1
         foot = sliding.foot
-        pressed = _press(problem, nodes, foot, active, depth, field, tolerance)
+        pressed = _press(problem, nodes, points, foot, active, depth, field, tolerance)
         field, moved = pressed.field, pressed.field[nodes]
         reaction = float(pressed.force.sum())
         missed = 0.0 if load is None else abs(reaction - load) / load
@@ -110,6 +110,7 @@ def _next_active(positions: Array, foot: Footing, active: Mask, force: Array, de
 def _press(
     problem: ContactProblem,
     nodes: Indices,
+    points: Array,
     foot: Footing,
     active: Mask,
     depth: float,
@@ -125,7 +126,7 @@ def _press(
     chosen = 3 * nodes[active] + 1
     held[chosen] = True
     asked = np.zeros(len(held))
-    asked[chosen] = foot.places[active, 1] - depth - solid.nodes[nodes[active], 1]
+    asked[chosen] = foot.places[active, 1] - depth - points[active, 1]
     asked[chosen] -= field.ravel()[chosen]
     u = field + _spread(solid.stiffness, problem, held, asked).reshape(-1, 3)
     force, residual, internal = _balance(problem, u, held, chosen)

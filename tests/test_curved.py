@@ -1,0 +1,104 @@
+"""Curved patches over triangles: smooth surfaces to second order, flats and edges kept."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from lattice_bodies import box_insert
+from tkamb.geometry.curved import CurvedSurface
+from tkamb.geometry.surface import Surface
+
+UP = np.array([0.0, 1.0, 0.0])
+RADIUS = 20e-3
+
+
+def ball(subdivisions):
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS)
+    return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+
+
+def sheet(x, z, height):
+    """A triangulated height field over x (a,) and z (b,), m."""
+    gx, gz = np.meshgrid(x, z, indexing="ij")
+    number = np.arange(gx.size).reshape(gx.shape)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    quads = np.stack([a, d, c, b], axis=-1).reshape(-1, 4)
+    points = np.column_stack([gx.ravel(), height(gx, gz).ravel(), gz.ravel()])
+    return Surface(points, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]))
+
+
+def scattered(surface, faces, seed=2):
+    """A random point on each of some triangles."""
+    weights = np.random.default_rng(seed).dirichlet([1, 1, 1], len(faces))
+    return np.einsum("ij,ijk->ik", weights, surface.triangles[faces])
+
+
+def test_a_faceted_sphere_becomes_round():
+    """Within 5 % of a facet's sagitta, at every size."""
+    for subdivisions in (3, 4, 5):
+        surface = ball(subdivisions)
+        faces = np.flatnonzero(surface.face_normals[:, 1] > 0.9)
+        points = scattered(surface, faces)
+        shift, normals = CurvedSurface.of(surface).shift(points, faces, UP)
+        radius = np.linalg.norm(points + shift[:, None] * UP, axis=1)
+        sagitta = RADIUS - np.linalg.norm(points, axis=1).min()
+        assert np.abs(radius - RADIUS).max() < 0.05 * sagitta
+        outward = points / np.linalg.norm(points, axis=1, keepdims=True)
+        assert np.einsum("ij,ij->i", normals, outward).min() > np.cos(np.radians(0.5))
+
+
+def test_neighbouring_patches_meet():
+    surface = ball(4)
+    patches, across = CurvedSurface.of(surface), surface.mesh.face_adjacency
+    ends = surface.vertices[surface.mesh.face_adjacency_edges]
+    points = 0.3 * ends[:, 0] + 0.7 * ends[:, 1]
+    upper = surface.face_normals[across[:, 0], 1] > 0.7
+    one, other = (patches.shift(points, across[:, side], UP)[0][upper] for side in (0, 1))
+    assert one.min() > 5e-6
+    np.testing.assert_allclose(one, other, rtol=2e-3)
+
+
+def test_a_box_keeps_its_faces():
+    surface = box_insert(20e-3, 8e-3, 30e-3)
+    shift, normals = CurvedSurface.of(surface).shift(
+        scattered(surface, np.arange(12)), np.arange(12), UP
+    )
+    np.testing.assert_array_equal(shift, 0.0)
+    np.testing.assert_allclose(normals, surface.face_normals, atol=1e-12)
+
+
+def test_a_flat_that_meets_a_fillet_stays_flat():
+    """Corner normals lean where the fillet begins; the mean of both turns would swell it."""
+    radius, x = 3e-3, np.concatenate([np.linspace(-6e-3, 0, 7), np.linspace(0.5e-3, 2.5e-3, 5)])
+
+    def height(gx, _):
+        return np.sqrt(radius**2 - np.clip(gx, 0.0, None) ** 2) - radius
+
+    surface = sheet(x, np.linspace(-2e-3, 2e-3, 5), height)
+    points = scattered(surface, np.arange(len(surface.faces)))
+    shift, _ = CurvedSurface.of(surface).shift(points, np.arange(len(surface.faces)), UP)
+    inner = np.abs(points[:, 2]) < 1e-3
+    flat, round_ = (
+        inner & (points[:, 0] < 0),
+        inner & (points[:, 0] > 0.5e-3) & (points[:, 0] < 1.5e-3),
+    )
+    exact = height(points[:, 0], 0.0) - points[:, 1]
+    assert np.abs(shift[flat]).max() < 1e-6
+    assert np.abs(shift - exact)[round_].max() < 0.35 * exact[round_].max()
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.7])
+def test_a_saddle_is_followed_both_ways(slope):
+    """Exact on a quadratic height field, whichever way it bends and leans."""
+    x = np.linspace(-5e-3, 5e-3, 11)
+
+    def height(gx, gz):
+        return gx**2 / 40e-3 - gz**2 / 60e-3 + slope * gx
+
+    surface = sheet(x, x, height)
+    inner = np.abs(surface.triangles[..., [0, 2]]).max(axis=(1, 2)) < 4.5e-3
+    faces = np.flatnonzero(inner)
+    points = scattered(surface, faces)
+    shift, _ = CurvedSurface.of(surface).shift(points, faces, UP)
+    exact = height(points[:, 0], points[:, 2]) - points[:, 1]
+    assert np.abs(shift - exact).max() < 0.1 * np.abs(exact).max()

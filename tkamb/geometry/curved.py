@@ -1,0 +1,89 @@
+"""The smooth surface that a triangulation stands for: a curved patch over every triangle."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.geometry.corner_normals import corner_normals
+from tkamb.geometry.frames import Array
+from tkamb.geometry.nearest import barycentric
+from tkamb.geometry.surface import Surface
+
+Indices = NDArray[np.int64]
+
+STEEPEST = 0.1
+"""Smallest cosine between normal and direction that a shift is divided by: 84 deg."""
+
+
+@dataclass(frozen=True, eq=False)
+class CurvedSurface:
+    """Quadratic patches over triangles, continuous across edges that are not sharp.
+
+    With barycentric coordinates b, over a triangle of unit normal N
+
+        h = 4 (b2 b3 s1 + b3 b1 s2 + b1 b2 s3),    s = t_i t_j / (2 (t_i + t_j))
+
+    s is the sagitta of the edge e from corner i to j, t_i = -n_i.e / n_i.N and
+    t_j = n_j.e / n_j.N how far the tangent planes at its ends rise over it. On a quadratic
+    surface t_i = t_j and h is exact. Where they differ their harmonic mean counts, and none
+    where they bend opposite ways: a flat that meets a fillet stays flat, where the mean
+    would swell it.
+
+    Args:
+        surface: its triangles share their vertices.
+        normals: (k, 3, 3) unit normals at the corners, see `corner_normals`.
+        sagittas: (k, 3) m, of the edge opposite each corner, along the triangle's normal.
+
+    Reference:
+        Vlachos et al., Curved PN triangles, Proc I3D 2001, doi:10.1145/364338.364387 (the
+        idea of patches from corner normals).
+    """
+
+    surface: Surface
+    normals: Array
+    sagittas: Array
+
+    @classmethod
+    def of(cls, surface: Surface) -> "CurvedSurface":
+        """Return the patches of a surface from its own corner normals."""
+        normals = corner_normals(surface)
+        return cls(surface, normals, _sagittas(surface, normals))
+
+    def shift(self, points: Array, faces: Indices, direction: Array) -> tuple[Array, Array]:
+        """Return how far the patches are from points on their triangles along a direction.
+
+        To first order in the patch's height.
+
+        Args:
+            points: (n, 3) m, on the triangles.
+            faces: (n,) their triangles.
+            direction: (3,) unit vector.
+
+        Returns:
+            Signed distance (n,), m, and outward unit normals (n, 3), which are interpolated
+            between the corners.
+        """
+        weights = barycentric(self.surface.triangles[faces], points)
+        normals = np.einsum("ij,ijk->ik", weights, self.normals[faces])
+        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        around = np.roll(weights, -1, axis=1) * np.roll(weights, -2, axis=1)
+        height = 4.0 * np.einsum("ij,ij->i", around, self.sagittas[faces])
+        along = np.einsum("ij,ij->i", normals, self.surface.face_normals[faces])
+        cosine = normals @ direction
+        steep = np.copysign(np.maximum(np.abs(cosine), STEEPEST), cosine)
+        return height * along / steep, normals
+
+
+def _sagittas(surface: Surface, normals: Array) -> Array:
+    """Return the sagittas (k, 3), m, of the edges opposite each corner."""
+    corners = surface.triangles
+    lean = np.einsum("kij,kj->ki", normals, surface.face_normals)
+    slant = normals / np.where(lean > 0.0, lean, np.inf)[..., None]
+    start, end = np.roll(slant, -1, axis=1), np.roll(slant, -2, axis=1)
+    edge = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
+    leaving = -np.einsum("kij,kij->ki", start, edge)
+    coming = np.einsum("kij,kij->ki", end, edge)
+    product, total = leaving * coming, leaving + coming
+    alike = product > 0.0
+    return np.asarray(np.where(alike, 0.5 * product / np.where(alike, total, 1.0), 0.0))
