@@ -32,10 +32,6 @@ class FemoralFloor:
     def _patches(self) -> CurvedSurface:
         return CurvedSurface.of(self.surface)
 
-    def prepare(self) -> None:
-        """Work the patches out now, not at the first ray."""
-        _ = self._patches
-
     def over(self, points: Array, pose: Array) -> tuple[Array, Array]:
         """Return the lowest femoral points (n, 3) above or below points, and their normals.
 
