@@ -67,6 +67,8 @@ def test_the_comparison_says_what_was_measured_and_what_was_wanted():
     assert "not reached" in comparison(rows)[1]
     peer = replace(rows[8], job=Job("two condyles", "calculix C3D8I", 2.0))
     assert "0.9 % in approach" in comparison([*rows, peer])[-1]
+    finer = [replace(row, job=replace(row.job, resolution_mm=1.0)) for row in (*rows, peer)]
+    assert comparison([*rows, *finer])[-1].startswith("at 1 mm, lattice 20 ms: calculix C3D8I")
 
 
 def test_rows_survive_their_json(tmp_path):

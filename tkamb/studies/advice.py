@@ -126,7 +126,21 @@ def comparison(rows: Sequence[Row]) -> list[str]:
     for label, row in by_label.items():
         if label.startswith(("fe", "calculix")):
             lines.append(_against(label, row, own))
-    return lines
+    return lines + _at_other_sizes(rows)
+
+
+def _at_other_sizes(rows: Sequence[Row]) -> list[str]:
+    """Return how the default lattice compares with the peer where it has other cell sizes."""
+    some = [row for row in rows if row.job.case == COMPARED_ON and row.errors]
+    own = {row.job.resolution_mm: row for row in some if row.job.label == DEFAULT}
+    return [
+        f"at {size:g} mm, {DEFAULT} {milliseconds(own[size].measure.warm_seconds)} ms: "
+        + _against(row.job.label, row, own[size])
+        for row in some
+        if row.job.label.startswith("calculix")
+        and (size := row.job.resolution_mm) != COMPARED_AT_MM
+        and size in own
+    ]
 
 
 def _against(label: str, row: Row, own: Row) -> str:

@@ -1,6 +1,7 @@
-"""CalculiX as a process: time, memory and iterations of its own, a limit, its printed numbers."""
+"""CalculiX as a process with one thread: time, memory, iterations, a limit, printed numbers."""
 
 import math
+import os
 import shutil
 import subprocess
 import tempfile
@@ -14,6 +15,7 @@ import numpy as np
 
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
+from tkamb.studies.measures import ONE_THREAD
 
 PROGRAM = "ccx"
 LONGEST_SECONDS = 900.0
@@ -78,11 +80,13 @@ def run_calculix(text: str, longest: float = LONGEST_SECONDS) -> PeerRun:
 
 
 def _wait(command: list[str], place: Path, longest: float) -> float:
-    """Run a command to its end; return its peak memory, MB."""
+    """Run a command to its end with one thread; return its peak memory, MB."""
     memory, start = math.nan, clock.perf_counter()
     with (
         open(place / SAID, "wb") as said,
-        subprocess.Popen(command, cwd=place, stdout=said, stderr=subprocess.STDOUT) as process,
+        subprocess.Popen(
+            command, cwd=place, stdout=said, stderr=subprocess.STDOUT, env=os.environ | ONE_THREAD
+        ) as process,
     ):
         try:
             while process.poll() is None:

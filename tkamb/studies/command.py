@@ -30,7 +30,7 @@ def add_tradeoff(commands: Any) -> None:
 def _tradeoff(options: argparse.Namespace) -> int:
     from tkamb.output.atomic import claim_directory, write_text
     from tkamb.studies import tradeoff as study
-    from tkamb.studies.advice import comparison, recommendations
+    from tkamb.studies.advice import DEFAULT, comparison, recommendations
     from tkamb.studies.body_trade import CHANGES, BodyRow, body_json, body_table, run_body_trade
     from tkamb.studies.kept_rows import KeptRows
     from tkamb.studies.matrix import expected_seconds, jobs
@@ -50,7 +50,8 @@ def _tradeoff(options: argparse.Namespace) -> int:
     )
     found = len(rows)
     if whole and options.peer:
-        more, whole = gather(study.run_peer(cases, references, kept), [1.0] * len(cases))
+        sizes = {job.resolution_mm for job in wanted if job.label == DEFAULT}
+        more, whole = gather(study.run_peer(cases, references, kept, sizes), [1.0] * len(cases))
         rows += more
     body: list[BodyRow] = []
     planned = 0

@@ -2,12 +2,12 @@
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tkamb.errors import ComputationError, InputError
+from tkamb.errors import InputError
 from tkamb.studies.cases import StudyCase, study_case
 from tkamb.studies.front import on_front
 from tkamb.studies.kept_rows import KeptRows, row_key
@@ -120,9 +120,18 @@ def with_fronts(rows: Sequence[Row]) -> list[Row]:
 
 
 def run_peer(
-    cases: Iterable[StudyCase], references: dict[str, Reference], kept: KeptRows | None = None
+    cases: Iterable[StudyCase],
+    references: dict[str, Reference],
+    kept: KeptRows | None = None,
+    sizes_mm: Collection[float] = (2.0,),
 ) -> Iterator[Row]:
     """Yield CalculiX's rows on the cases that it can do; one that fails is a row too.
+
+    Args:
+        cases: that may be pressed.
+        references: case name -> converged answer.
+        kept: rows of an earlier study that are taken as they are; new ones are added.
+        sizes_mm: cell sizes that are wanted.
 
     Raises:
         InputError: CalculiX is not installed.
@@ -131,13 +140,10 @@ def run_peer(
 
     for case in cases:
         reference = references[case.name]
-        key = row_key("calculix", case.hash, reference.values)
+        key = row_key("calculix", case.hash, reference.values, sorted(sizes_mm))
         found = kept.get(key) if kept else None
         if found is None:
-            try:
-                rows = peer_rows([case], references)
-            except ComputationError as error:
-                rows = [Row(Job(case.name, "calculix", 2.0), Measure(str(error)), {}, 0.0)]
+            rows = peer_rows([case], references, sizes_mm)
             found = {"rows": [[asdict(row.job), asdict(row.measure)] for row in rows]}
             if kept:
                 kept.put(key, found)
