@@ -89,6 +89,13 @@ def test_a_hang_is_stopped_and_the_next_case_judged():
     assert [v.kind for v in verdicts] == ["hang", "flagged"]
 
 
+def test_a_reference_that_takes_too_long_leaves_a_case_unverified(monkeypatch):
+    monkeypatch.setattr("tkamb.studies.stability.LONGEST_REFERENCE_SECONDS", 0.5)
+    slow = Extreme(load_N=20000.0, conformity=0.99)
+    (verdict,) = run_stability([slow])
+    assert verdict.kind == "unverified" and "no reference in 0.5 s" in verdict.reason
+
+
 def test_counts_add_up_and_failures_are_listed():
     verdicts = [Verdict(f"load_N={k}", "lattice", kind, "why", 0.1) for k, kind in enumerate(KINDS)]
     found = summary(verdicts)

@@ -5,7 +5,7 @@ import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from typing import Any
@@ -19,7 +19,11 @@ from tkamb.studies.verdict import KINDS, Verdict, judge
 Case = Extreme | SceneExtreme
 
 LONGEST_SECONDS = 120.0
-"""A case that takes longer hangs."""
+"""A case whose model takes longer hangs."""
+LONGEST_REFERENCE_SECONDS = 900.0
+"""A case whose reference takes longer is unverified."""
+PRESSED = "pressed"
+"""What a process says once the model has answered."""
 WORKERS = 2
 QUICK_SHARE = 9
 QUICK_GRID_MM = 3.0
@@ -113,11 +117,16 @@ class _Worker:
         assert process.stdin is not None
         process.stdin.write(json.dumps([type(case).__name__, asdict(case)]) + "\n")
         process.stdin.flush()
+        kind, limit = "hang", self._longest
         try:
-            line = self._lines.get(timeout=self._longest)
+            line = self._lines.get(timeout=limit)
+            if line.strip() == PRESSED:
+                kind, limit = "unverified", LONGEST_REFERENCE_SECONDS
+                line = self._lines.get(timeout=limit)
         except queue.Empty:
             self._end()
-            return _ended(case, "hang", f"no answer in {self._longest:g} s")
+            what = "no answer" if kind == "hang" else "no reference"
+            return _ended(case, kind, f"{what} in {limit:g} s")
         if self._stopped:
             raise ComputationError("was stopped", case.says)
         if not line:
@@ -162,10 +171,10 @@ def _ended(case: Case, kind: str, reason: str) -> Verdict:
     return Verdict(case.says, getattr(case, "model", "run"), kind, reason)
 
 
-def judge_safely(case: Case) -> Verdict:
+def judge_safely(case: Case, pressed: Callable[[], None] = lambda: None) -> Verdict:
     """Return the verdict on a case; an exception that is no clean error is a verdict too."""
     try:
-        return judge(case) if isinstance(case, Extreme) else judge_scene(case)
+        return judge(case, pressed) if isinstance(case, Extreme) else judge_scene(case)
     except TkambError as error:
         return _ended(case, "flagged", str(error))
     except Exception as error:
@@ -191,7 +200,7 @@ def _answers() -> Iterator[Verdict]:
     kinds = {"Extreme": Extreme, "SceneExtreme": SceneExtreme}
     for line in sys.stdin:
         kind, fields = json.loads(line)
-        yield judge_safely(kinds[kind](**fields))
+        yield judge_safely(kinds[kind](**fields), lambda: print(PRESSED, flush=True))
 
 
 if __name__ == "__main__":

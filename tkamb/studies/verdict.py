@@ -4,11 +4,12 @@
 - flagged: no answer or a doubtful one, and a reason that says so.
 - unflagged_wrong: status ok, no flag, and farther than 2 % from the reference.
 - unverified: status ok, but the reference did not converge; counts as failed.
-- exception: anything but the library's own clean errors; hang: beyond the time limit.
+- exception: anything but the library's own clean errors; hang: the model beyond its time limit.
 """
 
 import math
 import time as clock
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -56,8 +57,13 @@ class Verdict:
         return asdict(self)
 
 
-def judge(extreme: Extreme) -> Verdict:
-    """Press an extreme and compare with its reference."""
+def judge(extreme: Extreme, pressed: Callable[[], None] = lambda: None) -> Verdict:
+    """Press an extreme and compare with its reference.
+
+    Args:
+        extreme: the case.
+        pressed: called once the model has answered, before the reference is computed.
+    """
     start = clock.perf_counter()
     try:
         model = _model(extreme)
@@ -67,6 +73,7 @@ def judge(extreme: Extreme) -> Verdict:
         seconds = clock.perf_counter() - start
         return Verdict(extreme.says, extreme.model, "flagged", str(error), seconds=seconds)
     seconds = clock.perf_counter() - start
+    pressed()
     if result.status is not ContactStatus.OK:
         reason = "; ".join((result.status.value.replace("_", " "), *result.flags))
         return _verdict(extreme, "flagged", reason, None, seconds, result)
