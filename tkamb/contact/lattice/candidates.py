@@ -30,13 +30,13 @@ class ResponsePool:
         whole: response of all contact nodes.
         nodes: (p,) contact nodes at hand, increasing.
         half: their response alone.
-        matrix: (3p, 3p) m/N, their compliance.
+        compliance: (3, p, 3, p) m/N, see `ContactResponse`.
     """
 
     whole: HalfResponse
     nodes: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
     half: HalfResponse | None = None
-    matrix: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    compliance: Array = field(default_factory=lambda: np.zeros((3, 0, 3, 0)))
     _lock: Lock = field(default_factory=Lock)
 
     def among(self, wanted: Indices, spare: Indices) -> ContactResponse:
@@ -49,26 +49,23 @@ class ResponsePool:
         with self._lock:
             if self.half is None or not np.isin(wanted, self.nodes, assume_unique=True).all():
                 self._take(spare if len(spare) <= MOST_STORED else wanted)
-            nodes, half, matrix = self.nodes, self.half, self.matrix
+            nodes, half, compliance = self.nodes, self.half, self.compliance
         assert half is not None
-        place = np.searchsorted(nodes, wanted)
-        own = unknowns_of(place)
-        if len(wanted) < len(nodes):
-            matrix = matrix[own][:, own]
-        return ContactResponse(half, place, matrix)
+        return ContactResponse(half, np.searchsorted(nodes, wanted), compliance)
 
     def _take(self, nodes: Indices) -> None:
         """Take nodes, with what is known of their compliance already."""
         half = self.whole.among(unknowns_of(nodes))
         _, here, there = np.intersect1d(nodes, self.nodes, True, True)
         new = np.setdiff1d(np.arange(len(nodes)), here, assume_unique=True)
-        matrix = np.empty((3 * len(nodes), 3 * len(nodes)))
-        known, had, rows = unknowns_of(here), unknowns_of(there), unknowns_of(new)
-        matrix[np.ix_(known, known)] = self.matrix[np.ix_(had, had)]
-        if len(new):
-            matrix[rows] = half.compliance(rows)
-            matrix[:, rows] = matrix[rows].T
-        self.nodes, self.half, self.matrix = nodes, half, matrix
+        compliance = np.empty((3, len(nodes), 3, len(nodes)))
+        axes = np.arange(3)
+        known, had = ((axes, places, axes, places) for places in (here, there))
+        compliance[np.ix_(*known)] = self.compliance[np.ix_(*had)]
+        rows = half.compliance(unknowns_of(new)).reshape(len(new), 3, len(nodes), 3)
+        compliance[:, new] = rows.transpose(1, 0, 3, 2)
+        compliance[..., new] = rows.transpose(3, 2, 1, 0)
+        self.nodes, self.half, self.compliance = nodes, half, compliance
 
 
 def guessed_depth(problem: ContactProblem, gaps: Array, areas: Array, load: float) -> float:

@@ -72,11 +72,7 @@ class LostBalance:
         rest = np.setdiff1d(np.arange(len(operator.factor.fronts)), region.fronts)
         operator.factor.backward(self._x, rest)
         self.field = operator.nodal(self._x)
-        every = np.arange(len(solid.scatter.members))
-        others = np.setdiff1d(every, region.members, assume_unique=True)
-        forces = np.empty((len(every), self._forces.shape[1]))
-        forces[region.members], forces[others] = self._forces, solid.lost(self.field, others)
-        self._forces = forces
+        self._forces = solid.lost(self.field)
         self._judge(Region.everywhere(self._problem))
 
     def advance(self) -> None:

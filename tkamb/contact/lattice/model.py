@@ -101,19 +101,17 @@ class CellContact(ContactModel):
         """Return the solid on a lattice."""
 
     def prepare(self, pair: ContactPair) -> LatticeState:
-        """Build the grid, factorise its stiffness, store the contact nodes' response.
-
-        The first rays build the femoral component's trees and normals: they are fired here.
-        """
+        """Build the grid, factorise its stiffness, store the contact nodes' response."""
         lattice = build_grid(pair.insert, self.resolution)
         solid = self.solid(lattice, pair.material)
         held = fixed_unknowns(lattice.nodes, lattice.bottom_nodes, pair.bearing)
         nodes, surface = contact_map(lattice, pair.insert)
         operator = self._operator(solid, lattice, held, nodes)
         floor = FemoralFloor(pair.femoral, pair.femoral_rays)
-        problem = ContactProblem(solid, operator, lattice.index, held, floor, self.direction)
-        vertical_gaps(problem, np.eye(4))
-        pair.first_touch.travel(np.eye(4))
+        problem = ContactProblem(
+            solid, operator, lattice.index, held, floor, self.direction, surface.lift
+        )
+        _rehearse(problem, pair)
         pool = ResponsePool(operator.half)
         return LatticeState(pair, lattice, problem, surface, condyle_split(pair.femoral), pool)
 
@@ -222,6 +220,16 @@ class CellContact(ContactModel):
             return solve_by_newton(problem, pose, load, start, tolerance, solution.field)
         except ComputationError:
             return solution
+
+
+def _rehearse(problem: ContactProblem, pair: ContactPair) -> None:
+    """Have built now what the first rays and the first look at the cells would build."""
+    vertical_gaps(problem, np.eye(4))
+    pair.first_touch.travel(np.eye(4))
+    if not problem.solid.material.is_linear:
+        still = np.zeros_like(problem.solid.nodes)
+        problem.solid.lost(still)
+        problem.solid.least_principal_strain(still)
 
 
 @dataclass(frozen=True)

@@ -112,24 +112,54 @@ class ContactResponse:
     """What forces on candidate nodes do.
 
     Args:
-        half: response of the candidates and perhaps of more nodes.
+        half: response of the candidates and perhaps of more nodes, p in all.
         place: (m,) of the candidates among these.
-        compliance: (3m, 3m) m/N among the candidates.
+        compliance: (3, p, 3, p) m/N: component and node moved, component and node pushed.
     """
 
     half: HalfResponse
     place: Indices
     compliance: Array
 
+    @classmethod
+    def of(cls, half: HalfResponse) -> "ContactResponse":
+        """Return the response of candidates that are all of the nodes of `half`."""
+        return cls(half, np.arange(len(half.rank) // 3), by_component(half.compliance()))
+
     def push(self, force: Array, y: Array) -> None:
         """Add L⁻¹ of forces (m, 3), N, to y (in elimination order)."""
-        whole = np.zeros((len(self.half.rank) // 3, 3))
-        whole[self.place] = force
-        self.half.apply(whole.ravel(), y)
+        self.half.apply(self._spread(force).ravel(), y)
 
     def displacement(self, y: Array) -> Array:
         """Return the candidates' displacement (m, 3), m, under the load whose L⁻¹ f is y."""
         return np.asarray(self.half.project(y).reshape(-1, 3)[self.place])
+
+    def along(self, normals: Array) -> tuple[Array, Array]:
+        """Return the compliance along normals (m, 3), and all that forces along them move.
+
+        Returns:
+            (m, m) m/N among the candidates, and (3, p, p) m/N for `moved`.
+        """
+        n = self._spread(normals).T
+        pushed = np.einsum("aibj,bj->aij", self.compliance, n)
+        both = np.einsum("aij,ai->ij", pushed, n)
+        return both[self.place][:, self.place], pushed
+
+    def moved(self, pushed: Array, force: Array) -> Array:
+        """Return the candidates' displacement (m, 3), m, under forces (m,), N, along normals."""
+        return np.asarray(np.einsum("aij,j->ia", pushed, self._spread(force))[self.place])
+
+    def _spread(self, values: Array) -> Array:
+        """Return candidates' values (m, ...) on all the nodes (p, ...)."""
+        spread = np.zeros((self.compliance.shape[1], *values.shape[1:]))
+        spread[self.place] = values
+        return spread
+
+
+def by_component(matrix: Array) -> Array:
+    """Return a compliance (3p, 3p), ordered by node, as (3, p, 3, p)."""
+    count = len(matrix) // 3
+    return np.ascontiguousarray(matrix.reshape(count, 3, count, 3).transpose(1, 0, 3, 2))
 
 
 def unknowns_of(nodes: Indices) -> Indices:

@@ -93,16 +93,21 @@ class Solid(ABC):
     def strain(self, displacement: Array) -> Array:
         """Return each cell's mean strain (c, 3, 3)."""
         common, others, gradients = self._mean_gradients
-        corners = displacement[self.cells]
-        gradient = np.einsum("cna,nb->cab", corners, common)
-        gradient[others] = np.einsum("cna,cnb->cab", corners[others], gradients)
+        local = displacement[self.cells].reshape(-1, 24)
+        gradient = (local @ common).reshape(-1, 3, 3)
+        for a in range(3):
+            for b in range(3):
+                along = np.einsum("cn,nc->c", local[others, a::3], gradients[:, b])
+                gradient[others, a, b] = along
         return np.asarray((gradient + np.swapaxes(gradient, 1, 2)) / 2)
 
     @cached_property
     def _mean_gradients(self) -> tuple[Array, Indices, Array]:
-        """Mean gradients (8, 3) of the commonest shape, the other cells, and theirs."""
+        """Mean gradients of the commonest shape as (24, 9), the other cells, theirs (8, 3, k)."""
         gradients, (common, others) = mean_gradient(self.shapes)[0], self.kinds
-        return gradients[common], others, gradients[self.shape_of_cell[others]]
+        matrix = np.einsum("nb,ac->ncab", gradients[common], np.eye(3)).reshape(24, 9)
+        theirs = gradients[self.shape_of_cell[others]]
+        return matrix, others, np.ascontiguousarray(theirs.transpose(1, 2, 0))
 
     @cached_property
     def kinds(self) -> tuple[int, Indices]:

@@ -101,7 +101,7 @@ class Solution:
 
 
 def solve_pass(
-    compliance: Array,
+    response: ContactResponse,
     offset: Array,
     points: Array,
     foot: Footing,
@@ -111,19 +111,16 @@ def solve_pass(
     """Solve the contact for given femoral planes; return it and the displacement (m, 3).
 
     Args:
-        compliance: (3m, 3m) of the candidates.
+        response: of the candidates.
         offset: (m, 3) their displacement without contact forces.
         points: (m, 3) undeformed.
         foot: femoral planes.
         load: N, or None for approach 0.
         active: first guess.
     """
-    normals, count = foot.normals, len(points)
-    blocks = compliance.reshape(count, 3, count, 3)
-    half = np.einsum("iajb,jb->iaj", blocks, normals, optimize=True)
-    along = np.einsum("iaj,ia->ij", half, normals)
+    along, pushed = response.along(foot.normals)
     forces = solve_contact(along, foot.gap(points + offset), foot.lean, load, active)
-    return forces, offset + half @ forces.force
+    return forces, offset + response.moved(pushed, forces.force)
 
 
 def solve(
@@ -144,8 +141,8 @@ def solve(
     best: Solution | None = None
     while True:
         passes += 1
-        foot, compliance = sliding.foot, start.response.compliance
-        forces, moved = solve_pass(compliance, balance.offset, points, foot, load, active)
+        foot = sliding.foot
+        forces, moved = solve_pass(start.response, balance.offset, points, foot, load, active)
         active = forces.active
         balance.respond(forces.force[:, None] * foot.normals)
         missed = sliding.follow(moved, forces)
@@ -188,7 +185,7 @@ def _solve_linear(
     while True:
         passes += 1
         foot = sliding.foot
-        forces, moved = solve_pass(start.response.compliance, nothing, points, foot, load, active)
+        forces, moved = solve_pass(start.response, nothing, points, foot, load, active)
         active = forces.active
         missed = sliding.follow(moved, forces)
         done = missed <= tolerance.force
