@@ -2,6 +2,8 @@
 
 import http.client
 import json
+import re
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from tkamb.cli import main
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.surface import Surface
 from tkamb.view import browser as browser_module
+from tkamb.view.cameras import CAMERAS
 from tkamb.view.drawing import PressureMap
 from tkamb.view.levels import LEVELS, levels
 from tkamb.view.payload import Block, _placed
@@ -228,3 +231,9 @@ def test_a_coupled_run_is_drawn_where_its_forces_act(tmp_path):
     pressed = arrows["medial condyle"].forces + arrows["lateral condyle"].forces
     given = np.stack([results["force_ap_N"], -results["force_si_N"], results["force_ml_N"]], axis=1)
     np.testing.assert_allclose(pressed, given, atol=1e-3 * np.abs(given).max())
+
+
+def test_the_cameras_of_the_command_line_are_the_pages():
+    text = files("tkamb.view").joinpath("assets", "controls.js").read_text(encoding="utf-8")
+    block = text.split("const CAMERAS = {")[1].split("\n};")[0]
+    assert tuple(re.findall(r'^  "([^"]+)":', block, re.MULTILINE)) == CAMERAS

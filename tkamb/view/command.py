@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from tkamb.view.cameras import CAMERAS
+
 
 def add_view(commands: Any) -> None:
     """Add `view` to the command line."""
@@ -24,7 +26,7 @@ def add_view(commands: Any) -> None:
         help="contact model of a scene; several: side by side",
     )
     view.add_argument("--frame", type=int, default=0, metavar="K", help="shown first")
-    view.add_argument("--camera", default="oblique", metavar="NAME", help="'top of insert', ...")
+    view.add_argument("--camera", default="oblique", metavar="NAME", help=", ".join(CAMERAS))
     view.add_argument("--lattice", action="store_true", help="draw the lattice too")
     view.add_argument("--html", type=Path, metavar="F", help="write one file instead of a window")
     view.add_argument("--png", type=Path, metavar="F", help="write a picture of the frame")

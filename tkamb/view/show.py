@@ -13,6 +13,7 @@ from pathlib import Path
 from tkamb.errors import InputError
 from tkamb.output.atomic import replaced_file
 from tkamb.view.browser import take_picture
+from tkamb.view.cameras import CAMERAS
 from tkamb.view.draw import draw
 from tkamb.view.drawing import Drawing
 from tkamb.view.live import ContactSwitch
@@ -23,8 +24,6 @@ from tkamb.view.server import ViewServer
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 Line = Callable[[str], None]
-
-CAMERAS = ("oblique", "anterior", "medial", "lateral", "top of insert", "whole leg")
 
 
 class Show:
@@ -127,7 +126,9 @@ class Show:
         server = self.server(port)
         announce(f"viewer: {server.url} (this machine only; Ctrl-C ends it)")
         if browse and not open_window(server.url):
-            announce("no browser found here: open that address yourself, or use --html FILE")
+            announce(
+                "no window can be opened here: open that address in a browser, or use --html FILE"
+            )
         server.serve()
 
 
