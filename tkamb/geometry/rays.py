@@ -147,7 +147,8 @@ class RayCaster:
         """Return the triangle that embree finds first beyond `start`, -1 for none."""
         points = origins + start[:, None] * directions
         face = self._fire(points, directions)
-        missed = np.flatnonzero((face < 0) & self._meets_sphere(points, directions))
+        missed = np.flatnonzero(face < 0)
+        missed = missed[self._meets_sphere(points[missed], directions[missed])]
         u, v = _normal_plane(directions[missed])
         for a, b in ((1, 1), (-1, 1), (1, -1), (-1, -1)):
             if not missed.size:

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.contact.lattice.memory import Remembered
-from tkamb.contact.lattice.problem import ContactProblem
-from tkamb.contact.lattice.response import ContactResponse, HalfResponse, unknowns_of
+from tkamb.contact.lattice.problem import ContactProblem, Footing
+from tkamb.contact.lattice.response import SINGLE, ContactResponse, HalfResponse, unknowns_of
 from tkamb.contact.lattice.solver import Start
 from tkamb.geometry.frames import Array
 
@@ -19,7 +19,7 @@ MARGIN = 0.25
 SPARE = 1.6
 """The stored response covers nodes down to this many times the depth asked for."""
 MOST_STORED = 1500
-"""Nodes of the stored response: 160 MB of compliance."""
+"""Nodes of the stored response: 80 MB of compliance."""
 
 
 @dataclass
@@ -36,7 +36,7 @@ class ResponsePool:
     whole: HalfResponse
     nodes: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
     half: HalfResponse | None = None
-    compliance: Array = field(default_factory=lambda: np.zeros((3, 0, 3, 0)))
+    compliance: Array = field(default_factory=lambda: np.zeros((3, 0, 3, 0), SINGLE))
     _lock: Lock = field(default_factory=Lock)
 
     def among(self, wanted: Indices, spare: Indices) -> ContactResponse:
@@ -58,7 +58,7 @@ class ResponsePool:
         half = self.whole.among(unknowns_of(nodes))
         _, here, there = np.intersect1d(nodes, self.nodes, True, True)
         new = np.setdiff1d(np.arange(len(nodes)), here, assume_unique=True)
-        compliance = np.empty((3, len(nodes), 3, len(nodes)))
+        compliance: Array = np.empty((3, len(nodes), 3, len(nodes)), SINGLE)
         axes = np.arange(3)
         known, had = ((axes, places, axes, places) for places in (here, there))
         compliance[np.ix_(*known)] = self.compliance[np.ix_(*had)]
@@ -92,6 +92,7 @@ def guessed_depth(problem: ContactProblem, gaps: Array, areas: Array, load: floa
 def choose_start(
     pool: ResponsePool,
     gaps: Array,
+    foot: Footing,
     depth: float,
     at_pose: bool,
     touched: NDArray[np.bool_] | None,
@@ -102,6 +103,7 @@ def choose_start(
     Args:
         pool: where responses come from.
         gaps: (c,) vertical gaps, m.
+        foot: of all contact nodes, undeformed.
         depth: m, how deep the femoral component may go below the lowest gap.
         at_pose: the femoral component stays at the pose: candidates overlap it already.
         touched: (c,) nodes in contact in a neighbouring solution, or None.
@@ -120,6 +122,7 @@ def choose_start(
         active = touched[nodes]
     response = pool.among(nodes, spare)
     if earlier is None:
-        return Start(nodes, response, active, reach=reach)
+        return Start(nodes, response, active, foot.part(nodes), reach=reach)
     moved, region = earlier.moved[nodes], earlier.region
-    return Start(nodes, response, active, earlier.lost, moved, reach, region)
+    own = foot.part(nodes)
+    return Start(nodes, response, active, own, earlier.lost, moved, reach, region)

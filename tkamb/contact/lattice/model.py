@@ -16,8 +16,9 @@ from tkamb.contact.lattice.network import CalibratedNetwork
 from tkamb.contact.lattice.newton import solve_by_newton
 from tkamb.contact.lattice.operator import ElasticOperator, fixed_unknowns, prepare_operator
 from tkamb.contact.lattice.pressure_map import ContactMap, contact_map
-from tkamb.contact.lattice.problem import ContactProblem, Direction, vertical_gaps
+from tkamb.contact.lattice.problem import ContactProblem, Direction, Footing, undeformed
 from tkamb.contact.lattice.report import PressureRule, result_of, untouched
+from tkamb.contact.lattice.response import SINGLE
 from tkamb.contact.lattice.solid import Solid
 from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve
 from tkamb.contact.materials import LinearElastic, Material
@@ -125,7 +126,7 @@ class CellContact(ContactModel):
         """Return the operator, from disk if it was made before."""
 
         def make() -> ElasticOperator:
-            return prepare_operator(solid.stiffness, lattice.index, held, nodes, np.float32)
+            return prepare_operator(solid.stiffness, lattice.index, held, nodes, SINGLE)
 
         if not self.cache:
             return make()
@@ -136,13 +137,13 @@ class CellContact(ContactModel):
     ) -> ContactResult:
         """Return the contact at a pose; see `ContactModel`."""
         pose = np.array(pose, float)
-        gaps = vertical_gaps(state.problem, pose)
         if not np.isfinite(pose).all():
             return failed_result(state, pose, "the pose is not finite")
+        gaps, foot = undeformed(state.problem, pose)
         deepest = -float(gaps.min())
         if deepest <= 0:
             return untouched(state, pose, gaps)
-        return self._solved(state, pose, None, gaps, deepest, guess)
+        return self._solved(state, pose, None, (gaps, foot), deepest, guess)
 
     def press(
         self, state: LatticeState, load: float, pose: Array, guess: ContactResult | None = None
@@ -152,15 +153,15 @@ class CellContact(ContactModel):
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
             return failed_result(state, pose, "the pose is not finite")
-        gaps = vertical_gaps(state.problem, pose)
+        gaps, foot = undeformed(state.problem, pose)
         lowest = float(gaps.min())
         if not np.isfinite(lowest):
             return failed_result(state, pose, "the femoral component does not lie over the insert")
         if load == 0:
             pose = pose_at_approach(state.pair, pose, 0.0)
-            return untouched(state, pose, vertical_gaps(state.problem, pose))
+            return untouched(state, pose, undeformed(state.problem, pose)[0])
         pose[1, 3] -= lowest
-        gaps -= lowest
+        gaps, foot = gaps - lowest, foot.raised(-lowest)
         earlier = state.memory.of(guess)
         if earlier is not None:
             depth = earlier.depth
@@ -168,23 +169,27 @@ class CellContact(ContactModel):
             depth = guess.approach
         else:
             depth = guessed_depth(state.problem, gaps, state.map.area, load)
-        return self._solved(state, pose, load, gaps, depth, guess)
+        return self._solved(state, pose, load, (gaps, foot), depth, guess)
 
     def _solved(
         self,
         state: LatticeState,
         pose: Array,
         load: float | None,
-        gaps: Array,
+        rest: tuple[Array, Footing],
         depth: float,
         guess: ContactResult | None,
     ) -> ContactResult:
-        """Solve with growing candidate sets until they cover the approach."""
+        """Solve with growing candidate sets until they cover the approach.
+
+        `rest` is what `undeformed` says at the pose.
+        """
+        gaps, foot = rest
         tolerance = Tolerance(self.tolerance)
         earlier = state.memory.of(guess)
         touched = None if guess is None else guess.pressure > 0
         for _ in range(MOST_GROWTHS):
-            start = choose_start(state.pool, gaps, depth, load is None, touched, earlier)
+            start = choose_start(state.pool, gaps, foot, depth, load is None, touched, earlier)
             solution = self._solution(state.problem, pose, load, start, tolerance)
             covered = load is None or len(start.candidates) == np.isfinite(gaps).sum()
             below = -min(float(gaps.min()), 0.0)
@@ -224,7 +229,7 @@ class CellContact(ContactModel):
 
 def _rehearse(problem: ContactProblem, pair: ContactPair) -> None:
     """Have built now what the first rays and the first look at the cells would build."""
-    vertical_gaps(problem, np.eye(4))
+    undeformed(problem, np.eye(4))
     pair.first_touch.travel(np.eye(4))
     if not problem.solid.material.is_linear:
         still = np.zeros_like(problem.solid.nodes)

@@ -46,7 +46,7 @@ def solve_by_newton(
     points = problem.surface_points[start.candidates]
     u = np.zeros_like(solid.nodes) if field is None else field
     active, step, last, steps = start.active, 1.0, np.inf, 0
-    sliding = SlidingNodes(problem, points, u[nodes], pose)
+    sliding = SlidingNodes(problem, points, u[nodes], pose, start.foot)
     while True:
         steps += 1
         foot = sliding.foot

@@ -77,13 +77,24 @@ class Footing:
         """y of the normals (m,), negative."""
         return self.normals[:, 1]
 
+    def part(self, nodes: Indices) -> "Footing":
+        """Return the footing of some of the nodes."""
+        return Footing(self.places[nodes], self.normals[nodes])
 
-def vertical_gaps(problem: ContactProblem, pose: Array) -> Array:
-    """Return the vertical gap (c,) of all undeformed contact nodes; inf where none is above."""
+    def raised(self, height: float) -> "Footing":
+        """Return the footing when the femoral component has moved along y (m)."""
+        return Footing(self.places + np.array([0.0, height, 0.0]), self.normals)
+
+
+def undeformed(problem: ContactProblem, pose: Array) -> tuple[Array, Footing]:
+    """Return vertical gaps (c,) and footing of all contact nodes where they are at rest.
+
+    The gap is inf where there is no femoral surface above.
+    """
     points = problem.surface_points
-    places, normals = problem.floor.over(points, pose)
-    usable = normals[:, 1] < STEEPEST
-    return np.where(usable, places[:, 1] - points[:, 1], np.inf)
+    foot = footing(problem, points, pose, None)
+    usable = foot.lean < STEEPEST
+    return np.where(usable, foot.places[:, 1] - points[:, 1], np.inf), foot
 
 
 def footing(
@@ -95,8 +106,8 @@ def footing(
     """
     places, normals = problem.floor.over(positions, pose)
     lost = ~(normals[:, 1] < STEEPEST)
-    if lost.any() and last is not None:
+    if last is not None:
         places[lost], normals[lost] = last.places[lost], last.normals[lost]
     if problem.direction == "vertical":
-        normals = np.broadcast_to([0.0, -1.0, 0.0], places.shape)
+        normals = np.where(np.isnan(normals), np.nan, [0.0, -1.0, 0.0])
     return Footing(places, normals)

@@ -7,6 +7,7 @@ follow each other, so Z is kept as one dense block per member of the tree.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,10 @@ from tkamb.contact.lattice.multifrontal import CholeskyFactor
 from tkamb.geometry.frames import Array
 
 Indices = NDArray[np.int64]
+Precision = type[np.floating[Any]]
+
+SINGLE: Precision = np.float32
+"""What a stored operator is kept in: it halves what every solve has to read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,14 +145,16 @@ class ContactResponse:
         Returns:
             (m, m) m/N among the candidates, and (3, p, p) m/N for `moved`.
         """
-        n = self._spread(normals).T
+        n = np.ascontiguousarray(self._spread(normals).T, dtype=self.compliance.dtype)
         pushed = np.einsum("aibj,bj->aij", self.compliance, n)
         both = np.einsum("aij,ai->ij", pushed, n)
-        return both[self.place][:, self.place], pushed
+        return both[self.place][:, self.place].astype(np.float64), pushed
 
     def moved(self, pushed: Array, force: Array) -> Array:
         """Return the candidates' displacement (m, 3), m, under forces (m,), N, along normals."""
-        return np.asarray(np.einsum("aij,j->ia", pushed, self._spread(force))[self.place])
+        return np.asarray(
+            np.einsum("aij,j->ia", pushed, self._spread(force).astype(pushed.dtype))[self.place]
+        )
 
     def _spread(self, values: Array) -> Array:
         """Return candidates' values (m, ...) on all the nodes (p, ...)."""
@@ -168,7 +175,7 @@ def unknowns_of(nodes: Indices) -> Indices:
 
 
 def half_response(
-    factor: CholeskyFactor, unknowns: Indices, precision: type[np.floating] = np.float64
+    factor: CholeskyFactor, unknowns: Indices, precision: Precision = np.float64
 ) -> HalfResponse:
     """Return L⁻¹ of unit forces on unknowns given in elimination order (q,), -1 = held.
 
@@ -193,7 +200,7 @@ def half_response(
         right[rows[a:b] - front.start, np.arange(a, b) - first] += 1.0
         product = front.block @ right
         _pass_up(factor, values, spans, member, product[front.stop - front.start :])
-        done = np.ascontiguousarray(product[: front.stop - front.start], dtype=precision)
+        done: Array = np.ascontiguousarray(product[: front.stop - front.start], dtype=precision)
         blocks.append(Block(front.start, front.stop, first, last, done))
         values[member] = done
     return HalfResponse(rank, blocks)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from tkamb.contact.lattice.active_set import ContactForces
-from tkamb.contact.lattice.problem import ContactProblem, footing
+from tkamb.contact.lattice.problem import ContactProblem, Footing, footing
 from tkamb.geometry.frames import Array
 
 SLOW = 0.7
@@ -23,15 +23,16 @@ class SlidingNodes:
         points: (m, 3) undeformed candidates, m.
         moved: (m, 3) their first displacement, m.
         pose: (4, 4) pose_femoral_in_insert.
+        foot: planes under the undeformed candidates.
     """
 
-    def __init__(self, problem: ContactProblem, points: Array, moved: Array, pose: Array) -> None:
+    def __init__(
+        self, problem: ContactProblem, points: Array, moved: Array, pose: Array, foot: Footing
+    ) -> None:
         self._problem, self._points, self._pose = problem, points, pose
         self._fired = points + moved
         self._share, self._last = 1.0, np.inf
-        self.foot = footing(problem, points, pose, None)
-        if moved.any():
-            self.foot = footing(problem, self._fired, pose, self.foot)
+        self.foot = footing(problem, self._fired, pose, foot) if moved.any() else foot
 
     def follow(self, moved: Array, forces: ContactForces) -> float:
         """Renew the planes for nodes displaced by moved (m, 3).

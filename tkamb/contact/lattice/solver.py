@@ -52,6 +52,7 @@ class Start:
         candidates: (m,) positions among the contact nodes.
         response: of the candidates to forces on them.
         active: (m,) first guess of the active set.
+        foot: femoral planes under the undeformed candidates.
         lost: (n, 3) h, N, of an earlier solution, or None.
         moved: (m, 3) m, displacement of the candidates in an earlier solution, or None.
         reach: m, every node with a smaller vertical gap is a candidate.
@@ -61,6 +62,7 @@ class Start:
     candidates: Indices
     response: ContactResponse
     active: Mask
+    foot: Footing
     lost: Array | None = None
     moved: Array | None = None
     reach: float = np.inf
@@ -137,7 +139,7 @@ def solve(
     balance = LostBalance(problem, start.response, tolerance.force, start.lost, start.region)
     points = problem.surface_points[chosen]
     first = balance.offset if start.moved is None else start.moved
-    sliding = SlidingNodes(problem, points, first, pose)
+    sliding = SlidingNodes(problem, points, first, pose, start.foot)
     best: Solution | None = None
     while True:
         passes += 1
@@ -181,7 +183,7 @@ def _solve_linear(
     points = problem.surface_points[start.candidates]
     nothing, active, passes = np.zeros_like(points), start.active, 0
     first = nothing if start.moved is None else start.moved
-    sliding = SlidingNodes(problem, points, first, pose)
+    sliding = SlidingNodes(problem, points, first, pose, start.foot)
     while True:
         passes += 1
         foot = sliding.foot

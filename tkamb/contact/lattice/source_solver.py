@@ -60,7 +60,7 @@ def solve_by_source(
     """
     nodes = problem.contact_nodes[start.candidates]
     points = problem.surface_points[start.candidates]
-    sliding = SlidingNodes(problem, points, np.zeros_like(points), pose)
+    sliding = SlidingNodes(problem, points, np.zeros_like(points), pose, start.foot)
     depth = 0.0 if load is None else FIRST_DEPTH * float(start.reach)
     field, loops = np.zeros_like(problem.solid.nodes), 0
     active, seen = sliding.foot.gap(points) < depth, []
