@@ -8,7 +8,7 @@ tkamb.start = async function () {
     ? new Uint8Array(await (await fetch("scene.bin")).arrayBuffer())
     : Uint8Array.from(atob(document.getElementById("data").textContent), (c) => c.charCodeAt(0));
   const data = await tkamb.unpack(bytes);
-  tkamb.viewer = new MeshCat.Viewer(document.getElementById("pane"));
+  tkamb.viewer = newViewer(document.getElementById("pane"), asked.figure || !softwareGraphics());
   tkamb.build(data);
   addCameras();
   addLayers(asked.live && asked.live.length > 0);
@@ -27,6 +27,30 @@ tkamb.start = async function () {
   tkamb.viewer.render();
   document.body.dataset.ready = "yes";
 };
+
+// Without a graphics card smooth edges take a third of a frame's time: then only pictures have them.
+function newViewer(pane, smooth) {
+  const {prototype} = HTMLCanvasElement, usual = prototype.getContext;
+  if (!smooth) {
+    prototype.getContext = function (kind, wishes) {
+      return usual.call(this, kind, {...wishes, antialias: false});
+    };
+  }
+  try {
+    return new MeshCat.Viewer(pane);
+  } finally {
+    prototype.getContext = usual;
+  }
+}
+
+function softwareGraphics() {
+  const context = document.createElement("canvas").getContext("webgl");
+  const told = context && context.getExtension("WEBGL_debug_renderer_info");
+  const name = told ? context.getParameter(told.UNMASKED_RENDERER_WEBGL) : "";
+  const release = context && context.getExtension("WEBGL_lose_context");
+  if (release) release.loseContext();
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+}
 
 // Another contact model on the frame that is shown, computed by the server.
 class Live {
