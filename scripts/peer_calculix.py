@@ -137,7 +137,7 @@ def block(rows):
     for row in rows:
         off = differences(row, peers[same_case(row)])
         shown = dict.fromkeys(off, "") if row["model"] == PEER else {
-            key: f"{value:+.1f}" for key, value in off.items()
+            key: f"{round(value, 1) + 0.0:+.1f}" for key, value in off.items()
         }  # fmt: skip
         lines.append(
             f"| {row['law']} | {row['load_N']:.0f} | {row['varus_deg']:g} | {row['model']} "
@@ -156,7 +156,7 @@ def asked_for(rows, peers):
         for key, limit in limits.items() if some else ():
             worst = max(abs(differences(row, peers[same_case(row)])[key]) for row in some)
             verdict = "holds" if worst <= limit else "does not hold"
-            lines.append(f"| `{model}`, {law}: {key} | {limit:g} | {worst:.2g} | {verdict} |")
+            lines.append(f"| `{model}`, {law}: {key} | {limit:g} | {worst:.2f} | {verdict} |")
     return lines
 
 

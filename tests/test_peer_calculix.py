@@ -1,0 +1,146 @@
+"""CalculiX as a peer: its deck, its process, and, where it is installed, its numbers."""
+
+import json
+import runpy
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lattice_bodies import dished_insert
+from tkamb.contact.lattice.grid import build_grid
+from tkamb.contact.materials import material, tabulated_material
+from tkamb.contact.model import ContactPair
+from tkamb.contact.registry import contact_model
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.frames import knee_pose
+from tkamb.geometry.surface import Surface
+from tkamb.studies.bodies import balls, block, dishes
+from tkamb.studies.calculix import measure_by_calculix, peer_rows, press_by_calculix
+from tkamb.studies.calculix_deck import Deck
+from tkamb.studies.calculix_run import run_calculix
+from tkamb.studies.cases import study_case
+from tkamb.studies.references import read_references
+from tkamb.studies.tradeoff_block import with_block
+
+ROOT = Path(__file__).parents[1]
+WITH_CALCULIX = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
+LINEAR, NONLINEAR = "polyethylene-linear", "polyethylene"
+
+
+def two_condyles(material_name):
+    """Return the trade-off's condyles on its dishes."""
+    insert = block(dishes(8e-3, 34e-3, 11e-3), (30e-3, 46e-3), 1e-3)
+    return ContactPair(balls(22e-3, 11e-3, sectors=64), insert, material(material_name))
+
+
+def deck(**changes):
+    lattice = build_grid(dished_insert(cells=24), 6e-3)
+    patch = Surface(np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0.0]]), np.array([[0, 1, 2]]), "patch")
+    given = {"lattice": lattice, "patch": patch, "material": material(LINEAR),
+             "bearing": "fixed", "load": 1000.0, "element": "C3D8I"} | changes  # fmt: skip
+    return Deck(**given)
+
+
+def fake_program(folder, monkeypatch, script):
+    """Put a shell script in CalculiX's place."""
+    program = folder / "ccx"
+    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}:/usr/bin:/bin")
+
+
+def test_the_deck_holds_the_lattice_s_nodes_and_cells_in_millimetres():
+    asked = deck()
+    lines = asked.text.splitlines()
+    start = lines.index("*NODE, NSET=NALL") + 1
+    count = len(asked.lattice.nodes)
+    nodes = np.array([line.split(",") for line in lines[start : start + count]], float)
+    assert nodes[:, 0] == pytest.approx(np.arange(1, count + 1))
+    assert nodes[:, 1:] / 1e3 == pytest.approx(asked.lattice.nodes, abs=1e-10)
+    start = lines.index("*ELEMENT, TYPE=C3D8I, ELSET=INSERT") + 1
+    cells = [line.split(",") for line in lines[start : start + len(asked.lattice.cells)]]
+    assert (np.array(cells, int)[:, 1:] - 1 == asked.lattice.cells).all()
+    assert "*STEP, INC=300" in lines
+    assert "*STEP, INC=300, NLGEOM" in deck(material=material(NONLINEAR)).text.splitlines()
+
+
+def test_what_calculix_has_not_is_refused():
+    with pytest.raises(InputError, match="bottom"):
+        _ = deck(bearing="mobile").text
+    tabulated = tabulated_material("table", [0.0, 0.01, 0.05], [0.0, 5e6, 15e6], 0.45)
+    with pytest.raises(InputError, match="no law that CalculiX knows"):
+        _ = deck(material=tabulated).text
+
+
+def test_without_the_program_one_clear_line(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(InputError, match=r"CalculiX.*not installed.*apt-get"):
+        peer_rows([study_case("two condyles")], read_references())
+
+
+def test_a_run_that_takes_too_long_or_fails_is_a_row_with_the_reason(tmp_path, monkeypatch):
+    fake_program(tmp_path, monkeypatch, "exec sleep 60")
+    found = measure_by_calculix(study_case("sphere"), 6.0, longest=0.3)
+    assert "stopped after 0.3 s" in found.status
+    assert not found.values
+    fake_program(tmp_path, monkeypatch, "echo '*ERROR in cheese: no holes'; exit 201")
+    found = measure_by_calculix(study_case("sphere"), 6.0)
+    assert "no holes" in found.status
+
+
+def test_a_run_that_ends_without_an_answer_is_no_answer(tmp_path, monkeypatch):
+    fake_program(tmp_path, monkeypatch, "echo done")
+    with pytest.raises(ComputationError, match="no output"):
+        run_calculix("")
+
+
+@WITH_CALCULIX
+def test_its_pressures_sum_to_the_load():
+    answer = press_by_calculix(two_condyles(LINEAR), 1000.0, np.eye(4), 4.0)
+    assert answer.balance == pytest.approx(1, abs=2e-3)
+    result = answer.result
+    assert result.medial.force == pytest.approx(result.lateral.force, rel=1e-4)
+    assert -result.wrench_on_insert[1] == pytest.approx(1000.0, rel=2e-3)
+    assert answer.run.iterations > 1
+    assert 10 < answer.run.peak_rss_MB < 1000
+
+
+@pytest.mark.slow
+@WITH_CALCULIX
+@pytest.mark.parametrize(("load", "varus"), [(1000.0, 0.0), (2500.0, 0.0), (2500.0, 0.3)])
+def test_linear_lattice_and_fe_agree_with_calculix(load, varus):
+    pair, pose = two_condyles(LINEAR), knee_pose([0, 0, 0, 0, np.radians(varus), 0])
+    peer = press_by_calculix(pair, load, pose, 2.0).result
+    for name, approach, peak in (("lattice", 0.02, 0.04), ("fe", 0.015, 0.02)):
+        model = contact_model(name, 2.0)
+        own = model.press(model.prepare(pair), load, pose)
+        assert own.approach == pytest.approx(peer.approach, rel=approach)
+        assert own.pressure.max() == pytest.approx(peer.pressure.max(), rel=peak)
+        for side in ("medial", "lateral"):
+            force = getattr(peer, side).force
+            assert getattr(own, side).force == pytest.approx(force, rel=0.02)
+
+
+@pytest.mark.slow
+@WITH_CALCULIX
+@pytest.mark.parametrize("varus", [0.0, 0.3])
+def test_small_strain_is_near_calculix_s_finite_strain(varus):
+    pair, pose = two_condyles(NONLINEAR), knee_pose([0, 0, 0, 0, np.radians(varus), 0])
+    peer = press_by_calculix(pair, 2000.0, pose, 2.0).result
+    model = contact_model("lattice", 2.0)
+    own = model.press(model.prepare(pair), 2000.0, pose)
+    assert own.approach == pytest.approx(peer.approach, rel=0.05)
+    assert own.pressure.max() == pytest.approx(peer.pressure.max(), rel=0.05)
+    assert own.medial.force == pytest.approx(peer.medial.force, rel=0.03)
+
+
+def test_the_page_is_what_the_script_makes_of_its_json(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
+    made = runpy.run_path(str(ROOT / "scripts" / "peer_calculix.py"))
+    rows = json.loads((ROOT / "docs" / "peer_calculix.json").read_text(encoding="utf-8"))
+    text = (ROOT / "docs" / "peer_calculix.md").read_text(encoding="utf-8")
+    assert with_block(text, made["block"](rows), "peer") == text, (
+        "run scripts/peer_calculix.py --page"
+    )
