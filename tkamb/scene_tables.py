@@ -354,7 +354,9 @@ class ContactTable(SceneTable):
             "muscle line: adduction, axial_rotation, ap, si, ml (si always does)"
         ),
     )
-    options: dict[str, Any] = Field(default_factory=dict, description="the model's own options")
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="the model's own, see `tkamb contact list`"
+    )
 
     @model_validator(mode="after")
     def _released_once(self) -> Self:

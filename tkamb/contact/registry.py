@@ -26,8 +26,8 @@ BUILT_IN = {
     "hertz": "tkamb.contact.hertz:Hertz",
     "foundation": "tkamb.contact.foundation:ElasticFoundation",
     "foundation-linear": "tkamb.contact.foundation:LinearFoundation",
-    "lattice": "tkamb.contact.lattice.model:CalibratedLattice",
-    "lattice-linear": "tkamb.contact.lattice.model:LinearLattice",
+    "lattice": "tkamb.contact.lattice.calibrated_model:CalibratedLattice",
+    "lattice-linear": "tkamb.contact.lattice.calibrated_model:LinearLattice",
     "lattice-source": "tkamb.contact.lattice.source_model:SourceLattice",
     "fe": "tkamb.contact.fe:FiniteElements",
 }
@@ -78,8 +78,7 @@ def contact_model(name: str, resolution_mm: float = 1.0, **options: Any) -> Cont
     if not (math.isfinite(resolution_mm) and 0 < resolution_mm <= COARSEST_MM):
         mend = f"give more than 0, at most {COARSEST_MM:g} mm"
         raise InputError(f"resolution {resolution_mm} mm", where, mend)
-    known = [field.name for field in fields(found) if field.init]  # type: ignore[arg-type]
-    own = [option for option in known if option != "resolution"]
+    own = _options(found)
     for option, value in options.items():
         if option not in own:
             mend = f"it has: {', '.join(own)}" if own else "it has none"
@@ -88,7 +87,14 @@ def contact_model(name: str, resolution_mm: float = 1.0, **options: Any) -> Cont
         if words and value not in words:
             mend = f"one of {', '.join(map(str, words))}"
             raise InputError(f"option '{option}' cannot be {value!r}", where, mend)
+        _check_kind(found, option, value, where)
     return found(resolution=resolution_mm * MILLIMETRE, **options)  # type: ignore[call-arg]
+
+
+def _options(model: type[ContactModel]) -> list[str]:
+    """Return the names of a model's own options."""
+    known = [field.name for field in fields(model) if field.init]  # type: ignore[arg-type]
+    return [option for option in known if option != "resolution"]
 
 
 def _words(model: type[ContactModel], option: str) -> tuple[Any, ...]:
@@ -97,8 +103,21 @@ def _words(model: type[ContactModel], option: str) -> tuple[Any, ...]:
     return get_args(kind) if get_origin(kind) is Literal else ()
 
 
+def _check_kind(model: type[ContactModel], option: str, value: Any, where: str) -> None:
+    """Raise an InputError for a value that is not of the option's type."""
+    from pydantic import TypeAdapter, ValidationError
+
+    kind = get_type_hints(model)[option]
+    try:
+        TypeAdapter(kind).validate_python(value, strict=True)
+    except ValidationError:
+        name = kind.__name__ if isinstance(kind, type) else str(kind)
+        mend = f"give a value of type {name}"
+        raise InputError(f"option '{option}' cannot be {value!r}", where, mend) from None
+
+
 def contact_descriptions() -> dict[str, str]:
-    """Return for every name one line: what the model assumes and what it needs.
+    """Return for every name one line: what the model assumes, what it needs, its options.
 
     A model that cannot be loaded says so in its line.
     """
@@ -106,7 +125,8 @@ def contact_descriptions() -> dict[str, str]:
     for name in contact_names():
         try:
             found = contact_class(name)
-            lines[name] = f"assumes {found.assumes}; needs {found.needs}"
+            own = ", ".join(_options(found)) or "none"
+            lines[name] = f"assumes {found.assumes}; needs {found.needs}; options: {own}"
         except InputError as error:
             lines[name] = str(error)
     return lines

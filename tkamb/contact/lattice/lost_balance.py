@@ -28,7 +28,7 @@ class LostBalance:
         response: of the candidates.
         tolerance: largest imbalance relative to the contact forces.
         lost: (n, 3) h of an earlier solution, N, or None.
-        region: outside of which that is zero; everywhere by default.
+        region: outside of which that is taken as zero; everywhere by default.
 
     Attributes:
         lost: (n, 3) N, the h that the last pass asks for.
@@ -47,8 +47,10 @@ class LostBalance:
         region: Region | None = None,
     ) -> None:
         self._problem, self._response, self._tolerance = problem, response, tolerance
-        self.lost = np.zeros_like(problem.solid.nodes) if lost is None else lost
-        self.region = Region.everywhere(problem) if region is None else region
+        self.region = Region.everywhere(problem) if region is None else region.within(problem)
+        self.lost = np.zeros_like(problem.solid.nodes)
+        if lost is not None:
+            self.lost[self.region.nodes] = lost[self.region.nodes]
         self._mixer = AndersonMixer()
         self._begin()
 
@@ -60,20 +62,17 @@ class LostBalance:
         operator.factor.backward(self._x, region.fronts)
         self.field = np.zeros_like(self.lost)
         self.field[region.nodes] = operator.nodal(self._x)[region.nodes]
-        solid = self._problem.solid
-        self._forces = solid.lost(self.field, None if region.whole else region.members)
-        self._judge(region)
+        self._look(region)
 
     def look_everywhere(self) -> None:
         """Look at the rest of the solid, for the residual and the field of all of it."""
-        region, operator, solid = self.region, self._problem.operator, self._problem.solid
+        region, operator = self.region, self._problem.operator
         if self._narrowed:
             return
         rest = np.setdiff1d(np.arange(len(operator.factor.fronts)), region.fronts)
         operator.factor.backward(self._x, rest)
         self.field = operator.nodal(self._x)
-        self._forces = solid.lost(self.field)
-        self._judge(Region.everywhere(self._problem))
+        self._look(Region.everywhere(self._problem))
 
     def advance(self) -> None:
         """Take the next h."""
@@ -91,15 +90,18 @@ class LostBalance:
         self._x = operator.start(self.lost, self.region.fronts)
         self.offset = self._response.displacement(self._x)
 
-    def _judge(self, looked: Region) -> None:
-        """Find the imbalance; of all members, also which of them count."""
-        value = self._summed(self._forces, looked)
+    def _look(self, region: Region) -> None:
+        """Find the imbalance of a region; of the whole, also which members count."""
+        solid = self._problem.solid
+        every = region.whole and solid.softening is None
+        forces = solid.lost(self.field, None if every else region.members)
+        value = self._summed(forces, region)
         self.residual = float(np.linalg.norm(value - self._taken)) / self._size
-        if looked.whole:
-            size = np.linalg.norm(self._forces, axis=1)
-            allowed = SHARE * self._tolerance * self._size
-            self.region = Region.of(self._problem, members_that_count(size, allowed))
-            value = self._summed(self._forces[self.region.members], self.region)
+        if region.whole:
+            size = np.linalg.norm(forces, axis=1)
+            count = members_that_count(size, SHARE * self._tolerance * self._size)
+            self.region = Region.of(self._problem, region.members[count])
+            value = self._summed(forces[count], self.region)
             self._narrowed = True
         self.lost = value
 

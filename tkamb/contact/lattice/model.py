@@ -1,7 +1,7 @@
 """Contact models on a lattice of cells: the contract's prepare, evaluate and press."""
 
 from abc import abstractmethod
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -12,7 +12,6 @@ from tkamb.contact.lattice.candidates import ResponsePool, choose_start, guessed
 from tkamb.contact.lattice.femoral import FemoralFloor
 from tkamb.contact.lattice.grid import Lattice, build_grid
 from tkamb.contact.lattice.memory import Memory, Remembered
-from tkamb.contact.lattice.network import CalibratedNetwork
 from tkamb.contact.lattice.newton import solve_by_newton
 from tkamb.contact.lattice.operator import ElasticOperator, fixed_unknowns, prepare_operator
 from tkamb.contact.lattice.pressure_map import ContactMap, contact_map
@@ -21,7 +20,7 @@ from tkamb.contact.lattice.report import PressureRule, result_of, untouched
 from tkamb.contact.lattice.response import SINGLE
 from tkamb.contact.lattice.solid import Solid
 from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve
-from tkamb.contact.materials import LinearElastic, Material
+from tkamb.contact.materials import Material
 from tkamb.contact.model import ContactModel, ContactPair, ContactResult, PreparedContact
 from tkamb.contact.pressing import check_load, failed_result, pose_at_approach
 from tkamb.errors import ComputationError
@@ -190,7 +189,8 @@ class CellContact(ContactModel):
         touched = None if guess is None else guess.pressure > 0
         for _ in range(MOST_GROWTHS):
             start = choose_start(state.pool, gaps, foot, depth, load is None, touched, earlier)
-            solution = self._solution(state.problem, pose, load, start, tolerance)
+            problem = self._posed(state.problem, gaps, start)
+            solution = self._solution(problem, pose, load, start, tolerance)
             covered = load is None or len(start.candidates) == np.isfinite(gaps).sum()
             below = -min(float(gaps.min()), 0.0)
             reached = solution.forces.approach * REACH + below
@@ -206,6 +206,10 @@ class CellContact(ContactModel):
                 return result
             depth, touched = 1.1 * solution.forces.approach, None
         return failed_result(state, pose, "the set of candidate nodes is saturated")
+
+    def _posed(self, problem: ContactProblem, gaps: Array, start: Start) -> ContactProblem:
+        """Return the problem as it is solved at one pose; gaps (c,) are vertical, m."""
+        return problem
 
     def _solution(
         self,
@@ -235,37 +239,3 @@ def _rehearse(problem: ContactProblem, pair: ContactPair) -> None:
         still = np.zeros_like(problem.solid.nodes)
         problem.solid.lost(still)
         problem.solid.least_principal_strain(still)
-
-
-@dataclass(frozen=True)
-class CalibratedLattice(CellContact):
-    """The calibrated lattice: exact in the uniform-strain patch, any Poisson's ratio.
-
-    28 springs per cell weighted by the share of the cells that own them plus a cell volume
-    term; nonlinear by one secant shear modulus per cell (J2 deformation theory, elastic
-    bulk) from the material's curve, fed with small strain. See docs/lattice.md.
-    """
-
-    name: ClassVar[str] = "lattice"
-    assumes: ClassVar[str] = (
-        "a spring lattice calibrated to E, nu and the stress-strain curve; small strain, "
-        "no friction"
-    )
-    needs: ClassVar[str] = "a closed insert; seconds to prepare, then tenths of a second"
-
-    def solid(self, lattice: Lattice, material: Material) -> Solid:
-        """Return the calibrated network."""
-        return CalibratedNetwork(lattice.nodes, lattice.cells, lattice.spacing, material)
-
-
-@dataclass(frozen=True)
-class LinearLattice(CalibratedLattice):
-    """The calibrated lattice with Hooke's law: contact condensed to the surface nodes."""
-
-    name: ClassVar[str] = "lattice-linear"
-    assumes: ClassVar[str] = "a spring lattice calibrated to E and nu; linear, no friction"
-    needs: ClassVar[str] = "a closed insert; seconds to prepare, then milliseconds"
-
-    def solid(self, lattice: Lattice, material: Material) -> Solid:
-        """Return the calibrated network with the material's E and nu alone."""
-        return super().solid(lattice, replace(material, law=LinearElastic()))

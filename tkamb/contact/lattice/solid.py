@@ -25,9 +25,14 @@ class Solid(ABC):
         spacing: (3,) m, edges of the lattice's box cell.
         material: its E, nu and stress-strain law.
 
+    Attributes:
+        softening: (k,) members of `scatter` that may lose forces, increasing; None: all.
+
     Raises:
         InputError: a cell is turned inside out.
     """
+
+    softening: Indices | None = None
 
     def __init__(self, nodes: Array, cells: Indices, spacing: Array, material: Material) -> None:
         self.nodes, self.cells, self.spacing, self.material = nodes, cells, spacing, material
@@ -64,7 +69,7 @@ class Solid(ABC):
         """Return h = K u - f(u), N, (n, 3): linear forces minus the material's own."""
         if self.material.is_linear:
             return np.zeros_like(displacement)
-        return self.scatter.sum(self.lost(displacement))
+        return self.scatter.sum(self.lost(displacement, self.softening), self.softening)
 
     @abstractmethod
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
