@@ -74,7 +74,9 @@ def test_flat_faces_and_sharp_edges_survive_thinning():
     for _ in range(5):
         box = box.subdivide()
     fewer, error = thinned(surface(box), 3000)
-    assert len(fewer.faces) <= 3000 and error < 1e-8
+    assert len(fewer.faces) <= 3000 and error < 1e-4
+    off_the_box = np.abs(np.abs(fewer.vertices) - (0.01, 0.015, 0.02)).min(axis=1)
+    assert off_the_box.max() < 1e-8
     assert trimesh.Trimesh(fewer.vertices, fewer.faces).volume == pytest.approx(24e-6, rel=1e-6)
 
 
