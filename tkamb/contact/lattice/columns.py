@@ -19,8 +19,8 @@ Mask = NDArray[np.bool_]
 
 TIE = 1e-6
 """Cells: a distance this near half a cell counts as half a cell."""
-WALL = 1e-7
-"""m: vertices this near the bounding box are on its side (single-precision meshes)."""
+WALL = 0.02
+"""Cells: vertices this near the bounding box are on its side; what they differ by is noise."""
 
 
 @dataclass(eq=False)
@@ -126,8 +126,8 @@ def _grid_line(surface: Surface, axis: int, spacing: float) -> Array:
     lower, upper = surface.bounds[:, axis]
     line = np.linspace(lower, upper, round((upper - lower) / spacing) + 1)
     values = surface.vertices[:, axis]
-    line[0] = values[values <= lower + WALL].max()
-    line[-1] = values[values >= upper - WALL].min()
+    line[0] = values[values <= lower + WALL * spacing].max()
+    line[-1] = values[values >= upper - WALL * spacing].min()
     return np.asarray(line)
 
 

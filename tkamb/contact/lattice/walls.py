@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tkamb.contact.lattice.columns import NodeField
 from tkamb.contact.lattice.notches import fill_notches
-from tkamb.contact.lattice.refire import Nodes, inside, refired
+from tkamb.contact.lattice.refire import Nodes, inside, refired_inwards
 from tkamb.geometry.frames import Array
 from tkamb.geometry.height_field import inside_intervals
 from tkamb.geometry.rays import RayCaster
@@ -118,7 +118,7 @@ def _move_out(field: NodeField, firing: Array, hits: list[WallHits], rays: RayCa
         _leave_far_side(hits[axis : axis + 2], chosen & (forth > back), chosen & (forth <= back))
     moved: Nodes = np.nonzero((move != 0.0).any(axis=-1))
     target = _corner_or_wall(firing[moved], move[moved], rays)
-    height = refired(field, moved, target, rays)
+    height = refired_inwards(field, moved, target, -move[moved], rays)
     good = np.isfinite(height)
     moved = tuple(index[good] for index in moved)
     target[:, 1] = height
@@ -191,7 +191,7 @@ def _admit_at(
     field.lower_end[nodes], field.upper_end[nodes] = ends[0][nodes], ends[1][nodes]
     at_end = field.lower_end[nodes] | field.upper_end[nodes]
     field.points[..., 1][nodes] = np.where(at_end, height[nodes], start[:, 1])
-    settled = refired(field, nodes, target, rays)
+    settled = refired_inwards(field, nodes, target, move, rays)
     good = np.isfinite(settled)
     bad = tuple(n[~good] for n in nodes)
     field.lower_end[bad] = field.upper_end[bad] = False
