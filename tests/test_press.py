@@ -1,6 +1,7 @@
 """`tkamb press` on mesh files: what it prints, and that units, axes and side only relabel."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,11 @@ from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.surface import Surface
-from tkamb.press.press import press_meshes, read_pose
+from tkamb.press import press
+from tkamb.press.press import read_pose
 
+FOUNDATION = ["--contact", "foundation"]
+press_meshes = partial(press.press_meshes, contact="foundation")
 KEYS = [
     "contact",
     "resolution_mm",
@@ -85,7 +89,7 @@ SIDES = ("medial", "lateral")
 def test_report_has_the_interface_s_keys(meshes, capsys):
     femoral, insert = meshes()
     arguments = ["press", str(femoral), str(insert), "--load", "900", "--json"]
-    assert main([*arguments, "--contact", "foundation", "--resolution", "1.5"]) == 0
+    assert main([*arguments, *FOUNDATION, "--resolution", "1.5"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert list(found) == KEYS
     assert list(found["medial"]) == list(found["lateral"]) == CONDYLE_KEYS
@@ -100,11 +104,24 @@ def test_report_has_the_interface_s_keys(meshes, capsys):
 
 def test_text_names_both_condyles(meshes, capsys):
     femoral, insert = meshes()
-    assert main(["press", str(femoral), str(insert), "--load", "900"]) == 0
+    assert main(["press", str(femoral), str(insert), "--load", "900", *FOUNDATION]) == 0
     text = capsys.readouterr().out
     assert "medial" in text
     assert "lateral" in text
     assert "reaction 900 N" in text
+
+
+def test_the_lattice_is_the_default(meshes, capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("TKAMB_CACHE_DIR", str(tmp_path / "kept"))
+    femoral, insert = meshes()
+    arguments = ["press", str(femoral), str(insert), "--load", "900", "--no-cache", "--json"]
+    assert main([*arguments, "--resolution", "2"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["contact"] == "lattice"
+    assert found["reaction_N"] == pytest.approx(900, rel=1e-5)
+    assert not (tmp_path / "kept").exists()
+    assert main([*arguments, *FOUNDATION]) == 2
+    assert "'foundation' keeps nothing on disk" in capsys.readouterr().err
 
 
 def test_swapping_the_model_keeps_the_load(meshes):

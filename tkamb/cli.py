@@ -10,13 +10,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from tkamb.command_options import add_no_cache, without_cache
 from tkamb.errors import TkambError
+from tkamb.press.command import add_press
 from tkamb.studies.command import add_stability, add_tradeoff
 from tkamb.view.command import add_view
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `tkamb` and return its exit status: 0 done, 1 nothing computed, 2 bad input."""
+    _keep_to_one_thread()
     options = _parser().parse_args(arguments)
     logging.basicConfig(format="tkamb: %(levelname)s: %(message)s", level=logging.WARNING)
     try:
@@ -34,6 +37,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
+def _keep_to_one_thread() -> None:
+    """Have BLAS take one thread, unless the environment says how many or it runs already.
+
+    The lattice's solves wait for memory; further threads wait for each other, which on a
+    busy machine takes several times as long.
+    """
+    said = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    if "numpy" not in sys.modules and not any(name in os.environ for name in said):
+        os.environ["OMP_NUM_THREADS"] = "1"
+
+
 class _Parser(argparse.ArgumentParser):
     """Bad arguments are one line too, without the usage before it."""
 
@@ -45,7 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="tkamb", description="What happens inside a total knee replacement.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _add_run(commands)
-    _add_press(commands)
+    add_press(commands)
     _add_contact(commands)
     _add_mesh(commands)
     _add_scene(commands)
@@ -70,42 +84,12 @@ def _add_run(commands: Any) -> None:
         metavar="TABLE.KEY=VALUE",
         help="override a key of the scene",
     )
+    add_no_cache(run)
     run.add_argument("--resume", action="store_true", help="go on with an interrupted run")
     run.add_argument("--profile", action="store_true", help="what was touched, and time per part")
     run.add_argument("--strict", action="store_true", help="exit 1 when a frame failed")
     run.add_argument("--json", action="store_true", help="print summary.json")
     run.set_defaults(command=_run)
-
-
-def _add_press(commands: Any) -> None:
-    press = commands.add_parser("press", help="contact alone: press two meshes together")
-    press.add_argument("femoral", type=Path)
-    press.add_argument("insert", type=Path)
-    press.add_argument("--load", type=float, required=True, metavar="N")
-    press.add_argument("--units", choices=("mm", "m"), default="mm", help="of both meshes")
-    pose = press.add_mutually_exclusive_group()
-    pose.add_argument(
-        "--pose",
-        type=float,
-        nargs=6,
-        metavar=("X", "Y", "Z", "RX", "RY", "RZ"),
-        help="femoral mesh in the insert mesh's axes: mesh units, degrees (intrinsic x-y-z)",
-    )
-    pose.add_argument("--pose-file", type=Path, metavar="F", help="the same six numbers in a file")
-    press.add_argument("--contact", default="foundation", metavar="NAME")
-    press.add_argument("--resolution", type=float, default=1.0, metavar="MM")
-    press.add_argument("--bearing", choices=("fixed", "mobile"), default="fixed")
-    press.add_argument("--material", default="polyethylene", metavar="NAME")
-    press.add_argument(
-        "--axes",
-        default="+x,+y,+z",
-        metavar="ANT,SUP,RIGHT",
-        help="mesh axes that point anterior, superior, right; write --axes=-x,+y,-z",
-    )
-    press.add_argument("--side", choices=("right", "left"), default="right")
-    press.add_argument("--adjust", action=argparse.BooleanOptionalAction, default=False)
-    press.add_argument("--json", action="store_true")
-    press.set_defaults(command=_press)
 
 
 def _add_contact(commands: Any) -> None:
@@ -185,6 +169,10 @@ def _run(options: argparse.Namespace) -> int:
     if options.resolution is not None:
         overrides["contact.resolution_mm"] = options.resolution
     scene = load_scene(options.scene, overrides)
+    if options.no_cache:
+        name = scene.contact.model if scene.contact else None
+        overrides |= {f"contact.options.{k}": v for k, v in without_cache(name).items()}
+        scene = load_scene(options.scene, overrides)
     directory = options.out or scene.output.directory or _default_directory(options.scene)
     with claimed_directory(directory):
         results = simulate(
@@ -213,28 +201,6 @@ def _run(options: argparse.Namespace) -> int:
 
 def _default_directory(scene: Path) -> Path:
     return Path("out") / scene.resolve().parent.name
-
-
-def _press(options: argparse.Namespace) -> int:
-    from tkamb.press.press import press_meshes, read_pose
-
-    pose = read_pose(options.pose_file) if options.pose_file else options.pose
-    report = press_meshes(
-        options.femoral,
-        options.insert,
-        options.load,
-        units=options.units,
-        pose=None if pose is None else tuple(pose),
-        contact=options.contact,
-        resolution_mm=options.resolution,
-        bearing=options.bearing,
-        material=options.material,
-        axes=options.axes,
-        side=options.side,
-        adjust=options.adjust,
-    )
-    print(json.dumps(report.as_dict(), indent=2) if options.json else "\n".join(report.lines()))
-    return 0 if report.carried else 1
 
 
 def _contact_list(options: argparse.Namespace) -> int:

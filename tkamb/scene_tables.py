@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from tkamb.defaults import CONTACT_MODEL
+
 LengthUnit = Literal["m", "cm", "mm"]
 AngleUnit = Literal["rad", "deg"]
 Vector = tuple[float, float, float]
@@ -339,7 +341,7 @@ class PatellaTable(SceneTable):
 class ContactTable(SceneTable):
     """The femorotibial contact."""
 
-    model: str = Field(description="a name of `tkamb contact list`")
+    model: str = Field(CONTACT_MODEL, description="a name of `tkamb contact list`")
     resolution_mm: float = Field(1.0, gt=0)
     material: str = Field("polyethylene", description="a name of `tkamb.contact.materials`")
     friction: float = Field(0.05, ge=0, le=1, description="Coulomb coefficient")

@@ -91,6 +91,11 @@ def contact_model(name: str, resolution_mm: float = 1.0, **options: Any) -> Cont
     return found(resolution=resolution_mm * MILLIMETRE, **options)  # type: ignore[call-arg]
 
 
+def contact_options(name: str) -> tuple[str, ...]:
+    """Return the names of a model's own options."""
+    return tuple(_options(contact_class(name)))
+
+
 def _options(model: type[ContactModel]) -> list[str]:
     """Return the names of a model's own options."""
     known = [field.name for field in fields(model) if field.init]  # type: ignore[arg-type]

@@ -15,6 +15,7 @@ from tkamb.contact import materials
 from tkamb.contact.model import Bearing, ContactModel, ContactPair, ContactResult
 from tkamb.contact.pressing import check_load, first_touch_height
 from tkamb.contact.registry import contact_model
+from tkamb.defaults import CONTACT_MODEL
 from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.errors import InputError
 from tkamb.geometry.adjustment import Adjustment
@@ -39,7 +40,7 @@ def press_meshes(
     *,
     units: str = "mm",
     pose: Sequence[float] | None = None,
-    contact: str = "foundation",
+    contact: str = CONTACT_MODEL,
     resolution_mm: float = 1.0,
     bearing: Bearing = "fixed",
     material: str = "polyethylene",

@@ -1,0 +1,38 @@
+"""Options that several commands have, and what the command line sets up."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tkamb.cli import main
+
+SCENE = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
+
+
+def test_no_cache_reaches_the_model(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("TKAMB_CACHE_DIR", str(tmp_path / "kept"))
+    run = ["run", str(SCENE), "--frames", "50:51", "--resolution", "1.5", "--contact"]
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert main([*run, "lattice-linear", "--out", str(first), "--no-cache"]) == 0
+    assert not (tmp_path / "kept").exists()
+    assert main([*run, "lattice-linear", "--out", str(second)]) == 0
+    assert any((tmp_path / "kept").iterdir())
+    assert main([*run, "foundation", "--out", str(tmp_path / "third"), "--no-cache"]) == 2
+    assert "'foundation' keeps nothing on disk" in capsys.readouterr().err
+    assert not (tmp_path / "third").exists()
+
+
+@pytest.mark.parametrize(("given", "threads"), [({}, "1"), ({"OMP_NUM_THREADS": "3"}, "3")])
+def test_blas_keeps_to_one_thread_unless_told_otherwise(given, threads):
+    code = (
+        "import os, sys; from tkamb.cli import main; main(['contact', 'list']); "
+        "print(os.environ['OMP_NUM_THREADS'])"
+    )
+    kept = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    ran = subprocess.run(
+        [sys.executable, "-c", code], env=kept | given, capture_output=True, text=True, check=True
+    )
+    assert ran.stdout.splitlines()[-1] == threads
