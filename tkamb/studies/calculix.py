@@ -1,9 +1,11 @@
 """CalculiX beside the built-in models: the same hexahedra, pose and load, another program.
 
-CalculiX starts without any answer of the lattice's: the femoral component begins where an
-elastic foundation would carry the load. Each position begins anew, so that its cold and warm
-times are the same. Its pressures act on the deformed faces; here they become nodal forces,
-and those, over the undeformed tributary areas, pressures as the built-in models define them.
+It gets the smooth surfaces that the meshes stand for, as the lattice does: contact nodes lifted
+to the one, fine master triangles on the other. It starts without any answer of the lattice's: the
+femoral component begins where an elastic foundation would carry the load. Each position begins
+anew, so that its cold and warm times are the same. Its pressures act on the deformed faces; here
+they become nodal forces, and those, over the undeformed tributary areas, pressures as the built-in
+models define them.
 
 Strain: linear cases have small strain on both sides. CalculiX's Ramberg-Osgood law wants finite
 strain (true stress over the Eulerian strain of the deformed shape), the built-in models keep
@@ -17,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from trimesh.remesh import subdivide
 
 from tkamb.contact.lattice.femoral import FemoralFloor
 from tkamb.contact.lattice.grid import Lattice, build_grid
@@ -48,6 +51,8 @@ REACH = 3.0
 """Nodes whose gap at first touch is within this many times the guessed depth can be touched."""
 LEAST_LEAN = -0.3
 """Largest y of a femoral normal that takes part."""
+FINE = 0.25 * MILLIMETRE
+"""Edge of the master's triangles: 0.3 µm inside a sphere of 22 mm."""
 UNEVEN = 0.01
 """Largest difference of the summed contact forces from the load, over the load."""
 
@@ -162,7 +167,7 @@ class _Problem:
 
     Args:
         pair: the two bodies.
-        lattice: grid of the insert.
+        lattice: grid of the insert, its contact nodes on the smooth surface.
         nodes: (c,) contact nodes.
         map: contact surface.
         floor: femoral component from below.
@@ -186,16 +191,19 @@ class _Problem:
 def _problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -> _Problem:
     lattice = build_grid(pair.insert, grid_mm * MILLIMETRE)
     nodes, surface = contact_map(lattice, pair.insert)
+    smooth = lattice.nodes.copy()
+    smooth[nodes, 1] += surface.lift
     floor = FemoralFloor(pair.femoral, RayCaster(pair.femoral))
     guess = contact_model("foundation", grid_mm)
     depth = guess.press(guess.prepare(pair), load, pose).approach
     if not depth > 0:
         raise ComputationError("needs a load that presses the bodies together", "CalculiX")
-    touching = pose_at_approach(pair, pose, 0.0)
-    places, _ = floor.over(surface.points, touching)
+    places, _ = floor.over(surface.points, pose_at_approach(pair, pose, 0.0))
     near = places[:, 1] - surface.points[:, 1] < REACH * depth
     placed = pose_at_approach(pair, pose, depth)
     patch = _patch(pair.femoral.moved(placed), surface.points[near], grid_mm * MILLIMETRE)
+    patch = _on_patches(floor, placed, patch)
+    lattice = replace(lattice, nodes=smooth)
     return _Problem(pair, lattice, nodes, surface, floor, placed, depth, near, patch)
 
 
@@ -206,6 +214,15 @@ def _patch(femoral: Surface, points: Array, spacing: float) -> Surface:
     away, _ = cKDTree(points[:, ::2]).query(middle, distance_upper_bound=1.5 * spacing)
     used, faces = np.unique(femoral.faces[down[np.isfinite(away)]], return_inverse=True)
     return Surface(femoral.vertices[used], faces.reshape(-1, 3).astype(np.int64), "patch")
+
+
+def _on_patches(floor: FemoralFloor, pose: Array, patch: Surface) -> Surface:
+    """Return the patch with finer triangles, their corners on the smooth femoral surface."""
+    vertices, faces = patch.vertices, patch.faces
+    while np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)) > FINE:
+        vertices, faces = subdivide(vertices, faces)
+    places, _ = floor.over(vertices, pose)
+    return Surface(np.where(np.isfinite(places), places, vertices), faces, "patch")
 
 
 def _result(problem: _Problem, load: float, run: PeerRun) -> tuple[ContactResult, float]:
@@ -231,7 +248,7 @@ def _result(problem: _Problem, load: float, run: PeerRun) -> tuple[ContactResult
         normals=surface.normals,
         pressure=pressure,
         area=surface.area,
-        gap=above[:, 1] - surface.points[:, 1],
+        gap=above[:, 1] - surface.points[:, 1] - surface.lift,
         nodal_force=force,
         wrench_on_insert=wrench_of(surface.points, force),
         medial=medial,
