@@ -1,6 +1,7 @@
 """Elastic foundation: a bed of independent springs under a rigid femoral component."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -149,7 +150,7 @@ class ElasticFoundation(ContactModel):
             wrench_on_insert=wrench_of(bed.points, nodal_force),
             medial=medial,
             lateral=lateral,
-            approach=approach_at(state.pair, pose),
+            approach=partial(approach_at, state.pair, np.array(pose, float)),  # type: ignore[arg-type]
             status=ContactStatus.OK,
         )
 

@@ -5,6 +5,7 @@ of `evaluate`. A model that knows its tangent brings a faster probe with stiffne
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -30,17 +31,17 @@ class CondyleWrench:
     centre: Array
     stiffness: Array | None = None
 
-    @property
+    @cached_property
     def force(self) -> float:
         """N, magnitude of the resultant."""
         return float(np.linalg.norm(self.wrench[:3]))
 
-    @property
+    @cached_property
     def normal(self) -> Array:
         """(3,) unit, out of the insert into the femur: against the resultant on the insert."""
         return -self.wrench[:3] / self.force
 
-    @property
+    @cached_property
     def point(self) -> Array:
         """(3,) m, the point on the resultant's line of action nearest to the centre.
 

@@ -149,10 +149,10 @@ class RayCaster:
         face = self._fire(points, directions)
         missed = np.flatnonzero(face < 0)
         missed = missed[self._meets_sphere(points[missed], directions[missed])]
+        if not missed.size:
+            return face
         u, v = _normal_plane(directions[missed])
         for a, b in ((1, 1), (-1, 1), (1, -1), (-1, -1)):
-            if not missed.size:
-                break
             beside = points[missed] + NUDGE * self._radius * (a * u + b * v)
             face[missed] = self._fire(beside, directions[missed])
             still = face[missed] < 0
