@@ -45,7 +45,16 @@ SETTINGS = {
     "hertz": Settings((1.0,), ()),
     "foundation": Settings((2.0, 1.0), ()),
     "foundation-linear": Settings((2.0, 1.0), ()),
-    "lattice": Settings((3.0, 2.0), (1.5, 1.0), ({"tolerance": 1e-2}, {"tolerance": 1e-5})),
+    "lattice": Settings(
+        (3.0, 2.0),
+        (1.5, 1.0),
+        (
+            {"tolerance": 1e-2},
+            {"tolerance": 1e-5},
+            {"nonlinear_within_mm": 4.0},
+            {"nonlinear_within_mm": 8.0},
+        ),
+    ),
     "lattice-linear": Settings(),
     "lattice-source": Settings((2.0,), ()),
     "fe": Settings((2.0,), (1.5, 1.0), ({"newton": True},)),
