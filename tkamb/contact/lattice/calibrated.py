@@ -91,9 +91,10 @@ def body_diagonal_stiffness(edges: Array) -> float:
     kept = families.min(axis=1) >= 0
     if kept.any():
         candidates, families = candidates[kept], families[kept]
-    corners = box_corners(edges)[None]
-    softest = [np.linalg.eigvalsh(spring_matrix(corners, k)[0])[6] for k in families]
-    return float(candidates[int(np.argmax(softest))])
+    corners, none = box_corners(edges)[None], spring_families(edges, 0.0)
+    per_unit = spring_matrix(corners, spring_families(edges, 1.0) - none)
+    matrices = spring_matrix(corners, none) + candidates[:, None, None] * per_unit
+    return float(candidates[np.linalg.eigvalsh(matrices)[:, 6].argmax()])
 
 
 def strain_matrix(gradients: Array) -> Array:
