@@ -8,13 +8,16 @@ import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from tkamb.command_options import add_no_cache, without_cache
 from tkamb.errors import TkambError
 from tkamb.press.command import add_press
 from tkamb.studies.command import add_stability, add_tradeoff
 from tkamb.view.command import add_view
+
+if TYPE_CHECKING:
+    from tkamb.scene import Scene
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -160,19 +163,9 @@ def _run(options: argparse.Namespace) -> int:
     from tkamb.output.headline import cards
     from tkamb.results import write_results
     from tkamb.run.status import FAILED
-    from tkamb.scene import load_scene
     from tkamb.simulation import simulate
 
-    overrides = dict(options.set)
-    if options.contact:
-        overrides["contact.model"] = options.contact
-    if options.resolution is not None:
-        overrides["contact.resolution_mm"] = options.resolution
-    scene = load_scene(options.scene, overrides)
-    if options.no_cache:
-        name = scene.contact.model if scene.contact else None
-        overrides |= {f"contact.options.{k}": v for k, v in without_cache(name).items()}
-        scene = load_scene(options.scene, overrides)
+    scene = _scene_of(options)
     directory = options.out or scene.output.directory or _default_directory(options.scene)
     with claimed_directory(directory):
         results = simulate(
@@ -197,6 +190,24 @@ def _run(options: argparse.Namespace) -> int:
     if profile and not options.json:
         print("\n".join(profile_lines(results.summary["profile"])))
     return 1 if failed and (options.strict or len(failed) == len(results)) else 0
+
+
+def _scene_of(options: argparse.Namespace) -> "Scene":
+    """Return the scene of `run` with what the command line overrides."""
+    from tkamb.scene import load_scene
+
+    overrides = dict(options.set)
+    if options.contact:
+        overrides["contact.model"] = options.contact
+    if options.resolution is not None:
+        overrides["contact.resolution_mm"] = options.resolution
+    scene = load_scene(options.scene, overrides)
+    if not options.no_cache:
+        return scene
+    more = without_cache(scene.contact.model if scene.contact else None)
+    return load_scene(
+        options.scene, overrides | {f"contact.options.{k}": v for k, v in more.items()}
+    )
 
 
 def _default_directory(scene: Path) -> Path:

@@ -73,10 +73,7 @@ def press_meshes(
         InputError: bad file, unit, axes, name or load, or a femoral component that does not
             lie over the insert, or not near it where it is to be adjusted.
     """
-    check_load(load)
-    if load > LARGEST_LOAD:
-        limit = f"no knee carries more than {LARGEST_LOAD:g} N"
-        raise InputError(f"impossible load {load:g} N", mend=f"{limit}; is it in N?")
+    _check_load(load)
     model = contact_model(contact, resolution_mm, **(options or {}))
     pair, placed = load_pair(femoral, insert, units, pose, bearing, material, axes, side)
     if not math.isfinite(first_touch_height(pair, placed)):
@@ -103,6 +100,13 @@ def press_meshes(
         solve_seconds=solved - prepared,
         peak_rss_MB=peak_rss(),
     )
+
+
+def _check_load(load: float) -> None:
+    check_load(load)
+    if load > LARGEST_LOAD:
+        limit = f"no knee carries more than {LARGEST_LOAD:g} N"
+        raise InputError(f"impossible load {load:g} N", mend=f"{limit}; is it in N?")
 
 
 def _pressed(

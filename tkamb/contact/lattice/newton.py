@@ -41,8 +41,7 @@ def solve_by_newton(
     Raises:
         ComputationError: the tangent is not positive definite, or numbers overflow.
     """
-    solid, free = problem.solid, ~problem.held
-    nodes = problem.contact_nodes[start.candidates]
+    solid, nodes = problem.solid, problem.contact_nodes[start.candidates]
     points = problem.surface_points[start.candidates]
     u = np.zeros_like(solid.nodes) if field is None else field
     active, step, last, steps = start.active, 1.0, np.inf, 0
@@ -53,23 +52,28 @@ def solve_by_newton(
         u_full, forces = _step(problem, nodes, points, u, foot, load, active)
         u = u + step * (u_full - u)
         active = forces.active
-        pushed = np.zeros_like(u)
-        pushed[nodes] = forces.force[:, None] * foot.normals
-        size = max(float(np.linalg.norm(pushed)), 1e-300)
-        balance = (solid.internal_force(u) - pushed).ravel()[free]
-        residual = float(np.linalg.norm(balance)) / size
-        if not np.isfinite(residual):
-            raise ComputationError("Newton's iteration left the range of numbers")
+        residual = _imbalance(problem, nodes, u, forces.force[:, None] * foot.normals)
         missed = sliding.follow(u[nodes], forces)
         done = not active.any() or max(residual, missed) <= tolerance.force
         if done or steps == MOST_STEPS:
             forces = replace(forces, converged=done and forces.converged)
             lost = solid.correction(u)
-            lost[~free.reshape(-1, 3)] = 0.0
+            lost[problem.held.reshape(-1, 3)] = 0.0
             return Solution(
                 start.candidates, forces, foot, u[nodes], u, lost, steps, max(residual, missed)
             )
         step, last = 0.5 if residual > 2 * last else 1.0, residual
+
+
+def _imbalance(problem: ContactProblem, nodes: Indices, u: Array, force: Array) -> float:
+    """Return what is out of balance at u (n, 3) under forces (m, 3) on nodes, relative to them."""
+    outside = -problem.solid.internal_force(u)
+    outside[nodes] += force
+    size = max(float(np.linalg.norm(force)), 1e-300)
+    residual = float(np.linalg.norm(outside.ravel()[~problem.held])) / size
+    if not np.isfinite(residual):
+        raise ComputationError("Newton's iteration left the range of numbers")
+    return residual
 
 
 def _step(

@@ -1,5 +1,6 @@
 """From a solution of the lattice to the contract's result: pressures, sums, flags."""
 
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Literal
 
@@ -70,10 +71,23 @@ def result_of(
         return failed_result(state, pose, *flags)
     if not solution.converged:
         flags = (*flags, "the solver has not converged")
-    gap = gaps - depth
+    return replace(
+        _carried(state, pose, gaps - depth, solution, rule),
+        status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
+        iterations=solution.passes,
+        residual=solution.residual,
+        flags=flags,
+        approach=partial(approach_at, state.pair, pose),  # type: ignore[arg-type]
+    )
+
+
+def _carried(
+    state: "LatticeState", pose: Array, gaps: Array, solution: Solution, rule: PressureRule
+) -> ContactResult:
+    """Return the map and its sums; gaps (c,) are those of the undeformed insert at the pose."""
+    surface, gap = state.map, gaps.copy()
     gap[solution.candidates] = solution.forces.gap
-    force, pressure, area = _pressures(state, gaps - depth, solution, rule)
-    surface = state.map
+    force, pressure, area = _pressures(state, gaps, solution, rule)
     medial, lateral = summarise_condyles(
         medial_points(surface.points, pose, state.split),
         surface.points, pressure, area, force, surface.thickness,
@@ -89,11 +103,7 @@ def result_of(
         wrench_on_insert=wrench_of(surface.points, force),
         medial=medial,
         lateral=lateral,
-        approach=partial(approach_at, state.pair, pose),  # type: ignore[arg-type]
-        status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
-        iterations=solution.passes,
-        residual=solution.residual,
-        flags=flags,
+        approach=0.0,
     )
 
 

@@ -51,12 +51,8 @@ def solve_by_source(
 ) -> Solution:
     """Return the contact at a pose under a load (N), or at approach 0 when load is None.
 
-    Args:
-        problem: with `direction` "vertical".
-        pose: (4, 4) pose_femoral_in_insert.
-        load: N along -y, or None.
-        start: candidates and how deep they reach.
-        tolerance: of reaction, balance and femoral surface.
+    `start` gives candidates and how deep they reach; for the others see `solver.solve`. The
+    problem's `direction` is "vertical".
     """
     nodes = problem.contact_nodes[start.candidates]
     points = problem.surface_points[start.candidates]
@@ -73,9 +69,8 @@ def solve_by_source(
         missed = 0.0 if load is None else abs(reaction - load) / load
         changed = _next_active(points + moved, foot, active, pressed.force, depth)
         opening = np.where(active, 0.0, foot.gap(points + moved) - depth)
-        forces = ContactForces(
-            np.where(active, np.maximum(pressed.force, 0), 0.0), opening, depth, active, loops, True
-        )
+        force = np.where(active, np.maximum(pressed.force, 0), 0.0)
+        forces = ContactForces(force, opening, depth, active, loops, True)
         settled = sliding.follow(moved, forces) <= tolerance.force
         still = bool((changed == active).all())
         done = still and settled and max(missed, pressed.residual) <= tolerance.force
@@ -144,13 +139,16 @@ def _press(
         u = u + share * step
     everywhere = np.zeros(len(nodes))
     everywhere[active] = force
-    slope = np.nan
-    if solid.material.is_linear:
-        dummy = np.zeros(len(held))
-        dummy[chosen] = -1.0
-        dummy = _spread(solid.stiffness, problem, held, dummy)
-        slope = float(-(solid.stiffness @ dummy)[chosen].sum())
+    slope = _slope(problem, held, chosen) if solid.material.is_linear else np.nan
     return _Pressed(everywhere, u, slope, residual)
+
+
+def _slope(problem: ContactProblem, held: Mask, chosen: Indices) -> float:
+    """Return the reaction (N) to a unit dummy displacement of the chosen unknowns, per metre."""
+    dummy = np.zeros(len(held))
+    dummy[chosen] = -1.0
+    dummy = _spread(problem.solid.stiffness, problem, held, dummy)
+    return float(-(problem.solid.stiffness @ dummy)[chosen].sum())
 
 
 def _balance(
