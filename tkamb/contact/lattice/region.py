@@ -63,5 +63,5 @@ def members_that_count(size: Array, allowed: float) -> Indices:
         allowed: N, root of the sum of squares of those left out.
     """
     order = np.argsort(size)
-    left_out = int(np.searchsorted(np.cumsum(size[order] ** 2), allowed**2))
+    left_out = int(np.searchsorted(np.cumsum(size[order] ** 2), allowed**2, side="right"))
     return np.sort(order[left_out:])
