@@ -98,6 +98,7 @@ class PressReport:
             "iterations": result.iterations,
             "residual": _known(result.residual),
             "status": result.status.value,
+            "flags": list(result.flags),
         }
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.contact.lattice.edges import edge_flags
 from tkamb.contact.lattice.solver import Solution
 from tkamb.contact.model import ContactResult, ContactStatus
 from tkamb.contact.pressing import approach_at, failed_result
@@ -71,12 +72,13 @@ def result_of(
         return failed_result(state, pose, *flags)
     if not solution.converged:
         flags = (*flags, "the solver has not converged")
+    carried = _carried(state, pose, gaps - depth, solution, rule)
     return replace(
-        _carried(state, pose, gaps - depth, solution, rule),
+        carried,
         status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
         iterations=solution.passes,
         residual=solution.residual,
-        flags=flags,
+        flags=(*flags, *_edge_flags(state, carried)),
         approach=partial(approach_at, state.pair, pose),  # type: ignore[arg-type]
     )
 
@@ -137,6 +139,17 @@ def _areas(state: "LatticeState", gaps: Array, loaded: Mask, rule: PressureRule)
         return state.map.area
     overlap = float(state.map.area[gaps < 0].sum())
     return np.where(loaded, overlap / loaded.sum(), state.map.area)
+
+
+def _edge_flags(state: "LatticeState", carried: ContactResult) -> tuple[str, ...]:
+    """Return the flags of peaks at an edge of the femoral component."""
+    medial = medial_points(carried.points, carried.pose, state.split)
+    peaks = {}
+    for side, own in (("medial", medial), ("lateral", ~medial)):
+        pressure = np.where(own, carried.pressure, 0.0)
+        if pressure.max(initial=0.0) > 0.0:
+            peaks[side] = carried.points[np.argmax(pressure)]
+    return edge_flags(state.problem.floor, carried.pose, state.lattice.spacing, peaks)
 
 
 def _strain_flags(state: "LatticeState", solution: Solution) -> tuple[tuple[str, ...], bool]:
