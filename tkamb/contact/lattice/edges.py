@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from tkamb.contact.lattice.femoral import FemoralFloor
 from tkamb.geometry.frames import Array
-from tkamb.units import DEGREE
+from tkamb.units import DEGREE, MILLIMETRE
 
 REACH = 2.0
 """Cells from the peak to where the normal is looked at: a peak lies just inside its edge."""
+LEAST_REACH = 2.0 * MILLIMETRE
+"""And at least so far: an edge of 6 mm radius is an edge for any cell."""
 SHARPEST = 20.0 * DEGREE
 """Turn of the femoral normal over that way from which a peak is flagged: a radius of 6 cells."""
 
@@ -29,8 +31,8 @@ def edge_flags(
 ) -> tuple[str, ...]:
     """Return a flag for each peak where the femoral normal turns by more than `SHARPEST`.
 
-    The normal under the peak is compared with those `REACH` cells away along x, z and both
-    diagonals; where there is no femoral surface any more it ends.
+    The normal under the peak is compared with those `REACH` cells, at least `LEAST_REACH`, away
+    along x, z and both diagonals; where there is no femoral surface any more it ends.
 
     Args:
         floor: the femoral component seen from below.
@@ -44,13 +46,14 @@ def edge_flags(
 def _flags(
     floor: FemoralFloor, pose: Array, spacing: Array, peaks: Mapping[str, Array]
 ) -> Iterator[str]:
-    steps = REACH * AROUND / np.maximum(np.linalg.norm(AROUND, axis=1), 1.0)[:, None]
+    around = AROUND / np.maximum(np.linalg.norm(AROUND, axis=1), 1.0)[:, None]
+    reach = np.maximum(REACH * spacing, LEAST_REACH)
     for side, peak in peaks.items():
-        how = _sharpness(floor.over(peak + steps * spacing, pose)[1])
+        how = _sharpness(floor.over(peak + around * reach, pose)[1])
         if how:
             yield (
                 f"the {side} peak pressure lies at an edge of the femoral component, which {how} "
-                f"within {REACH:g} cells: it rises as cells shrink"
+                f"within {reach.max() / MILLIMETRE:.2g} mm: it rises as cells shrink"
             )
 
 
