@@ -152,11 +152,11 @@ class RayCaster:
         if not missed.size:
             return face
         u, v = _normal_plane(directions[missed])
-        for a, b in ((1, 1), (-1, 1), (1, -1), (-1, -1)):
-            beside = points[missed] + NUDGE * self._radius * (a * u + b * v)
-            face[missed] = self._fire(beside, directions[missed])
-            still = face[missed] < 0
-            missed, u, v = missed[still], u[still], v[still]
+        step = NUDGE * self._radius
+        beside = [points[missed] + step * (a * u + b * v) for a in (1, -1) for b in (1, -1)]
+        found = self._fire(np.concatenate(beside), np.tile(directions[missed], (4, 1)))
+        found = found.reshape(4, -1)
+        face[missed] = found[(found >= 0).argmax(axis=0), np.arange(len(missed))]
         return face
 
     def _fire(self, points: Array, directions: Array) -> Index:
