@@ -1,10 +1,10 @@
 """CalculiX beside the built-in models: the same hexahedra, pose and load, another program.
 
-It gets the smooth surfaces that the meshes stand for, as the lattice does: contact nodes lifted
-to the one, fine master triangles on the other. It starts without any answer of the lattice's: the
-femoral component begins where an elastic foundation would carry the load. Each position begins
-anew, so that its cold and warm times are the same. Its pressures act on the deformed faces; here
-they become nodal forces, and those, over the undeformed tributary areas, pressures as the built-in
+It starts without any answer of the lattice's: the femoral component begins where an elastic
+foundation would carry the load. Each position begins anew, so that its cold and warm times are the
+same. Its contact nodes lie on the smooth surface that the insert's mesh stands for, as those of the
+lattice do; the femoral component is faceted. Its pressures act on the deformed faces; here they
+become nodal forces, and those, over the undeformed tributary areas, pressures as the built-in
 models define them.
 
 Strain: linear cases have small strain on both sides. CalculiX's Ramberg-Osgood law wants finite
@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from trimesh.remesh import subdivide
 
 from tkamb.contact.lattice.femoral import FemoralFloor
 from tkamb.contact.lattice.grid import Lattice, build_grid
@@ -47,12 +46,10 @@ Mask = NDArray[np.bool_]
 GRIDS_MM: dict[str, tuple[float, ...]] = {"sphere": (2.0,), "two condyles": (2.0, 1.0)}
 """Cell sizes of the cases that CalculiX is given; two condyles at 1 mm take it minutes."""
 ELEMENT = "C3D8I"
-REACH = 3.0
+REACH = 2.0
 """Nodes whose gap at first touch is within this many times the guessed depth can be touched."""
 LEAST_LEAN = -0.3
 """Largest y of a femoral normal that takes part."""
-FINE = 0.25 * MILLIMETRE
-"""Edge of the master's triangles: 0.3 µm inside a sphere of 22 mm."""
 UNEVEN = 0.01
 """Largest difference of the summed contact forces from the load, over the load."""
 
@@ -202,7 +199,6 @@ def _problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -> _Pr
     near = places[:, 1] - surface.points[:, 1] < REACH * depth
     placed = pose_at_approach(pair, pose, depth)
     patch = _patch(pair.femoral.moved(placed), surface.points[near], grid_mm * MILLIMETRE)
-    patch = _on_patches(floor, placed, patch)
     lattice = replace(lattice, nodes=smooth)
     return _Problem(pair, lattice, nodes, surface, floor, placed, depth, near, patch)
 
@@ -211,18 +207,9 @@ def _patch(femoral: Surface, points: Array, spacing: float) -> Surface:
     """Return the downward triangles that lie within a cell of points, seen from above."""
     down = np.flatnonzero(femoral.face_normals[:, 1] < LEAST_LEAN)
     middle = femoral.triangles[down].mean(axis=1)[:, ::2]
-    away, _ = cKDTree(points[:, ::2]).query(middle, distance_upper_bound=1.5 * spacing)
+    away, _ = cKDTree(points[:, ::2]).query(middle, distance_upper_bound=spacing)
     used, faces = np.unique(femoral.faces[down[np.isfinite(away)]], return_inverse=True)
     return Surface(femoral.vertices[used], faces.reshape(-1, 3).astype(np.int64), "patch")
-
-
-def _on_patches(floor: FemoralFloor, pose: Array, patch: Surface) -> Surface:
-    """Return the patch with finer triangles, their corners on the smooth femoral surface."""
-    vertices, faces = patch.vertices, patch.faces
-    while np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)) > FINE:
-        vertices, faces = subdivide(vertices, faces)
-    places, _ = floor.over(vertices, pose)
-    return Surface(np.where(np.isfinite(places), places, vertices), faces, "patch")
 
 
 def _result(problem: _Problem, load: float, run: PeerRun) -> tuple[ContactResult, float]:

@@ -18,7 +18,7 @@ from tkamb.geometry.frames import Array
 from tkamb.studies.measures import ONE_THREAD
 
 PROGRAM = "ccx"
-LONGEST_SECONDS = 900.0
+LONGEST_SECONDS = 600.0
 """A run that takes longer is stopped and says so."""
 SAID = "said"
 LOOK_SECONDS = 0.05
