@@ -1,6 +1,7 @@
 """Stability at the extremes: every case judged in a process that may crash or hang."""
 
 import json
+import os
 import queue
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from typing import Any
 from tkamb.errors import ComputationError, TkambError
 from tkamb.studies.extremes import Extreme, extremes
 from tkamb.studies.kept_rows import KeptRows, row_key
+from tkamb.studies.measures import ONE_THREAD
 from tkamb.studies.scene_extremes import SceneExtreme, judge_scene, scene_extremes
 from tkamb.studies.verdict import KINDS, Verdict, judge
 
@@ -152,7 +154,12 @@ class _Worker:
         command = [sys.executable, "-m", "tkamb.studies.stability"]
         pipe = subprocess.PIPE
         process = subprocess.Popen(
-            command, stdin=pipe, stdout=pipe, text=True, start_new_session=True
+            command,
+            stdin=pipe,
+            stdout=pipe,
+            text=True,
+            start_new_session=True,
+            env=os.environ | ONE_THREAD,
         )
         lines: queue.Queue[str] = queue.Queue()
         self._process, self._lines = process, lines
