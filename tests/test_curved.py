@@ -28,9 +28,9 @@ def sheet(x, z, height):
 
 
 def scattered(surface, faces, seed=2):
-    """A random point on each of some triangles."""
+    """A random point on each of some triangles, and its barycentric coordinates."""
     weights = np.random.default_rng(seed).dirichlet([1, 1, 1], len(faces))
-    return np.einsum("ij,ijk->ik", weights, surface.triangles[faces])
+    return np.einsum("ij,ijk->ik", weights, surface.triangles[faces]), weights
 
 
 def test_a_faceted_sphere_becomes_round():
@@ -38,8 +38,8 @@ def test_a_faceted_sphere_becomes_round():
     for subdivisions in (3, 4, 5):
         surface = ball(subdivisions)
         faces = np.flatnonzero(surface.face_normals[:, 1] > 0.9)
-        points = scattered(surface, faces)
-        shift, normals = CurvedSurface.of(surface).shift(points, faces, UP)
+        points, weights = scattered(surface, faces)
+        shift, normals = CurvedSurface.of(surface).shift(faces, weights, UP)
         radius = np.linalg.norm(points + shift[:, None] * UP, axis=1)
         sagitta = RADIUS - np.linalg.norm(points, axis=1).min()
         assert np.abs(radius - RADIUS).max() < 0.05 * sagitta
@@ -53,16 +53,17 @@ def test_neighbouring_patches_meet():
     ends = surface.vertices[surface.mesh.face_adjacency_edges]
     points = 0.3 * ends[:, 0] + 0.7 * ends[:, 1]
     upper = surface.face_normals[across[:, 0], 1] > 0.7
-    one, other = (patches.shift(points, across[:, side], UP)[0][upper] for side in (0, 1))
+    one, other = (
+        patches.shift(faces, surface.barycentric(points, faces), UP)[0][upper] for faces in across.T
+    )
     assert one.min() > 5e-6
     np.testing.assert_allclose(one, other, rtol=2e-3)
 
 
 def test_a_box_keeps_its_faces():
     surface = box_insert(20e-3, 8e-3, 30e-3)
-    shift, normals = CurvedSurface.of(surface).shift(
-        scattered(surface, np.arange(12)), np.arange(12), UP
-    )
+    faces = np.arange(12)
+    shift, normals = CurvedSurface.of(surface).shift(faces, scattered(surface, faces)[1], UP)
     np.testing.assert_array_equal(shift, 0.0)
     np.testing.assert_allclose(normals, surface.face_normals, atol=1e-12)
 
@@ -75,8 +76,9 @@ def test_a_flat_that_meets_a_fillet_stays_flat():
         return np.sqrt(radius**2 - np.clip(gx, 0.0, None) ** 2) - radius
 
     surface = sheet(x, np.linspace(-2e-3, 2e-3, 5), height)
-    points = scattered(surface, np.arange(len(surface.faces)))
-    shift, _ = CurvedSurface.of(surface).shift(points, np.arange(len(surface.faces)), UP)
+    faces = np.arange(len(surface.faces))
+    points, weights = scattered(surface, faces)
+    shift, _ = CurvedSurface.of(surface).shift(faces, weights, UP)
     inner = np.abs(points[:, 2]) < 1e-3
     flat, round_ = (
         inner & (points[:, 0] < 0),
@@ -98,7 +100,7 @@ def test_a_saddle_is_followed_both_ways(slope):
     surface = sheet(x, x, height)
     inner = np.abs(surface.triangles[..., [0, 2]]).max(axis=(1, 2)) < 4.5e-3
     faces = np.flatnonzero(inner)
-    points = scattered(surface, faces)
-    shift, _ = CurvedSurface.of(surface).shift(points, faces, UP)
+    points, weights = scattered(surface, faces)
+    shift, _ = CurvedSurface.of(surface).shift(faces, weights, UP)
     exact = height(points[:, 0], points[:, 2]) - points[:, 1]
     assert np.abs(shift - exact).max() < 0.1 * np.abs(exact).max()

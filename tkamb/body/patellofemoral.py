@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from tkamb.errors import InputError
 from tkamb.geometry.corner_normals import corner_normals, sharp_edges
 from tkamb.geometry.frames import Array, pose, transform
-from tkamb.geometry.nearest import NearestPoints, barycentric
+from tkamb.geometry.nearest import NearestPoints
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
@@ -168,7 +168,7 @@ class PatellofemoralContact:
         if len(which) == 0:
             return
         near = self._nearest.at(here[which])
-        weights = barycentric(self._nearest.surface.triangles[near.faces], near.points)
+        weights = self._nearest.surface.barycentric(near.points, near.faces)
         on_edge = np.asarray((self._sharp[near.faces] & (weights < EDGE_MARGIN)).any(axis=1))
         smooth = np.einsum("ij,ijk->ik", weights, self._corner_normals[near.faces])
         outward = np.where(on_edge[:, None], near.normals, smooth)

@@ -51,8 +51,9 @@ def summarise_condyles(
 
 def wrench_of(points: Array, nodal_force: Array) -> Array:
     """Return force (N) and moment about the insert origin (N·m), (6,), of nodal forces."""
-    moment = np.cross(points, nodal_force).sum(axis=0)
-    return np.concatenate([nodal_force.sum(axis=0), moment])
+    carrying = nodal_force.any(axis=1)
+    force = nodal_force[carrying]
+    return np.concatenate([force.sum(axis=0), np.cross(points[carrying], force).sum(axis=0)])
 
 
 def _summarise(

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from tkamb.geometry.corner_normals import corner_normals
 from tkamb.geometry.frames import Array
-from tkamb.geometry.nearest import barycentric
 from tkamb.geometry.surface import Surface
 
 Indices = NDArray[np.int64]
@@ -50,24 +49,23 @@ class CurvedSurface:
         normals = corner_normals(surface)
         return cls(surface, normals, _sagittas(surface, normals))
 
-    def shift(self, points: Array, faces: Indices, direction: Array) -> tuple[Array, Array]:
+    def shift(self, faces: Indices, weights: Array, direction: Array) -> tuple[Array, Array]:
         """Return how far the patches are from points on their triangles along a direction.
 
         To first order in the patch's height.
 
         Args:
-            points: (n, 3) m, on the triangles.
-            faces: (n,) their triangles.
+            faces: (n,) triangles.
+            weights: (n, 3) barycentric coordinates of points on them.
             direction: (3,) unit vector.
 
         Returns:
             Signed distance (n,), m, and outward unit normals (n, 3), which are interpolated
             between the corners.
         """
-        weights = barycentric(self.surface.triangles[faces], points)
         normals = np.einsum("ij,ijk->ik", weights, self.normals[faces])
-        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        around = np.roll(weights, -1, axis=1) * np.roll(weights, -2, axis=1)
+        normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
+        around = weights[:, [1, 2, 0]] * weights[:, [2, 0, 1]]
         height = 4.0 * np.einsum("ij,ij->i", around, self.sagittas[faces])
         along = np.einsum("ij,ij->i", normals, self.surface.face_normals[faces])
         cosine = normals @ direction

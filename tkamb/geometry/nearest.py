@@ -81,9 +81,9 @@ class NearestPoints:
 
     def normals_at(self, points: Array, faces: Indices) -> Array:
         """Return the interpolated unit normals (n, 3) at points (n, 3) of given triangles."""
-        corners = self.surface.faces[faces]
-        weights = barycentric(self.surface.vertices[corners], points)
-        normal = np.einsum("ij,ijk->ik", weights, self.vertex_normals[corners])
+        weights = self.surface.barycentric(points, faces)
+        corners = self.vertex_normals[self.surface.faces[faces]]
+        normal = np.einsum("ij,ijk->ik", weights, corners)
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         return np.asarray(np.divide(normal, length, out=np.zeros_like(normal), where=length > 0))
 
@@ -140,13 +140,6 @@ def nearest_on_triangles(triangles: Array, points: Array) -> Array:
     nearest = ((on_edges - target) ** 2).sum(axis=2).argmin(axis=1)
     feet[outside] = on_edges[np.arange(len(start)), nearest]
     return np.asarray(feet)
-
-
-def barycentric(triangles: Array, points: Array) -> Array:
-    """Return the barycentric coordinates (n, 3) of points on triangles (n, 3, 3)."""
-    weights = _plane_weights(triangles, points)
-    weights = np.where(np.isnan(weights), 1 / 3, np.clip(weights, 0.0, 1.0))
-    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
 def _plane_weights(triangles: Array, points: Array) -> Array:

@@ -46,7 +46,8 @@ class RayCaster:
         lower, upper = surface.bounds
         self._centre = 0.5 * (lower + upper)
         self._radius = float(np.linalg.norm(upper - lower)) / 2.0
-        self._corner, self._first_edge, self._second_edge = _edges(surface)
+        self._nudge = NUDGE * self._radius
+        self._corner = np.ascontiguousarray(surface.triangles[:, 0])
         self._normals = surface.face_normals
         self._narrowest = _least_altitudes(surface)
         self._ring = _VertexRing(surface)
@@ -64,21 +65,34 @@ class RayCaster:
         Returns:
             distance (n,) m, inf where nothing is hit; face (n,), -1 where nothing is hit.
         """
+        distance, face, _ = self.first_in_face(origins, directions)
+        return distance, face
+
+    def first_in_face(
+        self, origins: ArrayLike, directions: ArrayLike
+    ) -> tuple[Array, Index, Array]:
+        """Return what `first` does, and where in the triangle each ray crosses.
+
+        Returns:
+            distance (n,) m, face (n,), barycentric coordinates (n, 3).
+        """
         origins, directions, start = self._prepared(origins, directions)
         face = self._propose(origins, directions, start)
-        distance = np.full(len(origins), np.inf)
-        clear, t = self._cross_well_inside(origins, directions, face, start)
-        distance[clear] = t[clear]
-        left = np.flatnonzero(~clear)
+        distance, weights = self._intersect(origins, directions, face)
+        inside = (weights.min(axis=1) > EDGE_TOLERANCE) & (distance > start + self._nudge)
+        left = np.flatnonzero(~inside & (face >= 0))
         if left.size:
             ray, t, hit = self._around(origins[left], directions[left], start[left], face[left])
             order = np.lexsort((t, ray))
             ray, t, hit = ray[order], t[order], hit[order]
             found, head = np.unique(ray, return_index=True)
-            face[left] = -1
+            distance[left], face[left] = np.inf, -1
             distance[left[found]], face[left[found]] = t[head], hit[head]
             self._look_behind(origins, directions, distance, face, left)
-        return distance, face
+            hit = left[face[left] >= 0]
+            points = origins[hit] + distance[hit, None] * directions[hit]
+            weights[hit] = self.surface.barycentric(points, face[hit])
+        return distance, face, weights
 
     def all(self, origins: ArrayLike, directions: ArrayLike) -> tuple[Index, Array, Index]:
         """Return every crossing of every ray at or beyond its origin.
@@ -96,7 +110,7 @@ class RayCaster:
         """
         origins, directions, start = self._prepared(origins, directions)
         live = np.arange(len(origins))
-        step = np.full(len(origins), NUDGE * self._radius)
+        step = np.full(len(origins), self._nudge)
         last = np.full(len(origins), -1)
         begin = start.copy()
         found: list[tuple[Index, Array, Index]] = []
@@ -104,7 +118,7 @@ class RayCaster:
             at = start[live]
             face = self._propose(origins[live], directions[live], at)
             reached = self._crossings_at(origins, directions, begin, live, face, found)
-            step[live] = np.where(face == last[live], 2.0 * step[live], NUDGE * self._radius)
+            step[live] = np.where(face == last[live], 2.0 * step[live], self._nudge)
             start[live] = np.maximum(at, np.where(np.isfinite(reached), reached, at)) + step[live]
             last[live] = face
             live = live[face >= 0]
@@ -124,8 +138,8 @@ class RayCaster:
         A crossing farther inside its triangle than two nudges stands alone; otherwise the
         triangles around are asked too.
         """
-        t, least = self._intersect(origins[live], directions[live], face)
-        alone = least * self._narrowest[face] > 2.0 * NUDGE * self._radius
+        t, weights = self._intersect(origins[live], directions[live], face)
+        alone = weights.min(axis=1) * self._narrowest[face] > 2.0 * self._nudge
         alone &= t >= begin[live]
         found.append((live[alone], t[alone], face[alone]))
         rest = np.flatnonzero(~alone & (face >= 0))
@@ -152,7 +166,7 @@ class RayCaster:
         if not missed.size:
             return face
         u, v = _normal_plane(directions[missed])
-        step = NUDGE * self._radius
+        step = self._nudge
         beside = [points[missed] + step * (a * u + b * v) for a in (1, -1) for b in (1, -1)]
         found = self._fire(np.concatenate(beside), np.tile(directions[missed], (4, 1)))
         found = found.reshape(4, -1)
@@ -172,39 +186,28 @@ class RayCaster:
         return np.asarray((off_axis <= 1.01 * self._radius) & (along >= -self._radius))
 
     def _intersect(self, origins: Array, directions: Array, face: Index) -> tuple[Array, Array]:
-        """Return the distance to each triangle's plane and the smallest barycentric there.
-
-        Moeller & Trumbore, J Graphics Tools 2:21 (1997), doi:10.1080/10867651.1997.10487468.
-        """
-        e1, e2 = self._first_edge[face], self._second_edge[face]
-        p = np.cross(directions, e2)
-        determinant = np.einsum("ij,ij->i", e1, p)
-        sine = np.abs(np.einsum("ij,ij->i", directions, self._normals[face]))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            s = origins - self._corner[face]
-            u = np.einsum("ij,ij->i", s, p) / determinant
-            q = np.cross(s, e1)
-            v = np.einsum("ij,ij->i", directions, q) / determinant
-            t = np.einsum("ij,ij->i", e2, q) / determinant
-            least = np.minimum(np.minimum(u, v), 1.0 - u - v)
-        lost = (face < 0) | (sine < PARALLEL) | ~np.isfinite(least)
-        return np.where(lost, np.inf, t), np.where(lost, -np.inf, least)
-
-    def _cross_well_inside(
-        self, origins: Array, directions: Array, face: Index, start: Array
-    ) -> tuple[NDArray[np.bool_], Array]:
-        """Say which proposed triangles are crossed clear of their edges, or are a clear miss."""
-        t, least = self._intersect(origins, directions, face)
-        inside = (least > EDGE_TOLERANCE) & (t > start + NUDGE * self._radius)
-        return inside | (face < 0), np.where(face < 0, np.inf, t)
+        """Return the distance to each triangle's plane and the barycentrics (n, 3) there."""
+        normal, offset = self._normals[face], origins - self._corner[face]
+        slope = np.einsum("ij,ij->i", directions, normal)
+        height = np.einsum("ij,ij->i", offset, normal)
+        lost = (face < 0) | ~(np.abs(slope) >= PARALLEL)
+        t = -height / np.where(lost, 1.0, slope)
+        there = offset + t[:, None] * directions
+        u, v = np.einsum("nij,nj->in", self.surface.barycentric_rows[face], there)
+        weights = np.stack([1.0 - u - v, u, v], axis=1)
+        lost |= ~np.isfinite(weights[:, 0])
+        t[lost], weights[lost] = np.inf, -np.inf
+        return t, weights
 
     def _around(
         self, origins: Array, directions: Array, start: Array, face: Index
     ) -> tuple[Index, Array, Index]:
         """Return crossings (ray, distance, face) with triangles at the vertices of `face`."""
         ray, candidate = self._ring.around(face)
-        t, least = self._intersect(origins[ray], directions[ray], candidate)
-        keep = (least >= -EDGE_TOLERANCE) & (t >= start[ray] - SAME_CROSSING * self._radius)
+        t, weights = self._intersect(origins[ray], directions[ray], candidate)
+        keep = (weights.min(axis=1) >= -EDGE_TOLERANCE) & (
+            t >= start[ray] - SAME_CROSSING * self._radius
+        )
         return ray[keep], t[keep], candidate[keep]
 
     def _look_behind(
@@ -262,11 +265,6 @@ class _VertexRing:
         triangle = self._order[first + np.arange(count.sum())]
         key = np.unique(owner * len(self._faces) + triangle)
         return key // len(self._faces), key % len(self._faces)
-
-
-def _edges(surface: Surface) -> tuple[Array, Array, Array]:
-    corner = surface.triangles[:, 0]
-    return corner, surface.triangles[:, 1] - corner, surface.triangles[:, 2] - corner
 
 
 def _least_altitudes(surface: Surface) -> Array:

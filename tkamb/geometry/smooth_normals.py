@@ -4,7 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array
-from tkamb.geometry.nearest import barycentric
 from tkamb.geometry.surface import Surface
 
 Indices = NDArray[np.int64]
@@ -22,7 +21,7 @@ def smooth_normals(surface: Surface, points: Array, faces: Indices) -> Array:
     """
     chosen, row = np.unique(faces, return_inverse=True)
     normals = _corner_normals(surface, chosen)[row.reshape(-1)]
-    weights = barycentric(surface.triangles[faces], points)
+    weights = surface.barycentric(points, faces)
     mixed = np.einsum("ij,ijk->ik", weights, normals)
     return np.asarray(mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
 

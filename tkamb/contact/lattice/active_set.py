@@ -72,7 +72,7 @@ def solve_contact(
         if load is not None and not active.any():
             active[np.argmin(gap / -lean)] = True
         force, depth = _forces_of(compliance, gap, lean, load, active, approach)
-        opening = gap + compliance[:, active] @ force[active] + depth * lean
+        opening = gap + compliance @ force + depth * lean
         opening[active] = 0.0
         count += 1
         scale = 1e-12 * max(float(np.abs(force).max(initial=0)), 1e-300)
@@ -108,7 +108,9 @@ def _forces_of(
     force = np.zeros(len(gap))
     if not active.any():
         return force, approach
-    factor = cho_factor(compliance[np.ix_(active, active)], lower=True, check_finite=False)
+    chosen = np.flatnonzero(active)
+    among = compliance[chosen[:, None], chosen]
+    factor = cho_factor(among, lower=True, overwrite_a=True, check_finite=False)
     right = np.column_stack([-gap[active], -lean[active]])
     closing, per_depth = cho_solve(factor, right, check_finite=False).T
     if load is not None:

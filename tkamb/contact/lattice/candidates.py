@@ -30,7 +30,7 @@ class ResponsePool:
         whole: response of all contact nodes.
         nodes: (p,) contact nodes at hand, increasing.
         half: their response alone.
-        compliance: (3, p, 3, p) m/N, see `ContactResponse`.
+        compliance: (3, p, 3, p) m/N: component and node moved, component and node pushed.
     """
 
     whole: HalfResponse
@@ -51,7 +51,8 @@ class ResponsePool:
                 self._take(spare if len(spare) <= MOST_STORED else wanted)
             nodes, half, compliance = self.nodes, self.half, self.compliance
         assert half is not None
-        return ContactResponse(half, np.searchsorted(nodes, wanted), compliance)
+        place = np.searchsorted(nodes, wanted)
+        return ContactResponse(half, place, _taken(_taken(compliance, place, 1), place, 3))
 
     def _take(self, nodes: Indices) -> None:
         """Take nodes, with what is known of their compliance already."""
@@ -66,6 +67,11 @@ class ResponsePool:
         compliance[:, new] = rows.transpose(1, 0, 3, 2)
         compliance[..., new] = rows.transpose(3, 2, 1, 0)
         self.nodes, self.half, self.compliance = nodes, half, compliance
+
+
+def _taken(values: Array, places: Indices, axis: int) -> Array:
+    """Return some places along an axis; "clip" spares numpy a copy, all are in range."""
+    return np.take(values, places, axis=axis, mode="clip")
 
 
 def guessed_depth(problem: ContactProblem, gaps: Array, areas: Array, load: float) -> float:

@@ -4,7 +4,7 @@ At a rounded edge narrower than the cells the pressure is that of a punch: it ri
 as the cells shrink (docs/lattice.md, "Convergence on real implants").
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,21 +40,17 @@ def edge_flags(
         spacing: (3,) m, edges of a cell.
         peaks: side -> (3,) m, where its pressure is highest, insert frame.
     """
-    return tuple(_flags(floor, pose, spacing, peaks))
-
-
-def _flags(
-    floor: FemoralFloor, pose: Array, spacing: Array, peaks: Mapping[str, Array]
-) -> Iterator[str]:
-    around = AROUND / np.maximum(np.linalg.norm(AROUND, axis=1), 1.0)[:, None]
     reach = np.maximum(REACH * spacing, LEAST_REACH)
-    for side, peak in peaks.items():
-        how = _sharpness(floor.over(peak + around * reach, pose)[1])
-        if how:
-            yield (
-                f"the {side} peak pressure lies at an edge of the femoral component, which {how} "
-                f"within {reach.max() / MILLIMETRE:.2g} mm: it rises as cells shrink"
-            )
+    around = AROUND / np.maximum(np.linalg.norm(AROUND, axis=1), 1.0)[:, None] * reach
+    sites = (np.array(list(peaks.values())).reshape(-1, 1, 3) + around).reshape(-1, 3)
+    normals = floor.over(sites, pose)[1].reshape(len(peaks), len(AROUND), 3)
+    sharp = zip(peaks, map(_sharpness, normals), strict=True)
+    return tuple(
+        f"the {side} peak pressure lies at an edge of the femoral component, which {how} "
+        f"within {reach.max() / MILLIMETRE:.2g} mm: it rises as cells shrink"
+        for side, how in sharp
+        if how
+    )
 
 
 def _sharpness(normals: NDArray[np.float64]) -> str:

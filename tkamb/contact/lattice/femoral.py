@@ -47,21 +47,18 @@ class FemoralFloor:
             part; they point down.
         """
         back = inverse(pose)
-        lowest = self.surface.bounds
-        start = float(pose[1, 3]) - 2 * float(np.abs(lowest).max()) - 1e-2
-        origins = transform(
-            back, np.column_stack([points[:, 0], np.full(len(points), start), points[:, 2]])
-        )
-        up = rotate(back, UP)
-        distance, face = self.rays.first(origins, up)
-        hit = face >= 0
+        start = float(pose[1, 3]) - 2 * float(np.abs(self.surface.bounds).max()) - 1e-2
+        below = points.copy()
+        below[:, 1] = start
+        origins, up = transform(back, below), rotate(back, UP)
+        distance, face, weights = self.rays.first_in_face(origins, up)
+        hit = np.flatnonzero(face >= 0)
+        shift, outward = self._patches.shift(face[hit], weights[hit], up)
         places = np.full((len(points), 3), np.nan)
         normals = np.full((len(points), 3), np.nan)
-        local = origins[hit] + distance[hit, None] * up
-        shift, outward = self._patches.shift(local, face[hit], up)
-        places[hit] = transform(pose, local + shift[:, None] * up)
-        places[hit, 0], places[hit, 2] = points[hit, 0], points[hit, 2]
-        normals[hit] = rotate(pose, outward)
-        inward = normals[:, 1] > 0
-        normals[inward] = -normals[inward]
+        below[:, 1] += distance
+        below[hit, 1] += shift
+        places[hit] = below[hit]
+        outward = rotate(pose, outward)
+        normals[hit] = np.where(outward[:, 1:2] > 0, -outward, outward)
         return places, normals

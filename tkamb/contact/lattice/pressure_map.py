@@ -69,8 +69,8 @@ def _thickness(points: Array, rays: RayCaster, spacing: Array) -> Array:
 def _lift(points: Array, rays: RayCaster) -> Array:
     """Return how far the smooth surface is above the points, m; 0 for one not on the mesh."""
     up = np.array([0.0, 1.0, 0.0])
-    distance, face = rays.first(points + ABOVE * up, -up)
+    distance, face, weights = rays.first_in_face(points + ABOVE * up, -up)
     on = np.abs(distance - ABOVE) < ON_MESH
     lift = np.zeros(len(points))
-    lift[on], _ = CurvedSurface.of(rays.surface).shift(points[on], face[on], up)
+    lift[on], _ = CurvedSurface.of(rays.surface).shift(face[on], weights[on], up)
     return lift

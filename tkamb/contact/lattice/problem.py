@@ -1,6 +1,7 @@
 """One insert under one femoral component, discretised: what every contact solver needs."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -48,11 +49,12 @@ class ContactProblem:
         """Nodes (c,) that can be touched."""
         return self.operator.contact_nodes
 
-    @property
+    @cached_property
     def surface_points(self) -> Array:
         """Undeformed contact nodes (c, 3), m, on the smooth surface of the insert."""
         points = self.solid.nodes[self.operator.contact_nodes]
         points[:, 1] += self.lift
+        points.flags.writeable = False
         return points
 
 

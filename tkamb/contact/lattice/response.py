@@ -119,7 +119,8 @@ class ContactResponse:
     Args:
         half: response of the candidates and perhaps of more nodes, p in all.
         place: (m,) of the candidates among these.
-        compliance: (3, p, 3, p) m/N: component and node moved, component and node pushed.
+        compliance: (3, m, 3, m) m/N, of the candidates: component and node moved, component
+            and node pushed.
     """
 
     half: HalfResponse
@@ -143,22 +144,19 @@ class ContactResponse:
         """Return the compliance along normals (m, 3), and all that forces along them move.
 
         Returns:
-            (m, m) m/N among the candidates, and (3, p, p) m/N for `moved`.
+            (m, m) m/N, and (3, m, m) m/N for `moved`.
         """
-        n = np.ascontiguousarray(self._spread(normals).T, dtype=self.compliance.dtype)
+        n = np.ascontiguousarray(normals.T, dtype=self.compliance.dtype)
         pushed = np.einsum("aibj,bj->aij", self.compliance, n)
-        both = np.einsum("aij,ai->ij", pushed, n)
-        return both[self.place][:, self.place].astype(np.float64), pushed
+        return np.einsum("aij,ai->ij", pushed, n).astype(np.float64), pushed
 
     def moved(self, pushed: Array, force: Array) -> Array:
         """Return the candidates' displacement (m, 3), m, under forces (m,), N, along normals."""
-        return np.asarray(
-            np.einsum("aij,j->ia", pushed, self._spread(force).astype(pushed.dtype))[self.place]
-        )
+        return np.asarray(np.einsum("aij,j->ia", pushed, force.astype(pushed.dtype)))
 
     def _spread(self, values: Array) -> Array:
-        """Return candidates' values (m, ...) on all the nodes (p, ...)."""
-        spread = np.zeros((self.compliance.shape[1], *values.shape[1:]))
+        """Return candidates' values (m, 3) on all the nodes (p, 3)."""
+        spread = np.zeros((len(self.half.rank) // 3, 3))
         spread[self.place] = values
         return spread
 
