@@ -33,11 +33,15 @@ def summarise_condyles(
 ) -> tuple[CondyleContact | None, CondyleContact | None]:
     """Return what the medial and the lateral condyle carry, None where there is no pressure.
 
+    A condyle's area is at least its force over its peak pressure: where contact is smaller
+    than the cells the mean pressure is not above the peak.
+
     Args:
         medial: (n,) which points belong to the medial condyle, see `medial_points`.
         points: (n, 3) m, insert frame.
         pressure: (n,) Pa.
-        area: (n,) m², tributary area.
+        area: (n,) m², in contact around each point; its tributary area where a model knows
+            no better.
         nodal_force: (n, 3) N on the insert.
         thickness: (n,) m, insert below each point along y.
     """
@@ -69,12 +73,13 @@ def _summarise(
     force = np.linalg.norm(nodal_force[chosen].sum(axis=0))
     weight = np.linalg.norm(nodal_force[chosen], axis=1)
     centre = weight @ points[chosen] / weight.sum()
-    covered = area[chosen].sum()
+    peak = float(pressure[chosen].max())
+    covered = max(float(area[chosen].sum()), float(force) / peak)
     return CondyleContact(
         force=float(force),
-        area=float(covered),
-        mean_pressure=float(force / covered),
-        peak_pressure=float(pressure[chosen].max()),
+        area=covered,
+        mean_pressure=float(force) / covered,
+        peak_pressure=peak,
         centre_of_pressure=centre,
         thickness=thickness_under(centre, points, thickness),
     )

@@ -80,11 +80,12 @@ class FrameContact:
         """Return the share of a condyle's contact area above a pressure (Pa)."""
         if self.result is None:
             return NAN
+        condyle = self.result.medial if side == "medial" else self.result.lateral
+        if condyle is None:
+            return NAN
         own = self.medial if side == "medial" else ~self.medial
-        loaded = own & (self.result.pressure > 0)
-        above = loaded & (self.result.pressure > pressure)
-        area = self.result.area
-        return float(area[above].sum() / area[loaded].sum()) if loaded.any() else NAN
+        above = self.result.area[own & (self.result.pressure > pressure)].sum()
+        return float(min(above / condyle.area, 1.0))
 
 
 class ContactSide:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from tkamb.contact.lattice.covered import covered_areas
 from tkamb.contact.lattice.femoral import FemoralFloor
 from tkamb.contact.lattice.grid import Lattice, build_grid
 from tkamb.contact.lattice.pressure_map import ContactMap, Indices, contact_map
@@ -218,24 +219,30 @@ def _result(problem: _Problem, load: float, run: PeerRun) -> tuple[ContactResult
         raise ComputationError("gave no contact stress", "CalculiX")
     approach = problem.depth - float(run.blocks["NREF"][-1, 2]) * MILLIMETRE
     pose = pose_at_approach(problem.pair, problem.pose, approach)
-    force = _nodal_forces(problem, pose, run)
+    bent = _bent(problem, run)
+    force = _nodal_forces(problem, pose, run, bent)
     balance = -float(force[:, 1].sum()) / load
     if not abs(balance - 1) <= UNEVEN:
         raise ComputationError(f"gave pressures that sum to {balance:.4f} of the load", "CalculiX")
     surface = problem.map
     pressure = np.linalg.norm(force, axis=1) / surface.area
+    above, _ = problem.floor.over(bent.points, pose)
+    gap = above[:, 1] - bent.points[:, 1] - surface.lift
+    covered = covered_areas(
+        surface.points, surface.triangles, surface.triangle_area,
+        pressure, gap, problem.pair.material,
+    )  # fmt: skip
     medial, lateral = summarise_condyles(
         medial_points(surface.points, pose, condyle_split(problem.pair.femoral)),
-        surface.points, pressure, surface.area, force, surface.thickness,
+        surface.points, pressure, covered, force, surface.thickness,
     )  # fmt: skip
-    above, _ = problem.floor.over(surface.points, pose)
     return ContactResult(
         pose=pose,
         points=surface.points,
         normals=surface.normals,
         pressure=pressure,
         area=surface.area,
-        gap=above[:, 1] - surface.points[:, 1] - surface.lift,
+        gap=gap,
         nodal_force=force,
         wrench_on_insert=wrench_of(surface.points, force),
         medial=medial,
@@ -246,12 +253,16 @@ def _result(problem: _Problem, load: float, run: PeerRun) -> tuple[ContactResult
     ), balance
 
 
-def _nodal_forces(problem: _Problem, pose: Array, run: PeerRun) -> Array:
-    """Return the forces (c, 3) on the contact nodes, N: pressure times deformed area."""
+def _bent(problem: _Problem, run: PeerRun) -> ContactMap:
+    """Return the deformed contact surface."""
     moved = run.blocks["NINSERT"]
     moved = moved[np.argsort(moved[:, 0]), 1:] * MILLIMETRE
     deformed = replace(problem.lattice, nodes=problem.lattice.nodes + moved)
-    _, bent = contact_map(deformed, problem.pair.insert)
+    return contact_map(deformed, problem.pair.insert)[1]
+
+
+def _nodal_forces(problem: _Problem, pose: Array, run: PeerRun, bent: ContactMap) -> Array:
+    """Return the forces (c, 3) on the contact nodes, N: pressure times deformed area."""
     stress = run.blocks["contact"]
     pressure = np.zeros(len(bent.points))
     place = np.searchsorted(problem.nodes, stress[:, 0].astype(np.int64) - 1)

@@ -1,6 +1,7 @@
 """From a solution to the contract's result: pressures, sums and flags."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,12 @@ class ContactMap:
     thickness: Array
     lift: Array
     triangles: Indices
+
+    @cached_property
+    def triangle_area(self) -> Array:
+        """Areas of the triangles (k,), m²."""
+        a, b, c = np.moveaxis(self.points[self.triangles], 1, 0)
+        return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
 
 def contact_map(lattice: Lattice, insert: Surface) -> tuple[Indices, ContactMap]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.contact.lattice.covered import covered_areas
 from tkamb.contact.lattice.edges import edge_flags
 from tkamb.contact.lattice.solver import Solution
 from tkamb.contact.model import ContactResult, ContactStatus
@@ -89,7 +90,13 @@ def _carried(
     """Return the map and its sums; gaps (c,) are those of the undeformed insert at the pose."""
     surface, gap = state.map, gaps.copy()
     gap[solution.candidates] = solution.forces.gap
-    force, pressure, area = _pressures(state, gaps, solution, rule)
+    force, pressure, stood_on = _pressures(state, gaps, solution, rule)
+    area = stood_on
+    if rule == "tributary":
+        area = covered_areas(
+            surface.points, surface.triangles, surface.triangle_area,
+            pressure, gap, state.pair.material,
+        )  # fmt: skip
     medial, lateral = summarise_condyles(
         medial_points(surface.points, pose, state.split),
         surface.points, pressure, area, force, surface.thickness,
@@ -99,7 +106,7 @@ def _carried(
         points=surface.points,
         normals=surface.normals,
         pressure=pressure,
-        area=area,
+        area=stood_on,
         gap=gap,
         nodal_force=force,
         wrench_on_insert=wrench_of(surface.points, force),

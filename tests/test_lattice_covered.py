@@ -1,0 +1,101 @@
+"""Contact area between the nodes: against Hertz, as the nodes give it and as the lattice does."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lattice_bodies import above, box_insert, pair, plate, sphere_cap
+from layer_contact import sphere_on_layer
+from tkamb.contact.lattice.covered import covered_areas
+from tkamb.contact.materials import material
+from tkamb.contact.registry import contact_model
+
+LINEAR = material("polyethylene-linear")
+RADIUS, A = 22e-3, 2.5e-3
+OFFSETS = [(0, 0), (0.5, 0.5), (0.5, 0), (0.25, 0.25), (0.13, 0.37), (0.4, 0.1)]
+
+
+def sheet(size, half=12):
+    """Return points of a level square grid, its triangles and their areas."""
+    ticks = size * np.arange(-half, half + 1)
+    x, z = (g.ravel() for g in np.meshgrid(ticks, ticks, indexing="ij"))
+    number = np.arange(x.size).reshape(2 * half + 1, -1)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    triangles = np.concatenate(
+        [np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, b, c), (a, c, d))]
+    )
+    points = np.stack([x, 0 * x, z], axis=1)
+    return points, triangles, np.full(len(triangles), 0.5 * size**2)
+
+
+def hertz(r):
+    """Return pressure and gap of a rigid sphere on a half-space, contact radius A."""
+    modulus = LINEAR.young_modulus / (1 - LINEAR.poisson_ratio**2)
+    p0 = 2 * A * modulus / (np.pi * RADIUS)
+    out = np.maximum(r, A)
+    sunk = (2 * A**2 - out**2) * np.arcsin(A / out) + A * np.sqrt(out**2 - A**2)
+    gap = p0 / (2 * A * modulus) * sunk - A**2 / RADIUS + out**2 / (2 * RADIUS)
+    return p0 * np.sqrt(np.maximum(1 - r**2 / A**2, 0)), np.where(r < A, 0.0, gap)
+
+
+def covered(size, offset):
+    points, triangles, area = sheet(size, int(4e-3 / size) + 2)
+    r = np.hypot(points[:, 0] - offset[0] * size, points[:, 2] - offset[1] * size)
+    return covered_areas(points, triangles, area, *hertz(r), LINEAR).sum() / (np.pi * A**2) - 1
+
+
+def test_exact_nodal_values_give_the_circle():
+    """Left are the polygon in place of the circle, and the edge's law at a finite distance."""
+    sizes = np.array([1e-3, 0.5e-3, 0.25e-3, 0.125e-3])
+    errors = np.array([[covered(size, offset) for offset in OFFSETS] for size in sizes])
+    rms = np.sqrt((errors**2).mean(axis=1))
+    assert np.abs(errors[0]).max() < 0.03
+    assert rms[-1] < 0.004
+    assert np.polyfit(np.log(sizes), np.log(rms), 1)[0] > 0.6
+
+
+@pytest.mark.parametrize(("size", "worst"), [(1.0, 0.06), (2.0, 0.08)])
+@pytest.mark.parametrize("nu", [0.3, 0.45, 0.4999])
+def test_a_pressed_sphere_has_its_area(size, worst, nu):
+    """500 N; nodes in contact with their tributary areas give 20 and 40 % too much."""
+    body = replace(LINEAR, poisson_ratio=nu)
+    model = contact_model("lattice-linear", size)
+    state = model.prepare(pair(sphere_cap(RADIUS), box_insert(16e-3, 8e-3, 16e-3), body))
+    a, *_ = sphere_on_layer(RADIUS, 8e-3, 500.0, body.young_modulus, nu)
+    found = [model.press(state, 500.0, above(*(np.array(o) * size * 1e-3))) for o in OFFSETS]
+    area = np.array([f.medial.area for f in found]) / (np.pi * a**2)
+    whole = np.array([f.area[f.pressure > 0].sum() for f in found]) / (np.pi * a**2)
+    assert abs(area.mean() - 1) < worst
+    assert area.std() < 0.06
+    assert whole.mean() > 1.15
+    assert found[0].medial.mean_pressure == pytest.approx(
+        found[0].medial.force / found[0].medial.area
+    )
+
+
+@pytest.mark.parametrize("name", ["lattice", "lattice-linear", "fe"])
+@pytest.mark.parametrize("load", [1e-3, 1.0, 50.0])
+def test_the_mean_pressure_is_never_above_the_peak(name, load):
+    """Contact smaller than a cell: the nodes cannot tell its area."""
+    model = contact_model(name, 2.0)
+    state = model.prepare(
+        pair(sphere_cap(RADIUS), box_insert(16e-3, 8e-3, 16e-3), material("polyethylene"))
+    )
+    for x in (0.0, 1e-3, 0.6e-3):
+        condyle = model.press(state, load, above(x, 0.3e-3)).medial
+        assert 0 < condyle.mean_pressure <= condyle.peak_pressure * (1 + 1e-12)
+
+
+def test_a_flat_with_sharp_edges_ends_half_way():
+    """A punch of 8 x 8 mm, edges between the nodes; its gap beyond is a step."""
+    model = contact_model("lattice-linear", 1.0)
+    state = model.prepare(pair(plate(8e-3, 8e-3), box_insert(16e-3, 6e-3, 16e-3), LINEAR))
+    found = model.press(state, 500.0, above(0.5e-3, 0.5e-3))
+    assert found.medial.area == pytest.approx(64e-6, rel=0.02)
+
+
+def test_contact_up_to_the_rim_of_the_insert_is_whole():
+    model = contact_model("lattice-linear", 1.0)
+    state = model.prepare(pair(plate(20e-3, 20e-3), box_insert(12e-3, 3e-3, 12e-3), LINEAR))
+    assert model.press(state, 1000.0, above()).medial.area == pytest.approx(144e-6, rel=1e-9)
