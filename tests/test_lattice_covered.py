@@ -1,4 +1,4 @@
-"""Contact area between the nodes: against Hertz, as the nodes give it and as the lattice does."""
+"""Small contacts: their area between the nodes, and a word where the nodes are too few."""
 
 from dataclasses import replace
 
@@ -99,3 +99,21 @@ def test_contact_up_to_the_rim_of_the_insert_is_whole():
     model = contact_model("lattice-linear", 1.0)
     state = model.prepare(pair(plate(20e-3, 20e-3), box_insert(12e-3, 3e-3, 12e-3), LINEAR))
     assert model.press(state, 1000.0, above()).medial.area == pytest.approx(144e-6, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["lattice-linear", "fe"])
+@pytest.mark.parametrize("size", [1.0, 2.0])
+def test_a_contact_of_few_nodes_is_flagged_and_any_other_has_its_peak(name, size):
+    model = contact_model(name, size)
+    state = model.prepare(pair(sphere_cap(RADIUS), box_insert(16e-3, 8e-3, 16e-3), LINEAR))
+    off = []
+    for load in (1.0, 50.0, 200.0, 500.0, 3000.0):
+        *_, exact = sphere_on_layer(RADIUS, 8e-3, load, LINEAR.young_modulus, LINEAR.poisson_ratio)
+        for x, z in np.array(OFFSETS) * size * 1e-3:
+            found = model.press(state, load, above(x, z))
+            few = bool([flag for flag in found.flags if "fewer than 16 nodes" in flag])
+            off.append((few, found.medial.peak_pressure / exact[0] - 1))
+    few, error = (np.array(column) for column in zip(*off, strict=True))
+    assert np.abs(error[~few]).max() < 0.08
+    assert error[few].max() < 0.01
+    assert error[few].min() < -0.8

@@ -44,4 +44,5 @@ def test_a_punch_is_flagged_at_every_size_and_its_peak_rises(model):
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("size", [2.5, 1.5])
 def test_a_sphere_has_no_edge(model, size):
-    assert pressed(model, sphere_cap(22e-3), size).flags == ()
+    flags = pressed(model, sphere_cap(22e-3), size).flags
+    assert not [flag for flag in flags if "edge of the femoral component" in flag]

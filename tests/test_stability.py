@@ -44,7 +44,7 @@ def test_the_matrix_is_wide_enough():
 
 def test_a_good_case_converges_to_newton():
     verdict = judge(SMALL)
-    assert (verdict.kind, verdict.reason) == ("converged", "")
+    assert verdict.kind == "converged" and "not converged" not in verdict.reason
     assert verdict.error < 2e-3
 
 

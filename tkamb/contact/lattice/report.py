@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.contact.lattice.coarse import coarse_flags
 from tkamb.contact.lattice.covered import covered_areas
 from tkamb.contact.lattice.edges import edge_flags
 from tkamb.contact.lattice.solver import Solution
@@ -79,7 +80,7 @@ def result_of(
         status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
         iterations=solution.passes,
         residual=solution.residual,
-        flags=(*flags, *_edge_flags(state, carried)),
+        flags=(*flags, *_peak_flags(state, carried)),
         approach=partial(approach_at, state.pair, pose),  # type: ignore[arg-type]
     )
 
@@ -148,15 +149,20 @@ def _areas(state: "LatticeState", gaps: Array, loaded: Mask, rule: PressureRule)
     return np.where(loaded, overlap / loaded.sum(), state.map.area)
 
 
-def _edge_flags(state: "LatticeState", carried: ContactResult) -> tuple[str, ...]:
-    """Return the flags of peaks at an edge of the femoral component."""
+def _peak_flags(state: "LatticeState", carried: ContactResult) -> tuple[str, ...]:
+    """Return the flags of peaks that the cells do not resolve."""
     medial = medial_points(carried.points, carried.pose, state.split)
-    peaks = {}
-    for side, own in (("medial", medial), ("lateral", ~medial)):
-        pressure = np.where(own, carried.pressure, 0.0)
-        if pressure.max(initial=0.0) > 0.0:
-            peaks[side] = carried.points[np.argmax(pressure)]
-    return edge_flags(state.problem.floor, carried.pose, state.lattice.spacing, peaks)
+    pressures = {
+        side: np.where(own, carried.pressure, 0.0)
+        for side, own in (("medial", medial), ("lateral", ~medial))
+    }
+    peaks = {
+        side: carried.points[np.argmax(pressure)]
+        for side, pressure in pressures.items()
+        if pressure.max(initial=0.0) > 0.0
+    }
+    floor, spacing = state.problem.floor, state.lattice.spacing
+    return (*coarse_flags(pressures), *edge_flags(floor, carried.pose, spacing, peaks))
 
 
 def _strain_flags(state: "LatticeState", solution: Solution) -> tuple[tuple[str, ...], bool]:
