@@ -71,7 +71,7 @@ def measure(case, data, name, resolution, load, repeats):
         "warm_passes": passes, "iterations": result.iterations, "status": result.status.value,
         "approach_mm": round(result.approach * 1e3, 5),
         "peak_MPa": round(float(result.pressure.max()) / 1e6, 3),
-        "area_mm2": round(float(result.area[result.pressure > 0].sum()) * 1e6, 2), **sides,
+        "area_mm2": round(sum(side["area_mm2"] for side in sides.values() if side), 2), **sides,
         "rss_MB": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3),
         "flags": result.flags,
     }  # fmt: skip

@@ -337,6 +337,12 @@ def test_ten_micrometres_of_jitter_leave_the_classes_right(name):
     assert right >= 0.999 * len(nodes)
 
 
+def test_more_cells_than_any_machine_holds_are_refused_before_they_are_made():
+    surface, _ = dished()
+    with pytest.raises(InputError, match=r"cells of 0.002 mm make .* of them"):
+        build_grid(surface, 2e-6)
+
+
 def test_an_open_surface_is_refused():
     surface, _ = dished()
     open_top = Surface(surface.vertices, surface.faces[surface.face_normals[:, 1] < 0.5], "tray")

@@ -11,6 +11,8 @@ JW_ALIGNED = ("jw", "0.00192979 0 0 0 0 0")
 """Components aligned, 0 deg, centred on the dishes."""
 DM_STANCE = ("dm", "-0.0065 0.041674 0.00014 -0.2406 2.9164 -9.9867")
 """Recorded at 30 % of the gait cycle."""
+DM_PRESSED_WIDE = ("dm", "-0.00616 0.041501 -0.000712 -1.1287 2.67 -9.8262")
+"""At 24 %: 2500 N on the lateral condyle press its rounded edge over several cells."""
 
 
 def pressed(capsys, subject, pose, size, *flags):
@@ -59,6 +61,14 @@ def test_dm_settles_but_for_its_peak(capsys, flags):
     check_settled(coarse, fine)
     for found in (coarse, fine):
         assert [flag for flag in found["flags"] if "peak pressure lies at an edge" in flag]
+
+
+@pytest.mark.slow
+def test_dm_settles_with_its_peak_where_the_edge_is_pressed_wide(capsys):
+    coarse, fine = (pressed(capsys, *DM_PRESSED_WIDE, size) for size in (1.0, 0.75))
+    check_settled(coarse, fine)
+    assert peak(fine) == pytest.approx(peak(coarse), rel=0.03)
+    assert [flag for flag in fine["flags"] if "peak pressure lies at an edge" in flag]
 
 
 def test_dm_is_told_that_its_peak_is_at_an_edge(capsys):

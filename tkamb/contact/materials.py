@@ -87,7 +87,9 @@ class RambergOsgood:
         elastic = np.abs(strain) * (young_modulus / self.reference_stress)
         if self.alpha == 0:
             return elastic
-        ratio = np.minimum(elastic, (elastic / self.alpha) ** (1 / self.exponent))
+        with np.errstate(over="ignore"):
+            plastic = (elastic / self.alpha) ** (1 / self.exponent)
+        ratio = np.minimum(elastic, plastic)
         for _ in range(60):
             power = self.alpha * ratio ** (self.exponent - 1)
             step = (ratio + power * ratio - elastic) / (1 + self.exponent * power)

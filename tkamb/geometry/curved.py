@@ -1,6 +1,7 @@
 """The smooth surface that a triangulation stands for: a curved patch over every triangle."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,11 @@ class CurvedSurface:
         normals = corner_normals(surface)
         return cls(surface, normals, _sagittas(surface, normals))
 
+    @cached_property
+    def _patches(self) -> Array:
+        """Corner normals, sagittas and plane's normal side by side (k, 15)."""
+        return np.hstack([self.normals.reshape(-1, 9), self.sagittas, self.surface.face_normals])
+
     def shift(self, faces: Indices, weights: Array, direction: Array) -> tuple[Array, Array]:
         """Return how far the patches are from points on their triangles along a direction.
 
@@ -63,11 +69,12 @@ class CurvedSurface:
             Signed distance (n,), m, and outward unit normals (n, 3), which are interpolated
             between the corners.
         """
-        normals = np.einsum("ij,ijk->ik", weights, self.normals[faces])
+        corners, sagittas, planes = np.split(self._patches[faces], [9, 12], axis=1)
+        normals = np.einsum("ij,ijk->ik", weights, corners.reshape(-1, 3, 3))
         normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
         around = weights[:, [1, 2, 0]] * weights[:, [2, 0, 1]]
-        height = 4.0 * np.einsum("ij,ij->i", around, self.sagittas[faces])
-        along = np.einsum("ij,ij->i", normals, self.surface.face_normals[faces])
+        height = 4.0 * np.einsum("ij,ij->i", around, sagittas)
+        along = np.einsum("ij,ij->i", normals, planes)
         cosine = normals @ direction
         steep = np.copysign(np.maximum(np.abs(cosine), STEEPEST), cosine)
         return height * along / steep, normals

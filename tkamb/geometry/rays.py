@@ -47,8 +47,8 @@ class RayCaster:
         self._centre = 0.5 * (lower + upper)
         self._radius = float(np.linalg.norm(upper - lower)) / 2.0
         self._nudge = NUDGE * self._radius
-        self._corner = np.ascontiguousarray(surface.triangles[:, 0])
-        self._normals = surface.face_normals
+        rows = surface.barycentric_rows.reshape(-1, 6)
+        self._planes = np.hstack([surface.triangles[:, 0], surface.face_normals, rows])
         self._narrowest = _least_altitudes(surface)
         self._ring = _VertexRing(surface)
         self._scene: Any = EmbreeScene(robust=True)
@@ -187,13 +187,14 @@ class RayCaster:
 
     def _intersect(self, origins: Array, directions: Array, face: Index) -> tuple[Array, Array]:
         """Return the distance to each triangle's plane and the barycentrics (n, 3) there."""
-        normal, offset = self._normals[face], origins - self._corner[face]
+        corner, normal, rows = np.split(self._planes[face], [3, 6], axis=1)
+        offset = origins - corner
         slope = np.einsum("ij,ij->i", directions, normal)
         height = np.einsum("ij,ij->i", offset, normal)
         lost = (face < 0) | ~(np.abs(slope) >= PARALLEL)
         t = -height / np.where(lost, 1.0, slope)
         there = offset + t[:, None] * directions
-        u, v = np.einsum("nij,nj->in", self.surface.barycentric_rows[face], there)
+        u, v = np.einsum("nij,nj->in", rows.reshape(-1, 2, 3), there)
         weights = np.stack([1.0 - u - v, u, v], axis=1)
         lost |= ~np.isfinite(weights[:, 0])
         t[lost], weights[lost] = np.inf, -np.inf
@@ -222,8 +223,9 @@ class RayCaster:
         distance[again[found]], face[again[found]] = t[head], hit[head]
 
     def _plane_distance(self, origins: Array, directions: Array, face: Index) -> Array:
-        height = np.einsum("ij,ij->i", self._corner[face] - origins, self._normals[face])
-        slope = np.einsum("ij,ij->i", directions, self._normals[face])
+        corner, normal, _ = np.split(self._planes[face], [3, 6], axis=1)
+        height = np.einsum("ij,ij->i", corner - origins, normal)
+        slope = np.einsum("ij,ij->i", directions, normal)
         safe = (face >= 0) & (np.abs(slope) > PARALLEL)
         return np.divide(height, slope, out=np.full(len(face), np.inf), where=safe)
 
@@ -234,7 +236,7 @@ class RayCaster:
         ray = np.concatenate([part[0] for part in found] or [np.zeros(0, np.int64)])
         t = np.concatenate([part[1] for part in found] or [np.zeros(0)])
         face = np.concatenate([part[2] for part in found] or [np.zeros(0, np.int64)])
-        entering = np.einsum("ij,ij->i", directions[ray], self._normals[face]) < 0.0
+        entering = np.einsum("ij,ij->i", directions[ray], self.surface.face_normals[face]) < 0.0
         order = np.lexsort((face, t, entering, ray))
         ray, t, face, entering = ray[order], t[order], face[order], entering[order]
         same = (np.diff(ray) == 0) & (np.diff(t) <= SAME_CROSSING * self._radius)
@@ -276,8 +278,13 @@ def _least_altitudes(surface: Surface) -> Array:
 
 
 def _normal_plane(directions: Array) -> tuple[Array, Array]:
-    """Return two unit vectors (n, 3) normal to each direction and to each other."""
-    axis = np.eye(3)[np.abs(directions).argmin(axis=1)] if len(directions) else directions
-    u = np.cross(directions, axis)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    return u, np.cross(directions, u)
+    """Return two unit vectors (n, 3) normal to each unit direction and to each other.
+
+    Duff et al., J Comput Graph Tech 6(1):1 (2017).
+    """
+    x, y, z = directions.T
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    u = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    return u, np.stack([b, sign + y * y * a, -y], axis=1)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dposv
 
 from tkamb.geometry.frames import Array
 
@@ -110,9 +110,11 @@ def _forces_of(
         return force, approach
     chosen = np.flatnonzero(active)
     among = compliance[chosen[:, None], chosen]
-    factor = cho_factor(among, lower=True, overwrite_a=True, check_finite=False)
-    right = np.column_stack([-gap[active], -lean[active]])
-    closing, per_depth = cho_solve(factor, right, check_finite=False).T
+    right = np.column_stack([-gap[chosen], -lean[chosen]])
+    *_, solved, failed = dposv(among, right, lower=True)
+    if failed:
+        raise np.linalg.LinAlgError("the compliance of the nodes in contact is singular")
+    closing, per_depth = solved.T
     if load is not None:
         approach = (load + lean[active] @ closing) / -(lean[active] @ per_depth)
     force[active] = closing + approach * per_depth

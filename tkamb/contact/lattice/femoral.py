@@ -29,7 +29,7 @@ class FemoralFloor:
     rays: RayCaster
 
     @cached_property
-    def _patches(self) -> CurvedSurface:
+    def _curved(self) -> CurvedSurface:
         return CurvedSurface.of(self.surface)
 
     def over(self, points: Array, pose: Array) -> tuple[Array, Array]:
@@ -53,7 +53,7 @@ class FemoralFloor:
         origins, up = transform(back, below), rotate(back, UP)
         distance, face, weights = self.rays.first_in_face(origins, up)
         hit = np.flatnonzero(face >= 0)
-        shift, outward = self._patches.shift(face[hit], weights[hit], up)
+        shift, outward = self._curved.shift(face[hit], weights[hit], up)
         places = np.full((len(points), 3), np.nan)
         normals = np.full((len(points), 3), np.nan)
         below[:, 1] += distance

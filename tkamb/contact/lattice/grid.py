@@ -41,6 +41,8 @@ MAX_EDGE_RATIO = 1.4
 """Longest over shortest edge of a grid cell."""
 FLATNESS = 5e-5
 """m: nodes this near the plane of the flat bottom lie in it."""
+MOST_CELLS = 4_000_000
+"""Of a grid over the bounding box: a knee's at 0.2 mm, tens of gigabytes."""
 LEAST_JACOBIAN = 0.05
 """A surface cell with a smaller scaled Jacobian is left out."""
 LEAST_EDGE = 0.2
@@ -120,9 +122,18 @@ def build_grid(insert: Surface, target_size: float) -> Lattice:
         target_size: wanted edge of a cell, m.
 
     Raises:
-        InputError: the surface is open beyond mending, or thinner than the cells.
+        InputError: the surface is open beyond mending, thinner than the cells, or they are
+            more than `MOST_CELLS`.
     """
-    spacing = grid_spacing(insert.bounds[1] - insert.bounds[0], target_size)
+    extent = insert.bounds[1] - insert.bounds[0]
+    spacing = grid_spacing(extent, target_size)
+    count = float((extent / spacing).prod())
+    if count > MOST_CELLS:
+        raise InputError(
+            f"cells of {target_size / MILLIMETRE:g} mm make {count:.2g} of them",
+            insert.name,
+            f"take larger ones ({MOST_CELLS:.0e} at most), and check the mesh's unit",
+        )
     field = settle_columns(insert, spacing)
     settle_walls(field, insert)
     if field.mended:
