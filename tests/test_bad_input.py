@@ -172,6 +172,7 @@ def test_a_mesh_file_cut_short(tmp_path, capfd):
         ("run", "scene.toml", "--frames", "nonsense"),
         ("run", "scene.toml", "--frames", "0:1.5"),
         ("run", "scene.toml", "--set", "contact.model"),
+        ("run", "scene.toml", "--set", "contact.resolution_mm=2\ncontact.model='hertz'"),
         ("press", "a.stl", "b.stl"),
         ("press", "a.stl", "b.stl", "--load", "much"),
         ("frobnicate",),

@@ -147,9 +147,12 @@ def _setting(text: str) -> tuple[str, Any]:
     if not equals or not key.strip():
         raise argparse.ArgumentTypeError(f"'{text}' is not TABLE.KEY=VALUE")
     try:
-        return key.strip(), tomllib.loads(f"value = {value}")["value"]
+        found = tomllib.loads(f"value = {value}")
     except tomllib.TOMLDecodeError:
         return key.strip(), value.strip()
+    if len(found) > 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is more than one key; give --set for each")
+    return key.strip(), found["value"]
 
 
 def _run(options: argparse.Namespace) -> int:
