@@ -17,9 +17,10 @@ from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.surface import Surface
 from tkamb.studies.bodies import balls, block, dishes
+from tkamb.studies import calculix
 from tkamb.studies.calculix import measure_by_calculix, peer_rows, press_by_calculix
 from tkamb.studies.calculix_deck import Deck
-from tkamb.studies.calculix_run import run_calculix
+from tkamb.studies.calculix_run import PeerRun, run_calculix
 from tkamb.studies.cases import study_case
 from tkamb.studies.references import read_references
 from tkamb.studies.tradeoff_block import with_block
@@ -41,6 +42,24 @@ def deck(**changes):
     given = {"lattice": lattice, "patch": patch, "material": material(LINEAR),
              "bearing": "fixed", "load": 1000.0, "element": "C3D8I"} | changes  # fmt: skip
     return Deck(**given)
+
+
+def test_an_undeformed_insert_has_the_gaps_of_its_smooth_surface():
+    """Facets of 2 mm in a dish: the lift is in the nodes already, the gap must not count it."""
+    insert = block(lambda x, z: 8e-3 + (x**2 + z**2) / 120e-3, (16e-3, 16e-3), 2e-3)
+    bodies = ContactPair(balls(22e-3, 0.0), insert, material(LINEAR))
+    problem = calculix._problem(bodies, 500.0, knee_pose(np.zeros(6)), 1.0)
+    still = np.zeros((len(problem.lattice.nodes), 4))
+    still[:, 0] = np.arange(1, len(still) + 1)
+    bent = calculix._bent(problem, PeerRun({"NINSERT": still}, 0.0, 0.0, 0))
+    pose = knee_pose([0, 40e-3, 0, 0, 0, 0])
+    gap = calculix._gaps(problem, pose, bent)
+    x, y, z = problem.map.points.T
+    smooth = y + problem.map.lift
+    near = np.hypot(x, z) < 5e-3
+    assert np.abs(problem.map.lift[near]).max() > 5e-6
+    exact = 40e-3 - np.sqrt(22e-3**2 - x[near] ** 2 - z[near] ** 2) - smooth[near]
+    np.testing.assert_allclose(gap[near], exact, atol=2e-6)
 
 
 def fake_program(folder, monkeypatch, script):

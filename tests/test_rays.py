@@ -32,6 +32,23 @@ def brute(surface, origins, direction):
     return best
 
 
+def test_where_in_its_triangle_a_ray_crosses():
+    """Through faces, edges and vertices; NaN beside the sphere."""
+    surface = sphere(0.02, 3, (0.0, 0.0, 0.0))
+    upper = surface.vertices[surface.vertices[:, 1] > 5e-3]
+    middles = surface.triangles.mean(axis=1)
+    ends = surface.vertices[surface.mesh.edges_unique].mean(axis=1)
+    aims = np.concatenate([upper, middles[middles[:, 1] > 5e-3], ends[ends[:, 1] > 5e-3]])
+    origins = np.concatenate([aims * [1, 0, 1] + [0, 0.05, 0], [[0.03, 0.05, 0.0]]])
+    distance, face, weights = RayCaster(surface).first_in_face(origins, DOWN)
+    assert face[-1] == -1 and np.isnan(weights[-1]).all()
+    assert (face[:-1] >= 0).all() and (weights[:-1] > -1e-9).all()
+    np.testing.assert_allclose(weights[:-1].sum(axis=1), 1.0, atol=1e-12)
+    points = np.einsum("ij,ijk->ik", weights[:-1], surface.triangles[face[:-1]])
+    hit = origins[:-1] + distance[:-1, None] * DOWN
+    np.testing.assert_allclose(points, hit, atol=1e-11)
+
+
 @pytest.mark.parametrize("far", [0.0, 1.0, 100.0])
 def test_first_agrees_with_all_triangles_in_double_precision(far):
     surface = sphere(0.02, 3, (far, 0.0, far))

@@ -146,13 +146,12 @@ def _setting(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise argparse.ArgumentTypeError(f"'{text}' is not TABLE.KEY=VALUE")
+    if "\n" in text.strip():
+        raise argparse.ArgumentTypeError("is more than one line; give --set for each key")
     try:
-        found = tomllib.loads(f"value = {value}")
+        return key.strip(), tomllib.loads(f"value = {value.strip()}")["value"]
     except tomllib.TOMLDecodeError:
         return key.strip(), value.strip()
-    if len(found) > 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is more than one key; give --set for each")
-    return key.strip(), found["value"]
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -77,7 +77,10 @@ class FrameContact:
     settled: "SettledKnee | None" = None
 
     def area_above(self, side: str, pressure: float) -> float:
-        """Return the share of a condyle's contact area above a pressure (Pa)."""
+        """Return the share of a condyle's contact area above a pressure (Pa).
+
+        The tributary areas of the points above it, over the condyle's own area; 1 at most.
+        """
         if self.result is None:
             return NAN
         condyle = self.result.medial if side == "medial" else self.result.lateral

@@ -74,7 +74,7 @@ class RayCaster:
         """Return what `first` does, and where in the triangle each ray crosses.
 
         Returns:
-            distance (n,) m, face (n,), barycentric coordinates (n, 3).
+            distance (n,) m, face (n,), barycentric coordinates (n, 3), NaN where nothing is hit.
         """
         origins, directions, start = self._prepared(origins, directions)
         face = self._propose(origins, directions, start)
@@ -92,6 +92,7 @@ class RayCaster:
             hit = left[face[left] >= 0]
             points = origins[hit] + distance[hit, None] * directions[hit]
             weights[hit] = self.surface.barycentric(points, face[hit])
+        weights[face < 0] = np.nan
         return distance, face, weights
 
     def all(self, origins: ArrayLike, directions: ArrayLike) -> tuple[Index, Array, Index]:

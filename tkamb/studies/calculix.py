@@ -226,8 +226,7 @@ def _result(problem: _Problem, load: float, run: PeerRun) -> tuple[ContactResult
         raise ComputationError(f"gave pressures that sum to {balance:.4f} of the load", "CalculiX")
     surface = problem.map
     pressure = np.linalg.norm(force, axis=1) / surface.area
-    above, _ = problem.floor.over(bent.points, pose)
-    gap = above[:, 1] - bent.points[:, 1] - surface.lift
+    gap = _gaps(problem, pose, bent)
     covered = covered_areas(
         surface.points, surface.triangles, surface.triangle_area,
         pressure, gap, problem.pair.material,
@@ -259,6 +258,12 @@ def _bent(problem: _Problem, run: PeerRun) -> ContactMap:
     moved = moved[np.argsort(moved[:, 0]), 1:] * MILLIMETRE
     deformed = replace(problem.lattice, nodes=problem.lattice.nodes + moved)
     return contact_map(deformed, problem.pair.insert)[1]
+
+
+def _gaps(problem: _Problem, pose: Array, bent: ContactMap) -> Array:
+    """Return the vertical gaps (c,) above the deformed nodes, m, inf where nothing is above."""
+    above, _ = problem.floor.over(bent.points, pose)
+    return np.nan_to_num(above[:, 1] - bent.points[:, 1], nan=np.inf)
 
 
 def _nodal_forces(problem: _Problem, pose: Array, run: PeerRun, bent: ContactMap) -> Array:

@@ -1,24 +1,35 @@
-"""Contacts too small for the cells: their peak is an average over more than the contact."""
+"""Contacts too narrow for the cells: their peak is an average over more than the contact."""
 
 from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-FEWEST_NODES = 16
-"""Nodes in contact from which a peak is right: on a sphere within 6 % for any place in a cell,
-20 % too low at 12, half at 5, nine tenths at 1 (docs/lattice.md)."""
+FEWEST_WITHIN = 5
+"""Nodes with contact all around from which a peak is right within 8 %, wherever the contact lies
+in its cells: a sphere's with about 17 nodes in contact, three rows of nodes under a cylinder. With
+none it is 5 to 96 % too low (docs/lattice.md)."""
 
 
-def coarse_flags(pressures: Mapping[str, NDArray[np.float64]]) -> Iterator[str]:
-    """Yield a flag for each condyle whose contact has fewer than `FEWEST_NODES`.
+def coarse_flags(
+    triangles: NDArray[np.int64],
+    touched: NDArray[np.bool_],
+    sides: Mapping[str, NDArray[np.bool_]],
+) -> Iterator[str]:
+    """Yield a flag for each condyle whose contact has fewer than `FEWEST_WITHIN`.
 
     Args:
-        pressures: side -> its nodes' pressures, Pa.
+        triangles: (k, 3) of the contact surface.
+        touched: (n,) which of its nodes are in contact.
+        sides: side -> (n,) which nodes are under it.
     """
-    for side, pressure in pressures.items():
-        if 0 < np.count_nonzero(pressure > 0) < FEWEST_NODES:
+    a, b, c = touched[triangles.T]
+    edge = triangles[(a | b | c) & ~(a & b & c)]
+    within = touched.copy()
+    within[edge] = False
+    for side, own in sides.items():
+        if touched[own].any() and np.count_nonzero(within & own) < FEWEST_WITHIN:
             yield (
-                f"the {side} contact has fewer than {FEWEST_NODES} nodes: its peak pressure is too "
-                "low; take finer cells"
+                f"the {side} contact is too narrow for the cells: its peak pressure cannot be "
+                "relied on and is mostly too low; take finer cells"
             )

@@ -41,8 +41,8 @@ MAX_EDGE_RATIO = 1.4
 """Longest over shortest edge of a grid cell."""
 FLATNESS = 5e-5
 """m: nodes this near the plane of the flat bottom lie in it."""
-MOST_CELLS = 4_000_000
-"""Of a grid over the bounding box: a knee's at 0.2 mm, tens of gigabytes."""
+MOST_CELLS = 1_000_000
+"""Of a grid over the bounding box: a knee's at 0.35 mm, more than fifty gigabytes."""
 LEAST_JACOBIAN = 0.05
 """A surface cell with a smaller scaled Jacobian is left out."""
 LEAST_EDGE = 0.2

@@ -1,4 +1,4 @@
-"""From a solution to the contract's result: pressures, sums and flags."""
+"""The contact surface of a lattice: its nodes, areas and triangles."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -152,17 +152,18 @@ def _areas(state: "LatticeState", gaps: Array, loaded: Mask, rule: PressureRule)
 def _peak_flags(state: "LatticeState", carried: ContactResult) -> tuple[str, ...]:
     """Return the flags of peaks that the cells do not resolve."""
     medial = medial_points(carried.points, carried.pose, state.split)
-    pressures = {
-        side: np.where(own, carried.pressure, 0.0)
-        for side, own in (("medial", medial), ("lateral", ~medial))
-    }
+    sides = {"medial": medial, "lateral": ~medial}
+    pressures = {side: np.where(own, carried.pressure, 0.0) for side, own in sides.items()}
     peaks = {
         side: carried.points[np.argmax(pressure)]
         for side, pressure in pressures.items()
         if pressure.max(initial=0.0) > 0.0
     }
     floor, spacing = state.problem.floor, state.lattice.spacing
-    return (*coarse_flags(pressures), *edge_flags(floor, carried.pose, spacing, peaks))
+    return (
+        *coarse_flags(state.map.triangles, carried.pressure > 0, sides),
+        *edge_flags(floor, carried.pose, spacing, peaks),
+    )
 
 
 def _strain_flags(state: "LatticeState", solution: Solution) -> tuple[tuple[str, ...], bool]:
