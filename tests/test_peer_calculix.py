@@ -16,8 +16,8 @@ from tkamb.contact.registry import contact_model
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.surface import Surface
-from tkamb.studies.bodies import balls, block, dishes
 from tkamb.studies import calculix
+from tkamb.studies.bodies import balls, block, dishes
 from tkamb.studies.calculix import measure_by_calculix, peer_rows, press_by_calculix
 from tkamb.studies.calculix_deck import Deck
 from tkamb.studies.calculix_run import PeerRun, run_calculix
