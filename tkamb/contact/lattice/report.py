@@ -73,7 +73,7 @@ def result_of(
     if collapsed:
         return failed_result(state, pose, *flags)
     if not solution.converged:
-        flags = (*flags, "the solver has not converged")
+        flags = (*flags, _unsettled(solution))
     carried = _carried(state, pose, gaps - depth, solution, rule)
     return replace(
         carried,
@@ -163,6 +163,14 @@ def _peak_flags(state: "LatticeState", carried: ContactResult) -> tuple[str, ...
     return (
         *coarse_flags(state.map.triangles, carried.pressure > 0, sides),
         *edge_flags(floor, carried.pose, spacing, peaks),
+    )
+
+
+def _unsettled(solution: Solution) -> str:
+    """Return in words how far a solution that has not converged is from rest."""
+    return (
+        f"the solver has not converged: {100 * solution.residual:.2g} % of the force or of the way "
+        f"to the femoral surface is left after {solution.passes} passes; is the femoral mesh rough?"
     )
 
 
