@@ -23,13 +23,19 @@ def coarse_flags(
         touched: (n,) which of its nodes are in contact.
         sides: side -> (n,) which nodes are under it.
     """
-    a, b, c = touched[triangles.T]
-    edge = triangles[(a | b | c) & ~(a & b & c)]
-    within = touched.copy()
-    within[edge] = False
+    within = surrounded(triangles, touched)
     for side, own in sides.items():
         if touched[own].any() and np.count_nonzero(within & own) < FEWEST_WITHIN:
             yield (
                 f"the {side} contact is too narrow for the cells: its peak pressure cannot be "
                 "relied on and is mostly too low; take finer cells"
             )
+
+
+def surrounded(triangles: NDArray[np.int64], touched: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which nodes (n,) have contact all around: at every corner of their triangles."""
+    a, b, c = touched[triangles.T]
+    edge = triangles[(a | b | c) & ~(a & b & c)]
+    within = touched.copy()
+    within[edge] = False
+    return within
