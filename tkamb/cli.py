@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from tkamb.command_options import add_no_cache, without_cache
 from tkamb.errors import TkambError
 from tkamb.press.command import add_press
+from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
 from tkamb.view.command import add_view
 
@@ -61,6 +62,7 @@ class _Parser(argparse.ArgumentParser):
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="tkamb", description="What happens inside a total knee replacement.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    add_new(commands)
     _add_run(commands)
     add_press(commands)
     _add_contact(commands)
