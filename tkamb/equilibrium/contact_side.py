@@ -25,7 +25,7 @@ from tkamb.contact.model import ContactPair, ContactResult, ContactStatus
 from tkamb.contact.pressing import first_touch_height
 from tkamb.contact.probe import condyle_wrenches
 from tkamb.contact.registry import contact_model
-from tkamb.contact.summary import medial_points
+from tkamb.contact.summary import area_above, medial_points
 from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.geometry.adjustment import Adjustment
@@ -63,6 +63,7 @@ class FrameContact:
         load_change: N, by the last of them.
         point_change: m, likewise, of the centres of pressure.
         settled: the search for the released coordinates, if there are any.
+        triangles: (k, 3) of the map.
     """
 
     result: ContactResult | None
@@ -75,20 +76,23 @@ class FrameContact:
     load_change: float = NAN
     point_change: float = NAN
     settled: "SettledKnee | None" = None
+    triangles: NDArray[np.int64] | None = None
 
     def area_above(self, side: str, pressure: float) -> float:
-        """Return the share of a condyle's contact area above a pressure (Pa).
+        """Return the share of a condyle's contact area above a pressure (Pa), 1 at most.
 
-        The tributary areas of the points above it, over the condyle's own area; 1 at most.
+        The pressure is taken as linear between the map's points, see
+        `tkamb.contact.summary.area_above`.
         """
-        if self.result is None:
+        if self.result is None or self.triangles is None:
             return NAN
         condyle = self.result.medial if side == "medial" else self.result.lateral
         if condyle is None:
             return NAN
         own = self.medial if side == "medial" else ~self.medial
-        above = self.result.area[own & (self.result.pressure > pressure)].sum()
-        return float(min(above / condyle.area, 1.0))
+        carried = np.where(own, self.result.pressure, 0.0)
+        above = area_above(self.result.points, self.triangles, carried, pressure)
+        return min(above / condyle.area, 1.0)
 
 
 class ContactSide:
@@ -285,7 +289,9 @@ class ContactSide:
             reason = f"contact {result.status.value.replace('_', ' ')}"
             words = "; ".join((reason, *result.flags))
             return FrameContact(None, medial, adjustment, seconds, words, ())
-        return FrameContact(result, medial, adjustment, seconds, "", result.flags)
+        return FrameContact(
+            result, medial, adjustment, seconds, "", result.flags, triangles=self.state.triangles
+        )
 
     def _nothing(self, problem: str) -> FrameContact:
         none = np.zeros(len(self.state.points), bool)
