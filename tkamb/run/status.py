@@ -35,6 +35,8 @@ def frame_status(case: Case, k: int, body: FrameLoads, contact: "FrameContact | 
     words += [_lift_off(body, side, settled) for side in sorted(body.loads.lifted)]
     if body.loads.slack:
         words.append("flexors needed, which are not modelled: quadriceps slack")
+    if body.loads.ambiguous:
+        words.append("several load states balance: the one that leaves out fewest is taken")
     words += list(contact.flags) if contact else []
     if failures:
         return FAILED + "; ".join([*failures, *words])
