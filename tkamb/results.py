@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.errors import InputError
+from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array
 from tkamb.output.atomic import claim_directory, write_text
 from tkamb.run.columns import COLUMNS, KINDS, is_ligament, ordered_names
@@ -56,7 +56,13 @@ class Results:
         return len(self.columns["status"])
 
     def __getitem__(self, name: str) -> Array:
-        """Return a numeric column (f,)."""
+        """Return a numeric column (f,).
+
+        Raises:
+            InputError: no such column; the message lists the nearest names.
+        """
+        if name not in self.columns:
+            raise InputError(f"no column '{name}'", "results", names_near(name, self.columns))
         return self.columns[name]
 
     @property
@@ -193,7 +199,7 @@ def _completed(given: Mapping[str, Any]) -> dict[str, Any]:
     names = ordered_names(given)
     unknown = sorted(set(given) - set(names))
     if unknown:
-        raise InputError(f"unknown column '{unknown[0]}'", "results")
+        raise InputError(f"unknown column '{unknown[0]}'", "results", names_near(unknown[0], KINDS))
     for needed in ("time_s", "status"):
         if needed not in given:
             raise InputError(f"column '{needed}' is missing", "results")
@@ -234,7 +240,7 @@ def _parsed(name: str, cells: tuple[str, ...], path: Path) -> Any:
     if KINDS.get(name) == "text":
         return list(cells)
     if name not in KINDS and not is_ligament(name):
-        raise InputError(f"unknown column '{name}'", path)
+        raise InputError(f"unknown column '{name}'", path, names_near(name, KINDS))
     try:
         return np.array([float(cell) if cell else math.nan for cell in cells])
     except ValueError as error:

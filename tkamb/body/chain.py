@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from tkamb.body.load import PointForces, wrenches
-from tkamb.errors import InputError
+from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array, inverse, rotate, transform
 
 KNEE = ("knee_ap", "knee_si", "knee_ml", "knee_axial_rotation", "knee_adduction", "knee_flexion")
@@ -65,7 +65,7 @@ class Chain:
         """Return Pinocchio's id of a link's frame, or raise InputError naming the links."""
         if not self.model.existFrame(link, pin.FrameType.BODY):
             names = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
-            raise InputError(f"no link '{link}' in the URDF", None, f"links: {', '.join(names)}")
+            raise InputError(f"no link '{link}' in the URDF", None, names_near(link, names))
         return int(self.model.getFrameId(link, pin.FrameType.BODY))
 
     @property
