@@ -12,6 +12,7 @@ from typing import Any, Self
 from pydantic import ValidationError, model_validator
 
 from tkamb.errors import InputError
+from tkamb.files import read_text
 from tkamb.scene_tables import (
     ContactTable,
     GenericLigamentsTable,
@@ -88,12 +89,8 @@ def load_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> Sce
     """
     path = Path(path)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError("no such scene file", path, "check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read ({error})", path) from None
-    except tomllib.TOMLDecodeError as error:
+        content = tomllib.loads(read_text(path, what="scene file"))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InputError(f"is not TOML ({error})", path) from None
     for key, value in (overrides or {}).items():
         _override(content, key, value)
