@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from tkamb.errors import InputError, names_near
+from tkamb.files import read_text
 from tkamb.scene_tables import (
     ContactTable,
     GenericLigamentsTable,
@@ -89,12 +90,8 @@ def load_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> Sce
     """
     path = Path(path)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError("no such scene file", path, "check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read ({error})", path) from None
-    except tomllib.TOMLDecodeError as error:
+        content = tomllib.loads(read_text(path, what="scene file"))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InputError(f"is not TOML ({error})", path) from None
     for key, value in (overrides or {}).items():
         _override(content, key, value)

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
+from tkamb.files import read_xml
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, pose
 from tkamb.inputs.segments import RigidInertia, Sex, combined, segment_inertia
 from tkamb.inputs.urdf_check import (
@@ -73,12 +74,7 @@ def load_urdf(table: PatientTable, with_patella: bool) -> str:
 
 
 def _parsed(path: Path) -> ElementTree.Element:
-    try:
-        robot = ElementTree.parse(path).getroot()
-    except FileNotFoundError:
-        raise InputError("no such URDF", path, "mend [patient] urdf") from None
-    except (OSError, ElementTree.ParseError) as error:
-        raise InputError(f"is not a readable URDF ({error})", path) from None
+    robot = read_xml(path, what="URDF")
     if robot.tag != "robot":
         raise InputError(f"is not a URDF: its root is <{robot.tag}>, not <robot>", path)
     return robot

@@ -2,12 +2,14 @@
 
 import math
 import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from tkamb.errors import MOST_NAMES, InputError, names_near
+from tkamb.files import TABLE_LIMIT, read_text
 from tkamb.geometry.frames import Array
 from tkamb.units import LENGTH
 
@@ -131,12 +133,7 @@ def read_table(path: Path, format: str | None = None) -> Table:
     kind = format or path.suffix.lower().lstrip(".")
     if kind not in FORMATS:
         raise InputError(f"unknown table format '{kind}'", path, f"use {', '.join(FORMATS)}")
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except FileNotFoundError:
-        raise InputError("no such file", path, "check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read ({error})", path) from None
+    lines = read_text(path, TABLE_LIMIT, "utf-8-sig").splitlines()
     if kind == "csv":
         return _read_csv(path, lines)
     return _read_trc(path, lines) if kind == "trc" else _read_storage(path, lines)
@@ -220,7 +217,7 @@ def _exact_time(time: Array, frame: Array, rate: str) -> Array:
 def _columns(path: Path, names: list[str], rows: list[tuple[int, list[str]]]) -> dict[str, Array]:
     if not rows:
         raise InputError("has no data rows", path)
-    if repeated := sorted({name for name in names if names.count(name) > 1}):
+    if repeated := sorted(name for name, count in Counter(names).items() if count > 1):
         raise InputError(f"has two columns named '{repeated[0]}'", path, "rename one")
     values = np.empty((len(rows), len(names)))
     for k, (number, cells) in enumerate(rows):

@@ -8,17 +8,14 @@ counts as absent.
 import hashlib
 import json
 import threading
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
 from tkamb.output.atomic import write_text
 
 FILE_NAME = "rows.jsonl"
-PACKAGE = Path(__file__).parents[1]
-NO_NUMBERS = ("output", "view")
-"""Subpackages that change how results look, not what they are."""
 
 Row = dict[str, Any]
 
@@ -81,15 +78,3 @@ def row_key(*what: Any) -> str:
     """
     text = json.dumps([code_identity(), *what], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-@lru_cache(maxsize=1)
-def code_identity() -> str:
-    """Return the SHA-256 of the package's source, but for what only shows results."""
-    digest = hashlib.sha256()
-    for path in sorted(PACKAGE.rglob("*.py")):
-        name = path.relative_to(PACKAGE)
-        shows = name.parts[0] in NO_NUMBERS or name.stem in ("cli", "command")
-        if not shows and not name.stem.endswith("_report"):
-            digest.update(name.as_posix().encode() + path.read_bytes())
-    return digest.hexdigest()

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.cache import cached_operator, operator_key
+from tkamb.contact.lattice.cache import cached_operator
 from tkamb.contact.lattice.candidates import ResponsePool, choose_start, guessed_depth
 from tkamb.contact.lattice.femoral import FemoralFloor
 from tkamb.contact.lattice.grid import Lattice, build_grid
@@ -129,7 +129,7 @@ class CellContact(ContactModel):
 
         if not self.cache:
             return make()
-        return cached_operator(operator_key(solid, held, nodes), make, int((~held).sum()))
+        return cached_operator(solid, held, nodes, make)
 
     def evaluate(
         self, state: LatticeState, pose: Array, guess: ContactResult | None = None
