@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, pose
+from tkamb.inputs.safe_xml import parse_xml
 from tkamb.inputs.segments import RigidInertia, Sex, combined, segment_inertia
 from tkamb.scene_tables import PatientTable
 
@@ -66,12 +67,7 @@ def load_urdf(table: PatientTable, with_patella: bool) -> str:
 
 
 def _parsed(path: Path) -> ElementTree.Element:
-    try:
-        robot = ElementTree.parse(path).getroot()
-    except FileNotFoundError:
-        raise InputError("no such URDF", path, "mend [patient] urdf") from None
-    except (OSError, ElementTree.ParseError) as error:
-        raise InputError(f"is not a readable URDF ({error})", path) from None
+    robot = parse_xml(path, "URDF", "mend [patient] urdf")
     if robot.tag != "robot":
         raise InputError(f"is not a URDF: its root is <{robot.tag}>, not <robot>", path)
     return robot
