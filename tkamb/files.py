@@ -8,7 +8,8 @@ import hashlib
 import os
 import stat
 from pathlib import Path
-from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
 
 from tkamb.errors import InputError
 
@@ -98,14 +99,25 @@ def read_xml(path: str | Path, limit: float = TEXT_LIMIT, *, what: str = "file")
     """Return the root element of an XML file.
 
     Raises:
-        InputError: as `read_bytes`, or not XML, or nested more than `DEEPEST` elements deep.
+        InputError: as `read_bytes`, or not XML, or it declares entities (which could grow without
+            end or name other files), or nested more than `DEEPEST` elements deep.
     """
     content, builder = read_bytes(path, limit, what=what), _ShallowBuilder(path)
+
+    def refuse_entity(name: str, *_: object) -> None:
+        mend = "write its text out"
+        raise InputError(f"declares an entity '{name}', which is refused", path, mend)
+
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
+    parser.EntityDeclHandler = refuse_entity
     try:
-        parser = XMLParser(target=builder)
-        parser.feed(content)
-        return parser.close()
-    except (ParseError, ValueError, LookupError) as error:  # the last: an unknown encoding
+        parser.Parse(content, True)
+        return builder.close()
+    except (expat.ExpatError, ValueError, LookupError) as error:  # the last: an unknown encoding
         raise InputError(f"is not a readable {what} ({error})", path) from None
 
 

@@ -203,10 +203,15 @@ class TibiaTable(SceneTable):
 
 
 class GroundReactionTable(SceneTable):
-    """The force that the ground exerts on the foot, measured on one level plate."""
+    """The force that the ground exerts on the foot: one level plate, or plates of a `.c3d`."""
 
     file: Path
-    format: Literal["csv", "sto", "mot"] | None = None
+    format: Literal["csv", "sto", "mot", "c3d"] | None = None
+    plates: tuple[int, ...] = Field(
+        (),
+        description="of a .c3d: the plates that the foot stood on, in turn or at once, from 1; "
+        "their wrenches are summed",
+    )
     columns: dict[str, str] = Field(
         default_factory=dict,
         description=(
@@ -215,7 +220,7 @@ class GroundReactionTable(SceneTable):
             "those not named and not in the file are zero)"
         ),
     )
-    length_unit: LengthUnit
+    length_unit: LengthUnit | None = Field(None, description="of the file; a .c3d states its own")
     laboratory_axes: Axes = Field(
         "+x,+y,+z", description="axes of the file that point forward, up and right"
     )

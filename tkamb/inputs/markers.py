@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, pose, transform
+from tkamb.inputs.labels import matched_labels
 from tkamb.inputs.tables import Table
 from tkamb.scene_tables import TibiaTable
 from tkamb.units import MILLIMETRE
@@ -16,14 +17,17 @@ WRONG_MARKERS = 0.05
 def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) -> Array:
     """Return the markers (n, m, 3), m, in the file's axes; gaps are NaN.
 
+    A marker is found by its label, whatever prefix, dots and underscores that carries.
+
     Raises:
         InputError: a marker is not in the file; the message lists the nearest names.
     """
-    known = {column[:-2] for column in table.columns if column.endswith("_x")}
+    labels = [column[:-2] for column in table.columns if column.endswith("_x")]
+    known = matched_labels(names, labels)
     for name in names:
         if name not in known:
             table.column(f"{name}_x")
-    columns = [[table.column(f"{name}_{axis}") for axis in "xyz"] for name in names]
+    columns = [[table.column(f"{known[name]}_{axis}") for axis in "xyz"] for name in names]
     return np.moveaxis(np.array(columns), 2, 0) * metres_per_unit
 
 

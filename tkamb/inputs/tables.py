@@ -1,4 +1,4 @@
-"""Read recorded tables: `.csv`, OpenSim `.sto` and `.mot`, and `.trc` markers."""
+"""Read recorded tables: `.csv`, OpenSim `.sto` and `.mot`, and markers of `.trc` and `.c3d`."""
 
 import math
 import re
@@ -13,7 +13,7 @@ from tkamb.files import TABLE_LIMIT, read_text
 from tkamb.geometry.frames import Array
 from tkamb.units import LENGTH
 
-FORMATS = ("csv", "sto", "mot", "trc")
+FORMATS = ("csv", "sto", "mot", "trc", "c3d")
 TRC_ROUNDING_S = 1e-3
 """Cameras write `.trc` times rounded to the millisecond; the header's rate is exact."""
 
@@ -32,8 +32,8 @@ class Table:
 
     Args:
         path: the file.
-        columns: name -> (n,) values. A `.trc` marker M has columns M_x, M_y, M_z.
-        length_unit: the unit that the file itself states (`.trc`), else None.
+        columns: name -> (n,) values. A marker M of `.trc` or `.c3d` has columns M_x, M_y, M_z.
+        length_unit: the unit that the file itself states (`.trc`, `.c3d`), else None.
         in_degrees: what the file itself states about angles (`.sto`, `.mot`), else None.
     """
 
@@ -123,7 +123,7 @@ def read_table(path: Path, format: str | None = None) -> Table:
 
     Args:
         path: the file.
-        format: "csv", "sto", "mot" or "trc"; by default the suffix.
+        format: "csv", "sto", "mot", "trc" or "c3d"; by default the suffix.
 
     Raises:
         InputError: missing or unreadable file, unknown format, a malformed header or row, an
@@ -133,6 +133,8 @@ def read_table(path: Path, format: str | None = None) -> Table:
     kind = format or path.suffix.lower().lstrip(".")
     if kind not in FORMATS:
         raise InputError(f"unknown table format '{kind}'", path, f"use {', '.join(FORMATS)}")
+    if kind == "c3d":
+        return _read_c3d(path)
     lines = read_text(path, TABLE_LIMIT, "utf-8-sig").splitlines()
     if kind == "csv":
         return _read_csv(path, lines)
@@ -198,6 +200,19 @@ def _read_trc(path: Path, lines: list[str]) -> Table:
     frame = table.pop("frame")
     table["time"] = _exact_time(table["time"], frame, header.get("DataRate", ""))
     return Table(path, table, length_unit=header.get("Units", "").strip() or None)
+
+
+def _read_c3d(path: Path) -> Table:
+    """Markers of a C3D file on the recording's own clock, m."""
+    from tkamb.inputs.c3d import read_c3d
+
+    recording = read_c3d(path)
+    columns = {
+        f"{label}_{axis}": recording.points[:, k, i]
+        for k, label in enumerate(recording.labels)
+        for i, axis in enumerate("xyz")
+    }
+    return Table(path, {"time": recording.time, **columns}, length_unit="m")
 
 
 def _exact_time(time: Array, frame: Array, rate: str) -> Array:
