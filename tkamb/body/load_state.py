@@ -79,7 +79,7 @@ def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
 def contradictions(
     state: LoadState, solutions: Mapping[LoadState, Solution], off: frozenset[str]
 ) -> list[str]:
-    """Return what is wrong with one of the sets: its signs, or a condyle lifted that would push.
+    """Return what is wrong with one of the sets: its signs, or a load left out that would act.
 
     Args:
         state: the set.
@@ -87,6 +87,11 @@ def contradictions(
         off: sides that the recorded gap keeps off the insert.
     """
     wrong = wrong_signs(state, solutions[state])
+    if state.slack:
+        taut = solutions[LoadState(state.lifted, False)]
+        pulls = [taut.values[name] for name in ("quadriceps", "patellar_ligament")]
+        if not min(pulls) < -ROUNDING:
+            wrong.append(f"quadriceps would pull with {pulls[0]:.3g} N")
     for side in sorted(state.lifted - off):
         there = solutions[LoadState(state.lifted - {side}, state.slack)]
         force = there.values[f"{side}_normal"]
