@@ -6,10 +6,11 @@ import numpy as np
 
 from tkamb.case import Case
 from tkamb.mechanics.mechanics import FrameLoads
+from tkamb.run.agreement import contradictions
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
-    from tkamb.equilibrium.contact_side import FrameContact
+    from tkamb.equilibrium.frame_contact import FrameContact
 
 FILTER_TRANSLATION = 0.5 * MILLIMETRE
 FILTER_ROTATION = 0.5 * DEGREE
@@ -35,6 +36,7 @@ def frame_status(case: Case, k: int, body: FrameLoads, contact: "FrameContact | 
     words += [_lift_off(body, side, settled) for side in sorted(body.loads.lifted)]
     if body.loads.slack:
         words.append("flexors needed, which are not modelled: quadriceps slack")
+    words += contradictions(case, body, contact)
     words += list(contact.flags) if contact else []
     if failures:
         return FAILED + "; ".join([*failures, *words])
