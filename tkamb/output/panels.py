@@ -24,8 +24,8 @@ def panels(results: Results) -> tuple[Panel, ...]:
     """Return the plots whose numbers the run has, in the report's order."""
     makers: tuple[Callable[[Results], Panel], ...] = (
         _total, _condyles, _share, _sensitivity, _extensor, _ratios, _areas, _pressures, _yield,
-        _external, _ground, _ligaments, _residuals, _residual_moment, _hip_force, _hip_moment, _motion,
-        _slip, _adjustment, _adjustment_effect, _condition,
+        _external, _ground, _ligaments, _residuals, _residual_moment, _hip_force, _hip_moment,
+        _motion, _slip, _adjustment, _adjustment_effect, _condition,
     )  # fmt: skip
     made = (without_empty_lines(make(results)) for make in makers)
     return tuple(panel for panel in made if panel.lines)

@@ -15,6 +15,7 @@ from tkamb.units import DEGREE
 if TYPE_CHECKING:
     from tkamb.case import Case
     from tkamb.equilibrium.frame_contact import FrameContact
+    from tkamb.mechanics.mechanics import FrameLoads
 
 SHARES_APART = 0.25
 """Two estimates of the medial share that differ by more contradict each other."""
