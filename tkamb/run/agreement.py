@@ -85,7 +85,7 @@ def split_determined(body: "FrameLoads", contact: "FrameContact") -> float:
     """Return 1 where the recorded adduction determines the split by deformation, else 0.
 
     It does not where 0.5 deg moves more than a quarter of the load from one condyle to the
-    other, or where one condyle carries all of it and equilibrium loads both. NaN where there is
+    other, or where one condyle carries all of it and equilibrium says otherwise. NaN where there is
     no sensitivity.
     """
     if np.isnan(contact.sensitivity):
@@ -93,7 +93,7 @@ def split_determined(body: "FrameLoads", contact: "FrameContact") -> float:
     moved = abs(contact.sensitivity) * ADDUCTION_KNOWN
     load = abs(float(body.loads.contact_force[1]))
     share, balanced = share_by_deformation(contact), share_by_equilibrium(body)
-    alone = not UNLOADED <= share <= 1.0 - UNLOADED and UNLOADED <= balanced <= 1.0 - UNLOADED
+    alone = min(share, 1.0 - share) < UNLOADED < abs(share - balanced)
     return float(moved <= MOVED_SHARE * load and not alone)
 
 

@@ -149,8 +149,8 @@ COLUMNS: tuple[Column, ...] = (
     Column(
         "split_determined",
         "1: the recorded adduction determines medial_force_N and lateral_force_N; 0: not, 0.5 deg "
-        "moves more than a quarter of the load, or one condyle carries all where equilibrium "
-        "loads both",
+        "moves more than a quarter of the load, or one condyle carries all and equilibrium "
+        "says otherwise",
         _RECORDED,
         "integer",
     ),
