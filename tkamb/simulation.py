@@ -17,7 +17,8 @@ from tkamb.run.tabulate import frame_row, join_rows
 from tkamb.scene import Scene, load_scene
 
 if TYPE_CHECKING:
-    from tkamb.equilibrium.contact_side import ContactSide, FrameContact
+    from tkamb.equilibrium.contact_side import ContactSide
+    from tkamb.equilibrium.frame_contact import FrameContact
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
 

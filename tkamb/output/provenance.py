@@ -12,6 +12,10 @@ SUMMARY_KEYS: dict[str, str] = {
     "versions": "package -> version",
     "seconds": "part -> computing time",
     "contact": "model, resolution_mm, material and the model's other options; absent: no contact",
+    "known_error": "largest relative errors of the contact model on the reference cases of the "
+    "trade-off (approach, force, mean_pressure, peak_pressure, area; cases: how many), or "
+    "'not measured'",
+    "split_not_determined_frames": "in how many frames split_determined is 0",
     "side": "right or left: the subject's knee",
     "lateral_axis": "+z (default; left knees are mirrored at input) or -z, in the results' frame",
     "frame": "a sentence on frame and side",

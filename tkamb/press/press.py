@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tkamb.contact import materials
+from tkamb.contact.known_errors import known_error
 from tkamb.contact.model import Bearing, ContactModel, ContactPair, ContactResult
 from tkamb.contact.pressing import check_load, first_touch_height
 from tkamb.contact.registry import contact_model
@@ -100,6 +101,7 @@ def press_meshes(
         prepare_seconds=prepared - started,
         solve_seconds=solved - prepared,
         peak_rss_MB=peak_rss(),
+        known_error=known_error(contact, resolution_mm, material, options),
     )
 
 

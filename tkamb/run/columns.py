@@ -31,6 +31,7 @@ _MUSCLE = "[quadriceps], [patellar_ligament], [patella]"
 _COUPLED = "[contact] coupling or released"
 _POINTS = "[contact] coupling = 'points'"
 _FREE = "[contact] released"
+_RECORDED = "[contact] with adduction not released"
 _ADJUST = "[contact] with adjust = true"
 
 LIGAMENT = "ligament_<name>_N"
@@ -139,6 +140,20 @@ COLUMNS: tuple[Column, ...] = (
         _ADJUST,
     ),
     Column("adjust_share_change", "the same, of medial_share_equilibrium", _ADJUST),
+    Column(
+        "medial_force_per_adduction_N_per_deg",
+        "change of medial_force_N with adduction at constant load, a finite difference; zero where "
+        "one condyle carries all, until the other touches",
+        _RECORDED,
+    ),
+    Column(
+        "split_determined",
+        "1: the recorded adduction determines medial_force_N and lateral_force_N; 0: not, 0.5 deg "
+        "moves more than a quarter of the load, or one condyle carries all and equilibrium "
+        "says otherwise",
+        _RECORDED,
+        "integer",
+    ),
 )
 
 KINDS: dict[str, Kind] = {column.name: column.kind for column in COLUMNS}

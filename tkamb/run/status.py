@@ -6,10 +6,11 @@ import numpy as np
 
 from tkamb.case import Case
 from tkamb.mechanics.mechanics import FrameLoads
+from tkamb.run.agreement import contradictions
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
-    from tkamb.equilibrium.contact_side import FrameContact
+    from tkamb.equilibrium.frame_contact import FrameContact
 
 FILTER_TRANSLATION = 0.5 * MILLIMETRE
 FILTER_ROTATION = 0.5 * DEGREE
@@ -37,6 +38,7 @@ def frame_status(case: Case, k: int, body: FrameLoads, contact: "FrameContact | 
         words.append("flexors needed, which are not modelled: quadriceps slack")
     if body.loads.ambiguous:
         words.append("several load states balance: the one that leaves out fewest is taken")
+    words += contradictions(case, body, contact)
     words += list(contact.flags) if contact else []
     if failures:
         return FAILED + "; ".join([*failures, *words])

@@ -74,7 +74,13 @@ def summary_of(
     if scene.patella:
         summary["first_wrapping_flexion_deg"] = _first_wrapping(columns)
     if scene.contact:
-        summary["contact"] = scene.contact.model_dump(mode="json")
+        from tkamb.contact.known_errors import as_json, known_error
+
+        table = scene.contact
+        error = known_error(table.model, table.resolution_mm, table.material, table.options)
+        summary["contact"] = table.model_dump(mode="json")
+        summary["known_error"] = as_json(error)
+        summary["split_not_determined_frames"] = int((columns["split_determined"] == 0).sum())
         summary["residuals"] = RESIDUALS
     if case.motion.cycle_percent is not None:
         percent, time = case.motion.cycle_percent, case.motion.time
