@@ -186,6 +186,8 @@ def _run(options: argparse.Namespace) -> int:
     failed = [k for k, status in enumerate(results.status) if status.startswith(FAILED)]
     for k in failed:
         print(f"tkamb: frame {k}: {results.status[k]}", file=sys.stderr)
+    for question in results.summary.get("questions", []):
+        print(f"tkamb: question: {question}", file=sys.stderr)
     if options.json:
         print((directory / "summary.json").read_text(encoding="utf-8"), end="")
     else:

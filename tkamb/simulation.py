@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from tkamb.case import Case, load_case
 from tkamb.errors import InputError
 from tkamb.mechanics.mechanics import Mechanics
+from tkamb.plausibility.plausibility import Plausibility
 from tkamb.results import Results
 from tkamb.run.recorder import FolderRecorder, Recorder, finished_results
 from tkamb.run.status import frame_status
@@ -94,6 +95,7 @@ class _Run:
     def prepare(self) -> None:
         """Build both sides of the equilibrium; whatever is wrong with the input shows here."""
         self.mechanics = Mechanics(self.case)
+        self.plausibility = Plausibility(self.mechanics)
         self.slips = self.mechanics.slips()
         self.seconds = {"read": clock.perf_counter() - self.start}
         self.side = self._contact_side() if self.case.scene.contact else None
@@ -125,6 +127,7 @@ class _Run:
         columns = join_rows(self.case, self.indices, self.recorder.rows)
         self.seconds["all"] = clock.perf_counter() - self.start
         summary = summary_of(self.case, columns, self.seconds, self.path, self.mechanics.strains)
+        summary["questions"] = [question.text for question in self.plausibility.questions]
         summary["identity"] = self.identity
         summary["resumed_frames"] = self.resumed
         summary["unfinished_frames"] = len(self.indices) - len(self.recorder.rows)
@@ -141,7 +144,8 @@ class _Run:
             before.append(contact)
             del before[:-LAST_FRAMES]
             arrays = contact_arrays(contact)
-        status = frame_status(self.case, k, body, contact)
+        doubts = self.plausibility.flags(k, body)
+        status = frame_status(self.case, k, body, contact, doubts)
         self.recorder.record(k, frame_row(self.case, k, body, contact, self.slips, status), arrays)
 
     def _contact_side(self) -> "ContactSide":

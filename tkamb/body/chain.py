@@ -85,6 +85,23 @@ class Chain:
             raise InputError(f"link '{link}' is not fixed to '{base}'", "URDF")
         return inverse(frames[1].placement.homogeneous) @ frames[0].placement.homogeneous
 
+    def carrier(self, link: str) -> str:
+        """Return which of tibia, femur and patella a link is fixed to."""
+        own = self.model.frames[self.frame_id(link)].parentJoint
+        for base in ("tibia", "femur", "patella"):
+            if self.model.frames[self.frame_id(base)].parentJoint == own:
+                return base
+        raise InputError(f"link '{link}' is fixed to neither tibia, femur nor patella", "URDF")
+
+    def segment(self, link: str) -> tuple[float, Array, Array]:
+        """Return the inertia of a link, and of all that is fixed to it, in the link's frame.
+
+        Mass (kg), centre (3,) m, and tensor (3, 3) kg·m² about the centre.
+        """
+        frame = self.model.frames[self.frame_id(link)]
+        whole = self.model.inertias[frame.parentJoint].se3Action(frame.placement.inverse())
+        return float(whole.mass), np.array(whole.lever), np.array(whole.inertia)
+
     def on_shank(self, link: str) -> bool:
         """Return whether a link is fixed to the tibia, and not on the femur's side."""
         ends = [self.model.frames[self.frame_id(name)].parentJoint for name in (link, "tibia")]

@@ -55,6 +55,7 @@ def _unbroken(text: str) -> str:
 def cards(results: Results, axis: HorizontalAxis) -> list[Card]:
     """Return the headline numbers that the run has."""
     found = (
+        _questions(results),
         _peak_force(results, axis),
         _shares(results),
         _peak_pressure(results, axis),
@@ -71,6 +72,13 @@ def _where(results: Results, axis: HorizontalAxis, frame: int) -> str:
         return f"at {flexion}"
     name = f"{axis.at(frame)} of the cycle" if axis.kind == "cycle" else axis.at(frame)
     return f"at {name} ({flexion})"
+
+
+def _questions(results: Results) -> Card | None:
+    asked = results.summary.get("questions") or []
+    if not asked:
+        return None
+    return Card("Questions to answer", str(len(asked)), " ".join(map(str, asked)), True)
 
 
 def _peak_force(results: Results, axis: HorizontalAxis) -> Card | None:

@@ -26,6 +26,7 @@ SUMMARY_KEYS: dict[str, str] = {
     "cycle_percent_s": "times of 0 % and of 100 % of the cycle; default: first and last frame",
     "residuals": "a sentence on where the residuals act and what they mean",
     "notes": "list of sentences: assumptions, departures, what a reader must know",
+    "questions": "list of sentences: what is unlikely about the input, with the likely mistake",
     "assumptions": "list of sentences",
     "not_modelled": "list: what the scene leaves out",
     "first_wrapping_flexion_deg": "least flexion at which the quadriceps wraps the femur; or null",

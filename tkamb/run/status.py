@@ -1,5 +1,6 @@
 """The status of a frame in words: "ok", why it failed, or what a reader must know."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,8 +27,22 @@ ADJUSTED_TOTAL = 0.01
 FAILED = "failed: "
 
 
-def frame_status(case: Case, k: int, body: FrameLoads, contact: "FrameContact | None") -> str:
-    """Return "ok", or reason words joined by "; ". A frame without force begins with failed."""
+def frame_status(
+    case: Case,
+    k: int,
+    body: FrameLoads,
+    contact: "FrameContact | None",
+    doubts: Sequence[str] = (),
+) -> str:
+    """Return "ok", or reason words joined by "; ". A frame without force begins with failed.
+
+    Args:
+        case: the case.
+        k: frame.
+        body: its body side.
+        contact: its contact side; None when not modelled.
+        doubts: flags of the questions that concern it (`tkamb.plausibility`).
+    """
     failures = list(body.loads.problems)
     if contact and contact.problem and not failures:
         failures.append(contact.problem)
@@ -40,6 +55,7 @@ def frame_status(case: Case, k: int, body: FrameLoads, contact: "FrameContact | 
         words.append("several load states balance: the one that leaves out fewest is taken")
     words += contradictions(case, body, contact)
     words += list(contact.flags) if contact else []
+    words += doubts
     if failures:
         return FAILED + "; ".join([*failures, *words])
     return "; ".join(words) or "ok"
