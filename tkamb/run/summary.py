@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from tkamb.case import Case
+from tkamb.code_identity import code_identity
+from tkamb.files import sha256_of
 from tkamb.mechanics.mechanics import STRAIN_FLEXIONS
 from tkamb.run.status import FAILED
 from tkamb.scene_tables import ContactTable
@@ -96,22 +98,33 @@ def scene_hash(case: Case) -> str:
 
 
 def run_identity(case: Case, frames: range) -> dict[str, Any]:
-    """Return what makes two runs the same: scene, what its files hold, frames, version."""
+    """Return what makes two runs the same: scene, what its files hold, frames, version, code."""
     return {
         "scene": scene_hash(case),
         "content of a file": files_hash(case),
         "choice of frames": [frames.start, frames.stop, frames.step],
         "version of tkamb": version("tkamb"),
+        "code of tkamb": code_identity(),
     }
 
 
 def files_hash(case: Case) -> str:
     """Return the SHA-256 of the files that the run reads: no mesh that nothing asks for."""
     digest = hashlib.sha256()
-    unread = {"output"} | ({"implant"} if case.femoral is None else set())
-    for path in _paths(case.scene.model_dump(exclude=unread)):
+    for path in _files_read(case):
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def input_hashes(case: Case, scene: Path | None) -> dict[str, str]:
+    """Return path -> SHA-256 of the scene file, if there is one, and of the files it has read."""
+    paths = [*([] if scene is None else [scene.absolute()]), *_files_read(case)]
+    return {str(path): sha256_of(path) for path in paths}
+
+
+def _files_read(case: Case) -> list[Path]:
+    unread = {"output"} | ({"implant"} if case.femoral is None else set())
+    return _paths(case.scene.model_dump(exclude=unread))
 
 
 def _paths(value: Any) -> list[Path]:

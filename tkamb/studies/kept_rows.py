@@ -1,8 +1,8 @@
 """Rows of a study, kept one by one as they are measured, so that it can be stopped and go on.
 
-Each row is one line of JSON, appended and flushed at once: {"key": ..., "row": ...}. The key is
-the SHA-256 of what was measured and of the code that measured it; a line cut short by a kill
-counts as absent.
+Each row is one line of JSON, appended and flushed at once: {"key": ..., "row": ..., "sha256": ...}.
+The key is the SHA-256 of what was measured and of the code that measured it, "sha256" that of key
+and row; a line cut short by a kill, or changed, counts as absent.
 """
 
 import hashlib
@@ -13,6 +13,7 @@ from typing import Any
 
 from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
+from tkamb.files import TABLE_LIMIT, read_bytes
 from tkamb.output.atomic import write_text
 
 FILE_NAME = "rows.jsonl"
@@ -47,25 +48,32 @@ class KeptRows:
             self._rows[key] = row
             try:
                 with open(self.path, "a", encoding="utf-8") as file:
-                    file.write(_line(key, row))
+                    # After a line that a full disk cut short the next one begins anew.
+                    file.write("\n" + _line(key, row))
             except OSError as error:
                 raise InputError(f"cannot be written ({error.strerror})", self.path) from None
 
 
 def _line(key: str, row: Row) -> str:
-    return json.dumps({"key": key, "row": row}) + "\n"
+    return json.dumps({"key": key, "row": row, "sha256": _row_hash(key, row)}) + "\n"
+
+
+def _row_hash(key: str, row: Row) -> str:
+    return hashlib.sha256(json.dumps([key, row], sort_keys=True).encode()).hexdigest()
 
 
 def _whole_rows(path: Path) -> dict[str, Row]:
-    """Return key -> row of the lines that are whole."""
+    """Return key -> row of the lines that are whole and as they were written."""
     if not path.exists():
         return {}
     found: dict[str, Row] = {}
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in read_bytes(path, TABLE_LIMIT).decode(errors="replace").splitlines():
         try:
             content = json.loads(line)
-            found[str(content["key"])] = dict(content["row"])
-        except (ValueError, KeyError, TypeError):
+            key, row = str(content["key"]), dict(content["row"])
+            if content["sha256"] == _row_hash(key, row):
+                found[key] = row
+        except (ValueError, KeyError, TypeError, RecursionError):
             continue
     return found
 
