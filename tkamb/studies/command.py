@@ -111,7 +111,7 @@ def _study_stability(options: argparse.Namespace, directory: Path) -> int:
     print(text if options.json else "\n".join([*lines, f"picture: {directory / 'stability.png'}"]))
     if not whole:
         raise KeyboardInterrupt(_goes_on(directory))
-    return 1 if any(v.kind in study.FAILED_KINDS for v in verdicts) else 0
+    return 1 if any(verdict.failed for verdict in verdicts) else 0
 
 
 def gather(found: Iterable[T], costs: Sequence[float]) -> tuple[list[T], bool]:
