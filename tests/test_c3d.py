@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import AMTI_CORNERS, standing_markers, write_c3d
 
+from recordings import AMTI_CORNERS, standing_markers, write_c3d
 from tkamb.errors import InputError
 from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.ground_reaction import load_ground_reaction
@@ -83,7 +83,7 @@ def test_each_type_gives_the_wrench_that_acts(tmp_path, kind, corners):
 
 def two_plates(tmp_path: Path, **more) -> Path:
     """Write a recording whose load is shared by two plates of type 2, half each."""
-    beside = AMTI_CORNERS + [0.0, 0.5, 0.0]
+    beside = AMTI_CORNERS + np.array([0.0, 0.5, 0.0])
     halves = [0.5 * plate_signals(2, corners, np.zeros(3)) for corners in (AMTI_CORNERS, beside)]
     plates = [
         {"type": 2, "corners": AMTI_CORNERS, "channels": range(1, 7)},
@@ -190,7 +190,10 @@ REFUSED = {
     "not there": (lambda d: d / "none.c3d", "no such file"),
     "type 5": (lambda d: written(d, plate={"type": 5}), "type 5"),
     "type 0": (lambda d: written(d, plate={"type": 0}), "type 0"),
-    "channel that is not there": (lambda d: written(d, plate={"channels": [1, 2, 3, 4, 5, 99]}), "99"),
+    "channel that is not there": (
+        lambda d: written(d, plate={"channels": [1, 2, 3, 4, 5, 99]}),
+        "99",
+    ),
     "no units": (lambda d: written(d, units=[""] * 6), "unit"),
     "pounds": (lambda d: written(d, units=["lbf"] * 6), "lbf"),
     "inches": (lambda d: written(d, point_unit="in"), "'in'"),
@@ -251,4 +254,6 @@ def test_jw_squat_stands_on_two_plates_and_keeps_its_weight():
 def test_jw_gait_keeps_the_clock_of_the_longer_trial():
     recording = read_c3d(JW / "jw_ngait_og3.c3d")
     assert recording.time[0] == pytest.approx(217 / 120, abs=1e-9)
-    assert np.isnan(read_c3d(JW / "jw_stairupf1.c3d").points).mean() == pytest.approx(0.15, abs=0.01)
+    assert np.isnan(read_c3d(JW / "jw_stairupf1.c3d").points).mean() == pytest.approx(
+        0.15, abs=0.01
+    )

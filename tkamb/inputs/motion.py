@@ -7,7 +7,8 @@ the clinical angles and the patella's sagittal coordinates keep theirs.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,6 +27,9 @@ from tkamb.inputs.laboratory import angle_scale, check_roles, poses_of_columns
 from tkamb.inputs.tables import Table, read_table
 from tkamb.scene_tables import MotionTable
 from tkamb.units import DEGREE, MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.inputs.marker_motion import MarkerKinematics
 
 PATELLA_COORDINATES = ("patella_ap", "patella_si", "patella_rotation")
 LIMITS_DEG = {"axial_rotation": (-90, 90), "adduction": (-45, 45), "flexion": (-45, 180)}
@@ -55,6 +59,7 @@ class KneeMotion:
         cycle_percent: (f,) per cent of the cycle, if the motion is one.
         closed_cycle: the cycle's ends agree, so it was filtered as periodic.
         unrecorded: coordinates without a column, held at zero here.
+        markers: what it was read from, if from skin markers.
     """
 
     time: Array
@@ -70,6 +75,7 @@ class KneeMotion:
     cycle_percent: Array | None = None
     closed_cycle: bool = False
     unrecorded: tuple[str, ...] = ()
+    markers: "MarkerKinematics | None" = None
 
 
 def load_motion(
@@ -78,6 +84,7 @@ def load_motion(
     pose_insert_mesh_in_insert: Array,
     pose_femoral_mesh_in_femur: Array,
     released: Sequence[str] = (),
+    pose_insert_in_tibia: Array | None = None,
 ) -> KneeMotion:
     """Read the recorded motion of the scene.
 
@@ -91,10 +98,14 @@ def load_motion(
             z points to the subject's right on both sides (not mirrored).
         pose_femoral_mesh_in_femur: (4, 4) m; likewise for the femur link.
         released: knee coordinates that will be solved for: they need no column.
+        pose_insert_in_tibia: (4, 4), for markers; of the (mirrored) patient.
 
     Raises:
         InputError: file, columns, times, filter or cycle cannot be used.
     """
+    if table.markers is not None:
+        assert pose_insert_in_tibia is not None
+        return _from_markers(table, side, pose_insert_in_tibia, released)
     recorded = read_table(table.file, table.format)
     _check_roles(table, recorded)
     unrecorded: tuple[str, ...] = ()
@@ -112,12 +123,37 @@ def load_motion(
         knee[:, 3:] = np.unwrap(knee[:, 3:], axis=0)
         if side == "left":
             knee[:, KNEE_COORDINATES.index("ml")] *= -1.0
-    _check_angles(knee, recorded)
-    _check_places(knee, recorded)
+    _check_angles(knee, recorded.path)
+    _check_places(knee, recorded.path)
     named = [c for c in PATELLA_COORDINATES if c in table.columns or c in recorded.columns]
     patella = _recorded_coordinates(recorded, table, PATELLA_COORDINATES) if named else None
-    motion = _differentiated(time, knee, patella, table, recorded)
+    motion = _differentiated(time, knee, patella, table, recorded.path)
     return replace(motion, unrecorded=unrecorded)
+
+
+def _from_markers(
+    table: MotionTable, side: Literal["right", "left"], insert: Array, released: Sequence[str]
+) -> KneeMotion:
+    """Return the motion that skin markers give: the coordinates that are taken from them."""
+    from tkamb.inputs.marker_motion import load_marker_motion
+
+    assert table.markers is not None
+    taken = table.markers.coordinates
+    unrecorded = tuple(name for name in KNEE_COORDINATES if name not in taken)
+    if needed := [name for name in unrecorded if name not in released]:
+        raise InputError(
+            f"nothing gives {', '.join(needed)}",
+            "[motion.markers]",
+            "add it to coordinates, or let the knee find it: [contact] released",
+        )
+    found = load_marker_motion(table, side, insert)
+    knee = found.coordinates.copy()
+    for name in unrecorded:
+        knee[:, KNEE_COORDINATES.index(name)] = 0.0
+    _check_angles(knee, table.file)
+    _check_places(knee, table.file)
+    motion = _differentiated(found.time, knee, None, table, table.file)
+    return replace(motion, unrecorded=unrecorded, markers=found)
 
 
 def _unrecorded(recorded: Table, table: MotionTable, released: Sequence[str]) -> tuple[str, ...]:
@@ -163,52 +199,52 @@ def _check_roles(table: MotionTable, recorded: Table) -> None:
     check_roles(table.columns, ("time", *own, *PATELLA_COORDINATES), recorded.path, "motion")
 
 
-def _check_angles(knee: Array, recorded: Table) -> None:
+def _check_angles(knee: Array, path: Path) -> None:
     for name, (low, high) in LIMITS_DEG.items():
         angle = knee[:, KNEE_COORDINATES.index(name)] / DEGREE
         if angle.min() < low or angle.max() > high:
             raise InputError(
                 f"{name} runs from {angle.min():.1f} to {angle.max():.1f} deg, which no knee "
                 f"does ({low} to {high})",
-                recorded.path,
+                path,
                 "check [motion] columns, sequence, angle_unit and the meshes' axes",
             )
 
 
-def _check_places(knee: Array, recorded: Table) -> None:
+def _check_places(knee: Array, path: Path) -> None:
     for name in ("ap", "si", "ml"):
         place = knee[:, KNEE_COORDINATES.index(name)]
         if np.abs(place).max() > FARTHEST_M:
             raise InputError(
                 f"{name} runs from {place.min() / MILLIMETRE:.4g} to "
                 f"{place.max() / MILLIMETRE:.4g} mm off the insert, which no knee does",
-                recorded.path,
+                path,
                 "check [motion] columns, length_unit and where the meshes have their origin",
             )
 
 
-def _check_rate(time: Array, recorded: Table) -> None:
+def _check_rate(time: Array, path: Path) -> None:
     spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if spacing > SLOWEST_S:
         raise InputError(
             f"samples are {spacing:g} s apart, too far to be a movement",
-            recorded.path,
+            path,
             "is the time in seconds?",
         )
 
 
 def _differentiated(
-    time: Array, knee: Array, patella: Array | None, table: MotionTable, recorded: Table
+    time: Array, knee: Array, patella: Array | None, table: MotionTable, path: Path
 ) -> KneeMotion:
     """Return the filtered motion at the scene's frames."""
     values = knee if patella is None else np.concatenate([knee, patella], axis=1)
-    cycle = Cycle.of(time, knee, table, recorded) if table.cycle_s else None
+    cycle = Cycle.of(time, knee, table, path) if table.cycle_s else None
     sampled = cycle.seconds(time) if cycle else time
-    _check_rate(sampled, recorded)
-    at = _frames(sampled, table.frames, cycle)
+    _check_rate(sampled, path)
+    at = _frames(sampled, table, cycle)
     inside = cycle.wrapped(at, sampled) if cycle else at
     closed = cycle is not None and cycle.closed
-    name = str(recorded.path)
+    name = str(path)
     x, v, a = differentiate_coordinates(sampled, values, table.cutoff_Hz, inside, closed, name)
     raw, _, _ = differentiate_coordinates(sampled, knee, "none", inside, name=name)
     filtered_pose, raw_pose = knee_pose(x[:, :6]), knee_pose(raw)
@@ -230,10 +266,18 @@ def _differentiated(
     )
 
 
-def _frames(sampled: Array, frames: int | None, cycle: "Cycle | None") -> Array:
+def _frames(sampled: Array, table: MotionTable, cycle: "Cycle | None") -> Array:
     if cycle:
-        return cycle.frames(sampled, frames)
-    return np.linspace(sampled[0], sampled[-1], frames) if frames else sampled
+        return cycle.frames(sampled, table.frames)
+    start, end = table.interval_s or (sampled[0], sampled[-1])
+    inside = sampled[(sampled >= start - 1e-9) & (sampled <= end + 1e-9)]
+    if len(inside) < 2 or start < sampled[0] - 1e-9 or end > sampled[-1] + 1e-9:
+        raise InputError(
+            f"covers {sampled[0]:g} to {sampled[-1]:g} s, but interval_s is {start:g} to {end:g}",
+            table.file,
+            "choose [motion] interval_s inside the recording",
+        )
+    return np.linspace(start, end, table.frames) if table.frames else inside
 
 
 @dataclass(frozen=True)
@@ -253,7 +297,7 @@ class Cycle:
     closed: bool
 
     @staticmethod
-    def of(percent: Array, knee: Array, table: MotionTable, recorded: Table) -> "Cycle":
+    def of(percent: Array, knee: Array, table: MotionTable, path: Path) -> "Cycle":
         """Return the scene's cycle.
 
         It is closed if 100 % was recorded too and no coordinate differs there from 0 % by
@@ -265,11 +309,11 @@ class Cycle:
         assert table.cycle_s is not None
         start, end = table.cycle_s
         if not start < end:
-            raise InputError("[motion] cycle_s does not rise", recorded.path)
+            raise InputError("[motion] cycle_s does not rise", path)
         if percent[0] < -1e-9 or percent[-1] > 100 + 1e-9 or percent[-1] - percent[0] < 2:
             raise InputError(
                 f"time runs from {percent[0]:g} to {percent[-1]:g}, which is not per cent",
-                recorded.path,
+                path,
                 "drop cycle_s, or give per cent of the cycle",
             )
         whole = percent[-1] - percent[0] > 100 - 1e-9
@@ -278,7 +322,7 @@ class Cycle:
         if table.cycle_offset_percent and not closed:
             raise InputError(
                 "is not a closed cycle, so it has no frame before or after its ends",
-                recorded.path,
+                path,
                 "set cycle_offset_percent to 0",
             )
         return Cycle(start, end - start, table.cycle_offset_percent, closed)

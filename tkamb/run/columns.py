@@ -31,6 +31,7 @@ _MUSCLE = "[quadriceps], [patellar_ligament], [patella]"
 _COUPLED = "[contact] coupling or released"
 _POINTS = "[contact] coupling = 'points'"
 _FREE = "[contact] released"
+_MARKERS = "[motion.markers]"
 _ADJUST = "[contact] with adjust = true"
 
 LIGAMENT = "ligament_<name>_N"
@@ -139,6 +140,19 @@ COLUMNS: tuple[Column, ...] = (
         _ADJUST,
     ),
     Column("adjust_share_change", "the same, of medial_share_equilibrium", _ADJUST),
+    Column(
+        "marker_rms_segments_mm",
+        "root mean square distance of shank and thigh markers, each segment fitted rigidly",
+        _MARKERS,
+    ),
+    Column("marker_rms_chain_mm", "the same of all segments held together by joints", _MARKERS),
+    Column("flexion_segments_deg", "flexion by rigid fits, unfiltered", _MARKERS),
+    Column("flexion_chain_deg", "flexion by the chain, unfiltered", _MARKERS),
+    Column(
+        "knee_centre_distance_mm",
+        "between the knee centres that shank and thigh markers carry, each by itself",
+        _MARKERS,
+    ),
 )
 
 KINDS: dict[str, Kind] = {column.name: column.kind for column in COLUMNS}
