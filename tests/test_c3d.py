@@ -83,7 +83,7 @@ def test_each_type_gives_the_wrench_that_acts(tmp_path, kind, corners):
 
 def two_plates(tmp_path: Path, **more) -> Path:
     """Write a recording whose load is shared by two plates of type 2, half each."""
-    beside = AMTI_CORNERS + [0.0, 0.5, 0.0]
+    beside = AMTI_CORNERS + np.array([0.0, 0.5, 0.0])
     halves = [0.5 * plate_signals(2, corners, np.zeros(3)) for corners in (AMTI_CORNERS, beside)]
     plates = [
         {"type": 2, "corners": AMTI_CORNERS, "channels": range(1, 7)},

@@ -73,7 +73,9 @@ class Scene(SceneTable):
         for name, asked in needs_implant.items():
             if asked and not (self.implant.femoral and self.implant.insert):
                 raise ValueError(f"{name} needs [implant.femoral] and [implant.insert]")
-        if self.ground_reaction and not self.tibia:
+        if self.tibia and self.motion.markers:
+            raise ValueError("[motion.markers] places the shank too: drop [tibia]")
+        if self.ground_reaction and not (self.tibia or self.motion.markers):
             raise ValueError("[ground_reaction] needs [tibia]: how the shank stands in the lab")
         return self
 

@@ -75,12 +75,89 @@ class PatientTable(SceneTable):
     )
 
 
+class MarkerSegmentTable(SceneTable):
+    """A segment with skin markers: the shank, the thigh, or what hangs on one of them."""
+
+    name: str = Field(description="'shank' and 'thigh' are the knee's; others are neighbours")
+    markers_mm: dict[str, Vector] = Field(
+        min_length=1,
+        description="marker -> position in the tibia link (shank), the femur link (thigh) or the "
+        "neighbour's own frame",
+    )
+    weights: dict[str, float] = Field(
+        default_factory=dict, description="of the squared distances, where not 1"
+    )
+    joined_to: Literal["shank", "thigh"] | None = Field(
+        None, description="a neighbour's: the segment that it hangs on by a ball joint"
+    )
+    joint_mm: Vector | None = Field(None, description="the ball joint in that segment's link")
+    centre_mm: Vector | None = Field(None, description="the same in the neighbour's own frame")
+
+    @model_validator(mode="after")
+    def _hangs_somewhere(self) -> Self:
+        knee = self.name in ("shank", "thigh")
+        given = [v is not None for v in (self.joined_to, self.joint_mm, self.centre_mm)]
+        if any(given) if knee else not all(given):
+            raise ValueError(
+                "'joined_to', 'joint_mm' and 'centre_mm' go together, on every segment but "
+                "shank and thigh"
+            )
+        for name, weight in self.weights.items():
+            if name not in self.markers_mm:
+                raise ValueError(f"a weight for '{name}', which is no marker of '{self.name}'")
+            if not weight >= 0:
+                raise ValueError(f"the weight of '{name}' is negative")
+        return self
+
+
+class MarkersTable(SceneTable):
+    """The knee's motion and the shank in the laboratory, from skin markers."""
+
+    method: Literal["segments", "chain"] = Field(
+        description="'segments': rigid fits of shank and thigh, each by itself; 'chain': all "
+        "segments at once, held together by their joints. Both are computed and compared"
+    )
+    knee: Literal["hinge", "free"] = Field(
+        "hinge", description="the chain's knee: flexion alone, or six freedoms"
+    )
+    coordinates: tuple[Literal["flexion", "adduction", "axial_rotation", "ap", "si", "ml"], ...] = (
+        Field(
+            ("flexion",),
+            min_length=1,
+            description="knee coordinates that are taken from the markers; [contact] releases "
+            "the others",
+        )
+    )
+    neutral_mm: Vector = Field(
+        description="ap, si, ml of the femur link in the insert frame, where a hinge keeps it"
+    )
+    neutral_deg: tuple[float, float] = Field(
+        (0.0, 0.0), description="axial rotation and adduction that a hinge keeps"
+    )
+    laboratory_axes: Axes = Field(
+        "+x,+y,+z", description="axes of the file that point forward, up and right"
+    )
+    segment: tuple[MarkerSegmentTable, ...] = Field(description="shank, thigh and neighbours")
+
+    @model_validator(mode="after")
+    def _shank_and_thigh(self) -> Self:
+        names = [segment.name for segment in self.segment]
+        if len(names) != len(set(names)):
+            raise ValueError("two segments have the same name")
+        if missing := {"shank", "thigh"} - set(names):
+            raise ValueError(f"segment '{min(missing)}' is missing")
+        if "flexion" not in self.coordinates:
+            raise ValueError("'coordinates' lacks flexion, which nothing else gives")
+        return self
+
+
 class MotionTable(SceneTable):
     """The knee's recorded motion.
 
     `interpretation = "coordinates"`: columns are the six knee coordinates (Grood-Suntay) of
     the femoral component in the insert frame. `"pose"`: columns are a rotation sequence and
-    a translation that place the femoral mesh in the insert mesh's own axes.
+    a translation that place the femoral mesh in the insert mesh's own axes. `"markers"`: skin
+    markers of shank and thigh, see [motion.markers]; they place the shank too.
     """
 
     file: Path
@@ -94,8 +171,11 @@ class MotionTable(SceneTable):
     slip_share: Number = Field(
         1.0, ge=0, le=10, description="roll-slip: share of the recorded slip; 0 is pure rolling"
     )
-    format: Literal["csv", "sto", "mot"] | None = Field(None, description="default: the suffix")
-    interpretation: Literal["coordinates", "pose"] = "coordinates"
+    format: Literal["csv", "sto", "mot", "trc", "c3d"] | None = Field(
+        None, description="default: the suffix"
+    )
+    interpretation: Literal["coordinates", "pose", "markers"] = "coordinates"
+    markers: MarkersTable | None = Field(None, description="with interpretation = 'markers'")
     sequence: str | None = Field(
         None,
         pattern="^([xyz]{3}|[XYZ]{3})$",
@@ -110,10 +190,15 @@ class MotionTable(SceneTable):
             "[contact] releases need no column"
         ),
     )
-    angle_unit: AngleUnit
-    length_unit: LengthUnit
+    angle_unit: AngleUnit | None = Field(None, description="of the file; markers need none")
+    length_unit: LengthUnit | None = Field(
+        None, description="of the file; .trc and .c3d state their own"
+    )
     cutoff_Hz: Number | Literal["none"] = Field(
         description="low-pass cut-off of the differentiation; 'none' trusts the samples"
+    )
+    interval_s: tuple[Number, Number] | None = Field(
+        None, description="the part of the recording that is computed; default: all of it"
     )
     cycle_s: tuple[Number, Number] | None = Field(
         None,
@@ -132,6 +217,13 @@ class MotionTable(SceneTable):
             raise ValueError("'sequence' belongs to interpretation = 'pose', and is needed there")
         if self.motion == "recorded" and "slip_share" in self.model_fields_set:
             raise ValueError("'slip_share' belongs to motion = 'roll-slip'")
+        if (self.interpretation == "markers") != (self.markers is not None):
+            raise ValueError("[motion.markers] belongs to interpretation = 'markers'")
+        if self.markers is None and not (self.angle_unit and self.length_unit):
+            missing = "length_unit" if self.angle_unit else "angle_unit"
+            raise ValueError(f"missing key '{missing}'")
+        if self.interval_s and (self.cycle_s or self.interval_s[0] >= self.interval_s[1]):
+            raise ValueError("'interval_s' must rise, and excludes cycle_s")
         return self
 
 

@@ -1,12 +1,12 @@
 """A cycle recorded over its per cent, laid on an interval of time."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.inputs.tables import Table
 from tkamb.scene_tables import MotionTable
 
 
@@ -27,7 +27,7 @@ class Cycle:
     closed: bool
 
     @staticmethod
-    def of(percent: Array, knee: Array, table: MotionTable, recorded: Table) -> "Cycle":
+    def of(percent: Array, knee: Array, table: MotionTable, path: Path) -> "Cycle":
         """Return the scene's cycle.
 
         It is closed if 100 % was recorded too and no coordinate differs there from 0 % by
@@ -39,11 +39,11 @@ class Cycle:
         assert table.cycle_s is not None
         start, end = table.cycle_s
         if not start < end:
-            raise InputError("[motion] cycle_s does not rise", recorded.path)
+            raise InputError("[motion] cycle_s does not rise", path)
         if percent[0] < -1e-9 or percent[-1] > 100 + 1e-9 or percent[-1] - percent[0] < 2:
             raise InputError(
                 f"time runs from {percent[0]:g} to {percent[-1]:g}, which is not per cent",
-                recorded.path,
+                path,
                 "drop cycle_s, or give per cent of the cycle",
             )
         whole = percent[-1] - percent[0] > 100 - 1e-9
@@ -52,7 +52,7 @@ class Cycle:
         if table.cycle_offset_percent and not closed:
             raise InputError(
                 "is not a closed cycle, so it has no frame before or after its ends",
-                recorded.path,
+                path,
                 "set cycle_offset_percent to 0",
             )
         return Cycle(start, end - start, table.cycle_offset_percent, closed)

@@ -1,4 +1,4 @@
-"""Inverse kinematics: the pose of a chain of segments that brings its markers closest to those seen.
+"""Inverse kinematics: where a chain of segments brings its markers closest to those seen.
 
 Per frame, with measured markers p_m, weights w_m (zero for a marker that is missing) and the
 chain's markers x_m(q),
@@ -76,8 +76,9 @@ def fit_chain(
     state, damping = start, np.full(len(measured), 1e-6)
     places, jacobian = chain.markers(state)
     cost = np.sum((root * (places - target)) ** 2, axis=(1, 2))
-    solved, steps = np.zeros(len(measured), bool), 0
-    while steps < MOST_STEPS and not solved.all():
+    steps = 0
+    solved = np.zeros(len(measured), np.bool_)
+    while steps < MOST_STEPS and not np.all(solved):
         step = _step(root * (target - places), root[..., None] * jacobian, damping)
         step[solved] = 0.0
         trial = chain.moved(state, step)
@@ -95,7 +96,7 @@ def fit_chain(
     distance = np.where(seen, np.linalg.norm(places - target, axis=2), np.nan)
     count = np.maximum(seen.sum(axis=1), 1)
     rms = np.sqrt(np.nansum(distance**2, axis=1) / count)
-    return ChainFit(state, np.where(seen.any(axis=1), rms, np.nan), distance, solved, steps)
+    return ChainFit(state, np.where(seen.sum(axis=1) > 0, rms, np.nan), distance, solved, steps)
 
 
 def _step(residual: Array, jacobian: Array, damping: Array) -> Array:
@@ -158,7 +159,7 @@ class LegChain:
     (flexion of a hinge, or translation and rotation of a free thigh), three of each ball joint.
 
     Args:
-        segments: "shank" and "thigh" among them; one that others hang on comes before them.
+        segments: "shank" and "thigh", and what hangs on either.
         pose_insert_in_shank: (4, 4), the frame of the knee coordinates.
         free: whether the knee has six freedoms; else flexion alone.
     """

@@ -40,7 +40,7 @@ def check_roles(columns: dict[str, str], roles: tuple[str, ...], path: Path, tab
             )
 
 
-def angle_scale(table: Table, angle_unit: str) -> float:
+def angle_scale(table: Table, angle_unit: str | None) -> float:
     """Return radians per unit of angle, unless the file's own header contradicts the scene."""
     if table.in_degrees is not None and table.in_degrees != (angle_unit == "deg"):
         stated = "degrees" if table.in_degrees else "radians"
@@ -49,11 +49,16 @@ def angle_scale(table: Table, angle_unit: str) -> float:
             table.path,
             "correct angle_unit",
         )
+    assert angle_unit is not None
     return ANGLE[angle_unit]
 
 
 def poses_of_columns(
-    table: Table, columns: dict[str, str], sequence: str, angle_unit: str, length_unit: str
+    table: Table,
+    columns: dict[str, str],
+    sequence: str,
+    angle_unit: str | None,
+    length_unit: str | None,
 ) -> Array:
     """Return the poses (n, 4, 4) of columns rotation_1..3 and translation_1..3, m.
 

@@ -7,7 +7,8 @@ the clinical angles and the patella's sagittal coordinates keep theirs.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -28,6 +29,9 @@ from tkamb.inputs.samples import OddSample, check_range, check_steps, odd_sample
 from tkamb.inputs.tables import Table, read_table
 from tkamb.scene_tables import MotionTable
 from tkamb.units import DEGREE, MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.inputs.marker_motion import MarkerKinematics
 
 PATELLA_COORDINATES = ("patella_ap", "patella_si", "patella_rotation")
 LIMITS_DEG = {"axial_rotation": (-90, 90), "adduction": (-45, 45), "flexion": (-45, 180)}
@@ -65,6 +69,7 @@ class KneeMotion:
         closed_cycle: the cycle's ends agree, so it was filtered as periodic.
         unrecorded: coordinates without a column, held at zero here.
         odd: samples off their neighbours' curve.
+        markers: what it was read from, if from skin markers.
     """
 
     time: Array
@@ -81,6 +86,7 @@ class KneeMotion:
     closed_cycle: bool = False
     unrecorded: tuple[str, ...] = ()
     odd: tuple[OddSample, ...] = ()
+    markers: "MarkerKinematics | None" = None
 
 
 def load_motion(
@@ -89,6 +95,7 @@ def load_motion(
     pose_insert_mesh_in_insert: Array,
     pose_femoral_mesh_in_femur: Array,
     released: Sequence[str] = (),
+    pose_insert_in_tibia: Array | None = None,
 ) -> KneeMotion:
     """Read the recorded motion of the scene.
 
@@ -102,10 +109,14 @@ def load_motion(
             z points to the subject's right on both sides (not mirrored).
         pose_femoral_mesh_in_femur: (4, 4) m; likewise for the femur link.
         released: knee coordinates that will be solved for: they need no column.
+        pose_insert_in_tibia: (4, 4), for markers; of the (mirrored) patient.
 
     Raises:
         InputError: file, columns, times, filter or cycle cannot be used.
     """
+    if table.markers is not None:
+        assert pose_insert_in_tibia is not None
+        return _from_markers(table, side, pose_insert_in_tibia, released)
     recorded = read_table(table.file, table.format)
     _check_roles(table, recorded)
     unrecorded: tuple[str, ...] = ()
@@ -122,13 +133,37 @@ def load_motion(
         knee = _recorded_coordinates(recorded, table, KNEE_COORDINATES, unrecorded)
         if side == "left":
             knee[:, KNEE_COORDINATES.index("ml")] *= -1.0
-    _check_knee(knee, recorded)
+    _check_knee(knee, recorded.path)
     named = [c for c in PATELLA_COORDINATES if c in table.columns or c in recorded.columns]
     patella = _recorded_coordinates(recorded, table, PATELLA_COORDINATES) if named else None
     if patella is not None:
-        _check_patella(patella, recorded)
-    motion = _differentiated(time, knee, patella, table, recorded)
+        _check_patella(patella, recorded.path)
+    motion = _differentiated(time, knee, patella, table, recorded.path)
     return replace(motion, unrecorded=unrecorded)
+
+
+def _from_markers(
+    table: MotionTable, side: Literal["right", "left"], insert: Array, released: Sequence[str]
+) -> KneeMotion:
+    """Return the motion that skin markers give: the coordinates that are taken from them."""
+    from tkamb.inputs.marker_motion import load_marker_motion
+
+    assert table.markers is not None
+    taken = table.markers.coordinates
+    unrecorded = tuple(name for name in KNEE_COORDINATES if name not in taken)
+    if needed := [name for name in unrecorded if name not in released]:
+        raise InputError(
+            f"nothing gives {', '.join(needed)}",
+            "[motion.markers]",
+            "add it to coordinates, or let the knee find it: [contact] released",
+        )
+    found = load_marker_motion(table, side, insert)
+    knee = found.coordinates.copy()
+    for name in unrecorded:
+        knee[:, KNEE_COORDINATES.index(name)] = 0.0
+    _check_knee(knee, table.file)
+    motion = _differentiated(found.time, knee, None, table, table.file)
+    return replace(motion, unrecorded=unrecorded, markers=found)
 
 
 def _unrecorded(recorded: Table, table: MotionTable, released: Sequence[str]) -> tuple[str, ...]:
@@ -174,7 +209,7 @@ def _check_roles(table: MotionTable, recorded: Table) -> None:
     check_roles(table.columns, ("time", *own, *PATELLA_COORDINATES), recorded.path, "motion")
 
 
-def _check_knee(knee: Array, recorded: Table) -> None:
+def _check_knee(knee: Array, path: Path) -> None:
     """Raise where knee coordinates (n, 6) are those of no knee."""
     for i, name in enumerate(KNEE_COORDINATES):
         if name in LIMITS_DEG:
@@ -183,10 +218,10 @@ def _check_knee(knee: Array, recorded: Table) -> None:
         else:
             question = "check [motion] columns, length_unit and where the meshes have their origin"
             values, limits, unit = knee[:, i] / MILLIMETRE, FARTHEST_MM, "mm"
-        check_range(recorded.path, f"knee: {name}", values, limits, unit, question)
+        check_range(path, f"knee: {name}", values, limits, unit, question)
 
 
-def _check_patella(patella: Array, recorded: Table) -> None:
+def _check_patella(patella: Array, path: Path) -> None:
     """Raise where the patella's coordinates (n, 3) are nowhere near the femoral component."""
     turn = (-LARGEST_TURN_DEG, LARGEST_TURN_DEG)
     for name, values, limits, unit, key in (
@@ -195,44 +230,44 @@ def _check_patella(patella: Array, recorded: Table) -> None:
         ("patella_rotation", patella[:, 2] / DEGREE, turn, "deg", "angle_unit"),
     ):
         question = f"is a cell mistyped? check [motion] columns and {key}"
-        check_range(recorded.path, f"knee: {name}", values, limits, unit, question)
+        check_range(path, f"knee: {name}", values, limits, unit, question)
 
 
-def _checked_steps(time: Array, values: Array, recorded: Table) -> tuple[OddSample, ...]:
+def _checked_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, ...]:
     """Return the odd samples of the coordinates (n, 6 or 9), none of which steps too fast."""
     odd: list[OddSample] = []
     for i, name in enumerate((*KNEE_COORDINATES, *PATELLA_COORDINATES)[: values.shape[1]]):
         moves = name.rsplit("_")[-1] in ("ap", "si", "ml")
         kind, scale, unit = ("move", MILLIMETRE, "mm") if moves else ("turn", DEGREE, "deg")
-        one = (recorded.path, name, time, values[:, i])
+        one = (path, name, time, values[:, i])
         check_steps(*one, FASTEST[kind], scale, unit)
         odd += odd_samples(*one, ODD[kind], scale, unit)
     return tuple(odd)
 
 
-def _check_rate(time: Array, recorded: Table) -> None:
+def _check_rate(time: Array, path: Path) -> None:
     spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if spacing > SLOWEST_S:
         raise InputError(
             f"samples are {spacing:g} s apart, too far to be a movement",
-            recorded.path,
+            path,
             "is the time in seconds?",
         )
 
 
 def _differentiated(
-    time: Array, knee: Array, patella: Array | None, table: MotionTable, recorded: Table
+    time: Array, knee: Array, patella: Array | None, table: MotionTable, path: Path
 ) -> KneeMotion:
     """Return the filtered motion at the scene's frames."""
     values = knee if patella is None else np.concatenate([knee, patella], axis=1)
-    cycle = Cycle.of(time, knee, table, recorded) if table.cycle_s else None
+    cycle = Cycle.of(time, knee, table, path) if table.cycle_s else None
     sampled = cycle.seconds(time) if cycle else time
-    _check_rate(sampled, recorded)
-    odd = _checked_steps(sampled, values, recorded)
-    at = _frames(sampled, table.frames, cycle)
+    _check_rate(sampled, path)
+    odd = _checked_steps(sampled, values, path)
+    at = _frames(sampled, table, cycle)
     inside = cycle.wrapped(at, sampled) if cycle else at
     closed = cycle is not None and cycle.closed
-    name = str(recorded.path)
+    name = str(path)
     x, v, a = differentiate_coordinates(sampled, values, table.cutoff_Hz, inside, closed, name)
     raw, _, _ = differentiate_coordinates(sampled, knee, "none", inside, name=name)
     filtered_pose, raw_pose = knee_pose(x[:, :6]), knee_pose(raw)
@@ -255,7 +290,15 @@ def _differentiated(
     )
 
 
-def _frames(sampled: Array, frames: int | None, cycle: Cycle | None) -> Array:
+def _frames(sampled: Array, table: MotionTable, cycle: Cycle | None) -> Array:
     if cycle:
-        return cycle.frames(sampled, frames)
-    return np.linspace(sampled[0], sampled[-1], frames) if frames else sampled
+        return cycle.frames(sampled, table.frames)
+    start, end = table.interval_s or (sampled[0], sampled[-1])
+    inside = sampled[(sampled >= start - 1e-9) & (sampled <= end + 1e-9)]
+    if len(inside) < 2 or start < sampled[0] - 1e-9 or end > sampled[-1] + 1e-9:
+        raise InputError(
+            f"covers {sampled[0]:g} to {sampled[-1]:g} s, but interval_s is {start:g} to {end:g}",
+            table.file,
+            "choose [motion] interval_s inside the recording",
+        )
+    return np.linspace(start, end, table.frames) if table.frames else inside

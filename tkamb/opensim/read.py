@@ -63,6 +63,11 @@ def read_osim(path: str | Path) -> OpenSimModel:
         muscles=muscles,
         ligaments=ligaments,
         wrap_objects=wraps,
+        offset_frames={
+            name: frames.resolve(model, name, owner)
+            for owner, name in frames.offsets
+            if owner in bodies
+        },
         left_out=(*left_out, *unread),
     )
 

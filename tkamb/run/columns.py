@@ -32,6 +32,7 @@ _COUPLED = "[contact] coupling or released"
 _POINTS = "[contact] coupling = 'points'"
 _FREE = "[contact] released"
 _RECORDED = "[contact] with adduction not released"
+_MARKERS = "[motion.markers]"
 _ADJUST = "[contact] with adjust = true"
 
 LIGAMENT = "ligament_<name>_N"
@@ -153,6 +154,19 @@ COLUMNS: tuple[Column, ...] = (
         "says otherwise",
         _RECORDED,
         "integer",
+    ),
+    Column(
+        "marker_rms_segments_mm",
+        "root mean square distance of shank and thigh markers, each segment fitted rigidly",
+        _MARKERS,
+    ),
+    Column("marker_rms_chain_mm", "the same of all segments held together by joints", _MARKERS),
+    Column("flexion_segments_deg", "flexion by rigid fits, unfiltered", _MARKERS),
+    Column("flexion_chain_deg", "flexion by the chain, unfiltered", _MARKERS),
+    Column(
+        "knee_centre_distance_mm",
+        "between the knee centres that shank and thigh markers carry, each by itself",
+        _MARKERS,
     ),
 )
 

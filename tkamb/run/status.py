@@ -24,6 +24,9 @@ recorded position, the ML one above all, deserves a look."""
 ADJUSTED_TOTAL = 0.01
 """BW: a femoral adjustment that changes the total force by more decides more than the split."""
 
+MARKERS_APART = 20.0 * MILLIMETRE
+"""Skin that has moved by more than this against the other segment's: at 700 N 14 N·m."""
+
 FAILED = "failed: "
 
 
@@ -93,4 +96,14 @@ def _motion_flags(case: Case, k: int) -> list[str]:
     motion = case.motion
     far = motion.deviation_translation[k] > FILTER_TRANSLATION
     turned = motion.deviation_rotation[k] > FILTER_ROTATION
-    return ["filter moves the recorded pose beyond 0.5 mm or 0.5 deg"] if far or turned else []
+    found = ["filter moves the recorded pose beyond 0.5 mm or 0.5 deg"] if far or turned else []
+    if motion.markers is not None:
+        time = motion.time[k : k + 1]
+        if motion.markers.at(motion.markers.missing.astype(float), time)[0] > 0:
+            found.append("a marker of shank or thigh is missing")
+        apart = motion.markers.at(motion.markers.centre_distance, time)[0]
+        if apart > MARKERS_APART:
+            found.append(
+                f"knee centres of shank and thigh markers {apart / MILLIMETRE:.0f} mm apart"
+            )
+    return found

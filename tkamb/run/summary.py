@@ -16,6 +16,7 @@ from tkamb.files import sha256_of
 from tkamb.mechanics.mechanics import STRAIN_FLEXIONS
 from tkamb.run.status import FAILED
 from tkamb.scene_tables import ContactTable
+from tkamb.units import DEGREE, MILLIMETRE
 
 RESIDUALS = (
     "Residuals are the AP and ML force and the axial moment on the tibia that balance still "
@@ -172,7 +173,9 @@ def assumptions(case: Case) -> list[str]:
             f"{', '.join(scene.generic_ligaments.ligaments)}: a generic set scaled to the "
             "implant, not this patient's; look at the strains."
         )
-    if not scene.tibia:
+    if case.motion.markers:
+        said.append(_marker_reading(case))
+    elif not scene.tibia:
         said.append("No [tibia]: the shank stands upright and still.")
     if scene.ground_reaction and scene.ground_reaction.applied == "ankle":
         said.append("The ground reaction acts at the ankle centre, without moment (the source).")
@@ -183,6 +186,23 @@ def assumptions(case: Case) -> list[str]:
     if scene.patient.side == "left":
         said.append("A left knee is computed as its mirror image: z is lateral.")
     return said
+
+
+def _marker_reading(case: Case) -> str:
+    """Return which reading of the skin markers is used, and how far the other one is off."""
+    markers = case.motion.markers
+    assert markers is not None and case.scene.motion.markers is not None
+    used = {"segments": "rigid fits of shank and thigh", "chain": "a chain with joints"}
+    taken = ", ".join(case.scene.motion.markers.coordinates)
+    time = case.motion.time
+    off = markers.at(np.nan_to_num(markers.centre_distance), time).max() / MILLIMETRE
+    turned = np.abs(markers.flexion["segments"] - markers.flexion["chain"])
+    turned = markers.at(np.nan_to_num(turned), time).max() / DEGREE
+    return (
+        f"Shank and {taken} are those of skin markers, by {used[markers.method]}: the knee "
+        f"centres of shank and thigh markers are up to {off:.0f} mm apart, and the two readings' "
+        f"flexions differ by up to {turned:.1f} deg."
+    )
 
 
 def _agreement(table: ContactTable) -> str:

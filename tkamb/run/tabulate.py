@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.case import Case
-from tkamb.geometry.frames import KNEE_COORDINATES, knee_coordinates
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates
 from tkamb.mechanics.mechanics import FrameLoads
 from tkamb.run.agreement import normal_force, share_by_equilibrium, split_determined
 from tkamb.run.columns import ligament_column
@@ -16,6 +16,7 @@ from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 if TYPE_CHECKING:
     from tkamb.body.slip import CondyleSlip
     from tkamb.equilibrium.frame_contact import FrameContact
+    from tkamb.inputs.marker_motion import MarkerKinematics
 
 NAN = float("nan")
 
@@ -79,6 +80,17 @@ def _motion_row(case: Case, k: int) -> dict[str, Any]:
         row["cycle_percent"] = motion.cycle_percent[k]
     for name in ("flexion", "adduction", "axial_rotation"):
         row[f"{name}_deg"] = coordinates[name] / DEGREE
+    if motion.markers is not None:
+        row |= _marker_row(motion.markers, motion.time[k : k + 1])
+    return row
+
+
+def _marker_row(markers: "MarkerKinematics", time: Array) -> dict[str, Any]:
+    row: dict[str, Any] = {}
+    for method in ("segments", "chain"):
+        row[f"marker_rms_{method}_mm"] = markers.at(markers.rms[method], time)[0] / MILLIMETRE
+        row[f"flexion_{method}_deg"] = markers.at(markers.flexion[method], time)[0] / DEGREE
+    row["knee_centre_distance_mm"] = markers.at(markers.centre_distance, time)[0] / MILLIMETRE
     return row
 
 
