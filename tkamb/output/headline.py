@@ -164,6 +164,10 @@ def _extensor(results: Results, axis: HorizontalAxis) -> Card | None:
     if "first_wrapping_flexion_deg" in results.summary:
         first = results.summary["first_wrapping_flexion_deg"]
         detail += "; wraps nowhere" if first is None else f"; wraps the femur from {first:.0f}°"
+    slope = results.columns.get("quadriceps_per_dome_mm_N")
+    if slope is not None and np.isfinite(slope[found.frame]):
+        percent = 100 * abs(slope[found.frame]) / found.value
+        detail += f"; ± {percent:.1f} % per mm of the button's height on the patella"
     return Card("Peak quadriceps tension", f"{value:.2f} BW", detail)
 
 
