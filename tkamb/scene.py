@@ -9,7 +9,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from tkamb.errors import InputError
 from tkamb.scene_tables import (
@@ -32,6 +32,13 @@ from tkamb.scene_tables import (
 class Scene(SceneTable):
     """Everything a run needs to know; see the tables."""
 
+    base: str | None = Field(
+        None,
+        description=(
+            "name of another scene file in the same folder: its keys hold where this file does "
+            "not give them, table by table; lists are replaced whole"
+        ),
+    )
     patient: PatientTable
     motion: MotionTable
     tibia: TibiaTable | None = None
@@ -87,14 +94,7 @@ def load_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> Sce
         InputError: unreadable file, unknown key, missing unit, value out of range.
     """
     path = Path(path)
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError("no such scene file", path, "check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read ({error})", path) from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"is not TOML ({error})", path) from None
+    content = _content(path)
     for key, value in (overrides or {}).items():
         _override(content, key, value)
     try:
@@ -102,6 +102,40 @@ def load_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> Sce
     except ValidationError as error:
         raise InputError(_first_complaint(error), path, _count(error)) from None
     return _resolved(scene, path.parent)
+
+
+def _content(path: Path) -> dict[str, Any]:
+    """Return what a scene file says, on top of what its base says."""
+    content = _parsed(path)
+    if "base" not in content:
+        return content
+    name = content["base"]
+    if not isinstance(name, str) or name != Path(name).name:
+        raise InputError("'base' is no file name", path, "name a scene file in the same folder")
+    base = _parsed(path.parent / name)
+    if "base" in base:
+        raise InputError(f"its base {name} has a base itself", path, "name that one")
+    return _merged(base, content)
+
+
+def _merged(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Return the base's keys with one's own in their place; tables are merged."""
+    merged = base | own
+    for key, value in own.items():
+        if isinstance(value, dict) and isinstance(base.get(key), dict):
+            merged[key] = _merged(base[key], value)
+    return merged
+
+
+def _parsed(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError("no such scene file", path, "check the path") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read ({error})", path) from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"is not TOML ({error})", path) from None
 
 
 def scene_schema() -> dict[str, Any]:

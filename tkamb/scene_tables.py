@@ -81,6 +81,13 @@ class MotionTable(SceneTable):
             "[contact] releases need no column"
         ),
     )
+    signs_turned: tuple[str, ...] = Field(
+        (),
+        description=(
+            "roles whose columns are read with the other sign: states another reading of a file "
+            "whose signs are in doubt"
+        ),
+    )
     angle_unit: AngleUnit
     length_unit: LengthUnit
     cutoff_Hz: float | Literal["none"] = Field(

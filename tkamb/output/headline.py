@@ -115,7 +115,7 @@ def _adduction(results: Results, unknown: int) -> list[str]:
     if unknown == 0:
         return [words]
     where = "in every frame" if unknown == len(results) else f"in {unknown} frames"
-    return [f"by deformation not determined {where}: {words}"]
+    return [f"the split by deformation is not determined {where}: {words}"]
 
 
 def _peak_pressure(results: Results, axis: HorizontalAxis) -> Card | None:
