@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tkamb.contact.known_errors import STORED, known_error, known_errors
 from tkamb.errors import InputError
+from tkamb.known_errors import STORED, known_error, known_errors
 from tkamb.studies import tradeoff
 from tkamb.studies.advice import comparison, recommendations
 from tkamb.studies.body_trade import read_body_rows

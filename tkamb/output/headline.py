@@ -6,8 +6,8 @@ from html import escape
 
 import numpy as np
 
-from tkamb.contact.known_errors import is_large, known_error_words
 from tkamb.geometry.frames import Array
+from tkamb.known_errors import is_large, known_error_words
 from tkamb.output import metrics
 from tkamb.output.axis import HorizontalAxis
 from tkamb.results import Results
