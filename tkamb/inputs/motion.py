@@ -119,6 +119,7 @@ def load_motion(
         return _from_markers(table, side, pose_insert_in_tibia, released)
     recorded = read_table(table.file, table.format)
     _check_roles(table, recorded)
+    recorded = _with_signs_turned(recorded, table)
     unrecorded: tuple[str, ...] = ()
     time = recorded.time(table.columns.get("time", "time"))
     if table.interpretation == "pose":
@@ -207,6 +208,20 @@ def _check_roles(table: MotionTable, recorded: Table) -> None:
     else:
         own = KNEE_COORDINATES
     check_roles(table.columns, ("time", *own, *PATELLA_COORDINATES), recorded.path, "motion")
+    for role in table.signs_turned:
+        if role not in own:
+            raise InputError(
+                f"unknown role '{role}' in [motion] signs_turned",
+                recorded.path,
+                f"one of {', '.join(own)}",
+            )
+
+
+def _with_signs_turned(recorded: Table, table: MotionTable) -> Table:
+    """Return the recording with the columns of the roles in `signs_turned` negated."""
+    names = {table.columns.get(role, role) for role in table.signs_turned}
+    turned = {name: -recorded.column(name) for name in names}
+    return replace(recorded, columns=recorded.columns | turned)
 
 
 def _check_knee(knee: Array, path: Path) -> None:

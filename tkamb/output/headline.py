@@ -6,8 +6,8 @@ from html import escape
 
 import numpy as np
 
-from tkamb.contact.known_errors import is_large, known_error_words
 from tkamb.geometry.frames import Array
+from tkamb.known_errors import is_large, known_error_words
 from tkamb.output import metrics
 from tkamb.output.axis import HorizontalAxis
 from tkamb.results import Results
@@ -123,7 +123,7 @@ def _adduction(results: Results, unknown: int) -> list[str]:
     if unknown == 0:
         return [words]
     where = "in every frame" if unknown == len(results) else f"in {unknown} frames"
-    return [f"by deformation not determined {where}: {words}"]
+    return [f"the split by deformation is not determined {where}: {words}"]
 
 
 def _peak_pressure(results: Results, axis: HorizontalAxis) -> Card | None:

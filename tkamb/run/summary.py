@@ -13,6 +13,7 @@ import numpy as np
 from tkamb.case import Case
 from tkamb.code_identity import code_identity
 from tkamb.files import sha256_of
+from tkamb.known_errors import as_json, known_error
 from tkamb.mechanics.mechanics import STRAIN_FLEXIONS
 from tkamb.run.status import FAILED
 from tkamb.scene_tables import ContactTable
@@ -77,8 +78,6 @@ def summary_of(
     if scene.patella:
         summary["first_wrapping_flexion_deg"] = _first_wrapping(columns)
     if scene.contact:
-        from tkamb.contact.known_errors import as_json, known_error
-
         table = scene.contact
         error = known_error(table.model, table.resolution_mm, table.material, table.options)
         summary["contact"] = table.model_dump(mode="json")
