@@ -21,7 +21,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import check_roles, laboratory_rotation
-from tkamb.inputs.samples import OddSample, check_range, odd_samples
+from tkamb.inputs.samples import OddSample, check_range, check_spacing, odd_samples
 from tkamb.inputs.tables import Table, read_table
 from tkamb.scene_tables import GroundReactionTable
 from tkamb.units import MILLIMETRE
@@ -76,6 +76,7 @@ def load_ground_reaction(
     """
     recorded = read_table(table.file, table.format)
     stamps = recorded.time(table.columns.get("time", "time"))
+    check_spacing(recorded.path, stamps)
     force, point, moment = _recorded(table, recorded)
     _check_upward(force, table, recorded)
     loaded = force[:, 1] >= table.unloaded_N

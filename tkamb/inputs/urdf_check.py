@@ -170,6 +170,8 @@ def check_chain(
         _check_order(robot, joints, list(wanted), (start, end), path)
     known = [_ANKLE_JOINT, *KNEE_JOINTS, *PATELLA_JOINTS]
     for name, joint in joints.items():
+        if joint.get("type") in ("revolute", "prismatic"):
+            _check_limit(joint, path)
         if name not in known and joint.get("type") != "fixed":
             raise InputError(
                 f"joint '{name}' is {joint.get('type')}",
@@ -211,12 +213,19 @@ def _check_axes(
                 path,
                 f"{mirrored}it must be {kind} about {' '.join(map(str, axis))}",
             )
-        limit = joint.find("limit")
-        if limit is None or not {"lower", "upper", "effort", "velocity"} <= set(limit.keys()):
-            mend = "give lower, upper, effort and velocity"
-            raise InputError(f"joint '{name}' has no complete <limit>", path, mend)
         if joint.find("mimic") is not None:
             raise InputError(f"joint '{name}' mimics another", path, "take <mimic> out")
+
+
+def _check_limit(joint: ElementTree.Element, path: Path) -> None:
+    """Raise unless a joint states all its limits, in order; they bound nothing here."""
+    limit, name = joint.find("limit"), joint.get("name")
+    if limit is None or not {"lower", "upper", "effort", "velocity"} <= set(limit.keys()):
+        mend = "give lower, upper, effort and velocity"
+        raise InputError(f"joint '{name}' has no complete <limit>", path, mend)
+    low, high = (float(numbers_of(limit, key)[0]) for key in ("lower", "upper"))
+    if low >= high:
+        raise InputError(f"joint '{name}' has limits {low:g} to {high:g}", path, "exchange them")
 
 
 def _check_order(
