@@ -48,7 +48,11 @@ def urdf_edit(bench, rng):
 
 
 def _joint(robot, rng, prefix=("knee_", "patella_")):
-    return pick(rng, [j for j in robot.findall("joint") if j.get("name").startswith(prefix)])
+    return pick(rng, [j for j in robot.findall("joint") if _moves(j, prefix)])
+
+
+def _moves(joint, prefix):
+    return joint.get("name").startswith(prefix) and joint.get("type") != "fixed"
 
 
 def _kind(robot, rng):
@@ -172,14 +176,13 @@ def _inner_mass(robot, rng):
 def _order(robot, rng):
     """Exchange two joints' places."""
     prefix = pick(rng, ("knee_", "patella_"))
-    joints = [j for j in robot.findall("joint") if j.get("name").startswith(prefix)]
+    joints = [j for j in robot.findall("joint") if _moves(j, prefix)]
     one, other = (joints[k] for k in rng.choice(len(joints), 2, replace=False))
     one_name, other_name = one.get("name"), other.get("name")
     one.set("name", other_name)
     other.set("name", one_name)
-    for part in ("axis",):
-        a, b = one.find(part), other.find(part)
-        a.attrib, b.attrib = dict(b.attrib), dict(a.attrib)
+    a, b = one.find("axis"), other.find("axis")
+    a.attrib, b.attrib = dict(b.attrib), dict(a.attrib)
     one_kind, other_kind = one.get("type"), other.get("type")
     one.set("type", other_kind)
     other.set("type", one_kind)
@@ -223,8 +226,8 @@ def _ends(robot, rng):
 def _removed(robot, rng):
     parent = pick(rng, [e for e in robot.iter() if len(e)])
     child = pick(rng, list(parent))
-    if child.tag == "inertial" and parent.get("name") == "patella":
-        return None  # has a documented default
+    if child.tag == "inertial":
+        return None  # absent, it has a documented default
     parent.remove(child)
     return f"without {child.tag} {child.attrib} of {parent.get('name')}"
 

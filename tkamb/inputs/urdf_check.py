@@ -133,6 +133,12 @@ def check_tree(robot: ElementTree.Element, path: Path) -> None:
     if len(roots) != 1:
         found = f"{len(roots)} roots ({', '.join(roots)})" if roots else "a loop and no root"
         raise InputError(f"has {found}", path, "a leg is one tree: docs/patient.md")
+    for name in links:
+        place, steps = name, 0
+        while place in parents and steps <= len(links):
+            place, steps = parents[place], steps + 1
+        if place != roots[0]:
+            raise InputError(f"link '{name}' hangs in a loop", path, "a leg is one tree")
 
 
 def ends_of(joint: ElementTree.Element) -> tuple[str, str]:
