@@ -203,12 +203,12 @@ def assert_none_passes(bench, rng, counts):
 
 
 def test_no_random_mistake_passes(knee):
-    assert_none_passes(knee, np.random.default_rng(0), (30, 30))
+    assert_none_passes(knee, np.random.default_rng(0), (20, 20))
 
 
 @needs_dm
 def test_no_random_mistake_passes_on_dm(dm):
-    assert_none_passes(dm, np.random.default_rng(1), (10, 10))
+    assert_none_passes(dm, np.random.default_rng(1), (6, 6))
 
 
 @pytest.mark.slow
