@@ -251,7 +251,7 @@ def test_pose_file(tmp_path):
         path.write_text(text)
         with pytest.raises(InputError, match="six numbers"):
             read_pose(path)
-    with pytest.raises(InputError, match="six numbers"):
+    with pytest.raises(InputError, match="no such pose file"):
         read_pose(tmp_path / "none.txt")
 
 

@@ -79,6 +79,7 @@ def load_case(scene: Scene) -> Case:
         parts.insert_mesh_in_insert,
         parts.femoral_mesh_in_femur,
         (*released, "si") if released else (),
+        chain.insert_in_tibia,
     )
     if motion.unrecorded:
         from tkamb.mechanics.seat import seated_motion
@@ -100,6 +101,9 @@ def load_case(scene: Scene) -> Case:
         from tkamb.inputs.tibia import load_tibia
 
         tibia = load_tibia(scene.tibia, motion.time, scene.patient.side, scene.motion.cutoff_Hz)
+    elif motion.markers:
+        cutoff = scene.motion.cutoff_Hz
+        tibia = motion.markers.shank_motion(cutoff, motion.time, str(scene.motion.file))
     if scene.ground_reaction:
         from tkamb.inputs.ground_reaction import check_under_foot, load_ground_reaction
 

@@ -1,5 +1,11 @@
 """The one error family: what went wrong, where, and how to mend it, in one line."""
 
+import difflib
+from collections.abc import Iterable
+
+MOST_NAMES = 8
+"""How many names a message lists."""
+
 
 class TkambError(Exception):
     """Base of every error that tkamb raises on purpose.
@@ -26,3 +32,14 @@ class InputError(TkambError):
 
 class ComputationError(TkambError):
     """Sound input, but nothing could be computed from it: exit status 1."""
+
+
+def names_near(name: str, names: Iterable[str]) -> str:
+    """Return "did you mean ..." with the names that resemble one, or else what there is."""
+    there = list(names)
+    lower = {known.lower(): known for known in there}
+    close = difflib.get_close_matches(name.lower(), lower, n=4, cutoff=0.5)
+    if close:
+        return f"did you mean {', '.join(lower[known] for known in close)}?"
+    more = ", …" if len(there) > MOST_NAMES else ""
+    return f"there are: {', '.join(there[:MOST_NAMES]) or 'none'}{more}"

@@ -134,7 +134,8 @@ def _plots_section(results: Results, axis: HorizontalAxis) -> str:
 
 def _plot(panel: Panel, results: Results, axis: HorizontalAxis) -> str:
     picture = svg_text(draw_panel(panel, results, axis), panel.name)
-    note = f"<figcaption>{escape(panel.note)}</figcaption>" if panel.note else ""
+    kind = " class='warning'" if panel.warning else ""
+    note = f"<figcaption{kind}>{escape(panel.note)}</figcaption>" if panel.note else ""
     return (
         f"<figure class='plot' id='figure-{panel.name}'><h3>{escape(panel.title)}"
         f" <small>({escape(panel.unit)})</small></h3>{picture}"

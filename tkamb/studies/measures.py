@@ -16,6 +16,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from tkamb.contact.known_errors import setting_label
 from tkamb.contact.model import ContactModel, ContactResult, ContactStatus
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.errors import TkambError
@@ -53,8 +54,7 @@ class Job:
     @property
     def label(self) -> str:
         """The model with its options: "lattice[tolerance=0.01]"."""
-        given = ",".join(f"{key}={value}" for key, value in self.options.items())
-        return f"{self.contact}[{given}]" if given else self.contact
+        return setting_label(self.contact, self.options)
 
 
 @dataclass(frozen=True)

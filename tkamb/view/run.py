@@ -41,7 +41,8 @@ class Run:
         contact = self.case.scene.contact
         if contact is None or (contact.coupling == "none" and not contact.released):
             return [self.mechanics.frame(k) for k in progress(self.frames)]
-        from tkamb.equilibrium.contact_side import ContactSide, FrameContact
+        from tkamb.equilibrium.contact_side import ContactSide
+        from tkamb.equilibrium.frame_contact import FrameContact
 
         side, found = ContactSide(self.case, self.mechanics), []
         touched: list[FrameContact] = []

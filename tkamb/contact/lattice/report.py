@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.coarse import coarse_flags
+from tkamb.contact.lattice.coarse import beside, coarse_flags
 from tkamb.contact.lattice.covered import covered_areas
 from tkamb.contact.lattice.edges import edge_flags
+from tkamb.contact.lattice.problem import STEEPEST, Indices, footing
 from tkamb.contact.lattice.solver import Solution
 from tkamb.contact.model import ContactResult, ContactStatus
 from tkamb.contact.pressing import approach_at, failed_result
@@ -89,9 +90,9 @@ def _carried(
     state: "LatticeState", pose: Array, gaps: Array, solution: Solution, rule: PressureRule
 ) -> ContactResult:
     """Return the map and its sums; gaps (c,) are those of the undeformed insert at the pose."""
-    surface, gap = state.map, gaps.copy()
-    gap[solution.candidates] = solution.forces.gap
+    surface = state.map
     force, pressure, stood_on = _pressures(state, gaps, solution, rule)
+    gap = _gaps(state, pose, gaps, force, solution)
     area = stood_on
     if rule == "tributary":
         area = covered_areas(
@@ -135,6 +136,49 @@ def _pressures(
     if rule == "source":
         size = np.maximum(-np.einsum("ij,ij->i", force, state.map.normals), 0.0)
     return force, size / area, area
+
+
+def _gaps(
+    state: "LatticeState", pose: Array, gaps: Array, force: Array, solution: Solution
+) -> Array:
+    """Return the gaps (c,), m: of the deformed insert in and beside the contact and where the
+    undeformed bodies overlap, of the undeformed one elsewhere.
+
+    Which nodes are candidates depends on how the solution began, so that a node beside the
+    contact may be none; the edge of contact lies by its gap all the same.
+
+    Args:
+        state: prepared contact.
+        pose: (4, 4) final.
+        gaps: (c,) vertical gaps of the undeformed insert there, m.
+        force: (c, 3) N.
+        solution: what the solver found.
+    """
+    loaded: Mask = np.asarray(force.any(axis=1), bool)
+    close = beside(state.map.triangles, loaded) | loaded | (gaps < 0)
+    own = solution.candidates[close[solution.candidates]]
+    gap = gaps.copy()
+    gap[own] = solution.forces.gap[close[solution.candidates]]
+    close[own] = False
+    rest = np.flatnonzero(close)
+    if rest.size:
+        gap[rest] = _gaps_of_others(state, pose, rest, force, solution)
+    return gap
+
+
+def _gaps_of_others(
+    state: "LatticeState", pose: Array, nodes: Indices, force: Array, solution: Solution
+) -> Array:
+    """Return the gaps (m,), m, of deformed nodes that are no candidates; inf: nothing above."""
+    problem = state.problem
+    if solution.field is not None:
+        moved = solution.field[problem.contact_nodes[nodes]]
+    else:
+        pushed = np.flatnonzero(force.any(axis=1))
+        moved = state.pool.moved(nodes, pushed, force[pushed])
+    positions = problem.surface_points[nodes] + moved
+    foot = footing(problem, positions, pose, None)
+    return np.where(foot.lean < STEEPEST, foot.gap(positions), np.inf)
 
 
 def _areas(state: "LatticeState", gaps: Array, loaded: Mask, rule: PressureRule) -> Array:

@@ -1,0 +1,7 @@
+"""OpenSim models without OpenSim: read, posed, their muscles' paths measured.
+
+- `tkamb.opensim.read`: `read_osim(path)` returns an `OpenSimModel`.
+- `tkamb.opensim.model`: what that holds.
+- `tkamb.opensim.kinematics`: `frame_poses(model, q)`; `Kinematics(model)` for many poses at
+  once, `.motion(q).points(bodies, locations)` for points with their Jacobians.
+"""
