@@ -217,7 +217,7 @@ def _more_closed_forms(solids: tuple[str, ...]) -> Iterator[ClosedForm]:
         yield _wide("layer", model, nu=nu, linear=True)
     for model, load in product(("foundation", "foundation-linear"), (1000.0, 10000.0)):
         yield _wide("bed", model, load)
-    for load, nu in product((30.0, 1000.0), (0.0, 0.4999)):
+    for load, nu in product((100.0, 1000.0), (0.0, 0.4999)):
         yield ClosedForm("hertz", "hertz", load, 30.0, nu=nu, radius_mm=22.0, resolution_mm=1.0)
     yield ClosedForm("kept", "fe", resolution_mm=KEPT_GRID_MM)
 
