@@ -87,7 +87,9 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
     hip = _one(model, [j for j in _moving(model) if j.outboard in femur], "above the femur", femur)
     below = [j for j in _moving(model) if j.inboard in tibia]
     ankles = [j for j in below if "ankle" in j.name.lower()]
-    ankle = _one(model, ankles or [j for j in below if not _is_patella(j)], "below the tibia", tibia)
+    ankle = _one(
+        model, ankles or [j for j in below if not _is_patella(j)], "below the tibia", tibia
+    )
     patellas = [
         body
         for body in model.bodies
@@ -161,9 +163,7 @@ def _rigid_groups(model: OpenSimModel) -> dict[str, set[str]]:
 
 def _ordered(model: OpenSimModel, group: set[str], stem: str) -> tuple[str, ...]:
     """Return the group's bodies, the heaviest with the stem in its name first."""
-    return tuple(
-        sorted(group, key=lambda b: (stem not in b.lower(), -model.bodies[b].mass_kg, b))
-    )
+    return tuple(sorted(group, key=lambda b: (stem not in b.lower(), -model.bodies[b].mass_kg, b)))
 
 
 def _carried(model: OpenSimModel, body: str) -> list[str]:

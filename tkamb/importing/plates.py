@@ -64,15 +64,15 @@ def plate_loads(recording: Recording, axes: str, feet: dict[str, list[str]]) -> 
     for plate in recording.plates:
         force, moment = plate.force @ rotation.T, plate.moment @ rotation.T
         loaded = force[:, 1] > LOADED_N
-        point = rotation @ plate.centre + np.stack(
-            [moment[:, 2], 0 * moment[:, 2], -moment[:, 0]], axis=1
-        ) / np.where(loaded, force[:, 1], np.nan)[:, None]
+        point = (
+            rotation @ plate.centre
+            + np.stack([moment[:, 2], 0 * moment[:, 2], -moment[:, 0]], axis=1)
+            / np.where(loaded, force[:, 1], np.nan)[:, None]
+        )
         for first, last in _runs(loaded):
             if time[last] - time[first] >= SHORTEST_S:
                 part = slice(first, last + 1)
-                loads.append(
-                    _load(plate.number, time[part], point[part], middles, part, recording)
-                )
+                loads.append(_load(plate.number, time[part], point[part], middles, part, recording))
     return sorted(loads, key=lambda load: load.start)
 
 

@@ -88,9 +88,7 @@ def _quadriceps(links: Links, said: list[str]) -> tuple[End, End] | None:
     return None
 
 
-def _patellar_ligament(
-    links: Links, said: list[str]
-) -> tuple[tuple[End, End] | None, float]:
+def _patellar_ligament(links: Links, said: list[str]) -> tuple[tuple[End, End] | None, float]:
     leg = links.leg
     if leg.patella is None:
         return None, np.nan

@@ -131,5 +131,7 @@ def _joint(
 
 def _origin(place: Array) -> str:
     angles = Rotation.from_matrix(place[:3, :3]).as_euler("xyz")
-    xyz, rpy = (" ".join(f"{round(v, 12) + 0.0:.9g}" for v in part) for part in (place[:3, 3], angles))
+    xyz, rpy = (
+        " ".join(f"{round(v, 12) + 0.0:.9g}" for v in part) for part in (place[:3, 3], angles)
+    )
     return f'<origin xyz="{xyz}" rpy="{rpy}"/>'
