@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array, inverse, pose, transform
+from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.opensim.kinematics import Kinematics
 from tkamb.opensim.model import Coordinate, Joint, OpenSimModel
 
