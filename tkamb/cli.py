@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from tkamb.command_options import add_no_cache, without_cache
 from tkamb.errors import InputError
 from tkamb.guard import guarded
+from tkamb.importing.command import add_import
 from tkamb.press.command import add_press
 from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
@@ -65,6 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_contact(commands)
     _add_mesh(commands)
     _add_scene(commands)
+    add_import(commands)
     add_view(commands)
     add_tradeoff(commands)
     add_stability(commands)

@@ -1,27 +1,38 @@
 """A patient brought in: model, recording and meshes to a URDF and a scene that runs."""
 
 import re
+import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from tkamb.case import Case, load_case
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import mirrored_pose
 from tkamb.importing.anatomy import OTHER, Leg, find_leg
 from tkamb.importing.links import Links, find_links
-from tkamb.importing.markers import Facing, ModelSegment, facing, feet, model_segments
+from tkamb.importing.markers import (
+    Facing,
+    ModelSegment,
+    facing,
+    feet,
+    model_segments,
+    segments_of,
+)
 from tkamb.importing.plates import Load, known_interval, own_plates, plate_loads, unmeasured
 from tkamb.importing.scene_text import GroundFile, MarkerFile, Meshes, SceneText
 from tkamb.importing.soft_tissue import soft_tissue
 from tkamb.importing.urdf import patient_urdf
 from tkamb.inputs.c3d import Recording, read_c3d
+from tkamb.inputs.labels import plain_label
+from tkamb.inputs.marker_motion import calibrated_markers
 from tkamb.inputs.meshes import load_surface
 from tkamb.inputs.tables import Table, read_table
 from tkamb.opensim.read import read_osim
 from tkamb.output.atomic import claim_directory, write_text
-from tkamb.scene import load_scene
+from tkamb.scene import Scene, load_scene
 from tkamb.units import DEGREE, MILLIMETRE
 
 SAME_MASS = 0.01
@@ -142,6 +153,9 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         tissue,
         _notes(scale, ground is not None, bool(tissue.bundles), meshes is not None),
     )
+    if request.static is not None:
+        scene, line = _with_static_markers(scene, request.static, segments)
+        report.append(line)
     comment = f"Made by tkamb import from {request.model.name}, {request.side} leg (m, kg)"
     return ImportedPatient(patient_urdf(links, scale, comment), scene, tuple(report))
 
@@ -185,8 +199,8 @@ def marker_lines(case: Case) -> tuple[str, ...]:
         flexion = found.at(found.flexion[method], case.motion.time) / DEGREE  # type: ignore[index]
         used = ", used" if found.method == method else ""
         lines.append(
-            f"markers, {words}{used}: rms {np.nanmedian(rms):.1f} mm (at most "
-            f"{np.nanmax(rms):.1f}), flexion {np.nanmin(flexion):.1f} to {np.nanmax(flexion):.1f} deg"
+            f"markers, {words}{used}: rms {np.nanmedian(rms):.1f} mm (at most {np.nanmax(rms):.1f})"
+            f", flexion {np.nanmin(flexion):.1f} to {np.nanmax(flexion):.1f} deg"
         )
     apart = found.at(found.centre_distance, case.motion.time) / MILLIMETRE
     turned = found.at(found.flexion["segments"] - found.flexion["chain"], case.motion.time) / DEGREE
@@ -373,10 +387,29 @@ def _notes(scale: float, ground: bool, own: bool, implant: bool) -> tuple[str, .
     return tuple(notes)
 
 
-def calibrated(patient: ImportedPatient, points: dict[str, dict[str, Array]]) -> ImportedPatient:
-    """Return the patient with the markers of its segments at other places."""
-    segments = tuple(
-        replace(s, points=s.points | points.get(s.name, {})) for s in patient.scene.markers.segments
+def _with_static_markers(
+    scene: SceneText, static: Path, segments: list[ModelSegment]
+) -> tuple[SceneText, str]:
+    """Return the scene with its markers where they sit in a standing trial, and a line on it."""
+    known = Scene.model_validate(tomllib.loads(scene.text())).motion.markers
+    assert known is not None
+    own = facing(segments_of(static, segments), read_table(static)).axes
+    known = known.model_copy(update={"laboratory_axes": own})
+    side: Literal["right", "left"] = "left" if scene.side == "left" else "right"
+    insert = scene.links.insert_in_tibia
+    if side == "left":
+        insert = mirrored_pose(insert)
+    places = calibrated_markers(known, static, side, insert)
+    moved, farthest = [], 0.0
+    for segment in segments:
+        there = {plain_label(k): v for k, v in places[segment.name].items()}
+        points = {k: there.get(plain_label(k), v) for k, v in segment.points.items()}
+        shifts = [np.linalg.norm(points[k] - v) for k, v in segment.points.items()]
+        farthest = max(farthest, float(np.max(shifts)))
+        moved.append(replace(segment, points=points))
+    markers = replace(scene.markers, segments=tuple(moved))
+    line = (
+        f"markers' places are those of the standing trial {static.name}, at most "
+        f"{farthest * 1e3:.1f} mm from the model's"
     )
-    markers = replace(patient.scene.markers, segments=segments)
-    return replace(patient, scene=replace(patient.scene, markers=markers))
+    return replace(scene, markers=markers), line
