@@ -11,10 +11,10 @@ import numpy as np
 
 from tkamb.geometry.frames import Array, inverse
 from tkamb.opensim.model import WrapObject
-from tkamb.opensim.wrapping import touch
+from tkamb.opensim.wrapping import Index, Mask, touch
 
 SWEEPS = 200
-TAUT = 1e-12
+TAUT = 1e-10
 """m: what the last sweep may still move a touching point."""
 
 
@@ -27,16 +27,23 @@ class WrappedStrings:
         entry: (f, w, 3) m, where it meets object w.
         exit: (f, w, 3) m, where it leaves object w.
         arc_m: (f, w) its length on object w; NaN where no taut string was found.
+        push: (f, w, 2, 3) what object w, where it yields, does to the string's two ends.
     """
 
-    order: Array
+    order: Index
     entry: Array
     exit: Array
     arc_m: Array
+    push: Array
 
 
 def strings_over(
-    wraps: Sequence[WrapObject], poses: Array, start: Array, end: Array, allowed: Array
+    wraps: Sequence[WrapObject],
+    poses: Array,
+    start: Array,
+    end: Array,
+    allowed: Mask,
+    moves: Mask,
 ) -> WrappedStrings:
     """Return the taut strings from start to end (f, 3) over the objects that lie in the way.
 
@@ -46,11 +53,12 @@ def strings_over(
         start: (f, 3) m.
         end: (f, 3) m.
         allowed: (f, w) whether a string may touch an object.
+        moves: (f, w, 2) whether the start and the end belong to another body than object w.
     """
     frames, count = allowed.shape
     order = np.full((frames, count), -1)
     entry, leave = np.zeros((2, frames, count, 3))
-    arc = np.zeros((frames, count))
+    arc, push = np.zeros((frames, count)), np.zeros((frames, count, 2, 3))
     back = inverse(poses)
     live = np.arange(frames)
     for _ in range(SWEEPS):
@@ -62,15 +70,23 @@ def strings_over(
                 free = free[(order[free] >= 0).sum(axis=1) >= gap]
                 if not len(free):
                     break
+                follower = order[free, gap]
+                last = follower < 0
                 before = start[free] if gap == 0 else leave[free, order[free, gap - 1]]
-                after = np.where(
-                    (order[free, gap] < 0)[:, None], end[free], entry[free, order[free, gap]]
+                after = np.where(last[:, None], end[free], entry[free, follower])
+                is_end = np.stack([np.full(len(free), gap == 0), last], axis=1)
+                found = touch(
+                    wrap,
+                    _moved(back[free, w], before),
+                    _moved(back[free, w], after),
+                    moves[free, w] & is_end,
                 )
-                found = touch(wrap, _moved(back[free, w], before), _moved(back[free, w], after))
                 hit = free[found.touches]
                 entry[hit, w] = _moved(poses[hit, w], found.entry[found.touches])
                 leave[hit, w] = _moved(poses[hit, w], found.exit[found.touches])
                 arc[hit, w] = found.arc_m[found.touches]
+                pushed = found.push[found.touches].swapaxes(-1, -2)
+                push[hit, w] = (poses[hit, w, :3, :3] @ pushed).swapaxes(-1, -2)
                 order[hit, gap:] = np.column_stack([np.full(len(hit), w), order[hit, gap:-1]])
                 free = free[~found.touches]
         shift = np.abs(entry[live] - was[1]) + np.abs(leave[live] - was[2])
@@ -79,7 +95,7 @@ def strings_over(
         if not len(live):
             break
     arc[live] = np.nan
-    return WrappedStrings(order, entry, leave, arc)
+    return WrappedStrings(order, entry, leave, arc, push)
 
 
 def _moved(poses: Array, points: Array) -> Array:
@@ -87,7 +103,7 @@ def _moved(poses: Array, points: Array) -> Array:
     return np.einsum("fij,fj->fi", poses[:, :3, :3], points) + poses[:, :3, 3]
 
 
-def _remove(order: Array, rows: Array, w: int) -> None:
+def _remove(order: Index, rows: Index, w: int) -> None:
     """Take object w out of the orders of some rows, and close the gaps."""
     kept = np.where(order[rows] == w, -1, order[rows])
     closed = np.argsort(kept < 0, axis=1, kind="stable")
