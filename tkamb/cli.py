@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from tkamb.command_options import add_no_cache, without_cache
-from tkamb.errors import InputError
 from tkamb.guard import guarded
 from tkamb.importing.command import add_import
 from tkamb.press.command import add_press
@@ -240,10 +239,9 @@ def _verify(options: argparse.Namespace) -> int:
 def _report(options: argparse.Namespace) -> int:
     from tkamb.output.claim import claimed_directory
     from tkamb.output.report import write_report
-    from tkamb.results import REPORT_NAME, SUMMARY_NAME, read_results
+    from tkamb.results import REPORT_NAME, read_results, read_summary
 
-    if not (options.folder / SUMMARY_NAME).is_file():
-        raise InputError("holds no results", options.folder, "give a folder that `tkamb run` wrote")
+    read_summary(options.folder)  # before a folder is made or marked
     with claimed_directory(options.folder) as folder:
         write_report(read_results(folder), folder / REPORT_NAME)
     print(f"report: {options.folder / REPORT_NAME}")

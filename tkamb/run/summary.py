@@ -4,6 +4,7 @@ import hashlib
 import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -51,8 +52,7 @@ def summary_of(
         "scene_sha256": scene_hash(case),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": " ".join(["tkamb", *sys.argv[1:]]),
-        "versions": {"python": sys.version.split()[0], "tkamb": version("tkamb")}
-        | {name: version(name) for name in LIBRARIES},
+        "versions": _versions(),
         "seconds": seconds,
         "side": scene.patient.side,
         "frame": "insert frame: x anterior, y superior, z "
@@ -90,6 +90,12 @@ def summary_of(
         start = time[0] - percent[0] * slope
         summary["cycle_percent_s"] = [start, start + 100.0 * slope]
     return summary
+
+
+@lru_cache(maxsize=1)
+def _versions() -> dict[str, str]:
+    own = {"python": sys.version.split()[0], "tkamb": version("tkamb")}
+    return own | {name: version(name) for name in LIBRARIES}
 
 
 def scene_hash(case: Case) -> str:
