@@ -128,19 +128,19 @@ class _Finder(ast.NodeVisitor):
 
 
 def all_faults(root: Path, folders: tuple[str, ...]) -> list[Fault]:
-    """Return every fault that the modules in some folders allow, in order."""
+    """Return every fault that the modules in some folders may allow, in order."""
     found = []
     for folder in folders:
         for path in sorted((root / folder).rglob("*.py")):
             text = path.read_text(encoding="utf-8")
             finder = _Finder(path.relative_to(root).as_posix(), text)
             finder.visit(ast.parse(text))
-            found += [fault for fault in finder.faults if _compiles(fault, text)]
+            found += finder.faults
     return found
 
 
-def drawn(faults: list[Fault], count: int, seed: int) -> list[Fault]:
-    """Return some of the faults: kinds in turn, at most one a line."""
+def drawn(root: Path, faults: list[Fault], count: int, seed: int) -> list[Fault]:
+    """Return some of the faults: kinds in turn, at most one a line, all of them Python."""
     order = random.Random(seed)
     heaps = {kind: [f for f in faults if f.kind == kind] for kind in KINDS}
     for heap in heaps.values():
@@ -150,7 +150,8 @@ def drawn(faults: list[Fault], count: int, seed: int) -> list[Fault]:
         for heap in heaps.values():
             while heap:
                 fault = heap.pop()
-                if (fault.file, fault.line) not in lines:
+                text = (root / fault.file).read_text(encoding="utf-8")
+                if (fault.file, fault.line) not in lines and _compiles(fault, text):
                     lines.add((fault.file, fault.line))
                     chosen.append(fault)
                     break
