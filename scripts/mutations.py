@@ -49,7 +49,7 @@ class _Finder(ast.NodeVisitor):
     """Collects the faults of a module; messages, annotations and defaults are left alone."""
 
     def __init__(self, file: str, text: str) -> None:
-        self.file, self.text, self.faults = file, text, []
+        self.file, self.lines, self.faults = file, text.encode().splitlines(), []
         self._inside: list[str] = []
         self._function = False
 
@@ -101,7 +101,7 @@ class _Finder(ast.NodeVisitor):
         plain = not any(isinstance(a, ast.Starred) for a in node.args)
         if plain and len(node.args) >= 2:
             first, second = (self._source(a) for a in node.args[:2])
-            if first != second and None not in (first, second):
+            if first != second:
                 rest = [self._source(a) for a in node.args[2:]]
                 keys = [f"{k.arg}={self._source(k.value)}" for k in node.keywords if k.arg]
                 if len(keys) == len(node.keywords):
@@ -116,10 +116,12 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def _source(self, node):
-        return ast.get_source_segment(self.text, node)
+        """Return a node's text, its first line if it has more."""
+        end = node.end_col_offset if node.lineno == node.end_lineno else None
+        return self.lines[node.lineno - 1][node.col_offset : end].decode()
 
     def _add(self, kind, node, after):
-        if not self._inside or node.lineno != node.end_lineno or "\n" in after:
+        if not self._inside or node.lineno != node.end_lineno:
             return
         before = self._source(node)
         spot = (node.lineno, node.col_offset, node.end_col_offset)
