@@ -49,7 +49,7 @@ class _Finder(ast.NodeVisitor):
     """Collects the faults of a module; messages, annotations and defaults are left alone."""
 
     def __init__(self, file: str, text: str) -> None:
-        self.file, self.text, self.faults = file, text, []
+        self.file, self.lines, self.faults = file, text.encode().splitlines(), []
         self._inside: list[str] = []
         self._function = False
 
@@ -101,7 +101,7 @@ class _Finder(ast.NodeVisitor):
         plain = not any(isinstance(a, ast.Starred) for a in node.args)
         if plain and len(node.args) >= 2:
             first, second = (self._source(a) for a in node.args[:2])
-            if first != second and None not in (first, second):
+            if first != second:
                 rest = [self._source(a) for a in node.args[2:]]
                 keys = [f"{k.arg}={self._source(k.value)}" for k in node.keywords if k.arg]
                 if len(keys) == len(node.keywords):
@@ -116,10 +116,12 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def _source(self, node):
-        return ast.get_source_segment(self.text, node)
+        """Return a node's text, its first line if it has more."""
+        end = node.end_col_offset if node.lineno == node.end_lineno else None
+        return self.lines[node.lineno - 1][node.col_offset : end].decode()
 
     def _add(self, kind, node, after):
-        if not self._inside or node.lineno != node.end_lineno or "\n" in after:
+        if not self._inside or node.lineno != node.end_lineno:
             return
         before = self._source(node)
         spot = (node.lineno, node.col_offset, node.end_col_offset)
@@ -128,19 +130,19 @@ class _Finder(ast.NodeVisitor):
 
 
 def all_faults(root: Path, folders: tuple[str, ...]) -> list[Fault]:
-    """Return every fault that the modules in some folders allow, in order."""
+    """Return every fault that the modules in some folders may allow, in order."""
     found = []
     for folder in folders:
         for path in sorted((root / folder).rglob("*.py")):
             text = path.read_text(encoding="utf-8")
             finder = _Finder(path.relative_to(root).as_posix(), text)
             finder.visit(ast.parse(text))
-            found += [fault for fault in finder.faults if _compiles(fault, text)]
+            found += finder.faults
     return found
 
 
-def drawn(faults: list[Fault], count: int, seed: int) -> list[Fault]:
-    """Return some of the faults: kinds in turn, at most one a line."""
+def drawn(root: Path, faults: list[Fault], count: int, seed: int) -> list[Fault]:
+    """Return some of the faults: kinds in turn, at most one a line, all of them Python."""
     order = random.Random(seed)
     heaps = {kind: [f for f in faults if f.kind == kind] for kind in KINDS}
     for heap in heaps.values():
@@ -150,7 +152,8 @@ def drawn(faults: list[Fault], count: int, seed: int) -> list[Fault]:
         for heap in heaps.values():
             while heap:
                 fault = heap.pop()
-                if (fault.file, fault.line) not in lines:
+                text = (root / fault.file).read_text(encoding="utf-8")
+                if (fault.file, fault.line) not in lines and _compiles(fault, text):
                     lines.add((fault.file, fault.line))
                     chosen.append(fault)
                     break
