@@ -18,9 +18,10 @@ Reference: Scholz et al., Multibody Syst Dyn 36:195 (2016), doi:10.1007/s11044-0
 Newton's method with Jacobi fields.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
 from tkamb.geometry.frames import Array
@@ -58,7 +59,7 @@ class Strings:
     exit: Array
     arc_m: Array
     length_m: Array
-    converged: Array
+    converged: NDArray[np.bool_]
 
 
 def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None = None) -> Strings:
@@ -68,10 +69,17 @@ def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None =
         start: (f, 3) m, outside.
         end: (f, 3) m, outside; the segment between them passes through the ellipsoid.
         axes: (3,) m, semi-axes.
-        half: (3,) direction of the half on which the string must lie; None: either.
+        half: (3,) direction of the half on which the string must touch; None: either.
+
+    Returns:
+        Strings; where none is taut on that half they have not converged.
     """
     first, second = _planar_starts(start / axes, end / axes, axes, half)
     found = [_taut(start, end, axes, *guess) for guess in (first, second)]
+    if half is not None:
+        found = [
+            replace(s, converged=s.converged & ((s.entry + s.exit) @ half > 0.0)) for s in found
+        ]
     lengths = [np.where(strings.converged, strings.length_m, np.inf) for strings in found]
     other = lengths[1] < lengths[0]
     return Strings(
@@ -126,7 +134,8 @@ def _planar_starts(
         + np.linalg.norm((circle[:, :, -1] - q[:, None]) * axes, axis=-1)
     )
     if half is not None:
-        lengths = np.where((outward[:, :, 0] * axes) @ half > 0.0, lengths, np.inf)
+        inside = ((circle[:, :, 0] + circle[:, :, -1]) * axes) @ half > 0.0
+        lengths = np.where(inside, lengths, np.inf)
     rows = np.arange(len(p))
     best = lengths.argmin(axis=1)
     lower = (lengths <= np.roll(lengths, 1, axis=1)) & (lengths <= np.roll(lengths, -1, axis=1))
