@@ -2,14 +2,18 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from tkamb.body.ligaments import Ligament
 from tkamb.case import Case
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.plausibility.question import Question, some
 from tkamb.scene_tables import Attachment
 from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.body.ligaments import Ligament
 
 STRAIN = 0.15
 """Ligaments of the knee tear at 12 to 20 % (Kennedy et al. 1976, Butler et al. 1986)."""
@@ -101,7 +105,7 @@ def stiffness_questions(case: Case) -> Iterator[Question]:
             )
 
 
-def torn_bundles(ligaments: Sequence[Ligament], tensions: Mapping[str, float]) -> list[str]:
+def torn_bundles(ligaments: "Sequence[Ligament]", tensions: Mapping[str, float]) -> list[str]:
     """Return the bundles whose tension (N) is above that of the strain they bear."""
     return [
         bundle.name
@@ -112,7 +116,7 @@ def torn_bundles(ligaments: Sequence[Ligament], tensions: Mapping[str, float]) -
 
 
 def strain_questions(
-    ligaments: Sequence[Ligament], strains: Mapping[str, Array], time: Array
+    ligaments: "Sequence[Ligament]", strains: Mapping[str, Array], time: Array
 ) -> Iterator[Question]:
     """Bundles that would tear, and bundles that never come near to being taut.
 
