@@ -1,7 +1,6 @@
 """Questions about lines of action: where they end, how stiff and how far stretched they are."""
 
 from collections.abc import Iterator, Mapping, Sequence
-
 from typing import TYPE_CHECKING
 
 import numpy as np
