@@ -104,7 +104,7 @@ def stiffness_questions(case: Case) -> Iterator[Question]:
             )
 
 
-def torn_bundles(ligaments: Sequence["Ligament"], tensions: Mapping[str, float]) -> list[str]:
+def torn_bundles(ligaments: "Sequence[Ligament]", tensions: Mapping[str, float]) -> list[str]:
     """Return the bundles whose tension (N) is above that of the strain they bear."""
     return [
         bundle.name
@@ -115,7 +115,7 @@ def torn_bundles(ligaments: Sequence["Ligament"], tensions: Mapping[str, float])
 
 
 def strain_questions(
-    ligaments: Sequence["Ligament"], strains: Mapping[str, Array], time: Array
+    ligaments: "Sequence[Ligament]", strains: Mapping[str, Array], time: Array
 ) -> Iterator[Question]:
     """Bundles that would tear, and bundles that never come near to being taut.
 
