@@ -117,13 +117,14 @@ def _shares(results: Results) -> Card | None:
 def _adduction(results: Results, unknown: int) -> list[str]:
     """Return what an error of the adduction does to the split by deformation, in words."""
     moved = metrics.moved_per_half_degree(results)
-    if not np.isfinite(moved).any():
-        return []
-    words = f"± 0.5 deg of adduction moves {_range(moved, ' N')} between the condyles"
-    if unknown == 0:
-        return [words]
-    where = "in every frame" if unknown == len(results) else f"in {unknown} frames"
-    return [f"the split by deformation is not determined {where}: {words}"]
+    words = []
+    if unknown:
+        where = "in every frame" if unknown == len(results) else f"in {unknown} frames"
+        words.append(f"the split by deformation is not determined {where}")
+    if np.isfinite(moved).any():
+        text = _range(moved, " N")
+        words.append(f"± 0.5 deg of adduction moves {text} between condyles that both carry")
+    return [": ".join(words)] if words else []
 
 
 def _peak_pressure(results: Results, axis: HorizontalAxis) -> Card | None:
