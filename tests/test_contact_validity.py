@@ -70,7 +70,7 @@ def test_a_spike_longer_than_the_insert_is_thick_is_out_of_range(name, body):
     ],
 )
 def test_a_shorter_spike_is_flagged(length, pose, words):
-    """On a node, and between the nodes, which see little of it while the approach counts from it."""
+    """On a node, and between nodes, which see little of it; the approach counts from its tip."""
     femoral = spiked(FEMORAL, -length, [0, -20e-3, 10e-3])
     result, _ = pressed("lattice-linear", femoral, dished_insert(cells=24), 1500.0, pose)
     assert result.status is ContactStatus.OK
