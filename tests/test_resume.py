@@ -96,7 +96,7 @@ def kill_and_resume(out, waits):
 
 
 def test_killed_again_and_again_the_run_ends_as_the_undisturbed_one(tmp_path, undisturbed):
-    """While it starts, at its first frames, in between and when all are there: scripts/study_kills."""
+    """While it starts, at its first frames, in between and at the end; see scripts/study_kills."""
     waits = [(0, 0.5), (1, 0.0), (3, 0.01), (8, 0.03), (14, 0.0), (TOTAL, 0.02)]
     found = kill_and_resume(tmp_path / "out", waits)
     check_same(found, undisturbed)

@@ -239,11 +239,11 @@ def _verify(options: argparse.Namespace) -> int:
 def _report(options: argparse.Namespace) -> int:
     from tkamb.output.claim import claimed_directory
     from tkamb.output.report import write_report
-    from tkamb.results import REPORT_NAME, read_results, read_summary
+    from tkamb.results import REPORT_NAME, read_results
 
-    read_summary(options.folder)  # before a folder is made or marked
+    results = read_results(options.folder)  # before a folder is made or marked
     with claimed_directory(options.folder) as folder:
-        write_report(read_results(folder), folder / REPORT_NAME)
+        write_report(results, folder / REPORT_NAME)
     print(f"report: {options.folder / REPORT_NAME}")
     return 0
 
