@@ -132,7 +132,7 @@ def test_a_flat_face_along_the_bounding_box_makes_patches():
     """The mean of three equal heights may be rounded below the lowest of them."""
     plate = flat_insert(10e-3, 24e-3, 24e-3)
     for height in np.linspace(0.1, 0.7, 50):
-        surface = Surface(plate.vertices + [0.0, height, 0.0], plate.faces, "plate")
+        surface = Surface(plate.vertices + np.array([0.0, height, 0.0]), plate.faces, "plate")
         low, high = Patches(surface, np.zeros(len(surface.vertices))).extent(np.eye(4))
         assert (low.min(axis=0) < surface.bounds[0] + 1e-9).all()
         assert (high.max(axis=0) > surface.bounds[1] - 1e-9).all()
