@@ -18,7 +18,7 @@ Reference: Scholz et al., Multibody Syst Dyn 36:195 (2016), doi:10.1007/s11044-0
 Newton's method with Jacobi fields.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ STEPS = 6
 """Runge-Kutta steps along a geodesic."""
 
 ITERATIONS = 30
-TOLERANCE = 1e-12
+TOLERANCE = 1e-11
 """Of the direction in which the string arrives, rad."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
@@ -74,31 +74,35 @@ def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None =
     Returns:
         Strings; where none is taut on that half they have not converged.
     """
-    first, second = _planar_starts(start / axes, end / axes, axes, half)
-    found = [_taut(start, end, axes, *guess) for guess in (first, second)]
+    count = len(start)
+    contour, pieces = _planar_starts(start / axes, end / axes, axes, half)
+    both = _taut(np.tile(start, (2, 1)), np.tile(end, (2, 1)), axes, contour, pieces)
+    converged = both.converged
     if half is not None:
-        found = [
-            replace(s, converged=s.converged & ((s.entry + s.exit) @ half > 0.0)) for s in found
-        ]
-    lengths = [np.where(strings.converged, strings.length_m, np.inf) for strings in found]
-    other = lengths[1] < lengths[0]
+        converged = converged & ((both.entry + both.exit) @ half > 0.0)
+    lengths = np.where(converged, both.length_m, np.inf).reshape(2, count)
+    chosen = np.arange(count) + count * (lengths[1] < lengths[0])
     return Strings(
-        *(
-            np.where(other[:, None] if a.ndim == 2 else other, b, a)
-            for a, b in (
-                (getattr(found[0], name), getattr(found[1], name))
-                for name in ("entry", "exit", "arc_m", "length_m", "converged")
-            )
-        )
+        both.entry[chosen],
+        both.exit[chosen],
+        both.arc_m[chosen],
+        both.length_m[chosen],
+        converged[chosen],
     )
 
 
-def _planar_starts(
-    p: Array, q: Array, axes: Array, half: Array | None
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Return the two shortest plane strings, not neighbours: contour points (f, 3), lengths (f,).
+def _planar_starts(p: Array, q: Array, axes: Array, half: Array | None) -> tuple[Array, Array]:
+    """Return the shortest plane strings (f), and below them the next shortest that stand apart.
 
-    All in the space where the ellipsoid is the unit sphere, but for the lengths.
+    Args:
+        p: (f, 3) start, in the space where the ellipsoid is the unit sphere.
+        q: (f, 3) end, likewise.
+        axes: (3,) m.
+        half: as in `shortest_strings`.
+
+    Returns:
+        Where they meet the ellipsoid (2f, 3), in that space; (2f, STEPS) m, their lengths on
+        it in steps of equal angle.
     """
     along = q - p
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -142,7 +146,8 @@ def _planar_starts(
     lower[rows, best] = False
     other = np.where(lower, lengths, np.inf).argmin(axis=1)
     other = np.where(lower.any(axis=1), other, best)
-    return tuple((circle[rows, k, 0], arcs[rows, k]) for k in (best, other))  # type: ignore[return-value]
+    rows, chosen = np.tile(rows, 2), np.concatenate([best, other])
+    return circle[rows, chosen, 0], arcs[rows, chosen]
 
 
 def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) -> Strings:
