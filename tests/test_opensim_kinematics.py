@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+
 from opensim_models import OWN, PUBLISHED, kinematics
 from opensim_references import WEIGHTS, references
-
 from tkamb.errors import InputError
 from tkamb.opensim.functions import Linear, Polynomial, Scaled, piecewise_linear, simm_spline
 from tkamb.opensim.kinematics import frame_poses

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from opensim_models import OWN, model
 
+from opensim_models import OWN, model
 from tkamb.errors import InputError
 from tkamb.opensim.read import read_osim
 

@@ -18,7 +18,7 @@ Reference: Scholz et al., Multibody Syst Dyn 36:195 (2016), doi:10.1007/s11044-0
 Newton's method with Jacobi fields.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,18 +29,22 @@ from tkamb.geometry.frames import Array
 PLANES = 24
 """Planes through both points that are tried for the start."""
 
+RIVAL = 0.1
+"""Share of its arc by which a plane string may be longer and still lead to the shortest one."""
+
 STEPS = 6
 """Runge-Kutta steps along a geodesic."""
 
 ITERATIONS = 30
-TOLERANCE = 1e-12
+TOLERANCE = 1e-11
 """Of the direction in which the string arrives, rad."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
-_WEIGHTS = _WEIGHTS / STEPS
-_PLACES = np.concatenate(
-    [[-1.0], ((2.0 * np.arange(STEPS) + 1.0)[:, None] + _NODES).ravel() / STEPS - 1.0, [1.0]]
-)
+_FINE = (((2.0 * np.arange(STEPS) + 1.0)[:, None] + _NODES) / STEPS - 1.0).ravel()
+_FINE_WEIGHTS = _WEIGHTS / STEPS
+_NODES, _COARSE_WEIGHTS = np.polynomial.legendre.leggauss(6)
+_COARSE = np.concatenate([[-1.0], _NODES, [1.0]])
+"""Places on an arc, -1 to 1: for its length in each step, and for its whole with both ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,75 +78,129 @@ def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None =
     Returns:
         Strings; where none is taut on that half they have not converged.
     """
-    first, second = _planar_starts(start / axes, end / axes, axes, half)
-    found = [_taut(start, end, axes, *guess) for guess in (first, second)]
+    count = len(start)
+    contour, pieces, rival = _planar_starts(start / axes, end / axes, axes, half)
+    rows = np.concatenate([np.arange(count), np.flatnonzero(rival)])
+    second = np.append(np.zeros(count, int), np.ones(len(rows) - count, int))
+    found = _taut(start[rows], end[rows], axes, contour[rows, second], pieces[rows, second])
+    converged = found.converged
     if half is not None:
-        found = [
-            replace(s, converged=s.converged & ((s.entry + s.exit) @ half > 0.0)) for s in found
-        ]
-    lengths = [np.where(strings.converged, strings.length_m, np.inf) for strings in found]
-    other = lengths[1] < lengths[0]
+        converged = converged & ((found.entry + found.exit) @ half > 0.0)
+    lengths = np.full((count, 2), np.inf)
+    lengths[rows, second] = np.where(converged, found.length_m, np.inf)
+    place = np.column_stack([np.arange(count), count + np.cumsum(rival) - 1])
+    chosen = np.where(lengths[:, 1] < lengths[:, 0], place[:, 1], place[:, 0])
     return Strings(
-        *(
-            np.where(other[:, None] if a.ndim == 2 else other, b, a)
-            for a, b in (
-                (getattr(found[0], name), getattr(found[1], name))
-                for name in ("entry", "exit", "arc_m", "length_m", "converged")
-            )
-        )
+        found.entry[chosen],
+        found.exit[chosen],
+        found.arc_m[chosen],
+        found.length_m[chosen],
+        converged[chosen],
     )
 
 
 def _planar_starts(
     p: Array, q: Array, axes: Array, half: Array | None
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Return the two shortest plane strings, not neighbours: contour points (f, 3), lengths (f,).
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return the shortest plane strings, and the next shortest that stand apart from them.
 
-    All in the space where the ellipsoid is the unit sphere, but for the lengths.
+    Args:
+        p: (f, 3) start, in the space where the ellipsoid is the unit sphere.
+        q: (f, 3) end, likewise.
+        axes: (3,) m.
+        half: as in `shortest_strings`.
+
+    Returns:
+        Where they meet the ellipsoid (f, 2, 3), in that space; (f, 2, STEPS) m, their lengths
+        on it in steps of equal angle; (f,) whether the second may turn out the shorter.
     """
-    along = q - p
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    middle = p - (p * along).sum(axis=1, keepdims=True) * along
-    offset = np.linalg.norm(middle, axis=1)
-    # Any direction across will do where the line passes through the centre.
-    spare = np.eye(3)[np.abs(along).argmin(axis=1)]
-    spare -= (spare * along).sum(axis=1, keepdims=True) * along
-    first = np.where(offset[:, None] > 1e-9, middle, spare)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(along, first)
-    angles = 2.0 * np.pi * np.arange(PLANES) / PLANES
-    outward = np.cos(angles)[:, None] * first[:, None] + np.sin(angles)[:, None] * second[:, None]
-    height = offset[:, None] * np.cos(angles)
-    radius = np.sqrt(np.maximum(1.0 - (offset[:, None] * np.sin(angles)) ** 2, 1e-12))
-    centre = middle[:, None] - height[..., None] * outward
-    ends = []
-    for point, sign in ((p, 1.0), (q, -1.0)):
-        ahead = ((point - middle) * along).sum(axis=1)[:, None]
-        reach = np.maximum(np.hypot(ahead, height), radius)
-        ends.append(np.arctan2(ahead, height) + sign * np.arccos(radius / reach))
-    spread = 0.5 * (ends[1] - ends[0])
-    at = 0.5 * (ends[0] + ends[1])[..., None] + spread[..., None] * _PLACES
-    across, ahead = np.cos(at)[..., None], np.sin(at)[..., None]
-    outward, along = outward[:, :, None], along[:, None, None]
-    circle = centre[:, :, None] + radius[..., None, None] * (across * outward + ahead * along)
-    speed = radius[..., None, None] * (across * along - ahead * outward) * axes
-    speed = np.linalg.norm(speed[:, :, 1:-1], axis=-1).reshape(*spread.shape, STEPS, -1)
-    arcs = spread[..., None] * (speed @ _WEIGHTS)
-    lengths = (
-        np.linalg.norm((circle[:, :, 0] - p[:, None]) * axes, axis=-1)
-        + arcs.sum(axis=-1)
-        + np.linalg.norm((circle[:, :, -1] - q[:, None]) * axes, axis=-1)
+    planes = _Planes.through(p, q)
+    points, speeds = planes.arc(_COARSE, axes)
+    arcs = speeds[..., 1:-1] @ _COARSE_WEIGHTS
+    lengths = arcs + sum(
+        np.linalg.norm((points[:, :, k] - end[:, None]) * axes, axis=-1)
+        for k, end in ((0, p), (-1, q))
     )
     if half is not None:
-        inside = ((circle[:, :, 0] + circle[:, :, -1]) * axes) @ half > 0.0
-        lengths = np.where(inside, lengths, np.inf)
+        touches = ((points[:, :, 0] + points[:, :, -1]) * axes) @ half > 0.0
+        lengths = np.where(touches, lengths, np.inf)
     rows = np.arange(len(p))
     best = lengths.argmin(axis=1)
     lower = (lengths <= np.roll(lengths, 1, axis=1)) & (lengths <= np.roll(lengths, -1, axis=1))
     lower[rows, best] = False
-    other = np.where(lower, lengths, np.inf).argmin(axis=1)
-    other = np.where(lower.any(axis=1), other, best)
-    return tuple((circle[rows, k, 0], arcs[rows, k]) for k in (best, other))  # type: ignore[return-value]
+    others = np.where(lower, lengths, np.inf)
+    other = others.argmin(axis=1)
+    rival = others[rows, other] - lengths[rows, best] < RIVAL * arcs[rows, other]
+    chosen = np.column_stack([best, other])
+    _, speeds = planes.chosen(rows[:, None], chosen).arc(_FINE, axes)
+    pieces = speeds.reshape(len(p), 2, STEPS, -1) @ _FINE_WEIGHTS
+    return points[rows[:, None], chosen, 0], pieces, rival
+
+
+@dataclass(frozen=True, eq=False)
+class _Planes:
+    """Half planes k through the line from p to q, and the circles they cut out of a unit sphere.
+
+    Args:
+        along: (f, 1, 3) direction of the line.
+        outward: (f, k, 3) direction across it.
+        centre: (f, k, 3) of the circle.
+        radius: (f, k) of the circle.
+        ends: (2, f, k) rad, where the taut string in the plane meets and leaves the circle,
+            counted from outward to along.
+    """
+
+    along: Array
+    outward: Array
+    centre: Array
+    radius: Array
+    ends: Array
+
+    @classmethod
+    def through(cls, p: Array, q: Array) -> "_Planes":
+        """Return planes at equal angles through lines from p to q (f, 3)."""
+        along = _unit(q - p)
+        middle = p - _dot(p, along)[:, None] * along
+        offset = np.linalg.norm(middle, axis=1)
+        # Any direction across will do where the line passes through the centre.
+        spare = np.eye(3)[np.abs(along).argmin(axis=1)]
+        spare = spare - _dot(spare, along)[:, None] * along
+        first = _unit(np.where(offset[:, None] > 1e-9, middle, spare))
+        second = np.cross(along, first)
+        angles = 2.0 * np.pi * np.arange(PLANES)[:, None] / PLANES
+        outward = np.cos(angles) * first[:, None] + np.sin(angles) * second[:, None]
+        height = offset[:, None] * np.cos(angles[:, 0])
+        radius = np.sqrt(np.maximum(1.0 - (offset[:, None] * np.sin(angles[:, 0])) ** 2, 1e-12))
+        ends = []
+        for point, sign in ((p, 1.0), (q, -1.0)):
+            ahead = _dot(point - middle, along)[:, None]
+            reach = np.maximum(np.hypot(ahead, height), radius)
+            ends.append(np.arctan2(ahead, height) + sign * np.arccos(radius / reach))
+        centre = middle[:, None] - height[..., None] * outward
+        return cls(along[:, None], outward, centre, radius, np.stack(ends))
+
+    def chosen(self, rows: NDArray[np.int64], planes: NDArray[np.int64]) -> "_Planes":
+        """Return some planes of each line."""
+        return _Planes(
+            self.along,
+            self.outward[rows, planes],
+            self.centre[rows, planes],
+            self.radius[rows, planes],
+            self.ends[:, rows, planes],
+        )
+
+    def arc(self, places: Array, axes: Array) -> tuple[Array, Array]:
+        """Return points (f, k, n, 3) at places in -1…1 of the arcs, and m per unit of place."""
+        spread = 0.5 * (self.ends[1] - self.ends[0])
+        angle = 0.5 * (self.ends[0] + self.ends[1])[..., None] + spread[..., None] * places
+        cosine, sine = (
+            self.radius[..., None] * np.cos(angle),
+            self.radius[..., None] * np.sin(angle),
+        )
+        outward, along = self.outward[:, :, None], self.along[:, :, None]
+        points = cosine[..., None] * outward + sine[..., None] * along + self.centre[:, :, None]
+        speeds = (cosine[..., None] * along - sine[..., None] * outward) * axes
+        return points, spread[..., None] * np.linalg.norm(speeds, axis=-1)
 
 
 def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) -> Strings:
@@ -235,6 +293,10 @@ class _Shot:
 
 def _dot(a: Array, b: Array) -> Array:
     return np.asarray((a * b).sum(axis=-1))
+
+
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
 def _normal(points: Array, axes: Array) -> tuple[Array, Array]:
