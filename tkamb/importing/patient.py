@@ -10,7 +10,7 @@ import numpy as np
 
 from tkamb.case import Case, load_case
 from tkamb.errors import InputError
-from tkamb.geometry.frames import mirrored_pose
+from tkamb.geometry.frames import Array, mirrored_pose
 from tkamb.importing.anatomy import OTHER, Leg, find_leg
 from tkamb.importing.links import Links, find_links
 from tkamb.importing.markers import (
@@ -35,6 +35,8 @@ from tkamb.output.atomic import claimed_directory, write_text
 from tkamb.scene import Scene, load_scene
 from tkamb.units import DEGREE, MILLIMETRE
 
+FRAMES_PER_CUTOFF = 5.0
+"""Frames per period of the cut-off: what is low-passed holds nothing between them."""
 SAME_MASS = 0.01
 """A model whose mass is within this share of the subject's is not scaled."""
 
@@ -126,8 +128,9 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
     seen = _facing(request, segments, recorded)
     ground, interval, stood = _ground(request, leg, recorded, seen.axes)
     tissue = soft_tissue(links)
+    interval, frames, thinned = _thinned(recorded.time(), interval, request.cutoff_Hz)
     markers = MarkerFile(
-        request.recording, seen.axes, tuple(segments), request.method, "hinge", interval
+        request.recording, seen.axes, tuple(segments), request.method, "hinge", interval, frames
     )
     report = [
         *_leg_lines(leg),
@@ -137,6 +140,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         *(_segment_line(segment) for segment in segments),
         _facing_line(request, seen),
         *stood,
+        thinned,
         *tissue.said,
     ]
     scene = SceneText(
@@ -299,6 +303,30 @@ def _ground(
     lines = [*(_load_line(load) for load in loads), _interval_line(request, interval)]
     lines += _unmeasured_line(loads, plates, recording, sides[leg.side], interval)
     return GroundFile(request.recording, axes, plates), interval, lines
+
+
+def _thinned(
+    time: Array, interval: tuple[float, float] | None, cutoff_Hz: float
+) -> tuple[tuple[float, float], int | None, str]:
+    """Return interval and number of frames at about five times the cut-off, and a line on it.
+
+    The frames are every k-th of the recording, at its own times.
+    """
+    start, end = interval or (float(time[0]), float(time[-1]))
+    inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
+    if len(inside) < 2:
+        raise InputError(
+            f"has no two frames between {start:g} and {end:g} s", "--interval", "choose another"
+        )
+    rate = 1.0 / float(np.median(np.diff(inside)))
+    every = max(int(rate / (FRAMES_PER_CUTOFF * cutoff_Hz) + 1e-9), 1)
+    count = (len(inside) - 1) // every + 1
+    even = np.ptp(np.diff(inside)) < 1e-6
+    if every == 1 or not even or count < 8:
+        return (float(inside[0]), float(inside[-1])), None, f"frames: all {len(inside)}"
+    last = float(inside[(count - 1) * every])
+    line = f"frames: every {every}th of the recording, {count} at {rate / every:g} Hz"
+    return (float(inside[0]), last), count, line
 
 
 def _load_line(load: Load) -> str:

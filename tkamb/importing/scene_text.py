@@ -45,6 +45,7 @@ class MarkerFile:
     method: str
     knee: str
     interval: tuple[float, float] | None
+    frames: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +113,12 @@ class SceneText:
         lines.append(f"cutoff_Hz = {self.cutoff_Hz:g}")
         if m.interval:
             lines.append("# the part in which all that the foot stands on was measured, own clock")
-            lines.append(f"interval_s = [{m.interval[0]:.6f}, {m.interval[1]:.6f}]")
+            lines.append(f"interval_s = [{m.interval[0]:.9f}, {m.interval[1]:.9f}]")
+        if m.frames:
+            lines.append(
+                "# every so many frames of the recording: five times the cut-off is enough"
+            )
+            lines.append(f"frames = {m.frames}")
         coordinates = ["flexion"] if self.meshes else _ALL
         lines += [
             "",
