@@ -9,6 +9,7 @@ from pathlib import Path
 from tkamb.geometry.frames import Array
 from tkamb.importing.links import Links
 from tkamb.importing.markers import ModelSegment
+from tkamb.importing.model_motion import MOTION_FILE, motion_tables
 from tkamb.importing.soft_tissue import End, SoftTissue
 from tkamb.units import DEGREE
 
@@ -60,7 +61,7 @@ class SceneText:
         urdf: name of the URDF beside the scene.
         cutoff_Hz: of markers and plates.
         links: of the leg.
-        markers: the recording.
+        markers: the recording; None: the model's own coordinates, in `motion.csv`.
         ground: the ground reaction; None without.
         meshes: the implant; None without.
         tissue: muscles and ligaments.
@@ -74,7 +75,7 @@ class SceneText:
     urdf: str
     cutoff_Hz: float
     links: Links
-    markers: MarkerFile
+    markers: MarkerFile | None
     ground: GroundFile | None
     meshes: Meshes | None
     tissue: SoftTissue
@@ -86,7 +87,7 @@ class SceneText:
             [f"# {line}" for line in self.title],
             self._patient(),
             self._motion(),
-            *(_segment(segment) for segment in self.markers.segments),
+            *(_segment(s) for s in (self.markers.segments if self.markers else ())),
             self._ground(),
             *self._implant(),
             self._muscles(),
@@ -109,6 +110,10 @@ class SceneText:
 
     def _motion(self) -> list[str]:
         m, neutral = self.markers, self.links.neutral
+        if m is None:
+            head = ["[motion]", f'file = "{MOTION_FILE}"', 'interpretation = "coordinates"']
+            head += ['angle_unit = "deg"', 'length_unit = "mm"', f"cutoff_Hz = {self.cutoff_Hz:g}"]
+            return [*head, "", *motion_tables(self.meshes is not None)]
         lines = ["[motion]", f"file = {self._path(m.path)}", 'interpretation = "markers"']
         lines.append(f"cutoff_Hz = {self.cutoff_Hz:g}")
         if m.interval:
@@ -216,7 +221,7 @@ class SceneText:
             'model = "foundation"',
             "resolution_mm = 1.0",
             'material = "polyethylene"',
-            "# skin markers say nothing of these: contact, ligaments and muscle line find them",
+            "# nobody recorded these: contact, ligaments and muscle line find them",
             'released = ["adduction", "axial_rotation", "ap", "ml"]',
         ]
 
