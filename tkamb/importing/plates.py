@@ -153,7 +153,7 @@ def _middle(table: Table, labels: list[str]) -> Array:
     if not labels:
         return np.full((rows, 3), np.nan)
     points = marker_trajectories(table, labels, 1.0)
-    seen = np.isfinite(points).all(axis=2)
+    seen = np.asarray(np.isfinite(points).all(axis=2))
     total = np.where(seen[:, :, None], points, 0.0).sum(axis=1)
     count = seen.sum(axis=1).astype(float)
     count[count == 0] = np.nan

@@ -133,7 +133,7 @@ def _bundles(links: Links, said: list[str]) -> tuple[Bundle, ...]:
         femur, tibia = _fixed(ligament.path, leg.femur), _fixed(ligament.path, leg.tibia)
         if not (femur and tibia):
             continue
-        reason = _reason_against(ligament)
+        reason = _reason_against(ligament, len(femur) + len(tibia))
         if reason or ligament.stiffness_N is None:
             out.setdefault(reason, []).append(ligament.name)
             continue
@@ -152,13 +152,15 @@ def _bundles(links: Links, said: list[str]) -> tuple[Bundle, ...]:
             "(wraps on bone are left out)"
         )
     for reason, names in out.items():
-        said.append(f"{len(names)} ligaments left out, {reason}: {_some(names)}")
+        said.append(f"ligaments left out, {reason}: {_some(names)}")
     return tuple(taken)
 
 
-def _reason_against(ligament: Ligament) -> str:
+def _reason_against(ligament: Ligament, fixed: int) -> str:
     if not ligament.enabled:
         return "switched off in the model"
+    if fixed != 2 or len(ligament.path.points) != 2:
+        return "which run by more than two points"
     if ligament.stiffness_N is None:
         return f"of class {ligament.kind}, whose law the scene does not have"
     if ligament.transition_strain is None or abs(ligament.transition_strain - TOE) > 1e-6:
