@@ -109,7 +109,7 @@ def test_at_the_solution_no_freedom_lowers_the_weighted_distance():
     fit = fit_chain(chain, measured, weights, start(chain, measured))
     places, jacobian = chain.markers(fit.state)
     pull = np.einsum("fmi,m,fmin->fn", places - measured, weights, jacobian)
-    assert fit.solved.all() and np.abs(pull).max() < 1e-6
+    assert fit.solved.all() and np.abs(pull).max() < 1e-5
     heavier = weights.copy()
     heavier[4] *= 1e6
     close = fit_chain(chain, measured, heavier, start(chain, measured))

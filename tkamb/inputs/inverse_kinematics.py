@@ -24,7 +24,7 @@ from tkamb.geometry.frames import Array, knee_pose, pose, transform
 
 FLEXION = 5
 """Index of flexion among the knee coordinates."""
-SETTLED = 1e-7
+SETTLED = 1e-6
 """Step (m and rad) below which a frame is solved."""
 MOST_STEPS = 60
 
