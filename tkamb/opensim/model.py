@@ -158,6 +158,7 @@ class OpenSimModel:
         muscles: by name.
         ligaments: by name.
         wrap_objects: by name.
+        offset_frames: those that hang on bodies: name -> body and pose (4, 4) in it.
         left_out: "class 'name'" of everything in the file that was not taken over.
     """
 
@@ -172,6 +173,7 @@ class OpenSimModel:
     muscles: dict[str, Muscle]
     ligaments: dict[str, Ligament]
     wrap_objects: dict[str, WrapObject]
+    offset_frames: dict[str, tuple[str, Array]]
     left_out: tuple[str, ...]
 
     @property

@@ -75,7 +75,7 @@ class Frames:
         steps = [step for step in socket.split("/") if step not in ("", ".", "..")]
         in_body = np.eye(4)
         for _ in range(len(self.offsets) + 1):
-            name = steps[-1] if steps else ""
+            name = steps[-1] if steps else owner  # ".." is who holds the frame
             above = steps[-2] if len(steps) > 1 else owner
             key = (above, name) if (above, name) in self.offsets else ("", name)
             if key not in self.offsets:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.results import Results
+from tkamb.run.agreement import UNLOADED
 from tkamb.units import MILLIMETRE, STANDARD_GRAVITY
 
 SIDES = ("medial", "lateral")
@@ -67,6 +68,28 @@ def medial_share(results: Results, estimate: str) -> Array:
     total = np.nan_to_num(medial) + np.nan_to_num(lateral)
     with np.errstate(invalid="ignore", divide="ignore"):
         return both * np.where(total > 0, np.nan_to_num(medial) / total, np.nan)
+
+
+def split_undetermined(results: Results) -> NDArray[np.bool_]:
+    """Return in which frames (f,) the recorded adduction does not determine the split."""
+    return np.asarray(results["split_determined"] == 0)
+
+
+def moved_per_half_degree(results: Results) -> Array:
+    """Return what 0.5 deg of adduction moves (f,) between the condyles by the tangent, N.
+
+    Never more than the whole load; NaN where one condyle carries all of it, since that slope
+    holds only until the other touches.
+    """
+    share = medial_share(results, "deformation")
+    moved = 0.5 * np.abs(results["medial_force_per_adduction_N_per_deg"])
+    moved = np.minimum(moved, np.abs(results["force_si_N"]))
+    return np.where(np.abs(share - 0.5) < 0.5 - UNLOADED, moved, np.nan)
+
+
+def shares_apart(results: Results) -> Array:
+    """Return by how much (f,) the two estimates of the medial share differ."""
+    return np.abs(medial_share(results, "deformation") - medial_share(results, "equilibrium"))
 
 
 def tension_ratio(results: Results, column: str) -> Array:
