@@ -10,7 +10,7 @@ from opensim_models import OWN, PUBLISHED, kinematics
 from opensim_references import references
 from tkamb.errors import InputError
 from tkamb.opensim.geodesic import shortest_strings
-from tkamb.opensim.model import WrapObject
+from tkamb.opensim.lines import WrapObject
 from tkamb.opensim.paths import LineSet
 from tkamb.opensim.strings import strings_over
 from tkamb.opensim.wrapping import touch

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.opensim.kinematics import Kinematics, Motion
-from tkamb.opensim.model import ConditionalPathPoint, Ligament, MovingPathPoint, Muscle, Path
+from tkamb.opensim.lines import ConditionalPathPoint, Ligament, MovingPathPoint, Muscle, Path
 from tkamb.opensim.strings import WrappedStrings, strings_over
 from tkamb.opensim.wrapping import Index
 

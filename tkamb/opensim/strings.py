@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tkamb.geometry.frames import Array, inverse
-from tkamb.opensim.model import WrapObject
+from tkamb.opensim.lines import WrapObject
 from tkamb.opensim.wrapping import Index, Mask, Touch, touch
 
 SWEEPS = 100

@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array
 from tkamb.opensim.geodesic import shortest_strings
-from tkamb.opensim.model import WrapObject
+from tkamb.opensim.lines import WrapObject
+from tkamb.opensim.plane_strings import dot, unit
 
 RING_PLACES = 48
 """Places around a torus's ring that are tried for where the string presses it."""
@@ -76,10 +77,6 @@ def touch(wrap: WrapObject, start: Array, end: Array, moves: Mask) -> Touch:
     if wrap.shape == "torus":
         return _torus(start, end, *wrap.dimensions)
     return _ellipsoid(start, end, np.array(wrap.dimensions), wrap.quadrant, moves)
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return np.asarray((a * b).sum(axis=-1))
 
 
 def _no_push(start: Array) -> Array:
@@ -150,10 +147,10 @@ def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] |
     """
     near, far = np.linalg.norm(start, axis=1), np.linalg.norm(end, axis=1)
     along, towards = start / near[:, None], end / far[:, None]
-    across = towards - _dot(towards, along)[:, None] * along
+    across = towards - dot(towards, along)[:, None] * along
     size = np.linalg.norm(across, axis=1)
     across /= np.maximum(size, 1e-300)[:, None]
-    sweep = np.arctan2(size, _dot(towards, along))
+    sweep = np.arctan2(size, dot(towards, along))
     turn, ahead, _ = _around((near, far), sweep, radius)
     touches = turn != 0.0
     if quadrant is not None:
@@ -214,7 +211,7 @@ def _ellipsoid(
     size = np.where(moves, depth / (1.0 + CLEARANCE), 1.0).min(axis=1)
     size = np.minimum(size, 1.0)
     step = q - p
-    share = np.clip(-_dot(p, step) / np.maximum(_dot(step, step), 1e-300), 0.0, 1.0)
+    share = np.clip(-dot(p, step) / np.maximum(dot(step, step), 1e-300), 0.0, 1.0)
     nearest = np.linalg.norm(p + share[:, None] * step, axis=1)
     touches = (depth.min(axis=1) > size) & (nearest < size)
     entry, leave, arc = np.zeros_like(start), np.zeros_like(end), np.zeros(len(start))
@@ -225,14 +222,10 @@ def _ellipsoid(
         strings = shortest_strings(here / k, there / k, axes, half)
         entry[touches], leave[touches] = k * strings.entry, k * strings.exit
         arc[touches] = np.where(strings.converged, k[:, 0] * strings.arc_m, np.nan)
-        first, last = (_unit(v) for v in (strings.entry - here / k, there / k - strings.exit))
-        growth = strings.length_m + (_dot(here, first) - _dot(there, last)) / k[:, 0]
+        first, last = (unit(v) for v in (strings.entry - here / k, there / k - strings.exit))
+        growth = strings.length_m + (dot(here, first) - dot(there, last)) / k[:, 0]
         yields = moves & (depth <= size[:, None] * (1.0 + CLEARANCE) * (1.0 + 1e-12))
         yields &= (size < 1.0)[:, None]
         by_point = np.stack([p, q], axis=1) / (depth * (1.0 + CLEARANCE))[..., None] / axes
         push[touches] = -(growth[:, None] * yields[touches])[..., None] * by_point[touches]
     return Touch(touches, entry, leave, arc, push)
-
-
-def _unit(vectors: Array) -> Array:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
