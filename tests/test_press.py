@@ -33,6 +33,7 @@ KEYS = [
     "residual",
     "status",
     "flags",
+    "known_error",
 ]
 CONDYLE_KEYS = ["force_N", "area_mm2", "mean_pressure_MPa", "peak_pressure_MPa", "cop_mm"]
 TURN = np.array([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]])
@@ -251,7 +252,7 @@ def test_pose_file(tmp_path):
         path.write_text(text)
         with pytest.raises(InputError, match="six numbers"):
             read_pose(path)
-    with pytest.raises(InputError, match="six numbers"):
+    with pytest.raises(InputError, match="no such pose file"):
         read_pose(tmp_path / "none.txt")
 
 

@@ -7,13 +7,15 @@ import os
 import sys
 import tomllib
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from tkamb.command_options import add_no_cache, without_cache
-from tkamb.errors import TkambError
+from tkamb.guard import guarded
 from tkamb.importing.command import add_import
 from tkamb.press.command import add_press
+from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
 from tkamb.view.command import add_view
 
@@ -24,21 +26,14 @@ if TYPE_CHECKING:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `tkamb` and return its exit status: 0 done, 1 nothing computed, 2 bad input."""
     _keep_to_one_thread()
-    options = _parser().parse_args(arguments)
-    logging.basicConfig(format="tkamb: %(levelname)s: %(message)s", level=logging.WARNING)
-    try:
-        status = int(options.command(options))
-        sys.stdout.flush()
-        return status
-    except TkambError as error:
-        print(f"tkamb: {error}", file=sys.stderr)
-        return error.exit_status
-    except BrokenPipeError:  # the reader of a pipe has gone, `tkamb ... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except KeyboardInterrupt as interrupt:
-        print(f"tkamb: interrupted: {interrupt or 'nothing is kept'}", file=sys.stderr)
-        return 130
+    options = argparse.Namespace()
+
+    def command() -> int:
+        _parser().parse_args(arguments, options)
+        logging.basicConfig(format="tkamb: %(levelname)s: %(message)s", level=logging.WARNING)
+        return int(options.command(options))
+
+    return guarded(command, options)
 
 
 def _keep_to_one_thread() -> None:
@@ -61,8 +56,11 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="tkamb", description="What happens inside a total knee replacement.")
+    parser.add_argument("--version", action="version", version=f"tkamb {version('tkamb')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    add_new(commands)
     _add_run(commands)
+    _add_folder_commands(commands)
     add_press(commands)
     _add_contact(commands)
     _add_mesh(commands)
@@ -90,11 +88,21 @@ def _add_run(commands: Any) -> None:
         help="override a key of the scene",
     )
     add_no_cache(run)
+    run.add_argument("--force", action="store_true", help="write into a folder that is not tkamb's")
     run.add_argument("--resume", action="store_true", help="go on with an interrupted run")
     run.add_argument("--profile", action="store_true", help="what was touched, and time per part")
     run.add_argument("--strict", action="store_true", help="exit 1 when a frame failed")
     run.add_argument("--json", action="store_true", help="print summary.json")
     run.set_defaults(command=_run)
+
+
+def _add_folder_commands(commands: Any) -> None:
+    verify = commands.add_parser("verify", help="is a folder of results what was written?")
+    verify.add_argument("folder", type=Path, metavar="DIR")
+    verify.set_defaults(command=_verify)
+    report = commands.add_parser("report", help="write report.html of a folder of results anew")
+    report.add_argument("folder", type=Path, metavar="DIR")
+    report.set_defaults(command=_report)
 
 
 def _add_contact(commands: Any) -> None:
@@ -162,8 +170,8 @@ def _run(options: argparse.Namespace) -> int:
     from tkamb.run.profiling import Profile, profile_lines
 
     profile = Profile() if options.profile else None
-    from tkamb.output.atomic import claimed_directory
     from tkamb.output.axis import horizontal_axis
+    from tkamb.output.claim import claimed_directory
     from tkamb.output.headline import cards
     from tkamb.results import write_results
     from tkamb.run.status import FAILED
@@ -171,7 +179,7 @@ def _run(options: argparse.Namespace) -> int:
 
     scene = _scene_of(options)
     directory = options.out or scene.output.directory or _default_directory(options.scene)
-    with claimed_directory(directory):
+    with claimed_directory(directory, options.force):
         results = simulate(
             scene,
             frames=options.frames,
@@ -186,6 +194,8 @@ def _run(options: argparse.Namespace) -> int:
     failed = [k for k, status in enumerate(results.status) if status.startswith(FAILED)]
     for k in failed:
         print(f"tkamb: frame {k}: {results.status[k]}", file=sys.stderr)
+    for question in results.summary.get("questions", []):
+        print(f"tkamb: question: {question}", file=sys.stderr)
     if options.json:
         print((directory / "summary.json").read_text(encoding="utf-8"), end="")
     else:
@@ -216,6 +226,26 @@ def _scene_of(options: argparse.Namespace) -> "Scene":
 
 def _default_directory(scene: Path) -> Path:
     return Path("out") / scene.resolve().parent.name
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from tkamb.verify import verify_results
+
+    verdict = verify_results(options.folder)
+    print("\n".join(f"{options.folder}: {line}" for line in verdict.lines()))
+    return 1 if verdict.differs else 0
+
+
+def _report(options: argparse.Namespace) -> int:
+    from tkamb.output.claim import claimed_directory
+    from tkamb.output.report import write_report
+    from tkamb.results import REPORT_NAME, read_results, read_summary
+
+    read_summary(options.folder)  # before a folder is made or marked
+    with claimed_directory(options.folder) as folder:
+        write_report(read_results(folder), folder / REPORT_NAME)
+    print(f"report: {options.folder / REPORT_NAME}")
+    return 0
 
 
 def _contact_list(options: argparse.Namespace) -> int:

@@ -6,13 +6,17 @@ Units are in the key names; unknown keys are errors; every table is frozen.
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, model_validator
 
 from tkamb.defaults import CONTACT_MODEL
 
 LengthUnit = Literal["m", "cm", "mm"]
 AngleUnit = Literal["rad", "deg"]
-Vector = tuple[float, float, float]
+Number = Annotated[float, Strict()]
+"""Neither `true` nor a number in quotes is one."""
+Count = Annotated[int, Strict()]
+Switch = Annotated[bool, Strict()]
+Vector = tuple[Number, Number, Number]
 KneeFreedom = Literal["ap", "si", "ml", "axial_rotation", "adduction"]
 
 
@@ -28,6 +32,25 @@ def _axes(text: str) -> str:
 Axes = Annotated[str, AfterValidator(_axes)]
 
 
+def _within(low: float, high: float, question: str) -> Any:
+    """Return the annotation of a number, or of each of a vector's, that must lie in a range."""
+
+    def checked(value: Any) -> Any:
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and not low <= number <= high:
+                raise ValueError(f"{number:g} is not within {low:g} to {high:g}; {question}")
+        return value
+
+    return AfterValidator(checked)
+
+
+Point = Annotated[Vector, _within(-1000, 1000, "is it in millimetres?")]
+"""A bone's length (0.6 m at most) and a frame's origin beside it are less than a metre."""
+Offset = Annotated[Vector, _within(-600, 600, "is it in millimetres?")]
+"""From a mesh's origin, at worst at the bone's other end, to the link's."""
+Turn = Annotated[Vector, _within(-360, 360, "is it in degrees?")]
+
+
 class SceneTable(BaseModel):
     """A table of the scene file: frozen, and unknown keys are errors."""
 
@@ -39,11 +62,17 @@ class PatientTable(SceneTable):
 
     urdf: Path
     side: Literal["right", "left"] = Field(description="the knee that is modelled")
-    mass_kg: float = Field(gt=0, description="body mass; forces in BW are relative to it")
+    # From a child of six with a tumour prosthesis to the heaviest patients operated on.
+    mass_kg: Annotated[Number, _within(20, 300, "is it in kilograms?")] = Field(
+        description="body mass, 20 to 300; forces in BW are relative to it"
+    )
     sex: Literal["male", "female"] | None = Field(
         None, description="only for segments without <inertial>: picks the de Leva table"
     )
-    height_mm: float | None = Field(None, gt=0)
+    # The same child to the tallest adults but a few.
+    height_mm: Annotated[Number | None, _within(1000, 2300, "is it in millimetres, standing?")] = (
+        Field(None, description="body height, 1000 to 2300")
+    )
 
 
 class MarkerSegmentTable(SceneTable):
@@ -139,8 +168,8 @@ class MotionTable(SceneTable):
             "SI from first touch; needs the implant"
         ),
     )
-    slip_share: float = Field(
-        1.0, ge=0, description="roll-slip: share of the recorded slip; 0 is pure rolling"
+    slip_share: Number = Field(
+        1.0, ge=0, le=10, description="roll-slip: share of the recorded slip; 0 is pure rolling"
     )
     format: Literal["csv", "sto", "mot", "trc", "c3d"] | None = Field(
         None, description="default: the suffix"
@@ -161,22 +190,31 @@ class MotionTable(SceneTable):
             "[contact] releases need no column"
         ),
     )
+    signs_turned: tuple[str, ...] = Field(
+        (),
+        description=(
+            "roles whose columns are read with the other sign: states another reading of a file "
+            "whose signs are in doubt"
+        ),
+    )
     angle_unit: AngleUnit | None = Field(None, description="of the file; markers need none")
     length_unit: LengthUnit | None = Field(
         None, description="of the file; .trc and .c3d state their own"
     )
-    cutoff_Hz: float | Literal["none"] = Field(
+    cutoff_Hz: Number | Literal["none"] = Field(
         description="low-pass cut-off of the differentiation; 'none' trusts the samples"
     )
-    interval_s: tuple[float, float] | None = Field(
+    interval_s: tuple[Number, Number] | None = Field(
         None, description="the part of the recording that is computed; default: all of it"
     )
-    cycle_s: tuple[float, float] | None = Field(
+    cycle_s: tuple[Number, Number] | None = Field(
         None,
         description="the motion's time column is per cent of a cycle, which lies on this interval",
     )
-    cycle_offset_percent: float = Field(0.0, description="per cent of the cycle at cycle_s[0]")
-    frames: int | None = Field(
+    cycle_offset_percent: Number = Field(
+        0.0, ge=-100, le=100, description="per cent of the cycle at cycle_s[0]"
+    )
+    frames: Count | None = Field(
         None, ge=2, description="resample to so many frames; default: as recorded"
     )
 
@@ -204,11 +242,11 @@ class JointCentreTable(SceneTable):
     """
 
     name: str
-    markers_mm: dict[str, Vector] = Field(
+    markers_mm: dict[str, Point] = Field(
         description="the neighbour's markers: name -> position in the neighbour's own frame"
     )
-    centre_mm: Vector = Field(description="the joint centre in the neighbour's own frame")
-    tibia_mm: Vector = Field(description="the joint centre in the tibia link")
+    centre_mm: Point = Field(description="the joint centre in the neighbour's own frame")
+    tibia_mm: Point = Field(description="the joint centre in the tibia link")
 
 
 class TibiaTable(SceneTable):
@@ -236,11 +274,13 @@ class TibiaTable(SceneTable):
     length_unit: LengthUnit | None = Field(
         None, description="of the file; needed for pose, and for markers unless the file says"
     )
-    cutoff_Hz: float | Literal["none"] | None = Field(
+    cutoff_Hz: Number | Literal["none"] | None = Field(
         None, description="low-pass cut-off; default: the motion's"
     )
-    ankle_mm: Vector = Field((0.0, 0.0, 0.0), description="sagittal: the fixed ankle in the lab")
-    markers_mm: dict[str, Vector] = Field(
+    ankle_mm: Annotated[Vector, _within(-20000, 20000, "is it in millimetres?")] = Field(
+        (0.0, 0.0, 0.0), description="sagittal: the fixed ankle in the lab"
+    )
+    markers_mm: dict[str, Point] = Field(
         default_factory=dict, description="markers: name -> position in the tibia link"
     )
     joint_centre: tuple[JointCentreTable, ...] = Field(
@@ -286,9 +326,9 @@ class GroundReactionTable(SceneTable):
     applied: Literal["cop", "ankle"] = Field(
         "cop", description="'ankle' applies the force alone at the ankle centre (the source)"
     )
-    cutoff_Hz: float | Literal["none"]
-    unloaded_N: float = Field(
-        20.0, gt=0, description="below this vertical force the centre of pressure is held"
+    cutoff_Hz: Number | Literal["none"]
+    unloaded_N: Number = Field(
+        20.0, gt=0, le=200, description="below this vertical force the centre of pressure is held"
     )
 
 
@@ -298,10 +338,10 @@ class FemoralImplantTable(SceneTable):
     mesh: Path
     unit: LengthUnit
     axes: Axes = "+x,+y,+z"
-    position_mm: Vector = Field(
+    position_mm: Offset = Field(
         (0.0, 0.0, 0.0), description="mesh origin in the femur link, anatomical axes"
     )
-    rotation_deg: Vector = Field((0.0, 0.0, 0.0), description="intrinsic x-y-z, after axes")
+    rotation_deg: Turn = Field((0.0, 0.0, 0.0), description="intrinsic x-y-z, after axes")
 
 
 class InsertImplantTable(SceneTable):
@@ -319,8 +359,8 @@ class PatellarImplantTable(SceneTable):
     mesh: Path
     unit: LengthUnit
     axes: Axes = "+x,+y,+z"
-    position_mm: Vector = (0.0, 0.0, 0.0)
-    rotation_deg: Vector = (0.0, 0.0, 0.0)
+    position_mm: Offset = (0.0, 0.0, 0.0)
+    rotation_deg: Turn = (0.0, 0.0, 0.0)
 
 
 class ImplantTable(SceneTable):
@@ -335,7 +375,7 @@ class Attachment(SceneTable):
     """A point fixed to a link of the URDF."""
 
     link: str
-    point_mm: Vector
+    point_mm: Point
 
 
 class LigamentTable(SceneTable):
@@ -349,14 +389,26 @@ class LigamentTable(SceneTable):
     proximal: Attachment
     distal: Attachment
     law: Literal["two-line", "quadratic-toe"]
-    stiffness_N_per_mm: float | None = Field(None, gt=0)
-    stiffness_N_per_strain: float | None = Field(None, gt=0)
-    slack_length_mm: float | None = Field(None, gt=0)
-    reference_strain: float | None = Field(
-        None, gt=-1, description="instead of slack_length_mm: strain at the reference pose"
+    # Ten times a whole cruciate ligament's (Race & Amis 1994: 347 N/mm), and as much a strain.
+    stiffness_N_per_mm: Annotated[Number | None, _within(0, 5000, "is it in N/m?")] = Field(
+        None, gt=0
     )
-    reference_flexion_deg: float = Field(
-        0.0, description="the recorded frame nearest to this flexion is the reference pose"
+    stiffness_N_per_strain: Annotated[
+        Number | None, _within(0, 150000, "is it in N per unit strain?")
+    ] = Field(None, gt=0)
+    # From a capsule's fibre to the superficial MCL's longest with its frame's length to spare.
+    slack_length_mm: Annotated[Number | None, _within(3, 300, "is it in millimetres?")] = Field(
+        None
+    )
+    # No ligament bears more than 0.3 (Butler et al. 1986).
+    reference_strain: Annotated[Number | None, _within(-0.5, 0.3, "is it in per cent?")] = Field(
+        None, description="instead of slack_length_mm: strain at the reference pose"
+    )
+    reference_flexion_deg: Number = Field(
+        0.0,
+        ge=-45,
+        le=180,
+        description="the recorded frame nearest to this flexion is the reference pose",
     )
 
     @model_validator(mode="after")
@@ -400,12 +452,15 @@ class QuadricepsTable(SceneTable):
 
     origin: Attachment
     insertion: Attachment
-    wrap: bool = True
+    wrap: Switch = True
     bone: BoneTable | None = None
-    half_thickness_mm: float = Field(3.5, ge=0, description="of the tendon, off the outline")
-    band_mm: float = Field(
+    half_thickness_mm: Number = Field(
+        3.5, ge=0, le=20, description="of the tendon, off the outline"
+    )
+    band_mm: Number = Field(
         5.0,
         ge=0,
+        le=50,
         description=(
             "wraps the sections within this distance of its sagittal plane: as far as, on "
             "average, the fibres of a lamina 20 mm wide; wider ones ride on the flanges"
@@ -421,12 +476,13 @@ class PatellarLigamentTable(SceneTable):
 
     proximal: Attachment
     distal: Attachment
-    length_mm: float | None = Field(
-        None, gt=0, description="its constant length; needed where the patella is solved"
+    # Half of the shortest measured one to twice the longest (25 to 65 mm).
+    length_mm: Annotated[Number | None, _within(12, 130, "is it in millimetres?")] = Field(
+        None, description="its constant length; needed where the patella is solved"
     )
-    wrap: bool = True
-    half_thickness_mm: float = Field(2.5, ge=0)
-    band_mm: float = Field(5.0, ge=0, description="likewise, of the insert's lip")
+    wrap: Switch = True
+    half_thickness_mm: Number = Field(2.5, ge=0, le=20)
+    band_mm: Number = Field(5.0, ge=0, le=50, description="likewise, of the insert's lip")
 
 
 class PatellaTable(SceneTable):
@@ -439,10 +495,10 @@ class ContactTable(SceneTable):
     """The femorotibial contact."""
 
     model: str = Field(CONTACT_MODEL, description="a name of `tkamb contact list`")
-    resolution_mm: float = Field(1.0, gt=0)
+    resolution_mm: Number = Field(1.0, gt=0)
     material: str = Field("polyethylene", description="a name of `tkamb.contact.materials`")
-    friction: float = Field(0.05, ge=0, le=1, description="Coulomb coefficient")
-    adjust: bool = Field(False, description="femoral adjustment before contact")
+    friction: Number = Field(0.05, ge=0, le=1, description="Coulomb coefficient")
+    adjust: Switch = Field(False, description="femoral adjustment before contact")
     coupling: Literal["none", "points"] = Field(
         "none", description="'points': the resultants of the deformed contact act in the equations"
     )
@@ -473,7 +529,7 @@ class OutputTable(SceneTable):
     """What is written and how it is read."""
 
     directory: Path | None = None
-    yield_stress_MPa: float = Field(21.0, gt=0)
+    yield_stress_MPa: Number = Field(21.0, ge=1, le=200)
     axis: Literal["flexion", "cycle", "time"] = Field(
         "flexion", description="the report's horizontal axis"
     )

@@ -33,7 +33,7 @@ from tkamb.inputs.marker_motion import calibrated_markers
 from tkamb.inputs.meshes import load_surface
 from tkamb.inputs.tables import Table, read_table
 from tkamb.opensim.read import read_osim
-from tkamb.output.atomic import claimed_directory, write_text
+from tkamb.output.atomic import claim_directory, write_text
 from tkamb.scene import Scene, load_scene
 from tkamb.units import DEGREE, MILLIMETRE
 
@@ -207,19 +207,22 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
     urdf, scene = folder / patient.scene.urdf, folder / name
     if scene.exists():
         raise InputError("is there already", scene, "choose another --out, or remove it")
-    with claimed_directory(folder):
-        files = {urdf: patient.urdf, scene: patient.scene.text()}
-        if patient.motion is not None:
-            files[folder / MOTION_FILE] = patient.motion
-        before = {p: p.read_text(encoding="utf-8") if p.is_file() else None for p in files}
-        for path, text in files.items():
-            write_text(path, text)
-        try:
-            case = load_case(load_scene(scene))
-        except InputError:
-            for path, old in before.items():
-                path.unlink() if old is None else write_text(path, old)
-            raise
+    files = {urdf: patient.urdf, scene: patient.scene.text()}
+    if patient.motion is not None:
+        files[folder / MOTION_FILE] = patient.motion
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    before = {p: p.read_text(encoding="utf-8") if p.is_file() else None for p in files}
+    claim_directory(folder)
+    for path, text in files.items():
+        write_text(path, text)
+    try:
+        case = load_case(load_scene(scene))
+    except InputError:
+        for path, old in before.items():
+            path.unlink() if old is None else write_text(path, old)
+        for place in made:
+            place.rmdir()
+        raise
     return marker_lines(case)
 
 

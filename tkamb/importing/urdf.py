@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.geometry.frames import Array, pose, transform
 from tkamb.importing.links import Links
-from tkamb.inputs.patient import KNEE_JOINTS, PATELLA_JOINTS
 from tkamb.inputs.segments import RigidInertia, combined
+from tkamb.inputs.urdf_check import KNEE_JOINTS, PATELLA_JOINTS
 
 RESERVED = ("ground", "tibia", "femur", "patella", "hip")
 """Links that docs/patient.md names; a body of one of these names gets `_bone` behind it."""

@@ -11,7 +11,7 @@ loaded frames on either side and the moment is whatever the wrench needs about t
 force and moment stay exactly as measured and filtered, only their point is conventional.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -22,11 +22,21 @@ from tkamb.geometry.frames import MIRROR, Array
 from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import check_roles, laboratory_rotation
+from tkamb.inputs.samples import OddSample, check_range, check_spacing, odd_samples
 from tkamb.inputs.tables import Table, read_table
 from tkamb.scene_tables import GroundReactionTable
+from tkamb.units import MILLIMETRE
 
 LEVEL_TOLERANCE = 0.01
 """m; a centre of pressure that rises by more than this is not on a level plate."""
+LARGEST_FORCE = 20000.0
+"""N, twice what a triple jumper's foot bears."""
+LARGEST_MOMENT = 1000.0
+"""N·m, many times any free moment; plates that give it about their own origin stay below it."""
+ODD_FORCE, ODD_POINT = 0.05, 5e-3
+"""Of the peak force, and m: as near to its neighbours' curve as that, no sample is odd."""
+WINDOW = 0.5
+"""s: samples farther from the frames than this do not reach them through the filter."""
 FARTHEST_FROM_ANKLE = 0.5
 """m; a centre of pressure farther from the ankle than this is under no foot of that leg."""
 
@@ -40,12 +50,14 @@ class GroundReaction:
         point: (f, 3) m, the centre of pressure.
         moment: (f, 3) N·m about that point; vertical while the foot is loaded.
         loaded: (f,) whether the vertical force is at or above `unloaded_N`.
+        odd: recorded samples around the frames that lie off their neighbours' curve.
     """
 
     force: Array
     point: Array
     moment: Array
     loaded: np.ndarray
+    odd: tuple[OddSample, ...] = ()
 
 
 def load_ground_reaction(
@@ -70,9 +82,12 @@ def load_ground_reaction(
         stamps = recorded.time(table.columns.get("time", "time"))
         force, point, moment = _recorded(table, recorded)
     path = table.file
+    check_spacing(path, stamps)
     _check_upward(force, table)
     loaded = force[:, 1] >= table.unloaded_N
     point = _held(stamps, point, loaded, path)
+    near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
+    odd = _odd_samples(path, stamps[near], force[near], point[near], loaded[near])
     level = float(np.median(point[loaded, 1])) if loaded.any() else 0.0
     if loaded.any() and np.abs(point[loaded, 1] - level).max() > LEVEL_TOLERANCE:
         raise InputError(
@@ -86,7 +101,29 @@ def load_ground_reaction(
     filtered, _, _ = differentiate_coordinates(
         stamps, wrench, table.cutoff_Hz, time, name=str(path)
     )
-    return _at_centre_of_pressure(filtered, level, table.unloaded_N, time, stamps, point)
+    reaction = _at_centre_of_pressure(filtered, level, table.unloaded_N, time, stamps, point)
+    return replace(reaction, odd=odd)
+
+
+def _odd_samples(
+    path: Path, stamps: Array, force: Array, point: Array, loaded: np.ndarray
+) -> tuple[OddSample, ...]:
+    """Return the odd samples of force and point (n, 3), where the plate stays loaded."""
+    if not loaded.any():
+        return ()
+    floor = ODD_FORCE * float(np.abs(force).max())
+    inside = loaded.copy()  # two samples away from where the foot comes down or leaves
+    for shift in (1, 2):
+        inside[shift:] &= loaded[:-shift]
+        inside[:-shift] &= loaded[shift:]
+    kept = set(stamps[inside].tolist())
+    odd: list[OddSample] = []
+    for axis in range(3):
+        one = (path, f"force_{axis + 1}", stamps, force[:, axis])
+        odd += odd_samples(*one, floor, 1.0, "N")
+        one = (path, f"point_{axis + 1}", stamps, point[:, axis])
+        odd += odd_samples(*one, ODD_POINT, MILLIMETRE, "mm")
+    return tuple(sample for sample in odd if sample.time in kept)
 
 
 def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
@@ -123,7 +160,16 @@ def _recorded(table: GroundReactionTable, recorded: Table) -> tuple[Array, Array
             columns.append(np.zeros_like(columns[0]))
     values = np.stack(columns, axis=1).reshape(-1, 3, 3) @ rotation.T
     scale = recorded.unit_scale(table.length_unit, "length_unit")
-    return values[:, 0], values[:, 1] * scale, values[:, 2]
+    force, point, moment = values[:, 0], values[:, 1] * scale, values[:, 2]
+    for kind, found, largest, unit in (
+        ("force", force, LARGEST_FORCE, "N"),
+        ("moment", moment, LARGEST_MOMENT, "N·m"),
+    ):
+        for axis in range(3):
+            what, limits = f"foot: {kind}_{axis + 1}", (-largest, largest)
+            question = f"is a cell mistyped, or the {kind} not in {unit}?"
+            check_range(recorded.path, what, found[:, axis], limits, unit, question)
+    return force, point, moment
 
 
 def _of_plates(table: GroundReactionTable) -> tuple[Array, Array, Array, Array]:

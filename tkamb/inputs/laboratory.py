@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tkamb.errors import InputError
+from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array, pose
 from tkamb.inputs.tables import Table
 from tkamb.units import ANGLE
@@ -36,7 +36,7 @@ def check_roles(columns: dict[str, str], roles: tuple[str, ...], path: Path, tab
     for role in columns:
         if role not in roles:
             raise InputError(
-                f"unknown role '{role}' in [{table}] columns", path, f"one of {', '.join(roles)}"
+                f"unknown role '{role}' in [{table}] columns", path, names_near(role, roles)
             )
 
 

@@ -8,6 +8,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
+from tkamb.files import MESH_LIMIT, check_file
 from tkamb.geometry.boundary import BoundaryLoop
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.geometry.repair import Repair, repair
@@ -119,8 +120,7 @@ def read_triangles(path: str | Path) -> tuple[Array, Indices]:
     """
     path = Path(path)
     try:
-        if not path.is_file():
-            raise InputError("no such mesh file", path, "check the path")
+        check_file(path, MESH_LIMIT, what="mesh file")
         mesh = trimesh.load(path, force="mesh", process=False)
     except InputError:
         raise

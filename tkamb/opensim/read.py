@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from tkamb.errors import InputError
+from tkamb.files import read_xml
 from tkamb.geometry.frames import Array
-from tkamb.inputs.safe_xml import parse_xml
 from tkamb.opensim.elements import Document, Element
 from tkamb.opensim.functions import Scaled
 from tkamb.opensim.model import (
@@ -41,7 +41,7 @@ def read_osim(path: str | Path) -> OpenSimModel:
         InputError: no such file, no OpenSim model, or something in it that cannot be read.
     """
     path = Path(path)
-    root = parse_xml(path, "OpenSim model")
+    root = read_xml(path, what="OpenSim model")
     document, model = _opened(root, path)
     bodies = _bodies(document, model)
     frames = Frames.of(document, model, (GROUND, *bodies))

@@ -70,9 +70,6 @@ def _wrap_object(document: Document, entry: Element, body: str) -> WrapObject:
         dimensions = np.array([document.number(entry, tag) for tag in tags])
     if not (dimensions > 0.0).all():
         raise InputError("has a dimension that is not positive", document.where(entry))
-    if shape == "torus":
-        # The tube lies between the two radii of the ring.
-        dimensions = np.array([dimensions.sum() / 2.0, np.ptp(dimensions) / 2.0])
     rotation = document.numbers(entry, "xyz_body_rotation", count=3, default="0 0 0")
     translation = document.numbers(entry, "translation", count=3, default="0 0 0")
     return WrapObject(

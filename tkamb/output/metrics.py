@@ -69,6 +69,25 @@ def medial_share(results: Results, estimate: str) -> Array:
         return both * np.where(total > 0, np.nan_to_num(medial) / total, np.nan)
 
 
+def split_undetermined(results: Results) -> NDArray[np.bool_]:
+    """Return in which frames (f,) the recorded adduction does not determine the split."""
+    return np.asarray(results["split_determined"] == 0)
+
+
+def moved_per_half_degree(results: Results) -> Array:
+    """Return what 0.5 deg of adduction moves (f,) between the condyles by the tangent, N.
+
+    Never more than the whole load.
+    """
+    moved = 0.5 * np.abs(results["medial_force_per_adduction_N_per_deg"])
+    return np.minimum(moved, np.abs(results["force_si_N"]))
+
+
+def shares_apart(results: Results) -> Array:
+    """Return by how much (f,) the two estimates of the medial share differ."""
+    return np.abs(medial_share(results, "deformation") - medial_share(results, "equilibrium"))
+
+
 def tension_ratio(results: Results, column: str) -> Array:
     """Return a force (f,) relative to the quadriceps tension."""
     quadriceps = results["quadriceps_N"]

@@ -5,8 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from tkamb.known_errors import is_large, known_error_words
 from tkamb.output import style
-from tkamb.output.metrics import body_weight, medial_share, residual_share, tension_ratio
+from tkamb.output.metrics import (
+    body_weight,
+    medial_share,
+    residual_share,
+    split_undetermined,
+    tension_ratio,
+)
 from tkamb.output.panel import Line, Panel, without_empty_lines
 from tkamb.output.style import BLACK, BLUE, GREEN, GREY, PURPLE, SIDE_COLOURS, VERMILLION
 from tkamb.results import Results
@@ -16,9 +23,9 @@ from tkamb.run.columns import is_ligament, ligament_of
 def panels(results: Results) -> tuple[Panel, ...]:
     """Return the plots whose numbers the run has, in the report's order."""
     makers: tuple[Callable[[Results], Panel], ...] = (
-        _total, _condyles, _share, _extensor, _ratios, _areas, _pressures, _yield, _external,
-        _ground, _ligaments, _residuals, _residual_moment, _hip_force, _hip_moment, _motion,
-        _slip, _adjustment, _adjustment_effect, _condition,
+        _total, _condyles, _share, _sensitivity, _extensor, _ratios, _areas, _pressures, _yield,
+        _external, _ground, _ligaments, _residuals, _residual_moment, _hip_force, _hip_moment,
+        _motion, _slip, _adjustment, _adjustment_effect, _condition,
     )  # fmt: skip
     made = (without_empty_lines(make(results)) for make in makers)
     return tuple(panel for panel in made if panel.lines)
@@ -87,7 +94,25 @@ def _share(results: Results) -> Panel:
         Line("equilibrium", "by equilibrium", medial_share(results, "equilibrium"), PURPLE, True),
     )
     title, unit = "Medial share of the load", "medial / (medial + lateral)"
-    return Panel("share", title, unit, lines, level=(0.5, "even"), limits=(0.0, 1.0))
+    panel = Panel("share", title, unit, lines, level=(0.5, "even"), limits=(0.0, 1.0))
+    unknown = int(split_undetermined(results).sum())
+    if not unknown:
+        return panel
+    note = (
+        f"By deformation not determined in {unknown} of {len(results)} frames: 0.5 deg of "
+        "adduction moves more than a quarter of the load, or one condyle alone carries it."
+    )
+    return replace(panel, note=note, warning=True)
+
+
+def _sensitivity(results: Results) -> Panel:
+    name = "medial_force_per_adduction_N_per_deg"
+    lines = (_line(results, name, "medial force", BLACK),)
+    note = (
+        "Change of the medial force by deformation with the adduction, at constant load. "
+        "Fluoroscopy knows the adduction to about 0.5 deg."
+    )
+    return Panel("sensitivity", "Sensitivity of the split to adduction", "N/deg", lines, note)
 
 
 def _extensor(results: Results) -> Panel:
@@ -113,7 +138,18 @@ def _ratios(results: Results) -> Panel:
 
 
 def _areas(results: Results) -> Panel:
-    return Panel("areas", "Contact area", "mm²", _both_sides(results, "area_mm2"))
+    lines = _both_sides(results, "area_mm2")
+    return _with_known_error(results, Panel("areas", "Contact area", "mm²", lines), ("area",))
+
+
+def _with_known_error(results: Results, panel: Panel, names: tuple[str, ...]) -> Panel:
+    """Return the panel with what its contact model is known to be off by."""
+    said = results.summary.get("known_error")
+    if said is None:
+        return panel
+    words = known_error_words(said, names)
+    note = f"{words[0].upper()}{words[1:]}."
+    return replace(panel, note=note, warning=is_large(said, names))
 
 
 def centre_panel(results: Results) -> Panel:
@@ -131,7 +167,8 @@ def _pressures(results: Results) -> Panel:
     )
     stress = results.summary.get("yield_stress_MPa")
     level = None if stress is None else (float(stress), f"yield {stress:g} MPa")
-    return Panel("pressures", "Contact pressure", "MPa", lines, level=level)
+    panel = Panel("pressures", "Contact pressure", "MPa", lines, level=level)
+    return _with_known_error(results, panel, ("peak_pressure", "mean_pressure"))
 
 
 def _yield(results: Results) -> Panel:

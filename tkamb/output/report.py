@@ -6,18 +6,25 @@ from typing import Any
 
 from tkamb.output.atomic import write_text
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
-from tkamb.output.cursor import cursor_bar
+from tkamb.output.cursor import SCRIPT, cursor_bar
 from tkamb.output.headline import cards
 from tkamb.output.metrics import body_weight, failed, flagged
 from tkamb.output.panel import Panel
 from tkamb.output.panels import centre_panel, panels
 from tkamb.output.plots import draw_panel
+from tkamb.output.policy import sources
 from tkamb.output.pressure_maps import draw_maps, draw_paths, mapped_frames, top_view
 from tkamb.output.provenance import provenance_rows, sentences
 from tkamb.output.report_style import CSS, NOTEBOOK_CSS
 from tkamb.output.style import svg_text
 from tkamb.output.tables import flags_table, motion_table, strain_table
 from tkamb.results import Results
+
+POLICY = (
+    f"default-src 'none'; script-src {sources(SCRIPT)}; style-src-elem {sources(CSS)}; "
+    "style-src-attr 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
+)
+"""The page runs its own script and loads nothing; the plots set their colours in attributes."""
 
 
 def write_report(results: Results, path: str | Path) -> None:
@@ -35,9 +42,11 @@ def report_html(results: Results) -> str:
     title = escape(_title(results.summary))
     return (
         "<!DOCTYPE html>\n"
-        f'<html lang="en"><head><meta charset="utf-8"><title>{title}</title>\n'
+        f'<html lang="en"><head><meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
+        f"<title>{title}</title>\n"
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<style>\n{CSS}</style></head>\n<body>\n"
+        f"<style>{CSS}</style></head>\n<body>\n"
         f"<header><h1>{title}</h1><p>{_subtitle(results)}</p></header>\n"
         f"{_summary_section(results, axis)}{_maps_section(results, axis)}"
         f"{_plots_section(results, axis)}{_tables_section(results, axis)}"
@@ -125,7 +134,8 @@ def _plots_section(results: Results, axis: HorizontalAxis) -> str:
 
 def _plot(panel: Panel, results: Results, axis: HorizontalAxis) -> str:
     picture = svg_text(draw_panel(panel, results, axis), panel.name)
-    note = f"<figcaption>{escape(panel.note)}</figcaption>" if panel.note else ""
+    kind = " class='warning'" if panel.warning else ""
+    note = f"<figcaption{kind}>{escape(panel.note)}</figcaption>" if panel.note else ""
     return (
         f"<figure class='plot' id='figure-{panel.name}'><h3>{escape(panel.title)}"
         f" <small>({escape(panel.unit)})</small></h3>{picture}"

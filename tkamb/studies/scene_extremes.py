@@ -28,6 +28,7 @@ from tkamb.studies.cases import SHIPPED_SCENE
 from tkamb.studies.recordings import change_recording, copied_scene, stretch_time
 from tkamb.studies.verdict import WRONG, Verdict
 
+CONTACT = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
 FRAMES = slice(20, 101, 40)
 TIME_SCALES = (1e-3, 1e-2, 0.1, 0.3, 3.0, 20.0, 1e4)
 SLOW = 10.0
@@ -100,7 +101,7 @@ def _run(scene: Path, overrides: dict[str, Any]) -> Results:
     from tkamb.scene import load_scene
     from tkamb.simulation import simulate
 
-    return simulate(load_scene(scene, {"contact.resolution_mm": 2.0} | overrides), frames=FRAMES)
+    return simulate(load_scene(scene, CONTACT | overrides), frames=FRAMES)
 
 
 def _drive(extreme: SceneExtreme, folder: Path) -> dict[str, Any]:

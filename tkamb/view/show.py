@@ -19,7 +19,7 @@ from tkamb.view.drawing import Drawing
 from tkamb.view.live import ContactSwitch
 from tkamb.view.page import page_html, write_page
 from tkamb.view.payload import pack, peak_pressure
-from tkamb.view.run import Run
+from tkamb.view.run import Run, no_frame
 from tkamb.view.server import ViewServer
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
@@ -102,7 +102,7 @@ class Show:
     def _checked(self, frame: int, camera: str) -> tuple[int, str]:
         most = max(len(run.frames) for run in self.runs)
         if not -most <= frame < most:
-            raise InputError(f"there is no frame {frame}", "--frame", f"0 to {most - 1}")
+            raise no_frame(frame, most)
         if camera not in CAMERAS:
             raise InputError(f"no view '{camera}'", "--camera", f"there are: {', '.join(CAMERAS)}")
         return frame % most, camera

@@ -1,0 +1,40 @@
+"""`tkamb new`: what it lays out runs as it is, and it takes nothing that is somebody's."""
+
+import numpy as np
+import pytest
+
+import tkamb
+from scenes import MODEL
+from tkamb.cli import main
+
+
+def test_what_is_laid_out_runs_as_it_is(tmp_path):
+    assert main(["new", str(tmp_path / "knee")]) == 0
+    started = tkamb.simulate(tmp_path / "knee" / "scene.toml", contact="foundation")
+    shipped = tkamb.simulate(MODEL / "scene.toml", contact="foundation", frames=slice(30, 81, 10))
+    np.testing.assert_allclose(started["flexion_deg"], shipped["flexion_deg"], rtol=1e-6)
+    # Fewer triangles and two of the six ligaments: the leg and its loads are the shipped ones.
+    np.testing.assert_allclose(started["quadriceps_N"], shipped["quadriceps_N"], rtol=0.02)
+    np.testing.assert_allclose(started["force_total_BW"], shipped["force_total_BW"], rtol=0.05)
+
+
+def test_a_folder_that_holds_something_is_left_as_it_is(tmp_path, capfd):
+    (tmp_path / "mine.txt").write_text("mine")
+    assert main(["new", str(tmp_path)]) == 2
+    assert "not empty" in capfd.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_an_empty_folder_is_taken(tmp_path):
+    assert main(["new", str(tmp_path / "empty")]) == 0
+    (tmp_path / "second").mkdir()
+    assert main(["new", str(tmp_path / "second")]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "second"]
+
+
+@pytest.mark.parametrize("name", ["file", "file/below"])
+def test_a_place_that_is_no_folder_is_refused(tmp_path, capfd, name):
+    (tmp_path / "file").write_text("mine")
+    assert main(["new", str(tmp_path / name)]) == 2
+    assert len(capfd.readouterr().err.strip().splitlines()) == 1
+    assert (tmp_path / "file").read_text() == "mine"
