@@ -191,10 +191,9 @@ def test_a_motion_in_the_models_coordinates_is_read_through_its_kinematics(tmp_p
 
 
 def bomb(path: Path) -> None:
-    entities = "".join(f'<!ENTITY a{k} "{"&a%d;" % (k - 1) * 10}">' for k in range(1, 9))
-    path.write_text(
-        f'<!DOCTYPE x [<!ENTITY a0 "x">{entities}]><OpenSimDocument>&a8;</OpenSimDocument>'
-    )
+    entities = "".join(f'<!ENTITY a{k} "{"".join([f"&a{k - 1};"] * 10)}">' for k in range(1, 9))
+    head = f'<!DOCTYPE x [<!ENTITY a0 "x">{entities}]>'
+    path.write_text(f"{head}<OpenSimDocument>&a8;</OpenSimDocument>")
 
 
 def changed(arguments: list[str], **options: str | None) -> list[str]:
