@@ -7,7 +7,7 @@ import numpy as np
 from tkamb.geometry.frames import Array
 from tkamb.importing.links import Links
 from tkamb.importing.urdf import body_link
-from tkamb.opensim.model import Ligament, Path, PathPoint
+from tkamb.opensim.lines import Ligament, Path, PathPoint
 
 TOE = 0.06
 """Strain at which the toe of law "quadratic-toe" ends: twice eps1 = 0.03 (Blankevoort 1991)."""

@@ -66,9 +66,7 @@ def strings_over(
     point, order = strings.places(), strings.order.copy()
     value = residual = np.full_like(point, np.nan)
     for _ in range(SWEEPS):
-        for w in range(len(wraps)):
-            strings.remove(w, live)
-            strings.insert(w, live[allowed[live, w]])
+        strings.sweep(live, allowed)
         same = (strings.order == order).all(axis=1)
         order, (last_value, last_residual) = strings.order.copy(), (value, residual)
         value = strings.places()
@@ -121,6 +119,12 @@ class _Strings:
         """Set the touching points from one row (f, 6w) a string."""
         both = places.reshape(*self.order.shape, 6)
         self.entry, self.exit = both[..., :3].copy(), both[..., 3:].copy()
+
+    def sweep(self, rows: Index, allowed: Mask) -> None:
+        """Lay some strings anew over each object (f, w) allowed, in turn."""
+        for w in range(len(self.wraps)):
+            self.remove(w, rows)
+            self.insert(w, rows[allowed[rows, w]])
 
     def remove(self, w: int, rows: Index) -> None:
         """Take object w out of the way of some strings."""
