@@ -15,8 +15,8 @@ HALF = 0.5
 """Approach over thickness beyond which a result is flagged; at 1 it is none."""
 AROUND = 0.5 * MILLIMETRE
 """Within this of its rim the insert is as thick as anywhere so near: it has no thickness there."""
-THINNEST = 1e-9
-"""m; nothing is thinner."""
+SKIN = 1e-7
+"""m; rays into the insert start so far below its surface, and nothing counts as thinner."""
 
 COLUMNS = np.array([(x, 0.0, z) for x in (0, -1, 1) for z in (0, -1, 1)]) * AROUND
 DOWN = np.array([0.0, -1.0, 0.0])
@@ -50,34 +50,31 @@ def compression(pair: ContactPair, touch: Touch, result: ContactResult) -> tuple
         for side, condyle in condyles.items()
         if condyle is not None
     }
-    found = []
-    for where, place in places.items():
-        thickness = thickness_near(pair, place)
-        x, z = place[[0, 2]] / MILLIMETRE
-        words = (
-            f"an approach of {result.approach / MILLIMETRE:.3g} mm {where} (x = {x:.1f}, "
-            f"z = {z:.1f} mm), where the insert is {thickness / MILLIMETRE:.3g} mm thick"
-        )
-        found.append((result.approach / thickness, words))
-    return max(found)
+    thickness = thickness_near(pair, np.array(list(places.values())))
+    worst = int(thickness.argmin())
+    where, (x, _, z) = list(places.items())[worst]
+    return result.approach / float(thickness[worst]), (
+        f"an approach of {result.approach / MILLIMETRE:.3g} mm {where} (x = {x / MILLIMETRE:.1f}, "
+        f"z = {z / MILLIMETRE:.1f} mm), where the insert is {thickness[worst] / MILLIMETRE:.3g} mm "
+        "thick"
+    )
 
 
-def thickness_near(pair: ContactPair, place: Array) -> float:
-    """Return the insert's thickness (m) along y at a place (3,), from the top to where it ends.
+def thickness_near(pair: ContactPair, places: Array) -> Array:
+    """Return the insert's thickness (n,), m, along y at places (n, 3), from its top down.
 
-    Near a rim it is the largest within `AROUND`; the height above the bottom where no column
-    meets the insert.
+    To where it ends first. Near a rim it is the largest within `AROUND`; the height above the
+    bottom where no column meets the insert.
     """
     low, high = pair.insert.bounds[:, 1]
-    origins = place + COLUMNS
-    origins[:, 1] = high + AROUND
-    ray, along, face = pair.insert_rays.all(origins, DOWN)
-    leaves = pair.insert.face_normals[face, 1] < 0
-    enter, exit_ = np.full(len(origins), np.inf), np.full(len(origins), np.inf)
-    np.minimum.at(enter, ray[~leaves], along[~leaves])
-    np.minimum.at(exit_, ray[leaves], along[leaves])
-    whole = np.isfinite(enter) & np.isfinite(exit_)
-    thick = exit_[whole] - enter[whole]
-    if not whole.any():
-        thick = place[1:2] - low
-    return max(float(thick[0] if whole.all() else thick.max()), THINNEST)
+    columns = (places[:, None] + COLUMNS).reshape(-1, 3)
+    columns[:, 1] = high + AROUND
+    enter, _ = pair.insert_rays.first(columns, DOWN)
+    met = np.isfinite(enter)
+    columns[met, 1] -= enter[met] + SKIN
+    leave, _ = pair.insert_rays.first(columns, DOWN)
+    met &= np.isfinite(leave)
+    thick = np.where(met, leave + SKIN, 0.0).reshape(len(places), -1)
+    whole = met.reshape(thick.shape).all(axis=1)
+    found = np.where(whole, thick[:, 0], thick.max(axis=1))
+    return np.maximum(np.where(found > 0, found, places[:, 1] - low), SKIN)
