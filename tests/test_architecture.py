@@ -12,6 +12,7 @@ FORBIDDEN = {
     "body": ("contact", "inputs", "mechanics", "equilibrium", "run", "output"),
     "contact": ("body", "inputs", "mechanics", "equilibrium", "run", "output"),
     "inputs": ("body", "contact", "mechanics", "equilibrium", "run", "output"),
+    "opensim": ("body", "contact", "mechanics", "equilibrium", "run", "output"),
     "mechanics": ("contact", "equilibrium", "run", "output"),
     "equilibrium": ("inputs", "run", "output", "studies", "view"),
     "output": ("body", "inputs"),

@@ -21,7 +21,7 @@ A, B, Z0 = 0.12, 0.2, -0.04  # m; where a type 3 plate has its sensors
 def pushes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return force (k, 3) N, point (k, 3) m on the surface and free moment (k) N·m, lab axes."""
     t = np.linspace(0.0, 1.0, COUNT * RATIO)
-    force = np.stack([30 * np.sin(3 * t), 20 * np.cos(4 * t), 600 + 100 * np.sin(5 * t)], axis=1)
+    force = np.stack([30 * np.sin(3 * t), 20 * np.cos(4 * t), 380 + 100 * np.sin(5 * t)], axis=1)
     point = np.stack([0.2 + 0.1 * t, 0.15 + 0.05 * t**2, 0 * t], axis=1)
     return force, point, 5 * np.cos(2 * t)
 
@@ -118,7 +118,7 @@ def test_one_foot_on_two_plates_is_their_summed_wrench_at_one_centre_of_pressure
 def test_below_the_threshold_the_point_is_held_and_the_wrench_kept(tmp_path):
     path = two_plates(tmp_path)
     table = GroundReactionTable(
-        file=path, plates=(1,), laboratory_axes="+x,+z,-y", cutoff_Hz="none", unloaded_N=320.0
+        file=path, plates=(1,), laboratory_axes="+x,+z,-y", cutoff_Hz="none", unloaded_N=195.0
     )
     recording = read_c3d(path)
     ground = load_ground_reaction(table, recording.analog_time, "right")

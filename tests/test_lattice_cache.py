@@ -100,11 +100,12 @@ def test_a_file_cut_short_is_made_again(folder, caplog):
         check_made_again_with_one_notice(folder, caplog)
 
 
-def test_flipped_bits_anywhere_are_noticed(folder, caplog):
+@pytest.mark.parametrize("flips", [60, pytest.param(1000, marks=pytest.mark.slow)])
+def test_flipped_bits_anywhere_are_noticed(folder, caplog, flips):
     first = cached()[0].half.compliance()
     path = only_file(folder)
     whole, chance = path.read_bytes(), np.random.default_rng(4)
-    places = [*range(0, 80, 5), *chance.integers(80, len(whole), 150).tolist()]
+    places = [*range(0, 80, 5), *chance.integers(80, len(whole), flips).tolist()]
     for place in places:
         spoilt = bytearray(whole)
         spoilt[place] ^= 1 << int(chance.integers(8))

@@ -33,6 +33,7 @@ KEYS = [
     "residual",
     "status",
     "flags",
+    "known_error",
 ]
 CONDYLE_KEYS = ["force_N", "area_mm2", "mean_pressure_MPa", "peak_pressure_MPa", "cop_mm"]
 TURN = np.array([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]])

@@ -178,6 +178,21 @@ def test_residuals_are_relative_to_the_superior_inferior_force(bend):
     assert np.allclose(drawn["residual_sensitivity_N"].values, sensitivity)
 
 
+def test_the_known_error_stands_beside_pressure_and_area_in_colour_where_it_is_large(bend):
+    small = {"approach": 0.3, "force": 0.2, "mean_pressure": 0.02, "peak_pressure": 0.04}
+    for area, coloured in ((0.03, False), (0.11, True), (None, False)):
+        said = "not measured" if area is None else small | {"area": area, "cases": 4}
+        summary = bend.summary | {"known_error": said}
+        results = Results(bend.columns, summary, bend.maps)
+        (card,) = [c for c in cards(results, horizontal_axis(results)) if "pressure" in c.title]
+        assert card.warning is coloured
+        words = ["not measured"] if area is None else ["4 % in peak", "2 % in mean"]
+        assert all(word in card.detail for word in words)
+        (areas,) = [panel for panel in panels(results) if panel.name == "areas"]
+        assert areas.warning is coloured
+        assert ("class='warning'" in report_html(results)) is coloured
+
+
 def test_moments_in_percent_of_weight_and_height(bend, gait):
     (panel,) = (p for p in panels(bend) if p.name == "external")
     assert panel.second[0] == pytest.approx(100 / (MASS_KG * 9.80665 * 1.75))

@@ -95,10 +95,12 @@ def kill_and_resume(out, waits):
     return read_results(out)
 
 
-def test_killed_twice_the_run_ends_as_the_undisturbed_one(tmp_path, undisturbed):
-    found = kill_and_resume(tmp_path / "out", [(3, 0.01), (11, 0.0)])
+def test_killed_again_and_again_the_run_ends_as_the_undisturbed_one(tmp_path, undisturbed):
+    """While it starts, at its first frames, in between and at the end; see scripts/study_kills."""
+    waits = [(0, 0.5), (1, 0.0), (3, 0.01), (8, 0.03), (14, 0.0), (TOTAL, 0.02)]
+    found = kill_and_resume(tmp_path / "out", waits)
     check_same(found, undisturbed)
-    assert found.summary["resumed_frames"] >= 11
+    assert found.summary["resumed_frames"] >= 14
 
 
 @pytest.mark.slow

@@ -7,12 +7,19 @@ from pathlib import Path
 import pytest
 
 from tkamb.errors import InputError
+from tkamb.known_errors import STORED, known_error, known_errors
 from tkamb.studies import tradeoff
 from tkamb.studies.advice import comparison, recommendations
 from tkamb.studies.body_trade import read_body_rows
 from tkamb.studies.measures import Job, Measure
 from tkamb.studies.references import read_references
-from tkamb.studies.tradeoff_block import MARKERS, block, body_block, with_block
+from tkamb.studies.tradeoff_block import (
+    MARKERS,
+    block,
+    body_block,
+    known_errors_json,
+    with_block,
+)
 from tkamb.studies.tradeoff_report import picture, table
 
 ROOT = Path(__file__).parents[1]
@@ -99,3 +106,29 @@ def test_the_pages_tables_are_the_study_s():
     ):
         text = (ROOT / page).read_text(encoding="utf-8")
         assert with_block(text, lines, name) == text, f"{page}: run scripts/make_tradeoff_table"
+
+
+def test_what_runs_say_of_their_error_is_the_readme_s_table():
+    rows = tradeoff.read_rows(ROOT / "docs" / "tradeoff.json")
+    assert STORED.read_text(encoding="utf-8") == known_errors_json(rows)
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    for (label, resolution), error in known_errors().items():
+        (line,) = [line for line in lines if line.startswith(f"| {label} | {resolution:g} |")]
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        found = (error.approach, error.force, error.mean_pressure, error.peak_pressure, error.area)
+        assert cells[6:11] == [f"{100 * share:.2g}" for share in found], label
+        assert cells[12] == f"{error.cases}"
+
+
+def test_what_was_not_measured_has_no_known_error():
+    assert known_error("lattice", 1.0, "polyethylene", {}).cases == 4
+    assert known_error("lattice", 1.0, "polyethylene", {"cache": False}) is not None
+    assert known_error("lattice", 2.0, "polyethylene", {"tolerance": 1e-2}) is not None
+    for model, resolution, material, options in (
+        ("lattice", 1.25, "polyethylene", {}),
+        ("lattice", 1.0, "polyethylene-linear", {}),
+        ("lattice", 1.0, "polyethylene", {"tolerance": 1e-2}),
+        ("winkler", 1.0, "polyethylene", {}),
+        ("calculix C3D8I", 1.0, "polyethylene", {}),
+    ):
+        assert known_error(model, resolution, material, options) is None

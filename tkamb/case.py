@@ -187,9 +187,27 @@ class _Parts:
         table = scene.implant.insert
         assert table is not None
         surface = load_surface(table.mesh, table.unit, table.axes, name="insert", closed=True)
-        placement = insert_placement(surface, axes_rotation(table.axes))
+        try:
+            placement = insert_placement(surface, axes_rotation(table.axes))
+        except InputError as error:
+            if scene.implant.femoral and self._could_be_insert(scene.implant.femoral):
+                question = "are the meshes of [implant.femoral] and [implant.insert] exchanged?"
+                raise InputError(error.what, error.where, question) from None
+            raise
         self.insert_mesh_in_insert = placement @ pose(axes_rotation(table.axes), np.zeros(3))
         self.insert = self._sided(surface.moved(placement))
+
+    def _could_be_insert(self, table: FemoralImplantTable) -> bool:
+        """Say whether the mesh that the scene calls femoral has an insert's flat bottom."""
+        from tkamb.geometry.flat_bottom import insert_placement
+        from tkamb.inputs.meshes import axes_rotation, load_surface
+
+        try:
+            surface = load_surface(table.mesh, table.unit, table.axes, name="femoral component")
+            insert_placement(surface, axes_rotation(table.axes))
+        except InputError:
+            return False
+        return True
 
     def _place(
         self, name: str, table: FemoralImplantTable | PatellarImplantTable

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from tkamb.command_options import add_no_cache, without_cache
-from tkamb.errors import InputError
 from tkamb.guard import guarded
+from tkamb.importing.command import add_import
 from tkamb.press.command import add_press
 from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
@@ -65,6 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_contact(commands)
     _add_mesh(commands)
     _add_scene(commands)
+    add_import(commands)
     add_view(commands)
     add_tradeoff(commands)
     add_stability(commands)
@@ -238,12 +239,11 @@ def _verify(options: argparse.Namespace) -> int:
 def _report(options: argparse.Namespace) -> int:
     from tkamb.output.claim import claimed_directory
     from tkamb.output.report import write_report
-    from tkamb.results import REPORT_NAME, SUMMARY_NAME, read_results
+    from tkamb.results import REPORT_NAME, read_results
 
-    if not (options.folder / SUMMARY_NAME).is_file():
-        raise InputError("holds no results", options.folder, "give a folder that `tkamb run` wrote")
+    results = read_results(options.folder)  # before a folder is made or marked
     with claimed_directory(options.folder) as folder:
-        write_report(read_results(folder), folder / REPORT_NAME)
+        write_report(results, folder / REPORT_NAME)
     print(f"report: {options.folder / REPORT_NAME}")
     return 0
 

@@ -34,12 +34,12 @@ class ComputationError(TkambError):
     """Sound input, but nothing could be computed from it: exit status 1."""
 
 
-def names_near(name: str, names: Iterable[str]) -> str:
-    """Return "did you mean ..." with the names that resemble one, or else what there is."""
+def names_near(name: str, names: Iterable[str], title: str = "there are") -> str:
+    """Return "did you mean ..." with the names that resemble one, and the first of all names."""
     there = list(names)
     lower = {known.lower(): known for known in there}
-    close = difflib.get_close_matches(name.lower(), lower, n=4, cutoff=0.5)
-    if close:
-        return f"did you mean {', '.join(lower[known] for known in close)}?"
+    close = difflib.get_close_matches(name.lower(), lower, n=4, cutoff=0.6)
     more = ", …" if len(there) > MOST_NAMES else ""
-    return f"there are: {', '.join(there[:MOST_NAMES]) or 'none'}{more}"
+    listed = f"{title}: {', '.join(there[:MOST_NAMES]) or 'none'}{more}"
+    guess = f"did you mean {', '.join(lower[known] for known in close)}? " if close else ""
+    return guess + listed

@@ -17,6 +17,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from typing import TextIO
 
 from tkamb.errors import TkambError
 
@@ -33,13 +34,14 @@ def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
         with warnings.catch_warnings():
             if not sys.warnoptions:
                 warnings.simplefilter("ignore")  # they are for whoever writes the code
-            status = command()
-        sys.stdout.flush()
-        return status
-    except SystemExit:  # argparse has said what was wrong, or printed what was asked for
-        return _flushed_exit()
+            try:
+                return command()
+            finally:  # also when argparse exits: what it printed must have arrived
+                sys.stdout.flush()
     except TkambError as error:
         say(str(error))
+        if isinstance(error, StreamError):
+            _silence(sys.stdout)
         return error.exit_status
     except BrokenPipeError:  # the reader of a pipe has gone, `tkamb ... | head`
         _silence(sys.stdout)
@@ -48,9 +50,11 @@ def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
         say(f"interrupted: {interrupt or 'nothing is kept'}")
         return 130
     except Exception as error:
-        if isinstance(error, OSError) and _stdout_fails():
-            return 1
         return _unforeseen(error, options)
+
+
+class StreamError(TkambError):
+    """Standard output cannot be written: what was computed has not arrived."""
 
 
 def say(line: str) -> None:
@@ -73,7 +77,7 @@ def open_streams() -> None:
         except OSError:  # the lowest free number is given: this one
             os.open(os.devnull, os.O_RDONLY if number == 1 else os.O_RDWR)
     if sys.stdout is None:
-        sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+        sys.stdout = sys.__stdout__ = open(1, "w", encoding="utf-8", closefd=False)  # type: ignore[misc]  # noqa: SIM115
     if sys.stderr is None:
         sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
     try:
@@ -83,28 +87,26 @@ def open_streams() -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         # Names of files may hold what the encoding does not have.
         sys.stdout.reconfigure(errors="backslashreplace")
+        if sys.stdout is sys.__stdout__ and "write" not in vars(sys.stdout):
+            _watch(sys.stdout)
     logging.raiseExceptions = False
 
 
-def _flushed_exit() -> int:
-    error = sys.exception()
-    assert isinstance(error, SystemExit)
-    with suppress(OSError):
-        sys.stdout.flush()
-        raise error
-    _stdout_fails()
-    return 1
+def _watch(stream: TextIO) -> None:
+    """Have a stream say `StreamError` when it cannot be written, as on a full disk."""
+    for name in ("write", "flush"):
+        inner = getattr(stream, name)
 
+        def call(*given: str, inner: Callable[..., object] = inner) -> object:
+            try:
+                return inner(*given)
+            except BrokenPipeError:
+                raise
+            except OSError as error:
+                what = f"standard output cannot be written ({error.strerror})"
+                raise StreamError(what) from None
 
-def _stdout_fails() -> bool:
-    """Say on standard error that standard output cannot be written, if that is so."""
-    try:
-        sys.stdout.flush()
-    except OSError as error:
-        say(f"standard output cannot be written ({error.strerror})")
-        _silence(sys.stdout)
-        return True
-    return False
+        setattr(stream, name, call)
 
 
 def _silence(stream: object) -> None:

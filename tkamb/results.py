@@ -168,7 +168,7 @@ def read_summary(directory: Path) -> dict[str, Any]:
     """
     path = directory / SUMMARY_NAME
     try:
-        found = json.loads(read_text(path, SUMMARY_LIMIT))
+        found = json.loads(read_text(path, SUMMARY_LIMIT, what="summary of a run"))
     except (ValueError, RecursionError) as error:
         raise InputError(f"cannot be read as JSON ({error})", path) from None
     if not isinstance(found, dict):

@@ -9,7 +9,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, Self, get_args
 
-from pydantic import BaseModel, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from tkamb.errors import InputError, names_near
@@ -34,6 +34,13 @@ from tkamb.scene_tables import (
 class Scene(SceneTable):
     """Everything a run needs to know; see the tables."""
 
+    base: str | None = Field(
+        None,
+        description=(
+            "name of another scene file in the same folder: its keys hold where this file does "
+            "not give them, table by table; lists are replaced whole"
+        ),
+    )
     patient: PatientTable
     motion: MotionTable
     tibia: TibiaTable | None = None
@@ -91,10 +98,7 @@ def load_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> Sce
         InputError: unreadable file, unknown key, missing unit, value out of range.
     """
     path = Path(path)
-    try:
-        content = tomllib.loads(read_text(path, what="scene file"))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"is not TOML ({error})", path) from None
+    content = _content(path)
     for key, value in (overrides or {}).items():
         _override(content, key, value)
     try:
@@ -102,6 +106,36 @@ def load_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> Sce
     except ValidationError as error:
         raise _complaint(error, path, overrides or {}) from None
     return _resolved(scene, path.parent)
+
+
+def _content(path: Path) -> dict[str, Any]:
+    """Return what a scene file says, on top of what its base says."""
+    content = _parsed(path)
+    if "base" not in content:
+        return content
+    name = content["base"]
+    if not isinstance(name, str) or name != Path(name).name:
+        raise InputError("'base' is no file name", path, "name a scene file in the same folder")
+    base = _parsed(path.parent / name)
+    if "base" in base:
+        raise InputError(f"its base {name} has a base itself", path, "name that one")
+    return _merged(base, content)
+
+
+def _merged(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Return the base's keys with one's own in their place; tables are merged."""
+    merged = base | own
+    for key, value in own.items():
+        if isinstance(value, dict) and isinstance(base.get(key), dict):
+            merged[key] = _merged(base[key], value)
+    return merged
+
+
+def _parsed(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(read_text(path, what="scene file"))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"is not TOML ({error})", path) from None
 
 
 def scene_schema() -> dict[str, Any]:

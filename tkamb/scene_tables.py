@@ -190,6 +190,13 @@ class MotionTable(SceneTable):
             "[contact] releases need no column"
         ),
     )
+    signs_turned: tuple[str, ...] = Field(
+        (),
+        description=(
+            "roles whose columns are read with the other sign: states another reading of a file "
+            "whose signs are in doubt"
+        ),
+    )
     angle_unit: AngleUnit | None = Field(None, description="of the file; markers need none")
     length_unit: LengthUnit | None = Field(
         None, description="of the file; .trc and .c3d state their own"

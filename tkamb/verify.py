@@ -42,8 +42,6 @@ def verify_results(directory: str | Path) -> Verdict:
         InputError: it is not a folder of results.
     """
     directory = Path(directory)
-    if not (directory / SUMMARY_NAME).is_file():
-        raise InputError("holds no results", directory, "give a folder that `tkamb run` wrote")
     settle(directory)
     summary = read_summary(directory)
     if not isinstance(summary.get("versions"), Mapping):

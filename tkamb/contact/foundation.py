@@ -24,6 +24,7 @@ from tkamb.contact.pressing import (
     press_by_search,
 )
 from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
+from tkamb.contact.validity import peak_flags
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import Array, inverse, rotate, transform
 from tkamb.geometry.rays import RayCaster
@@ -152,6 +153,7 @@ class ElasticFoundation(ContactModel):
             lateral=lateral,
             approach=partial(approach_at, state.pair, np.array(pose, float)),  # type: ignore[arg-type]
             status=ContactStatus.OK,
+            flags=tuple(peak_flags(medial, lateral)),
         )
 
     def press(

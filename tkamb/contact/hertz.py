@@ -21,6 +21,7 @@ from tkamb.contact.model import (
 )
 from tkamb.contact.pressing import approach_at, failed_result
 from tkamb.contact.summary import summarise_condyles, thickness_under, wrench_of
+from tkamb.contact.validity import peak_flags
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import Array
@@ -268,7 +269,7 @@ def _collected(
         lateral=sides[1],
         approach=approach_at(state.pair, pose),
         status=ContactStatus.OK,
-        flags=flags,
+        flags=(*flags, *peak_flags(*sides)),
     )
 
 

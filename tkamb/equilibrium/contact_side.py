@@ -21,7 +21,7 @@ from tkamb.body.unknowns import CondylePoint
 from tkamb.case import Case
 from tkamb.contact.materials import material
 from tkamb.contact.model import ContactPair, ContactResult, ContactStatus
-from tkamb.contact.pressing import first_touch_height
+from tkamb.contact.pressing import first_touch_height, within_insert
 from tkamb.contact.probe import condyle_wrenches
 from tkamb.contact.registry import contact_model
 from tkamb.contact.summary import medial_points
@@ -185,6 +185,7 @@ class ContactSide:
         result, contact = None, self._nothing(settled.problem)
         if not settled.problem:
             result = self.model.evaluate(self.state, knee_pose(settled.coordinates), guess)
+            result = within_insert(self.state, result)
             contact = self._contact(result, None, 0.0)
         contact = replace(
             contact,

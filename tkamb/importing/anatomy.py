@@ -19,6 +19,8 @@ from tkamb.opensim.kinematics import Kinematics
 from tkamb.opensim.model import Coordinate, Joint, OpenSimModel
 
 OTHER = {"right": "left", "left": "right"}
+SEGMENT_LENGTH = (0.15, 0.75)
+"""m; thigh and shank of a child of six (about 0.25) to the tallest (about 0.6), with room."""
 SUFFIX = {"right": ("_r", "_R", ".r"), "left": ("_l", "_L", ".l")}
 
 
@@ -100,7 +102,7 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
     q = {flexion.name: 0.0} if flexion else {}
     kinematics = Kinematics(model)
     poses = kinematics.poses(kinematics.coupled(q))
-    return Leg(
+    leg = Leg(
         model,
         side,
         joint,
@@ -114,6 +116,22 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
         hip.inboard,
         {name: poses[k] for name, k in kinematics.bodies.items()},
     )
+    _check_lengths(leg)
+    return leg
+
+
+def _check_lengths(leg: Leg) -> None:
+    """Raise unless thigh and shank are as long as a person's: else the knee is another joint."""
+    body, knee = _end(leg.knee, leg.femur)
+    centre = transform(leg.neutral[body], knee)
+    for name, (other, point) in {"thigh": leg.hip_centre, "shank": leg.ankle_centre}.items():
+        length = float(np.linalg.norm(transform(leg.neutral[other], point) - centre))
+        if not SEGMENT_LENGTH[0] < length < SEGMENT_LENGTH[1]:
+            raise InputError(
+                f"has a {name} of {length * 1e3:.0f} mm with joint '{leg.knee.name}' as the knee",
+                leg.model.name,
+                "give the femorotibial joint with --knee, or mend the model's lengths",
+            )
 
 
 def _knee(model: OpenSimModel, side: str, name: str | None) -> Joint:

@@ -106,7 +106,7 @@ def find_links(
         InputError: no frame for a mesh, or axes that do not agree with the bone's.
     """
     turn = pose(axes_rotation(axes), np.zeros(3))
-    said = []
+    said: list[str] = []
     if insert is None:
         femur = pose(np.eye(3), _knee_centre(leg))
     else:

@@ -1,6 +1,7 @@
 """The leg's markers in a recording: matched to the model's, and what they say of the laboratory."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from tkamb.importing.anatomy import Leg, find_leg
 from tkamb.importing.links import Links
 from tkamb.inputs.labels import matched_labels
 from tkamb.inputs.markers import fit_seen, marker_trajectories
-from tkamb.inputs.tables import Table
+from tkamb.inputs.tables import Table, read_table
 from tkamb.units import DEGREE
 
 
@@ -77,6 +78,17 @@ def model_segments(links: Links, recorded: Table) -> list[ModelSegment]:
                 f"the recording {', '.join(labels[:12])}, …",
             )
     return [segment for segment in found if len(segment.points) >= 3]
+
+
+def segments_of(recording: Path, segments: list[ModelSegment]) -> list[ModelSegment]:
+    """Return the segments with the labels of another recording, those that it holds."""
+    labels = recorded_labels(read_table(recording))
+    found = []
+    for segment in segments:
+        match = matched_labels(segment.points, labels)
+        points = {match[name]: p for name, p in segment.points.items() if name in match}
+        found.append(replace(segment, points=points))
+    return found
 
 
 def recorded_labels(recorded: Table) -> list[str]:

@@ -1,29 +1,44 @@
 """A patient brought in: model, recording and meshes to a URDF and a scene that runs."""
 
 import re
+import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from tkamb.case import Case, load_case
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, mirrored_pose
 from tkamb.importing.anatomy import OTHER, Leg, find_leg
 from tkamb.importing.links import Links, find_links
-from tkamb.importing.markers import Facing, ModelSegment, facing, feet, model_segments
+from tkamb.importing.markers import (
+    Facing,
+    ModelSegment,
+    facing,
+    feet,
+    model_segments,
+    recorded_labels,
+    segments_of,
+)
+from tkamb.importing.model_motion import MOTION_FILE, ModelMotion, model_motion
 from tkamb.importing.plates import Load, known_interval, own_plates, plate_loads, unmeasured
 from tkamb.importing.scene_text import GroundFile, MarkerFile, Meshes, SceneText
 from tkamb.importing.soft_tissue import soft_tissue
 from tkamb.importing.urdf import patient_urdf
 from tkamb.inputs.c3d import Recording, read_c3d
+from tkamb.inputs.labels import plain_label
+from tkamb.inputs.marker_motion import calibrated_markers
 from tkamb.inputs.meshes import load_surface
 from tkamb.inputs.tables import Table, read_table
 from tkamb.opensim.read import read_osim
 from tkamb.output.atomic import claim_directory, write_text
-from tkamb.scene import load_scene
+from tkamb.scene import Scene, load_scene
 from tkamb.units import DEGREE, MILLIMETRE
 
+FRAMES_PER_CUTOFF = 5.0
+"""Frames per period of the cut-off: what is low-passed holds nothing between them."""
 SAME_MASS = 0.01
 """A model whose mass is within this share of the subject's is not scaled."""
 
@@ -36,7 +51,7 @@ class ImportRequest:
         model: the .osim file.
         side: of the knee.
         mass_kg: of the subject.
-        recording: .c3d or .trc.
+        recording: .c3d or .trc; .mot or .sto of the model's coordinates.
         grf: table of ground reactions, beside a .trc.
         static: recording of a standing trial, from which the markers' places are calibrated.
         meshes: the implant's.
@@ -76,11 +91,13 @@ class ImportedPatient:
     Args:
         urdf: text of patient.urdf.
         scene: the scene, to be written as text.
+        motion: text of motion.csv; None where markers are read from the recording.
         report: lines on what was understood and assumed.
     """
 
     urdf: str
     scene: SceneText
+    motion: str | None
     report: tuple[str, ...]
 
 
@@ -110,24 +127,13 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         bool(meshes and meshes.patella),
     )
     scale, weighed = _mass_scale(request, leg)
-    recorded = read_table(request.recording)
-    segments = model_segments(links, recorded)
-    seen = _facing(request, segments, recorded)
-    ground, interval, stood = _ground(request, leg, recorded, seen.axes)
     tissue = soft_tissue(links)
-    markers = MarkerFile(
-        request.recording, seen.axes, tuple(segments), request.method, "hinge", interval
+    recorded = read_table(request.recording)
+    found = (
+        _from_markers(request, leg, links, recorded)
+        if recorded_labels(recorded)
+        else _from_coordinates(request, leg, links, recorded)
     )
-    report = [
-        *_leg_lines(leg),
-        weighed,
-        *links.said,
-        *_patella_line(links),
-        *(_segment_line(segment) for segment in segments),
-        _facing_line(request, seen),
-        *stood,
-        *tissue.said,
-    ]
     scene = SceneText(
         _title(request),
         folder,
@@ -136,14 +142,57 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         "patient.urdf",
         request.cutoff_Hz,
         links,
-        markers,
-        ground,
+        found.markers,
+        found.ground,
         meshes,
         tissue,
-        _notes(scale, ground is not None, bool(tissue.bundles), meshes is not None),
+        _notes(scale, found.ground is not None, bool(tissue.bundles), meshes is not None),
     )
+    report = [*_leg_lines(leg), weighed, *links.said, *_patella_line(links)]
+    report += [*found.said, *tissue.said]
+    if request.static is not None and found.markers is not None:
+        scene, line = _with_static_markers(scene, request.static, list(found.markers.segments))
+        report.append(line)
     comment = f"Made by tkamb import from {request.model.name}, {request.side} leg (m, kg)"
-    return ImportedPatient(patient_urdf(links, scale, comment), scene, tuple(report))
+    motion = found.motion.text() if found.motion else None
+    return ImportedPatient(patient_urdf(links, scale, comment), scene, motion, tuple(report))
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """What a recording gives: markers or coordinates, ground reaction, and lines on them."""
+
+    markers: MarkerFile | None
+    motion: ModelMotion | None
+    ground: GroundFile | None
+    said: tuple[str, ...]
+
+
+def _from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> _Trial:
+    segments = model_segments(links, recorded)
+    seen = _facing(request, segments, recorded)
+    ground, interval, stood = _ground(request, leg, recorded, seen.axes)
+    interval, frames, thinned = _thinned(recorded.time(), interval, request.cutoff_Hz)
+    markers = MarkerFile(
+        request.recording, seen.axes, tuple(segments), request.method, "hinge", interval, frames
+    )
+    matched = [_segment_line(segment) for segment in segments]
+    said = (*matched, _facing_line(request, seen), *stood, thinned)
+    return _Trial(markers, None, ground, said)
+
+
+def _from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> _Trial:
+    motion = model_motion(links, recorded)
+    said = [f"motion: the model's coordinates in {recorded.path.name}, into {MOTION_FILE}"]
+    if motion.missing:
+        said.append(f"not in the motion, so at their defaults: {', '.join(motion.missing)}")
+    ground = None
+    if request.grf is not None:
+        ground, line = _table_ground(request.grf, leg.side, "+x,+y,+z")
+        said.append(line + "; laboratory: the model's ground, x forward, y up")
+    else:
+        said.append("no ground reaction given: none is modelled")
+    return _Trial(None, motion, ground, tuple(said))
 
 
 def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[str, ...]:
@@ -158,18 +207,21 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
     urdf, scene = folder / patient.scene.urdf, folder / name
     if scene.exists():
         raise InputError("is there already", scene, "choose another --out, or remove it")
-    before = urdf.read_text(encoding="utf-8") if urdf.is_file() else None
+    files = {urdf: patient.urdf, scene: patient.scene.text()}
+    if patient.motion is not None:
+        files[folder / MOTION_FILE] = patient.motion
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
     claim_directory(folder)
-    write_text(urdf, patient.urdf)
-    write_text(scene, patient.scene.text())
+    before = {p: p.read_text(encoding="utf-8") if p.is_file() else None for p in files}
     try:
+        for path, text in files.items():
+            write_text(path, text)
         case = load_case(load_scene(scene))
     except InputError:
-        scene.unlink()
-        if before is None:
-            urdf.unlink()
-        else:
-            write_text(urdf, before)
+        for path, old in before.items():
+            path.unlink(missing_ok=True) if old is None else write_text(path, old)
+        for place in made:
+            place.rmdir()
         raise
     return marker_lines(case)
 
@@ -185,8 +237,8 @@ def marker_lines(case: Case) -> tuple[str, ...]:
         flexion = found.at(found.flexion[method], case.motion.time) / DEGREE  # type: ignore[index]
         used = ", used" if found.method == method else ""
         lines.append(
-            f"markers, {words}{used}: rms {np.nanmedian(rms):.1f} mm (at most "
-            f"{np.nanmax(rms):.1f}), flexion {np.nanmin(flexion):.1f} to {np.nanmax(flexion):.1f} deg"
+            f"markers, {words}{used}: rms {np.nanmedian(rms):.1f} mm (at most {np.nanmax(rms):.1f})"
+            f", flexion {np.nanmin(flexion):.1f} to {np.nanmax(flexion):.1f} deg"
         )
     apart = found.at(found.centre_distance, case.motion.time) / MILLIMETRE
     turned = found.at(found.flexion["segments"] - found.flexion["chain"], case.motion.time) / DEGREE
@@ -287,6 +339,30 @@ def _ground(
     return GroundFile(request.recording, axes, plates), interval, lines
 
 
+def _thinned(
+    time: Array, interval: tuple[float, float] | None, cutoff_Hz: float
+) -> tuple[tuple[float, float], int | None, str]:
+    """Return interval and number of frames at about five times the cut-off, and a line on it.
+
+    The frames are every k-th of the recording, at its own times.
+    """
+    start, end = interval or (float(time[0]), float(time[-1]))
+    inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
+    if len(inside) < 2:
+        raise InputError(
+            f"has no two frames between {start:g} and {end:g} s", "--interval", "choose another"
+        )
+    rate = 1.0 / float(np.median(np.diff(inside)))
+    every = max(int(rate / (FRAMES_PER_CUTOFF * cutoff_Hz) + 1e-9), 1)
+    count = (len(inside) - 1) // every + 1
+    even = np.ptp(np.diff(inside)) < 1e-6
+    if every == 1 or not even or count < 8:
+        return (float(inside[0]), float(inside[-1])), None, f"frames: all {len(inside)}"
+    last = float(inside[(count - 1) * every])
+    line = f"frames: every {every}th of the recording, {count} at {rate / every:g} Hz"
+    return (float(inside[0]), last), count, line
+
+
 def _load_line(load: Load) -> str:
     other = "" if np.isnan(load.other) else f", {load.other * 1e3:.0f} mm from the other's"
     return (
@@ -373,10 +449,30 @@ def _notes(scale: float, ground: bool, own: bool, implant: bool) -> tuple[str, .
     return tuple(notes)
 
 
-def calibrated(patient: ImportedPatient, points: dict[str, dict[str, Array]]) -> ImportedPatient:
-    """Return the patient with the markers of its segments at other places."""
-    segments = tuple(
-        replace(s, points=s.points | points.get(s.name, {})) for s in patient.scene.markers.segments
+def _with_static_markers(
+    scene: SceneText, static: Path, segments: list[ModelSegment]
+) -> tuple[SceneText, str]:
+    """Return the scene with its markers where they sit in a standing trial, and a line on it."""
+    assert scene.markers is not None
+    known = Scene.model_validate(tomllib.loads(scene.text())).motion.markers
+    assert known is not None
+    own = facing(segments_of(static, segments), read_table(static)).axes
+    known = known.model_copy(update={"laboratory_axes": own})
+    side: Literal["right", "left"] = "left" if scene.side == "left" else "right"
+    insert = scene.links.insert_in_tibia
+    if side == "left":
+        insert = mirrored_pose(insert)
+    places = calibrated_markers(known, static, side, insert)
+    moved, farthest = [], 0.0
+    for segment in segments:
+        there = {plain_label(k): v for k, v in places[segment.name].items()}
+        points = {k: there.get(plain_label(k), v) for k, v in segment.points.items()}
+        shifts = [np.linalg.norm(points[k] - v) for k, v in segment.points.items()]
+        farthest = max(farthest, float(np.max(shifts)))
+        moved.append(replace(segment, points=points))
+    markers = replace(scene.markers, segments=tuple(moved))
+    line = (
+        f"markers' places are those of the standing trial {static.name}, at most "
+        f"{farthest * 1e3:.1f} mm from the model's"
     )
-    markers = replace(patient.scene.markers, segments=segments)
-    return replace(patient, scene=replace(patient.scene, markers=markers))
+    return replace(scene, markers=markers), line

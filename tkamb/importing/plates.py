@@ -9,7 +9,7 @@ from tkamb.geometry.frames import Array
 from tkamb.inputs.c3d import Recording
 from tkamb.inputs.laboratory import laboratory_rotation
 from tkamb.inputs.markers import marker_trajectories
-from tkamb.inputs.tables import read_table
+from tkamb.inputs.tables import Table, read_table
 
 LOADED_N = 40.0
 """Vertical force at which a plate counts as stood upon."""
@@ -147,15 +147,17 @@ def unmeasured(
     return np.asarray(time[inside & ~on & (speed < STILL)])
 
 
-def _middle(table: object, labels: list[str]) -> Array:
+def _middle(table: Table, labels: list[str]) -> Array:
     """Return the mean (n, 3) m of the markers that are seen; NaN without any."""
-    rows = len(table.time())  # type: ignore[attr-defined]
+    rows = table.rows
     if not labels:
         return np.full((rows, 3), np.nan)
-    points = marker_trajectories(table, labels, 1.0)  # type: ignore[arg-type]
-    seen = np.isfinite(points).all(axis=2)
+    points = marker_trajectories(table, labels, 1.0)
+    seen = np.asarray(np.isfinite(points).all(axis=2))
     total = np.where(seen[:, :, None], points, 0.0).sum(axis=1)
-    return np.asarray(total / np.where(seen.any(axis=1), seen.sum(axis=1), np.nan)[:, None])
+    count = seen.sum(axis=1).astype(float)
+    count[count == 0] = np.nan
+    return np.asarray(total / count[:, None])
 
 
 def _interpolated(values: Array, time: Array, at: Array) -> Array:

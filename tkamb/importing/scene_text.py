@@ -9,6 +9,7 @@ from pathlib import Path
 from tkamb.geometry.frames import Array
 from tkamb.importing.links import Links
 from tkamb.importing.markers import ModelSegment
+from tkamb.importing.model_motion import MOTION_FILE, motion_tables
 from tkamb.importing.soft_tissue import End, SoftTissue
 from tkamb.units import DEGREE
 
@@ -45,6 +46,7 @@ class MarkerFile:
     method: str
     knee: str
     interval: tuple[float, float] | None
+    frames: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +61,7 @@ class SceneText:
         urdf: name of the URDF beside the scene.
         cutoff_Hz: of markers and plates.
         links: of the leg.
-        markers: the recording.
+        markers: the recording; None: the model's own coordinates, in `motion.csv`.
         ground: the ground reaction; None without.
         meshes: the implant; None without.
         tissue: muscles and ligaments.
@@ -73,7 +75,7 @@ class SceneText:
     urdf: str
     cutoff_Hz: float
     links: Links
-    markers: MarkerFile
+    markers: MarkerFile | None
     ground: GroundFile | None
     meshes: Meshes | None
     tissue: SoftTissue
@@ -85,7 +87,7 @@ class SceneText:
             [f"# {line}" for line in self.title],
             self._patient(),
             self._motion(),
-            *(_segment(segment) for segment in self.markers.segments),
+            *(_segment(s) for s in (self.markers.segments if self.markers else ())),
             self._ground(),
             *self._implant(),
             self._muscles(),
@@ -108,11 +110,20 @@ class SceneText:
 
     def _motion(self) -> list[str]:
         m, neutral = self.markers, self.links.neutral
+        if m is None:
+            head = ["[motion]", f'file = "{MOTION_FILE}"', 'interpretation = "coordinates"']
+            head += ['angle_unit = "deg"', 'length_unit = "mm"', f"cutoff_Hz = {self.cutoff_Hz:g}"]
+            return [*head, "", *motion_tables(self.meshes is not None)]
         lines = ["[motion]", f"file = {self._path(m.path)}", 'interpretation = "markers"']
         lines.append(f"cutoff_Hz = {self.cutoff_Hz:g}")
         if m.interval:
             lines.append("# the part in which all that the foot stands on was measured, own clock")
-            lines.append(f"interval_s = [{m.interval[0]:.6f}, {m.interval[1]:.6f}]")
+            lines.append(f"interval_s = [{m.interval[0]:.9f}, {m.interval[1]:.9f}]")
+        if m.frames:
+            lines.append(
+                "# every so many frames of the recording: five times the cut-off is enough"
+            )
+            lines.append(f"frames = {m.frames}")
         coordinates = ["flexion"] if self.meshes else _ALL
         lines += [
             "",
@@ -210,7 +221,7 @@ class SceneText:
             'model = "foundation"',
             "resolution_mm = 1.0",
             'material = "polyethylene"',
-            "# skin markers say nothing of these: contact, ligaments and muscle line find them",
+            "# nobody recorded these: contact, ligaments and muscle line find them",
             'released = ["adduction", "axial_rotation", "ap", "ml"]',
         ]
 

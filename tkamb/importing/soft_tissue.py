@@ -94,15 +94,15 @@ def _patellar_ligament(links: Links, said: list[str]) -> tuple[tuple[End, End] |
         return None, np.nan
     for constraint in leg.model.constant_distances:
         points = dict(zip(constraint.bodies, constraint.points, strict=True))
-        tibia = [body for body in constraint.bodies if body in leg.tibia]
-        if leg.patella in points and tibia:
+        on_tibia = [body for body in constraint.bodies if body in leg.tibia]
+        if leg.patella in points and on_tibia:
             length = constraint.distance
             said.append(
                 f"patellar ligament: {length * 1e3:.1f} mm long, by the constraint "
                 f"'{constraint.name}'; resting lengths of its strands are not used"
             )
-            ends = End(body_link(leg.patella), points[leg.patella])
-            return (ends, End(body_link(tibia[0]), points[tibia[0]])), length
+            upper = End(body_link(leg.patella), points[leg.patella])
+            return (upper, End(body_link(on_tibia[0]), points[on_tibia[0]])), length
     strands = [
         (patella[0], tibia[-1], ligament)
         for ligament in leg.model.ligaments.values()
@@ -127,12 +127,13 @@ def _patellar_ligament(links: Links, said: list[str]) -> tuple[tuple[End, End] |
 
 def _bundles(links: Links, said: list[str]) -> tuple[Bundle, ...]:
     leg = links.leg
-    taken, out = [], {}
+    taken: list[Bundle] = []
+    out: dict[str, list[str]] = {}
     for ligament in leg.model.ligaments.values():
         femur, tibia = _fixed(ligament.path, leg.femur), _fixed(ligament.path, leg.tibia)
         if not (femur and tibia):
             continue
-        reason = _reason_against(ligament)
+        reason = _reason_against(ligament, len(femur) + len(tibia))
         if reason or ligament.stiffness_N is None:
             out.setdefault(reason, []).append(ligament.name)
             continue
@@ -151,13 +152,15 @@ def _bundles(links: Links, said: list[str]) -> tuple[Bundle, ...]:
             "(wraps on bone are left out)"
         )
     for reason, names in out.items():
-        said.append(f"{len(names)} ligaments left out, {reason}: {_some(names)}")
+        said.append(f"ligaments left out, {reason}: {_some(names)}")
     return tuple(taken)
 
 
-def _reason_against(ligament: Ligament) -> str:
+def _reason_against(ligament: Ligament, fixed: int) -> str:
     if not ligament.enabled:
         return "switched off in the model"
+    if fixed != 2 or len(ligament.path.points) != 2:
+        return "which run by more than two points"
     if ligament.stiffness_N is None:
         return f"of class {ligament.kind}, whose law the scene does not have"
     if ligament.transition_strain is None or abs(ligament.transition_strain - TOE) > 1e-6:

@@ -22,7 +22,7 @@ from tkamb.geometry.frames import MIRROR, Array
 from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import check_roles, laboratory_rotation
-from tkamb.inputs.samples import OddSample, check_range, odd_samples
+from tkamb.inputs.samples import OddSample, check_range, check_spacing, odd_samples
 from tkamb.inputs.tables import Table, read_table
 from tkamb.scene_tables import GroundReactionTable
 from tkamb.units import MILLIMETRE
@@ -82,6 +82,7 @@ def load_ground_reaction(
         stamps = recorded.time(table.columns.get("time", "time"))
         force, point, moment = _recorded(table, recorded)
     path = table.file
+    check_spacing(path, stamps)
     _check_upward(force, table)
     loaded = force[:, 1] >= table.unloaded_N
     point = _held(stamps, point, loaded, path)

@@ -13,31 +13,65 @@ Reference: Lu & O'Connor, J Biomech 32:129 (1999), doi:10.1016/S0021-9290(98)001
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tkamb.geometry.frames import Array, knee_pose, pose, transform
 
 FLEXION = 5
 """Index of flexion among the knee coordinates."""
-SETTLED = 1e-9
+SETTLED = 1e-6
 """Step (m and rad) below which a frame is solved."""
 MOST_STEPS = 60
 
 State = TypeVar("State")
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """The least squares of f frames, linearised where they stand.
+
+    Args:
+        cost: (f,) m², sum of weighted squared distances.
+        matrix: (f, n, n) Jᵀ W J.
+        right: (f, n) Jᵀ W (p - x).
+    """
+
+    cost: Array
+    matrix: Array
+    right: Array
+
+    def replaced(self, frames: Index, part: "NormalEquations") -> "NormalEquations":
+        """Return the equations with some frames as in `part`."""
+        return NormalEquations(
+            put(self.cost, frames, part.cost),
+            put(self.matrix, frames, part.matrix),
+            put(self.right, frames, part.right),
+        )
 
 
 class MarkerChain(Protocol[State]):
     """What the least squares need of a chain with n freedoms and m markers."""
 
-    def markers(self, state: State) -> tuple[Array, Array]:
-        """Return the markers (f, m, 3) m and their Jacobian (f, m, 3, n)."""
+    def places(self, state: State) -> Array:
+        """Return the markers (f, m, 3) m."""
+
+    def normal(self, state: State, target: Array, weights: Array) -> NormalEquations:
+        """Return the least squares to markers (f, m, 3) m with weights (f, m)."""
 
     def moved(self, state: State, step: Array) -> State:
         """Return the state after a step (f, n)."""
+
+    def chosen(self, state: State, frames: Index) -> State:
+        """Return the state of some frames."""
+
+    def replaced(self, state: State, frames: Index, part: State) -> State:
+        """Return the state with some frames as in `part`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,45 +105,40 @@ def fit_chain(
         start: where the iteration begins.
     """
     seen = np.isfinite(measured).all(axis=2)
-    root = np.where(seen, np.sqrt(weights), 0.0)[:, :, None]
-    target = np.nan_to_num(measured)
-    state, damping = start, np.full(len(measured), 1e-6)
-    places, jacobian = chain.markers(state)
-    cost = np.sum((root * (places - target)) ** 2, axis=(1, 2))
-    steps = 0
-    solved = np.zeros(len(measured), np.bool_)
-    while steps < MOST_STEPS and not np.all(solved):
-        step = _step(root * (target - places), root[..., None] * jacobian, damping)
-        step[solved] = 0.0
-        trial = chain.moved(state, step)
-        trial_places, trial_jacobian = chain.markers(trial)
-        trial_cost = np.sum((root * (trial_places - target)) ** 2, axis=(1, 2))
-        better = trial_cost <= cost + 1e-18
-        solved |= np.abs(step).max(axis=1) < SETTLED
-        # a frame that got worse stays where it was and is damped more
-        state = chain.moved(state, np.where(better[:, None], step, 0.0))
-        places = np.where(better[:, None, None], trial_places, places)
-        jacobian = np.where(better[:, None, None, None], trial_jacobian, jacobian)
-        cost = np.where(better, trial_cost, cost)
-        damping = np.where(better, np.maximum(damping / 10.0, 1e-12), damping * 10.0)
+    target, each = np.nan_to_num(measured), np.where(seen, weights, 0.0)
+    damping = np.full(len(measured), 1e-6)
+    left, steps = np.arange(len(measured)), 0
+    state, here = start, chain.normal(start, target, each)
+    while steps < MOST_STEPS and len(left):
+        step = _step(here, left, damping[left])
+        trial = chain.moved(chain.chosen(state, left), step)
+        there = chain.normal(trial, target[left], each[left])
+        # a frame that would get worse stays where it is
+        better = there.cost <= here.cost[left] * (1.0 + 1e-12) + 1e-24
+        taken, kept = left[better], np.flatnonzero(better)
+        state = chain.replaced(state, taken, chain.chosen(trial, kept))
+        part = NormalEquations(there.cost[kept], there.matrix[kept], there.right[kept])
+        here = here.replaced(taken, part)
+        damping[left] = np.clip(damping[left] * np.where(better, 0.1, 10.0), 1e-12, 1e6)
+        left = left[np.abs(step).max(axis=1) >= SETTLED]
         steps += 1
-    distance = np.where(seen, np.linalg.norm(places - target, axis=2), np.nan)
-    count = np.maximum(seen.sum(axis=1), 1)
-    rms = np.sqrt(np.nansum(distance**2, axis=1) / count)
-    return ChainFit(state, np.where(seen.sum(axis=1) > 0, rms, np.nan), distance, solved, steps)
+    distance = np.where(seen, np.linalg.norm(chain.places(state) - target, axis=2), np.nan)
+    count = seen.sum(axis=1)
+    rms = np.sqrt(np.nansum(distance**2, axis=1) / np.maximum(count, 1))
+    solved = np.ones(len(measured), np.bool_)
+    solved[left] = False
+    return ChainFit(state, np.where(count > 0, rms, np.nan), distance, solved, steps)
 
 
-def _step(residual: Array, jacobian: Array, damping: Array) -> Array:
-    """Return the damped Gauss-Newton steps (f, n)."""
-    frames, freedoms = len(residual), jacobian.shape[-1]
-    j = jacobian.reshape(frames, -1, freedoms)
-    normal = np.swapaxes(j, 1, 2) @ j
-    right = np.einsum("fki,fk->fi", j, residual.reshape(frames, -1))
-    diagonal = np.einsum("fii->fi", normal)
+def _step(equations: NormalEquations, frames: Index, damping: Array) -> Array:
+    """Return the damped Gauss-Newton steps (f, n) of some frames."""
+    matrix = equations.matrix[frames].copy()
+    diagonal = np.einsum("fii->fi", matrix)
     # the floor keeps what no marker sees where it is
     floor = 1e-9 * diagonal.max(axis=1, keepdims=True, initial=1e-12)
-    normal[:, np.arange(freedoms), np.arange(freedoms)] += damping[:, None] * diagonal + floor
-    return np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0])
+    each = np.arange(matrix.shape[1])
+    matrix[:, each, each] += damping[:, None] * diagonal + floor
+    return np.asarray(np.linalg.solve(matrix, equations.right[frames][:, :, None])[:, :, 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,6 +236,23 @@ class LegChain:
             state.turns[ball.name] = np.swapaxes(parent[:, :3, :3], 1, 2) @ own
         return state
 
+    def places(self, state: LegState) -> Array:
+        """Return the markers (f, m, 3) m."""
+        return self.markers(state)[0]
+
+    def normal(self, state: LegState, target: Array, weights: Array) -> NormalEquations:
+        """Return the least squares to markers (f, m, 3) m with weights (f, m)."""
+        places, jacobian = self.markers(state)
+        frames = len(places)
+        off, w = target - places, weights[:, :, None]
+        j = jacobian.reshape(frames, -1, self.freedoms)
+        weighted = (w[..., None] * jacobian).reshape(frames, -1, self.freedoms)
+        return NormalEquations(
+            np.sum(w * off**2, axis=(1, 2)),
+            np.swapaxes(j, 1, 2) @ weighted,
+            np.einsum("fki,fk->fi", weighted, off.reshape(frames, -1)),
+        )
+
     def markers(self, state: LegState) -> tuple[Array, Array]:
         """Return the markers (f, m, 3) m and their Jacobian (f, m, 3, n)."""
         poses, places, blocks = self.poses(state), [], []
@@ -218,7 +264,7 @@ class LegChain:
                 ball, column = self.segments[name], self._columns[name]
                 assert ball.centre is not None
                 centre = transform(poses[name], ball.centre)
-                block[..., column : column + 3] = _turning(x - centre[:, None])
+                block[..., column : column + 3] = -skew(x - centre[:, None])
                 name = ball.joined_to
             self._add_knee(block, x, name, state)
             places.append(x)
@@ -229,10 +275,10 @@ class LegChain:
         """Add the freedoms of shank and knee to the Jacobian of markers x of a chain's end."""
         if name == "thigh" and self.free:
             block[..., 6:9] = np.eye(3)
-            block[..., 9:12] = _turning(x - state.thigh[:, None, :3, 3])
+            block[..., 9:12] = -skew(x - state.thigh[:, None, :3, 3])
             return
         block[..., :3] = np.eye(3)
-        block[..., 3:6] = _turning(x - state.shank[:, None, :3, 3])
+        block[..., 3:6] = -skew(x - state.shank[:, None, :3, 3])
         if name == "thigh":
             axis = state.thigh[:, None, :3, 2]  # flexion turns about the femur's z
             block[..., 6] = np.cross(axis, x - state.thigh[:, None, :3, 3])
@@ -253,7 +299,22 @@ class LegChain:
             parent = parents[ball.joined_to][:, :3, :3]
             own = world @ parent @ state.turns[ball.name]
             turns[ball.name] = np.swapaxes(parent, 1, 2) @ own
-        return replace(state, shank=shank, knee=knee, thigh=thigh, turns=turns)
+        return LegState(shank, knee, thigh, turns)
+
+    def chosen(self, state: LegState, frames: Index) -> LegState:
+        """Return the state of some frames."""
+        turns = {name: turn[frames] for name, turn in state.turns.items()}
+        return LegState(state.shank[frames], state.knee[frames], state.thigh[frames], turns)
+
+    def replaced(self, state: LegState, frames: Index, part: LegState) -> LegState:
+        """Return the state with some frames as in `part`."""
+        turns = {name: put(turn, frames, part.turns[name]) for name, turn in state.turns.items()}
+        return LegState(
+            put(state.shank, frames, part.shank),
+            put(state.knee, frames, part.knee),
+            put(state.thigh, frames, part.thigh),
+            turns,
+        )
 
 
 def _carried(poses: Array, step: Array) -> Array:
@@ -261,13 +322,20 @@ def _carried(poses: Array, step: Array) -> Array:
     return pose(turn @ poses[:, :3, :3], poses[:, :3, 3] + step[:, :3])
 
 
-def _turning(arm: Array) -> Array:
-    """Return the matrices (..., 3, 3) of ω ↦ ω × arm."""
-    result = np.zeros((*arm.shape, 3))
-    x, y, z = np.moveaxis(arm, -1, 0)
-    result[..., 0, 1], result[..., 0, 2] = z, -y
-    result[..., 1, 0], result[..., 1, 2] = -z, x
-    result[..., 2, 0], result[..., 2, 1] = y, -x
+def put(values: Array, frames: Index, part: Array) -> Array:
+    """Return values with some frames as in `part`."""
+    result = values.copy()
+    result[frames] = part
+    return result
+
+
+def skew(vectors: Array) -> Array:
+    """Return the matrices (..., 3, 3) of a ↦ v × a for vectors v (..., 3)."""
+    result = np.zeros((*vectors.shape, 3))
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    result[..., 0, 1], result[..., 0, 2] = -z, y
+    result[..., 1, 0], result[..., 1, 2] = z, -x
+    result[..., 2, 0], result[..., 2, 1] = -y, x
     return result
 
 

@@ -125,7 +125,8 @@ def fit_seen(points: Array, reference: Array, weights: Array, name: str) -> tupl
             "name three or more that span a triangle",
         )
     w = np.where(seen, weights, 0.0)
-    usable = np.array([_spans(reference[row > 0]) for row in w])
+    patterns, of_frame = np.unique(w > 0, axis=0, return_inverse=True)
+    usable = np.array([_spans(reference[row]) for row in patterns])[of_frame.ravel()]
     total = np.where(usable, w.sum(axis=1), 1.0)[:, None]
     there = np.nan_to_num(points)
     mean = np.einsum("nm,nmi->ni", w, there) / total

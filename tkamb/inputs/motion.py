@@ -25,7 +25,7 @@ from tkamb.geometry.frames import (
 from tkamb.inputs.cycle import Cycle
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import angle_scale, check_roles, poses_of_columns
-from tkamb.inputs.samples import OddSample, check_range, check_steps, odd_samples
+from tkamb.inputs.samples import OddSample, check_range, check_spacing, check_steps, odd_samples
 from tkamb.inputs.tables import Table, read_table
 from tkamb.scene_tables import MotionTable
 from tkamb.units import DEGREE, MILLIMETRE
@@ -45,8 +45,6 @@ FASTEST = {"turn": 100.0, "move": 10.0}
 """rad/s and m/s: five times the fastest kick, and more than noise makes of a recording."""
 ODD = {"turn": 0.5 * DEGREE, "move": 0.5 * MILLIMETRE}
 """What fluoroscopy errs by: a sample that is no farther off its neighbours' curve is not odd."""
-SLOWEST_S = 5.0
-"""Samples farther apart than this are no record of a movement: the time is in another unit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +117,7 @@ def load_motion(
         return _from_markers(table, side, pose_insert_in_tibia, released)
     recorded = read_table(table.file, table.format)
     _check_roles(table, recorded)
+    recorded = _with_signs_turned(recorded, table)
     unrecorded: tuple[str, ...] = ()
     time = recorded.time(table.columns.get("time", "time"))
     if table.interpretation == "pose":
@@ -207,6 +206,20 @@ def _check_roles(table: MotionTable, recorded: Table) -> None:
     else:
         own = KNEE_COORDINATES
     check_roles(table.columns, ("time", *own, *PATELLA_COORDINATES), recorded.path, "motion")
+    for role in table.signs_turned:
+        if role not in own:
+            raise InputError(
+                f"unknown role '{role}' in [motion] signs_turned",
+                recorded.path,
+                f"one of {', '.join(own)}",
+            )
+
+
+def _with_signs_turned(recorded: Table, table: MotionTable) -> Table:
+    """Return the recording with the columns of the roles in `signs_turned` negated."""
+    names = {table.columns.get(role, role) for role in table.signs_turned}
+    turned = {name: -recorded.column(name) for name in names}
+    return replace(recorded, columns=recorded.columns | turned)
 
 
 def _check_knee(knee: Array, path: Path) -> None:
@@ -245,16 +258,6 @@ def _checked_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, .
     return tuple(odd)
 
 
-def _check_rate(time: Array, path: Path) -> None:
-    spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    if spacing > SLOWEST_S:
-        raise InputError(
-            f"samples are {spacing:g} s apart, too far to be a movement",
-            path,
-            "is the time in seconds?",
-        )
-
-
 def _differentiated(
     time: Array, knee: Array, patella: Array | None, table: MotionTable, path: Path
 ) -> KneeMotion:
@@ -262,7 +265,7 @@ def _differentiated(
     values = knee if patella is None else np.concatenate([knee, patella], axis=1)
     cycle = Cycle.of(time, knee, table, path) if table.cycle_s else None
     sampled = cycle.seconds(time) if cycle else time
-    _check_rate(sampled, path)
+    check_spacing(path, sampled)
     odd = _checked_steps(sampled, values, path)
     at = _frames(sampled, table, cycle)
     inside = cycle.wrapped(at, sampled) if cycle else at

@@ -175,13 +175,13 @@ def _segment(robot: ElementTree.Element, name: str, sex: Sex, table: PatientTabl
 def _fixed_pose(robot: ElementTree.Element, link: str, base: str, path: Path) -> Array:
     """Return the pose of `link` in `base`, which must be joined to it by fixed joints."""
     parents = {joint.find("child").get("link"): joint for joint in robot.findall("joint")}  # type: ignore[union-attr]
-    result = np.eye(4)
-    while link != base:
-        joint = parents.get(link)
+    result, place = np.eye(4), link
+    while place != base:
+        joint = parents.get(place)
         if joint is None or joint.get("type") != "fixed":
             raise InputError(f"link '{link}' is not fixed to '{base}'", path, "use fixed joints")
         result = _origin(joint) @ result
-        link = joint.find("parent").get("link")  # type: ignore[union-attr,assignment]
+        place = joint.find("parent").get("link")  # type: ignore[union-attr,assignment]
     return result
 
 

@@ -18,6 +18,8 @@ AROUND = 12
 """Samples on either side that show what is usual."""
 MANY_TIMES = 8.0
 """Of the usual: normal noise reaches it once in 10 million samples."""
+SLOWEST = 5.0
+"""s: samples farther apart than this are no record of a movement."""
 AT_THE_ENDS = 4.0
 """A cubic carried on by one sample errs by so much more than one between samples."""
 
@@ -87,6 +89,17 @@ def _usual(away: Array) -> Array:
     windows = np.lib.stride_tricks.sliding_window_view(away, width)
     start = np.clip(np.arange(len(away)) - width // 2, 0, len(windows) - 1)
     return np.asarray(np.median(windows, axis=1)[start])
+
+
+def check_spacing(path: Path, time: Array) -> None:
+    """Raise an InputError where the samples at (n,) s are too far apart to be a movement."""
+    spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if spacing > SLOWEST:
+        raise InputError(
+            f"samples are {spacing:g} s apart, too far to be a movement",
+            path,
+            "is the time in seconds?",
+        )
 
 
 def check_steps(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tkamb.errors import MOST_NAMES, InputError, names_near
+from tkamb.errors import InputError, names_near
 from tkamb.files import TABLE_LIMIT, read_text
 from tkamb.geometry.frames import Array
 from tkamb.units import LENGTH
@@ -54,10 +54,7 @@ class Table:
             InputError: no such column; the message lists the nearest names.
         """
         if name not in self.columns:
-            shown = ", ".join(list(self.columns)[:MOST_NAMES])
-            header = f"its header: {shown}{', …' if len(self.columns) > MOST_NAMES else ''}"
-            near = names_near(name, self.columns)
-            mend = f"{near} {header}" if near.startswith("did") else header
+            mend = names_near(name, self.columns, "its header")
             raise InputError(f"has no column '{name}'", self.path, mend)
         return self.columns[name]
 

@@ -19,7 +19,7 @@ from tkamb.inputs.laboratory import (
     poses_of_columns,
 )
 from tkamb.inputs.markers import check_fit, complete_run, fit_rigid, shank_points
-from tkamb.inputs.samples import OddSample, check_range, check_steps, odd_samples
+from tkamb.inputs.samples import OddSample, check_range, check_spacing, check_steps, odd_samples
 from tkamb.inputs.tables import Table, read_table
 from tkamb.scene_tables import TibiaTable
 from tkamb.units import DEGREE, MILLIMETRE
@@ -93,6 +93,7 @@ def load_tibia(
     if side == "left":
         poses = mirrored_pose(poses)
     name = str(recorded.path)
+    check_spacing(recorded.path, stamps)
     odd = _odd_poses(recorded, stamps, poses, time)
     filtered, velocity, acceleration = differentiate_poses(stamps, poses, cutoff, time, name)
     at_frames = None if residual is None else np.interp(time, stamps, residual)
@@ -127,6 +128,7 @@ def _sagittal(
     limits = (-MOST_LEAN_DEG, MOST_LEAN_DEG)
     question = "check [tibia] columns and angle_unit: it is the lean from the vertical"
     check_range(recorded.path, "shank: angle", lean / DEGREE, limits, "deg", question)
+    check_spacing(recorded.path, stamps)
     one = (recorded.path, "the shank's lean", stamps, lean)
     check_steps(*one, FASTEST_TURN, DEGREE, "deg")
     odd = odd_samples(*one, ODD_TURN, DEGREE, "deg")

@@ -133,6 +133,12 @@ def check_tree(robot: ElementTree.Element, path: Path) -> None:
     if len(roots) != 1:
         found = f"{len(roots)} roots ({', '.join(roots)})" if roots else "a loop and no root"
         raise InputError(f"has {found}", path, "a leg is one tree: docs/patient.md")
+    for name in links:
+        place, steps = name, 0
+        while place in parents and steps <= len(links):
+            place, steps = parents[place], steps + 1
+        if place != roots[0]:
+            raise InputError(f"link '{name}' hangs in a loop", path, "a leg is one tree")
 
 
 def ends_of(joint: ElementTree.Element) -> tuple[str, str]:
@@ -170,6 +176,8 @@ def check_chain(
         _check_order(robot, joints, list(wanted), (start, end), path)
     known = [_ANKLE_JOINT, *KNEE_JOINTS, *PATELLA_JOINTS]
     for name, joint in joints.items():
+        if joint.get("type") in ("revolute", "prismatic"):
+            _check_limit(joint, path)
         if name not in known and joint.get("type") != "fixed":
             raise InputError(
                 f"joint '{name}' is {joint.get('type')}",
@@ -211,12 +219,19 @@ def _check_axes(
                 path,
                 f"{mirrored}it must be {kind} about {' '.join(map(str, axis))}",
             )
-        limit = joint.find("limit")
-        if limit is None or not {"lower", "upper", "effort", "velocity"} <= set(limit.keys()):
-            mend = "give lower, upper, effort and velocity"
-            raise InputError(f"joint '{name}' has no complete <limit>", path, mend)
         if joint.find("mimic") is not None:
             raise InputError(f"joint '{name}' mimics another", path, "take <mimic> out")
+
+
+def _check_limit(joint: ElementTree.Element, path: Path) -> None:
+    """Raise unless a joint states all its limits, in order; they bound nothing here."""
+    limit, name = joint.find("limit"), joint.get("name")
+    if limit is None or not {"lower", "upper", "effort", "velocity"} <= set(limit.keys()):
+        mend = "give lower, upper, effort and velocity"
+        raise InputError(f"joint '{name}' has no complete <limit>", path, mend)
+    low, high = (float(numbers_of(limit, key)[0]) for key in ("lower", "upper"))
+    if low >= high:
+        raise InputError(f"joint '{name}' has limits {low:g} to {high:g}", path, "exchange them")
 
 
 def _check_order(

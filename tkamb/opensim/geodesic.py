@@ -21,25 +21,15 @@ Newton's method with Jacobi fields.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
 from tkamb.geometry.frames import Array
-
-PLANES = 24
-"""Planes through both points that are tried for the start."""
-
-STEPS = 6
-"""Runge-Kutta steps along a geodesic."""
+from tkamb.opensim.plane_strings import dot, planar_starts
 
 ITERATIONS = 30
-TOLERANCE = 1e-12
+TOLERANCE = 1e-11
 """Of the direction in which the string arrives, rad."""
-
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
-_WEIGHTS = _WEIGHTS / STEPS
-_PLACES = np.concatenate(
-    [[-1.0], ((2.0 * np.arange(STEPS) + 1.0)[:, None] + _NODES).ravel() / STEPS - 1.0, [1.0]]
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +48,7 @@ class Strings:
     exit: Array
     arc_m: Array
     length_m: Array
-    converged: Array
+    converged: NDArray[np.bool_]
 
 
 def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None = None) -> Strings:
@@ -68,72 +58,30 @@ def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None =
         start: (f, 3) m, outside.
         end: (f, 3) m, outside; the segment between them passes through the ellipsoid.
         axes: (3,) m, semi-axes.
-        half: (3,) direction of the half on which the string must lie; None: either.
+        half: (3,) direction of the half on which the string must touch; None: either.
+
+    Returns:
+        Strings; where none is taut on that half they have not converged.
     """
-    first, second = _planar_starts(start / axes, end / axes, axes, half)
-    found = [_taut(start, end, axes, *guess) for guess in (first, second)]
-    lengths = [np.where(strings.converged, strings.length_m, np.inf) for strings in found]
-    other = lengths[1] < lengths[0]
-    return Strings(
-        *(
-            np.where(other[:, None] if a.ndim == 2 else other, b, a)
-            for a, b in (
-                (getattr(found[0], name), getattr(found[1], name))
-                for name in ("entry", "exit", "arc_m", "length_m", "converged")
-            )
-        )
-    )
-
-
-def _planar_starts(
-    p: Array, q: Array, axes: Array, half: Array | None
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Return the two shortest plane strings, not neighbours: contour points (f, 3), lengths (f,).
-
-    All in the space where the ellipsoid is the unit sphere, but for the lengths.
-    """
-    along = q - p
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    middle = p - (p * along).sum(axis=1, keepdims=True) * along
-    offset = np.linalg.norm(middle, axis=1)
-    # Any direction across will do where the line passes through the centre.
-    spare = np.eye(3)[np.abs(along).argmin(axis=1)]
-    spare -= (spare * along).sum(axis=1, keepdims=True) * along
-    first = np.where(offset[:, None] > 1e-9, middle, spare)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(along, first)
-    angles = 2.0 * np.pi * np.arange(PLANES) / PLANES
-    outward = np.cos(angles)[:, None] * first[:, None] + np.sin(angles)[:, None] * second[:, None]
-    height = offset[:, None] * np.cos(angles)
-    radius = np.sqrt(np.maximum(1.0 - (offset[:, None] * np.sin(angles)) ** 2, 1e-12))
-    centre = middle[:, None] - height[..., None] * outward
-    ends = []
-    for point, sign in ((p, 1.0), (q, -1.0)):
-        ahead = ((point - middle) * along).sum(axis=1)[:, None]
-        reach = np.maximum(np.hypot(ahead, height), radius)
-        ends.append(np.arctan2(ahead, height) + sign * np.arccos(radius / reach))
-    spread = 0.5 * (ends[1] - ends[0])
-    at = 0.5 * (ends[0] + ends[1])[..., None] + spread[..., None] * _PLACES
-    across, ahead = np.cos(at)[..., None], np.sin(at)[..., None]
-    outward, along = outward[:, :, None], along[:, None, None]
-    circle = centre[:, :, None] + radius[..., None, None] * (across * outward + ahead * along)
-    speed = radius[..., None, None] * (across * along - ahead * outward) * axes
-    speed = np.linalg.norm(speed[:, :, 1:-1], axis=-1).reshape(*spread.shape, STEPS, -1)
-    arcs = spread[..., None] * (speed @ _WEIGHTS)
-    lengths = (
-        np.linalg.norm((circle[:, :, 0] - p[:, None]) * axes, axis=-1)
-        + arcs.sum(axis=-1)
-        + np.linalg.norm((circle[:, :, -1] - q[:, None]) * axes, axis=-1)
-    )
+    count = len(start)
+    contour, pieces, rival = planar_starts(start / axes, end / axes, axes, half)
+    rows = np.concatenate([np.arange(count), np.flatnonzero(rival)])
+    second = np.append(np.zeros(count, int), np.ones(len(rows) - count, int))
+    found = _taut(start[rows], end[rows], axes, contour[rows, second], pieces[rows, second])
+    converged = found.converged
     if half is not None:
-        lengths = np.where((outward[:, :, 0] * axes) @ half > 0.0, lengths, np.inf)
-    rows = np.arange(len(p))
-    best = lengths.argmin(axis=1)
-    lower = (lengths <= np.roll(lengths, 1, axis=1)) & (lengths <= np.roll(lengths, -1, axis=1))
-    lower[rows, best] = False
-    other = np.where(lower, lengths, np.inf).argmin(axis=1)
-    other = np.where(lower.any(axis=1), other, best)
-    return tuple((circle[rows, k, 0], arcs[rows, k]) for k in (best, other))  # type: ignore[return-value]
+        converged = converged & ((found.entry + found.exit) @ half > 0.0)
+    lengths = np.full((count, 2), np.inf)
+    lengths[rows, second] = np.where(converged, found.length_m, np.inf)
+    place = np.column_stack([np.arange(count), count + np.cumsum(rival) - 1])
+    chosen = np.where(lengths[:, 1] < lengths[:, 0], place[:, 1], place[:, 0])
+    return Strings(
+        found.entry[chosen],
+        found.exit[chosen],
+        found.arc_m[chosen],
+        found.length_m[chosen],
+        converged[chosen],
+    )
 
 
 def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) -> Strings:
@@ -206,26 +154,22 @@ class _Shot:
         rest = rest / reach
         shift = (moved * ahead).sum(axis=1)[:, None] * direction + field[:, None] * binormal
         by_arc, by_angle = (self._turn(v, normal, slope) for v in (direction, shift))
-        residual = np.stack([_dot(rest, normal), _dot(rest, binormal)], axis=1)
+        residual = np.stack([dot(rest, normal), dot(rest, binormal)], axis=1)
         jacobian = np.empty((len(angle), 2, 2))
-        jacobian[:, 0, 0] = _dot(rest, by_angle)
-        jacobian[:, 0, 1] = _dot(rest, by_arc)
+        jacobian[:, 0, 0] = dot(rest, by_angle)
+        jacobian[:, 0, 1] = dot(rest, by_arc)
         jacobian[:, 1, 0] = (
-            _dot(rest, np.cross(by_angle, direction))
+            dot(rest, np.cross(by_angle, direction))
             - field / reach[:, 0]
-            - rate * _dot(rest, direction)
+            - rate * dot(rest, direction)
         )
-        jacobian[:, 1, 1] = _dot(rest, np.cross(by_arc, direction))
+        jacobian[:, 1, 1] = dot(rest, np.cross(by_arc, direction))
         return residual, jacobian, entry, leave
 
     def _turn(self, velocity: Array, normal: Array, slope: Array) -> Array:
         """Return the rate (f, 3) of the unit normal where a point moves with a velocity."""
         bent = velocity / self.axes**2
-        return (bent - _dot(bent, normal)[:, None] * normal) / slope[:, None]
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return np.asarray((a * b).sum(axis=-1))
+        return (bent - dot(bent, normal)[:, None] * normal) / slope[:, None]
 
 
 def _normal(points: Array, axes: Array) -> tuple[Array, Array]:

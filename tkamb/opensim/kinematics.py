@@ -31,11 +31,13 @@ class Motion:
         bodies: names, ground first.
         poses: (..., b, 4, 4) of each body in ground.
         twists: (..., b, 6, n) twist at ground's origin per unit of each coordinate.
+        axes: (..., a, 6) twist of child against parent frame per unit of each joint axis.
     """
 
     bodies: dict[str, int]
     poses: Array
     twists: Array
+    axes: Array
 
     def points(self, bodies: Sequence[str], locations: ArrayLike) -> tuple[Array, Array]:
         """Return points of bodies in ground and their Jacobian.
@@ -136,7 +138,7 @@ class Kinematics:
             sign = -1.0 if joint.backwards else 1.0
             twists[..., outboard, :, :] = twists[..., inboard, :, :] + sign * added
             first = last
-        return Motion(self.bodies, poses, twists)
+        return Motion(self.bodies, poses, twists, axis_twists)
 
     def axis_values(self, q: Array) -> Array:
         """Return the angles and translations u (..., a) of all joint axes."""
@@ -151,6 +153,15 @@ class Kinematics:
         for k, c, axis in self._curved:
             slopes[..., k, c] = axis.function.slope(q[..., c])
         return slopes
+
+    def axis_rates(self, q: Array, rates: Array, accelerations: Array) -> tuple[Array, Array]:
+        """Return du/dt and d²u/dt² (..., a) from the coordinates' own (..., n)."""
+        slopes = self.axis_slopes(q)
+        speeds = (slopes @ rates[..., None])[..., 0]
+        second = (slopes @ accelerations[..., None])[..., 0]
+        for k, c, axis in self._curved:
+            second[..., k] += axis.function.curvature(q[..., c]) * rates[..., c] ** 2
+        return speeds, second
 
     def _chain(self, values: Array) -> tuple[Array, Array]:
         """Return body poses (..., b, 4, 4) and each axis's twist in ground (..., a, 6)."""

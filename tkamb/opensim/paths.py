@@ -22,8 +22,9 @@ from numpy.typing import ArrayLike
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.opensim.kinematics import Kinematics, Motion
-from tkamb.opensim.model import ConditionalPathPoint, MovingPathPoint, Path
+from tkamb.opensim.lines import ConditionalPathPoint, Ligament, MovingPathPoint, Muscle, Path
 from tkamb.opensim.strings import WrappedStrings, strings_over
+from tkamb.opensim.wrapping import Index
 
 CONDITION_SLACK = 1e-5
 """rad or m by which OpenSim widens the range of a conditional point."""
@@ -61,7 +62,7 @@ class LineSet:
     def __init__(self, kinematics: Kinematics, names: Iterable[str] | None = None) -> None:
         self.kinematics, model = kinematics, kinematics.model
         self.names = tuple(model.muscles if names is None else names)
-        owners = {**model.ligaments, **model.muscles}
+        owners: dict[str, Muscle | Ligament] = {**model.ligaments, **model.muscles}
         for name in self.names:
             if name not in owners:
                 raise InputError(f"has no muscle or ligament '{name}'", model.name)
@@ -135,7 +136,7 @@ class LineSet:
                         rates.append((k, c, np.outer(function.slope(value), np.eye(3)[axis])))
         return locations, rates
 
-    def _followers(self, q: Array) -> Array:
+    def _followers(self, q: Array) -> Index:
         """Return the next active point (f, k) of each active one on its path; -1: none."""
         follower = np.full((len(q), len(self._points)), -1)
         ends = set(self._last.tolist())
@@ -160,8 +161,8 @@ class LineSet:
         path: Path,
         first: int,
         k: int,
-        rows: Array,
-        there: Array,
+        rows: Index,
+        there: Index,
         motion: Motion,
         work: "_Tension",
     ) -> None:
@@ -173,10 +174,14 @@ class LineSet:
             work.pull(rows, np.full(len(rows), k), there)
             return
         bodies = [self.kinematics.bodies[wrap.body] for wrap in wraps]
-        poses = motion.poses[np.ix_(rows, bodies)] @ np.stack([wrap.pose for wrap in wraps])
+        poses = motion.poses[rows[:, None], np.array(bodies)] @ np.stack(
+            [wrap.pose for wrap in wraps]
+        )
         allowed = there[:, None] <= first + np.array([w.last for w in usable])
         start, end = work.points[rows, k], work.points[rows, there]
-        found = strings_over(wraps, poses, start, end, allowed)
+        ends = np.stack([np.full(len(rows), self._body[k]), self._body[there]], axis=1)
+        moves = ends[:, None, :] != np.array(bodies)[:, None]
+        found = strings_over(wraps, poses, start, end, allowed, moves)
         work.pull_wrapped(self._owner[k], rows, k, there, found, np.array(bodies))
 
 
@@ -193,7 +198,7 @@ class _Tension:
         self.pulls = np.zeros_like(points)
         self.lengths = np.zeros(points.shape[:2])
 
-    def pull(self, rows: Array, here: Array, there: Array) -> None:
+    def pull(self, rows: Index, here: Index, there: Index) -> None:
         """Add straight strings between points of some rows."""
         u, distance = _direction(self.points[rows, here], self.points[rows, there])
         self.lengths[rows, here] += distance
@@ -201,7 +206,7 @@ class _Tension:
         self.pulls[rows, there] -= u
 
     def pull_wrapped(
-        self, owner: int, rows: Array, k: int, there: Array, strings: WrappedStrings, bodies: Array
+        self, owner: int, rows: Index, k: int, there: Index, strings: WrappedStrings, bodies: Index
     ) -> None:
         """Add strings from point k to others of some rows, over objects fixed to bodies."""
         at = np.arange(len(rows))
@@ -223,12 +228,16 @@ class _Tension:
             self.pulls[rows[~on], there[~on]] -= u[~on]
             rows, there, last, at = rows[on], there[on], upcoming[on], at[on]
             self.lengths[rows, k] += strings.arc_m[at, last]
+            for end, points in enumerate((np.full(len(rows), k), there)):
+                push = strings.push[at, last, end]
+                self.pulls[rows, points] += push
+                self._press(owner, rows, bodies[last], self.points[rows, points], -push)
             place = strings.exit[at, last]
 
-    def _press(self, owner: int, rows: Array, bodies: Array, points: Array, forces: Array) -> None:
+    def _press(self, owner: int, rows: Index, bodies: Index, points: Array, forces: Array) -> None:
         self.wrenches[rows, owner, bodies] += np.hstack([np.cross(points, forces), forces])
 
-    def press_points(self, owner: Array, bodies: Array) -> None:
+    def press_points(self, owner: Index, bodies: Index) -> None:
         """Add the pulls on the path points to the wrenches."""
         wrenches = np.concatenate([np.cross(self.points, self.pulls), self.pulls], axis=-1)
         count = self.wrenches.shape[2]

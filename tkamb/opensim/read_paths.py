@@ -8,10 +8,9 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.opensim.elements import Document, Element
 from tkamb.opensim.functions import Function
-from tkamb.opensim.model import (
+from tkamb.opensim.lines import (
     AnyPathPoint,
     ConditionalPathPoint,
-    Coordinate,
     Ligament,
     MovingPathPoint,
     Muscle,
@@ -21,6 +20,7 @@ from tkamb.opensim.model import (
     Shape,
     WrapObject,
 )
+from tkamb.opensim.model import Coordinate
 from tkamb.opensim.read_joints import Frames, offset_pose
 
 MUSCLES = (

@@ -11,18 +11,35 @@ Around a circle of radius r, from the distance d₁ to d₂, swept angle Δ abou
     θ = Δ - acos(r/d₁) - acos(r/d₂),   S = √(d₁² - r²) + r θ + √(d₂² - r²),   touching if θ > 0.
 
 On a cylinder the whole unrolls: L = √(S² + Δz²), z linear in S.
+
+A path point of another body that moves into an ellipsoid would lose it at once: lengths then
+jump, in OpenSim by up to 14 mm. Here the ellipsoid shrinks with the point, so that the length is
+continuous: with the size k = |P/a|, and L homogeneous of degree one in P, Q and k,
+
+    ∂L/∂k = (L + P·u_P - Q·u_Q) / k,
+
+u the string's directions at P and Q; the point is pushed out by -∂L/∂k ∂k/∂P.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array
 from tkamb.opensim.geodesic import shortest_strings
-from tkamb.opensim.model import WrapObject
+from tkamb.opensim.lines import WrapObject
+from tkamb.opensim.plane_strings import dot, unit
 
 RING_PLACES = 48
 """Places around a torus's ring that are tried for where the string presses it."""
+
+
+CLEARANCE = 1e-3
+"""Share of its size by which an ellipsoid keeps clear of a point that moves into it."""
+
+Mask = NDArray[np.bool_]
+Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,27 +51,36 @@ class Touch:
         entry: (f, 3) m, where they meet it, in its frame.
         exit: (f, 3) m, where they leave it.
         arc_m: (f,) length on it.
+        push: (f, 2, 3) what an object that yields does to start and end, per unit tension.
     """
 
-    touches: Array
+    touches: Mask
     entry: Array
     exit: Array
     arc_m: Array
+    push: Array
 
 
-def touch(wrap: WrapObject, start: Array, end: Array) -> Touch:
-    """Return where strings from start to end (f, 3) touch a wrap object, in its frame."""
+def touch(wrap: WrapObject, start: Array, end: Array, moves: Mask) -> Touch:
+    """Return where strings touch a wrap object, in its frame.
+
+    Args:
+        wrap: the object.
+        start: (f, 3) m.
+        end: (f, 3) m.
+        moves: (f, 2) whether start and end are path points of another body than the object's.
+    """
     if wrap.shape == "cylinder":
         return _cylinder(start, end, wrap.dimensions[0], wrap.dimensions[1], wrap.quadrant)
     if wrap.shape == "sphere":
         return _sphere(start, end, wrap.dimensions[0], wrap.quadrant)
     if wrap.shape == "torus":
         return _torus(start, end, *wrap.dimensions)
-    return _ellipsoid(start, end, np.array(wrap.dimensions), wrap.quadrant)
+    return _ellipsoid(start, end, np.array(wrap.dimensions), wrap.quadrant, moves)
 
 
-def _dot(a: Array, b: Array) -> Array:
-    return np.asarray((a * b).sum(axis=-1))
+def _no_push(start: Array) -> Array:
+    return np.zeros((len(start), 2, 3))
 
 
 def _polar(points: Array) -> tuple[Array, Array]:
@@ -109,7 +135,8 @@ def _cylinder(
         for a, z in zip((angle + ahead, angle + ahead + turn), heights, strict=True)
     )
     off = np.minimum(np.abs(heights[0]), np.abs(heights[1])) > length / 2.0
-    return Touch((turn != 0.0) & ~off, entry, leave, on_circle * np.hypot(1.0, rise))
+    arc = on_circle * np.hypot(1.0, rise)
+    return Touch((turn != 0.0) & ~off, entry, leave, arc, _no_push(start))
 
 
 def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] | None) -> Touch:
@@ -120,10 +147,10 @@ def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] |
     """
     near, far = np.linalg.norm(start, axis=1), np.linalg.norm(end, axis=1)
     along, towards = start / near[:, None], end / far[:, None]
-    across = towards - _dot(towards, along)[:, None] * along
+    across = towards - dot(towards, along)[:, None] * along
     size = np.linalg.norm(across, axis=1)
     across /= np.maximum(size, 1e-300)[:, None]
-    sweep = np.arctan2(size, _dot(towards, along))
+    sweep = np.arctan2(size, dot(towards, along))
     turn, ahead, _ = _around((near, far), sweep, radius)
     touches = turn != 0.0
     if quadrant is not None:
@@ -136,7 +163,7 @@ def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] |
         radius * (np.cos(a)[:, None] * along + np.sin(a)[:, None] * across)
         for a in (ahead, ahead + turn)
     )
-    return Touch(touches, entry, leave, radius * np.abs(turn))
+    return Touch(touches, entry, leave, radius * np.abs(turn), _no_push(start))
 
 
 def _torus(start: Array, end: Array, ring: float, tube: float) -> Touch:
@@ -171,21 +198,34 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> Touch:
     found, lengths, frame = at(0.5 * (low + high))
     centre = -ring * frame[rows, 0]
     entry, leave = (np.einsum("fji,fj->fi", frame, p) + centre for p in (found.entry, found.exit))
-    return Touch(found.touches & np.isfinite(lengths), entry, leave, found.arc_m)
+    touches = found.touches & np.isfinite(lengths)
+    return Touch(touches, entry, leave, found.arc_m, _no_push(start))
 
 
-def _ellipsoid(start: Array, end: Array, axes: Array, quadrant: tuple[int, int] | None) -> Touch:
+def _ellipsoid(
+    start: Array, end: Array, axes: Array, quadrant: tuple[int, int] | None, moves: Mask
+) -> Touch:
     """Return strings around an ellipsoid: geodesics where the straight line would cut it."""
     p, q = start / axes, end / axes
+    depth = np.stack([np.linalg.norm(p, axis=1), np.linalg.norm(q, axis=1)], axis=1)
+    size = np.where(moves, depth / (1.0 + CLEARANCE), 1.0).min(axis=1)
+    size = np.minimum(size, 1.0)
     step = q - p
-    share = np.clip(-_dot(p, step) / np.maximum(_dot(step, step), 1e-300), 0.0, 1.0)
-    nearest = p + share[:, None] * step
-    outside = np.minimum(_dot(p, p), _dot(q, q)) > 1.0
-    touches = outside & (_dot(nearest, nearest) < 1.0)
+    share = np.clip(-dot(p, step) / np.maximum(dot(step, step), 1e-300), 0.0, 1.0)
+    nearest = np.linalg.norm(p + share[:, None] * step, axis=1)
+    touches = (depth.min(axis=1) > size) & (nearest < size)
     entry, leave, arc = np.zeros_like(start), np.zeros_like(end), np.zeros(len(start))
+    push = _no_push(start)
     if touches.any():
+        k, here, there = size[touches, None], start[touches], end[touches]
         half = None if quadrant is None else quadrant[1] * np.eye(3)[quadrant[0]]
-        strings = shortest_strings(start[touches], end[touches], axes, half)
-        entry[touches], leave[touches] = strings.entry, strings.exit
-        arc[touches] = np.where(strings.converged, strings.arc_m, np.nan)
-    return Touch(touches, entry, leave, arc)
+        strings = shortest_strings(here / k, there / k, axes, half)
+        entry[touches], leave[touches] = k * strings.entry, k * strings.exit
+        arc[touches] = np.where(strings.converged, k[:, 0] * strings.arc_m, np.nan)
+        first, last = (unit(v) for v in (strings.entry - here / k, there / k - strings.exit))
+        growth = strings.length_m + (dot(here, first) - dot(there, last)) / k[:, 0]
+        yields = moves & (depth <= size[:, None] * (1.0 + CLEARANCE) * (1.0 + 1e-12))
+        yields &= (size < 1.0)[:, None]
+        by_point = np.stack([p, q], axis=1) / (depth * (1.0 + CLEARANCE))[..., None] / axes
+        push[touches] = -(growth[:, None] * yields[touches])[..., None] * by_point[touches]
+    return Touch(touches, entry, leave, arc, push)

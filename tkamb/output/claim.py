@@ -77,7 +77,7 @@ def claimed_directory(path: str | Path, force: bool = False) -> Iterator[Path]:
             finally:
                 _held.discard(key)
     except InputError:
-        with suppress(OSError):  # no longer empty
+        with suppress(OSError, ValueError):  # no longer empty, or never made
             for folder in made:
                 folder.rmdir()
         raise

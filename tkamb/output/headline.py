@@ -6,8 +6,8 @@ from html import escape
 
 import numpy as np
 
-from tkamb.contact.known_errors import is_large, known_error_words
 from tkamb.geometry.frames import Array
+from tkamb.known_errors import is_large, known_error_words
 from tkamb.output import metrics
 from tkamb.output.axis import HorizontalAxis
 from tkamb.results import Results
@@ -117,13 +117,14 @@ def _shares(results: Results) -> Card | None:
 def _adduction(results: Results, unknown: int) -> list[str]:
     """Return what an error of the adduction does to the split by deformation, in words."""
     moved = metrics.moved_per_half_degree(results)
-    if not np.isfinite(moved).any():
-        return []
-    words = f"± 0.5 deg of adduction moves {_range(moved, ' N')} between the condyles"
-    if unknown == 0:
-        return [words]
-    where = "in every frame" if unknown == len(results) else f"in {unknown} frames"
-    return [f"by deformation not determined {where}: {words}"]
+    words = []
+    if unknown:
+        where = "in every frame" if unknown == len(results) else f"in {unknown} frames"
+        words.append(f"the split by deformation is not determined {where}")
+    if np.isfinite(moved).any():
+        text = _range(moved, " N")
+        words.append(f"± 0.5 deg of adduction moves {text} between condyles that both carry")
+    return [": ".join(words)] if words else []
 
 
 def _peak_pressure(results: Results, axis: HorizontalAxis) -> Card | None:
@@ -164,6 +165,10 @@ def _extensor(results: Results, axis: HorizontalAxis) -> Card | None:
     if "first_wrapping_flexion_deg" in results.summary:
         first = results.summary["first_wrapping_flexion_deg"]
         detail += "; wraps nowhere" if first is None else f"; wraps the femur from {first:.0f}°"
+    slope = results.columns.get("quadriceps_per_dome_mm_N")
+    if slope is not None and np.isfinite(slope[found.frame]):
+        percent = 100 * abs(slope[found.frame]) / found.value
+        detail += f"; ± {percent:.1f} % per mm of the button's height on the patella"
     return Card("Peak quadriceps tension", f"{value:.2f} BW", detail)
 
 

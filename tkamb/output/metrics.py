@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.results import Results
+from tkamb.run.agreement import UNLOADED
 from tkamb.units import MILLIMETRE, STANDARD_GRAVITY
 
 SIDES = ("medial", "lateral")
@@ -77,10 +78,13 @@ def split_undetermined(results: Results) -> NDArray[np.bool_]:
 def moved_per_half_degree(results: Results) -> Array:
     """Return what 0.5 deg of adduction moves (f,) between the condyles by the tangent, N.
 
-    Never more than the whole load.
+    Never more than the whole load; NaN where one condyle carries all of it, since that slope
+    holds only until the other touches.
     """
+    share = medial_share(results, "deformation")
     moved = 0.5 * np.abs(results["medial_force_per_adduction_N_per_deg"])
-    return np.minimum(moved, np.abs(results["force_si_N"]))
+    moved = np.minimum(moved, np.abs(results["force_si_N"]))
+    return np.where(np.abs(share - 0.5) < 0.5 - UNLOADED, moved, np.nan)
 
 
 def shares_apart(results: Results) -> Array:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tkamb.contact.known_errors import is_large, known_error_words
+from tkamb.known_errors import is_large, known_error_words
 from tkamb.output import style
 from tkamb.output.metrics import (
     body_weight,

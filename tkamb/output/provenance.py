@@ -32,6 +32,10 @@ SUMMARY_KEYS: dict[str, str] = {
     "first_wrapping_flexion_deg": "least flexion at which the quadriceps wraps the femur; or null",
     "ligament_strain": "flexion_deg: list; strain: bundle -> list, null where not recorded",
     "failed_frames": "list of {frame, time_s, status}",
+    "identity": "what makes two runs the same: scene, its files, frames, version and code",
+    "inputs": "path -> SHA-256 of the scene file and of the files it names",
+    "files": "results.csv and contact.h5 -> SHA-256",
+    "summary_sha256": "of all the rest of the summary",
 }
 """What `Results.summary` may hold for the report, beyond anything else that JSON can hold."""
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from tkamb.case import Case
+from tkamb.geometry.frames import knee_pose, transform
 from tkamb.plausibility.question import Question
 from tkamb.units import MILLIMETRE
 
@@ -19,8 +20,12 @@ ANKLE_ABOVE = (0.03, 0.32)
 """m, of the ankle above the plate: barefoot and flat, to tiptoe in high heels."""
 WELL_LOADED = 0.2
 """Of the peak force: below, the centre of pressure is a quotient of small numbers."""
-IN_METRES = 2.0 * MILLIMETRE
-"""A path of the centre of pressure as small as this is one in metres, called millimetres."""
+SWING = 0.03
+"""Of forward over upward: below, a force hardly leans and the sign of its lean says nothing."""
+AWAY = 0.03
+"""Of sideways over upward force, outwards: in standing, walking and squatting it is inwards."""
+AT_ANKLE = 0.015
+"""m: who stands has it 0.04 ahead; a path as near as this to the ankle is in another unit."""
 
 
 def load_questions(case: Case) -> Iterator[Question]:
@@ -38,6 +43,42 @@ def load_questions(case: Case) -> Iterator[Question]:
         )
 
 
+def direction_questions(case: Case) -> Iterator[Question]:
+    """Whether the horizontal force points where it does in a leg that bears the body.
+
+    The ground reaction passes near the body's centre of mass, which rides near the hip: its
+    slope forward goes with that of the line from the centre of pressure to the hip, and it
+    points to the other leg, not away from it.
+    """
+    ground, tibia, table = case.ground, case.tibia, case.scene.ground_reaction
+    if ground is None or tibia is None or table is None or table.applied != "cop":
+        return
+    loaded = ground.loaded & (ground.force[:, 1] > WELL_LOADED * ground.force[:, 1].max())
+    if loaded.sum() < 5:
+        return
+    hip_in_femur = case.chain.link_in("hip", "femur")[:3, 3]
+    femur = tibia.pose @ case.chain.insert_in_tibia @ knee_pose(case.motion.coordinates)
+    leg = (transform(femur, hip_in_femur[None])[:, 0] - ground.point)[loaded]
+    force = ground.force[loaded]
+    forward = tibia.pose[loaded, :3, 0] * [1.0, 0.0, 1.0]
+    forward /= np.maximum(np.linalg.norm(forward, axis=1), 1e-9)[:, None]
+    slopes = [np.einsum("fi,fi->f", line, forward) / line[:, 1] for line in (force, leg)]
+    if min(np.std(slope) for slope in slopes) > SWING and np.corrcoef(slopes)[0, 1] < -0.5:
+        yield Question(
+            "the ground reaction leans forward where the leg leans back: is the sign of its "
+            "forward column turned, or are the columns left-handed?",
+            "ground reaction leans against the leg",
+        )
+    aside = float((force[:, 2] * forward[:, 0] - force[:, 0] * forward[:, 2]).sum())
+    if aside > AWAY * force[:, 1].sum():
+        yield Question(
+            f"the ground pushes the leg outwards with {100 * aside / force[:, 1].sum():.0f} % of "
+            "its upward force: is the sign of its sideways column turned, or are the columns "
+            "left-handed?",
+            "ground reaction points away from the other leg",
+        )
+
+
 def foot_questions(case: Case) -> Iterator[Question]:
     """Whether the centre of pressure lies under the foot that the shank stands on."""
     ground, tibia, table = case.ground, case.tibia, case.scene.ground_reaction
@@ -46,14 +87,14 @@ def foot_questions(case: Case) -> Iterator[Question]:
     loaded = ground.loaded & (ground.force[:, 1] > WELL_LOADED * ground.force[:, 1].max())
     if not loaded.any():
         return
-    path = ground.point[loaded][:, [0, 2]]
-    if 0.0 < np.abs(path).max() < IN_METRES:
-        yield Question(
-            f"the centre of pressure stays within {np.abs(path).max() / MILLIMETRE:.2g} mm of the "
-            "laboratory's origin: is it in metres?",
-            "centre of pressure hardly moves",
-        )
     away = ground.point - tibia.pose[:, :3, 3]
+    nearest = float(np.linalg.norm(away[loaded][:, [0, 2]], axis=1).max())
+    if nearest < AT_ANKLE:
+        yield Question(
+            f"the centre of pressure stays within {nearest / MILLIMETRE:.2g} mm of the ankle, "
+            "seen from above: is it in centimetres or metres?",
+            "centre of pressure stays under the ankle",
+        )
     forward = tibia.pose[:, :3, 0] * [1.0, 0.0, 1.0]
     forward /= np.maximum(np.linalg.norm(forward, axis=1), 1e-9)[:, None]
     ahead = np.einsum("fi,fi->f", away, forward)

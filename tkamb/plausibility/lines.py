@@ -1,15 +1,18 @@
 """Questions about lines of action: where they end, how stiff and how far stretched they are."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.body.ligaments import Ligament
 from tkamb.case import Case
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.plausibility.question import Question, some
 from tkamb.scene_tables import Attachment
 from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.body.ligaments import Ligament
 
 STRAIN = 0.15
 """Ligaments of the knee tear at 12 to 20 % (Kennedy et al. 1976, Butler et al. 1986)."""
@@ -20,6 +23,8 @@ STIFFNESS_PER_MM, STIFFNESS_PER_STRAIN = (2.0, 500.0), (20.0, 30000.0)
 (347 N/mm: Race & Amis 1994; 18 kN for both PCL bundles: Blankevoort & Huiskes 1996)."""
 FARTHEST_ATTACHMENT = 0.16
 """m from the insert's centre: the superficial MCL, the farthest, ends 0.06 to 0.12 below it."""
+BEYOND = 0.03
+"""m, of a tibial end above the insert's bottom, or of a femoral one below the flexion axis."""
 TENDON = (0.025, 0.085)
 """m, of the patellar ligament's length."""
 PATELLA_AWAY = (0.015, 0.08)
@@ -43,12 +48,12 @@ def attachment_questions(case: Case) -> Iterator[Question]:
         for t in scene.ligament
         for side in ("proximal", "distal")
     ]
-    far = [name for name, end in ends if _away(case, end) > FARTHEST_ATTACHMENT]
+    far = [name for name, end in ends if not _belongs(*_placed(case, end))]
     if far:
         yield Question(
-            f"{some(far)} ends more than {FARTHEST_ATTACHMENT / MILLIMETRE:.0f} mm from the knee: "
-            "is its point_mm, sign or link another one?",
-            "attachment far from the knee",
+            f"{some(far)} ends more than {FARTHEST_ATTACHMENT / MILLIMETRE:.0f} mm from the knee, "
+            "or beyond the joint: is its point_mm, sign or link another one?",
+            "attachment far from its place",
         )
     if scene.quadriceps and scene.patellar_ligament:
         ends += [
@@ -78,9 +83,10 @@ def _placed(case: Case, end: Attachment) -> tuple[str, Array]:
     return carrier, place
 
 
-def _away(case: Case, end: Attachment) -> float:
-    """Return the distance (m) of an attachment from the knee's centre on its own side."""
-    return float(np.linalg.norm(_placed(case, end)[1]))
+def _belongs(carrier: str, place: Array) -> bool:
+    """Say whether a ligament may end at a place (3,) m, as `_placed` gives it."""
+    beyond = {"tibia": place[1], "femur": -place[1]}.get(carrier, 0.0)
+    return float(np.linalg.norm(place)) <= FARTHEST_ATTACHMENT and beyond <= BEYOND
 
 
 def stiffness_questions(case: Case) -> Iterator[Question]:
@@ -98,7 +104,7 @@ def stiffness_questions(case: Case) -> Iterator[Question]:
             )
 
 
-def torn_bundles(ligaments: Sequence[Ligament], tensions: Mapping[str, float]) -> list[str]:
+def torn_bundles(ligaments: "Sequence[Ligament]", tensions: Mapping[str, float]) -> list[str]:
     """Return the bundles whose tension (N) is above that of the strain they bear."""
     return [
         bundle.name
@@ -109,7 +115,7 @@ def torn_bundles(ligaments: Sequence[Ligament], tensions: Mapping[str, float]) -
 
 
 def strain_questions(
-    ligaments: Sequence[Ligament], strains: Mapping[str, Array], time: Array
+    ligaments: "Sequence[Ligament]", strains: Mapping[str, Array], time: Array
 ) -> Iterator[Question]:
     """Bundles that would tear, and bundles that never come near to being taut.
 

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.plausibility.ground import foot_questions, load_questions
+from tkamb.plausibility.ground import direction_questions, foot_questions, load_questions
 from tkamb.plausibility.movement import motion_questions, sample_questions
 from tkamb.plausibility.question import Question, some
 from tkamb.plausibility.segments import segment_questions
@@ -35,6 +35,7 @@ class Plausibility:
             *sample_questions(case),
             *load_questions(case),
             *foot_questions(case),
+            *direction_questions(case),
         ]
         if case.scene.ligament or case.scene.quadriceps:
             found += _line_questions(mechanics)

@@ -13,6 +13,11 @@ from tkamb.units import DEGREE, MILLIMETRE
 SEGMENT_MASS = 1.6
 """Times or one over: a segment's mass against de Leva's share of the body's, which differs by
 1.35 at most between cadaver studies and by 1.3 with obesity. Pounds for kilograms are 2.2."""
+PATELLA_MASS = (0.02, 0.6)
+"""kg, from the bone alone to all that moves with it."""
+PATELLA_SIZE = 0.05
+"""m."""
+
 SHANK_SHARE, THIGH_SHARE = (0.19, 0.30), (0.19, 0.31)
 """Of body height: 0.246 and 0.245 (Drillis & Contini 1966) and a fourth more or less."""
 INSERT_TURN = 20.0 * DEGREE
@@ -45,6 +50,8 @@ def segment_questions(case: Case) -> Iterator[Question]:
             f"does in a body of {patient.mass_kg:g} kg: is mass_kg, or the URDF's, in pounds?",
             "masses of URDF and [patient] disagree",
         )
+    if case.scene.patella:
+        yield from _of_patella(case)
     for link, end, shares_of_height in (
         ("tibia", knee, SHANK_SHARE),
         ("femur", hip, THIGH_SHARE),
@@ -66,6 +73,18 @@ def segment_questions(case: Case) -> Iterator[Question]:
             f"the insert's axes are turned by {leans.max():.0f} deg from the tibia's: is the rpy "
             "of knee_ap right?",
             "insert far turned in the tibia",
+        )
+
+
+def _of_patella(case: Case) -> Iterator[Question]:
+    """The patella's mass, and where its centre is."""
+    mass, centre, _ = case.chain.segment("patella")
+    if not PATELLA_MASS[0] <= mass <= PATELLA_MASS[1] or np.linalg.norm(centre) > PATELLA_SIZE:
+        shown = ", ".join(f"{value / MILLIMETRE:.0f}" for value in centre)
+        yield Question(
+            f"'patella' of the URDF weighs {mass:.3g} kg, its centre of mass at ({shown}) mm: is "
+            "its <inertial> in kilograms and metres?",
+            "mass or centre of patella unlike a patella's",
         )
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tkamb.contact import materials
-from tkamb.contact.known_errors import known_error
 from tkamb.contact.model import Bearing, ContactModel, ContactPair, ContactResult
 from tkamb.contact.pressing import check_load, first_touch_height
 from tkamb.contact.registry import contact_model
@@ -28,6 +27,7 @@ from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import Array, mirrored_pose
 from tkamb.geometry.frames import pose as pose_matrix
 from tkamb.inputs.meshes import axes_rotation, load_surface, mirrored
+from tkamb.known_errors import known_error
 from tkamb.press.press_report import PressReport, Side
 from tkamb.units import DEGREE, LENGTH
 

@@ -6,9 +6,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tkamb.contact.known_errors import KnownError, as_json, known_error_words
 from tkamb.contact.model import CondyleContact, ContactPair, ContactResult, ContactStatus
 from tkamb.geometry.adjustment import Adjustment
+from tkamb.known_errors import KnownError, as_json, known_error_words
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 Side = Literal["right", "left"]

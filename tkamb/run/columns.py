@@ -72,6 +72,12 @@ COLUMNS: tuple[Column, ...] = (
     Column("patellofemoral_N", "patellofemoral force along the contact normal", _MUSCLE),
     Column("patellofemoral_tangential_N", "the same across the normal; near zero", _MUSCLE),
     Column("quadriceps_wrap_deg", "angle over which the quadriceps wraps the femur", _MUSCLE),
+    Column(
+        "quadriceps_per_dome_mm_N",
+        "change of quadriceps_N as the button sits 1 mm higher on the patella, its place kept",
+        _MUSCLE,
+    ),
+    Column("patellofemoral_per_dome_mm_N", "the same, of patellofemoral_N", _MUSCLE),
     Column("hip_force_ap_N", "intersegmental force on the femur at the hip, insert x"),
     Column("hip_force_si_N", "the same, insert y"),
     Column("hip_force_ml_N", "the same, insert z"),

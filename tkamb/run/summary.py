@@ -4,6 +4,7 @@ import hashlib
 import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 from tkamb.case import Case
 from tkamb.code_identity import code_identity
 from tkamb.files import sha256_of
+from tkamb.known_errors import as_json, known_error
 from tkamb.mechanics.mechanics import STRAIN_FLEXIONS
 from tkamb.run.status import FAILED
 from tkamb.scene_tables import ContactTable
@@ -50,8 +52,7 @@ def summary_of(
         "scene_sha256": scene_hash(case),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": " ".join(["tkamb", *sys.argv[1:]]),
-        "versions": {"python": sys.version.split()[0], "tkamb": version("tkamb")}
-        | {name: version(name) for name in LIBRARIES},
+        "versions": _versions(),
         "seconds": seconds,
         "side": scene.patient.side,
         "frame": "insert frame: x anterior, y superior, z "
@@ -77,8 +78,6 @@ def summary_of(
     if scene.patella:
         summary["first_wrapping_flexion_deg"] = _first_wrapping(columns)
     if scene.contact:
-        from tkamb.contact.known_errors import as_json, known_error
-
         table = scene.contact
         error = known_error(table.model, table.resolution_mm, table.material, table.options)
         summary["contact"] = table.model_dump(mode="json")
@@ -91,6 +90,12 @@ def summary_of(
         start = time[0] - percent[0] * slope
         summary["cycle_percent_s"] = [start, start + 100.0 * slope]
     return summary
+
+
+@lru_cache(maxsize=1)
+def _versions() -> dict[str, str]:
+    own = {"python": sys.version.split()[0], "tkamb": version("tkamb")}
+    return own | {name: version(name) for name in LIBRARIES}
 
 
 def scene_hash(case: Case) -> str:

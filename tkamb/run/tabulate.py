@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tkamb.body.dome_sensitivity import dome_sensitivity
 from tkamb.case import Case
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates
 from tkamb.mechanics.mechanics import FrameLoads
@@ -127,6 +128,9 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
     row["residual_axial_Nm"] = values.get("residual_axial", NAN)
     row["residual_coronal_Nm"] = values.get("residual_coronal", NAN)
     row["residual_flexion_Nm"] = values.get("residual_flexion", NAN)
+    friction = case.scene.contact.friction if case.scene.contact else 0.0
+    dome = {} if loads.problems else dome_sensitivity(frame.geometry, friction)
+    row |= {f"{name}_per_dome_mm_N": slope * MILLIMETRE for name, slope in dome.items()}
     if frame.geometry.ground:
         ground = frame.geometry.ground.forces[0]
         row |= {

@@ -16,10 +16,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from tkamb.contact.known_errors import setting_label
 from tkamb.contact.model import ContactModel, ContactResult, ContactStatus
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.errors import TkambError
+from tkamb.known_errors import setting_label
 from tkamb.studies.cases import StudyCase, study_case
 from tkamb.studies.quantities import Quantities, quantities, raster_map
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from statistics import median
 
-from tkamb.contact.known_errors import KnownError
 from tkamb.errors import InputError
+from tkamb.known_errors import KnownError
 from tkamb.studies.advice import (
     Setting,
     bodies_of,
@@ -52,7 +52,7 @@ def block(rows: Sequence[Row]) -> list[str]:
 
 
 def known_errors_json(rows: Sequence[Row]) -> str:
-    """Return the text of `tkamb/contact/known_errors.json`: the table's errors, setting by setting.
+    """Return the text of `tkamb/known_errors.json`: the table's errors, setting by setting.
 
     Settings that failed on a case, or that belong to another program, are left out: nothing is
     known of them that would hold for every run.

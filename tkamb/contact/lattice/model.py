@@ -17,13 +17,13 @@ from tkamb.contact.lattice.newton import solve_by_newton
 from tkamb.contact.lattice.operator import ElasticOperator, fixed_unknowns, prepare_operator
 from tkamb.contact.lattice.pressure_map import ContactMap, contact_map
 from tkamb.contact.lattice.problem import ContactProblem, Direction, Footing, undeformed
-from tkamb.contact.lattice.report import PressureRule, result_of, untouched
+from tkamb.contact.lattice.report import PressureRule, result_of, unseen_flags, untouched
 from tkamb.contact.lattice.response import SINGLE
 from tkamb.contact.lattice.solid import Solid
 from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve
 from tkamb.contact.materials import Material
 from tkamb.contact.model import ContactModel, ContactPair, ContactResult, PreparedContact
-from tkamb.contact.pressing import check_load, failed_result, pose_at_approach
+from tkamb.contact.pressing import check_load, failed_result, pose_at_approach, within_insert
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import Array
@@ -216,6 +216,9 @@ class CellContact(ContactModel):
                 earlier = Remembered(solution.lost, moved, below, solution.region)
             if covered or reached <= start.reach:
                 result = result_of(state, pose, load, gaps, solution, self.pressure_rule)
+                if load is not None:
+                    sunk = solution.forces.approach + max(-float(gaps.min()), 0.0)
+                    result = within_insert(state, result, *unseen_flags(state, result, sunk))
                 if solution.converged and earlier is not None:
                     state.memory.keep(result, earlier)
                 return result

@@ -1,5 +1,6 @@
 """From a solution of the lattice to the contract's result: pressures, sums, flags."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Literal
@@ -15,7 +16,9 @@ from tkamb.contact.lattice.solver import Solution
 from tkamb.contact.model import ContactResult, ContactStatus
 from tkamb.contact.pressing import approach_at, failed_result
 from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
+from tkamb.contact.validity import HALF, peak_flags
 from tkamb.geometry.frames import Array
+from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.contact.lattice.model import LatticeState
@@ -25,6 +28,8 @@ PressureRule = Literal["tributary", "source"]
 
 STRAIN_FLAG = -0.4
 """Principal strain below which a result is flagged: the law has no barrier at -100 %."""
+MOST_UNSEEN = 0.2e-3
+"""m; a node of a 3 mm cell misses the bottom of a ball of 15 mm by 0.15 mm."""
 COLLAPSE = -1.0
 """Principal strain at which a cell is compressed to nothing: out of range."""
 
@@ -205,6 +210,7 @@ def _peak_flags(state: "LatticeState", carried: ContactResult) -> tuple[str, ...
     }
     floor, spacing = state.problem.floor, state.lattice.spacing
     return (
+        *peak_flags(carried.medial, carried.lateral),
         *coarse_flags(state.map.triangles, carried.pressure > 0, sides),
         *edge_flags(floor, carried.pose, spacing, peaks),
     )
@@ -216,6 +222,23 @@ def _unsettled(solution: Solution) -> str:
         f"the solver has not converged: {100 * solution.residual:.2g} % of the force or of the way "
         f"to the femoral surface is left after {solution.passes} passes; is the femoral mesh rough?"
     )
+
+
+def unseen_flags(state: "LatticeState", result: ContactResult, depth: float) -> Iterator[str]:
+    """Yield a flag where much of the approach is seen by no node.
+
+    Args:
+        state: prepared contact.
+        result: of a press.
+        depth: m, how far the femoral component went below the first contact node.
+    """
+    unseen = result.approach - depth
+    if unseen > max(MOST_UNSEEN, HALF * result.approach):
+        yield (
+            f"the meshes first touch {unseen / MILLIMETRE:.2g} mm before any node does (cells of "
+            f"{state.lattice.spacing.max() / MILLIMETRE:.2g} mm); the approach counts from there: "
+            "is there a spike or a ridge in a mesh?"
+        )
 
 
 def _strain_flags(state: "LatticeState", solution: Solution) -> tuple[tuple[str, ...], bool]:
