@@ -40,7 +40,7 @@ def open_regular(path: str | Path, limit: float, *, what: str = "file", follow: 
     # O_NONBLOCK: opening a FIFO that nobody writes to would wait; regular files ignore it.
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)
     try:
-        descriptor = os.open(path, flags)
+        descriptor = os.open(os.fspath(path), flags)  # text: `tkamb run --profile` hears it
     except FileNotFoundError:
         raise InputError(f"no such {what}", path, "check the path") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL character in the path
