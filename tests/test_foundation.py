@@ -14,8 +14,9 @@ from tkamb.contact.foundation import (
     layer_slope,
 )
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactPair, ContactStatus
+from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import first_touch_height, pose_at_approach
+from tkamb.contact.result import ContactStatus
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, knee_pose, pose
 from tkamb.geometry.surface import Surface

@@ -9,7 +9,7 @@ import pytest
 from scenes import MODEL
 from tkamb.case import load_case
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactPair
+from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.contact.summary import area_above, medial_points
 from tkamb.geometry.frames import knee_pose

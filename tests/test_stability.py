@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from tkamb.cli import main
-from tkamb.contact.model import ContactStatus
 from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactStatus
 from tkamb.studies.extremes import Extreme, extremes
 from tkamb.studies.kept_rows import KeptRows, row_key
 from tkamb.studies.scene_extremes import SceneExtreme, judge_scene, scene_extremes

@@ -9,8 +9,9 @@ from lattice_bodies import above, box_insert, condyles
 from scenes import MODEL
 from tkamb.case import load_case
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactPair, ContactStatus
+from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactStatus
 from tkamb.geometry.curved import CurvedSurface
 from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.rays import RayCaster

@@ -4,15 +4,19 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.contact.model import ContactModel, ContactPair, ContactResult, ContactStatus
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.contact.validity import HALF, compression
 from tkamb.errors import InputError
 from tkamb.geometry.first_touch import Touch
 from tkamb.geometry.frames import Array
+
+if TYPE_CHECKING:
+    from tkamb.contact.model import ContactModel
 
 LOAD_TOLERANCE = 1e-6
 """Largest relative difference between reaction and load that counts as reached."""
@@ -77,7 +81,7 @@ def check_load(load: float) -> None:
 
 
 def press_by_search(
-    model: ContactModel,
+    model: "ContactModel",
     state: Any,
     load: float,
     pose: Array,
@@ -140,7 +144,7 @@ class _Evaluations:
     """Evaluates a model at approaches and keeps the last result."""
 
     def __init__(
-        self, model: ContactModel, state: Any, pose: Array, guess: ContactResult | None
+        self, model: "ContactModel", state: Any, pose: Array, guess: ContactResult | None
     ) -> None:
         self._model, self._state, self._pose, self._guess = model, state, pose, guess
         self._approach = math.nan
@@ -218,7 +222,7 @@ def _between(low: float, low_value: float, high: float, high_value: float) -> fl
     return trial if low < trial < high else middle
 
 
-def unloaded_result(model: ContactModel, state: Any, pose: Array) -> ContactResult:
+def unloaded_result(model: "ContactModel", state: Any, pose: Array) -> ContactResult:
     """Return first touch: no pressure, no force."""
     touching = pose_at_approach(state.pair, pose, 0.0)
     result = model.evaluate(state, touching)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.model import CondyleContact
+from tkamb.contact.result import CondyleContact
 from tkamb.geometry.frames import Array, inverse, transform
 
 

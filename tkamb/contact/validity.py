@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tkamb.contact.model import CondyleContact, ContactPair, ContactResult
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.result import CondyleContact, ContactResult
 from tkamb.geometry.first_touch import Touch
 from tkamb.geometry.frames import Array
 from tkamb.units import MEGAPASCAL, MILLIMETRE

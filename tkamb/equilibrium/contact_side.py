@@ -20,10 +20,11 @@ from tkamb.body.knee import solve_knee, unsolved
 from tkamb.body.unknowns import CondylePoint
 from tkamb.case import Case
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactPair, ContactResult, ContactStatus
+from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import first_touch_height, within_insert
 from tkamb.contact.probe import condyle_wrenches
 from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.contact.summary import medial_points
 from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.equilibrium.balance import BalanceStatus

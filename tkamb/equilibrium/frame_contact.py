@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.model import ContactResult
+from tkamb.contact.result import ContactResult
 from tkamb.contact.summary import area_above
 from tkamb.geometry.adjustment import Adjustment
 

@@ -6,7 +6,8 @@ contact model: what it costs is one more warm press, and what it says holds for 
 
 from typing import Any
 
-from tkamb.contact.model import ContactModel, ContactResult, ContactStatus
+from tkamb.contact.model import ContactModel
+from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_coordinates, knee_pose
 from tkamb.units import DEGREE
 

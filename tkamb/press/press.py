@@ -12,9 +12,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tkamb.contact import materials
-from tkamb.contact.model import Bearing, ContactModel, ContactPair, ContactResult
+from tkamb.contact.model import ContactModel
+from tkamb.contact.pair import Bearing, ContactPair
 from tkamb.contact.pressing import check_load, first_touch_height
 from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactResult
 from tkamb.defaults import CONTACT_MODEL
 from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.errors import InputError

@@ -6,7 +6,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tkamb.contact.model import CondyleContact, ContactPair, ContactResult, ContactStatus
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.result import CondyleContact, ContactResult, ContactStatus
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.known_errors import KnownError, as_json, known_error_words
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE

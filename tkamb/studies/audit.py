@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from tkamb.contact.model import ContactResult
+from tkamb.contact.result import ContactResult
 
 CARRIED = 0.005
 """Relative: forces, pressures and condyles against the load."""

@@ -32,8 +32,9 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from tkamb.contact.materials import Material, material
-from tkamb.contact.model import Bearing, ContactPair, ContactResult
+from tkamb.contact.pair import Bearing, ContactPair
 from tkamb.contact.registry import contact_class, contact_model
+from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from tkamb.contact.materials import material
-from tkamb.contact.model import Bearing, ContactPair
+from tkamb.contact.pair import Bearing, ContactPair
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.geometry.surface import Surface

@@ -16,8 +16,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from tkamb.contact.model import ContactModel, ContactResult, ContactStatus
+from tkamb.contact.model import ContactModel
 from tkamb.contact.registry import contact_class, contact_model
+from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import TkambError
 from tkamb.known_errors import setting_label
 from tkamb.studies.cases import StudyCase, study_case

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tkamb.contact.model import ContactResult
+from tkamb.contact.result import ContactResult
 from tkamb.errors import InputError
 from tkamb.studies.extremes import Extreme
 from tkamb.studies.quantities import Quantities, errors, quantities

@@ -19,9 +19,10 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from tkamb.contact.model import ContactModel, ContactResult, ContactStatus
+from tkamb.contact.model import ContactModel
 from tkamb.contact.pressing import press_by_search
 from tkamb.contact.registry import contact_class, contact_model
+from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import ComputationError, TkambError
 from tkamb.studies.audit import complaints
 from tkamb.studies.closed_forms import TOLERANCES, ClosedForm, apart, press_closed_form

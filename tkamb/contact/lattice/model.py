@@ -22,8 +22,10 @@ from tkamb.contact.lattice.response import SINGLE
 from tkamb.contact.lattice.solid import Solid
 from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve
 from tkamb.contact.materials import Material
-from tkamb.contact.model import ContactModel, ContactPair, ContactResult, PreparedContact
+from tkamb.contact.model import ContactModel
+from tkamb.contact.pair import ContactPair, PreparedContact
 from tkamb.contact.pressing import check_load, failed_result, pose_at_approach, within_insert
+from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import Array

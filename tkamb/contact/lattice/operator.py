@@ -11,7 +11,7 @@ from tkamb.contact.lattice.dissection import dissect
 from tkamb.contact.lattice.memory_need import check_memory, factor_memory
 from tkamb.contact.lattice.multifrontal import CholeskyFactor, factorise
 from tkamb.contact.lattice.response import HalfResponse, half_response
-from tkamb.contact.model import Bearing
+from tkamb.contact.pair import Bearing
 from tkamb.geometry.frames import Array
 
 Indices = NDArray[np.int64]

@@ -13,8 +13,8 @@ from tkamb.contact.lattice.covered import covered_areas
 from tkamb.contact.lattice.edges import edge_flags
 from tkamb.contact.lattice.problem import STEEPEST, Indices, footing
 from tkamb.contact.lattice.solver import Solution
-from tkamb.contact.model import ContactResult, ContactStatus
 from tkamb.contact.pressing import approach_at, failed_result
+from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
 from tkamb.contact.validity import HALF, peak_flags
 from tkamb.geometry.frames import Array
