@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tkamb.output.maps_file import ContactMaps
-    from tkamb.view.show import Show
 
 __all__ = ["COLUMNS", "Results", "claim_directory", "read_results", "write_results"]
 
@@ -104,20 +103,6 @@ class Results:
         from tkamb.output.plots import plot
 
         return plot(self, names, axis)
-
-    def view(self, frame: int = 0) -> "Show":
-        """Return the run to look at and turn around, which notebooks show.
-
-        Args:
-            frame: shown first.
-
-        Raises:
-            InputError: the scene is not there, or no longer what was run.
-        """
-        from tkamb.view.run import run_of
-        from tkamb.view.show import Show
-
-        return Show([run_of(self)], frame=frame)
 
     def _repr_html_(self) -> str:
         """Return the report's headline numbers, for notebooks."""

@@ -3,6 +3,7 @@
 import re
 from dataclasses import dataclass
 from html import escape
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,8 +11,10 @@ from tkamb.geometry.frames import Array
 from tkamb.known_errors import is_large, known_error_words
 from tkamb.output import metrics
 from tkamb.output.axis import HorizontalAxis
-from tkamb.results import Results
 from tkamb.run.agreement import LARGE_RESIDUAL, SHARES_APART
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
 PRESSURE_AND_AREA = ("peak_pressure", "mean_pressure", "area")
 
@@ -52,7 +55,7 @@ def _unbroken(text: str) -> str:
     return re.sub(r"([\d.]+–[\d.]+)", r'<span class="whole">\1</span>', text)
 
 
-def cards(results: Results, axis: HorizontalAxis) -> list[Card]:
+def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
     """Return the headline numbers that the run has."""
     found = (
         _questions(results),
@@ -66,7 +69,7 @@ def cards(results: Results, axis: HorizontalAxis) -> list[Card]:
     return [card for card in found if card is not None]
 
 
-def _where(results: Results, axis: HorizontalAxis, frame: int) -> str:
+def _where(results: "Results", axis: HorizontalAxis, frame: int) -> str:
     flexion = f"{results['flexion_deg'][frame]:.0f}° of flexion"
     if axis.kind == "flexion":
         return f"at {flexion}"
@@ -74,14 +77,14 @@ def _where(results: Results, axis: HorizontalAxis, frame: int) -> str:
     return f"at {name} ({flexion})"
 
 
-def _questions(results: Results) -> Card | None:
+def _questions(results: "Results") -> Card | None:
     asked = results.summary.get("questions") or []
     if not asked:
         return None
     return Card("Questions to answer", str(len(asked)), " ".join(map(str, asked)), True)
 
 
-def _peak_force(results: Results, axis: HorizontalAxis) -> Card | None:
+def _peak_force(results: "Results", axis: HorizontalAxis) -> Card | None:
     found = metrics.peak(results, "force_total_BW")
     if found is None:
         return None
@@ -93,7 +96,7 @@ def _peak_force(results: Results, axis: HorizontalAxis) -> Card | None:
     return Card("Peak contact force", f"{found.value:.2f} BW", detail)
 
 
-def _shares(results: Results) -> Card | None:
+def _shares(results: "Results") -> Card | None:
     texts = {}
     for estimate in ("deformation", "equilibrium"):
         share = 100 * metrics.medial_share(results, estimate)
@@ -114,7 +117,7 @@ def _shares(results: Results) -> Card | None:
     return Card("Medial share of the load", texts[first], detail, bool(alone or apart or unknown))
 
 
-def _adduction(results: Results, unknown: int) -> list[str]:
+def _adduction(results: "Results", unknown: int) -> list[str]:
     """Return what an error of the adduction does to the split by deformation, in words."""
     moved = metrics.moved_per_half_degree(results)
     words = []
@@ -127,7 +130,7 @@ def _adduction(results: Results, unknown: int) -> list[str]:
     return [": ".join(words)] if words else []
 
 
-def _peak_pressure(results: Results, axis: HorizontalAxis) -> Card | None:
+def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
     found = metrics.peak(results, "<side>_peak_pressure_MPa")
     if found is None:
         return None
@@ -149,12 +152,12 @@ def _peak_pressure(results: Results, axis: HorizontalAxis) -> Card | None:
     return Card("Peak contact pressure", f"{found.value:.1f} MPa", detail, large)
 
 
-def _model(results: Results) -> str:
+def _model(results: "Results") -> str:
     table = results.summary.get("contact") or {}
     return f"{table.get('model', 'the contact model')} at {table.get('resolution_mm', 0.0):g} mm:"
 
 
-def _extensor(results: Results, axis: HorizontalAxis) -> Card | None:
+def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:
     found = metrics.peak(results, "quadriceps_N")
     if found is None:
         return None
@@ -172,7 +175,7 @@ def _extensor(results: Results, axis: HorizontalAxis) -> Card | None:
     return Card("Peak quadriceps tension", f"{value:.2f} BW", detail)
 
 
-def _residuals(results: Results) -> Card | None:
+def _residuals(results: "Results") -> Card | None:
     share = 100 * metrics.residual_share(results)
     if not np.isfinite(share).any():
         return None
@@ -185,7 +188,7 @@ def _residuals(results: Results) -> Card | None:
     return Card("Residual force", middle, detail, bool(np.nanmax(share) > 100 * LARGE_RESIDUAL))
 
 
-def _frames(results: Results) -> Card:
+def _frames(results: "Results") -> Card:
     failed = int(metrics.failed(results).sum())
     flagged = int(metrics.flagged(results).sum())
     value = f"{len(results) - failed} of {len(results)}"

@@ -40,7 +40,7 @@ from tkamb.studies.cases import StudyCase
 from tkamb.studies.measures import Job, Measure
 from tkamb.studies.quantities import quantities, raster_map
 from tkamb.studies.references import Reference
-from tkamb.studies.tradeoff import Row, compared
+from tkamb.studies.row import Row, compared
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 Mask = NDArray[np.bool_]

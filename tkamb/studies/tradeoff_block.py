@@ -18,7 +18,7 @@ from tkamb.studies.advice import (
 )
 from tkamb.studies.body_trade import HEADS as BODY_HEADS
 from tkamb.studies.body_trade import BodyRow
-from tkamb.studies.tradeoff import KEYS, Row
+from tkamb.studies.row import KEYS, Row
 
 MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
 HEADS = ("approach", "condyle force", "mean p", "peak p", "area", "map L2")
