@@ -13,6 +13,7 @@ from tkamb.studies.advice import comparison, recommendations
 from tkamb.studies.body_trade import read_body_rows
 from tkamb.studies.measures import Job, Measure
 from tkamb.studies.references import read_references
+from tkamb.studies.row import KEYS, TIMES, Row
 from tkamb.studies.tradeoff_block import (
     MARKERS,
     block,
@@ -25,8 +26,8 @@ from tkamb.studies.tradeoff_report import picture, table
 ROOT = Path(__file__).parents[1]
 KEYS = {
     *("case", "contact", "resolution_mm", "on_front", "status", "reference_known", "values"),
-    *tradeoff.TIMES,
-    *(f"error_{key}" for key in tradeoff.KEYS),
+    *TIMES,
+    *(f"error_{key}" for key in KEYS),
 }
 
 
@@ -38,9 +39,9 @@ def made_up_rows():
         for contact, grid, seconds, error in settings:
             values = dict.fromkeys(read_references()[case].values, 1.0 + error)
             found = Measure("ok", 1.0, seconds, seconds, 100.0, values=values)
-            compared = dict.fromkeys(tradeoff.KEYS, error)
-            rows.append(tradeoff.Row(Job(case, contact, grid), found, compared, 0.005))
-        rows.append(tradeoff.Row(Job(case, "lattice", 1.0), Measure("out of range"), {}, 0.005))
+            compared = dict.fromkeys(KEYS, error)
+            rows.append(Row(Job(case, contact, grid), found, compared, 0.005))
+        rows.append(Row(Job(case, "lattice", 1.0), Measure("out of range"), {}, 0.005))
     return tradeoff.with_fronts(rows)
 
 
