@@ -10,8 +10,8 @@ from recordings import write_c3d
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse
-from tkamb.importing.anatomy import find_leg, quarter_turn
-from tkamb.importing.links import find_links
+from tkamb.importing.anatomy import find_leg
+from tkamb.importing.links import find_links, quarter_turn
 from tkamb.importing.model_fit import ModelChain, fit_model
 from tkamb.importing.soft_tissue import soft_tissue
 from tkamb.importing.urdf import link_inertias, patient_urdf
