@@ -21,6 +21,9 @@ from tkamb.inputs.tables import Table, read_table
 FRAMES_PER_CUTOFF = 5.0
 """Frames per period of the cut-off: what is low-passed holds nothing between them."""
 
+ON_A_STEP = 0.15
+"""m; the middle of a foot's markers is some 50 mm above what it stands on."""
+
 
 @dataclass(frozen=True, eq=False)
 class Trial:
@@ -145,9 +148,15 @@ def _thinned(
 
 def _load_line(load: Load) -> str:
     other = "" if np.isnan(load.other) else f", {load.other * 1e3:.0f} mm from the other's"
+    step = (
+        f"; the foot is {load.height * 1e3:.0f} mm above it: a step stands on the plate, whose "
+        "wrench is taken as it is, with its point at the plate's level"
+        if load.height > ON_A_STEP
+        else ""
+    )
     return (
         f"force plate {load.plate}: {load.side} foot from {load.start:.3f} to {load.end:.3f} s "
-        f"(centre of pressure {load.distance * 1e3:.0f} mm from that foot's markers{other})"
+        f"(centre of pressure {load.distance * 1e3:.0f} mm from that foot's markers{other}){step}"
     )
 
 
