@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import tkamb
 from recordings import write_c3d
 from tkamb.cli import main
 from tkamb.errors import InputError
@@ -130,6 +131,18 @@ def test_a_model_without_implant_becomes_a_scene_that_loads_and_bends(tmp_path, 
     assert scene.contact is None and scene.motion.markers is not None
     assert "not scaled" in said and "+x,+y,+z" in said and "no implant" in said
     assert "flexion 5.7 to 67.7 deg" in said  # 0.1 rad to 1.2 less one frame in sixty
+
+
+def test_a_run_on_markers_holds_both_readings_frame_by_frame(tmp_path):
+    assert main(recorded_leg(tmp_path)) == 0
+    results = tkamb.simulate(tmp_path / "out" / "scene.toml")
+    for method in ("segments", "chain"):
+        assert results[f"marker_rms_{method}_mm"].max() < 1e-3  # the file has 1e-5 mm
+        bend = np.radians(results[f"flexion_{method}_deg"])
+        np.testing.assert_allclose(bend, np.linspace(0.1, 1.2, 60)[::2], atol=1e-6)
+    assert results["knee_centre_distance_mm"].max() < 1e-2
+    np.testing.assert_allclose(results["time_s"], np.arange(60)[::2] / 60.0, atol=1e-8)
+    assert "skin markers" in " ".join(results.summary["assumptions"])
 
 
 def test_what_is_inferred_stands_in_the_scene(tmp_path):
