@@ -340,6 +340,18 @@ def test_quarter_turns():
     np.testing.assert_array_equal(axes, [[0, -1, 0], [-1, 0, 0], [0, 0, -1]])
 
 
+@pytest.mark.skipif(not DATA.is_dir(), reason="no shared data beside the project")
+@pytest.mark.parametrize("name", ["gait2392", "Rajagopal2016"])
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_widely_used_models_have_legs_too(name, side):
+    leg = find_leg(read_osim(DATA / "opensim" / f"{name}.osim"), side)
+    links = find_links(leg, None, "+x,+y,+z", {}, False)
+    assert leg.knee.name.endswith("_" + side[0]) and leg.flexion == f"knee_angle_{side[0]}"
+    assert 0.3 < links.insert_in_tibia[1, 3] < 0.5  # m, from the ankle up to the knee
+    assert 0.3 < links.hip[1] < 0.5  # and from there to the hip
+    ElementTree.fromstring(patient_urdf(links, 1.0, ""))
+
+
 @needs_dm
 def test_dms_urdf_is_the_one_that_was_made_by_hand():
     model = read_osim(DM / "DM.osim")

@@ -61,6 +61,21 @@ class Leg:
         return inverse(self.neutral[other]) @ self.neutral[body]
 
     @property
+    def knee_centre(self) -> Array:
+        """(3,) m, the knee's centre in ground at the neutral pose.
+
+        The joint's end on the femur; where that is the hip, because the joint's translation
+        carries the thigh's length (Delp's models), its end on the tibia.
+        """
+        hip = transform(self.neutral[self.hip_centre[0]], self.hip_centre[1])
+        for group in (self.femur, self.tibia):
+            body, point = _end(self.knee, group)
+            centre = transform(self.neutral[body], point)
+            if np.linalg.norm(centre - hip) > SEGMENT_LENGTH[0]:
+                break
+        return np.asarray(centre)
+
+    @property
     def hip_centre(self) -> tuple[str, Array]:
         """Body and point (3,) m of the hip joint's centre in the femur."""
         return _end(self.hip, self.femur)
@@ -122,8 +137,7 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
 
 def _check_lengths(leg: Leg) -> None:
     """Raise unless thigh and shank are as long as a person's: else the knee is another joint."""
-    body, knee = _end(leg.knee, leg.femur)
-    centre = transform(leg.neutral[body], knee)
+    centre = leg.knee_centre
     for name, (other, point) in {"thigh": leg.hip_centre, "shank": leg.ankle_centre}.items():
         length = float(np.linalg.norm(transform(leg.neutral[other], point) - centre))
         if not SEGMENT_LENGTH[0] < length < SEGMENT_LENGTH[1]:

@@ -185,7 +185,7 @@ def find_links(
     turn = pose(axes_rotation(axes), np.zeros(3))
     said: list[str] = []
     if insert is None:
-        femur = pose(np.eye(3), _knee_centre(leg))
+        femur = pose(np.eye(3), transform(inverse(leg.neutral[leg.femur[0]]), leg.knee_centre))
     else:
         found = mesh_frame(leg, "femoral component", frames.get("femoral component"))
         femur = _anatomical(leg, found, leg.femur[0], turn, "femoral component", said)
@@ -202,14 +202,6 @@ def find_links(
         insert_in_tibia = inverse(tibia) @ mesh @ inverse(placement)
     patella, button, error = _patella(leg, femur, turn, frames, with_button, said)
     return Links(leg, femur, tibia, patella, insert_in_tibia, button, error, tuple(said))
-
-
-def _knee_centre(leg: Leg) -> Array:
-    """Return the knee joint's centre (3,) m in the femur's body, as the joint's frame has it."""
-    joint = leg.knee
-    own = joint.pose_parent_frame if joint.parent in leg.femur else joint.pose_child_frame
-    body = joint.parent if joint.parent in leg.femur else joint.child
-    return transform(leg.in_body(body, leg.femur[0]), own[:3, 3])
 
 
 def _anatomical(
