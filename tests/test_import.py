@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import tkamb
 from recordings import write_c3d
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse
-from tkamb.importing.anatomy import find_leg, quarter_turn
-from tkamb.importing.links import find_links
+from tkamb.importing.anatomy import find_leg
+from tkamb.importing.links import find_links, quarter_turn
 from tkamb.importing.model_fit import ModelChain, fit_model
 from tkamb.importing.soft_tissue import soft_tissue
 from tkamb.importing.urdf import link_inertias, patient_urdf
@@ -130,6 +131,18 @@ def test_a_model_without_implant_becomes_a_scene_that_loads_and_bends(tmp_path, 
     assert scene.contact is None and scene.motion.markers is not None
     assert "not scaled" in said and "+x,+y,+z" in said and "no implant" in said
     assert "flexion 5.7 to 67.7 deg" in said  # 0.1 rad to 1.2 less one frame in sixty
+
+
+def test_a_run_on_markers_holds_both_readings_frame_by_frame(tmp_path):
+    assert main(recorded_leg(tmp_path)) == 0
+    results = tkamb.simulate(tmp_path / "out" / "scene.toml")
+    for method in ("segments", "chain"):
+        assert results[f"marker_rms_{method}_mm"].max() < 1e-3  # the file has 1e-5 mm
+        bend = np.radians(results[f"flexion_{method}_deg"])
+        np.testing.assert_allclose(bend, np.linspace(0.1, 1.2, 60)[::2], atol=1e-6)
+    assert results["knee_centre_distance_mm"].max() < 1e-2
+    np.testing.assert_allclose(results["time_s"], np.arange(60)[::2] / 60.0, atol=1e-8)
+    assert "skin markers" in " ".join(results.summary["assumptions"])
 
 
 def test_what_is_inferred_stands_in_the_scene(tmp_path):
@@ -325,6 +338,18 @@ def test_quarter_turns():
     turn = np.array([[0.1, -0.99, 0.05], [-0.99, -0.1, 0.02], [0.0, 0.05, -1.0]])
     axes, _ = quarter_turn(turn)
     np.testing.assert_array_equal(axes, [[0, -1, 0], [-1, 0, 0], [0, 0, -1]])
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="no shared data beside the project")
+@pytest.mark.parametrize("name", ["gait2392", "Rajagopal2016"])
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_widely_used_models_have_legs_too(name, side):
+    leg = find_leg(read_osim(DATA / "opensim" / f"{name}.osim"), side)
+    links = find_links(leg, None, "+x,+y,+z", {}, False)
+    assert leg.knee.name.endswith("_" + side[0]) and leg.flexion == f"knee_angle_{side[0]}"
+    assert 0.3 < links.insert_in_tibia[1, 3] < 0.5  # m, from the ankle up to the knee
+    assert 0.3 < links.hip[1] < 0.5  # and from there to the hip
+    ElementTree.fromstring(patient_urdf(links, 1.0, ""))
 
 
 @needs_dm

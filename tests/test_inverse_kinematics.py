@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_coordinates, knee_pose, pose, transform
-from tkamb.inputs.inverse_kinematics import FLEXION, LegChain, LegState, Segment, fit_chain
+from tkamb.inputs.inverse_kinematics import fit_chain
+from tkamb.inputs.leg_chain import FLEXION, LegChain, LegState, Segment
 from tkamb.inputs.markers import fit_rigid, fit_seen
 
 FRAMES = 7

@@ -61,6 +61,21 @@ class Leg:
         return inverse(self.neutral[other]) @ self.neutral[body]
 
     @property
+    def knee_centre(self) -> Array:
+        """(3,) m, the knee's centre in ground at the neutral pose.
+
+        The joint's end on the femur; where that is the hip, because the joint's translation
+        carries the thigh's length (Delp's models), its end on the tibia.
+        """
+        hip = transform(self.neutral[self.hip_centre[0]], self.hip_centre[1])
+        for group in (self.femur, self.tibia):
+            body, point = _end(self.knee, group)
+            centre = transform(self.neutral[body], point)
+            if np.linalg.norm(centre - hip) > SEGMENT_LENGTH[0]:
+                break
+        return np.asarray(centre)
+
+    @property
     def hip_centre(self) -> tuple[str, Array]:
         """Body and point (3,) m of the hip joint's centre in the femur."""
         return _end(self.hip, self.femur)
@@ -122,8 +137,7 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
 
 def _check_lengths(leg: Leg) -> None:
     """Raise unless thigh and shank are as long as a person's: else the knee is another joint."""
-    body, knee = _end(leg.knee, leg.femur)
-    centre = transform(leg.neutral[body], knee)
+    centre = leg.knee_centre
     for name, (other, point) in {"thigh": leg.hip_centre, "shank": leg.ankle_centre}.items():
         length = float(np.linalg.norm(transform(leg.neutral[other], point) - centre))
         if not SEGMENT_LENGTH[0] < length < SEGMENT_LENGTH[1]:
@@ -218,85 +232,3 @@ def _end(joint: Joint, group: tuple[str, ...]) -> tuple[str, Array]:
     if joint.parent in group:
         return joint.parent, joint.pose_parent_frame[:3, 3]
     return joint.child, joint.pose_child_frame[:3, 3]
-
-
-@dataclass(frozen=True, eq=False)
-class MeshFrame:
-    """Where a mesh's own frame stands in a body of the model.
-
-    Args:
-        body: the body.
-        pose: (4, 4) in it; None: at its origin, with the axes that anatomy says.
-        why: how it was found, for the reader.
-    """
-
-    body: str
-    pose: Array | None
-    why: str
-
-
-_STEMS = {
-    "femoral component": ("femur_implant", "femoral_implant", "femoral_component"),
-    "insert": ("tibia_implant", "tibial_implant", "insert", "tibial_tray", "tray"),
-    "patellar button": ("patella_implant", "patellar_implant", "button"),
-}
-
-
-def mesh_frame(leg: Leg, part: str, given: str | None) -> MeshFrame:
-    """Return where a part's mesh frame stands: as given, or by the name of a frame or body.
-
-    Args:
-        leg: the leg.
-        part: "femoral component", "insert" or "patellar button".
-        given: name of an offset frame or body; None: look for one.
-
-    Raises:
-        InputError: no such frame, or none that is named after the part.
-    """
-    model = leg.model
-    group = {
-        "femoral component": leg.femur,
-        "insert": leg.tibia,
-        "patellar button": (leg.patella,),
-    }[part]
-    there = {name: (body, at) for name, (body, at) in model.offset_frames.items() if body in group}
-    there |= {body: (body, np.eye(4)) for body in group if body}
-    if given is not None:
-        if given not in there:
-            raise InputError(
-                f"has no frame '{given}' on {', '.join(filter(None, group))}",
-                model.name,
-                f"it has {', '.join(there)}",
-            )
-        return MeshFrame(*there[given], f"frame '{given}', as given")
-    for stem in _STEMS[part]:
-        for name in there:
-            if stem in name.lower():
-                return MeshFrame(*there[name], f"'{name}', by its name")
-    if part == "patellar button" and leg.patella:
-        return MeshFrame(leg.patella, None, "the patella's origin, for want of a frame")
-    option = {"femoral component": "--femoral-frame", "insert": "--insert-frame"}.get(
-        part, "--patella-frame"
-    )
-    raise InputError(
-        f"says nowhere how the {part}'s mesh stands on the bone",
-        model.name,
-        f"give {option}, one of {', '.join(there)}",
-    )
-
-
-def quarter_turn(rotation: Array) -> tuple[Array, float]:
-    """Return the nearest rotation (3, 3) by quarter turns, and how far (rad) it is."""
-    best = np.zeros((3, 3))
-    left = np.abs(rotation).copy()
-    for _ in range(3):
-        i, j = np.unravel_index(int(np.argmax(left)), (3, 3))
-        best[i, j] = np.sign(rotation[i, j])
-        left[i, :], left[:, j] = -1.0, -1.0
-    angle = np.arccos(np.clip((np.trace(best.T @ rotation) - 1.0) / 2.0, -1.0, 1.0))
-    return best, float(angle)
-
-
-def point_in(leg: Leg, body: str, point: Array, other: str) -> Array:
-    """Return a point (3,) of a body in another that moves with it."""
-    return transform(leg.in_body(body, other), point)

@@ -58,7 +58,8 @@ def _interval(text: str) -> tuple[float, float]:
 
 
 def _import(options: argparse.Namespace) -> int:
-    from tkamb.importing.patient import ImportRequest, import_patient, write_patient
+    from tkamb.importing.patient import import_patient, write_patient
+    from tkamb.importing.request import ImportRequest
 
     if not options.mass_kg > 0:
         raise InputError(f"{options.mass_kg:g} kg is no mass", "--mass-kg")

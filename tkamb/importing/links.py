@@ -8,12 +8,89 @@ from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import Array, inverse, knee_coordinates, pose, transform
 from tkamb.geometry.surface import Surface
-from tkamb.importing.anatomy import Leg, MeshFrame, mesh_frame, quarter_turn
+from tkamb.importing.anatomy import Leg
 from tkamb.inputs.meshes import axes_rotation
 from tkamb.units import DEGREE
 
 MOST_TURNED = 35.0 * DEGREE
 """An implant's axes lie within this of the bone's; a wrong axis is 90 deg off."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeshFrame:
+    """Where a mesh's own frame stands in a body of the model.
+
+    Args:
+        body: the body.
+        pose: (4, 4) in it; None: at its origin, with the axes that anatomy says.
+        why: how it was found, for the reader.
+    """
+
+    body: str
+    pose: Array | None
+    why: str
+
+
+_STEMS = {
+    "femoral component": ("femur_implant", "femoral_implant", "femoral_component"),
+    "insert": ("tibia_implant", "tibial_implant", "insert", "tibial_tray", "tray"),
+    "patellar button": ("patella_implant", "patellar_implant", "button"),
+}
+
+
+def mesh_frame(leg: Leg, part: str, given: str | None) -> MeshFrame:
+    """Return where a part's mesh frame stands: as given, or by the name of a frame or body.
+
+    Args:
+        leg: the leg.
+        part: "femoral component", "insert" or "patellar button".
+        given: name of an offset frame or body; None: look for one.
+
+    Raises:
+        InputError: no such frame, or none that is named after the part.
+    """
+    model = leg.model
+    group = {
+        "femoral component": leg.femur,
+        "insert": leg.tibia,
+        "patellar button": (leg.patella,),
+    }[part]
+    there = {name: (body, at) for name, (body, at) in model.offset_frames.items() if body in group}
+    there |= {body: (body, np.eye(4)) for body in group if body}
+    if given is not None:
+        if given not in there:
+            raise InputError(
+                f"has no frame '{given}' on {', '.join(filter(None, group))}",
+                model.name,
+                f"it has {', '.join(there)}",
+            )
+        return MeshFrame(*there[given], f"frame '{given}', as given")
+    for stem in _STEMS[part]:
+        for name in there:
+            if stem in name.lower():
+                return MeshFrame(*there[name], f"'{name}', by its name")
+    if part == "patellar button" and leg.patella:
+        return MeshFrame(leg.patella, None, "the patella's origin, for want of a frame")
+    option = {"femoral component": "--femoral-frame", "insert": "--insert-frame"}.get(
+        part, "--patella-frame"
+    )
+    raise InputError(
+        f"says nowhere how the {part}'s mesh stands on the bone",
+        model.name,
+        f"give {option}, one of {', '.join(there)}",
+    )
+
+
+def quarter_turn(rotation: Array) -> tuple[Array, float]:
+    """Return the nearest rotation (3, 3) by quarter turns, and how far (rad) it is."""
+    best = np.zeros((3, 3))
+    left = np.abs(rotation).copy()
+    for _ in range(3):
+        i, j = np.unravel_index(int(np.argmax(left)), (3, 3))
+        best[i, j] = np.sign(rotation[i, j])
+        left[i, :], left[:, j] = -1.0, -1.0
+    angle = np.arccos(np.clip((np.trace(best.T @ rotation) - 1.0) / 2.0, -1.0, 1.0))
+    return best, float(angle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +185,7 @@ def find_links(
     turn = pose(axes_rotation(axes), np.zeros(3))
     said: list[str] = []
     if insert is None:
-        femur = pose(np.eye(3), _knee_centre(leg))
+        femur = pose(np.eye(3), transform(inverse(leg.neutral[leg.femur[0]]), leg.knee_centre))
     else:
         found = mesh_frame(leg, "femoral component", frames.get("femoral component"))
         femur = _anatomical(leg, found, leg.femur[0], turn, "femoral component", said)
@@ -125,14 +202,6 @@ def find_links(
         insert_in_tibia = inverse(tibia) @ mesh @ inverse(placement)
     patella, button, error = _patella(leg, femur, turn, frames, with_button, said)
     return Links(leg, femur, tibia, patella, insert_in_tibia, button, error, tuple(said))
-
-
-def _knee_centre(leg: Leg) -> Array:
-    """Return the knee joint's centre (3,) m in the femur's body, as the joint's frame has it."""
-    joint = leg.knee
-    own = joint.pose_parent_frame if joint.parent in leg.femur else joint.pose_child_frame
-    body = joint.parent if joint.parent in leg.femur else joint.child
-    return transform(leg.in_body(body, leg.femur[0]), own[:3, 3])
 
 
 def _anatomical(

@@ -32,6 +32,7 @@ class Load:
         end: s.
         distance: m, median, between the centre of pressure and that foot's markers.
         other: m, the same to the other foot's; NaN if that has no markers.
+        height: m, median, of the middle of that foot's markers above the plate.
     """
 
     plate: int
@@ -40,6 +41,7 @@ class Load:
     end: float
     distance: float
     other: float
+    height: float
 
 
 def plate_loads(recording: Recording, axes: str, feet: dict[str, list[str]]) -> list[Load]:
@@ -97,7 +99,8 @@ def _load(
             "check --laboratory-axes and the foot's labels, or give --plates",
         )
     rest = [distance for side, distance in away.items() if side != nearest]
-    return Load(number, nearest, float(time[0]), float(time[-1]), away[nearest], rest[0])
+    height = float(np.nanmedian(middles[nearest][part, 1] - point[:, 1]))
+    return Load(number, nearest, float(time[0]), float(time[-1]), away[nearest], rest[0], height)
 
 
 def own_plates(loads: list[Load], side: str, recording: Recording) -> tuple[int, ...]:

@@ -75,7 +75,8 @@ def load_ground_reaction(
             mainly upwards, or a centre of pressure is missing or not level while the plate is
             loaded.
     """
-    if (table.format or table.file.suffix.lower().lstrip(".")) == "c3d":
+    from_plates = (table.format or table.file.suffix.lower().lstrip(".")) == "c3d"
+    if from_plates:
         stamps, force, point, moment = _of_plates(table)
     else:
         recorded = read_table(table.file, table.format)
@@ -87,7 +88,9 @@ def load_ground_reaction(
     loaded = force[:, 1] >= table.unloaded_N
     point = _held(stamps, point, loaded, path)
     near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
-    odd = _odd_samples(path, stamps[near], force[near], point[near], loaded[near])
+    # of plates the wrench was recorded: their point is a quotient, which small forces shake
+    points = None if from_plates else point[near]
+    odd = _odd_samples(path, stamps[near], force[near], points, loaded[near])
     level = float(np.median(point[loaded, 1])) if loaded.any() else 0.0
     if loaded.any() and np.abs(point[loaded, 1] - level).max() > LEVEL_TOLERANCE:
         raise InputError(
@@ -106,9 +109,9 @@ def load_ground_reaction(
 
 
 def _odd_samples(
-    path: Path, stamps: Array, force: Array, point: Array, loaded: np.ndarray
+    path: Path, stamps: Array, force: Array, point: Array | None, loaded: np.ndarray
 ) -> tuple[OddSample, ...]:
-    """Return the odd samples of force and point (n, 3), where the plate stays loaded."""
+    """Return the odd samples of force and recorded point (n, 3), where the plate stays loaded."""
     if not loaded.any():
         return ()
     floor = ODD_FORCE * float(np.abs(force).max())
@@ -121,8 +124,9 @@ def _odd_samples(
     for axis in range(3):
         one = (path, f"force_{axis + 1}", stamps, force[:, axis])
         odd += odd_samples(*one, floor, 1.0, "N")
-        one = (path, f"point_{axis + 1}", stamps, point[:, axis])
-        odd += odd_samples(*one, ODD_POINT, MILLIMETRE, "mm")
+        if point is not None:
+            one = (path, f"point_{axis + 1}", stamps, point[:, axis])
+            odd += odd_samples(*one, ODD_POINT, MILLIMETRE, "mm")
     return tuple(sample for sample in odd if sample.time in kept)
 
 

@@ -12,7 +12,6 @@ their disagreement: it acts on the knee's moments as a lever of that length.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -23,19 +22,11 @@ from tkamb.geometry.frames import (
     Array,
     inverse,
     knee_coordinates,
-    transform,
 )
 from tkamb.inputs.filtering import Cutoff, differentiate_poses
-from tkamb.inputs.inverse_kinematics import (
-    FLEXION,
-    ChainFit,
-    LegChain,
-    LegState,
-    Segment,
-    fit_chain,
-)
-from tkamb.inputs.labels import matched_labels
+from tkamb.inputs.inverse_kinematics import ChainFit, fit_chain
 from tkamb.inputs.laboratory import laboratory_rotation
+from tkamb.inputs.leg_chain import FLEXION, LegChain, LegState, Segment
 from tkamb.inputs.markers import WRONG_MARKERS, fit_seen, marker_trajectories
 from tkamb.inputs.tables import Table, read_table
 from tkamb.inputs.tibia import BodyMotion
@@ -104,7 +95,7 @@ def load_marker_motion(
     segments, measured = leg_segments(table.markers, recorded, table.length_unit, side)
     neutral = neutral_coordinates(table.markers, side)
     chain = LegChain(segments, pose_insert_in_tibia, table.markers.knee == "free")
-    fits, whole = _both_fits(chain, segments, measured, neutral, recorded)
+    fits, whole = both_fits(chain, segments, measured, neutral, recorded)
     if not whole.solved.all():
         raise InputError(
             f"the chain of segments does not settle at {time[int(np.argmin(whole.solved))]:.4f} s",
@@ -123,7 +114,7 @@ def load_marker_motion(
     return _compared(table, recorded, time, readings, rms, chain, measured, neutral)
 
 
-def _both_fits(
+def both_fits(
     chain: LegChain,
     segments: list[Segment],
     measured: dict[str, Array],
@@ -137,52 +128,6 @@ def _both_fits(
     weights = np.concatenate([s.weights for s in segments])
     start = chain.start({name: fit[0] for name, fit in fits.items()}, neutral)
     return fits, fit_chain(chain, points, weights, start)
-
-
-def calibrated_markers(
-    table: MarkersTable,
-    file: Path,
-    side: Literal["right", "left"],
-    pose_insert_in_tibia: Array,
-) -> dict[str, dict[str, Array]]:
-    """Return where the markers sit on a subject who stands: segment -> marker -> (3,) m.
-
-    The chain is fitted to the standing trial with the markers as the table has them; each
-    marker's mean place in its fitted segment is its calibrated one. So the chain decides how
-    the bones stand, and the markers follow.
-
-    Args:
-        table: markers and joints; those that the trial does not hold are left as they are.
-        file: the standing trial.
-        side: of the leg.
-        pose_insert_in_tibia: (4, 4), of the (mirrored) patient.
-
-    Raises:
-        InputError: the trial cannot be read, or its markers do not fit.
-    """
-    recorded = read_table(file)
-    labels = [column[:-2] for column in recorded.columns if column.endswith("_x")]
-    there = [
-        own.model_copy(
-            update={
-                "markers_mm": {
-                    k: v for k, v in own.markers_mm.items() if matched_labels([k], labels)
-                }
-            }
-        )
-        for own in table.segment
-    ]
-    table = table.model_copy(update={"segment": tuple(there)})
-    segments, measured = leg_segments(table, recorded, None, side)
-    chain = LegChain(segments, pose_insert_in_tibia, table.knee == "free")
-    neutral = neutral_coordinates(table, side)
-    _, whole = _both_fits(chain, segments, measured, neutral, recorded)
-    mirror = MIRROR if side == "left" else np.eye(3)
-    found = {}
-    for name, poses in chain.poses(whole.state).items():
-        own_axes = np.nanmean(transform(inverse(poses), measured[name]), axis=0) @ mirror
-        found[name] = dict(zip(chain.segments[name].labels, own_axes, strict=True))
-    return found
 
 
 def leg_segments(
