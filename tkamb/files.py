@@ -5,9 +5,11 @@ each is refused before a byte of it is read.
 """
 
 import hashlib
+import json
 import os
 import stat
 from pathlib import Path
+from typing import Any
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
@@ -93,6 +95,18 @@ def read_text(
     except UnicodeDecodeError as error:
         raise InputError(f"cannot be read ({error})", path) from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_json(path: str | Path, limit: float = TEXT_LIMIT, *, what: str = "file") -> Any:
+    """Return what a JSON file holds.
+
+    Raises:
+        InputError: as `read_bytes`, or not JSON, or nested beyond all measure.
+    """
+    try:
+        return json.loads(read_text(path, limit, what=what))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"cannot be read as JSON ({error})", path) from None
 
 
 def read_xml(path: str | Path, limit: float = TEXT_LIMIT, *, what: str = "file") -> Element:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.errors import InputError, names_near
-from tkamb.files import MEGABYTE, read_text, sha256_of
+from tkamb.files import MEGABYTE, read_json, sha256_of
 from tkamb.geometry.frames import Array
 from tkamb.output.atomic import (
     Replacement,
@@ -152,10 +152,7 @@ def read_summary(directory: Path) -> dict[str, Any]:
         InputError: no such file, or not a JSON object.
     """
     path = directory / SUMMARY_NAME
-    try:
-        found = json.loads(read_text(path, SUMMARY_LIMIT, what="summary of a run"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"cannot be read as JSON ({error})", path) from None
+    found = read_json(path, SUMMARY_LIMIT, what="summary of a run")
     if not isinstance(found, dict):
         raise InputError("is no JSON object", path, "is it a folder that `tkamb run` wrote?")
     return found

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tkamb.errors import InputError
-from tkamb.files import read_text
+from tkamb.files import read_json
 
 MARKER = ".tkamb"
 """Says that a folder is tkamb's (`tkamb.output.claim`), and what its temporary files are called."""
@@ -27,8 +27,8 @@ _PLAIN_NAME = re.compile(r"[A-Za-z0-9_.][A-Za-z0-9_.-]*")
 def folder_token(folder: Path) -> str | None:
     """Return what the names of a folder's temporary files begin with; None: it has no marker."""
     try:
-        found = json.loads(read_text(folder / MARKER))
-    except (InputError, ValueError):
+        found = read_json(folder / MARKER)
+    except InputError:
         return None
     token = found.get("token") if isinstance(found, dict) else None
     return token if isinstance(token, str) and re.fullmatch("[0-9a-f]{16}", token) else None
@@ -154,7 +154,7 @@ def finish_replacement(folder: Path) -> None:
     if not replacement_pending(folder):
         return
     try:
-        content = json.loads(read_text(journal))
+        content = read_json(journal)
         written, removed = dict(content["written"]), list(content["removed"])
         names = [*written, *written.values(), *removed]
     except (ValueError, KeyError, TypeError) as error:

@@ -16,9 +16,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from tkamb.errors import InputError
-from tkamb.files import read_text
+from tkamb.files import TABLE_LIMIT, read_json, read_text
 from tkamb.output.atomic import (
     MARKER,
     claim_directory,
@@ -186,20 +187,23 @@ def is_ours(path: Path) -> bool:
     """
     if (path / MARKER).is_file() and not (path / MARKER).is_symlink():
         return True
-    summary = _json(path / "summary.json")
-    if isinstance(summary.get("versions"), dict) and "tkamb" in summary["versions"]:
+    versions = _object(path / "summary.json").get("versions")
+    if isinstance(versions, dict) and "tkamb" in versions:
         return True
-    if "version of tkamb" in _json(path / ".frames" / "run.json"):
+    if "version of tkamb" in _object(path / ".frames" / "run.json"):
         return True
-    return {"key", "row"} <= set(_json(path / "rows.jsonl", lines=1))
-
-
-def _json(path: Path, lines: int | None = None) -> dict:
-    """Return the object in a JSON file, or in its first lines; an empty one if there is none."""
     try:
-        text = read_text(path)
-        found = json.loads("\n".join(text.splitlines()[:lines]) if lines else text)
-    except (InputError, ValueError, RecursionError):
+        rows = read_text(path / "rows.jsonl", TABLE_LIMIT)
+    except InputError:
+        return False
+    return rows.startswith('{"key": ') and '"row": ' in rows.partition("\n")[0]
+
+
+def _object(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file; an empty one if there is none."""
+    try:
+        found = read_json(path)
+    except InputError:
         return {}
     return found if isinstance(found, dict) else {}
 

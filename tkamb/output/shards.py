@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.files import read_bytes, read_text
+from tkamb.files import read_bytes, read_json
 from tkamb.geometry.frames import Array
 from tkamb.output.atomic import replaced_file, write_text
 
@@ -125,8 +125,8 @@ class Shards:
         if not path.exists():
             return None
         try:
-            return dict(json.loads(read_text(path)))
-        except (ValueError, TypeError) as error:
+            return dict(read_json(path))
+        except (ValueError, TypeError, InputError) as error:
             what = f"does not say whose the frames beside it are ({error})"
             raise InputError(what, path, "leave out --resume to begin again") from None
 
