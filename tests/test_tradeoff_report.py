@@ -24,7 +24,7 @@ from tkamb.studies.tradeoff_block import (
 from tkamb.studies.tradeoff_report import picture, table
 
 ROOT = Path(__file__).parents[1]
-KEYS = {
+JSON_KEYS = {
     *("case", "contact", "resolution_mm", "on_front", "status", "reference_known", "values"),
     *TIMES,
     *(f"error_{key}" for key in KEYS),
@@ -49,7 +49,7 @@ def test_rows_table_and_advice():
     rows = made_up_rows()
     assert [row.on_front for row in rows[:5]] == [True, False, True, True, False]
     content = json.loads(tradeoff.as_json(rows))
-    assert all(set(row) == KEYS for row in content)
+    assert all(set(row) == JSON_KEYS for row in content)
     assert content[4]["error_approach"] is None
     text = "\n".join(table(rows, read_references()))
     assert "out of range" in text and "*hertz" in text
