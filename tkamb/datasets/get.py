@@ -117,8 +117,8 @@ def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
     try:
         return Path(pooch.retrieve(address, known, "whole", folder, downloader=fetch))
     except HTTPError as error:
-        status = f"HTTP status {error.response.status_code}"
-        raise InputError(f"cannot be downloaded ({status})", address, mend) from None
+        status = error.response.status_code if error.response is not None else "unknown"
+        raise InputError(f"cannot be downloaded (HTTP status {status})", address, mend) from None
     except RequestException as error:
         what = type(error).__name__  # its text is a page of nested causes
         raise InputError(f"cannot be downloaded (no network? {what})", address, mend) from None
