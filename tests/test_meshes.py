@@ -336,6 +336,8 @@ def test_an_open_sheet_is_refused_with_the_reason(tmp_path):
     for closed in (True, False):
         message = refused("open sheet", path, "mm", closed=closed)
         assert "whole closed part" in message
+    assert "  an open sheet" in "\n".join(check_mesh(path).lines())
+    assert "open sheet" not in "\n".join(check_mesh(save(path, insert)).lines())
 
 
 @needs_data

@@ -12,7 +12,7 @@ from tkamb.geometry.flat_bottom import facing, find_flats
 from tkamb.geometry.frames import Array
 from tkamb.geometry.repair import Repair, connected_parts, repair
 from tkamb.geometry.surface import Surface
-from tkamb.inputs.meshes import BONE_SIZE, Indices, plausible_units, read_triangles
+from tkamb.inputs.meshes import BONE_SIZE, SHEET_WIDTH, Indices, plausible_units, read_triangles
 from tkamb.units import LENGTH
 
 _TYPICAL = 0.08
@@ -137,6 +137,10 @@ class MeshHealth:
         for hole in self.remaining_holes[:5]:
             where = ", ".join(f"{value:.4g}" for value in hole.centre)
             lines.append(f"  open: {hole.edges} edges, {hole.width:.3g} wide, at ({where})")
+        if self.remaining_holes and self.remaining_holes[0].width > SHEET_WIDTH * max(self.extents):
+            lines.append(
+                "  an open sheet, which no run takes as a part: give the whole closed part"
+            )
         if len(self.remaining_holes) > 5:
             lines.append(f"  open: {len(self.remaining_holes) - 5} more")
         if self.forks:
