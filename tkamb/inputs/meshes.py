@@ -130,7 +130,7 @@ def read_triangles(path: str | Path) -> tuple[Array, Indices]:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(f"cannot be read as a mesh ({reason})", path, _FORMATS) from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError("holds no triangles", path, _FORMATS)
+        raise InputError("holds no triangles: is it cut short, or text?", path, _FORMATS)
     faces = np.asarray(mesh.faces, np.int64)
     vertices = np.asarray(mesh.vertices, np.float64)
     bad = ~np.isfinite(vertices[faces]).all(axis=(1, 2))
