@@ -19,6 +19,7 @@ from tkamb.studies.tradeoff_block import (
     block,
     body_block,
     known_errors_json,
+    short_block,
     with_block,
 )
 from tkamb.studies.tradeoff_report import picture, table
@@ -101,18 +102,20 @@ def test_a_block_goes_between_its_markers_and_nowhere_else():
 
 
 def test_the_pages_tables_are_the_study_s():
+    rows = tradeoff.read_rows(ROOT / "docs" / "tradeoff.json")
     for page, lines, name in (
-        ("README.md", block(tradeoff.read_rows(ROOT / "docs" / "tradeoff.json")), "tradeoff"),
+        ("README.md", short_block(rows), "short"),
+        ("docs/studies.md", block(rows), "tradeoff"),
         ("docs/studies.md", body_block(read_body_rows(ROOT / "docs" / "body.json")), "body"),
     ):
         text = (ROOT / page).read_text(encoding="utf-8")
         assert with_block(text, lines, name) == text, f"{page}: run scripts/make_tradeoff_table"
 
 
-def test_what_runs_say_of_their_error_is_the_readme_s_table():
+def test_what_runs_say_of_their_error_is_the_page_s_table():
     rows = tradeoff.read_rows(ROOT / "docs" / "tradeoff.json")
     assert STORED.read_text(encoding="utf-8") == known_errors_json(rows)
-    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    lines = (ROOT / "docs" / "studies.md").read_text(encoding="utf-8").splitlines()
     for (label, resolution), error in known_errors().items():
         (line,) = [line for line in lines if line.startswith(f"| {label} | {resolution:g} |")]
         cells = [cell.strip() for cell in line.strip("|").split("|")]

@@ -201,8 +201,9 @@ def test_results_of_a_changed_scene_are_refused(tmp_path, capsys):
     out = tmp_path / "out"
     out.mkdir()
     short_results(out, scene, every=100)
-    text = scene.read_text()
-    scene.write_text(text.replace("mass_kg = 75.0", "mass_kg = 76.0"))
+    text, changed = re.subn(r'(mass_kg"? = )75\.0', r"\g<1>76.0", scene.read_text())
+    assert changed == 1
+    scene.write_text(text)
     assert main(["view", str(out), "--html", str(tmp_path / "x.html")]) == 2
     line = capsys.readouterr().err.strip().splitlines()[-1]
     assert "has changed" in line and "tkamb run" in line

@@ -129,7 +129,7 @@ def read_triangles(path: str | Path) -> tuple[Array, Indices]:
     path = Path(path)
     vertices, faces = read_vtp(path) if path.suffix.lower() == ".vtp" else _read_mesh(path)
     if len(faces) == 0:
-        raise InputError("holds no triangles", path, _FORMATS)
+        raise InputError(_NO_TRIANGLES, path, _FORMATS)
     bad = ~np.isfinite(vertices[faces]).all(axis=(1, 2))
     if bad.any():
         raise InputError(
@@ -154,7 +154,7 @@ def _read_mesh(path: Path) -> tuple[Array, Indices]:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(f"cannot be read as a mesh ({reason})", path, _FORMATS) from None
     if not isinstance(mesh, trimesh.Trimesh):
-        raise InputError("holds no triangles", path, _FORMATS)
+        raise InputError(_NO_TRIANGLES, path, _FORMATS)
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
 
 
@@ -179,6 +179,7 @@ def describe_holes(holes: tuple[BoundaryLoop, ...], unit: str) -> str:
     return text if more == 0 else f"{text}, and {more} more"
 
 
+_NO_TRIANGLES = "holds no triangles: is it cut short, or text?"
 _FORMATS = "give an STL, OBJ, PLY or VTP file of triangles"
 _CLOSE = "close it in a mesh editor; holes up to about a lattice cell (2 mm) are closed for you"
 

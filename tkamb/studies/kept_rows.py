@@ -35,7 +35,7 @@ class KeptRows:
     def __init__(self, directory: Path, resume: bool) -> None:
         self.path = directory / FILE_NAME
         self._rows = _whole_rows(self.path) if resume else {}
-        self._lock = threading.Lock()
+        self._lock, self._before_next = threading.Lock(), ""
         write_text(self.path, "".join(_line(key, row) for key, row in self._rows.items()))
 
     def get(self, key: str) -> Row | None:
@@ -48,9 +48,10 @@ class KeptRows:
             self._rows[key] = row
             try:
                 with open(self.path, "a", encoding="utf-8") as file:
-                    # After a line that a full disk cut short the next one begins anew.
-                    file.write("\n" + _line(key, row))
+                    file.write(self._before_next + _line(key, row))
+                self._before_next = ""
             except OSError as error:
+                self._before_next = "\n"  # a full disk may have cut this line short
                 raise InputError(f"cannot be written ({error.strerror})", self.path) from None
 
 

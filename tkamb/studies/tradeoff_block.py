@@ -51,6 +51,32 @@ def block(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
+SHORT = (
+    ("hertz", 1.0),
+    ("foundation", 1.0),
+    ("lattice-linear", 1.0),
+    ("lattice", 1.0),
+    ("calculix C3D8I", 1.0),
+)
+"""Settings of the README's five rows."""
+
+
+def short_block(rows: Sequence[Row]) -> list[str]:
+    """Return the README's few lines: time of a position, and the largest errors, of `SHORT`."""
+    settings = _settings(rows)
+    lines = [
+        "| contact, 1 mm | ms a position | condyle force % | peak pressure % | area % |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    for setting in SHORT:
+        some = settings[setting]
+        warm = milliseconds(median(warm_by_bodies(some)))
+        keys = ("force", "peak_pressure", "area")
+        cells = " | ".join(_percent([row.errors[key] for row in some]) for key in keys)
+        lines.append(f"| {setting[0]} | {warm} | {cells} |")
+    return lines
+
+
 def known_errors_json(rows: Sequence[Row]) -> str:
     """Return the text of `tkamb/known_errors.json`: the table's errors, setting by setting.
 
