@@ -217,7 +217,7 @@ def test_zero_load_and_too_great_a_load(meshes):
         ({"units": "inch"}, "unit"),
         ({"units": "m"}, "unit"),
         ({"axes": "+x,+x,+z"}, "axes"),
-        ({"axes": "+y,+z,+x"}, "bottom"),
+        ({"axes": "+y,+z,+x"}, "axes wrong"),
         ({"side": "both"}, "side"),
         ({"bearing": "loose"}, "bearing"),
         ({"pose": (0, 0, 0)}, "six finite numbers"),

@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from tkamb.command_options import add_no_cache, without_cache
+from tkamb.datasets.command import add_data
 from tkamb.guard import guarded
 from tkamb.importing.command import add_import
+from tkamb.mesh_command import add_mesh
 from tkamb.press.command import add_press
 from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
@@ -63,9 +65,10 @@ def _parser() -> argparse.ArgumentParser:
     _add_folder_commands(commands)
     add_press(commands)
     _add_contact(commands)
-    _add_mesh(commands)
+    add_mesh(commands)
     _add_scene(commands)
     add_import(commands)
+    add_data(commands)
     add_view(commands)
     add_tradeoff(commands)
     add_stability(commands)
@@ -111,29 +114,6 @@ def _add_contact(commands: Any) -> None:
     verbs.add_parser("list", help="names, what each assumes and needs").set_defaults(
         command=_contact_list
     )
-
-
-def _add_mesh(commands: Any) -> None:
-    mesh = commands.add_parser("mesh", help="look at a mesh before it is used")
-    verbs = mesh.add_subparsers(required=True, metavar="VERB")
-    check = verbs.add_parser("check", help="health, and unit and axes as questions")
-    check.add_argument("files", type=Path, nargs="+", metavar="FILE")
-    check.add_argument("--json", action="store_true")
-    check.set_defaults(command=_mesh_check)
-    lattice = verbs.add_parser("lattice", help="the lattice of an insert, and how good it is")
-    lattice.add_argument("insert", type=Path, metavar="INSERT")
-    lattice.add_argument("--resolution", type=float, default=1.0, metavar="MM", help="cell size")
-    lattice.add_argument("--units", choices=("mm", "m"), default="mm", help="of the mesh")
-    lattice.add_argument(
-        "--axes",
-        default="+x,+y,+z",
-        metavar="ANT,SUP,RIGHT",
-        help="mesh axes that point anterior, superior, right; write --axes=-x,+y,-z",
-    )
-    lattice.add_argument("--side", choices=("right", "left"), default="right")
-    lattice.add_argument("--out", type=Path, metavar="F.vtu", help="for ParaView or meshio")
-    lattice.add_argument("--json", action="store_true")
-    lattice.set_defaults(command=_mesh_lattice)
 
 
 def _add_scene(commands: Any) -> None:
@@ -253,32 +233,6 @@ def _contact_list(options: argparse.Namespace) -> int:
 
     for name, line in contact_descriptions().items():
         print(f"{name:18s} {line}")
-    return 0
-
-
-def _mesh_check(options: argparse.Namespace) -> int:
-    from tkamb.inputs.mesh_check import check_mesh
-
-    found = [check_mesh(path) for path in options.files]
-    if options.json:
-        print(json.dumps([health.as_dict() for health in found], indent=2))
-    else:
-        print("\n".join(line for health in found for line in health.lines()))
-    return 0
-
-
-def _mesh_lattice(options: argparse.Namespace) -> int:
-    from tkamb.lattice_file import lattice_of_file
-
-    report = lattice_of_file(
-        options.insert,
-        options.resolution,
-        units=options.units,
-        axes=options.axes,
-        side=options.side,
-        out=options.out,
-    )
-    print(json.dumps(report.as_dict(), indent=2) if options.json else "\n".join(report.lines()))
     return 0
 
 

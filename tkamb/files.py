@@ -116,7 +116,16 @@ def read_xml(path: str | Path, limit: float = TEXT_LIMIT, *, what: str = "file")
         InputError: as `read_bytes`, or not XML, or it declares entities (which could grow without
             end or name other files), or nested more than `DEEPEST` elements deep.
     """
-    content, builder = read_bytes(path, limit, what=what), _ShallowBuilder(path)
+    return parse_xml(read_bytes(path, limit, what=what), path, what=what)
+
+
+def parse_xml(content: bytes, path: str | Path, *, what: str = "file") -> Element:
+    """Return the root element of XML that was read from a path.
+
+    Raises:
+        InputError: as `read_xml`.
+    """
+    builder = _ShallowBuilder(path)
 
     def refuse_entity(name: str, *_: object) -> None:
         mend = "write its text out"
