@@ -228,6 +228,9 @@ def _removed(robot, rng):
     child = pick(rng, list(parent))
     if child.tag == "inertial":
         return None  # absent, it has a documented default
+    place = np.array(child.get("xyz", "1 1 1").split(), float)
+    if child.tag == "origin" and "rpy" not in child.attrib and np.linalg.norm(place) < LEAST["m"]:
+        return None  # absent, it is zero
     parent.remove(child)
     return f"without {child.tag} {child.attrib} of {parent.get('name')}"
 

@@ -16,7 +16,9 @@ SEGMENT_MASS = 1.6
 PATELLA_MASS = (0.02, 0.6)
 """kg, from the bone alone to all that moves with it."""
 PATELLA_SIZE = 0.05
-"""m."""
+"""m: a patella's centre of mass is not farther than this from its origin."""
+PATELLA_RADII = (0.005, 0.04)
+"""m, of gyration: a bone 45 mm wide and 20 mm thick has 9 to 13 mm."""
 
 SHANK_SHARE, THIGH_SHARE = (0.19, 0.30), (0.19, 0.31)
 """Of body height: 0.246 and 0.245 (Drillis & Contini 1966) and a fourth more or less."""
@@ -77,8 +79,15 @@ def segment_questions(case: Case) -> Iterator[Question]:
 
 
 def _of_patella(case: Case) -> Iterator[Question]:
-    """The patella's mass, and where its centre is."""
-    mass, centre, _ = case.chain.segment("patella")
+    """The patella's mass, where its centre is, and its inertia."""
+    mass, centre, tensor = case.chain.segment("patella")
+    radii = np.sqrt(np.linalg.eigvalsh(tensor) / mass)
+    if radii[0] < PATELLA_RADII[0] or radii[-1] > PATELLA_RADII[1]:
+        shown = " to ".join(f"{radius / MILLIMETRE:.3g}" for radius in radii[[0, -1]])
+        yield Question(
+            f"the radii of gyration of 'patella' are {shown} mm: is its <inertia> in kg·m²?",
+            "inertia of patella unlike a patella's",
+        )
     if not PATELLA_MASS[0] <= mass <= PATELLA_MASS[1] or np.linalg.norm(centre) > PATELLA_SIZE:
         shown = ", ".join(f"{value / MILLIMETRE:.0f}" for value in centre)
         yield Question(
