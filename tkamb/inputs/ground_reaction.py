@@ -33,8 +33,9 @@ LARGEST_FORCE = 20000.0
 """N, twice what a triple jumper's foot bears."""
 LARGEST_MOMENT = 1000.0
 """N·m, many times any free moment; plates that give it about their own origin stay below it."""
-ODD_FORCE, ODD_POINT = 0.05, 5e-3
-"""Of the peak force, and m: as near to its neighbours' curve as that, no sample is odd."""
+ODD_FORCE, LEAST_ODD_FORCE, ODD_POINT = 0.05, 0.01, 5e-3
+"""Of a component's own peak, of the whole force's, and m: as near to its neighbours' curve as the
+larger of the forces, or as the last, no sample is odd."""
 WINDOW = 0.5
 """s: samples farther from the frames than this do not reach them through the filter."""
 FARTHEST_FROM_ANKLE = 0.5
@@ -114,7 +115,8 @@ def _odd_samples(
     """Return the odd samples of force and recorded point (n, 3), where the plate stays loaded."""
     if not loaded.any():
         return ()
-    floor = ODD_FORCE * float(np.abs(force).max())
+    peaks = np.abs(force).max(axis=0)
+    floors = np.maximum(ODD_FORCE * peaks, LEAST_ODD_FORCE * peaks.max())
     inside = loaded.copy()  # two samples away from where the foot comes down or leaves
     for shift in (1, 2):
         inside[shift:] &= loaded[:-shift]
@@ -123,7 +125,7 @@ def _odd_samples(
     odd: list[OddSample] = []
     for axis in range(3):
         one = (path, f"force_{axis + 1}", stamps, force[:, axis])
-        odd += odd_samples(*one, floor, 1.0, "N")
+        odd += odd_samples(*one, float(floors[axis]), 1.0, "N")
         if point is not None:
             one = (path, f"point_{axis + 1}", stamps, point[:, axis])
             odd += odd_samples(*one, ODD_POINT, MILLIMETRE, "mm")
