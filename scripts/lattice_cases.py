@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactPair
+from tkamb.contact.pair import ContactPair
 from tkamb.geometry.frames import knee_pose, pose
 from tkamb.geometry.surface import Surface
 

@@ -5,7 +5,7 @@ import numpy as np
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
 from tkamb.body.demand import KneeDemand, LigamentSet, unit_keeper
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactPair
+from tkamb.contact.pair import ContactPair
 from tkamb.equilibrium.released import SCALE, ReleasedForces, released_indices
 from tkamb.geometry.frames import KNEE_COORDINATES
 

@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from tkamb.contact.model import ContactPair
+from tkamb.contact.pair import ContactPair
 from tkamb.geometry.surface import Surface
 
 

@@ -1,14 +1,20 @@
 """The shipped knee bend as a starting point: copies of its scene with keys changed or left out."""
 
 import shutil
+import tempfile
 import tomllib
+from functools import cache
 from pathlib import Path
 
 MODEL = Path(__file__).parents[1] / "models" / "deep_knee_bend"
+HELD = []
+"""Folders that go when the tests end."""
 
 
 def write_scene(folder, drop=(), **changes):
     """Write a copy of the shipped patient into `folder`; return the scene's path.
+
+    The contact is by `foundation`, for speed, unless the changes name another.
 
     Args:
         folder: where to; the model's files are copied there.
@@ -19,6 +25,8 @@ def write_scene(folder, drop=(), **changes):
     content = tomllib.loads((MODEL / "scene.toml").read_text(encoding="utf-8"))
     for table in drop:
         content.pop(table, None)
+    if "contact" in content:
+        content["contact"]["model"] = "foundation"
     for dotted, value in changes.items():
         *tables, key = dotted.split("__")
         inner = content
@@ -31,6 +39,14 @@ def write_scene(folder, drop=(), **changes):
     path = Path(folder) / "scene.toml"
     path.write_text(as_toml(content), encoding="utf-8")
     return path
+
+
+@cache
+def fast_scene():
+    """Return the path of the shipped scene by `foundation`, the same for all tests."""
+    held = tempfile.TemporaryDirectory(prefix="tkamb-tests-")
+    HELD.append(held)
+    return write_scene(Path(held.name) / "deep_knee_bend")
 
 
 def as_toml(content):

@@ -55,7 +55,8 @@ def test_the_adjustment_mends_the_split_of_a_coronal_error(tmp_path, degrees):
     np.testing.assert_allclose(adjusted["adjust_force_change_BW"], change, rtol=1e-9)
     share = adjusted["medial_share_equilibrium"] - recorded["medial_share_equilibrium"]
     np.testing.assert_allclose(adjusted["adjust_share_change"], share, rtol=1e-9)
-    assert adjusted.status == recorded.status
+    assert set(adjusted.status) == {"ok"}
+    assert any("contradicts" in status for status in recorded.status)
     assert (np.abs(adjusted["adjust_coronal_deg"]) > 0.3).all()
     kept = adjusted["adjust_restored"] == 0
     error = [np.abs(split(results) - split(right))[kept].max() for results in (adjusted, recorded)]

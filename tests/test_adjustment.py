@@ -6,8 +6,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactPair, ContactResult
+from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactResult
 from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.errors import InputError
 from tkamb.geometry.adjustment import adjust

@@ -12,6 +12,7 @@ FORBIDDEN = {
     "body": ("contact", "inputs", "mechanics", "equilibrium", "run", "output"),
     "contact": ("body", "inputs", "mechanics", "equilibrium", "run", "output"),
     "inputs": ("body", "contact", "mechanics", "equilibrium", "run", "output"),
+    "opensim": ("body", "contact", "mechanics", "equilibrium", "run", "output"),
     "mechanics": ("contact", "equilibrium", "run", "output"),
     "equilibrium": ("inputs", "run", "output", "studies", "view"),
     "output": ("body", "inputs"),
@@ -64,3 +65,43 @@ def test_only_two_files_see_body_and_contact():
         sees |= {layer for module, layer in through.items() if module in names}
         if len(sees) == 2:
             assert path.name in SEES_BODY_AND_CONTACT, f"{path.name} sees {sees}"
+
+
+def module_name(path):
+    """Return the dotted name of a file of the package."""
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def circles(graph):
+    """Return the sets of modules that can reach each other: depth first, after Tarjan (1972)."""
+    order, low, stack, found = {}, {}, [], []
+
+    def visit(node):
+        order[node] = low[node] = len(order)
+        stack.append(node)
+        for other in graph[node] - {node}:
+            if other not in order:
+                visit(other)
+            if other in stack:
+                low[node] = min(low[node], low[other])
+        if low[node] == order[node]:
+            first = stack.index(node)
+            found.append(set(stack[first:]))
+            del stack[first:]
+
+    for node in graph:
+        if node not in order:
+            visit(node)
+    return [one for one in found if len(one) > 1]
+
+
+def test_no_circle_of_imports_late_ones_counted():
+    files = {module_name(path): path for path in PACKAGE.rglob("*.py")}
+    graph = {name: imported(path) & set(files) for name, path in files.items()}
+    assert graph["tkamb.simulation"]
+    assert circles(graph) == []
+
+
+def test_a_circle_is_found():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [{"a", "b", "c"}]

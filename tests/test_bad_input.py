@@ -41,7 +41,7 @@ def rewrite(path, change):
         ({"patient__colour": "blue"}, "unknown key 'patient.colour'"),
         ({"ligamnet": []}, "unknown key 'ligamnet'"),
         ({"implant__insert__unit": None}, "missing key 'implant.insert.unit'"),
-        ({"motion__length_unit": None}, "missing key 'motion.length_unit'"),
+        ({"motion__length_unit": None}, "missing key 'length_unit'"),
         ({"motion__cutoff_Hz": 5000.0}, "cut-off"),
         ({"contact__model": "magic"}, "foundation"),
         ({"contact__material": "cheese"}, "polyethylene"),

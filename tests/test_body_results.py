@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scenes import MODEL, write_scene
+from scenes import fast_scene, write_scene
 from tkamb import load_scene, simulate
 from tkamb.case import load_case
 from tkamb.errors import InputError
@@ -18,7 +18,7 @@ FRAMES = slice(10, 91, 40)
 
 @pytest.fixture(scope="module")
 def bend():
-    return simulate(MODEL / "scene.toml", frames=FRAMES)
+    return simulate(fast_scene(), frames=FRAMES)
 
 
 @pytest.mark.parametrize("side", ["medial", "lateral"])
@@ -51,9 +51,7 @@ def test_a_femur_that_is_lifted_violates_it(tmp_path):
 def test_strains_and_first_wrapping_are_in_the_summary(bend):
     found = bend.summary["ligament_strain"]
     assert list(found["flexion_deg"]) == [0.0, 60.0, 90.0]
-    assert set(found["strain"]) == {
-        bundle.name for bundle in load_scene(MODEL / "scene.toml").ligament
-    }
+    assert set(found["strain"]) == {bundle.name for bundle in load_scene(fast_scene()).ligament}
     assert all(abs(strain) < 0.2 for row in found["strain"].values() for strain in row)
     wrapped = bend["flexion_deg"][bend["quadriceps_wrap_deg"] > 0]
     assert bend.summary["first_wrapping_flexion_deg"] == wrapped.min()
@@ -64,8 +62,8 @@ def test_strains_and_first_wrapping_are_in_the_summary(bend):
 
 def test_roll_slip_with_the_recorded_slip_is_the_recorded_motion():
     """AP from rolling plus slip gives back AP, SI from contact SI, on a motion in touch."""
-    recorded = load_case(load_scene(MODEL / "scene.toml", FEW)).motion
-    case = load_case(load_scene(MODEL / "scene.toml", FEW | {"motion.motion": "roll-slip"}))
+    recorded = load_case(load_scene(fast_scene(), FEW)).motion
+    case = load_case(load_scene(fast_scene(), FEW | {"motion.motion": "roll-slip"}))
     rolled = case.motion
     np.testing.assert_array_equal(rolled.coordinates[:, 2:], recorded.coordinates[:, 2:])
     np.testing.assert_allclose(rolled.coordinates[:, 0], recorded.coordinates[:, 0], atol=1e-4)
@@ -79,12 +77,12 @@ def test_roll_slip_with_the_recorded_slip_is_the_recorded_motion():
 def test_pure_rolling_leaves_this_insert_and_says_so():
     changes = FEW | {"motion.motion": "roll-slip", "motion.slip_share": 0.0}
     with pytest.raises(InputError, match="rolls off the insert at"):
-        load_case(load_scene(MODEL / "scene.toml", changes))
+        load_case(load_scene(fast_scene(), changes))
 
 
 def test_generic_ligaments_are_named_so():
     changes = FEW | {"ligament": [], "generic_ligaments.ligaments": ["MCL", "PCL"]}
-    results = simulate(load_scene(MODEL / "scene.toml", changes), frames=slice(15, 16))
+    results = simulate(load_scene(fast_scene(), changes), frames=slice(15, 16))
     names = [name for name in results.columns if name.startswith("ligament_")]
     assert len(names) == 5
     assert all(name.startswith("ligament_generic_") for name in names)
@@ -105,7 +103,7 @@ def test_generic_ligaments_are_named_so():
 )
 def test_keys_that_do_not_go_together(changes, words):
     with pytest.raises(InputError, match=words):
-        load_scene(MODEL / "scene.toml", changes)
+        load_scene(fast_scene(), changes)
 
 
 def test_a_reference_pose_that_was_not_recorded_is_refused(tmp_path):
@@ -124,7 +122,7 @@ def test_a_wider_band_wraps_sooner_and_further():
     wraps = []
     for band in (5.0, 12.0):
         mechanics = Mechanics(
-            load_case(load_scene(MODEL / "scene.toml", FEW | {"quadriceps.band_mm": band}))
+            load_case(load_scene(fast_scene(), FEW | {"quadriceps.band_mm": band}))
         )
         wraps.append([mechanics.placed(k).wrap for k in (12, 19, 25)])
     assert wraps[0][0] == 0.0

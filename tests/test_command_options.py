@@ -3,13 +3,13 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
+from scenes import fast_scene
 from tkamb.cli import main
 
-SCENE = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
+SCENE = fast_scene()
 
 
 def test_no_cache_reaches_the_model(tmp_path, monkeypatch, capsys):

@@ -1,10 +1,9 @@
 """Body and contact agree: points coupled, adduction released, on the shipped knee bend."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from scenes import fast_scene
 from tkamb.case import load_case
 from tkamb.equilibrium.contact_side import LOAD_CHANGE, POINT_CHANGE, ContactSide
 from tkamb.errors import InputError
@@ -12,7 +11,7 @@ from tkamb.mechanics.mechanics import Mechanics
 from tkamb.scene import load_scene
 from tkamb.simulation import simulate
 
-SCENE = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
+SCENE = fast_scene()
 FRAMES = slice(0, 101, 20)
 COARSE = {"contact.resolution_mm": 2.0}
 

@@ -11,9 +11,12 @@ import pytest
 from tkamb.body.ligaments import build_ligaments, quadratic_toe_force
 from tkamb.case import Case, load_case
 from tkamb.geometry.closest import ClosestPointQuery
-from tkamb.geometry.frames import inverse, knee_pose, transform
+from tkamb.geometry.flat_bottom import insert_placement
+from tkamb.geometry.frames import inverse, knee_pose, pose, transform
 from tkamb.inputs.ground_reaction import load_ground_reaction
 from tkamb.inputs.markers import marker_trajectories
+from tkamb.inputs.meshes import axes_rotation, load_surface
+from tkamb.inputs.motion import load_motion
 from tkamb.inputs.tables import read_table
 from tkamb.inputs.tibia import load_tibia
 from tkamb.scene import load_scene
@@ -69,6 +72,27 @@ def test_condylar_gaps_of_the_recorded_poses():
         gaps = np.array([getattr(gap, side).gap for gap in found]) * 1e3
         expected = np.array([float(value) for value in stated.split()])
         assert (np.abs(gaps - expected) <= 0.05).sum() >= 19
+
+
+def test_the_mirrored_reading_closes_the_gaps_as_well_and_half_of_it_does_not():
+    """Spread of medial less lateral gap in swing, mm: geometry alone cannot tell the two."""
+    roles = ("rotation_1", "rotation_2", "translation_3")
+    mirrored = load_scene(SCENE.with_name("mirrored.toml"))
+    assert mirrored.motion.signs_turned == roles
+    assert mirrored.ligament == case().scene.ligament
+    query = ClosestPointQuery(case().femoral, case().insert, case().split)
+    part = mirrored.implant.insert
+    turn = axes_rotation(part.axes)
+    placed = insert_placement(load_surface(part.mesh, part.unit, part.axes, name="insert"), turn)
+    turn = pose(turn, np.zeros(3))
+    spread = {}
+    for turned in ((), roles[:1], roles[1:2], roles):
+        table = mirrored.motion.model_copy(update={"signs_turned": turned})
+        motion = load_motion(table, "right", placed @ turn, turn)
+        found = [query.at(place) for place in knee_pose(motion.raw_coordinates[62:101:3])]
+        spread[turned] = 1e3 * np.std([gap.medial.gap - gap.lateral.gap for gap in found])
+    assert spread[roles] == pytest.approx(spread[()], abs=0.05)
+    assert min(spread[roles[:1]], spread[roles[1:2]]) > 1.5 * spread[()]
 
 
 def test_shank_stands_upright_and_rolls_forward():

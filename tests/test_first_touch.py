@@ -126,3 +126,13 @@ def test_patches_stay_in_their_boxes():
         assert patches.reach[patch] == reach[corners].max()
         seen.append(faces)
     assert np.array_equal(np.sort(np.concatenate(seen)), np.arange(len(femoral.faces)))
+
+
+def test_a_flat_face_along_the_bounding_box_makes_patches():
+    """The mean of three equal heights may be rounded below the lowest of them."""
+    plate = flat_insert(10e-3, 24e-3, 24e-3)
+    for height in np.linspace(0.1, 0.7, 50):
+        surface = Surface(plate.vertices + np.array([0.0, height, 0.0]), plate.faces, "plate")
+        low, high = Patches(surface, np.zeros(len(surface.vertices))).extent(np.eye(4))
+        assert (low.min(axis=0) < surface.bounds[0] + 1e-9).all()
+        assert (high.max(axis=0) > surface.bounds[1] - 1e-9).all()

@@ -17,6 +17,7 @@ from tkamb.scene import load_scene
 
 BEND = Path(__file__).parents[1] / "models" / "deep_knee_bend"
 ALL = ["ap", "ml", "axial_rotation", "adduction"]
+COARSE = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
 PATELLA = {"patella_ap", "patella_si", "patella_rotation"}
 ROLES = {"time": "time_s", "flexion": "flexion_deg"} | {
     role: f"{role}_{'deg' if role.endswith('rotation') else 'mm'}" for role in PATELLA
@@ -30,7 +31,7 @@ def scene_of(folder, columns, released):
     values = np.stack([table.columns[name] for name in columns], axis=1)
     np.savetxt(file, values, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")
     overrides = {"motion.file": str(file), "contact.released": released}
-    overrides |= {"contact.resolution_mm": 2.0}
+    overrides |= COARSE
     scene = load_scene(BEND / "scene.toml", overrides)
     named = {k: v for k, v in scene.motion.columns.items() if v in columns}
     return scene.model_copy(update={"motion": scene.motion.model_copy(update={"columns": named})})
@@ -38,9 +39,7 @@ def scene_of(folder, columns, released):
 
 def test_flexion_alone_finds_the_state_of_the_whole_recording(tmp_path):
     alone = load_case(scene_of(tmp_path, list(ROLES.values()), ALL))
-    whole = load_case(
-        load_scene(BEND / "scene.toml", {"contact.released": ALL, "contact.resolution_mm": 2.0})
-    )
+    whole = load_case(load_scene(BEND / "scene.toml", {"contact.released": ALL} | COARSE))
     assert set(alone.motion.unrecorded) == {*ALL, "si"}
     sides = [ContactSide(case, Mechanics(case)) for case in (alone, whole)]
     for k in (30, 75):

@@ -7,10 +7,16 @@ import pytest
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
 from tkamb.contact.bed import sample_bed
-from tkamb.contact.foundation import ElasticFoundation, LinearFoundation, layer_pressure
+from tkamb.contact.foundation import (
+    ElasticFoundation,
+    LinearFoundation,
+    layer_pressure,
+    layer_slope,
+)
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactPair, ContactStatus
+from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import first_touch_height, pose_at_approach
+from tkamb.contact.result import ContactStatus
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, knee_pose, pose
 from tkamb.geometry.surface import Surface
@@ -250,3 +256,12 @@ def test_a_real_implant_is_loaded_on_both_dishes():
         assert abs(condyle["cop_mm"][0]) < 6
         assert 12 < condyle["peak_pressure_MPa"] < 25
         assert 45 < condyle["area_mm2"] < 90
+
+
+@pytest.mark.parametrize("law", ["linear", "nonlinear"])
+@pytest.mark.parametrize("name", ["polyethylene", "polyethylene-linear"])
+def test_the_slope_is_that_of_the_pressure(law, name):
+    chosen, strain, step = material(name), np.array([1e-3, 0.02, 0.1, 0.3]), 1e-6
+    ends = [layer_pressure(law, chosen, strain + side * step) for side in (-1, 1)]
+    slope = (ends[1] - ends[0]) / (2 * step)
+    np.testing.assert_allclose(layer_slope(law, chosen, strain), slope, rtol=1e-5)

@@ -8,7 +8,8 @@ from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
 from tkamb.contact.ellipse import contact_ellipse
 from tkamb.contact.hertz import Hertz, condyle_geometry
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactPair, ContactStatus
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.result import ContactStatus
 from tkamb.geometry.frames import knee_pose, pose
 from tkamb.geometry.surface import Surface
 

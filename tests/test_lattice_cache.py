@@ -1,5 +1,8 @@
 """Prepared operators on disk: the same answers, whole files only, a limit that holds."""
 
+import fcntl
+import os
+from dataclasses import replace
 from multiprocessing import get_context
 
 import numpy as np
@@ -7,34 +10,37 @@ import pytest
 
 from lattice_blocks import block
 from tkamb.contact.lattice import cache
+from tkamb.contact.lattice.bbar import BbarHexahedra
 from tkamb.contact.lattice.network import CalibratedNetwork
 from tkamb.contact.lattice.operator import fixed_unknowns, prepare_operator
+from tkamb.contact.lattice.operator_check import operator_error
+from tkamb.contact.lattice.response import SINGLE
 from tkamb.contact.materials import material
 
 EDGES = np.full(3, 1e-3)
 
 
-def parts(counts=(5, 3, 6), nu=0.45):
+def parts(counts=(5, 3, 6), nu=0.45, kind=CalibratedNetwork):
     nodes, index, cells, _ = block(counts, EDGES, 0.3)
-    solid = CalibratedNetwork(nodes, cells, EDGES, material("polyethylene", poisson_ratio=nu))
+    solid = kind(nodes, cells, EDGES, material("polyethylene", poisson_ratio=nu))
     held = fixed_unknowns(nodes, np.flatnonzero(index[:, 1] == 0), "fixed")
     top = np.flatnonzero(index[:, 1] == counts[1])
     return solid, index, held, top
 
 
-def cached(counts=(5, 3, 6), limit=1e9):
-    solid, index, held, top = parts(counts)
+def cached(counts=(5, 3, 6), limit=1e9, nu=0.45):
+    solid, index, held, top = parts(counts, nu)
     made = []
 
     def make():
         made.append(True)
-        return prepare_operator(solid.stiffness, index, held, top)
+        return prepare_operator(solid.stiffness, index, held, top, SINGLE)
 
-    key = cache.operator_key(solid, held, top)
-    return cache.cached_operator(key, make, 10**9, limit), bool(made), solid
+    return cache.cached_operator(solid, held, top, make, limit), bool(made), solid
 
 
 def solve_twice(_):
+    cache.LEAST_UNKNOWNS = 1
     operator, _, solid = cached()
     return operator.solve(np.ones_like(solid.nodes))
 
@@ -42,6 +48,7 @@ def solve_twice(_):
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("TKAMB_CACHE_DIR", str(tmp_path / "operators"))
+    monkeypatch.setattr(cache, "LEAST_UNKNOWNS", 1)
     return tmp_path / "operators"
 
 
@@ -68,12 +75,133 @@ def test_key_knows_material_boundary_and_shape():
     assert len(keys) == 5
 
 
-def test_broken_file_counts_as_absent(folder):
-    cached()
-    path = next(folder.iterdir())
-    path.write_bytes(path.read_bytes()[:-800])
+def only_file(folder):
+    (path,) = folder.iterdir()
+    return path
+
+
+def check_made_again_with_one_notice(folder, caplog, words=""):
+    """A file that cannot be used is replaced, once, and one line says so."""
+    caplog.clear()
     assert cached()[1]
+    assert len(caplog.records) == 1, caplog.text
+    assert "the operator is made again" in caplog.text and words in caplog.text
     assert not cached()[1]
+    assert only_file(folder).is_file() and not only_file(folder).is_symlink()
+
+
+def test_a_file_cut_short_is_made_again(folder, caplog):
+    cached()
+    path = only_file(folder)
+    whole = path.read_bytes()
+    for size in (0, 10, 60, 200, len(whole) - 800, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        path.chmod(0o600)
+        check_made_again_with_one_notice(folder, caplog)
+
+
+@pytest.mark.parametrize("flips", [60, pytest.param(1000, marks=pytest.mark.slow)])
+def test_flipped_bits_anywhere_are_noticed(folder, caplog, flips):
+    first = cached()[0].half.compliance()
+    path = only_file(folder)
+    whole, chance = path.read_bytes(), np.random.default_rng(4)
+    places = [*range(0, 80, 5), *chance.integers(80, len(whole), flips).tolist()]
+    for place in places:
+        spoilt = bytearray(whole)
+        spoilt[place] ^= 1 << int(chance.integers(8))
+        path.write_bytes(spoilt)
+        caplog.clear()
+        again, made, _ = cached()
+        assert made and len(caplog.records) == 1
+        assert np.array_equal(again.half.compliance(), first)
+
+
+def test_an_operator_under_another_name_is_noticed(folder, caplog):
+    cached()
+    path = only_file(folder)
+    cached((5, 3, 7))
+    (other,) = set(folder.iterdir()) - {path}
+    other.replace(path)
+    check_made_again_with_one_notice(folder, caplog, "another key")
+
+
+def test_what_is_no_regular_file_of_the_user_is_not_opened(folder, caplog, tmp_path):
+    cached()
+    path = only_file(folder)
+    path.rename(tmp_path / "elsewhere")
+    path.symlink_to(tmp_path / "elsewhere")
+    check_made_again_with_one_notice(folder, caplog)
+    assert (tmp_path / "elsewhere").exists()
+    path.unlink()
+    os.mkfifo(path)
+    check_made_again_with_one_notice(folder, caplog, "FIFO")
+    path.chmod(0o666)
+    check_made_again_with_one_notice(folder, caplog, "not the user's own")
+
+
+def test_sizes_are_checked_before_anything_is_read(folder, caplog):
+    """A header of 800 GB, and a file of 800 GB with nothing in it."""
+    cached()
+    path = only_file(folder)
+    whole = bytearray(path.read_bytes())
+    whole[48:56] = (800_000_000_000).to_bytes(8, "little")
+    path.write_bytes(whole)
+    check_made_again_with_one_notice(folder, caplog, "no such header")
+    os.truncate(path, 800_000_000_000)
+    check_made_again_with_one_notice(folder, caplog, "MB large")
+
+
+@pytest.mark.parametrize("what", ["fronts", "half", "one block", "indices", "another material"])
+def test_a_wrong_operator_with_a_right_hash_is_noticed(folder, caplog, what):
+    """Whoever knows the format can sign anything: the cells' own stiffness does not agree."""
+    operator, _, solid = cached()
+    path = only_file(folder)
+    fronts, blocks = list(operator.factor.fronts), list(operator.half.blocks)
+    if what == "fronts":
+        fronts = [replace(f, block=f.block * np.float32(0.9)) for f in fronts]
+    elif what == "half":
+        blocks = [replace(b, values=b.values * np.float32(0.9)) for b in blocks]
+    elif what == "one block":
+        fronts[1] = replace(fronts[1], block=np.zeros_like(fronts[1].block))
+    elif what == "indices":
+        fronts[0] = replace(fronts[0], boundary=fronts[0].boundary + 10**6)
+    else:
+        operator = cached(nu=0.3)[0]
+        fronts, blocks = operator.factor.fronts, operator.half.blocks
+        path = next(p for p in folder.iterdir() if p != path)
+        path.unlink()
+        path = only_file(folder)
+    half = replace(operator.half, blocks=blocks)
+    wrong = replace(operator, factor=replace(operator.factor, fronts=fronts), half=half)
+    cache.write_operator(path, path.stem, wrong)
+    check_made_again_with_one_notice(folder, caplog)
+    assert operator_error(cached()[0], solid) < 1e-6
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.45, 0.4999])
+@pytest.mark.parametrize("bearing", ["fixed", "mobile"])
+def test_a_sound_operator_agrees_with_the_cells(nu, bearing):
+    """float32 leaves its rounding alone, whatever the condition of the stiffness."""
+    for kind in (CalibratedNetwork, BbarHexahedra):
+        solid, index, _, top = parts((8, 3, 7), nu, kind)
+        held = fixed_unknowns(solid.nodes, np.flatnonzero(index[:, 1] == 0), bearing)
+        operator = prepare_operator(solid.stiffness, index, held, top, SINGLE)
+        assert operator_error(operator, solid) < 1e-6
+
+
+def test_orphans_go_and_are_counted(folder, caplog):
+    folder.mkdir(parents=True)
+    orphan, young, held = (folder / f".tkamb-{name}.part" for name in ("old", "young", "held"))
+    for path in (orphan, young, held):
+        path.write_bytes(bytes(1000))
+    for path in (orphan, held):
+        os.utime(path, (1e9, 1e9))
+    (folder / ".tkamb-link.part").symlink_to(orphan)
+    with open(held) as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        cached()
+    assert "1 unfinished file(s) removed" in caplog.text
+    assert not orphan.exists() and young.exists() and held.exists()
 
 
 def test_limit_drops_the_least_recently_used(folder):
@@ -96,11 +224,15 @@ def test_two_processes_at_once_agree(folder):
     assert [p.suffix for p in folder.iterdir()] == [".operator"]
 
 
-def test_small_operators_leave_no_file(folder):
-    solid, index, held, top = parts()
-    cache.cached_operator(
-        cache.operator_key(solid, held, top),
-        lambda: prepare_operator(solid.stiffness, index, held, top),
-        int((~held).sum()),
-    )
+def test_small_operators_leave_no_file(folder, monkeypatch):
+    monkeypatch.undo()
+    monkeypatch.setenv("TKAMB_CACHE_DIR", str(folder))
+    assert cached()[1] and cached()[1]
     assert not folder.exists()
+
+
+def test_a_folder_that_cannot_be_written_is_said(folder, caplog):
+    folder.parent.mkdir(exist_ok=True)
+    folder.write_text("a file")
+    assert cached()[1]
+    assert "not kept" in caplog.text

@@ -7,8 +7,8 @@ from lattice_bodies import above, box_insert, condyles, dished_insert, pair, pla
 from layer_contact import sphere_on_layer
 from tkamb.contact.lattice.active_set import solve_contact
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactStatus
 from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactStatus
 from tkamb.geometry.frames import knee_pose
 from tkamb.testing import check_contact_model
 

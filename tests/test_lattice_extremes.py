@@ -11,8 +11,8 @@ import trimesh
 
 from lattice_bodies import above, box_insert, condyles, dished_insert, pair, sphere_cap
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactStatus
 from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactStatus
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.surface import Surface

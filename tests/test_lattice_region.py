@@ -11,8 +11,8 @@ from tkamb.contact.lattice.problem import undeformed
 from tkamb.contact.lattice.region import Region, members_that_count
 from tkamb.contact.lattice.solver import Tolerance, solve
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactResult
 from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactResult
 from tkamb.geometry.frames import knee_pose
 
 POSE = knee_pose([1e-3, 0.0, 0.3e-3, 0.0, np.radians(0.3), 0.0])

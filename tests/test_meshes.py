@@ -9,7 +9,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shapes import plate, sphere, two_dishes
+from shapes import joined, plate, sphere, two_dishes
+from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.boundary import boundary_loops
 from tkamb.geometry.repair import repair
@@ -281,6 +282,68 @@ def test_check_lists_defects(tmp_path):
     assert not health.closed_after_repair
     assert health.remaining_holes[0].width == pytest.approx(8.0, abs=2.0)
     assert any("small hole" in phrase for phrase in health.repairs)
+
+
+def test_several_bodies_are_named_refused_and_taken_apart(tmp_path, capsys):
+    insert, tray = two_dishes(), sphere(0.015, 3, (0.0, -0.03, 0.0))
+    void = sphere(0.002, 1, (0.0, 0.003, 0.0))
+    void = Surface(void.vertices, void.faces[:, ::-1])
+    path = save(tmp_path / "assembly.ply", joined(tray, insert, void))
+    for closed in (True, False):
+        message = refused("2 separate bodies", path, "mm", closed=closed)
+        assert "30 × 30 × 30" in message
+        assert "tkamb mesh part" in message
+    health = check_mesh(path)
+    assert [part.triangles for part in health.bodies] == [
+        len(insert.faces) + len(void.faces),
+        len(tray.faces),
+    ]
+    assert health.bodies[1].centre == pytest.approx((0.0, -30.0, 0.0), abs=1e-3)
+    assert any("30 × 30 × 30 at" in line for line in health.lines())
+    out = tmp_path / "insert.ply"
+    assert main(["mesh", "part", str(path), "1", "--out", str(out)]) == 0
+    assert "body 1 of 2" in capsys.readouterr().out
+    alone = load_surface(out, "mm", name="insert", closed=True)
+    expected = insert.mesh.volume - sphere(0.002, 1).mesh.volume
+    assert alone.mesh.volume == pytest.approx(expected, rel=1e-6)
+
+
+def test_parts_that_cannot_be_written(tmp_path, capsys):
+    path = save(tmp_path / "insert.ply", two_dishes())
+    for number, out in (("2", "new.stl"), ("0", "new.stl"), ("1", "new.txt"), ("1", "insert.ply")):
+        assert main(["mesh", "part", str(path), number, "--out", str(tmp_path / out)]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["insert.ply"]
+
+
+def test_two_condyles_side_by_side_are_one_part_and_a_pair_from_two_legs_is_not(tmp_path):
+    def pair(apart, radius=0.02):
+        medial, lateral = (0.0, 0.0, -apart / 2), (0.0, 0.0, apart / 2)
+        return save(
+            tmp_path / "pair.ply", joined(sphere(0.02, 3, medial), sphere(radius, 3, lateral))
+        )
+
+    assert len(load_surface(pair(0.046), "mm", name="femoral component").faces) == 2 * 1280
+    refused("2 separate bodies", pair(0.15), "mm")
+    refused("2 separate bodies", pair(0.046, 0.005), "mm")
+    refused("axes wrong", pair(0.046), "mm", axes="+z,+x,+y")
+
+
+def test_an_open_sheet_is_refused_with_the_reason(tmp_path):
+    insert = two_dishes()
+    faces = np.flatnonzero(insert.mesh.face_normals[:, 1] < 0.5)
+    path = save(tmp_path / "insert_contact.ply", without(insert, faces))
+    for closed in (True, False):
+        message = refused("open sheet", path, "mm", closed=closed)
+        assert "whole closed part" in message
+    assert "  an open sheet" in "\n".join(check_mesh(path).lines())
+    assert "open sheet" not in "\n".join(check_mesh(save(path, insert)).lines())
+
+
+@needs_data
+def test_real_contact_surfaces_are_refused():
+    for path in sorted((DATA / "dm" / "geometry").glob("*_contact.stl")):
+        refused("open sheet", path, "m", "-x,+y,-z")
 
 
 @needs_data

@@ -209,7 +209,7 @@ def test_refusals(tmp_path):
     good = coordinate_columns(bend())
     refused(tmp_path, "axial_rotation runs from .* deg, which no knee does", angle_unit="rad")
     refused(tmp_path, "unknown role 'flex'", columns={"flex": "flexion"})
-    refused(tmp_path, "no column 'bend'; it has time", columns={"flexion": "bend"})
+    refused(tmp_path, "no column 'bend'; its header: time", columns={"flexion": "bend"})
     refused(tmp_path, "half the sampling rate", cutoff_Hz=20.0)
     refused(tmp_path, "shorter than one period", cutoff_Hz=0.2)
     refused(tmp_path, "missing or non-finite", good | {"si": np.full(101, np.nan)})

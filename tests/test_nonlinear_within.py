@@ -6,8 +6,8 @@ import pytest
 from lattice_bodies import condyles, dished_insert, pair
 from tkamb.contact.lattice.network import CalibratedNetwork
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactStatus
 from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactStatus
 from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_pose
 

@@ -11,7 +11,7 @@ import pytest
 from lattice_bodies import dished_insert
 from tkamb.contact.lattice.grid import build_grid
 from tkamb.contact.materials import material, tabulated_material
-from tkamb.contact.model import ContactPair
+from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import knee_pose

@@ -12,7 +12,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from scenes import MODEL, as_toml
+from scenes import MODEL, as_toml, fast_scene
 from tkamb.cli import main
 from tkamb.errors import TkambError
 from tkamb.scene import load_scene
@@ -23,7 +23,7 @@ GENTLE = settings(
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
-SCENE = tomllib.loads((MODEL / "scene.toml").read_text(encoding="utf-8"))
+SCENE = tomllib.loads(fast_scene().read_text(encoding="utf-8"))
 NUMBERS = st.one_of(
     st.floats(allow_nan=False, allow_infinity=False), st.integers(-(10**6), 10**6), st.just(0.0)
 )

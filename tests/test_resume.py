@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes import MODEL, write_scene
+from scenes import fast_scene, write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.output.maps_file import read_maps
@@ -76,29 +76,31 @@ def check_same(found: Results, undisturbed: Results, tolerance=0.0):
 
 @pytest.fixture(scope="module")
 def undisturbed():
-    return simulate(MODEL / "scene.toml", frames=slice(0, 40, 2))
+    return simulate(fast_scene(), frames=slice(0, 40, 2))
 
 
 def kill_and_resume(out, waits):
     """Kill a run once for each wait (frames, s), going on each time; return the results."""
     for count, seconds in waits:
-        process = start(MODEL / "scene.toml", out, "--resume")
+        process = start(fast_scene(), out, "--resume")
         wait_for_frames(process, out, count)
         time.sleep(seconds)
         kill(process)
         if out.exists():
             check_whole(out)
-    process = start(MODEL / "scene.toml", out, "--resume")
+    process = start(fast_scene(), out, "--resume")
     assert process.wait(timeout=300) == 0, process.stderr.read()
     process.communicate()
     assert not (out / ".frames").exists()
     return read_results(out)
 
 
-def test_killed_twice_the_run_ends_as_the_undisturbed_one(tmp_path, undisturbed):
-    found = kill_and_resume(tmp_path / "out", [(3, 0.01), (11, 0.0)])
+def test_killed_again_and_again_the_run_ends_as_the_undisturbed_one(tmp_path, undisturbed):
+    """While it starts, at its first frames, in between and at the end; see scripts/study_kills."""
+    waits = [(0, 0.5), (1, 0.0), (3, 0.01), (8, 0.03), (14, 0.0), (TOTAL, 0.02)]
+    found = kill_and_resume(tmp_path / "out", waits)
     check_same(found, undisturbed)
-    assert found.summary["resumed_frames"] >= 11
+    assert found.summary["resumed_frames"] >= 14
 
 
 @pytest.mark.slow
@@ -113,9 +115,9 @@ def test_killed_at_twenty_random_moments_likewise(tmp_path, undisturbed):
 def test_a_lattice_goes_on_within_its_tolerance(tmp_path, model):
     frames = slice(30, 50, 2)
     options = {"contact": model, "resolution_mm": 2.0, "frames": frames}
-    whole = simulate(MODEL / "scene.toml", **options)
+    whole = simulate(fast_scene(), **options)
     stop_after(tmp_path, 4, **options)
-    found = simulate(MODEL / "scene.toml", directory=tmp_path, resume=True, **options)
+    found = simulate(fast_scene(), directory=tmp_path, resume=True, **options)
     for name in ("approach_mm", "medial_force_N", "medial_peak_pressure_MPa"):
         np.testing.assert_allclose(found[name], whole[name], rtol=3e-3, err_msg=name)
 
@@ -131,7 +133,7 @@ def test_released_coordinates_go_on_where_they_were(tmp_path):
     check_same(simulate(scene, directory=out, resume=True, **options), whole, tolerance=1e-6)
 
 
-def stop_after(directory, count, scene=MODEL / "scene.toml", **options):
+def stop_after(directory, count, scene=None, **options):
     """Interrupt a run after that many frames."""
 
     def progress(indices):
@@ -140,13 +142,14 @@ def stop_after(directory, count, scene=MODEL / "scene.toml", **options):
                 raise KeyboardInterrupt
             yield k
 
+    given = scene or fast_scene()
     with pytest.raises(KeyboardInterrupt, match=f"{count} of "):
-        simulate(scene, directory=directory, progress=progress, **options)
+        simulate(given, directory=directory, progress=progress, **options)
 
 
 def test_an_interrupt_leaves_a_readable_part_and_says_so(tmp_path):
     out = tmp_path / "out"
-    process = start(MODEL / "scene.toml", out)
+    process = start(fast_scene(), out)
     wait_for_frames(process, out, 4)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)
@@ -183,7 +186,7 @@ def test_another_run_is_not_resumed(tmp_path, change, word):
     options = {"frames": slice(0, 8)}
     stop_after(tmp_path, 2, **options)
     with pytest.raises(InputError, match=word):
-        simulate(MODEL / "scene.toml", directory=tmp_path, resume=True, **(options | change))
+        simulate(fast_scene(), directory=tmp_path, resume=True, **(options | change))
     assert (tmp_path / ".frames").exists()
 
 
@@ -201,7 +204,7 @@ def test_a_changed_file_is_another_run(tmp_path, capsys):
 
 
 def test_a_finished_run_is_not_computed_again(tmp_path, capsys):
-    given = ["run", str(MODEL / "scene.toml"), "--out", str(tmp_path), "--frames", "0:3"]
+    given = ["run", str(fast_scene()), "--out", str(tmp_path), "--frames", "0:3"]
     assert main(given) == 0
     before = (tmp_path / "results.csv").read_bytes()
     assert main([*given, "--resume"]) == 0
@@ -211,10 +214,10 @@ def test_a_finished_run_is_not_computed_again(tmp_path, capsys):
 
 
 def test_nothing_to_resume_begins_at_the_beginning(tmp_path):
-    found = simulate(MODEL / "scene.toml", frames=slice(0, 2), directory=tmp_path, resume=True)
+    found = simulate(fast_scene(), frames=slice(0, 2), directory=tmp_path, resume=True)
     assert len(found) == 2
     with pytest.raises(InputError, match="no folder"):
-        simulate(MODEL / "scene.toml", frames=slice(0, 2), resume=True)
+        simulate(fast_scene(), frames=slice(0, 2), resume=True)
 
 
 def test_a_torn_shard_counts_as_absent(tmp_path):

@@ -4,11 +4,14 @@ import json
 import runpy
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from scenes import MODEL, write_scene
+from tkamb.case import load_case
 from tkamb.cli import main
 from tkamb.errors import InputError
+from tkamb.geometry.frames import KNEE_COORDINATES
 from tkamb.scene import load_scene
 
 ROOT = Path(__file__).parents[1]
@@ -78,3 +81,33 @@ def test_two_ligaments_of_one_name(tmp_path):
     bundles = tomllib.loads((MODEL / "scene.toml").read_text(encoding="utf-8"))["ligament"]
     with pytest.raises(InputError, match="same name"):
         load_scene(write_scene(tmp_path, ligament=[bundles[0], bundles[0]]))
+
+
+def test_a_scene_on_a_base_differs_in_what_it_says_alone(tmp_path):
+    base = write_scene(tmp_path)
+    own = tmp_path / "own.toml"
+    own.write_text('base = "scene.toml"\n[contact]\nfriction = 0.0\n[patient]\nmass_kg = 80.0\n')
+    scene, plain = load_scene(own), load_scene(base)
+    assert (scene.contact.friction, scene.patient.mass_kg) == (0.0, 80.0)
+    assert scene.ligament == plain.ligament
+    assert scene.contact.model_copy(update={"friction": plain.contact.friction}) == plain.contact
+    for text, words in (
+        ('base = "nothing.toml"', "no such scene file"),
+        ('base = "../scene.toml"', "same folder"),
+        ("base = 3", "same folder"),
+        ('base = "own.toml"', "has a base itself"),
+    ):
+        wrong = tmp_path / "wrong.toml"
+        wrong.write_text(text)
+        with pytest.raises(InputError, match=words):
+            load_scene(wrong)
+
+
+def test_signs_turned_is_the_recording_with_its_columns_negated(tmp_path):
+    path = write_scene(tmp_path)
+    whole = load_case(load_scene(path)).motion.raw_coordinates
+    turned = load_case(load_scene(path, {"motion.signs_turned": ["ml", "adduction"]})).motion
+    signs = [-1.0 if name in ("ml", "adduction") else 1.0 for name in KNEE_COORDINATES]
+    np.testing.assert_allclose(turned.raw_coordinates, whole * signs, atol=1e-12)
+    with pytest.raises(InputError, match="unknown role 'rotation_1'"):
+        load_case(load_scene(path, {"motion.signs_turned": ["rotation_1"]}))

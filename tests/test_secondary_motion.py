@@ -19,13 +19,15 @@ from tkamb.scene import load_scene
 
 ROOT = Path(__file__).parents[1]
 BEND = ROOT / "models" / "deep_knee_bend" / "scene.toml"
+COARSE = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
 DM = ROOT / "models" / "dm" / "scene.toml"
 DATA = ROOT.parent / "shared" / "data" / "dm"
 ALL = ["ap", "ml", "axial_rotation", "adduction"]
 
 
 def side_of(scene, more=None, **contact):
-    overrides = (more or {}) | {"contact.resolution_mm": 2.0, "contact.released": ALL}
+    overrides = COARSE | (more or {})
+    overrides |= {"contact.released": ALL}
     overrides |= {f"contact.{key}": value for key, value in contact.items()}
     case = load_case(load_scene(scene, overrides))
     return ContactSide(case, Mechanics(case))
@@ -114,9 +116,7 @@ def test_friction_drags_the_knee_back(bend, settled):
 
 def test_without_anything_that_holds_it_a_frame_fails_with_the_reason(bend):
     """No ligaments, and the femur so far off that nothing catches it."""
-    case = load_case(
-        load_scene(BEND, {"contact.resolution_mm": 2.0, "contact.released": ALL, "ligament": []})
-    )
+    case = load_case(load_scene(BEND, COARSE | {"contact.released": ALL, "ligament": []}))
     side = ContactSide(case, Mechanics(case))
     start = case.motion.coordinates[60].copy()
     start[0] += 60e-3

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scenes import MODEL, write_scene
+from scenes import fast_scene, write_scene
 from tkamb import load_scene, simulate
 from tkamb.errors import InputError
 from tkamb.run.columns import COLUMNS
@@ -16,7 +16,7 @@ CLOCKS = {"body_seconds", "query_seconds", "contact_seconds"}
 
 @pytest.fixture(scope="module")
 def bend():
-    return simulate(MODEL / "scene.toml", frames=EVERY_TENTH)
+    return simulate(fast_scene(), frames=EVERY_TENTH)
 
 
 def test_every_frame_has_numbers(bend):
@@ -70,7 +70,7 @@ def test_patella_balances_as_three_forces(bend):
 
 
 def test_another_contact_model_changes_contact_columns_only(bend):
-    other = simulate(MODEL / "scene.toml", contact="hertz", frames=EVERY_TENTH)
+    other = simulate(fast_scene(), contact="hertz", frames=EVERY_TENTH)
     changed = set()
     for name in bend.columns:
         if name in CLOCKS or name == "status":
@@ -95,7 +95,7 @@ def test_a_left_knee_gives_the_right_knees_numbers(tmp_path, bend):
 
 
 def test_body_weight_scales_everything_but_geometry(tmp_path):
-    scene = load_scene(MODEL / "scene.toml")
+    scene = load_scene(fast_scene())
     assert scene.patient.mass_kg == 75.0
     results = simulate(write_scene(tmp_path, patient__mass_kg=150.0), frames=slice(50, 51))
     assert results["force_total_BW"][0] == pytest.approx(
@@ -106,4 +106,4 @@ def test_body_weight_scales_everything_but_geometry(tmp_path):
 @pytest.mark.parametrize("frames", [slice(0, 200), slice(-300, 10), slice(5, 5), slice(0, 9, 0)])
 def test_frames_outside_the_motion_are_refused(frames):
     with pytest.raises(InputError, match="not in the motion"):
-        simulate(MODEL / "scene.toml", frames=frames)
+        simulate(fast_scene(), frames=frames)

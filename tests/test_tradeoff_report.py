@@ -7,19 +7,28 @@ from pathlib import Path
 import pytest
 
 from tkamb.errors import InputError
+from tkamb.known_errors import STORED, known_error, known_errors
 from tkamb.studies import tradeoff
 from tkamb.studies.advice import comparison, recommendations
 from tkamb.studies.body_trade import read_body_rows
 from tkamb.studies.measures import Job, Measure
 from tkamb.studies.references import read_references
-from tkamb.studies.tradeoff_block import MARKERS, block, body_block, with_block
+from tkamb.studies.row import KEYS, TIMES, Row
+from tkamb.studies.tradeoff_block import (
+    MARKERS,
+    block,
+    body_block,
+    known_errors_json,
+    short_block,
+    with_block,
+)
 from tkamb.studies.tradeoff_report import picture, table
 
 ROOT = Path(__file__).parents[1]
-KEYS = {
+JSON_KEYS = {
     *("case", "contact", "resolution_mm", "on_front", "status", "reference_known", "values"),
-    *tradeoff.TIMES,
-    *(f"error_{key}" for key in tradeoff.KEYS),
+    *TIMES,
+    *(f"error_{key}" for key in KEYS),
 }
 
 
@@ -31,9 +40,9 @@ def made_up_rows():
         for contact, grid, seconds, error in settings:
             values = dict.fromkeys(read_references()[case].values, 1.0 + error)
             found = Measure("ok", 1.0, seconds, seconds, 100.0, values=values)
-            compared = dict.fromkeys(tradeoff.KEYS, error)
-            rows.append(tradeoff.Row(Job(case, contact, grid), found, compared, 0.005))
-        rows.append(tradeoff.Row(Job(case, "lattice", 1.0), Measure("out of range"), {}, 0.005))
+            compared = dict.fromkeys(KEYS, error)
+            rows.append(Row(Job(case, contact, grid), found, compared, 0.005))
+        rows.append(Row(Job(case, "lattice", 1.0), Measure("out of range"), {}, 0.005))
     return tradeoff.with_fronts(rows)
 
 
@@ -41,7 +50,7 @@ def test_rows_table_and_advice():
     rows = made_up_rows()
     assert [row.on_front for row in rows[:5]] == [True, False, True, True, False]
     content = json.loads(tradeoff.as_json(rows))
-    assert all(set(row) == KEYS for row in content)
+    assert all(set(row) == JSON_KEYS for row in content)
     assert content[4]["error_approach"] is None
     text = "\n".join(table(rows, read_references()))
     assert "out of range" in text and "*hertz" in text
@@ -93,9 +102,37 @@ def test_a_block_goes_between_its_markers_and_nowhere_else():
 
 
 def test_the_pages_tables_are_the_study_s():
+    rows = tradeoff.read_rows(ROOT / "docs" / "tradeoff.json")
     for page, lines, name in (
-        ("README.md", block(tradeoff.read_rows(ROOT / "docs" / "tradeoff.json")), "tradeoff"),
+        ("README.md", short_block(rows), "short"),
+        ("docs/studies.md", block(rows), "tradeoff"),
         ("docs/studies.md", body_block(read_body_rows(ROOT / "docs" / "body.json")), "body"),
     ):
         text = (ROOT / page).read_text(encoding="utf-8")
         assert with_block(text, lines, name) == text, f"{page}: run scripts/make_tradeoff_table"
+
+
+def test_what_runs_say_of_their_error_is_the_page_s_table():
+    rows = tradeoff.read_rows(ROOT / "docs" / "tradeoff.json")
+    assert STORED.read_text(encoding="utf-8") == known_errors_json(rows)
+    lines = (ROOT / "docs" / "studies.md").read_text(encoding="utf-8").splitlines()
+    for (label, resolution), error in known_errors().items():
+        (line,) = [line for line in lines if line.startswith(f"| {label} | {resolution:g} |")]
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        found = (error.approach, error.force, error.mean_pressure, error.peak_pressure, error.area)
+        assert cells[6:11] == [f"{100 * share:.2g}" for share in found], label
+        assert cells[12] == f"{error.cases}"
+
+
+def test_what_was_not_measured_has_no_known_error():
+    assert known_error("lattice", 1.0, "polyethylene", {}).cases == 4
+    assert known_error("lattice", 1.0, "polyethylene", {"cache": False}) is not None
+    assert known_error("lattice", 2.0, "polyethylene", {"tolerance": 1e-2}) is not None
+    for model, resolution, material, options in (
+        ("lattice", 1.25, "polyethylene", {}),
+        ("lattice", 1.0, "polyethylene-linear", {}),
+        ("lattice", 1.0, "polyethylene", {"tolerance": 1e-2}),
+        ("winkler", 1.0, "polyethylene", {}),
+        ("calculix C3D8I", 1.0, "polyethylene", {}),
+    ):
+        assert known_error(model, resolution, material, options) is None

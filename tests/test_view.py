@@ -3,6 +3,7 @@
 import http.client
 import json
 import re
+import socket
 from importlib.resources import files
 
 import numpy as np
@@ -40,12 +41,18 @@ def server(show):
     server.close()
 
 
-def ask(server, method, path, body=None, **headers):
-    host, port = server.url.removeprefix("http://").strip("/").split(":")
-    connection = http.client.HTTPConnection(host, int(port), timeout=60)
-    connection.request(method, path, body, {"Host": f"{host}:{port}"} | headers)
-    response = connection.getresponse()
+def ask(server, method, path, body=None, below=None, **headers):
+    """Ask for a path below the token, or below another root."""
+    response = answer(server, method, path, body, below, **headers)
     return response.status, response.read()
+
+
+def answer(server, method, path, body=None, below=None, **headers):
+    where, own, _ = server.url.removeprefix("http://").split("/")
+    connection = http.client.HTTPConnection(*where.split(":"), timeout=60)
+    root = f"/{own}" if below is None else below
+    connection.request(method, root + path, body, {"Host": where} | headers)
+    return connection.getresponse()
 
 
 def sphere(rings=60):
@@ -127,12 +134,59 @@ def test_other_hosts_and_sites_are_refused(server, headers):
     assert ask(server, "POST", "/contact", body, **headers)[0] == 403
 
 
+@pytest.mark.parametrize("below", ["", "/x", "/" + "A" * 24, "//"])
+def test_an_address_without_the_token_is_refused(server, below):
+    token = server.url.rstrip("/").rsplit("/", 1)[1]
+    assert len(token) >= 20
+    assert ask(server, "GET", "/", below=below)[0] == 403
+    assert ask(server, "GET", "/scene.bin", below=below)[0] == 403
+    body = json.dumps({"frame": 0, "model": "hertz"})
+    status, told = ask(server, "POST", "/contact", body, below=below)
+    assert status == 403 and token.encode() not in told
+
+
+def test_each_window_has_its_own_token(show, server):
+    other = show.server()
+    assert other.url.split("/")[3] != server.url.split("/")[3]
+    serve_in_background(other)
+    other.close()
+
+
+@pytest.mark.parametrize("path", ["/", "/scene.bin", "/nothing"])
+def test_no_other_page_may_frame_the_window(server, path):
+    headers = answer(server, "GET", path).headers
+    assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
+    assert headers["X-Frame-Options"] == "DENY"
+    assert headers["Referrer-Policy"] == "no-referrer"
+
+
+def test_a_client_that_says_nothing_is_cut_off(server, monkeypatch):
+    handler = server._server.RequestHandlerClass
+    monkeypatch.setattr(handler, "timeout", 0.2)
+    where, own, _ = server.url.removeprefix("http://").split("/")
+    host, port = where.split(":")
+    question = f"POST /{own}/contact HTTP/1.1\r\nHost: {where}\r\nContent-Length: 50\r\n\r\n{{"
+    for sent, heard in ((b"", b""), (b"GET /", b""), (question.encode(), b" 408 ")):
+        with socket.create_connection((host, int(port)), timeout=60) as client:
+            client.sendall(sent)
+            told = b"".join(iter(lambda: client.recv(4096), b""))
+        assert heard in told and bool(heard) == bool(told)
+    assert ask(server, "GET", "/")[0] == 200
+
+
 @pytest.mark.parametrize(
     ("body", "word"),
     [
         (b"", "bytes"),
         (b"[]", "object"),
         (b"{", "Expecting"),
+        (b"\xff\xfe{", "decode"),
+        (b"[" * 9999, "recursion"),
+        (b'{"frame": 1e400, "model": "hertz"}', "integer"),
+        (b'{"frame": NaN, "model": "hertz"}', "integer"),
+        (b'{"frame": true, "model": "hertz"}', "integer"),
+        (b'{"frame": 0, "model": ["hertz"]}', "name"),
+        (b'{"frame": 1' + b"0" * 5000 + b', "model": "hertz"}', "limit"),
         (b'{"frame": 999, "model": "hertz"}', "999"),
         (b'{"frame": 0, "model": "none such"}', "none such"),
     ],
@@ -147,8 +201,9 @@ def test_results_of_a_changed_scene_are_refused(tmp_path, capsys):
     out = tmp_path / "out"
     out.mkdir()
     short_results(out, scene, every=100)
-    text = scene.read_text()
-    scene.write_text(text.replace("mass_kg = 75.0", "mass_kg = 76.0"))
+    text, changed = re.subn(r'(mass_kg"? = )75\.0', r"\g<1>76.0", scene.read_text())
+    assert changed == 1
+    scene.write_text(text)
     assert main(["view", str(out), "--html", str(tmp_path / "x.html")]) == 2
     line = capsys.readouterr().err.strip().splitlines()[-1]
     assert "has changed" in line and "tkamb run" in line
@@ -181,13 +236,23 @@ def test_without_a_browser_one_line_says_so(folder, monkeypatch, tmp_path, capsy
     ("options", "word"),
     [
         (["--frame", "999"], "999"),
+        (["--frame", "-999"], "-999"),
         (["--camera", "behind"], "behind"),
         (["--contact", "hertz"], "own"),
+        (["--contact", "nothing"], "nothing"),
+        (["--port", "-1"], "no port -1"),
+        (["--port", "65536"], "no port 65536"),
+        (["--png", "/no/such/folder/x.png"], "cannot be written"),
     ],
 )
-def test_bad_options_are_one_line(folder, tmp_path, capsys, options, word):
-    assert main(["view", str(folder), "--html", str(tmp_path / "x.html"), *options]) == 2
+def test_bad_options_are_one_line_before_anything_is_drawn(
+    folder, tmp_path, capsys, monkeypatch, options, word
+):
+    monkeypatch.setattr("tkamb.view.run.joined", None)
+    page = tmp_path / "x.html"
+    assert main(["view", str(folder), "--html", str(page), *options]) == 2
     assert word in capsys.readouterr().err.strip().splitlines()[-1]
+    assert not page.exists()
 
 
 def test_a_missing_folder_is_one_line(tmp_path, capsys):

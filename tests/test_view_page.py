@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import tkamb
 from tkamb.output.maps_file import read_maps
 from tkamb.results import read_results
 from tkamb.view.browser import HeadlessBrowser, find_browser
@@ -269,5 +270,5 @@ def test_the_lattice_is_drawn_when_its_layer_is_switched_on(live, show):
 
 
 def test_results_can_be_viewed_in_a_notebook(folder):
-    text = read_results(folder).view(frame=1)._repr_html_()
+    text = tkamb.show(read_results(folder), frame=1)._repr_html_()
     assert text.startswith("<iframe srcdoc=") and "&lt;script" in text

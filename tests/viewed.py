@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from scenes import fast_scene
 from tkamb.results import write_results
 from tkamb.simulation import simulate
 
 MODELS = Path(__file__).parents[1] / "models"
-SCENE = MODELS / "deep_knee_bend" / "scene.toml"
+SCENE = fast_scene()
 HELD = []
 """Folders that go when the tests end."""
 

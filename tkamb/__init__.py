@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from tkamb.results import Results, read_results
     from tkamb.scene import Scene, load_scene
     from tkamb.simulation import simulate
+    from tkamb.view.show import show
 
-__all__ = ["Results", "Scene", "contact_model", "load_scene", "read_results", "simulate"]
+__all__ = ["Results", "Scene", "contact_model", "load_scene", "read_results", "show", "simulate"]
 
 _HOMES = {
     "Results": "tkamb.results",
@@ -25,6 +26,7 @@ _HOMES = {
     "contact_model": "tkamb.contact.registry",
     "load_scene": "tkamb.scene",
     "read_results": "tkamb.results",
+    "show": "tkamb.view.show",
     "simulate": "tkamb.simulation",
 }
 

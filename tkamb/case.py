@@ -79,6 +79,7 @@ def load_case(scene: Scene) -> Case:
         parts.insert_mesh_in_insert,
         parts.femoral_mesh_in_femur,
         (*released, "si") if released else (),
+        chain.insert_in_tibia,
     )
     if motion.unrecorded:
         from tkamb.mechanics.seat import seated_motion
@@ -100,6 +101,9 @@ def load_case(scene: Scene) -> Case:
         from tkamb.inputs.tibia import load_tibia
 
         tibia = load_tibia(scene.tibia, motion.time, scene.patient.side, scene.motion.cutoff_Hz)
+    elif motion.markers:
+        cutoff = scene.motion.cutoff_Hz
+        tibia = motion.markers.shank_motion(cutoff, motion.time, str(scene.motion.file))
     if scene.ground_reaction:
         from tkamb.inputs.ground_reaction import check_under_foot, load_ground_reaction
 
@@ -183,9 +187,27 @@ class _Parts:
         table = scene.implant.insert
         assert table is not None
         surface = load_surface(table.mesh, table.unit, table.axes, name="insert", closed=True)
-        placement = insert_placement(surface, axes_rotation(table.axes))
+        try:
+            placement = insert_placement(surface, axes_rotation(table.axes))
+        except InputError as error:
+            if scene.implant.femoral and self._could_be_insert(scene.implant.femoral):
+                question = "are the meshes of [implant.femoral] and [implant.insert] exchanged?"
+                raise InputError(error.what, error.where, question) from None
+            raise
         self.insert_mesh_in_insert = placement @ pose(axes_rotation(table.axes), np.zeros(3))
         self.insert = self._sided(surface.moved(placement))
+
+    def _could_be_insert(self, table: FemoralImplantTable) -> bool:
+        """Say whether the mesh that the scene calls femoral has an insert's flat bottom."""
+        from tkamb.geometry.flat_bottom import insert_placement
+        from tkamb.inputs.meshes import axes_rotation, load_surface
+
+        try:
+            surface = load_surface(table.mesh, table.unit, table.axes, name="femoral component")
+            insert_placement(surface, axes_rotation(table.axes))
+        except InputError:
+            return False
+        return True
 
     def _place(
         self, name: str, table: FemoralImplantTable | PatellarImplantTable

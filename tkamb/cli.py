@@ -7,11 +7,15 @@ import os
 import sys
 import tomllib
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from tkamb.command_options import add_no_cache, without_cache
-from tkamb.errors import TkambError
+from tkamb.datasets.command import add_data
+from tkamb.guard import guarded
+from tkamb.importing.command import add_import
+from tkamb.mesh_command import add_mesh
 from tkamb.press.command import add_press
 from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
@@ -24,21 +28,14 @@ if TYPE_CHECKING:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `tkamb` and return its exit status: 0 done, 1 nothing computed, 2 bad input."""
     _keep_to_one_thread()
-    options = _parser().parse_args(arguments)
-    logging.basicConfig(format="tkamb: %(levelname)s: %(message)s", level=logging.WARNING)
-    try:
-        status = int(options.command(options))
-        sys.stdout.flush()
-        return status
-    except TkambError as error:
-        print(f"tkamb: {error}", file=sys.stderr)
-        return error.exit_status
-    except BrokenPipeError:  # the reader of a pipe has gone, `tkamb ... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except KeyboardInterrupt as interrupt:
-        print(f"tkamb: interrupted: {interrupt or 'nothing is kept'}", file=sys.stderr)
-        return 130
+    options = argparse.Namespace()
+
+    def command() -> int:
+        _parser().parse_args(arguments, options)
+        logging.basicConfig(format="tkamb: %(levelname)s: %(message)s", level=logging.WARNING)
+        return int(options.command(options))
+
+    return guarded(command, options)
 
 
 def _keep_to_one_thread() -> None:
@@ -61,13 +58,17 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="tkamb", description="What happens inside a total knee replacement.")
+    parser.add_argument("--version", action="version", version=f"tkamb {version('tkamb')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     add_new(commands)
     _add_run(commands)
+    _add_folder_commands(commands)
     add_press(commands)
     _add_contact(commands)
-    _add_mesh(commands)
+    add_mesh(commands)
     _add_scene(commands)
+    add_import(commands)
+    add_data(commands)
     add_view(commands)
     add_tradeoff(commands)
     add_stability(commands)
@@ -90,11 +91,21 @@ def _add_run(commands: Any) -> None:
         help="override a key of the scene",
     )
     add_no_cache(run)
+    run.add_argument("--force", action="store_true", help="write into a folder that is not tkamb's")
     run.add_argument("--resume", action="store_true", help="go on with an interrupted run")
     run.add_argument("--profile", action="store_true", help="what was touched, and time per part")
     run.add_argument("--strict", action="store_true", help="exit 1 when a frame failed")
     run.add_argument("--json", action="store_true", help="print summary.json")
     run.set_defaults(command=_run)
+
+
+def _add_folder_commands(commands: Any) -> None:
+    verify = commands.add_parser("verify", help="is a folder of results what was written?")
+    verify.add_argument("folder", type=Path, metavar="DIR")
+    verify.set_defaults(command=_verify)
+    report = commands.add_parser("report", help="write report.html of a folder of results anew")
+    report.add_argument("folder", type=Path, metavar="DIR")
+    report.set_defaults(command=_report)
 
 
 def _add_contact(commands: Any) -> None:
@@ -103,29 +114,6 @@ def _add_contact(commands: Any) -> None:
     verbs.add_parser("list", help="names, what each assumes and needs").set_defaults(
         command=_contact_list
     )
-
-
-def _add_mesh(commands: Any) -> None:
-    mesh = commands.add_parser("mesh", help="look at a mesh before it is used")
-    verbs = mesh.add_subparsers(required=True, metavar="VERB")
-    check = verbs.add_parser("check", help="health, and unit and axes as questions")
-    check.add_argument("files", type=Path, nargs="+", metavar="FILE")
-    check.add_argument("--json", action="store_true")
-    check.set_defaults(command=_mesh_check)
-    lattice = verbs.add_parser("lattice", help="the lattice of an insert, and how good it is")
-    lattice.add_argument("insert", type=Path, metavar="INSERT")
-    lattice.add_argument("--resolution", type=float, default=1.0, metavar="MM", help="cell size")
-    lattice.add_argument("--units", choices=("mm", "m"), default="mm", help="of the mesh")
-    lattice.add_argument(
-        "--axes",
-        default="+x,+y,+z",
-        metavar="ANT,SUP,RIGHT",
-        help="mesh axes that point anterior, superior, right; write --axes=-x,+y,-z",
-    )
-    lattice.add_argument("--side", choices=("right", "left"), default="right")
-    lattice.add_argument("--out", type=Path, metavar="F.vtu", help="for ParaView or meshio")
-    lattice.add_argument("--json", action="store_true")
-    lattice.set_defaults(command=_mesh_lattice)
 
 
 def _add_scene(commands: Any) -> None:
@@ -162,8 +150,8 @@ def _run(options: argparse.Namespace) -> int:
     from tkamb.run.profiling import Profile, profile_lines
 
     profile = Profile() if options.profile else None
-    from tkamb.output.atomic import claimed_directory
     from tkamb.output.axis import horizontal_axis
+    from tkamb.output.claim import claimed_directory
     from tkamb.output.headline import cards
     from tkamb.results import write_results
     from tkamb.run.status import FAILED
@@ -171,7 +159,7 @@ def _run(options: argparse.Namespace) -> int:
 
     scene = _scene_of(options)
     directory = options.out or scene.output.directory or _default_directory(options.scene)
-    with claimed_directory(directory):
+    with claimed_directory(directory, options.force):
         results = simulate(
             scene,
             frames=options.frames,
@@ -186,6 +174,8 @@ def _run(options: argparse.Namespace) -> int:
     failed = [k for k, status in enumerate(results.status) if status.startswith(FAILED)]
     for k in failed:
         print(f"tkamb: frame {k}: {results.status[k]}", file=sys.stderr)
+    for question in results.summary.get("questions", []):
+        print(f"tkamb: question: {question}", file=sys.stderr)
     if options.json:
         print((directory / "summary.json").read_text(encoding="utf-8"), end="")
     else:
@@ -218,37 +208,31 @@ def _default_directory(scene: Path) -> Path:
     return Path("out") / scene.resolve().parent.name
 
 
+def _verify(options: argparse.Namespace) -> int:
+    from tkamb.verify import verify_results
+
+    verdict = verify_results(options.folder)
+    print("\n".join(f"{options.folder}: {line}" for line in verdict.lines()))
+    return 1 if verdict.differs else 0
+
+
+def _report(options: argparse.Namespace) -> int:
+    from tkamb.output.claim import claimed_directory
+    from tkamb.output.report import write_report
+    from tkamb.results import REPORT_NAME, read_results
+
+    results = read_results(options.folder)  # before a folder is made or marked
+    with claimed_directory(options.folder) as folder:
+        write_report(results, folder / REPORT_NAME)
+    print(f"report: {options.folder / REPORT_NAME}")
+    return 0
+
+
 def _contact_list(options: argparse.Namespace) -> int:
     from tkamb.contact.registry import contact_descriptions
 
     for name, line in contact_descriptions().items():
         print(f"{name:18s} {line}")
-    return 0
-
-
-def _mesh_check(options: argparse.Namespace) -> int:
-    from tkamb.inputs.mesh_check import check_mesh
-
-    found = [check_mesh(path) for path in options.files]
-    if options.json:
-        print(json.dumps([health.as_dict() for health in found], indent=2))
-    else:
-        print("\n".join(line for health in found for line in health.lines()))
-    return 0
-
-
-def _mesh_lattice(options: argparse.Namespace) -> int:
-    from tkamb.lattice_file import lattice_of_file
-
-    report = lattice_of_file(
-        options.insert,
-        options.resolution,
-        units=options.units,
-        axes=options.axes,
-        side=options.side,
-        out=options.out,
-    )
-    print(json.dumps(report.as_dict(), indent=2) if options.json else "\n".join(report.lines()))
     return 0
 
 

@@ -1,5 +1,11 @@
 """The one error family: what went wrong, where, and how to mend it, in one line."""
 
+import difflib
+from collections.abc import Iterable
+
+MOST_NAMES = 8
+"""How many names a message lists."""
+
 
 class TkambError(Exception):
     """Base of every error that tkamb raises on purpose.
@@ -26,3 +32,14 @@ class InputError(TkambError):
 
 class ComputationError(TkambError):
     """Sound input, but nothing could be computed from it: exit status 1."""
+
+
+def names_near(name: str, names: Iterable[str], title: str = "there are") -> str:
+    """Return "did you mean ..." with the names that resemble one, and the first of all names."""
+    there = list(names)
+    lower = {known.lower(): known for known in there}
+    close = difflib.get_close_matches(name.lower(), lower, n=4, cutoff=0.6)
+    more = ", …" if len(there) > MOST_NAMES else ""
+    listed = f"{title}: {', '.join(there[:MOST_NAMES]) or 'none'}{more}"
+    guess = f"did you mean {', '.join(lower[known] for known in close)}? " if close else ""
+    return guess + listed

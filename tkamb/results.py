@@ -1,7 +1,6 @@
 """What a run found: one row per frame, the contact maps, and where it all came from."""
 
-import csv
-import io
+import hashlib
 import json
 import math
 from collections.abc import Mapping
@@ -11,20 +10,31 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.errors import InputError
+from tkamb.errors import InputError, names_near
+from tkamb.files import MEGABYTE, read_json, sha256_of
 from tkamb.geometry.frames import Array
-from tkamb.output.atomic import claim_directory, write_text
-from tkamb.run.columns import COLUMNS, KINDS, is_ligament, ordered_names
+from tkamb.output.atomic import (
+    Replacement,
+    claim_directory,
+    replaced_together,
+    write_synced,
+    write_text,
+)
+from tkamb.output.claim import claimed_directory, settle
+from tkamb.output.results_csv import csv_text, read_csv
+from tkamb.run.columns import COLUMNS, KINDS, ordered_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tkamb.output.maps_file import ContactMaps
-    from tkamb.view.show import Show
 
 __all__ = ["COLUMNS", "Results", "claim_directory", "read_results", "write_results"]
 
 CSV_NAME, SUMMARY_NAME, REPORT_NAME = "results.csv", "summary.json", "report.html"
+MAPS_NAME = "contact.h5"
+SUMMARY_LIMIT = 256 * MEGABYTE
+"""Bytes of a summary: a line for every failed frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +66,13 @@ class Results:
         return len(self.columns["status"])
 
     def __getitem__(self, name: str) -> Array:
-        """Return a numeric column (f,)."""
+        """Return a numeric column (f,).
+
+        Raises:
+            InputError: no such column; the message lists the nearest names.
+        """
+        if name not in self.columns:
+            raise InputError(f"no column '{name}'", "results", names_near(name, self.columns))
         return self.columns[name]
 
     @property
@@ -88,20 +104,6 @@ class Results:
 
         return plot(self, names, axis)
 
-    def view(self, frame: int = 0) -> "Show":
-        """Return the run to look at and turn around, which notebooks show.
-
-        Args:
-            frame: shown first.
-
-        Raises:
-            InputError: the scene is not there, or no longer what was run.
-        """
-        from tkamb.view.run import run_of
-        from tkamb.view.show import Show
-
-        return Show([run_of(self)], frame=frame)
-
     def _repr_html_(self) -> str:
         """Return the report's headline numbers, for notebooks."""
         from tkamb.output.report import headline_html
@@ -114,86 +116,124 @@ class Results:
         Raises:
             InputError: the folder cannot be written.
         """
-        write_text(Path(path), _csv_text(self.columns))
+        write_text(Path(path), csv_text(self.columns))
 
 
-def read_results(directory: str | Path) -> Results:
+def read_results(directory: str | Path, *, check: bool = True) -> Results:
     """Read what `write_results` wrote; numbers come back bit for bit.
 
+    What a kill left to be put in place is put there first.
+
+    Args:
+        directory: the folder.
+        check: hold the files against the SHA-256 in summary.json.
+
     Raises:
-        InputError: a file is missing or is not what it should be.
+        InputError: a file is missing, is not what it should be, or not what was written.
     """
     directory = Path(directory)
+    settle(directory)
     columns = read_csv(directory / CSV_NAME)
-    summary = _read_json(directory / SUMMARY_NAME)
-    maps_path = directory / "contact.h5"
+    summary = read_summary(directory)
     maps = None
-    if maps_path.exists():
+    if (directory / MAPS_NAME).exists():
         from tkamb.output.maps_file import read_maps
 
-        maps = read_maps(maps_path)
+        maps = read_maps(directory / MAPS_NAME)
+    if check and (found := differences(directory, summary)):
+        raise InputError(found[0], directory, "`tkamb verify` tells all; run it again")
     return Results(columns, summary, maps, directory)
 
 
-def write_results(results: Results, directory: str | Path) -> None:
-    """Write results.csv, summary.json and report.html, each whole or not at all.
-
-    Maps that are in memory are written to contact.h5 too; without maps, a contact.h5 of an
-    earlier run in that folder is removed, since it would pass for this run's. The shards of a
-    run under way (`tkamb.output.shards`) have served and go.
+def read_summary(directory: Path) -> dict[str, Any]:
+    """Return a folder's summary.json.
 
     Raises:
-        InputError: the folder cannot be written.
+        InputError: no such file, or not a JSON object.
     """
-    from tkamb.output.report import write_report
+    path = directory / SUMMARY_NAME
+    found = read_json(path, SUMMARY_LIMIT, what="summary of a run")
+    if not isinstance(found, dict):
+        raise InputError("is no JSON object", path, "is it a folder that `tkamb run` wrote?")
+    return found
+
+
+def differences(directory: Path, summary: Mapping[str, Any]) -> list[str]:
+    """Return in words what of a folder's files is not what was written with the summary.
+
+    Results of a release that kept no SHA-256 differ in nothing that could be known.
+    """
+    said, recorded = [], summary.get("files")
+    if not isinstance(recorded, Mapping):
+        return []
+    if summary.get("summary_sha256") != _summary_hash(summary):
+        said.append(f"{SUMMARY_NAME} has changed since it was written")
+    for name in (CSV_NAME, MAPS_NAME):
+        there = (directory / name).exists()
+        if there and name not in recorded:
+            said.append(f"{name} does not belong to these results")
+        elif not there and name in recorded:
+            said.append(f"{name} is missing")
+        elif there and sha256_of(directory / name) != recorded[name]:
+            said.append(f"{name} has changed since it was written")
+    return said
+
+
+def write_results(results: Results, directory: str | Path, *, force: bool = False) -> None:
+    """Write results.csv, summary.json, contact.h5 and report.html: all of them or none.
+
+    Without maps, a contact.h5 of an earlier run in that folder is removed, since it would pass
+    for this run's. The shards of a run under way (`tkamb.output.shards`) have served and go.
+
+    Args:
+        results: what to write.
+        directory: the folder; made if it is not there.
+        force: write even into a folder that holds things that are not tkamb's.
+
+    Raises:
+        InputError: the folder cannot be claimed (`tkamb.output.claim`) or written.
+    """
+    from tkamb.output.report import report_html
     from tkamb.output.shards import remove_shards
 
-    directory = claim_directory(directory)
-    write_numbers(results, directory)
-    _settle_maps(results.maps, directory)
-    write_report(results, directory / REPORT_NAME)
-    remove_shards(directory)
+    with claimed_directory(directory, force) as folder:
+        with replaced_together(folder) as files:
+            _put_maps(results.maps, files)
+            put_numbers(results, files)
+            write_synced(files.path(REPORT_NAME), report_html(results))
+        remove_shards(folder)
 
 
-def write_numbers(results: Results, directory: Path) -> None:
-    """Write results.csv and summary.json, each whole or not at all.
+def put_numbers(results: Results, files: Replacement) -> None:
+    """Write results.csv and summary.json with what becomes results.csv's and contact.h5's SHA-256.
 
-    Raises:
-        InputError: the folder cannot be written.
+    Args:
+        results: what to write.
+        files: among which a new contact.h5 is already; else the one in place is kept.
     """
-    results.write_csv(directory / CSV_NAME)
-    text = json.dumps(_plain(results.summary), indent=2, ensure_ascii=False, allow_nan=False)
-    write_text(directory / SUMMARY_NAME, text + "\n")
+    write_synced(files.path(CSV_NAME), csv_text(results.columns))
+    recorded = {CSV_NAME: sha256_of(files.path(CSV_NAME))}
+    if results.maps is None:
+        files.remove(MAPS_NAME)
+    else:
+        recorded[MAPS_NAME] = sha256_of(files.current(MAPS_NAME))
+    summary = _plain(results.summary) | {"files": recorded}
+    summary["summary_sha256"] = _summary_hash(summary)
+    text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
+    write_synced(files.path(SUMMARY_NAME), text + "\n")
 
 
-def read_csv(path: str | Path) -> dict[str, Any]:
-    """Read the columns of a results.csv.
-
-    Raises:
-        InputError: no such file, an unknown column, a row of another length, not a number.
-    """
-    path = Path(path)
-    try:
-        rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))
-    except FileNotFoundError:
-        raise InputError("no such file", path, "give a folder that `tkamb run` wrote") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read ({error})", path) from None
-    if not rows:
-        raise InputError("is empty", path)
-    header, body = rows[0], rows[1:]
-    for number, row in enumerate(body, start=2):
-        if len(row) != len(header):
-            raise InputError(f"line {number} has {len(row)} cells, not {len(header)}", path)
-    cells = list(zip(*body, strict=True)) or [() for _ in header]
-    return {name: _parsed(name, values, path) for name, values in zip(header, cells, strict=True)}
+def _summary_hash(summary: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of all of a summary but this."""
+    content = {key: value for key, value in summary.items() if key != "summary_sha256"}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _completed(given: Mapping[str, Any]) -> dict[str, Any]:
     names = ordered_names(given)
     unknown = sorted(set(given) - set(names))
     if unknown:
-        raise InputError(f"unknown column '{unknown[0]}'", "results")
+        raise InputError(f"unknown column '{unknown[0]}'", "results", names_near(unknown[0], KINDS))
     for needed in ("time_s", "status"):
         if needed not in given:
             raise InputError(f"column '{needed}' is missing", "results")
@@ -210,46 +250,6 @@ def _completed(given: Mapping[str, Any]) -> dict[str, Any]:
     return columns
 
 
-def _csv_text(columns: Mapping[str, Any]) -> str:
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(columns)
-    cells = [[_cell(name, value) for value in values] for name, values in columns.items()]
-    writer.writerows(zip(*cells, strict=True))
-    return buffer.getvalue()
-
-
-def _cell(name: str, value: Any) -> str:
-    kind = KINDS.get(name, "number")
-    if kind == "text":
-        return str(value)
-    if math.isnan(value):
-        return ""
-    if kind == "integer" and float(value).is_integer():
-        return str(int(value))
-    return repr(float(value))
-
-
-def _parsed(name: str, cells: tuple[str, ...], path: Path) -> Any:
-    if KINDS.get(name) == "text":
-        return list(cells)
-    if name not in KINDS and not is_ligament(name):
-        raise InputError(f"unknown column '{name}'", path)
-    try:
-        return np.array([float(cell) if cell else math.nan for cell in cells])
-    except ValueError as error:
-        raise InputError(f"column '{name}': {error}", path) from None
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError("no such file", path) from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot be read as JSON ({error})", path) from None
-
-
 def _plain(value: Any) -> Any:
     """Return the value with numpy, paths and NaN turned into what JSON has."""
     if isinstance(value, Mapping):
@@ -263,13 +263,15 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _settle_maps(maps: "ContactMaps | None", directory: Path) -> None:
-    path = directory / "contact.h5"
+def _put_maps(maps: "ContactMaps | None", files: Replacement) -> None:
+    """Write maps that are not in their place already."""
     if maps is None:
-        path.unlink(missing_ok=True)
         return
-    if isinstance(maps.source, Path) and maps.source.absolute() == path.absolute():
+    if (
+        isinstance(maps.source, Path)
+        and maps.source.absolute() == files.current(MAPS_NAME).absolute()
+    ):
         return
     from tkamb.output.maps_file import write_maps
 
-    write_maps(maps, path)
+    write_maps(maps, files.path(MAPS_NAME))

@@ -2,6 +2,7 @@
 
 import time as clock
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,15 +10,18 @@ from typing import TYPE_CHECKING, Any
 from tkamb.case import Case, load_case
 from tkamb.errors import InputError
 from tkamb.mechanics.mechanics import Mechanics
+from tkamb.output.claim import claimed_directory
+from tkamb.plausibility.plausibility import Plausibility
 from tkamb.results import Results
 from tkamb.run.recorder import FolderRecorder, Recorder, finished_results
 from tkamb.run.status import frame_status
-from tkamb.run.summary import run_identity, scene_hash, summary_of
+from tkamb.run.summary import input_hashes, run_identity, scene_hash, summary_of
 from tkamb.run.tabulate import frame_row, join_rows
 from tkamb.scene import Scene, load_scene
 
 if TYPE_CHECKING:
-    from tkamb.equilibrium.contact_side import ContactSide, FrameContact
+    from tkamb.equilibrium.contact_side import ContactSide
+    from tkamb.equilibrium.frame_contact import FrameContact
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
 
@@ -35,6 +39,7 @@ def simulate(
     scene_path: str | Path | None = None,
     progress: Progress = lambda frames: frames,
     resume: bool = False,
+    force: bool = False,
 ) -> Results:
     """Run a scene and return its results.
 
@@ -43,16 +48,17 @@ def simulate(
         contact: contact model, instead of the scene's.
         resolution_mm: spacing of the map points, instead of the scene's.
         frames: which frames; default all.
-        directory: an existing folder where the finished frames are kept, see
-            `tkamb.run.recorder`; None keeps them in memory.
+        directory: folder where the finished frames are kept, see `tkamb.run.recorder`; None
+            keeps them in memory.
         scene_path: where the scene came from, for the summary.
         progress: wraps the frame indices, a progress bar for example.
         resume: go on with what an earlier, interrupted run of the same scene and frames left
             in the folder; needs one.
+        force: write into the folder even if it holds things that are not tkamb's.
 
     Raises:
-        InputError: the scene or a file that it names cannot be used, or the run to resume is
-            another one.
+        InputError: the scene or a file that it names cannot be used, the run to resume is
+            another one, or the folder cannot be claimed (`tkamb.output.claim`).
         KeyboardInterrupt: with a folder, what was finished is written there first.
     """
     if isinstance(scene, str | Path):
@@ -68,16 +74,15 @@ def simulate(
         if done is not None:
             return done
     path = None if scene_path is None else Path(scene_path)
-    run = _Run(case, indices, identity, path, start)
+    run = _Run(case, indices, identity, input_hashes(case, path), path, start)
     run.prepare()  # before the folder is touched: bad input leaves it as it was
-    if directory is None:
+    with ExitStack() as stack:
         recorder = Recorder()
-    else:
-        recorder = FolderRecorder(Path(directory), identity, resume)
-    try:
+        if directory is not None:
+            folder = stack.enter_context(claimed_directory(directory, force))
+            recorder = FolderRecorder(folder, identity, resume)
+        stack.callback(recorder.close)
         return run.compute(recorder, progress)
-    finally:
-        recorder.close()
 
 
 @dataclass(eq=False)
@@ -87,12 +92,14 @@ class _Run:
     case: Case
     indices: range
     identity: dict[str, Any]
+    inputs: dict[str, str]
     path: Path | None
     start: float
 
     def prepare(self) -> None:
         """Build both sides of the equilibrium; whatever is wrong with the input shows here."""
         self.mechanics = Mechanics(self.case)
+        self.plausibility = Plausibility(self.mechanics)
         self.slips = self.mechanics.slips()
         self.seconds = {"read": clock.perf_counter() - self.start}
         self.side = self._contact_side() if self.case.scene.contact else None
@@ -117,14 +124,18 @@ class _Run:
             done = f"{len(self.recorder.rows)} of {len(self.indices)} frames"
             raise KeyboardInterrupt(f"{done} are kept; go on with --resume") from None
         self.recorder.finish()
-        return self.results()
+        results = self.results()
+        self.recorder.publish(results)
+        return results
 
     def results(self) -> Results:
         """Return the results so far; frames that are still to do are failed ones."""
         columns = join_rows(self.case, self.indices, self.recorder.rows)
         self.seconds["all"] = clock.perf_counter() - self.start
         summary = summary_of(self.case, columns, self.seconds, self.path, self.mechanics.strains)
+        summary["questions"] = [question.text for question in self.plausibility.questions]
         summary["identity"] = self.identity
+        summary["inputs"] = self.inputs
         summary["resumed_frames"] = self.resumed
         summary["unfinished_frames"] = len(self.indices) - len(self.recorder.rows)
         return Results(columns, summary, self.recorder.maps)
@@ -140,7 +151,8 @@ class _Run:
             before.append(contact)
             del before[:-LAST_FRAMES]
             arrays = contact_arrays(contact)
-        status = frame_status(self.case, k, body, contact)
+        doubts = self.plausibility.flags(k, body)
+        status = frame_status(self.case, k, body, contact, doubts)
         self.recorder.record(k, frame_row(self.case, k, body, contact, self.slips, status), arrays)
 
     def _contact_side(self) -> "ContactSide":

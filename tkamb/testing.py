@@ -11,8 +11,10 @@ import numpy as np
 import trimesh
 
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactModel, ContactPair, ContactResult, ContactStatus
+from tkamb.contact.model import ContactModel
+from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import first_touch_height, pose_at_approach
+from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array, inverse, knee_pose
 from tkamb.geometry.surface import Surface

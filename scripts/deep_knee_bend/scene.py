@@ -83,7 +83,7 @@ length_mm = {length:.1f}
 motion = "recorded"
 
 [contact]
-model = "foundation"
+model = "lattice"
 resolution_mm = 1.0
 material = "polyethylene"
 friction = 0.05

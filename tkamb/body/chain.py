@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from tkamb.body.load import PointForces, wrenches
-from tkamb.errors import InputError
+from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array, inverse, rotate, transform
 
 KNEE = ("knee_ap", "knee_si", "knee_ml", "knee_axial_rotation", "knee_adduction", "knee_flexion")
@@ -65,7 +65,7 @@ class Chain:
         """Return Pinocchio's id of a link's frame, or raise InputError naming the links."""
         if not self.model.existFrame(link, pin.FrameType.BODY):
             names = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
-            raise InputError(f"no link '{link}' in the URDF", None, f"links: {', '.join(names)}")
+            raise InputError(f"no link '{link}' in the URDF", None, names_near(link, names))
         return int(self.model.getFrameId(link, pin.FrameType.BODY))
 
     @property
@@ -84,6 +84,23 @@ class Chain:
         if frames[0].parentJoint != frames[1].parentJoint:
             raise InputError(f"link '{link}' is not fixed to '{base}'", "URDF")
         return inverse(frames[1].placement.homogeneous) @ frames[0].placement.homogeneous
+
+    def carrier(self, link: str) -> str:
+        """Return which of tibia, femur and patella a link is fixed to."""
+        own = self.model.frames[self.frame_id(link)].parentJoint
+        for base in ("tibia", "femur", "patella"):
+            if self.model.frames[self.frame_id(base)].parentJoint == own:
+                return base
+        raise InputError(f"link '{link}' is fixed to neither tibia, femur nor patella", "URDF")
+
+    def segment(self, link: str) -> tuple[float, Array, Array]:
+        """Return the inertia of a link, and of all that is fixed to it, in the link's frame.
+
+        Mass (kg), centre (3,) m, and tensor (3, 3) kg·m² about the centre.
+        """
+        frame = self.model.frames[self.frame_id(link)]
+        whole = self.model.inertias[frame.parentJoint].se3Action(frame.placement.inverse())
+        return float(whole.mass), np.array(whole.lever), np.array(whole.inertia)
 
     def on_shank(self, link: str) -> bool:
         """Return whether a link is fixed to the tibia, and not on the femur's side."""

@@ -18,6 +18,7 @@ from tkamb.body import unknowns
 from tkamb.body.chain import ChainState
 from tkamb.body.inverse_dynamics import Unknown, solve
 from tkamb.body.load import PointForces
+from tkamb.body.load_state import LoadState, contradictions, load_states, wrong_signs
 from tkamb.body.unknowns import CondylePoint
 from tkamb.geometry.frames import Array
 
@@ -79,6 +80,7 @@ class KneeLoads:
         condition: condition number (unit columns).
         lifted: sides that carry nothing.
         slack: the quadriceps would have had to push, so it carries nothing.
+        ambiguous: other load states have all signs right, too.
         problems: plain words; empty when all is well.
     """
 
@@ -90,52 +92,44 @@ class KneeLoads:
     condition: float
     lifted: frozenset[str]
     slack: bool
+    ambiguous: bool
     problems: tuple[str, ...]
 
 
 def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
-    """Return all loads of one frame.
+    """Return all loads of one frame: those of the load state whose signs all hold.
 
-    A muscle cannot push: where the quadriceps would have to, the extensor mechanism is slack
-    and the flexion moment that flexors would have to carry becomes a residual. A condyle
-    cannot pull: it is lifted off and the coronal moment becomes a residual.
+    Where several hold, the one that leaves out fewest loads is taken, and `ambiguous` says so;
+    where none does, the frame has no number. See `tkamb.body.load_state`.
 
     Args:
         geometry: the frame.
         friction: Coulomb coefficient of the femorotibial contact.
     """
-    system = _System(geometry, friction, geometry.lifted, slack=False)
-    if system.solution.values.get("quadriceps", 0.0) < 0:
-        system = _System(geometry, friction, geometry.lifted, slack=True)
-    pulling = system.pulling
-    if pulling and len(system.touching) == 2:
-        side = min(pulling, key=lambda name: system.solution.values[f"{name}_normal"])
-        system = _System(geometry, friction, system.lifted | {side}, system.slack)
-        pulling = system.pulling
-    solution = system.solution
-    problems = ["contact would have to pull"] if pulling else []
-    if not solution.regular:
-        problems.append("singular equations")
-    if problems:
-        return replace(unsolved(problems), condition=solution.condition)
-    flexion, adduction = system.external_moments()
-    return KneeLoads(
-        solution.values | (dict.fromkeys(EXTENSOR, 0.0) if system.slack else {}),
-        system.contact_force(solution.values),
-        flexion,
-        adduction,
-        system.sensitivity(),
-        solution.condition,
-        system.lifted,
-        system.slack,
-        (),
-    )
+    off = geometry.lifted
+    first, *others = load_states(geometry.condyles, off, geometry.extensor is not None)
+    full = _System(geometry, friction, first)
+    condition = full.solution.condition
+    if not full.solution.regular:
+        return replace(unsolved(("singular equations",)), condition=condition)
+    if not wrong_signs(first, full.solution):
+        return full.loads()
+    systems = {first: full} | {state: _System(geometry, friction, state) for state in others}
+    solutions = {state: system.solution for state, system in systems.items()}
+    wrong = {state: contradictions(state, solutions, off) for state in systems}
+    held = [system for state, system in systems.items() if not wrong[state]]
+    if not held:
+        reasons = ", ".join(f"{state.label}: {wrong[state][0]}" for state in systems)
+        problem = f"no load state has all signs right ({reasons})"
+        return replace(unsolved((problem,)), condition=condition)
+    return replace(held[0].loads(), ambiguous=len(held) > 1)
 
 
 def unsolved(problems: Iterable[str]) -> KneeLoads:
     """Return a frame without a number, and why."""
     nan = np.nan
-    return KneeLoads({}, np.full(3, nan), nan, nan, nan, nan, frozenset(), False, tuple(problems))
+    nothing = (frozenset[str](), False, False)
+    return KneeLoads({}, np.full(3, nan), nan, nan, nan, nan, *nothing, tuple(problems))
 
 
 class _System:
@@ -144,15 +138,12 @@ class _System:
     Args:
         geometry: the frame.
         friction: Coulomb coefficient.
-        lifted: sides that carry nothing.
-        slack: the extensor mechanism carries nothing.
+        assumed: what carries nothing.
     """
 
-    def __init__(
-        self, geometry: KneeGeometry, friction: float, lifted: frozenset[str], slack: bool
-    ) -> None:
+    def __init__(self, geometry: KneeGeometry, friction: float, assumed: LoadState) -> None:
         self.geometry, self.friction = geometry, friction
-        self.lifted, self.slack = lifted, slack
+        self.lifted, self.slack = assumed
         state = geometry.state
         hip = unknowns.hip(state.point("hip", np.zeros(3)))
         found = [*hip, *self._extensor(), *self._knee()]
@@ -171,10 +162,22 @@ class _System:
         """Sides that carry load."""
         return [side for side in self.geometry.condyles if side not in self.lifted]
 
-    @property
-    def pulling(self) -> list[str]:
-        """Sides whose contact force would have to be tensile."""
-        return [side for side in self.touching if self.solution.values[f"{side}_normal"] < 0]
+    def loads(self) -> KneeLoads:
+        """Return the loads of this set."""
+        values = self.solution.values
+        flexion, adduction = self.external_moments()
+        return KneeLoads(
+            values | (dict.fromkeys(EXTENSOR, 0.0) if self.slack else {}),
+            self.contact_force(values),
+            flexion,
+            adduction,
+            self.sensitivity(),
+            self.solution.condition,
+            self.lifted,
+            self.slack,
+            ambiguous=False,
+            problems=(),
+        )
 
     def contact_force(self, values: Mapping[str, float]) -> Array:
         """Return the femorotibial force on the femur (3,), insert frame, without residuals."""

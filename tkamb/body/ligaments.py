@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tkamb.body.load import PointForces
-from tkamb.errors import InputError
+from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array, transform
 from tkamb.scene_tables import Attachment, LigamentTable
 from tkamb.units import DEGREE, MILLIMETRE
@@ -177,8 +177,8 @@ def _build(table: LigamentTable, poses: Mapping[str, Array], flexion: Array) -> 
         raise InputError("has no stiffness", f"ligament {table.name}")
     for end in (table.proximal, table.distal):
         if end.link not in poses:
-            known = ", ".join(sorted(poses))
-            raise InputError(f"no link '{end.link}'", f"ligament {table.name}", f"links: {known}")
+            where = f"ligament {table.name}"
+            raise InputError(f"no link '{end.link}'", where, names_near(end.link, poses))
     bundle = Ligament(
         table.name,
         table.proximal.link,

@@ -39,6 +39,14 @@ NEAR = 5e-3
 """m: a place found farther from where the button first touched lies behind the femur."""
 
 
+class _Lost(ComputationError):
+    """A search that ended without a place: which condition was not met."""
+
+    def __init__(self, status: PatellaStatus) -> None:
+        super().__init__(status.value)
+        self.status = status
+
+
 @dataclass(frozen=True, eq=False)
 class _Balance:
     """Forces on the patella per unit quadriceps tension, in the joint's frame."""
@@ -68,17 +76,19 @@ def solve_patella(
         The state; coordinates and forces are NaN unless status is OK, SEVERAL or EDGE.
     """
     frame = _Frame(mechanism, pose_femur_in_insert)
-    several = False
-    try:
-        found = None if guess is None or not np.isfinite(guess).all() else frame.follow(guess)
-        if found is None:
-            found, several = frame.scan()
-    except ComputationError:
-        found = None
+    found, several = None, False
+    if guess is not None and np.isfinite(guess).all():
+        try:
+            found = frame.follow(guess)
+        except ComputationError:
+            found = None  # a guess that leads nowhere says nothing: all rotations are searched
     if found is None:
-        return _nothing(PatellaStatus.NOT_FOUND)
+        try:
+            found, several = frame.scan()
+        except _Lost as lost:
+            return _nothing(lost.status)
     if found.normal_force <= 0.0 or found.ligament_force <= 0.0:
-        return _nothing(PatellaStatus.NO_CONTACT)
+        return _nothing(PatellaStatus.PULL)
     status = PatellaStatus.SEVERAL if several else PatellaStatus.OK
     if found.contact.on_edge > 0.5:
         status = PatellaStatus.EDGE
@@ -137,8 +147,12 @@ class _Frame:
             float(moment),
         )
 
-    def settled(self, start: Array, rotation: float) -> _Balance | None:
-        """Return the balance where gap and ligament length hold at a rotation (Newton)."""
+    def settled(self, start: Array, rotation: float) -> _Balance:
+        """Return the balance where gap and ligament length hold at a rotation (Newton).
+
+        Raises:
+            ComputationError: they do not, or a line cannot run there.
+        """
         coordinates = np.array([start[0], start[1], rotation])
         for _ in range(40):
             balance = self.balance(coordinates)
@@ -151,57 +165,72 @@ class _Frame:
             step = np.linalg.solve(slopes, -errors)
             step *= min(1.0, 5e-3 / np.linalg.norm(step))
             coordinates = coordinates + np.append(step, 0.0)
-        return None
+        worst = np.argmax(np.abs(errors))
+        raise _Lost((PatellaStatus.GAP, PatellaStatus.LIGAMENT)[worst])
 
-    def follow(self, guess: Array) -> _Balance | None:
-        """Return the stable balance next to a guess: turn with the moment to its zero."""
+    def follow(self, guess: Array) -> _Balance:
+        """Return the stable balance next to a guess: turn with the moment to its zero.
+
+        Raises:
+            ComputationError: there is none within `WIDEST_TURN`.
+        """
         here = self.settled(guess, float(guess[2]))
-        if here is None:
-            return None
         step = FIRST_STEP
         while abs(here.coordinates[2] - guess[2]) < WIDEST_TURN:
             turn = here.coordinates[2] + np.sign(here.moment) * step
             there = self.settled(here.coordinates, float(turn))
-            if there is None:
-                return None
             if there.moment * here.moment <= 0.0:
                 return self.between(here, there)
             here, step = there, 1.6 * step
-        return None
+        raise _Lost(PatellaStatus.MOMENT)
 
-    def between(self, here: _Balance, there: _Balance) -> _Balance | None:
+    def between(self, here: _Balance, there: _Balance) -> _Balance:
         """Return the balance at the zero of the moment between two rotations."""
         last = here
 
         def moment(rotation: float) -> float:
             nonlocal last
-            settled = self.settled(last.coordinates, rotation)
-            if settled is None:
-                raise ComputationError("the patella's search left the femoral component")
-            last = settled
-            return settled.moment
+            last = self.settled(last.coordinates, rotation)
+            return last.moment
 
         ends = (here.coordinates[2], there.coordinates[2])
         brentq(moment, *ends, xtol=TURN_TOLERANCE, rtol=1e-12)
         return last
 
-    def scan(self) -> tuple[_Balance | None, bool]:
-        """Return the stable balance with the shortest quadriceps, and whether there are more."""
+    def scan(self) -> tuple[_Balance, bool]:
+        """Return the stable balance with the shortest quadriceps, and whether there are more.
+
+        Raises:
+            _Lost: there is none; with the condition that the nearest miss did not meet.
+        """
         flexion = np.arctan2(self.in_insert[1, 0], self.in_insert[0, 0])
         rotations = -0.65 * flexion + np.deg2rad(np.arange(-50.0, 50.1, 10.0))
-        places = [self.first_touch(float(rotation)) for rotation in rotations]
+        places: list[_Balance | None] = []
+        misses = []
+        for rotation in rotations:
+            try:
+                places.append(self.first_touch(float(rotation)))
+            except ComputationError as error:
+                places.append(None)
+                misses.append(_condition(error))
         found = []
         for here, there in pairwise(places):
             if here and there and here.moment > 0.0 >= there.moment:
-                balance = self.between(here, there)
-                if balance is not None:
-                    found.append(balance)
+                try:
+                    found.append(self.between(here, there))
+                except ComputationError as error:
+                    misses.append(_condition(error))
         if not found:
-            return None, False
+            misses += [PatellaStatus.MOMENT] * any(places)
+            raise _Lost(max(misses, key=_CONDITIONS.index))
         return min(found, key=lambda b: b.quadriceps.length), len(found) > 1
 
-    def first_touch(self, rotation: float) -> _Balance | None:
-        """Return the balance at a rotation, the patella swung in on its ligament from in front."""
+    def first_touch(self, rotation: float) -> _Balance:
+        """Return the balance at a rotation, the patella swung in on its ligament from in front.
+
+        Raises:
+            ComputationError: it touches nothing, or gap or length do not hold where it does.
+        """
         m = self.mechanism
         turned = m.contact.pose(np.array([0.0, 0.0, rotation]))
         proximal = transform(turned, m.ligament_proximal)
@@ -212,21 +241,17 @@ class _Frame:
             return np.append(self.tuberosity[:2] + swing - proximal[:2], rotation)
 
         leans = np.deg2rad(np.arange(75.0, -75.1, -5.0))
-        if m.contact.touches(place(leans[0])):
-            return None
         touching = next((k for k, lean in enumerate(leans) if m.contact.touches(place(lean))), 0)
-        if touching == 0:
-            return None
+        if touching == 0:  # never, or from the start
+            raise _Lost(PatellaStatus.NO_CONTACT)
         free, deep = leans[touching - 1], leans[touching]
         for _ in range(6):
             middle = 0.5 * (free + deep)
             free, deep = (free, middle) if m.contact.touches(place(middle)) else (middle, deep)
-        try:
-            found = self.settled(place(free), rotation)
-        except ComputationError:
-            return None
-        far = found is None or np.linalg.norm((found.coordinates - place(free))[:2]) > NEAR
-        return None if far else found
+        found = self.settled(place(free), rotation)
+        if np.linalg.norm((found.coordinates - place(free))[:2]) > NEAR:
+            raise _Lost(PatellaStatus.GAP)
+        return found
 
     def state(self, balance: _Balance, status: PatellaStatus) -> PatellaState:
         """Return the result in the insert frame."""
@@ -244,6 +269,21 @@ class _Frame:
             contact.tilt,
             status,
         )
+
+
+_CONDITIONS = (
+    PatellaStatus.NO_CONTACT,
+    PatellaStatus.LINE,
+    PatellaStatus.LIGAMENT,
+    PatellaStatus.GAP,
+    PatellaStatus.MOMENT,
+)
+"""In the order in which a search meets them: the last that any rotation missed is named."""
+
+
+def _condition(error: ComputationError) -> PatellaStatus:
+    """Return the condition that a search missed; errors of the lines have no status."""
+    return error.status if isinstance(error, _Lost) else PatellaStatus.LINE
 
 
 def _cross(a: Array, b: Array) -> float:

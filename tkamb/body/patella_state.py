@@ -8,13 +8,22 @@ from tkamb.geometry.frames import Array
 
 
 class PatellaStatus(Enum):
-    """How the search ended."""
+    """How the search ended: found, or which condition of the place was not met."""
 
     OK = "ok"
     SEVERAL = "several_solutions"
     EDGE = "contact_on_edge_of_femoral_mesh"
-    NO_CONTACT = "no_contact"
-    NOT_FOUND = "not_found"
+    NO_CONTACT = "no contact: the button meets the femoral component at no rotation"
+    LINE = "a line's end lies inside what it wraps, or runs along the contact normal"
+    GAP = "the gap to the femoral component does not close"
+    LIGAMENT = "the patellar ligament's length is not met"
+    MOMENT = "moments balance at no rotation that was tried"
+    PULL = "the contact would have to pull, or the patellar ligament to push"
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a place; else the value says which condition failed."""
+        return self in (PatellaStatus.OK, PatellaStatus.SEVERAL, PatellaStatus.EDGE)
 
 
 @dataclass(frozen=True, eq=False)

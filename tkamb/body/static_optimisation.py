@@ -24,7 +24,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from tkamb.errors import ComputationError
+from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
 
 NEWTON_TOLERANCE = 1e-10
@@ -127,6 +127,7 @@ def share_load(problem: LoadSharing) -> Shared:
     Raises:
         ComputationError: no activations within their bounds keep y within its own, or the
             sequence of programmes does not converge.
+        InputError: DAQP is not installed.
     """
     p, w = problem.exponent, problem.weight
     rest, pull, _ = problem._quadratic()
@@ -174,8 +175,11 @@ def kkt_residual(problem: LoadSharing, shared: Shared) -> float:
 
 def _programme(problem: LoadSharing, hessian: Array, gradient: Array) -> tuple[Array, Array, Array]:
     """Return activations and multipliers of min 1/2 a.H a + g.a within all bounds."""
-    import daqp
-
+    try:
+        import daqp
+    except ImportError:
+        mend = "install it: pip install 'tkamb[muscles]'"
+        raise InputError("the solver DAQP is not installed", "muscles", mend) from None
     scale = _row_scale(problem)
     bounded = np.isfinite(problem.lower) | np.isfinite(problem.upper)
     rows = problem.gain[bounded] / scale[bounded, None]

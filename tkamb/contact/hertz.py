@@ -11,16 +11,12 @@ from tkamb.contact.bed import STEEPEST, Bed, sample_bed
 from tkamb.contact.curvature import OsculatingContact, osculate
 from tkamb.contact.ellipse import ContactEllipse, contact_ellipse
 from tkamb.contact.foundation import gaps_along_normals
-from tkamb.contact.model import (
-    CondyleContact,
-    ContactModel,
-    ContactPair,
-    ContactResult,
-    ContactStatus,
-    PreparedContact,
-)
+from tkamb.contact.model import ContactModel
+from tkamb.contact.pair import ContactPair, PreparedContact
 from tkamb.contact.pressing import approach_at, failed_result
+from tkamb.contact.result import CondyleContact, ContactResult, ContactStatus
 from tkamb.contact.summary import summarise_condyles, thickness_under, wrench_of
+from tkamb.contact.validity import peak_flags
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import Array
@@ -268,7 +264,7 @@ def _collected(
         lateral=sides[1],
         approach=approach_at(state.pair, pose),
         status=ContactStatus.OK,
-        flags=flags,
+        flags=(*flags, *peak_flags(*sides)),
     )
 
 

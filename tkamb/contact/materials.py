@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 
-from tkamb.errors import InputError
+from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array
 from tkamb.units import MEGAPASCAL
 
@@ -263,7 +263,7 @@ def material(name: str, **overrides: float) -> Material:
         InputError: unknown name or override, or a value out of range.
     """
     if name not in MATERIALS:
-        raise InputError(f"no material '{name}'", mend=f"there are: {', '.join(MATERIALS)}")
+        raise InputError(f"no material '{name}'", mend=names_near(name, MATERIALS))
     linear = name == "polyethylene-linear"
     allowed = ("young_modulus", "poisson_ratio") if linear else tuple(_POLYETHYLENE)
     for key in overrides:

@@ -4,13 +4,19 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.contact.model import ContactModel, ContactPair, ContactResult, ContactStatus
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.validity import HALF, compression
 from tkamb.errors import InputError
+from tkamb.geometry.first_touch import Touch
 from tkamb.geometry.frames import Array
+
+if TYPE_CHECKING:
+    from tkamb.contact.model import ContactModel
 
 LOAD_TOLERANCE = 1e-6
 """Largest relative difference between reaction and load that counts as reached."""
@@ -51,11 +57,8 @@ def first_touch_height(pair: ContactPair, pose: Array) -> float:
     femoral component does not lie over the insert or the pose is not finite. The last few
     answers are kept.
     """
-    level = np.array(pose, float)
-    if not np.isfinite(level).all():
-        return math.nan
-    level[1, 3] = 0.0
-    return _touch_height(pair, level.tobytes())
+    touch = _touch_at(pair, pose)
+    return math.nan if touch is None else -touch.travel
 
 
 def approach_at(pair: ContactPair, pose: Array) -> float:
@@ -78,7 +81,7 @@ def check_load(load: float) -> None:
 
 
 def press_by_search(
-    model: ContactModel,
+    model: "ContactModel",
     state: Any,
     load: float,
     pose: Array,
@@ -120,7 +123,7 @@ def press_by_search(
         why = seen.at(found.deepest).flags
         lost = f"a load of {load:g} N cannot be reached"
         return failed_result(state, pose, lost, *why, found=found)
-    return _carried(seen.at(found.approach), found, load)
+    return within_insert(state, _carried(seen.at(found.approach), found, load))
 
 
 def _carried(result: ContactResult, found: LoadSearch, load: float) -> ContactResult:
@@ -141,7 +144,7 @@ class _Evaluations:
     """Evaluates a model at approaches and keeps the last result."""
 
     def __init__(
-        self, model: ContactModel, state: Any, pose: Array, guess: ContactResult | None
+        self, model: "ContactModel", state: Any, pose: Array, guess: ContactResult | None
     ) -> None:
         self._model, self._state, self._pose, self._guess = model, state, pose, guess
         self._approach = math.nan
@@ -219,7 +222,7 @@ def _between(low: float, low_value: float, high: float, high_value: float) -> fl
     return trial if low < trial < high else middle
 
 
-def unloaded_result(model: ContactModel, state: Any, pose: Array) -> ContactResult:
+def unloaded_result(model: "ContactModel", state: Any, pose: Array) -> ContactResult:
     """Return first touch: no pressure, no force."""
     touching = pose_at_approach(state.pair, pose, 0.0)
     result = model.evaluate(state, touching)
@@ -271,6 +274,39 @@ def failed_result(
     )
 
 
+def within_insert(state: Any, result: ContactResult, *more: str) -> ContactResult:
+    """Return the result if the bodies are not pressed through each other.
+
+    OUT_OF_RANGE where the approach is as large as the insert is thick; a flag from half of
+    that on. See `tkamb.contact.validity.compression`.
+
+    Args:
+        state: prepared contact.
+        result: a contact.
+        more: flags to add.
+    """
+    touch = _touch_at(state.pair, result.pose)
+    if touch is not None and result.approach > 0:
+        ratio, words = compression(state.pair, touch, result)
+        if ratio >= 1.0:
+            return failed_result(state, result.pose, f"{words}: {_THROUGH}", *result.flags)
+        if ratio >= HALF:
+            more = (*more, f"{words}: {_THROUGH}")
+    return replace(result, flags=(*result.flags, *more)) if more else result
+
+
+_THROUGH = "is there a spike or a thin place in a mesh?"
+
+
+def _touch_at(pair: ContactPair, pose: Array) -> Touch | None:
+    """Return the first touch of either condyle, whatever the pose's y; travel from y = 0."""
+    level = np.array(pose, float)
+    if not np.isfinite(level).all():
+        return None
+    level[1, 3] = 0.0
+    return _first_touch(pair, level.tobytes())
+
+
 @lru_cache(maxsize=8)
-def _touch_height(pair: ContactPair, level: bytes) -> float:
-    return -pair.first_touch.travel(np.frombuffer(level).reshape(4, 4))
+def _first_touch(pair: ContactPair, level: bytes) -> Touch | None:
+    return pair.first_touch.either(np.frombuffer(level).reshape(4, 4))

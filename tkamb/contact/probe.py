@@ -6,14 +6,17 @@ of `evaluate`. A model that knows its tangent brings a faster probe with stiffne
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.contact.model import ContactModel, ContactResult, ContactStatus
+from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.contact.summary import medial_points, wrench_of
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import Array
+
+if TYPE_CHECKING:
+    from tkamb.contact.model import ContactModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +85,9 @@ class Probe:
         guess: an earlier result.
     """
 
-    def __init__(self, model: ContactModel, state: Any, guess: ContactResult | None = None) -> None:
+    def __init__(
+        self, model: "ContactModel", state: Any, guess: ContactResult | None = None
+    ) -> None:
         self._model, self._state, self._guess = model, state, guess
         self._split = condyle_split(state.pair.femoral)
 

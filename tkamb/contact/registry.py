@@ -14,7 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tkamb.contact.model import ContactModel
-from tkamb.errors import InputError
+from tkamb.errors import InputError, names_near
 from tkamb.units import MILLIMETRE
 
 ENTRY_POINT_GROUP = "tkamb.contact"
@@ -50,7 +50,7 @@ def contact_class(name: str) -> type[ContactModel]:
     """
     offers = _offers()
     if name not in offers:
-        raise InputError(f"no contact model '{name}'", mend=f"there are: {', '.join(offers)}")
+        raise InputError(f"no contact model '{name}'", mend=names_near(name, offers))
     where = f"contact model '{name}' ({offers[name]})"
     module, _, attribute = offers[name].partition(":")
     try:
@@ -81,8 +81,7 @@ def contact_model(name: str, resolution_mm: float = 1.0, **options: Any) -> Cont
     own = _options(found)
     for option, value in options.items():
         if option not in own:
-            mend = f"it has: {', '.join(own)}" if own else "it has none"
-            raise InputError(f"has no option '{option}'", where, mend)
+            raise InputError(f"has no option '{option}'", where, names_near(option, own))
         words = _words(found, option)
         if words and value not in words:
             mend = f"one of {', '.join(map(str, words))}"

@@ -10,7 +10,8 @@ The source joins the two conditions by "and"; `restore_when="both"` does so.
 from dataclasses import replace
 from typing import Any, Literal
 
-from tkamb.contact.model import ContactModel, ContactResult, ContactStatus
+from tkamb.contact.model import ContactModel
+from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.geometry.adjustment import Adjustment, raised, touches, travel_to_touch
 from tkamb.geometry.closest import ClosestPointQuery
 

@@ -11,23 +11,25 @@
 
 import time as clock
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.body.knee import solve_knee, unsolved
 from tkamb.body.unknowns import CondylePoint
 from tkamb.case import Case
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactPair, ContactResult, ContactStatus
-from tkamb.contact.pressing import first_touch_height
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.pressing import first_touch_height, within_insert
 from tkamb.contact.probe import condyle_wrenches
 from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.contact.summary import medial_points
 from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.equilibrium.balance import BalanceStatus
+from tkamb.equilibrium.frame_contact import FrameContact
+from tkamb.equilibrium.split_sensitivity import split_sensitivity
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.mechanics.mechanics import FrameLoads, Mechanics
@@ -46,49 +48,6 @@ ASTRAY = (BalanceStatus.OUT_OF_RANGE, BalanceStatus.NOT_CONVERGED)
 """Ends of a search that another start may mend."""
 FIRST_DEPTH = 5e-5
 """m: how deep the search for released coordinates begins."""
-
-
-@dataclass(frozen=True, eq=False)
-class FrameContact:
-    """The contact side of one frame.
-
-    Args:
-        result: the contact, None where it could not be computed.
-        medial: (n,) which map points lie under the medial condyle.
-        adjustment: the femoral adjustment, checked and perhaps restored; None if not asked for.
-        seconds: computing time.
-        problem: why there is no result, or empty.
-        flags: plain words that a reader must know.
-        iterations: of body and contact, until they agreed; 0 if not coupled.
-        load_change: N, by the last of them.
-        point_change: m, likewise, of the centres of pressure.
-        settled: the search for the released coordinates, if there are any.
-    """
-
-    result: ContactResult | None
-    medial: NDArray[np.bool_]
-    adjustment: Adjustment | None
-    seconds: float
-    problem: str
-    flags: tuple[str, ...]
-    iterations: int = 0
-    load_change: float = NAN
-    point_change: float = NAN
-    settled: "SettledKnee | None" = None
-
-    def area_above(self, side: str, pressure: float) -> float:
-        """Return the share of a condyle's contact area above a pressure (Pa).
-
-        The tributary areas of the points above it, over the condyle's own area; 1 at most.
-        """
-        if self.result is None:
-            return NAN
-        condyle = self.result.medial if side == "medial" else self.result.lateral
-        if condyle is None:
-            return NAN
-        own = self.medial if side == "medial" else ~self.medial
-        above = self.result.area[own & (self.result.pressure > pressure)].sum()
-        return float(min(above / condyle.area, 1.0))
 
 
 class ContactSide:
@@ -125,8 +84,21 @@ class ContactSide:
             before: the contacts of the frames before: the last is a guess that saves time,
                 and the last that were found are where released coordinates begin.
         """
-        if self.released is not None:
-            return self._settled(self.released, k, before)
+        if self.released is None:
+            body, contact = self._pressed(k, before)
+        else:
+            body, contact = self._settled(self.released, k, before)
+        if contact.result is None or body.loads.problems or self.case.split is None:
+            return body, contact
+        if "adduction" in self.table.released:
+            return body, contact
+        start = clock.perf_counter()
+        sensitivity = split_sensitivity(self.model, self.state, contact.result)
+        seconds = contact.seconds + clock.perf_counter() - start
+        return body, replace(contact, sensitivity=sensitivity, seconds=seconds)
+
+    def _pressed(self, k: int, before: Sequence[FrameContact]) -> tuple[FrameLoads, FrameContact]:
+        """Return body and contact at the recorded rotation."""
         guess = before[-1].result if before else None
         body = self.mechanics.frame(k)
         contact = self.carry(body, self.mechanics.poses[k], guess)
@@ -214,6 +186,7 @@ class ContactSide:
         result, contact = None, self._nothing(settled.problem)
         if not settled.problem:
             result = self.model.evaluate(self.state, knee_pose(settled.coordinates), guess)
+            result = within_insert(self.state, result)
             contact = self._contact(result, None, 0.0)
         contact = replace(
             contact,
@@ -285,7 +258,9 @@ class ContactSide:
             reason = f"contact {result.status.value.replace('_', ' ')}"
             words = "; ".join((reason, *result.flags))
             return FrameContact(None, medial, adjustment, seconds, words, ())
-        return FrameContact(result, medial, adjustment, seconds, "", result.flags)
+        return FrameContact(
+            result, medial, adjustment, seconds, "", result.flags, triangles=self.state.triangles
+        )
 
     def _nothing(self, problem: str) -> FrameContact:
         none = np.zeros(len(self.state.points), bool)

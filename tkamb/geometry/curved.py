@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from tkamb.geometry.corner_normals import corner_normals
 from tkamb.geometry.frames import Array
+from tkamb.geometry.subdivision import Coarsened, coarsened
 from tkamb.geometry.surface import Surface
 
 Indices = NDArray[np.int64]
@@ -28,12 +29,15 @@ class CurvedSurface:
     t_j = n_j.e / n_j.N how far the tangent planes at its ends rise over it. On a quadratic
     surface t_i = t_j and h is exact. Where they differ their harmonic mean counts, and none
     where they bend opposite ways: a flat that meets a fillet stays flat, where the mean
-    would swell it.
+    would swell it. Where a surface has been cut finer without being curved, the patches are
+    those of the triangles before (`coarsened`).
 
     Args:
         surface: its triangles share their vertices.
         normals: (k, 3, 3) unit normals at the corners, see `corner_normals`.
         sagittas: (k, 3) m, of the edge opposite each corner, along the triangle's normal.
+        finer: the triangles that points are given on, and where they lie on the surface's;
+            None: they are the surface's own.
 
     Reference:
         Vlachos et al., Curved PN triangles, Proc I3D 2001, doi:10.1145/364338.364387 (the
@@ -43,12 +47,15 @@ class CurvedSurface:
     surface: Surface
     normals: Array
     sagittas: Array
+    finer: Coarsened | None = None
 
     @classmethod
     def of(cls, surface: Surface) -> "CurvedSurface":
         """Return the patches of a surface from its own corner normals."""
+        finer = coarsened(surface)
+        surface = surface if finer is None else finer.surface
         normals = corner_normals(surface)
-        return cls(surface, normals, _sagittas(surface, normals))
+        return cls(surface, normals, _sagittas(surface, normals), finer)
 
     @cached_property
     def _patches(self) -> Array:
@@ -61,7 +68,7 @@ class CurvedSurface:
         To first order in the patch's height.
 
         Args:
-            faces: (n,) triangles.
+            faces: (n,) triangles, of the finer surface if there is one.
             weights: (n, 3) barycentric coordinates of points on them.
             direction: (3,) unit vector.
 
@@ -69,6 +76,9 @@ class CurvedSurface:
             Signed distance (n,), m, and outward unit normals (n, 3), which are interpolated
             between the corners.
         """
+        if self.finer is not None:
+            weights = np.einsum("ij,ijk->ik", weights, self.finer.corners[faces])
+            faces = self.finer.parent[faces]
         corners, sagittas, planes = np.split(self._patches[faces], [9, 12], axis=1)
         normals = np.einsum("ij,ijk->ik", weights, corners.reshape(-1, 3, 3))
         normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]

@@ -86,8 +86,12 @@ class FirstTouch:
 
     def travel(self, pose: ArrayLike) -> float:
         """Return the travel (m) until either condyle touches; NaN if none lies over the insert."""
-        touch = self._touch(np.asarray(pose, float), None)
+        touch = self.either(pose)
         return float("nan") if touch is None else touch.travel
+
+    def either(self, pose: ArrayLike) -> Touch | None:
+        """Return the first touch of either condyle; None if none lies over the insert."""
+        return self._touch(np.asarray(pose, float), None)
 
     def _touch(self, pose: Array, side: int | None) -> Touch | None:
         """Return the touch of one condyle, 0 (medial) or 1 (lateral), or of either."""

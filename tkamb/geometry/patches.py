@@ -26,7 +26,8 @@ class Patches:
     def __init__(self, surface: Surface, reach: Array) -> None:
         low, high = surface.bounds
         edge = max(EDGE, float((high - low).max()) / MOST_CUBES)
-        cube = np.floor((surface.triangles.mean(axis=1) - low) / edge).astype(np.int64)
+        middle = np.maximum(surface.triangles.mean(axis=1) - low, 0.0)  # rounding may fall below
+        cube = np.floor(middle / edge).astype(np.int64)
         key = np.ravel_multi_index(tuple(cube.T), tuple(cube.max(axis=0) + 1))
         self._faces = np.argsort(key, kind="stable")
         begin = np.flatnonzero(np.diff(key[self._faces], prepend=-1))

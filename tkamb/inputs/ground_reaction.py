@@ -1,4 +1,4 @@
-"""The ground reaction on the foot, from one force plate.
+"""The ground reaction on the foot, from one force plate or from plates that share the load.
 
 The centre of pressure is a quotient, M/F, that means nothing near F = 0. So force and
 moment about the fixed laboratory origin are filtered, which is linear, and the centre of
@@ -11,7 +11,7 @@ loaded frames on either side and the moment is whatever the wrench needs about t
 force and moment stay exactly as measured and filtered, only their point is conventional.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -19,13 +19,25 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array
+from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import check_roles, laboratory_rotation
+from tkamb.inputs.samples import OddSample, check_range, check_spacing, odd_samples
 from tkamb.inputs.tables import Table, read_table
 from tkamb.scene_tables import GroundReactionTable
+from tkamb.units import MILLIMETRE
 
 LEVEL_TOLERANCE = 0.01
 """m; a centre of pressure that rises by more than this is not on a level plate."""
+LARGEST_FORCE = 20000.0
+"""N, twice what a triple jumper's foot bears."""
+LARGEST_MOMENT = 1000.0
+"""N·m, many times any free moment; plates that give it about their own origin stay below it."""
+ODD_FORCE, LEAST_ODD_FORCE, ODD_POINT = 0.05, 0.01, 5e-3
+"""Of a component's own peak, of the whole force's, and m: as near to its neighbours' curve as the
+larger of the forces, or as the last, no sample is odd."""
+WINDOW = 0.5
+"""s: samples farther from the frames than this do not reach them through the filter."""
 FARTHEST_FROM_ANKLE = 0.5
 """m; a centre of pressure farther from the ankle than this is under no foot of that leg."""
 
@@ -39,12 +51,14 @@ class GroundReaction:
         point: (f, 3) m, the centre of pressure.
         moment: (f, 3) N·m about that point; vertical while the foot is loaded.
         loaded: (f,) whether the vertical force is at or above `unloaded_N`.
+        odd: recorded samples around the frames that lie off their neighbours' curve.
     """
 
     force: Array
     point: Array
     moment: Array
     loaded: np.ndarray
+    odd: tuple[OddSample, ...] = ()
 
 
 def load_ground_reaction(
@@ -62,26 +76,60 @@ def load_ground_reaction(
             mainly upwards, or a centre of pressure is missing or not level while the plate is
             loaded.
     """
-    recorded = read_table(table.file, table.format)
-    stamps = recorded.time(table.columns.get("time", "time"))
-    force, point, moment = _recorded(table, recorded)
-    _check_upward(force, table, recorded)
+    from_plates = (table.format or table.file.suffix.lower().lstrip(".")) == "c3d"
+    if from_plates:
+        stamps, force, point, moment = _of_plates(table)
+    else:
+        recorded = read_table(table.file, table.format)
+        stamps = recorded.time(table.columns.get("time", "time"))
+        force, point, moment = _recorded(table, recorded)
+    path = table.file
+    check_spacing(path, stamps)
+    _check_upward(force, table)
     loaded = force[:, 1] >= table.unloaded_N
-    point = _held(stamps, point, loaded, recorded)
+    point = _held(stamps, point, loaded, path)
+    near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
+    # of plates the wrench was recorded: their point is a quotient, which small forces shake
+    points = None if from_plates else point[near]
+    odd = _odd_samples(path, stamps[near], force[near], points, loaded[near])
     level = float(np.median(point[loaded, 1])) if loaded.any() else 0.0
     if loaded.any() and np.abs(point[loaded, 1] - level).max() > LEVEL_TOLERANCE:
         raise InputError(
             "the centre of pressure leaves the plate's level while it is loaded",
-            recorded.path,
+            path,
             "check columns point_1..3, length_unit and laboratory_axes",
         )
     if side == "left":
         force, point, moment = force @ MIRROR, point @ MIRROR, -moment @ MIRROR
     wrench = np.concatenate([force, np.cross(point, force) + moment], axis=1)
     filtered, _, _ = differentiate_coordinates(
-        stamps, wrench, table.cutoff_Hz, time, name=str(recorded.path)
+        stamps, wrench, table.cutoff_Hz, time, name=str(path)
     )
-    return _at_centre_of_pressure(filtered, level, table.unloaded_N, time, stamps, point)
+    reaction = _at_centre_of_pressure(filtered, level, table.unloaded_N, time, stamps, point)
+    return replace(reaction, odd=odd)
+
+
+def _odd_samples(
+    path: Path, stamps: Array, force: Array, point: Array | None, loaded: np.ndarray
+) -> tuple[OddSample, ...]:
+    """Return the odd samples of force and recorded point (n, 3), where the plate stays loaded."""
+    if not loaded.any():
+        return ()
+    peaks = np.abs(force).max(axis=0)
+    floors = np.maximum(ODD_FORCE * peaks, LEAST_ODD_FORCE * peaks.max())
+    inside = loaded.copy()  # two samples away from where the foot comes down or leaves
+    for shift in (1, 2):
+        inside[shift:] &= loaded[:-shift]
+        inside[:-shift] &= loaded[shift:]
+    kept = set(stamps[inside].tolist())
+    odd: list[OddSample] = []
+    for axis in range(3):
+        one = (path, f"force_{axis + 1}", stamps, force[:, axis])
+        odd += odd_samples(*one, float(floors[axis]), 1.0, "N")
+        if point is not None:
+            one = (path, f"point_{axis + 1}", stamps, point[:, axis])
+            odd += odd_samples(*one, ODD_POINT, MILLIMETRE, "mm")
+    return tuple(sample for sample in odd if sample.time in kept)
 
 
 def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
@@ -118,10 +166,58 @@ def _recorded(table: GroundReactionTable, recorded: Table) -> tuple[Array, Array
             columns.append(np.zeros_like(columns[0]))
     values = np.stack(columns, axis=1).reshape(-1, 3, 3) @ rotation.T
     scale = recorded.unit_scale(table.length_unit, "length_unit")
-    return values[:, 0], values[:, 1] * scale, values[:, 2]
+    force, point, moment = values[:, 0], values[:, 1] * scale, values[:, 2]
+    for kind, found, largest, unit in (
+        ("force", force, LARGEST_FORCE, "N"),
+        ("moment", moment, LARGEST_MOMENT, "N·m"),
+    ):
+        for axis in range(3):
+            what, limits = f"foot: {kind}_{axis + 1}", (-largest, largest)
+            question = f"is a cell mistyped, or the {kind} not in {unit}?"
+            check_range(recorded.path, what, found[:, axis], limits, unit, question)
+    return force, point, moment
 
 
-def _check_upward(force: Array, table: GroundReactionTable, recorded: Table) -> None:
+def _of_plates(table: GroundReactionTable) -> tuple[Array, Array, Array, Array]:
+    """Return times (k,) s, force, point and free moment, each (k, 3), of a recording's plates.
+
+    The wrenches are summed about the laboratory's origin and kept: the point lies on the level
+    of the plates' surface, carried over in time while the vertical force is below `unloaded_N`.
+    """
+    recording = read_c3d(table.file)
+    check_roles(table.columns, (), table.file, "ground_reaction")
+    there = {plate.number: plate for plate in recording.plates}
+    missing = [number for number in table.plates if number not in there]
+    if missing or not table.plates:
+        asked = f"has no force plate {missing[0]}" if missing else "holds several force plates"
+        raise InputError(
+            asked if there else "holds no force plate",
+            table.file,
+            f"give [ground_reaction] plates, of {', '.join(map(str, there)) or 'none'}",
+        )
+    rotation = laboratory_rotation(table.laboratory_axes, table.file)
+    plates = [there[number] for number in dict.fromkeys(table.plates)]
+    wrench = np.sum([plate.wrench for plate in plates], axis=0)
+    force, about_origin = wrench[:, :3] @ rotation.T, wrench[:, 3:] @ rotation.T
+    levels = [float((rotation @ plate.centre)[1]) for plate in plates]
+    if np.ptp(levels) > LEVEL_TOLERANCE:
+        raise InputError("the plates lie at different levels", table.file, "give them one by one")
+    point = np.full_like(force, np.nan)
+    loaded = force[:, 1] >= table.unloaded_N
+    point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], levels[0])
+    point = _held(recording.analog_time, point, loaded, table.file)
+    return recording.analog_time, force, point, about_origin - np.cross(point, force)
+
+
+def _centre_of_pressure(force: Array, about_origin: Array, level: float) -> Array:
+    """Return the point (k, 3) m at a level where the moment is vertical; see the module."""
+    fx, fy, fz = force.T
+    x = (about_origin[:, 2] + level * fx) / fy
+    z = (level * fz - about_origin[:, 0]) / fy
+    return np.stack([x, np.full_like(x, level), z], axis=1)
+
+
+def _check_upward(force: Array, table: GroundReactionTable) -> None:
     """Raise where the largest force on the foot points down or sideways."""
     up, down = float(force[:, 1].max()), float(-force[:, 1].min())
     aside = float(np.hypot(force[:, 0], force[:, 2]).max())
@@ -130,19 +226,19 @@ def _check_upward(force: Array, table: GroundReactionTable, recorded: Table) -> 
         raise InputError(
             f"the ground pushes the foot up with {max(up, 0.0):.4g} N at most, but {word} with "
             f"{size:.4g} N",
-            recorded.path,
+            table.file,
             "check [ground_reaction] columns and laboratory_axes; it is the force on the foot",
         )
 
 
-def _held(stamps: Array, point: Array, loaded: np.ndarray, recorded: Table) -> Array:
+def _held(stamps: Array, point: Array, loaded: np.ndarray, path: Path) -> Array:
     """Return the points with those of the unloaded plate carried over in time."""
     missing = loaded & ~np.isfinite(point).all(axis=1)
     if missing.any():
         raise InputError(
             f"the centre of pressure is missing at {stamps[np.argmax(missing)]:g} s, "
             "where the plate is loaded",
-            recorded.path,
+            path,
             "fill the gap",
         )
     if not loaded.any():
@@ -158,8 +254,6 @@ def _at_centre_of_pressure(
     loaded = force[:, 1] >= unloaded_N
     point = np.stack([np.interp(time, stamps, held[:, k]) for k in range(3)], axis=1)
     point[:, 1] = level
-    fx, fy, fz = force[loaded].T
-    point[loaded, 0] = (about_origin[loaded, 2] + level * fx) / fy
-    point[loaded, 2] = (level * fz - about_origin[loaded, 0]) / fy
+    point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], level)
     moment = about_origin - np.cross(point, force)
     return GroundReaction(force, point, moment, loaded)

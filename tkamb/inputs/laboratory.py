@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tkamb.errors import InputError
+from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array, pose
 from tkamb.inputs.tables import Table
 from tkamb.units import ANGLE
@@ -36,11 +36,11 @@ def check_roles(columns: dict[str, str], roles: tuple[str, ...], path: Path, tab
     for role in columns:
         if role not in roles:
             raise InputError(
-                f"unknown role '{role}' in [{table}] columns", path, f"one of {', '.join(roles)}"
+                f"unknown role '{role}' in [{table}] columns", path, names_near(role, roles)
             )
 
 
-def angle_scale(table: Table, angle_unit: str) -> float:
+def angle_scale(table: Table, angle_unit: str | None) -> float:
     """Return radians per unit of angle, unless the file's own header contradicts the scene."""
     if table.in_degrees is not None and table.in_degrees != (angle_unit == "deg"):
         stated = "degrees" if table.in_degrees else "radians"
@@ -49,11 +49,16 @@ def angle_scale(table: Table, angle_unit: str) -> float:
             table.path,
             "correct angle_unit",
         )
+    assert angle_unit is not None
     return ANGLE[angle_unit]
 
 
 def poses_of_columns(
-    table: Table, columns: dict[str, str], sequence: str, angle_unit: str, length_unit: str
+    table: Table,
+    columns: dict[str, str],
+    sequence: str,
+    angle_unit: str | None,
+    length_unit: str | None,
 ) -> Array:
     """Return the poses (n, 4, 4) of columns rotation_1..3 and translation_1..3, m.
 

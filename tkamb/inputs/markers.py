@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, pose, transform
+from tkamb.inputs.labels import matched_labels
 from tkamb.inputs.tables import Table
 from tkamb.scene_tables import TibiaTable
 from tkamb.units import MILLIMETRE
@@ -16,14 +17,17 @@ WRONG_MARKERS = 0.05
 def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) -> Array:
     """Return the markers (n, m, 3), m, in the file's axes; gaps are NaN.
 
+    A marker is found by its label, whatever prefix, dots and underscores that carries.
+
     Raises:
         InputError: a marker is not in the file; the message lists the nearest names.
     """
-    known = {column[:-2] for column in table.columns if column.endswith("_x")}
+    labels = [column[:-2] for column in table.columns if column.endswith("_x")]
+    known = matched_labels(names, labels)
     for name in names:
         if name not in known:
             table.column(f"{name}_x")
-    columns = [[table.column(f"{name}_{axis}") for axis in "xyz"] for name in names]
+    columns = [[table.column(f"{known[name]}_{axis}") for axis in "xyz"] for name in names]
     return np.moveaxis(np.array(columns), 2, 0) * metres_per_unit
 
 
@@ -82,8 +86,7 @@ def fit_rigid(points: Array, reference: Array, name: str = "the tibia") -> tuple
 
     Reference: Kabsch, Acta Cryst A32:922 (1976), doi:10.1107/S0567739476001873.
     """
-    centred = reference - reference.mean(axis=0)
-    if len(reference) < 3 or np.linalg.svd(centred, compute_uv=False)[1] < 1e-3:
+    if not _spans(reference):
         raise InputError(
             f"markers of {name} fix no orientation: fewer than three, or all on one line",
             "[tibia]",
@@ -96,14 +99,67 @@ def fit_rigid(points: Array, reference: Array, name: str = "the tibia") -> tuple
     return result, residual
 
 
+def fit_seen(points: Array, reference: Array, weights: Array, name: str) -> tuple[Array, Array]:
+    """Return the weighted rigid fit of the markers that are seen, frame by frame.
+
+    As `fit_rigid`, with weights and with gaps: a frame needs three markers that span a
+    triangle, others give NaN.
+
+    Args:
+        points: (n, m, 3) m, gaps NaN.
+        reference: (m, 3) m.
+        weights: (m,) of the squared distances.
+        name: of the body, for the message.
+
+    Returns:
+        pose_body_in_world (n, 4, 4), and root mean square distance (n,) m of those seen.
+
+    Raises:
+        InputError: the reference markers fix no orientation.
+    """
+    seen = np.isfinite(points).all(axis=2)
+    if not _spans(reference[weights > 0]):
+        raise InputError(
+            f"markers of {name} fix no orientation: fewer than three, or all on one line",
+            "[motion.markers]",
+            "name three or more that span a triangle",
+        )
+    w = np.where(seen, weights, 0.0)
+    patterns, of_frame = np.unique(w > 0, axis=0, return_inverse=True)
+    usable = np.array([_spans(reference[row]) for row in patterns])[of_frame.ravel()]
+    total = np.where(usable, w.sum(axis=1), 1.0)[:, None]
+    there = np.nan_to_num(points)
+    mean = np.einsum("nm,nmi->ni", w, there) / total
+    own = w @ reference / total
+    h = np.einsum("nm,nmi,nmj->nij", w, reference - own[:, None], there - mean[:, None])
+    rotation = _nearest_rotation(h)
+    poses = pose(rotation, mean - np.einsum("nij,nj->ni", rotation, own))
+    fitted = transform(poses, np.broadcast_to(reference, points.shape))
+    square = np.where(seen, np.sum((fitted - there) ** 2, axis=2), 0.0)
+    rms = np.sqrt(square.sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
+    poses[~usable], rms[~usable] = np.nan, np.nan
+    return poses, rms
+
+
+def _spans(reference: Array) -> bool:
+    """Return whether points (m, 3) span a triangle."""
+    centred = reference - reference.mean(axis=0) if len(reference) else reference
+    return len(reference) >= 3 and bool(np.linalg.svd(centred, compute_uv=False)[1] >= 1e-3)
+
+
+def _nearest_rotation(h: Array) -> Array:
+    """Return the rotations (n, 3, 3) of Kabsch's covariances (n, 3, 3); see `fit_rigid`."""
+    u, _, vt = np.linalg.svd(h)
+    v, ut = np.swapaxes(vt, 1, 2), np.swapaxes(u, 1, 2)
+    signs = np.ones((len(h), 3))
+    signs[:, 2] = np.sign(np.linalg.det(v @ ut))
+    return np.asarray((v * signs[:, None, :]) @ ut)
+
+
 def _fitted(points: Array, reference: Array) -> tuple[Array, Array]:
     means, centre = points.mean(axis=1), reference.mean(axis=0)
     h = np.einsum("mi,nmj->nij", reference - centre, points - means[:, None])
-    u, _, vt = np.linalg.svd(h)
-    v, ut = np.swapaxes(vt, 1, 2), np.swapaxes(u, 1, 2)
-    signs = np.ones((len(points), 3))
-    signs[:, 2] = np.sign(np.linalg.det(v @ ut))
-    rotation = (v * signs[:, None, :]) @ ut
+    rotation = _nearest_rotation(h)
     poses = pose(rotation, means - rotation @ centre)
     fitted = transform(poses, np.broadcast_to(reference, points.shape))
     residual = np.sqrt(np.mean(np.sum((fitted - points) ** 2, axis=2), axis=1))

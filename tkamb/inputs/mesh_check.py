@@ -6,16 +6,18 @@ from typing import Any
 
 import numpy as np
 
+from tkamb.geometry.bodies import separate_bodies
 from tkamb.geometry.boundary import BoundaryLoop, boundary_loops
 from tkamb.geometry.flat_bottom import facing, find_flats
 from tkamb.geometry.frames import Array
 from tkamb.geometry.repair import Repair, connected_parts, repair
 from tkamb.geometry.surface import Surface
-from tkamb.inputs.meshes import BONE_SIZE, Indices, plausible_units, read_triangles
+from tkamb.inputs.meshes import BONE_SIZE, SHEET_WIDTH, Indices, plausible_units, read_triangles
 from tkamb.units import LENGTH
 
 _TYPICAL = 0.08
 _LEAST_SHARE = 0.12
+_MOST_LISTED = 10
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,23 @@ class FlatSide:
 
 
 @dataclass(frozen=True)
+class Part:
+    """One of the separate bodies: triangles, extents and centre in file units, closed or not."""
+
+    triangles: int
+    extents: tuple[float, ...]
+    centre: tuple[float, ...]
+    closed: bool
+
+    def line(self) -> str:
+        """Return its size and place, in file units."""
+        size = " × ".join(f"{extent:.4g}" for extent in self.extents)
+        where = ", ".join(f"{value:.4g}" for value in self.centre)
+        state = "closed" if self.closed else "open"
+        return f"{self.triangles} triangles, {size} at ({where}), {state}"
+
+
+@dataclass(frozen=True)
 class MeshHealth:
     """What a mesh file holds. Lengths are in the file's own units.
 
@@ -46,6 +65,8 @@ class MeshHealth:
         vertices: after equal corners are merged.
         extents: along the mesh's x, y and z.
         components: connected parts.
+        bodies: the separate bodies once small defects are mended, the largest skin first; a
+            void belongs to the body around it.
         watertight: whether the mesh is closed as it is.
         closed_after_repair: whether it is closed once small defects are mended.
         repairs: what loading would mend.
@@ -62,6 +83,7 @@ class MeshHealth:
     vertices: int
     extents: tuple[float, ...]
     components: int
+    bodies: tuple[Part, ...]
     watertight: bool
     closed_after_repair: bool
     repairs: tuple[str, ...]
@@ -83,11 +105,22 @@ class MeshHealth:
             f"{self.file}",
             f"  {self.triangles} triangles, {self.vertices} vertices, "
             f"{_counted(self.components, 'component')}",
+            *self._parts(),
             f"  {self._closedness()}",
             *(f"  would be mended when loaded: {phrase}" for phrase in self.repairs),
             *self._defects(),
             f"  extents {size} in file units: {self._unit_question()}",
             *self._axis_questions(),
+        ]
+
+    def _parts(self) -> list[str]:
+        if len(self.bodies) < 2:
+            return []
+        rest = len(self.bodies) - _MOST_LISTED
+        return [
+            f"  {len(self.bodies)} separate bodies; `tkamb mesh part FILE N --out F` writes one:",
+            *(f"    {n}: {b.line()}" for n, b in enumerate(self.bodies[:_MOST_LISTED], start=1)),
+            *([f"    and {rest} smaller"] if rest > 0 else []),
         ]
 
     def _extent(self, axis: str) -> float:
@@ -104,6 +137,10 @@ class MeshHealth:
         for hole in self.remaining_holes[:5]:
             where = ", ".join(f"{value:.4g}" for value in hole.centre)
             lines.append(f"  open: {hole.edges} edges, {hole.width:.3g} wide, at ({where})")
+        if self.remaining_holes and self.remaining_holes[0].width > SHEET_WIDTH * max(self.extents):
+            lines.append(
+                "  an open sheet, which no run takes as a part: give the whole closed part"
+            )
         if len(self.remaining_holes) > 5:
             lines.append(f"  open: {len(self.remaining_holes) - 5} more")
         if self.forks:
@@ -142,10 +179,7 @@ def check_mesh(path: str | Path) -> MeshHealth:
         InputError: no such file, not a mesh, no triangles, or NaN.
     """
     vertices, faces = read_triangles(path)
-    extents = np.ptp(vertices[faces.reshape(-1)], axis=0)
-    longest = float(extents.max())
-    units = plausible_units(longest) or plausible_units(longest, BONE_SIZE)
-    scale = LENGTH[units[0]] if units else _TYPICAL / (longest or 1.0)
+    extents, units, scale = _measured(vertices, faces)
     mended = repair(vertices * scale, faces)
     merged, corners, watertight = _as_it_is(vertices, faces)
     return MeshHealth(
@@ -154,6 +188,7 @@ def check_mesh(path: str | Path) -> MeshHealth:
         vertices=len(merged),
         extents=tuple(float(extent) for extent in extents),
         components=int(connected_parts(corners).max()) + 1,
+        bodies=_bodies(mended, scale),
         watertight=watertight,
         closed_after_repair=not (mended.holes or len(mended.forks) or mended.one_sided),
         repairs=mended.notices,
@@ -163,6 +198,37 @@ def check_mesh(path: str | Path) -> MeshHealth:
         one_sided=mended.one_sided,
         units=tuple(units),
         flats=_flats(mended, str(path)),
+    )
+
+
+def mended_mesh(path: str | Path) -> tuple[Repair, float]:
+    """Return a mesh as loading would mend it, in metres by a guessed unit, and that unit in m.
+
+    Raises:
+        InputError: as `check_mesh`.
+    """
+    vertices, faces = read_triangles(path)
+    scale = _measured(vertices, faces)[2]
+    return repair(vertices * scale, faces), scale
+
+
+def _measured(vertices: Array, faces: Indices) -> tuple[Array, list[str], float]:
+    """Return the extents, the units that make it a part of a knee, and a unit in m."""
+    extents = np.ptp(vertices[faces.reshape(-1)], axis=0)
+    longest = float(extents.max())
+    units = plausible_units(longest) or plausible_units(longest, BONE_SIZE)
+    return extents, units, LENGTH[units[0]] if units else _TYPICAL / (longest or 1.0)
+
+
+def _bodies(mended: Repair, scale: float) -> tuple[Part, ...]:
+    return tuple(
+        Part(
+            len(body.faces),
+            tuple(float(extent) for extent in body.extents / scale),
+            tuple(float(value) for value in body.centre / scale),
+            body.closed,
+        )
+        for body in separate_bodies(mended.vertices, mended.faces)
     )
 
 

@@ -8,10 +8,13 @@ import trimesh
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
+from tkamb.files import MESH_LIMIT, check_file
+from tkamb.geometry.bodies import Body, separate_bodies
 from tkamb.geometry.boundary import BoundaryLoop
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.geometry.repair import Repair, repair
 from tkamb.geometry.surface import Surface
+from tkamb.inputs.vtp import read_vtp
 from tkamb.units import LENGTH, MILLIMETRE
 
 Indices = NDArray[np.int64]
@@ -20,6 +23,9 @@ IMPLANT_SIZE = (0.010, 0.250)
 """m; least and greatest length of a part of a knee implant."""
 BONE_SIZE = (0.010, 0.650)
 """m; least and greatest length of a bone at the knee, whole or in part."""
+
+SHEET_WIDTH = 1.0 / 3.0
+"""An opening wider than this share of a part's length makes it a sheet."""
 
 _log = logging.getLogger("tkamb")
 
@@ -67,7 +73,7 @@ def load_surface(
     closed: bool = False,
     size: tuple[float, float] = IMPLANT_SIZE,
 ) -> Surface:
-    """Read an STL, OBJ or PLY file as a surface in anatomical axes and metres.
+    """Read an STL, OBJ, PLY or VTP file as a surface in anatomical axes and metres.
 
     Mended with one warning on the logger "tkamb": duplicate, degenerate and wrongly wound
     faces, loose vertices, cracks and small holes (`tkamb.geometry.repair`).
@@ -85,7 +91,8 @@ def load_surface(
 
     Raises:
         InputError: no such file, no mesh, no triangles, NaN, a size that no knee part has,
-            not a surface, or open where it must be closed.
+            not a surface, or open where it must be closed; a part of an implant that is an
+            open sheet or, where it must be closed, several separate bodies.
     """
     rotation = axes_rotation(axes)
     if unit not in LENGTH:
@@ -94,6 +101,8 @@ def load_surface(
     _check_size(vertices[faces.reshape(-1)], unit, path, name, size)
     mended = repair(vertices * LENGTH[unit], faces)
     _check_surface(mended, path, name, unit)
+    if size == IMPLANT_SIZE:
+        _check_part(mended, path, name, rotation[2])
     if closed and mended.holes:
         raise InputError(
             f"{name} is not closed: {describe_holes(mended.holes, unit)}", path, _CLOSE
@@ -118,21 +127,9 @@ def read_triangles(path: str | Path) -> tuple[Array, Indices]:
         InputError: no such file, not a mesh, no triangles, or NaN.
     """
     path = Path(path)
-    try:
-        if not path.is_file():
-            raise InputError("no such mesh file", path, "check the path")
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except InputError:
-        raise
-    except ImportError:  # an STL that is not binary goes to the reader of text, which is extra
-        raise InputError("cannot be read as a mesh (cut short, or text)", path, _FORMATS) from None
-    except Exception as error:  # readers of many formats: each raises what it likes
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise InputError(f"cannot be read as a mesh ({reason})", path, _FORMATS) from None
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError("holds no triangles", path, _FORMATS)
-    faces = np.asarray(mesh.faces, np.int64)
-    vertices = np.asarray(mesh.vertices, np.float64)
+    vertices, faces = read_vtp(path) if path.suffix.lower() == ".vtp" else _read_mesh(path)
+    if len(faces) == 0:
+        raise InputError(_NO_TRIANGLES, path, _FORMATS)
     bad = ~np.isfinite(vertices[faces]).all(axis=(1, 2))
     if bad.any():
         raise InputError(
@@ -141,13 +138,34 @@ def read_triangles(path: str | Path) -> tuple[Array, Indices]:
             path,
             "export the mesh again",
         )
-    vertices = np.where(np.isfinite(vertices), vertices, 0.0)
-    return vertices, faces
+    return np.where(np.isfinite(vertices), vertices, 0.0), faces
+
+
+def _read_mesh(path: Path) -> tuple[Array, Indices]:
+    """Return vertices and faces of an STL, OBJ or PLY file, as trimesh reads it."""
+    try:
+        check_file(path, MESH_LIMIT, what="mesh file")
+        mesh = trimesh.load(path, force="mesh", process=False)
+    except InputError:
+        raise
+    except ImportError:  # an STL that is not binary goes to the reader of text, which is extra
+        raise InputError("cannot be read as a mesh (cut short, or text)", path, _FORMATS) from None
+    except Exception as error:  # readers of many formats: each raises what it likes
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise InputError(f"cannot be read as a mesh ({reason})", path, _FORMATS) from None
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise InputError(_NO_TRIANGLES, path, _FORMATS)
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
 
 
 def plausible_units(extent: float, size: tuple[float, float] = IMPLANT_SIZE) -> list[str]:
     """Return the units in which the largest extent (file units) is within `size` (m)."""
     return [unit for unit, metres in LENGTH.items() if size[0] <= extent * metres <= size[1]]
+
+
+def body_size(body: Body, unit: float) -> str:
+    """Return the extents of a body along the mesh's axes, in a unit of `unit` m."""
+    return " × ".join(f"{extent / unit:.3g}" for extent in body.extents)
 
 
 def describe_holes(holes: tuple[BoundaryLoop, ...], unit: str) -> str:
@@ -161,7 +179,8 @@ def describe_holes(holes: tuple[BoundaryLoop, ...], unit: str) -> str:
     return text if more == 0 else f"{text}, and {more} more"
 
 
-_FORMATS = "give an STL, OBJ or PLY file of triangles"
+_NO_TRIANGLES = "holds no triangles: is it cut short, or text?"
+_FORMATS = "give an STL, OBJ, PLY or VTP file of triangles"
 _CLOSE = "close it in a mesh editor; holes up to about a lattice cell (2 mm) are closed for you"
 
 
@@ -169,6 +188,44 @@ def _opposite(names: list[str]) -> str:
     last = names[2]
     turned = f"-{last[-1]}" if last[0] != "-" else f"+{last[-1]}"
     return ",".join([*names[:2], turned])
+
+
+def _check_part(mended: Repair, path: str | Path, name: str, right: Array) -> None:
+    """Refuse an open sheet, such as a contact surface, and several bodies in one file."""
+    extent = float(np.ptp(mended.vertices, axis=0).max())
+    if mended.holes and mended.holes[0].width > SHEET_WIDTH * extent:
+        raise InputError(
+            f"{name} is an open sheet, like a contact surface: its opening is "
+            f"{mended.holes[0].width / MILLIMETRE:.3g} mm wide, so that nothing tells its inside "
+            "(where another part overlaps it) from its outside",
+            path,
+            "give the whole closed part that the sheet was cut from",
+        )
+    bodies = separate_bodies(mended.vertices, mended.faces)
+    if len(bodies) > 1 and not _two_condyles(bodies, right):
+        sizes = ", ".join(body_size(body, MILLIMETRE) for body in bodies[:3])
+        more = f", and {len(bodies) - 3} more" if len(bodies) > 3 else ""
+        raise InputError(
+            f"{name} is {len(bodies)} separate bodies ({sizes}{more}; mm), not one",
+            path,
+            "`tkamb mesh check` numbers them, `tkamb mesh part` writes one into a file of its own"
+            + ("; or are they two condyles, and the axes wrong?" if len(bodies) == 2 else ""),
+        )
+
+
+def _two_condyles(bodies: list[Body], right: Array) -> bool:
+    """Say whether there are two bodies of like size, one beside the other (`right`, a unit axis).
+
+    So are the components of a bicompartmental knee; a tray or an insert lies below, a pair
+    from both legs further apart than either is wide.
+    """
+    if len(bodies) != 2:
+        return False
+    widths = [float(np.abs(right) @ body.extents) for body in bodies]
+    lengths = sorted(float(body.extents.max()) for body in bodies)
+    apart = abs(float(right @ (bodies[0].centre - bodies[1].centre)))
+    gap = apart - sum(widths) / 2.0
+    return -0.1 * min(widths) <= gap <= max(widths) and lengths[0] >= lengths[1] / 2.0
 
 
 def _check_size(

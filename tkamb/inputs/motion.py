@@ -7,7 +7,8 @@ the clinical angles and the patella's sagittal coordinates keep theirs.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,19 +22,29 @@ from tkamb.geometry.frames import (
     knee_pose,
     mirrored_pose,
 )
+from tkamb.inputs.cycle import Cycle
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import angle_scale, check_roles, poses_of_columns
+from tkamb.inputs.samples import OddSample, check_range, check_spacing, check_steps, odd_samples
 from tkamb.inputs.tables import Table, read_table
 from tkamb.scene_tables import MotionTable
 from tkamb.units import DEGREE, MILLIMETRE
 
+if TYPE_CHECKING:
+    from tkamb.inputs.marker_motion import MarkerKinematics
+
 PATELLA_COORDINATES = ("patella_ap", "patella_si", "patella_rotation")
 LIMITS_DEG = {"axial_rotation": (-90, 90), "adduction": (-45, 45), "flexion": (-45, 180)}
 """Beyond these, columns, axes or units are mistaken; adduction also stays off its gimbal."""
-FARTHEST_M = 0.2
-"""The femoral origin lies within a hand's breadth of the insert; beyond, units are mistaken."""
-SLOWEST_S = 5.0
-"""Samples farther apart than this are no record of a movement: the time is in another unit."""
+FARTHEST_MM = (-200, 200)
+"""The femoral origin lies within a hand's breadth of the insert; beyond, units are mistaken.
+So does the patella of the femoral origin."""
+LARGEST_TURN_DEG = 180
+"""Either way, of the patella on the femur."""
+FASTEST = {"turn": 100.0, "move": 10.0}
+"""rad/s and m/s: five times the fastest kick, and more than noise makes of a recording."""
+ODD = {"turn": 0.5 * DEGREE, "move": 0.5 * MILLIMETRE}
+"""What fluoroscopy errs by: a sample that is no farther off its neighbours' curve is not odd."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +66,8 @@ class KneeMotion:
         cycle_percent: (f,) per cent of the cycle, if the motion is one.
         closed_cycle: the cycle's ends agree, so it was filtered as periodic.
         unrecorded: coordinates without a column, held at zero here.
+        odd: samples off their neighbours' curve.
+        markers: what it was read from, if from skin markers.
     """
 
     time: Array
@@ -70,6 +83,8 @@ class KneeMotion:
     cycle_percent: Array | None = None
     closed_cycle: bool = False
     unrecorded: tuple[str, ...] = ()
+    odd: tuple[OddSample, ...] = ()
+    markers: "MarkerKinematics | None" = None
 
 
 def load_motion(
@@ -78,6 +93,7 @@ def load_motion(
     pose_insert_mesh_in_insert: Array,
     pose_femoral_mesh_in_femur: Array,
     released: Sequence[str] = (),
+    pose_insert_in_tibia: Array | None = None,
 ) -> KneeMotion:
     """Read the recorded motion of the scene.
 
@@ -91,12 +107,17 @@ def load_motion(
             z points to the subject's right on both sides (not mirrored).
         pose_femoral_mesh_in_femur: (4, 4) m; likewise for the femur link.
         released: knee coordinates that will be solved for: they need no column.
+        pose_insert_in_tibia: (4, 4), for markers; of the (mirrored) patient.
 
     Raises:
         InputError: file, columns, times, filter or cycle cannot be used.
     """
+    if table.markers is not None:
+        assert pose_insert_in_tibia is not None
+        return _from_markers(table, side, pose_insert_in_tibia, released)
     recorded = read_table(table.file, table.format)
     _check_roles(table, recorded)
+    recorded = _with_signs_turned(recorded, table)
     unrecorded: tuple[str, ...] = ()
     time = recorded.time(table.columns.get("time", "time"))
     if table.interpretation == "pose":
@@ -109,15 +130,39 @@ def load_motion(
     else:
         unrecorded = _unrecorded(recorded, table, released)
         knee = _recorded_coordinates(recorded, table, KNEE_COORDINATES, unrecorded)
-        knee[:, 3:] = np.unwrap(knee[:, 3:], axis=0)
         if side == "left":
             knee[:, KNEE_COORDINATES.index("ml")] *= -1.0
-    _check_angles(knee, recorded)
-    _check_places(knee, recorded)
+    _check_knee(knee, recorded.path)
     named = [c for c in PATELLA_COORDINATES if c in table.columns or c in recorded.columns]
     patella = _recorded_coordinates(recorded, table, PATELLA_COORDINATES) if named else None
-    motion = _differentiated(time, knee, patella, table, recorded)
+    if patella is not None:
+        _check_patella(patella, recorded.path)
+    motion = _differentiated(time, knee, patella, table, recorded.path)
     return replace(motion, unrecorded=unrecorded)
+
+
+def _from_markers(
+    table: MotionTable, side: Literal["right", "left"], insert: Array, released: Sequence[str]
+) -> KneeMotion:
+    """Return the motion that skin markers give: the coordinates that are taken from them."""
+    from tkamb.inputs.marker_motion import load_marker_motion
+
+    assert table.markers is not None
+    taken = table.markers.coordinates
+    unrecorded = tuple(name for name in KNEE_COORDINATES if name not in taken)
+    if needed := [name for name in unrecorded if name not in released]:
+        raise InputError(
+            f"nothing gives {', '.join(needed)}",
+            "[motion.markers]",
+            "add it to coordinates, or let the knee find it: [contact] released",
+        )
+    found = load_marker_motion(table, side, insert)
+    knee = found.coordinates.copy()
+    for name in unrecorded:
+        knee[:, KNEE_COORDINATES.index(name)] = 0.0
+    _check_knee(knee, table.file)
+    motion = _differentiated(found.time, knee, None, table, table.file)
+    return replace(motion, unrecorded=unrecorded, markers=found)
 
 
 def _unrecorded(recorded: Table, table: MotionTable, released: Sequence[str]) -> tuple[str, ...]:
@@ -161,54 +206,71 @@ def _check_roles(table: MotionTable, recorded: Table) -> None:
     else:
         own = KNEE_COORDINATES
     check_roles(table.columns, ("time", *own, *PATELLA_COORDINATES), recorded.path, "motion")
-
-
-def _check_angles(knee: Array, recorded: Table) -> None:
-    for name, (low, high) in LIMITS_DEG.items():
-        angle = knee[:, KNEE_COORDINATES.index(name)] / DEGREE
-        if angle.min() < low or angle.max() > high:
+    for role in table.signs_turned:
+        if role not in own:
             raise InputError(
-                f"{name} runs from {angle.min():.1f} to {angle.max():.1f} deg, which no knee "
-                f"does ({low} to {high})",
+                f"unknown role '{role}' in [motion] signs_turned",
                 recorded.path,
-                "check [motion] columns, sequence, angle_unit and the meshes' axes",
+                f"one of {', '.join(own)}",
             )
 
 
-def _check_places(knee: Array, recorded: Table) -> None:
-    for name in ("ap", "si", "ml"):
-        place = knee[:, KNEE_COORDINATES.index(name)]
-        if np.abs(place).max() > FARTHEST_M:
-            raise InputError(
-                f"{name} runs from {place.min() / MILLIMETRE:.4g} to "
-                f"{place.max() / MILLIMETRE:.4g} mm off the insert, which no knee does",
-                recorded.path,
-                "check [motion] columns, length_unit and where the meshes have their origin",
-            )
+def _with_signs_turned(recorded: Table, table: MotionTable) -> Table:
+    """Return the recording with the columns of the roles in `signs_turned` negated."""
+    names = {table.columns.get(role, role) for role in table.signs_turned}
+    turned = {name: -recorded.column(name) for name in names}
+    return replace(recorded, columns=recorded.columns | turned)
 
 
-def _check_rate(time: Array, recorded: Table) -> None:
-    spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    if spacing > SLOWEST_S:
-        raise InputError(
-            f"samples are {spacing:g} s apart, too far to be a movement",
-            recorded.path,
-            "is the time in seconds?",
-        )
+def _check_knee(knee: Array, path: Path) -> None:
+    """Raise where knee coordinates (n, 6) are those of no knee."""
+    for i, name in enumerate(KNEE_COORDINATES):
+        if name in LIMITS_DEG:
+            question = "check [motion] columns, sequence, angle_unit and the meshes' axes"
+            values, limits, unit = knee[:, i] / DEGREE, LIMITS_DEG[name], "deg"
+        else:
+            question = "check [motion] columns, length_unit and where the meshes have their origin"
+            values, limits, unit = knee[:, i] / MILLIMETRE, FARTHEST_MM, "mm"
+        check_range(path, f"knee: {name}", values, limits, unit, question)
+
+
+def _check_patella(patella: Array, path: Path) -> None:
+    """Raise where the patella's coordinates (n, 3) are nowhere near the femoral component."""
+    turn = (-LARGEST_TURN_DEG, LARGEST_TURN_DEG)
+    for name, values, limits, unit, key in (
+        ("patella_ap", patella[:, 0] / MILLIMETRE, FARTHEST_MM, "mm", "length_unit"),
+        ("patella_si", patella[:, 1] / MILLIMETRE, FARTHEST_MM, "mm", "length_unit"),
+        ("patella_rotation", patella[:, 2] / DEGREE, turn, "deg", "angle_unit"),
+    ):
+        question = f"is a cell mistyped? check [motion] columns and {key}"
+        check_range(path, f"knee: {name}", values, limits, unit, question)
+
+
+def _checked_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, ...]:
+    """Return the odd samples of the coordinates (n, 6 or 9), none of which steps too fast."""
+    odd: list[OddSample] = []
+    for i, name in enumerate((*KNEE_COORDINATES, *PATELLA_COORDINATES)[: values.shape[1]]):
+        moves = name.rsplit("_")[-1] in ("ap", "si", "ml")
+        kind, scale, unit = ("move", MILLIMETRE, "mm") if moves else ("turn", DEGREE, "deg")
+        one = (path, name, time, values[:, i])
+        check_steps(*one, FASTEST[kind], scale, unit)
+        odd += odd_samples(*one, ODD[kind], scale, unit)
+    return tuple(odd)
 
 
 def _differentiated(
-    time: Array, knee: Array, patella: Array | None, table: MotionTable, recorded: Table
+    time: Array, knee: Array, patella: Array | None, table: MotionTable, path: Path
 ) -> KneeMotion:
     """Return the filtered motion at the scene's frames."""
     values = knee if patella is None else np.concatenate([knee, patella], axis=1)
-    cycle = Cycle.of(time, knee, table, recorded) if table.cycle_s else None
+    cycle = Cycle.of(time, knee, table, path) if table.cycle_s else None
     sampled = cycle.seconds(time) if cycle else time
-    _check_rate(sampled, recorded)
-    at = _frames(sampled, table.frames, cycle)
+    check_spacing(path, sampled)
+    odd = _checked_steps(sampled, values, path)
+    at = _frames(sampled, table, cycle)
     inside = cycle.wrapped(at, sampled) if cycle else at
     closed = cycle is not None and cycle.closed
-    name = str(recorded.path)
+    name = str(path)
     x, v, a = differentiate_coordinates(sampled, values, table.cutoff_Hz, inside, closed, name)
     raw, _, _ = differentiate_coordinates(sampled, knee, "none", inside, name=name)
     filtered_pose, raw_pose = knee_pose(x[:, :6]), knee_pose(raw)
@@ -227,83 +289,19 @@ def _differentiated(
         patella_acceleration=a[:, 6:] if has_patella else None,
         cycle_percent=cycle.percent(at) if cycle else None,
         closed_cycle=closed,
+        odd=odd,
     )
 
 
-def _frames(sampled: Array, frames: int | None, cycle: "Cycle | None") -> Array:
+def _frames(sampled: Array, table: MotionTable, cycle: Cycle | None) -> Array:
     if cycle:
-        return cycle.frames(sampled, frames)
-    return np.linspace(sampled[0], sampled[-1], frames) if frames else sampled
-
-
-@dataclass(frozen=True)
-class Cycle:
-    """A cycle recorded over its per cent, laid on an interval of time.
-
-    Args:
-        start: s.
-        period: s.
-        offset_percent: per cent of the cycle at `start`.
-        closed: 0 and 100 % were recorded and agree.
-    """
-
-    start: float
-    period: float
-    offset_percent: float
-    closed: bool
-
-    @staticmethod
-    def of(percent: Array, knee: Array, table: MotionTable, recorded: Table) -> "Cycle":
-        """Return the scene's cycle.
-
-        It is closed if 100 % was recorded too and no coordinate differs there from 0 % by
-        more than its largest step between neighbouring samples.
-
-        Raises:
-            InputError: not per cent, not an interval, or an offset into an open cycle.
-        """
-        assert table.cycle_s is not None
-        start, end = table.cycle_s
-        if not start < end:
-            raise InputError("[motion] cycle_s does not rise", recorded.path)
-        if percent[0] < -1e-9 or percent[-1] > 100 + 1e-9 or percent[-1] - percent[0] < 2:
-            raise InputError(
-                f"time runs from {percent[0]:g} to {percent[-1]:g}, which is not per cent",
-                recorded.path,
-                "drop cycle_s, or give per cent of the cycle",
-            )
-        whole = percent[-1] - percent[0] > 100 - 1e-9
-        steps = np.abs(np.diff(knee, axis=0)).max(axis=0)
-        closed = bool(whole and np.all(np.abs(knee[-1] - knee[0]) <= steps))
-        if table.cycle_offset_percent and not closed:
-            raise InputError(
-                "is not a closed cycle, so it has no frame before or after its ends",
-                recorded.path,
-                "set cycle_offset_percent to 0",
-            )
-        return Cycle(start, end - start, table.cycle_offset_percent, closed)
-
-    def seconds(self, percent: Array) -> Array:
-        """Return the times of per cents, not wrapped into the interval."""
-        return self.start + (percent - self.offset_percent) / 100.0 * self.period
-
-    def percent(self, time: Array) -> Array:
-        """Return per cent of the cycle, rising from the offset."""
-        return self.offset_percent + (time - self.start) / self.period * 100.0
-
-    def frames(self, sampled: Array, count: int | None) -> Array:
-        """Return the times of the frames: evenly `count`, or those recorded."""
-        if not self.closed:
-            return np.linspace(sampled[0], sampled[-1], count) if count else sampled
-        if count:
-            return np.linspace(self.start, self.start + self.period, count)
-        if not self.offset_percent:
-            return sampled
-        turn = np.mod(sampled[:-1] - self.start, self.period)
-        return self.start + np.append(np.unique(np.round(turn, 12)), self.period)
-
-    def wrapped(self, at: Array, sampled: Array) -> Array:
-        """Return times inside the recorded cycle, whole periods away from `at`."""
-        if not self.closed or not self.offset_percent:
-            return np.clip(at, sampled[0], sampled[-1])
-        return np.clip(sampled[0] + np.mod(at - sampled[0], self.period), sampled[0], sampled[-1])
+        return cycle.frames(sampled, table.frames)
+    start, end = table.interval_s or (sampled[0], sampled[-1])
+    inside = sampled[(sampled >= start - 1e-9) & (sampled <= end + 1e-9)]
+    if len(inside) < 2 or start < sampled[0] - 1e-9 or end > sampled[-1] + 1e-9:
+        raise InputError(
+            f"covers {sampled[0]:g} to {sampled[-1]:g} s, but interval_s is {start:g} to {end:g}",
+            table.file,
+            "choose [motion] interval_s inside the recording",
+        )
+    return np.linspace(start, end, table.frames) if table.frames else inside

@@ -2,8 +2,8 @@
 
 Links that must exist: `tibia` (shank and foot, its origin at the ankle centre), `femur`,
 `patella`, and `hip`, a frame fixed to the femur at the hip centre. Joints: `ankle` (or the
-tibia as root), the six single-axis knee joints in the order of `KNEE_JOINTS`, and the three of
-`PATELLA_JOINTS`.
+tibia as root), the six single-axis knee joints of `tkamb.inputs.urdf_check` in their order, and
+the patella's three.
 The origin of `knee_ap` is the insert frame in the tibia; the femur link's frame is that of
 the femoral component. Any other link fixed to these may carry attachment points.
 """
@@ -15,31 +15,37 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
+from tkamb.files import read_xml
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, pose
 from tkamb.inputs.segments import RigidInertia, Sex, combined, segment_inertia
+from tkamb.inputs.urdf_check import (
+    check_chain,
+    check_elements,
+    check_inertia,
+    check_links,
+    check_tree,
+    numbers_of,
+)
 from tkamb.scene_tables import PatientTable
-
-KNEE_JOINTS = {
-    "knee_ap": ("prismatic", (1, 0, 0)),
-    "knee_si": ("prismatic", (0, 1, 0)),
-    "knee_ml": ("prismatic", (0, 0, 1)),
-    "knee_axial_rotation": ("revolute", (0, -1, 0)),
-    "knee_adduction": ("revolute", (-1, 0, 0)),
-    "knee_flexion": ("revolute", (0, 0, 1)),
-}
-"""Knee joints of a right knee, tibia to femur; a left one has (0 1 0) and (1 0 0) instead."""
-
-PATELLA_JOINTS = {
-    "patella_ap": ("prismatic", (1, 0, 0)),
-    "patella_si": ("prismatic", (0, 1, 0)),
-    "patella_rotation": ("revolute", (0, 0, 1)),
-}
 
 PATELLA_MASS = 0.1
 """kg, at the patella link's origin unless the URDF says otherwise."""
 
 PATELLA_RADIUS_OF_GYRATION = 0.015
 """m: about that of a disc 40 mm across and 20 mm thick."""
+
+
+THIGH = (0.2, 0.7)
+"""m, from the femoral component's flexion axis to the hip centre: a child's to a giant's."""
+
+SHANK = (0.15, 0.65)
+"""m, from the ankle centre to the insert's bottom, likewise."""
+
+MOST_TURNED = np.radians(40.0)
+"""rad, of the insert's axes from the tibia's: slope, torsion and varus of a deformed leg."""
+
+ASIDE = 0.5
+"""Of that distance: how far the other end may lie beside the link's y axis, which is upwards."""
 
 
 def load_urdf(table: PatientTable, with_patella: bool) -> str:
@@ -52,83 +58,33 @@ def load_urdf(table: PatientTable, with_patella: bool) -> str:
     Raises:
         InputError: missing file, link or joint, wrong axis, singular inertia.
     """
-    robot = _parsed(table.urdf)
-    _check_numbers(robot, table.urdf)
+    path = table.urdf
+    robot = _parsed(path)
+    check_elements(robot, path)
+    check_links(robot, path, with_patella)
+    check_tree(robot, path)
     if table.side == "left":
         _mirror(robot)
-    wanted = KNEE_JOINTS | (PATELLA_JOINTS if with_patella else {})
-    _require_chain(robot, table, wanted, with_patella)
-    _check_tree(robot, table.urdf)
+    check_chain(robot, path, table.side, with_patella)
+    _check_places(robot, path)
     _complete_inertias(robot, table, with_patella)
     for link in robot.findall("link"):
-        _check_inertia(link, table.urdf, link.get("name") in {"tibia", "femur", "patella"})
+        check_inertia(link, path, link.get("name") in {"tibia", "femur", "patella"})
     return ElementTree.tostring(robot, encoding="unicode")
 
 
 def _parsed(path: Path) -> ElementTree.Element:
-    try:
-        robot = ElementTree.parse(path).getroot()
-    except FileNotFoundError:
-        raise InputError("no such URDF", path, "mend [patient] urdf") from None
-    except (OSError, ElementTree.ParseError) as error:
-        raise InputError(f"is not a readable URDF ({error})", path) from None
+    robot = read_xml(path, what="URDF")
     if robot.tag != "robot":
         raise InputError(f"is not a URDF: its root is <{robot.tag}>, not <robot>", path)
     return robot
 
 
-def _check_numbers(robot: ElementTree.Element, path: Path) -> None:
-    """Raise where a place, an axis or an inertia is not numbers; parsers drop those silently."""
-    inertia = [("inertia", key, 1) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")]
-    wanted = [("origin", "xyz", 3), ("origin", "rpy", 3), ("axis", "xyz", 3), ("mass", "value", 1)]
-    for tag, key, count in [*wanted, *inertia]:
-        for element in robot.iter(tag):
-            text = element.get(key)
-            if text is not None and not _finite(text, count):
-                numbers = "a number" if count == 1 else f"{count} numbers"
-                raise InputError(f'<{tag} {key}="{text}"> is not {numbers}', path)
-
-
-def _finite(text: str, count: int) -> bool:
-    try:
-        values = [float(part) for part in text.split()]
-    except ValueError:
-        return False
-    return len(values) == count and bool(np.isfinite(values).all())
-
-
-def _check_tree(robot: ElementTree.Element, path: Path) -> None:
-    """Raise unless the joints make one tree of all the links."""
-    links = [str(link.get("name")) for link in robot.findall("link")]
-    parents: dict[str, str] = {}
-    for joint in robot.findall("joint"):
-        ends = (joint.find("parent"), joint.find("child"))
-        parent, child = ("" if end is None else end.get("link", "") for end in ends)
-        where = f"{path}: joint '{joint.get('name')}'"
-        for end in (parent, child):
-            if end not in links:
-                raise InputError(f"names a link '{end}' that is not there", where, "add it")
-        if child in parents:
-            raise InputError(f"link '{child}' hangs on a second joint", where, "keep one")
-        parents[child] = parent
-    if repeated := sorted({name for name in links if links.count(name) > 1}):
-        raise InputError(f"has two links '{repeated[0]}'", path, "rename one")
-    roots = [name for name in links if name not in parents]
-    if len(roots) != 1:
-        found = f"{len(roots)} roots ({', '.join(roots)})" if roots else "a loop and no root"
-        raise InputError(f"has {found}", path, "a leg is one tree: docs/patient.md")
-
-
-def _numbers(element: ElementTree.Element | None, key: str, default: str = "0 0 0") -> Array:
-    text = default if element is None else element.get(key, default)
-    return np.array([float(part) for part in text.split()])
-
-
 def _origin(element: ElementTree.Element) -> Array:
     """Return the 4x4 pose of the <origin> of a joint or inertial."""
     origin = element.find("origin")
-    rotation = Rotation.from_euler("xyz", _numbers(origin, "rpy")).as_matrix()
-    return pose(rotation, _numbers(origin, "xyz"))
+    rotation = Rotation.from_euler("xyz", numbers_of(origin, "rpy")).as_matrix()
+    return pose(rotation, numbers_of(origin, "xyz"))
 
 
 def _set_origin(element: ElementTree.Element, value: Array) -> None:
@@ -152,42 +108,39 @@ def _mirror(robot: ElementTree.Element) -> None:
         _set_origin(joint, mirrored_pose(_origin(joint)))
         axis = joint.find("axis")
         if axis is not None and joint.get("type") != "prismatic":
-            axis.set("xyz", _text(-MIRROR @ _numbers(axis, "xyz")))
+            axis.set("xyz", _text(-MIRROR @ numbers_of(axis, "xyz")))
     for inertial in robot.iterfind("link/inertial"):
         _set_origin(inertial, mirrored_pose(_origin(inertial)))
         tensor = inertial.find("inertia")
         for key in ("ixz", "iyz"):
             if tensor is not None:
-                tensor.set(key, _text(-_numbers(tensor, key, "0")))
+                tensor.set(key, _text(-numbers_of(tensor, key, "0")))
 
 
-def _require_chain(
-    robot: ElementTree.Element,
-    table: PatientTable,
-    wanted: dict[str, tuple[str, tuple[int, int, int]]],
-    with_patella: bool,
-) -> None:
-    links = {link.get("name") for link in robot.findall("link")}
-    for name in ("tibia", "femur", "hip") + (("patella",) if with_patella else ()):
-        if name not in links:
-            raise InputError(f"has no link '{name}'", table.urdf, "add it: docs/patient.md")
+def _check_places(robot: ElementTree.Element, path: Path) -> None:
+    """Raise unless hip and insert lie where a leg has them, above femur and ankle."""
     joints = {joint.get("name"): joint for joint in robot.findall("joint")}
-    for name, (kind, axis) in wanted.items():
-        joint = joints.get(name)
-        if joint is None:
-            raise InputError(f"has no joint '{name}'", table.urdf, "add it: docs/patient.md")
-        is_kind = joint.get("type") == kind or (kind, joint.get("type")) == (
-            "revolute",
-            "continuous",
-        )
-        found = _numbers(joint.find("axis"), "xyz", "1 0 0")
-        if not is_kind or not np.allclose(found, axis, atol=1e-9):
-            side = "after mirroring " if table.side == "left" else ""
+    found = (
+        ("the hip", "femur", _fixed_pose(robot, "hip", "femur", path)[:3, 3], THIGH),
+        ("the origin of knee_ap", "tibia", _origin(joints["knee_ap"])[:3, 3], SHANK),
+    )
+    for name, link, place, (low, high) in found:
+        away = float(np.linalg.norm(place))
+        if not low <= away <= high or place[1] < 0 or np.hypot(*place[[0, 2]]) > ASIDE * away:
+            shown = ", ".join(f"{value:.4g}" for value in place)
             raise InputError(
-                f"joint '{name}' is {joint.get('type')} about {_text(found)}",
-                table.urdf,
-                f"{side}it must be {kind} about {' '.join(map(str, axis))}",
+                f"{name} is at ({shown}) m in '{link}', {away:.4g} m from its origin",
+                path,
+                f"it must lie {low:g} to {high:g} m above it, along y: is it in metres?",
             )
+    turn = _origin(joints["knee_ap"])[:3, :3]
+    if min(turn[0, 0], turn[1, 1]) < np.cos(MOST_TURNED):
+        tilts = ", ".join(f"{np.degrees(np.arccos(turn[i, i])):.0f}" for i in range(3))
+        raise InputError(
+            f"the origin of knee_ap turns the insert's axes by {tilts} deg from the tibia's",
+            path,
+            "is its rpy in radians, and are the axes anterior, superior and right?",
+        )
 
 
 def _complete_inertias(robot: ElementTree.Element, table: PatientTable, with_patella: bool) -> None:
@@ -222,13 +175,13 @@ def _segment(robot: ElementTree.Element, name: str, sex: Sex, table: PatientTabl
 def _fixed_pose(robot: ElementTree.Element, link: str, base: str, path: Path) -> Array:
     """Return the pose of `link` in `base`, which must be joined to it by fixed joints."""
     parents = {joint.find("child").get("link"): joint for joint in robot.findall("joint")}  # type: ignore[union-attr]
-    result = np.eye(4)
-    while link != base:
-        joint = parents.get(link)
+    result, place = np.eye(4), link
+    while place != base:
+        joint = parents.get(place)
         if joint is None or joint.get("type") != "fixed":
             raise InputError(f"link '{link}' is not fixed to '{base}'", path, "use fixed joints")
         result = _origin(joint) @ result
-        link = joint.find("parent").get("link")  # type: ignore[union-attr,assignment]
+        place = joint.find("parent").get("link")  # type: ignore[union-attr,assignment]
     return result
 
 
@@ -246,28 +199,3 @@ def _write_inertia(link: ElementTree.Element, inertia: RigidInertia) -> None:
     }
     values = {key: repr(float(inertia.tensor[index])) for key, index in rows.items()}
     ElementTree.SubElement(inertial, "inertia", values)
-
-
-def _check_inertia(link: ElementTree.Element, path: Path, needed: bool) -> None:
-    """Raise unless the mass is positive and the tensor is that of a real body."""
-    inertial = link.find("inertial")
-    if inertial is None:
-        return
-    where = f"{path}: link '{link.get('name')}'"
-    mass, tensor = inertial.find("mass"), inertial.find("inertia")
-    if mass is None or tensor is None:
-        raise InputError("has an incomplete <inertial>", where, "give <mass> and <inertia>")
-    kilograms = float(_numbers(mass, "value", "nan")[0])
-    rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
-    matrix = np.array([[_numbers(tensor, key, "0")[0] for key in row] for row in rows])
-    if not needed and kilograms == 0 and not matrix.any():
-        return
-    principal = np.linalg.eigvalsh(matrix) if np.isfinite(matrix).all() else np.full(3, np.nan)
-    is_body = principal[0] > 0 and principal[2] <= (principal[0] + principal[1]) * (1 + 1e-9)
-    if not (kilograms > 0 and is_body):
-        moments = ", ".join(f"{p:.3g}" for p in principal)
-        raise InputError(
-            f"singular inertia: mass {kilograms:g} kg, principal moments {moments} kg·m²",
-            where,
-            "a body needs mass > 0 and moments > 0, none larger than the sum of the others",
-        )

@@ -1,22 +1,29 @@
-"""Read recorded tables: `.csv`, OpenSim `.sto` and `.mot`, and `.trc` markers."""
+"""Read recorded tables: `.csv`, OpenSim `.sto` and `.mot`, and markers of `.trc` and `.c3d`."""
 
-import difflib
 import math
 import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from tkamb.errors import InputError
+from tkamb.errors import InputError, names_near
+from tkamb.files import TABLE_LIMIT, read_text
 from tkamb.geometry.frames import Array
 from tkamb.units import LENGTH
 
-FORMATS = ("csv", "sto", "mot", "trc")
+FORMATS = ("csv", "sto", "mot", "trc", "c3d")
 TRC_ROUNDING_S = 1e-3
 """Cameras write `.trc` times rounded to the millisecond; the header's rate is exact."""
 
 _NOT_A_NUMBER = re.compile(r"[+-]?(nan(\(\w*\))?|1\.#(ind|qnan)0*)")
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
+"""Plain decimal: Python alone also reads 1_000 and the digits of other scripts."""
+_INFINITE = re.compile(r"[+-]?inf(inity)?")
+_LARGEST = 1e12
+"""Beyond any measurement and any clock: the square of a larger number may overflow."""
+_COMMA_NUMBER = re.compile(r"[+-]?[0-9]+,[0-9]+")
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +32,8 @@ class Table:
 
     Args:
         path: the file.
-        columns: name -> (n,) values. A `.trc` marker M has columns M_x, M_y, M_z.
-        length_unit: the unit that the file itself states (`.trc`), else None.
+        columns: name -> (n,) values. A marker M of `.trc` or `.c3d` has columns M_x, M_y, M_z.
+        length_unit: the unit that the file itself states (`.trc`, `.c3d`), else None.
         in_degrees: what the file itself states about angles (`.sto`, `.mot`), else None.
     """
 
@@ -47,7 +54,8 @@ class Table:
             InputError: no such column; the message lists the nearest names.
         """
         if name not in self.columns:
-            raise InputError(f"has no column '{name}'", self.path, _near(name, self.columns))
+            mend = names_near(name, self.columns, "its header")
+            raise InputError(f"has no column '{name}'", self.path, mend)
         return self.columns[name]
 
     def complete_column(self, name: str) -> Array:
@@ -112,7 +120,7 @@ def read_table(path: Path, format: str | None = None) -> Table:
 
     Args:
         path: the file.
-        format: "csv", "sto", "mot" or "trc"; by default the suffix.
+        format: "csv", "sto", "mot", "trc" or "c3d"; by default the suffix.
 
     Raises:
         InputError: missing or unreadable file, unknown format, a malformed header or row, an
@@ -122,12 +130,9 @@ def read_table(path: Path, format: str | None = None) -> Table:
     kind = format or path.suffix.lower().lstrip(".")
     if kind not in FORMATS:
         raise InputError(f"unknown table format '{kind}'", path, f"use {', '.join(FORMATS)}")
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except FileNotFoundError:
-        raise InputError("no such file", path, "check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read ({error})", path) from None
+    if kind == "c3d":
+        return _read_c3d(path)
+    lines = read_text(path, TABLE_LIMIT, "utf-8-sig").splitlines()
     if kind == "csv":
         return _read_csv(path, lines)
     return _read_trc(path, lines) if kind == "trc" else _read_storage(path, lines)
@@ -143,6 +148,10 @@ def _read_csv(path: Path, lines: list[str]) -> Table:
     if not rows:
         raise InputError("is empty", path)
     names = [name.strip().strip('"') for name in rows[0][1]]
+    for sign, word in ((";", "semicolons"), ("\t", "tabs")):
+        if len(names) == 1 and sign in names[0]:
+            mend = "save it with commas between the cells and points in the numbers"
+            raise InputError(f"has {word} between its cells, not commas", path, mend)
     return Table(path, _columns(path, names, rows[1:]))
 
 
@@ -190,6 +199,19 @@ def _read_trc(path: Path, lines: list[str]) -> Table:
     return Table(path, table, length_unit=header.get("Units", "").strip() or None)
 
 
+def _read_c3d(path: Path) -> Table:
+    """Markers of a C3D file on the recording's own clock, m."""
+    from tkamb.inputs.c3d import read_c3d
+
+    recording = read_c3d(path)
+    columns = {
+        f"{label}_{axis}": recording.points[:, k, i]
+        for k, label in enumerate(recording.labels)
+        for i, axis in enumerate("xyz")
+    }
+    return Table(path, {"time": recording.time, **columns}, length_unit="m")
+
+
 def _exact_time(time: Array, frame: Array, rate: str) -> Array:
     """Return the camera's even time if the column is that, rounded; else the column.
 
@@ -207,12 +229,13 @@ def _exact_time(time: Array, frame: Array, rate: str) -> Array:
 def _columns(path: Path, names: list[str], rows: list[tuple[int, list[str]]]) -> dict[str, Array]:
     if not rows:
         raise InputError("has no data rows", path)
-    if repeated := sorted({name for name in names if names.count(name) > 1}):
+    if repeated := sorted(name for name, count in Counter(names).items() if count > 1):
         raise InputError(f"has two columns named '{repeated[0]}'", path, "rename one")
     values = np.empty((len(rows), len(names)))
     for k, (number, cells) in enumerate(rows):
         if len(cells) != len(names):
-            raise InputError(f"line {number} has {len(cells)} cells, the header {len(names)}", path)
+            wrong = f"line {number} has {len(cells)} cells, the header {len(names)}"
+            raise InputError(wrong, path, _why_uneven(len(cells), len(names)))
         values[k] = [_number(cell, path, number) for cell in cells]
     return {name: values[:, k].copy() for k, name in enumerate(names)}
 
@@ -221,19 +244,22 @@ def _number(cell: str, path: Path, line: int) -> float:
     text = cell.strip()
     if not text or _NOT_A_NUMBER.fullmatch(text.lower()):
         return math.nan
-    try:
-        number = float(text)
-    except ValueError:
-        raise InputError(f"line {line} holds '{text}', which is no number", path) from None
+    if not (_NUMBER.fullmatch(text) or _INFINITE.fullmatch(text.lower())):
+        comma = "is the comma a decimal point? write a point" if _COMMA_NUMBER.match(text) else None
+        plain = comma or "write plain decimal numbers like -12.5"
+        raise InputError(f"line {line} holds '{text}', which is no number", path, plain)
+    number = float(text)
     if math.isinf(number):
         mend = "leave the cell empty where nothing was measured"
         raise InputError(f"line {line} holds '{text}', which is not finite", path, mend)
+    if abs(number) > _LARGEST:
+        raise InputError(
+            f"line {line} holds '{text}', which nothing measures", path, "is it a typing mistake?"
+        )
     return number
 
 
-def _near(name: str, columns: dict[str, Array]) -> str:
-    lower = {column.lower(): column for column in columns}
-    close = difflib.get_close_matches(name.lower(), list(lower), n=4, cutoff=0.5)
-    listed = [lower[c] for c in close] or list(columns)[:8]
-    more = "" if close or len(columns) <= 8 else ", …"
-    return f"{'did you mean' if close else 'it has'} {', '.join(listed)}{more}"
+def _why_uneven(cells: int, names: int) -> str:
+    if cells > names:
+        return "are there decimal commas? write points"
+    return "is a cell missing, or a comma?"

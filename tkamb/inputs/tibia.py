@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, pose
+from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, pose, transform
 from tkamb.inputs.filtering import Cutoff, differentiate_coordinates, differentiate_poses
 from tkamb.inputs.laboratory import (
     angle_scale,
@@ -19,9 +19,23 @@ from tkamb.inputs.laboratory import (
     poses_of_columns,
 )
 from tkamb.inputs.markers import check_fit, complete_run, fit_rigid, shank_points
+from tkamb.inputs.samples import OddSample, check_range, check_spacing, check_steps, odd_samples
 from tkamb.inputs.tables import Table, read_table
 from tkamb.scene_tables import TibiaTable
-from tkamb.units import MILLIMETRE
+from tkamb.units import DEGREE, MILLIMETRE
+
+MOST_LEAN_DEG = 150.0
+"""Of a shank from the vertical, either way; a sprinter's swings back by 110."""
+FARTHEST = 100.0
+"""m from the laboratory's origin: what no camera covers."""
+FASTEST_TURN, FASTEST_MOVE = 100.0, 30.0
+"""rad/s and m/s: twice the fastest sprinter's and kicker's shank."""
+ODD_TURN, ODD_MOVE = 0.5 * DEGREE, 3.0 * MILLIMETRE
+"""As near to its neighbours' curve as skin markers are, no sample is odd."""
+SHANK_LENGTH = 0.4
+"""m: where the far end of the shank is looked at."""
+WINDOW = 0.5
+"""s: samples farther from the frames than this do not reach them through the filter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +50,7 @@ class BodyMotion:
         acceleration: (f, 6) its rate, component by component.
         residual: (f,) m, root mean square distance of the marker fit before filtering; None
             if the pose was not fitted.
+        odd: samples around the frames that lie off their neighbours' curve.
     """
 
     time: Array
@@ -43,6 +58,7 @@ class BodyMotion:
     velocity: Array
     acceleration: Array
     residual: Array | None = None
+    odd: tuple[OddSample, ...] = ()
 
 
 def load_tibia(
@@ -77,9 +93,28 @@ def load_tibia(
     if side == "left":
         poses = mirrored_pose(poses)
     name = str(recorded.path)
+    check_spacing(recorded.path, stamps)
+    odd = _odd_poses(recorded, stamps, poses, time)
     filtered, velocity, acceleration = differentiate_poses(stamps, poses, cutoff, time, name)
     at_frames = None if residual is None else np.interp(time, stamps, residual)
-    return BodyMotion(time, filtered, velocity, acceleration, at_frames)
+    return BodyMotion(time, filtered, velocity, acceleration, at_frames, odd)
+
+
+def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tuple[OddSample, ...]:
+    """Return the odd samples of the shank's two ends, none of which is or moves impossibly."""
+    near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
+    ends = {"ankle": np.zeros(3), "knee's end of the shank": np.array([0.0, SHANK_LENGTH, 0.0])}
+    odd: list[OddSample] = []
+    for end, point in ends.items():
+        places = transform(poses[near], point)
+        for axis, values in zip("xyz", places.T, strict=True):
+            what = f"{axis} of the {end}"
+            limits, question = (-FARTHEST, FARTHEST), "check [tibia] columns and length_unit"
+            check_range(recorded.path, f"shank: {what}", values, limits, "m", question)
+            one = (recorded.path, what, stamps[near], values)
+            check_steps(*one, FASTEST_MOVE, MILLIMETRE, "mm")
+            odd += odd_samples(*one, ODD_MOVE, MILLIMETRE, "mm")
+    return tuple(odd)
 
 
 def _sagittal(
@@ -90,6 +125,13 @@ def _sagittal(
     stamps = recorded.time(table.columns.get("time", "time"))
     lean = recorded.complete_column(table.columns.get("angle", "angle"))
     lean = lean * angle_scale(recorded, table.angle_unit)
+    limits = (-MOST_LEAN_DEG, MOST_LEAN_DEG)
+    question = "check [tibia] columns and angle_unit: it is the lean from the vertical"
+    check_range(recorded.path, "shank: angle", lean / DEGREE, limits, "deg", question)
+    check_spacing(recorded.path, stamps)
+    one = (recorded.path, "the shank's lean", stamps, lean)
+    check_steps(*one, FASTEST_TURN, DEGREE, "deg")
+    odd = odd_samples(*one, ODD_TURN, DEGREE, "deg")
     angle, rate, rate_of_rate = differentiate_coordinates(
         stamps, -lean, cutoff, time, name=str(recorded.path)
     )
@@ -99,7 +141,7 @@ def _sagittal(
     velocity, acceleration = np.zeros((len(time), 6)), np.zeros((len(time), 6))
     velocity[:, 5], acceleration[:, 5] = rate, rate_of_rate
     rotation = Rotation.from_euler("z", angle[:, None]).as_matrix()
-    return BodyMotion(time, pose(rotation, ankle), velocity, acceleration)
+    return BodyMotion(time, pose(rotation, ankle), velocity, acceleration, odd=odd)
 
 
 def _recorded_poses(table: TibiaTable, recorded: Table) -> Array:

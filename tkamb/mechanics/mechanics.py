@@ -271,15 +271,19 @@ class Mechanics:
             return (), {}
         from tkamb.body.ligaments import build_ligaments, strain_table
 
-        recorded = self.case.motion.coordinates
-        states = [self.case.chain.at(self._chain_motion(k, x)) for k, x in enumerate(recorded)]
-        poses = {
-            link: np.stack([state.pose(link) for state in states])
-            for link in self._attachment_links()
-        }
+        poses = self.recorded_poses()
         flexion = self.case.motion.coordinates[:, 5]
         bundles = build_ligaments(self.case.scene.ligament, poses, flexion)
         return bundles, strain_table(bundles, poses, flexion, STRAIN_FLEXIONS)
+
+    def recorded_poses(self) -> dict[str, Array]:
+        """Return link -> pose_link_in_insert (f, 4, 4) as recorded, of links with attachments."""
+        recorded, scene = self.case.motion.coordinates, self.case.scene
+        states = [self.case.chain.at(self._chain_motion(k, x)) for k, x in enumerate(recorded)]
+        links = self._attachment_links()
+        if scene.patellar_ligament:
+            links |= {scene.patellar_ligament.proximal.link, scene.patellar_ligament.distal.link}
+        return {link: np.stack([state.pose(link) for state in states]) for link in links}
 
     def _attachment_links(self) -> set[str]:
         ends = [end for table in self.case.scene.ligament for end in (table.proximal, table.distal)]

@@ -2,13 +2,16 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.results import Results
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
 LABELS = {"flexion": "flexion (deg)", "cycle": "cycle (%)", "time": "time (s)"}
 UNITS = {"flexion": "°", "cycle": " %", "time": " s"}
@@ -73,7 +76,7 @@ def round_step(step: float) -> float:
     return float(choices[choices >= step * (1 - 1e-9)][0])
 
 
-def horizontal_axis(results: Results, kind: str | None = None) -> HorizontalAxis:
+def horizontal_axis(results: "Results", kind: str | None = None) -> HorizontalAxis:
     """Return the axis that the summary's `axis` (or `kind`) asks for.
 
     Per cent of the cycle are the column of that name; without it they are counted from the

@@ -5,7 +5,7 @@ the page reads as before.
 """
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,10 +13,12 @@ from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis
 from tkamb.output.panel import Panel
 from tkamb.output.panels import centre_panel, panels
-from tkamb.results import Results
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
 
-def cursor_bar(results: Results, axis: HorizontalAxis) -> str:
+def cursor_bar(results: "Results", axis: HorizontalAxis) -> str:
     """Return the slider, the numbers that it shows and the script that moves it (HTML)."""
     data = json.dumps(cursor_data(results, axis), separators=(",", ":"), allow_nan=False)
     data = data.replace("<", "\\u003c")
@@ -28,7 +30,7 @@ def cursor_bar(results: Results, axis: HorizontalAxis) -> str:
     )
 
 
-def cursor_data(results: Results, axis: HorizontalAxis) -> dict[str, Any]:
+def cursor_data(results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
     """Return what the cursor shows: places, flexion, status, and the lines of every plot."""
     drawn = (*panels(results), centre_panel(results))
     return {

@@ -3,13 +3,20 @@
 import re
 from dataclasses import dataclass
 from html import escape
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tkamb.geometry.frames import Array
+from tkamb.known_errors import is_large, known_error_words
 from tkamb.output import metrics
 from tkamb.output.axis import HorizontalAxis
-from tkamb.results import Results
+from tkamb.run.agreement import LARGE_RESIDUAL, SHARES_APART
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
+
+PRESSURE_AND_AREA = ("peak_pressure", "mean_pressure", "area")
 
 
 @dataclass(frozen=True)
@@ -48,9 +55,10 @@ def _unbroken(text: str) -> str:
     return re.sub(r"([\d.]+–[\d.]+)", r'<span class="whole">\1</span>', text)
 
 
-def cards(results: Results, axis: HorizontalAxis) -> list[Card]:
+def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
     """Return the headline numbers that the run has."""
     found = (
+        _questions(results),
         _peak_force(results, axis),
         _shares(results),
         _peak_pressure(results, axis),
@@ -61,7 +69,7 @@ def cards(results: Results, axis: HorizontalAxis) -> list[Card]:
     return [card for card in found if card is not None]
 
 
-def _where(results: Results, axis: HorizontalAxis, frame: int) -> str:
+def _where(results: "Results", axis: HorizontalAxis, frame: int) -> str:
     flexion = f"{results['flexion_deg'][frame]:.0f}° of flexion"
     if axis.kind == "flexion":
         return f"at {flexion}"
@@ -69,7 +77,14 @@ def _where(results: Results, axis: HorizontalAxis, frame: int) -> str:
     return f"at {name} ({flexion})"
 
 
-def _peak_force(results: Results, axis: HorizontalAxis) -> Card | None:
+def _questions(results: "Results") -> Card | None:
+    asked = results.summary.get("questions") or []
+    if not asked:
+        return None
+    return Card("Questions to answer", str(len(asked)), " ".join(map(str, asked)), True)
+
+
+def _peak_force(results: "Results", axis: HorizontalAxis) -> Card | None:
     found = metrics.peak(results, "force_total_BW")
     if found is None:
         return None
@@ -81,7 +96,7 @@ def _peak_force(results: Results, axis: HorizontalAxis) -> Card | None:
     return Card("Peak contact force", f"{found.value:.2f} BW", detail)
 
 
-def _shares(results: Results) -> Card | None:
+def _shares(results: "Results") -> Card | None:
     texts = {}
     for estimate in ("deformation", "equilibrium"):
         share = 100 * metrics.medial_share(results, estimate)
@@ -89,16 +104,33 @@ def _shares(results: Results) -> Card | None:
             texts[estimate] = _range(share, " %")
     if not texts:
         return None
-    first = next(iter(texts))
+    unknown = int(metrics.split_undetermined(results).sum())
+    first = "equilibrium" if unknown and "equilibrium" in texts else next(iter(texts))
     rest = [f"by {name} {text}" for name, text in texts.items() if name != first]
-    share = metrics.medial_share(results, first)
+    share = metrics.medial_share(results, "deformation" if "deformation" in texts else first)
     alone = int(((share <= 0) | (share >= 1)).sum())
     rest += [f"one condyle carries nothing in {alone} frames"] if alone else []
+    apart = int((metrics.shares_apart(results) > SHARES_APART).sum())
+    rest += [f"the two contradict each other in {apart} frames"] if apart else []
+    rest += _adduction(results, unknown)
     detail = "; ".join([f"by {first}, the rest lateral", *rest])
-    return Card("Medial share of the load", texts[first], detail)
+    return Card("Medial share of the load", texts[first], detail, bool(alone or apart or unknown))
 
 
-def _peak_pressure(results: Results, axis: HorizontalAxis) -> Card | None:
+def _adduction(results: "Results", unknown: int) -> list[str]:
+    """Return what an error of the adduction does to the split by deformation, in words."""
+    moved = metrics.moved_per_half_degree(results)
+    words = []
+    if unknown:
+        where = "in every frame" if unknown == len(results) else f"in {unknown} frames"
+        words.append(f"the split by deformation is not determined {where}")
+    if np.isfinite(moved).any():
+        text = _range(moved, " N")
+        words.append(f"± 0.5 deg of adduction moves {text} between condyles that both carry")
+    return [": ".join(words)] if words else []
+
+
+def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
     found = metrics.peak(results, "<side>_peak_pressure_MPa")
     if found is None:
         return None
@@ -113,10 +145,19 @@ def _peak_pressure(results: Results, axis: HorizontalAxis) -> Card | None:
             )
         else:
             detail += f"; never above yield ({stress:g}\u00a0MPa)"
-    return Card("Peak contact pressure", f"{found.value:.1f} MPa", detail)
+    said = results.summary.get("known_error")
+    if said is not None:
+        detail += f"; {_model(results)} {known_error_words(said, PRESSURE_AND_AREA)}"
+    large = said is not None and is_large(said, PRESSURE_AND_AREA)
+    return Card("Peak contact pressure", f"{found.value:.1f} MPa", detail, large)
 
 
-def _extensor(results: Results, axis: HorizontalAxis) -> Card | None:
+def _model(results: "Results") -> str:
+    table = results.summary.get("contact") or {}
+    return f"{table.get('model', 'the contact model')} at {table.get('resolution_mm', 0.0):g} mm:"
+
+
+def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:
     found = metrics.peak(results, "quadriceps_N")
     if found is None:
         return None
@@ -127,10 +168,14 @@ def _extensor(results: Results, axis: HorizontalAxis) -> Card | None:
     if "first_wrapping_flexion_deg" in results.summary:
         first = results.summary["first_wrapping_flexion_deg"]
         detail += "; wraps nowhere" if first is None else f"; wraps the femur from {first:.0f}°"
+    slope = results.columns.get("quadriceps_per_dome_mm_N")
+    if slope is not None and np.isfinite(slope[found.frame]):
+        percent = 100 * abs(slope[found.frame]) / found.value
+        detail += f"; ± {percent:.1f} % per mm of the button's height on the patella"
     return Card("Peak quadriceps tension", f"{value:.2f} BW", detail)
 
 
-def _residuals(results: Results) -> Card | None:
+def _residuals(results: "Results") -> Card | None:
     share = 100 * metrics.residual_share(results)
     if not np.isfinite(share).any():
         return None
@@ -140,10 +185,10 @@ def _residuals(results: Results) -> Card | None:
     if np.isfinite(change).any():
         largest = np.nanmax(change)
         detail += f"; acting 10 mm higher or lower changes the total by ≤ {largest:.1f} %"
-    return Card("Residual force", middle, detail, bool(np.nanmax(share) > 10))
+    return Card("Residual force", middle, detail, bool(np.nanmax(share) > 100 * LARGE_RESIDUAL))
 
 
-def _frames(results: Results) -> Card:
+def _frames(results: "Results") -> Card:
     failed = int(metrics.failed(results).sum())
     flagged = int(metrics.flagged(results).sum())
     value = f"{len(results) - failed} of {len(results)}"

@@ -5,7 +5,8 @@ as the number of whole frames, also when the run was killed. Compressed chunks o
 keep what earlier frames wrote untouched.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -47,15 +48,18 @@ class MapWriter:
     ) -> None:
         self.path = Path(path)
         points = np.asarray(points, float)
-        try:
+        with self._written():
             self._file = h5py.File(self.path, "w")
-        except OSError as error:
-            raise InputError(f"cannot be written ({error})", self.path) from None
+            self._begin(points, np.asarray(triangles, np.int64), attributes)
+
+    def _begin(
+        self, points: Array, triangles: NDArray[np.int64], attributes: Mapping[str, Any]
+    ) -> None:
         self._file.attrs["units"] = UNITS
         for name, value in attributes.items():
             self._file.attrs[name] = value
         self._file.create_dataset("points_m", data=points)
-        self._file.create_dataset("triangles", data=np.asarray(triangles, np.int64))
+        self._file.create_dataset("triangles", data=triangles)
         n = len(points)
         shapes = ((n,), (n,), (n, 3), (4, 4))
         for name, shape in zip(PER_FRAME, shapes, strict=False):
@@ -92,15 +96,17 @@ class MapWriter:
             nodal_force: (n, 3) N on the insert.
             femoral_pose: (4, 4) pose_femoral_in_insert at which the map holds.
         """
-        frame = len(self)
-        for name, value in zip(PER_FRAME, (pressure, gap, nodal_force, femoral_pose), strict=False):
-            dataset = self._file[name]
-            dataset.resize(frame + 1, axis=0)
-            dataset[frame] = value
-        self._file.flush()
-        self._file["time_s"].resize(frame + 1, axis=0)
-        self._file["time_s"][frame] = time
-        self._file.flush()
+        values = (pressure, gap, nodal_force, femoral_pose)
+        with self._written():
+            frame = len(self)
+            for name, value in zip(PER_FRAME, values, strict=False):
+                dataset = self._file[name]
+                dataset.resize(frame + 1, axis=0)
+                dataset[frame] = value
+            self._file.flush()
+            self._file["time_s"].resize(frame + 1, axis=0)
+            self._file["time_s"][frame] = time
+            self._file.flush()
 
     def append_failed(self, time: float) -> None:
         """Add a frame without a result: NaN everywhere but the time."""
@@ -116,8 +122,22 @@ class MapWriter:
         return ContactMaps(self.path)
 
     def close(self) -> None:
-        """Close the file; nothing can be appended after it."""
-        self._file.close()
+        """Close the file; nothing can be appended after it.
+
+        Raises:
+            InputError: what was appended could not be written.
+        """
+        with self._written():
+            self._file.close()
+
+    @contextmanager
+    def _written(self) -> Iterator[None]:
+        """Have what HDF5 says of a disk that is full or gone in one line."""
+        try:
+            yield
+        except (OSError, RuntimeError) as error:
+            reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+            raise InputError(f"cannot be written ({reason})", self.path) from None
 
     def __enter__(self) -> Self:
         return self
@@ -128,7 +148,11 @@ class MapWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self.close()
+        try:
+            self.close()
+        except InputError:
+            if error is None:  # else the block has said it already
+                raise
 
 
 @dataclass(frozen=True, eq=False)

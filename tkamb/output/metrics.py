@@ -1,14 +1,18 @@
 """The few numbers that say what happened in a run."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.results import Results
+from tkamb.run.agreement import UNLOADED
 from tkamb.units import MILLIMETRE, STANDARD_GRAVITY
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
 SIDES = ("medial", "lateral")
 JUMP = 8.0 * MILLIMETRE
@@ -34,7 +38,7 @@ class Peak:
     side: str = ""
 
 
-def body_weight(results: Results) -> float:
+def body_weight(results: "Results") -> float:
     """Return body weight, N: mass x 9.80665 m/s².
 
     Raises:
@@ -46,7 +50,7 @@ def body_weight(results: Results) -> float:
     return float(mass) * STANDARD_GRAVITY
 
 
-def peak(results: Results, column: str) -> Peak | None:
+def peak(results: "Results", column: str) -> Peak | None:
     """Return the largest value of a column, or of its two sides for "<side>_..."."""
     sides = SIDES if column.startswith("<side>") else ("",)
     found = [
@@ -57,7 +61,7 @@ def peak(results: Results, column: str) -> Peak | None:
     return max(found, key=lambda one: one.value, default=None)
 
 
-def medial_share(results: Results, estimate: str) -> Array:
+def medial_share(results: "Results", estimate: str) -> Array:
     """Return the medial share (f,) by "deformation" or by "equilibrium"."""
     if estimate == "equilibrium":
         return results["medial_share_equilibrium"]
@@ -69,7 +73,29 @@ def medial_share(results: Results, estimate: str) -> Array:
         return both * np.where(total > 0, np.nan_to_num(medial) / total, np.nan)
 
 
-def tension_ratio(results: Results, column: str) -> Array:
+def split_undetermined(results: "Results") -> NDArray[np.bool_]:
+    """Return in which frames (f,) the recorded adduction does not determine the split."""
+    return np.asarray(results["split_determined"] == 0)
+
+
+def moved_per_half_degree(results: "Results") -> Array:
+    """Return what 0.5 deg of adduction moves (f,) between the condyles by the tangent, N.
+
+    Never more than the whole load; NaN where one condyle carries all of it, since that slope
+    holds only until the other touches.
+    """
+    share = medial_share(results, "deformation")
+    moved = 0.5 * np.abs(results["medial_force_per_adduction_N_per_deg"])
+    moved = np.minimum(moved, np.abs(results["force_si_N"]))
+    return np.where(np.abs(share - 0.5) < 0.5 - UNLOADED, moved, np.nan)
+
+
+def shares_apart(results: "Results") -> Array:
+    """Return by how much (f,) the two estimates of the medial share differ."""
+    return np.abs(medial_share(results, "deformation") - medial_share(results, "equilibrium"))
+
+
+def tension_ratio(results: "Results", column: str) -> Array:
     """Return a force (f,) relative to the quadriceps tension."""
     quadriceps = results["quadriceps_N"]
     with np.errstate(invalid="ignore"):
@@ -77,33 +103,33 @@ def tension_ratio(results: Results, column: str) -> Array:
     return results[column] / taut
 
 
-def residual_force(results: Results) -> Array:
+def residual_force(results: "Results") -> Array:
     """Return the magnitude (f,) of the AP and ML residual forces, N."""
     return np.hypot(results["residual_ap_N"], results["residual_ml_N"])
 
 
-def residual_share(results: Results) -> Array:
+def residual_share(results: "Results") -> Array:
     """Return that magnitude relative to the superior-inferior contact force (f,)."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return residual_force(results) / np.abs(results["force_si_N"])
 
 
-def failed(results: Results) -> NDArray[np.bool_]:
+def failed(results: "Results") -> NDArray[np.bool_]:
     """Return which frames (f,) say that they failed, or are not ok and have no contact force."""
     said = np.array([status.startswith("failed") for status in results.status], bool)
     return said | (~_clean(results) & np.isnan(results["force_total_N"]))
 
 
-def flagged(results: Results) -> NDArray[np.bool_]:
+def flagged(results: "Results") -> NDArray[np.bool_]:
     """Return which frames (f,) have numbers and a reason to look at them with care."""
     return ~_clean(results) & ~failed(results)
 
 
-def _clean(results: Results) -> NDArray[np.bool_]:
+def _clean(results: "Results") -> NDArray[np.bool_]:
     return np.array([status == "ok" for status in results.status], bool)
 
 
-def map_rows(results: Results) -> dict[int, int]:
+def map_rows(results: "Results") -> dict[int, int]:
     """Return frame -> row of the maps of the same time, for every frame that has a map."""
     if results.maps is None:
         return {}

@@ -41,6 +41,7 @@ class Panel:
         logarithmic: vertical axis.
         from_zero: the vertical axis holds zero.
         limits: of the vertical axis, where they are known beforehand.
+        warning: the note is something to look at.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Panel:
     logarithmic: bool = False
     from_zero: bool = True
     limits: tuple[float, float] | None = None
+    warning: bool = False
 
 
 def without_empty_lines(panel: Panel) -> Panel:

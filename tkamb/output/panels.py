@@ -2,35 +2,45 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tkamb.known_errors import is_large, known_error_words
 from tkamb.output import style
-from tkamb.output.metrics import body_weight, medial_share, residual_share, tension_ratio
+from tkamb.output.metrics import (
+    body_weight,
+    medial_share,
+    residual_share,
+    split_undetermined,
+    tension_ratio,
+)
 from tkamb.output.panel import Line, Panel, without_empty_lines
 from tkamb.output.style import BLACK, BLUE, GREEN, GREY, PURPLE, SIDE_COLOURS, VERMILLION
-from tkamb.results import Results
 from tkamb.run.columns import is_ligament, ligament_of
 
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
-def panels(results: Results) -> tuple[Panel, ...]:
+
+def panels(results: "Results") -> tuple[Panel, ...]:
     """Return the plots whose numbers the run has, in the report's order."""
     makers: tuple[Callable[[Results], Panel], ...] = (
-        _total, _condyles, _share, _extensor, _ratios, _areas, _pressures, _yield, _external,
-        _ground, _ligaments, _residuals, _residual_moment, _hip_force, _hip_moment, _motion,
-        _slip, _adjustment, _adjustment_effect, _condition,
+        _total, _condyles, _share, _sensitivity, _extensor, _ratios, _areas, _pressures, _yield,
+        _external, _ground, _ligaments, _residuals, _residual_moment, _hip_force, _hip_moment,
+        _motion, _slip, _adjustment, _adjustment_effect, _condition,
     )  # fmt: skip
     made = (without_empty_lines(make(results)) for make in makers)
     return tuple(panel for panel in made if panel.lines)
 
 
-def lateral_axis_name(results: Results) -> str:
+def lateral_axis_name(results: "Results") -> str:
     """Return what insert z points to: "lateral" unless the summary's `lateral_axis` is "-z"."""
     return "lateral" if results.summary.get("lateral_axis", "+z") == "+z" else "medial"
 
 
 def _line(
-    results: Results,
+    results: "Results",
     column: str,
     label: str,
     colour: str,
@@ -41,7 +51,7 @@ def _line(
     return Line(column, label, values * scale, colour, dashed)
 
 
-def _components(results: Results, stem: str, unit: str, scale: float = 1.0) -> tuple[Line, ...]:
+def _components(results: "Results", stem: str, unit: str, scale: float = 1.0) -> tuple[Line, ...]:
     right = lateral_axis_name(results)
     return (
         _line(results, f"{stem}_si_{unit}", "superior", BLUE, scale=scale),
@@ -51,7 +61,7 @@ def _components(results: Results, stem: str, unit: str, scale: float = 1.0) -> t
 
 
 def _both_sides(
-    results: Results, column: str, label: str = "", dashed: bool = False, scale: float = 1.0
+    results: "Results", column: str, label: str = "", dashed: bool = False, scale: float = 1.0
 ) -> tuple[Line, ...]:
     return tuple(
         _line(results, f"{side}_{column}", f"{side}{label}", colour, dashed, scale)
@@ -59,7 +69,7 @@ def _both_sides(
     )
 
 
-def _total(results: Results) -> Panel:
+def _total(results: "Results") -> Panel:
     scale = 1 / body_weight(results)
     total = Line("force_total_BW", "total", results["force_total_BW"], BLACK)
     parts = _components(results, "force", "N", scale)
@@ -68,7 +78,7 @@ def _total(results: Results) -> Panel:
     return Panel("forces", "Tibiofemoral contact force", "BW", lines, note)
 
 
-def _condyles(results: Results) -> Panel:
+def _condyles(results: "Results") -> Panel:
     scale = 1 / body_weight(results)
     lines = (
         *_both_sides(results, "force_N", ", deformation", scale=scale),
@@ -81,16 +91,34 @@ def _condyles(results: Results) -> Panel:
     return Panel("condyles", "Medial and lateral force, two estimates", "BW", lines, note)
 
 
-def _share(results: Results) -> Panel:
+def _share(results: "Results") -> Panel:
     lines = (
         Line("deformation", "by deformation", medial_share(results, "deformation"), BLACK),
         Line("equilibrium", "by equilibrium", medial_share(results, "equilibrium"), PURPLE, True),
     )
     title, unit = "Medial share of the load", "medial / (medial + lateral)"
-    return Panel("share", title, unit, lines, level=(0.5, "even"), limits=(0.0, 1.0))
+    panel = Panel("share", title, unit, lines, level=(0.5, "even"), limits=(0.0, 1.0))
+    unknown = int(split_undetermined(results).sum())
+    if not unknown:
+        return panel
+    note = (
+        f"By deformation not determined in {unknown} of {len(results)} frames: 0.5 deg of "
+        "adduction moves more than a quarter of the load, or one condyle alone carries it."
+    )
+    return replace(panel, note=note, warning=True)
 
 
-def _extensor(results: Results) -> Panel:
+def _sensitivity(results: "Results") -> Panel:
+    name = "medial_force_per_adduction_N_per_deg"
+    lines = (_line(results, name, "medial force", BLACK),)
+    note = (
+        "Change of the medial force by deformation with the adduction, at constant load. "
+        "Fluoroscopy knows the adduction to about 0.5 deg."
+    )
+    return Panel("sensitivity", "Sensitivity of the split to adduction", "N/deg", lines, note)
+
+
+def _extensor(results: "Results") -> Panel:
     scale = 1 / body_weight(results)
     tangential = ("patellofemoral_tangential_N", "patellofemoral, tangential", GREY, True)
     lines = (
@@ -102,7 +130,7 @@ def _extensor(results: Results) -> Panel:
     return Panel("extensor", "Extensor mechanism", "BW", lines)
 
 
-def _ratios(results: Results) -> Panel:
+def _ratios(results: "Results") -> Panel:
     ligament = tension_ratio(results, "patellar_ligament_N")
     patella = tension_ratio(results, "patellofemoral_N")
     lines = (
@@ -112,11 +140,22 @@ def _ratios(results: Results) -> Panel:
     return Panel("ratios", "Ratios to the quadriceps tension", "force / quadriceps", lines)
 
 
-def _areas(results: Results) -> Panel:
-    return Panel("areas", "Contact area", "mm²", _both_sides(results, "area_mm2"))
+def _areas(results: "Results") -> Panel:
+    lines = _both_sides(results, "area_mm2")
+    return _with_known_error(results, Panel("areas", "Contact area", "mm²", lines), ("area",))
 
 
-def centre_panel(results: Results) -> Panel:
+def _with_known_error(results: "Results", panel: Panel, names: tuple[str, ...]) -> Panel:
+    """Return the panel with what its contact model is known to be off by."""
+    said = results.summary.get("known_error")
+    if said is None:
+        return panel
+    words = known_error_words(said, names)
+    note = f"{words[0].upper()}{words[1:]}."
+    return replace(panel, note=note, warning=is_large(said, names))
+
+
+def centre_panel(results: "Results") -> Panel:
     """Return the anterior positions of the centres of pressure over the motion."""
     lines = _both_sides(results, "cop_ap_mm")
     title = "Anterior position of the centres of pressure"
@@ -124,24 +163,25 @@ def centre_panel(results: Results) -> Panel:
     return without_empty_lines(Panel("centres", title, "mm", lines, note))
 
 
-def _pressures(results: Results) -> Panel:
+def _pressures(results: "Results") -> Panel:
     lines = (
         *_both_sides(results, "peak_pressure_MPa", ", peak"),
         *_both_sides(results, "mean_pressure_MPa", ", mean", dashed=True),
     )
     stress = results.summary.get("yield_stress_MPa")
     level = None if stress is None else (float(stress), f"yield {stress:g} MPa")
-    return Panel("pressures", "Contact pressure", "MPa", lines, level=level)
+    panel = Panel("pressures", "Contact pressure", "MPa", lines, level=level)
+    return _with_known_error(results, panel, ("peak_pressure", "mean_pressure"))
 
 
-def _yield(results: Results) -> Panel:
+def _yield(results: "Results") -> Panel:
     lines = _both_sides(results, "area_above_yield", scale=100)
     if not any(np.nanmax(line.values, initial=0) > 0 for line in lines):
         lines = ()
     return Panel("above_yield", "Contact area above yield", "% of the condyle's area", lines)
 
 
-def _external(results: Results) -> Panel:
+def _external(results: "Results") -> Panel:
     lines = (
         _line(results, "external_flexion_moment_Nm", "flexing", BLUE),
         _line(results, "external_adduction_moment_Nm", "adducting", VERMILLION),
@@ -153,12 +193,12 @@ def _external(results: Results) -> Panel:
     return Panel("external", "External knee moments", "N·m", lines, second=second)
 
 
-def _ground(results: Results) -> Panel:
+def _ground(results: "Results") -> Panel:
     lines = _components(results, "ground_reaction", "N", 1 / body_weight(results))
     return Panel("ground", "Ground reaction along the insert axes", "BW", lines)
 
 
-def _ligaments(results: Results) -> Panel:
+def _ligaments(results: "Results") -> Panel:
     names = [name for name in results.columns if is_ligament(name)]
     bundles: dict[str, list[str]] = {}
     for name in names:
@@ -173,7 +213,7 @@ def _ligaments(results: Results) -> Panel:
     return Panel("ligaments", "Ligament tension", "N", lines, note)
 
 
-def _bundle(results: Results, bundle: str, strands: Sequence[str], position: int) -> Line:
+def _bundle(results: "Results", bundle: str, strands: Sequence[str], position: int) -> Line:
     """Return the summed tension of strands; NaN only where all of them are."""
     tension = np.array([results[name] for name in strands])
     missing = np.isnan(tension).all(axis=0)
@@ -184,7 +224,7 @@ def _bundle(results: Results, bundle: str, strands: Sequence[str], position: int
     return Line(name, label, values, colour, position >= len(style.CYCLE))
 
 
-def _residuals(results: Results) -> Panel:
+def _residuals(results: "Results") -> Panel:
     with np.errstate(divide="ignore", invalid="ignore"):
         percent = 100 / np.abs(results["force_si_N"])
         sensitivity = _line(
@@ -203,7 +243,7 @@ def _residuals(results: Results) -> Panel:
     return Panel("residuals", "Residual forces", "% of the SI contact force", lines, note)
 
 
-def _residual_moment(results: Results) -> Panel:
+def _residual_moment(results: "Results") -> Panel:
     lines = (
         _line(results, "residual_axial_Nm", "axial", BLUE),
         _line(results, "residual_coronal_Nm", "coronal, one condyle off", VERMILLION),
@@ -212,18 +252,18 @@ def _residual_moment(results: Results) -> Panel:
     return Panel("residual_moment", "Residual moments", "N·m", lines)
 
 
-def _hip_force(results: Results) -> Panel:
+def _hip_force(results: "Results") -> Panel:
     lines = _components(results, "hip_force", "N", 1 / body_weight(results))
     return Panel("hip_force", "Intersegmental force on the femur at the hip", "BW", lines)
 
 
-def _hip_moment(results: Results) -> Panel:
+def _hip_moment(results: "Results") -> Panel:
     lines = _components(results, "hip_moment", "Nm")
     note = "About the axes named; stands for the muscles across the hip, which are not modelled."
     return Panel("hip_moment", "Intersegmental moment on the femur at the hip", "N·m", lines, note)
 
 
-def _motion(results: Results) -> Panel:
+def _motion(results: "Results") -> Panel:
     lines = [
         _line(results, "adduction_deg", "adduction", VERMILLION),
         _line(results, "axial_rotation_deg", "axial rotation", GREEN),
@@ -234,11 +274,11 @@ def _motion(results: Results) -> Panel:
     return Panel("motion", "Knee rotations", "deg", tuple(lines), note)
 
 
-def _slip(results: Results) -> Panel:
+def _slip(results: "Results") -> Panel:
     return Panel("slip", "Slip since the first frame", "mm", _both_sides(results, "slip_mm"))
 
 
-def _adjustment(results: Results) -> Panel:
+def _adjustment(results: "Results") -> Panel:
     lines = (
         _line(results, "adjust_translation_mm", "translation, mm", BLUE),
         _line(results, "adjust_coronal_deg", "coronal angle, deg", VERMILLION),
@@ -246,7 +286,7 @@ def _adjustment(results: Results) -> Panel:
     return Panel("adjustment", "Femoral adjustment before contact", "mm or deg", lines)
 
 
-def _adjustment_effect(results: Results) -> Panel:
+def _adjustment_effect(results: "Results") -> Panel:
     lines = (
         _line(results, "adjust_force_change_BW", "total force, BW", BLACK),
         _line(results, "adjust_share_change", "medial share (by equilibrium)", PURPLE, True),
@@ -255,7 +295,7 @@ def _adjustment_effect(results: Results) -> Panel:
     return Panel("adjustment_effect", "What the adjustment changes", "BW or share", lines, note)
 
 
-def _condition(results: Results) -> Panel:
+def _condition(results: "Results") -> Panel:
     lines = (_line(results, "condition_number", "condition number", BLACK),)
     note = "How much an input error may grow in the solution (scaled columns)."
     title = "Condition number of the equilibrium"

@@ -1,6 +1,6 @@
 """Line plots of a run, drawn in time order against flexion, cycle or time."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,14 +19,16 @@ from tkamb.output.metrics import failed, flagged
 from tkamb.output.panel import Panel
 from tkamb.output.panels import centre_panel, panels
 from tkamb.output.style import BLACK, GREY, ORANGE, legend_above, new_figure, settings
-from tkamb.results import Results
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
 WIDTH, HEIGHT = 5.4, 3.1
 DEFAULT = ("forces", "condyles", "ratios", "pressures")
 DASHES = (0, (4, 2))
 
 
-def draw_panel(panel: Panel, results: Results, axis: HorizontalAxis) -> Figure:
+def draw_panel(panel: Panel, results: "Results", axis: HorizontalAxis) -> Figure:
     """Return one plot with its flagged and failed frames marked along the bottom.
 
     Each curve's id in the picture is its line's name.
@@ -41,7 +43,7 @@ def draw_panel(panel: Panel, results: Results, axis: HorizontalAxis) -> Figure:
     return figure
 
 
-def plot(results: Results, names: tuple[str, ...] = (), axis: str | None = None) -> Figure:
+def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = None) -> Figure:
     """Return the plots of a run in one figure, for notebooks.
 
     Args:
@@ -74,7 +76,7 @@ def plot(results: Results, names: tuple[str, ...] = (), axis: str | None = None)
     return figure
 
 
-def mark_frames(axes: Axes, results: Results, axis: HorizontalAxis) -> None:
+def mark_frames(axes: Axes, results: "Results", axis: HorizontalAxis) -> None:
     """Mark flagged frames with ticks and failed ones with crosses along the bottom."""
     transform = axes.get_xaxis_transform()
     for mask, marker, colour, name in (

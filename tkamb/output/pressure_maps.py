@@ -5,7 +5,7 @@ insert; for a left knee, which is mirrored at input, the picture is mirrored bac
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,8 +23,10 @@ from tkamb.output.maps_file import ContactMaps
 from tkamb.output.metrics import map_rows, stretches
 from tkamb.output.panels import lateral_axis_name
 from tkamb.output.style import BLACK, GREY, PRESSURE_MAP, SIDE_COLOURS, new_figure, settings
-from tkamb.results import Results
 from tkamb.units import MEGAPASCAL, MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
 TOUCHED = 1e-3
 """Share of the largest pressure from which a point is coloured."""
@@ -81,7 +83,7 @@ class TopView:
         axes.text(0, low - 0.8, "10 mm", ha="center", va="top", fontsize=7, color=GREY)
 
 
-def top_view(results: Results) -> TopView | None:
+def top_view(results: "Results") -> TopView | None:
     """Return the view of the run's insert; None without maps."""
     if results.maps is None or len(results.maps.triangles) == 0:
         return None
@@ -89,7 +91,7 @@ def top_view(results: Results) -> TopView | None:
     return TopView(results.maps, side, lateral_axis_name(results))
 
 
-def mapped_frames(results: Results, axis: HorizontalAxis, count: int = 8) -> list[int]:
+def mapped_frames(results: "Results", axis: HorizontalAxis, count: int = 8) -> list[int]:
     """Return at most `count` frames with a pressure map, spread over the motion."""
     frames = np.array(sorted(map_rows(results)), int)
     if not len(frames):
@@ -98,7 +100,7 @@ def mapped_frames(results: Results, axis: HorizontalAxis, count: int = 8) -> lis
 
 
 def draw_maps(
-    results: Results, view: TopView, axis: HorizontalAxis, frames: Sequence[int]
+    results: "Results", view: TopView, axis: HorizontalAxis, frames: Sequence[int]
 ) -> Figure:
     """Return pressure maps of these frames on one colour scale, 0 to the run's largest."""
     pressure, rows = _pressure(results), map_rows(results)
@@ -129,7 +131,7 @@ def draw_maps(
 
 
 def draw_paths(
-    results: Results, view: TopView, axis: HorizontalAxis, frames: Sequence[int]
+    results: "Results", view: TopView, axis: HorizontalAxis, frames: Sequence[int]
 ) -> Figure:
     """Return the paths of both centres of pressure over the insert, in time order."""
     with settings():
@@ -151,7 +153,7 @@ def draw_paths(
     return figure
 
 
-def _pressure(results: Results) -> Array:
+def _pressure(results: "Results") -> Array:
     if results.maps is None:
         raise ValueError("the run has no pressure maps")
     return results.maps.pressure_Pa / MEGAPASCAL
@@ -178,14 +180,14 @@ def _draw_pressure(axes: Axes, view: TopView, pressure: Array, scale: Normalize)
     )
 
 
-def _draw_centres(axes: Axes, view: TopView, results: Results, frame: int) -> None:
+def _draw_centres(axes: Axes, view: TopView, results: "Results", frame: int) -> None:
     for side in SIDE_COLOURS:
         x, y = view.place(results[f"{side}_cop_ap_mm"][frame], results[f"{side}_cop_ml_mm"][frame])
         axes.plot(x, y, "+", color="white", markersize=7, markeredgewidth=2.4)
         axes.plot(x, y, "+", color=BLACK, markersize=6, markeredgewidth=1.1)
 
 
-def _caption(results: Results, axis: HorizontalAxis, frame: int) -> str:
+def _caption(results: "Results", axis: HorizontalAxis, frame: int) -> str:
     force = results["force_total_BW"][frame]
     return f"{axis.label.split(' (')[0]} {axis.at(frame)}, {force:.2f} BW"
 

@@ -12,6 +12,10 @@ SUMMARY_KEYS: dict[str, str] = {
     "versions": "package -> version",
     "seconds": "part -> computing time",
     "contact": "model, resolution_mm, material and the model's other options; absent: no contact",
+    "known_error": "largest relative errors of the contact model on the reference cases of the "
+    "trade-off (approach, force, mean_pressure, peak_pressure, area; cases: how many), or "
+    "'not measured'",
+    "split_not_determined_frames": "in how many frames split_determined is 0",
     "side": "right or left: the subject's knee",
     "lateral_axis": "+z (default; left knees are mirrored at input) or -z, in the results' frame",
     "frame": "a sentence on frame and side",
@@ -22,11 +26,16 @@ SUMMARY_KEYS: dict[str, str] = {
     "cycle_percent_s": "times of 0 % and of 100 % of the cycle; default: first and last frame",
     "residuals": "a sentence on where the residuals act and what they mean",
     "notes": "list of sentences: assumptions, departures, what a reader must know",
+    "questions": "list of sentences: what is unlikely about the input, with the likely mistake",
     "assumptions": "list of sentences",
     "not_modelled": "list: what the scene leaves out",
     "first_wrapping_flexion_deg": "least flexion at which the quadriceps wraps the femur; or null",
     "ligament_strain": "flexion_deg: list; strain: bundle -> list, null where not recorded",
     "failed_frames": "list of {frame, time_s, status}",
+    "identity": "what makes two runs the same: scene, its files, frames, version and code",
+    "inputs": "path -> SHA-256 of the scene file and of the files it names",
+    "files": "results.csv and contact.h5 -> SHA-256",
+    "summary_sha256": "of all the rest of the summary",
 }
 """What `Results.summary` may hold for the report, beyond anything else that JSON can hold."""
 

@@ -2,25 +2,34 @@
 
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tkamb.output.atomic import write_text
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
-from tkamb.output.cursor import cursor_bar
+from tkamb.output.cursor import SCRIPT, cursor_bar
 from tkamb.output.headline import cards
 from tkamb.output.metrics import body_weight, failed, flagged
 from tkamb.output.panel import Panel
 from tkamb.output.panels import centre_panel, panels
 from tkamb.output.plots import draw_panel
+from tkamb.output.policy import sources
 from tkamb.output.pressure_maps import draw_maps, draw_paths, mapped_frames, top_view
 from tkamb.output.provenance import provenance_rows, sentences
 from tkamb.output.report_style import CSS, NOTEBOOK_CSS
 from tkamb.output.style import svg_text
 from tkamb.output.tables import flags_table, motion_table, strain_table
-from tkamb.results import Results
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
+
+POLICY = (
+    f"default-src 'none'; script-src {sources(SCRIPT)}; style-src-elem {sources(CSS)}; "
+    "style-src-attr 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
+)
+"""The page runs its own script and loads nothing; the plots set their colours in attributes."""
 
 
-def write_report(results: Results, path: str | Path) -> None:
+def write_report(results: "Results", path: str | Path) -> None:
     """Write the report of a run as one self-contained HTML page, whole or not at all.
 
     Raises:
@@ -29,15 +38,17 @@ def write_report(results: Results, path: str | Path) -> None:
     write_text(Path(path), report_html(results))
 
 
-def report_html(results: Results) -> str:
+def report_html(results: "Results") -> str:
     """Return the report as HTML: vector plots, pictures and style are inside the page."""
     axis = horizontal_axis(results)
     title = escape(_title(results.summary))
     return (
         "<!DOCTYPE html>\n"
-        f'<html lang="en"><head><meta charset="utf-8"><title>{title}</title>\n'
+        f'<html lang="en"><head><meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
+        f"<title>{title}</title>\n"
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<style>\n{CSS}</style></head>\n<body>\n"
+        f"<style>{CSS}</style></head>\n<body>\n"
         f"<header><h1>{title}</h1><p>{_subtitle(results)}</p></header>\n"
         f"{_summary_section(results, axis)}{_maps_section(results, axis)}"
         f"{_plots_section(results, axis)}{_tables_section(results, axis)}"
@@ -45,7 +56,7 @@ def report_html(results: Results) -> str:
     )
 
 
-def headline_html(results: Results) -> str:
+def headline_html(results: "Results") -> str:
     """Return the headline numbers alone, with their style, for notebooks."""
     boxes = "".join(card.html() for card in cards(results, horizontal_axis(results)))
     title = escape(_title(results.summary))
@@ -63,7 +74,7 @@ def _title(summary: dict[str, Any]) -> str:
     return name.upper() if len(name) <= 3 else name.replace("_", " ").capitalize()
 
 
-def _subtitle(results: Results) -> str:
+def _subtitle(results: "Results") -> str:
     summary = results.summary
     contact = summary.get("contact") or {}
     weight = body_weight(results)
@@ -86,14 +97,14 @@ def _contact_words(contact: dict[str, Any]) -> str:
     return words
 
 
-def _summary_section(results: Results, axis: HorizontalAxis) -> str:
+def _summary_section(results: "Results", axis: HorizontalAxis) -> str:
     boxes = "".join(card.html() for card in cards(results, axis))
     notes = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences(results.summary))
     listed = f"<h2>What to know</h2><ul class='notes'>{notes}</ul>" if notes else ""
     return f"<section><div class='cards'>{boxes}</div>{listed}</section>\n"
 
 
-def _maps_section(results: Results, axis: HorizontalAxis) -> str:
+def _maps_section(results: "Results", axis: HorizontalAxis) -> str:
     view = top_view(results)
     frames = mapped_frames(results, axis)
     if view is None or not frames:
@@ -115,7 +126,7 @@ def _maps_section(results: Results, axis: HorizontalAxis) -> str:
     )
 
 
-def _plots_section(results: Results, axis: HorizontalAxis) -> str:
+def _plots_section(results: "Results", axis: HorizontalAxis) -> str:
     drawn = "".join(_plot(panel, results, axis) for panel in panels(results))
     return (
         f"<section><h2>Over the motion</h2>{_marks(results)}"
@@ -123,9 +134,10 @@ def _plots_section(results: Results, axis: HorizontalAxis) -> str:
     )
 
 
-def _plot(panel: Panel, results: Results, axis: HorizontalAxis) -> str:
+def _plot(panel: Panel, results: "Results", axis: HorizontalAxis) -> str:
     picture = svg_text(draw_panel(panel, results, axis), panel.name)
-    note = f"<figcaption>{escape(panel.note)}</figcaption>" if panel.note else ""
+    kind = " class='warning'" if panel.warning else ""
+    note = f"<figcaption{kind}>{escape(panel.note)}</figcaption>" if panel.note else ""
     return (
         f"<figure class='plot' id='figure-{panel.name}'><h3>{escape(panel.title)}"
         f" <small>({escape(panel.unit)})</small></h3>{picture}"
@@ -133,7 +145,7 @@ def _plot(panel: Panel, results: Results, axis: HorizontalAxis) -> str:
     )
 
 
-def _marks(results: Results) -> str:
+def _marks(results: "Results") -> str:
     words = ["Lines run in time order."]
     if flagged(results).any():
         words.append("Orange ticks at the bottom: frames to be read with care.")
@@ -142,7 +154,7 @@ def _marks(results: Results) -> str:
     return f"<p class='legend'>{' '.join(words)}</p>"
 
 
-def _tables_section(results: Results, axis: HorizontalAxis) -> str:
+def _tables_section(results: "Results", axis: HorizontalAxis) -> str:
     return (
         "<section><h2>Numbers</h2>"
         f"{motion_table(results, axis)}"
@@ -153,6 +165,6 @@ def _tables_section(results: Results, axis: HorizontalAxis) -> str:
     )
 
 
-def _provenance_section(results: Results) -> str:
+def _provenance_section(results: "Results") -> str:
     rows = provenance_rows(results.summary)
     return f"<section><h2>Where it comes from</h2><table class='keys'>{rows}</table></section>\n"

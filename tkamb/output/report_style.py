@@ -22,8 +22,10 @@ h3 small { font-weight: normal; color: var(--soft); }
 .grid { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 26px 30px; }
 figure { margin: 0; break-inside: avoid; }
 figure svg { display: block; width: 100%; height: auto; }
+figure svg * { stroke-linejoin: round; stroke-linecap: butt; }
 figure text { font-family: "DejaVu Sans", Verdana, sans-serif !important; }
 figcaption, .legend { font-size: 12.5px; color: var(--soft); margin: 4px 0 0; }
+figcaption.warning { color: var(--warn); }
 .legend { margin-bottom: 14px; }
 .wide { margin-bottom: 22px; }
 .readout { display: none; }

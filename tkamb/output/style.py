@@ -66,6 +66,7 @@ def settings() -> Any:
 def svg_text(figure: "Figure", name: str, dpi: int = 200) -> str:
     """Return the figure as inline SVG that scales with the page.
 
+    It has no style element: the page's own says how lines join.
     Every id is prefixed with `name`, so that many figures live in one page. `data-box` holds
     the left, right, top and bottom of the first axes in the picture's units and `data-range`
     the values at its left and right end, for whoever draws over it.
@@ -75,7 +76,7 @@ def svg_text(figure: "Figure", name: str, dpi: int = 200) -> str:
         figure.savefig(buffer, format="svg", dpi=dpi, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r"<(metadata|style)\b.*?</\1>", "", text, flags=re.DOTALL)
     text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
     text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
     text = re.sub(r' xmlns(:xlink)?="[^"]*"', "", text)

@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from itertools import zip_longest
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,7 +16,9 @@ from tkamb.output.metrics import (
     residual_share,
     tension_ratio,
 )
-from tkamb.results import Results
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
 Entry = tuple[str, str, Array, int]
 """Heading, unit, values (f,), digits."""
@@ -24,7 +26,7 @@ Entry = tuple[str, str, Array, int]
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 
-def motion_table(results: Results, axis: HorizontalAxis) -> str:
+def motion_table(results: "Results", axis: HorizontalAxis) -> str:
     """Return the HTML table of the frames nearest to 0, 10, ..., or at even times."""
     entries = [entry for entry in _entries(results, axis) if np.isfinite(entry[2]).any()]
     head = "".join(
@@ -62,7 +64,7 @@ def _percent(strain: float | None) -> float:
     return float("nan") if strain is None else 100.0 * strain
 
 
-def flags_table(results: Results, axis: HorizontalAxis) -> str:
+def flags_table(results: "Results", axis: HorizontalAxis) -> str:
     """Return the HTML table of what is not ok: one row per reason, and in which frames."""
     rows = "".join(
         f"<tr><td>{escape(reason)}</td><td>{len(frames)}</td><td>{_stretches(frames)}</td>"
@@ -127,7 +129,7 @@ def _places(frames: Sequence[int], axis: HorizontalAxis) -> str:
     )
 
 
-def _entries(results: Results, axis: HorizontalAxis) -> list[Entry]:
+def _entries(results: "Results", axis: HorizontalAxis) -> list[Entry]:
     weight = body_weight(results)
     entries: list[Entry] = [("flexion", "deg", results["flexion_deg"], 1)]
     if axis.kind != "flexion":

@@ -12,12 +12,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tkamb.contact import materials
-from tkamb.contact.model import Bearing, ContactModel, ContactPair, ContactResult
+from tkamb.contact.model import ContactModel
+from tkamb.contact.pair import Bearing, ContactPair
 from tkamb.contact.pressing import check_load, first_touch_height
 from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactResult
 from tkamb.defaults import CONTACT_MODEL
 from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.errors import InputError
+from tkamb.files import read_text
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.adjustment import adjust as adjusted
 from tkamb.geometry.closest import ClosestPointQuery
@@ -26,6 +29,7 @@ from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import Array, mirrored_pose
 from tkamb.geometry.frames import pose as pose_matrix
 from tkamb.inputs.meshes import axes_rotation, load_surface, mirrored
+from tkamb.known_errors import known_error
 from tkamb.press.press_report import PressReport, Side
 from tkamb.units import DEGREE, LENGTH
 
@@ -99,6 +103,7 @@ def press_meshes(
         prepare_seconds=prepared - started,
         solve_seconds=solved - prepared,
         peak_rss_MB=peak_rss(),
+        known_error=known_error(contact, resolution_mm, material, options),
     )
 
 
@@ -177,9 +182,9 @@ def read_pose(path: str | Path) -> tuple[float, ...]:
         InputError: no such file, or not six numbers.
     """
     try:
-        words = Path(path).read_text(encoding="utf-8").replace(",", " ").split()
+        words = read_text(path, what="pose file").replace(",", " ").split()
         values = tuple(float(word) for word in words)
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise InputError(f"cannot be read ({error})", path, _SIX) from None
     if len(values) != 6:
         raise InputError(f"holds {len(values)} numbers", path, _SIX)

@@ -6,8 +6,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tkamb.contact.model import CondyleContact, ContactPair, ContactResult, ContactStatus
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.result import CondyleContact, ContactResult, ContactStatus
 from tkamb.geometry.adjustment import Adjustment
+from tkamb.known_errors import KnownError, as_json, known_error_words
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 Side = Literal["right", "left"]
@@ -16,6 +18,7 @@ _CONDYLE = (
     "{force_N:8.1f} N {area_mm2:7.1f} mm2  mean {mean_pressure_MPa:5.2f}  "
     "peak {peak_pressure_MPa:5.2f} MPa  centre ({:.1f}, {:.1f}, {:.1f}) mm"
 )
+_ERRORS_TOLD = ("peak_pressure", "mean_pressure", "area", "approach")
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +37,7 @@ class PressReport:
         prepare_seconds: for the geometry.
         solve_seconds: for the press.
         peak_rss_MB: largest resident memory of the process so far.
+        known_error: of the contact model at this resolution; None if it was not measured.
     """
 
     contact: str
@@ -47,6 +51,7 @@ class PressReport:
     prepare_seconds: float
     solve_seconds: float
     peak_rss_MB: float
+    known_error: KnownError | None = None
 
     @property
     def carried(self) -> bool:
@@ -73,6 +78,7 @@ class PressReport:
                 f"adjusted {done.translation / MILLIMETRE:.3f} mm along y, "
                 f"{done.coronal_angle / DEGREE:.3f} deg coronal{restored}"
             )
+        lines.append(known_error_words(found["known_error"], _ERRORS_TOLD))
         lines += [f"note: {flag}" for flag in self.result.flags]
         took = f"prepared in {self.prepare_seconds:.3g} s, solved in {self.solve_seconds:.3g} s"
         return [*lines, f"{took}, {self.result.iterations} iterations"]
@@ -99,6 +105,7 @@ class PressReport:
             "residual": _known(result.residual),
             "status": result.status.value,
             "flags": list(result.flags),
+            "known_error": as_json(self.known_error),
         }
 
 

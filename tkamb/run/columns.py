@@ -31,6 +31,8 @@ _MUSCLE = "[quadriceps], [patellar_ligament], [patella]"
 _COUPLED = "[contact] coupling or released"
 _POINTS = "[contact] coupling = 'points'"
 _FREE = "[contact] released"
+_RECORDED = "[contact] with adduction not released"
+_MARKERS = "[motion.markers]"
 _ADJUST = "[contact] with adjust = true"
 
 LIGAMENT = "ligament_<name>_N"
@@ -70,6 +72,12 @@ COLUMNS: tuple[Column, ...] = (
     Column("patellofemoral_N", "patellofemoral force along the contact normal", _MUSCLE),
     Column("patellofemoral_tangential_N", "the same across the normal; near zero", _MUSCLE),
     Column("quadriceps_wrap_deg", "angle over which the quadriceps wraps the femur", _MUSCLE),
+    Column(
+        "quadriceps_per_dome_mm_N",
+        "change of quadriceps_N as the button sits 1 mm higher on the patella, its place kept",
+        _MUSCLE,
+    ),
+    Column("patellofemoral_per_dome_mm_N", "the same, of patellofemoral_N", _MUSCLE),
     Column("hip_force_ap_N", "intersegmental force on the femur at the hip, insert x"),
     Column("hip_force_si_N", "the same, insert y"),
     Column("hip_force_ml_N", "the same, insert z"),
@@ -139,6 +147,33 @@ COLUMNS: tuple[Column, ...] = (
         _ADJUST,
     ),
     Column("adjust_share_change", "the same, of medial_share_equilibrium", _ADJUST),
+    Column(
+        "medial_force_per_adduction_N_per_deg",
+        "change of medial_force_N with adduction at constant load, a finite difference; zero where "
+        "one condyle carries all, until the other touches",
+        _RECORDED,
+    ),
+    Column(
+        "split_determined",
+        "1: the recorded adduction determines medial_force_N and lateral_force_N; 0: not, 0.5 deg "
+        "moves more than a quarter of the load, or one condyle carries all and equilibrium "
+        "says otherwise",
+        _RECORDED,
+        "integer",
+    ),
+    Column(
+        "marker_rms_segments_mm",
+        "root mean square distance of shank and thigh markers, each segment fitted rigidly",
+        _MARKERS,
+    ),
+    Column("marker_rms_chain_mm", "the same of all segments held together by joints", _MARKERS),
+    Column("flexion_segments_deg", "flexion by rigid fits, unfiltered", _MARKERS),
+    Column("flexion_chain_deg", "flexion by the chain, unfiltered", _MARKERS),
+    Column(
+        "knee_centre_distance_mm",
+        "between the knee centres that shank and thigh markers carry, each by itself",
+        _MARKERS,
+    ),
 )
 
 KINDS: dict[str, Kind] = {column.name: column.kind for column in COLUMNS}

@@ -4,6 +4,7 @@
 """
 
 import math
+import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -65,10 +66,10 @@ class Profile:
         return list(dict.fromkeys(path for path in inside if path.is_file()))
 
     def _hear(self, event: str, given: tuple[Any, ...]) -> None:
-        if event == "open" and isinstance(given[0], str):
-            mode = given[1] if isinstance(given[1], str) else "r"
-            if not set("wax+") & set(mode):
-                self.opened.append(Path(given[0]))
+        if event != "open" or not isinstance(given[0], str):
+            return
+        if given[2] & os.O_ACCMODE == os.O_RDONLY:
+            self.opened.append(Path(given[0]))
 
 
 def profile_lines(report: dict[str, Any]) -> list[str]:

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.contact.model import ContactResult, PreparedContact
+from tkamb.contact.pair import PreparedContact
 from tkamb.contact.probe import ProbedContact
+from tkamb.contact.result import ContactResult
 from tkamb.equilibrium.balance import Balance, BalanceStatus
-from tkamb.equilibrium.contact_side import ContactSide, FrameContact
+from tkamb.equilibrium.contact_side import ContactSide
+from tkamb.equilibrium.frame_contact import FrameContact
 from tkamb.equilibrium.released import SettledKnee
 from tkamb.geometry.frames import Array
 

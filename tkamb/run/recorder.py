@@ -1,8 +1,8 @@
 """What takes the frames of a run as they are finished: memory, or a folder that survives a kill.
 
 In a folder every finished frame is a file of its own (`tkamb.output.shards`) before the next
-begins. contact.h5 grows beside them and is copied to its place, whole, about once a second,
-together with a results.csv that calls the other frames not computed.
+begins. contact.h5 grows beside them; about once a second a copy takes its place together with
+results.csv, which calls the other frames not computed, and summary.json.
 """
 
 import shutil
@@ -14,9 +14,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.output.atomic import replaced_file
 from tkamb.output.shards import Row, Shard, Shards, check_same_run
 
 if TYPE_CHECKING:
@@ -82,7 +80,7 @@ class Recorder:
         """Show what is finished to the outside."""
 
     def finish(self) -> None:
-        """Put the maps where they stay: every frame is there."""
+        """Close the maps: every frame is there."""
 
     @property
     def maps(self) -> "ContactMaps | None":
@@ -100,8 +98,10 @@ class Recorder:
 class FolderRecorder(Recorder):
     """Keeps the frames of a run in its output folder.
 
+    Nothing in the folder changes before the first frame is finished.
+
     Args:
-        directory: an existing folder.
+        directory: a folder that this process has claimed (`tkamb.output.claim`).
         identity: what makes two runs the same.
         resume: go on with the frames that an earlier run left there.
 
@@ -114,23 +114,34 @@ class FolderRecorder(Recorder):
         self._directory = directory
         self._shards = Shards(directory, identity, resume)
         self._pause, self._shown = 0.0, -SHORTEST_PAUSE
+        self._map_arguments: tuple[Any, ...] | None = None
+
+    def begin_maps(self, points: Array, triangles: Array, labels: Mapping[str, Any]) -> None:
+        """See `Recorder`; the file is made with the first frame."""
+        self._map_arguments = (points, triangles, labels)
 
     def take_earlier(self, frames: range) -> dict[int, dict[str, Array] | None]:
         """See `Recorder`; in order, up to the first gap."""
         found = {}
-        for frame in frames:
+        for frame in frames if self._shards.resumed else ():
             shard = self._shards.get(frame)
             if shard is None:
                 break
             found[frame] = shard.contact
-            super().record(frame, shard.row, shard.contact)
+            self._record(frame, shard.row, shard.contact)
         return found
 
     def record(self, frame: int, row: Row, contact: dict[str, Array] | None) -> None:
         """See `Recorder`; an interrupt waits until the frame is written."""
         with interrupt_later():
             self._shards.put(frame, Shard(row, contact))
-            super().record(frame, row, contact)
+            self._record(frame, row, contact)
+
+    def _record(self, frame: int, row: Row, contact: dict[str, Array] | None) -> None:
+        self._shards.begin()
+        if self._map_arguments is not None and self._sink is None:
+            super().begin_maps(*self._map_arguments)
+        super().record(frame, row, contact)
 
     keeps_files = True
 
@@ -146,33 +157,24 @@ class FolderRecorder(Recorder):
         return None if self._sink is None else ContactMaps(self._directory / FILE_NAME)
 
     def finish(self) -> None:
-        """See `Recorder`."""
+        """See `Recorder`; what is published afterwards is whole."""
         with interrupt_later():
             self.close()
-            self._copy_maps()
 
     def publish(self, results: "Results") -> None:
-        """Write results.csv, summary.json and contact.h5, each whole; a report goes."""
-        from tkamb.results import REPORT_NAME, write_numbers
+        """Put results.csv, summary.json and contact.h5 in their places together; a report goes."""
+        from tkamb.output.atomic import replaced_together
+        from tkamb.output.maps_file import FILE_NAME
+        from tkamb.results import REPORT_NAME, put_numbers
 
         start = clock.perf_counter()
-        with interrupt_later():
-            write_numbers(results, self._directory)
-            (self._directory / REPORT_NAME).unlink(missing_ok=True)
-            self._copy_maps()
+        with interrupt_later(), replaced_together(self._directory) as files:
+            if self._sink is not None:
+                shutil.copyfile(self._shards.folder / FILE_NAME, files.path(FILE_NAME))
+            put_numbers(results, files)
+            files.remove(REPORT_NAME)
         self._shown = clock.perf_counter()
         self._pause = max(SHORTEST_PAUSE, (self._shown - start) / DEAREST_SHARE)
-
-    def _copy_maps(self) -> None:
-        """Copy contact.h5 to its place; without contact an older one there goes."""
-        from tkamb.output.maps_file import FILE_NAME
-
-        place = self._directory / FILE_NAME
-        if self._sink is None:
-            place.unlink(missing_ok=True)
-            return
-        with replaced_file(place) as temporary:
-            shutil.copyfile(self._shards.folder / FILE_NAME, temporary)
 
     def _map_folder(self) -> Path | None:
         return self._shards.folder
@@ -195,16 +197,15 @@ def interrupt_later() -> Iterator[None]:
 
 
 def finished_results(directory: Path, identity: Mapping[str, Any]) -> "Results | None":
-    """Return the results in a folder if they are all of that run's; None if not.
+    """Return the results in a folder if they are all of that run's; None if there are none.
 
     Raises:
-        InputError: they are another run's.
+        InputError: they are another run's, or no longer what was written.
     """
-    from tkamb.results import read_results
+    from tkamb.results import SUMMARY_NAME, read_results
 
-    try:
-        results = read_results(directory)
-    except InputError:
+    if not (directory / SUMMARY_NAME).exists():
         return None
+    results = read_results(directory)
     check_same_run(results.summary.get("identity"), identity, directory)
     return None if results.summary.get("unfinished_frames", 1) else results

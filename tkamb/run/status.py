@@ -1,15 +1,17 @@
 """The status of a frame in words: "ok", why it failed, or what a reader must know."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tkamb.case import Case
 from tkamb.mechanics.mechanics import FrameLoads
+from tkamb.run.agreement import contradictions
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
-    from tkamb.equilibrium.contact_side import FrameContact
+    from tkamb.equilibrium.frame_contact import FrameContact
 
 FILTER_TRANSLATION = 0.5 * MILLIMETRE
 FILTER_ROTATION = 0.5 * DEGREE
@@ -22,11 +24,28 @@ recorded position, the ML one above all, deserves a look."""
 ADJUSTED_TOTAL = 0.01
 """BW: a femoral adjustment that changes the total force by more decides more than the split."""
 
+MARKERS_APART = 20.0 * MILLIMETRE
+"""Skin that has moved by more than this against the other segment's: at 700 N 14 N·m."""
+
 FAILED = "failed: "
 
 
-def frame_status(case: Case, k: int, body: FrameLoads, contact: "FrameContact | None") -> str:
-    """Return "ok", or reason words joined by "; ". A frame without force begins with failed."""
+def frame_status(
+    case: Case,
+    k: int,
+    body: FrameLoads,
+    contact: "FrameContact | None",
+    doubts: Sequence[str] = (),
+) -> str:
+    """Return "ok", or reason words joined by "; ". A frame without force begins with failed.
+
+    Args:
+        case: the case.
+        k: frame.
+        body: its body side.
+        contact: its contact side; None when not modelled.
+        doubts: flags of the questions that concern it (`tkamb.plausibility`).
+    """
     failures = list(body.loads.problems)
     if contact and contact.problem and not failures:
         failures.append(contact.problem)
@@ -35,7 +54,11 @@ def frame_status(case: Case, k: int, body: FrameLoads, contact: "FrameContact | 
     words += [_lift_off(body, side, settled) for side in sorted(body.loads.lifted)]
     if body.loads.slack:
         words.append("flexors needed, which are not modelled: quadriceps slack")
+    if body.loads.ambiguous:
+        words.append("several load states balance: the one that leaves out fewest is taken")
+    words += contradictions(case, body, contact)
     words += list(contact.flags) if contact else []
+    words += doubts
     if failures:
         return FAILED + "; ".join([*failures, *words])
     return "; ".join(words) or "ok"
@@ -73,4 +96,14 @@ def _motion_flags(case: Case, k: int) -> list[str]:
     motion = case.motion
     far = motion.deviation_translation[k] > FILTER_TRANSLATION
     turned = motion.deviation_rotation[k] > FILTER_ROTATION
-    return ["filter moves the recorded pose beyond 0.5 mm or 0.5 deg"] if far or turned else []
+    found = ["filter moves the recorded pose beyond 0.5 mm or 0.5 deg"] if far or turned else []
+    if motion.markers is not None:
+        time = motion.time[k : k + 1]
+        if motion.markers.at(motion.markers.missing.astype(float), time)[0] > 0:
+            found.append("a marker of shank or thigh is missing")
+        apart = motion.markers.at(motion.markers.centre_distance, time)[0]
+        if apart > MARKERS_APART:
+            found.append(
+                f"knee centres of shank and thigh markers {apart / MILLIMETRE:.0f} mm apart"
+            )
+    return found

@@ -4,6 +4,7 @@ import hashlib
 import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,13 @@ from typing import Any
 import numpy as np
 
 from tkamb.case import Case
+from tkamb.code_identity import code_identity
+from tkamb.files import sha256_of
+from tkamb.known_errors import as_json, known_error
 from tkamb.mechanics.mechanics import STRAIN_FLEXIONS
 from tkamb.run.status import FAILED
 from tkamb.scene_tables import ContactTable
+from tkamb.units import DEGREE, MILLIMETRE
 
 RESIDUALS = (
     "Residuals are the AP and ML force and the axial moment on the tibia that balance still "
@@ -47,8 +52,7 @@ def summary_of(
         "scene_sha256": scene_hash(case),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": " ".join(["tkamb", *sys.argv[1:]]),
-        "versions": {"python": sys.version.split()[0], "tkamb": version("tkamb")}
-        | {name: version(name) for name in LIBRARIES},
+        "versions": _versions(),
         "seconds": seconds,
         "side": scene.patient.side,
         "frame": "insert frame: x anterior, y superior, z "
@@ -74,7 +78,11 @@ def summary_of(
     if scene.patella:
         summary["first_wrapping_flexion_deg"] = _first_wrapping(columns)
     if scene.contact:
-        summary["contact"] = scene.contact.model_dump(mode="json")
+        table = scene.contact
+        error = known_error(table.model, table.resolution_mm, table.material, table.options)
+        summary["contact"] = table.model_dump(mode="json")
+        summary["known_error"] = as_json(error)
+        summary["split_not_determined_frames"] = int((columns["split_determined"] == 0).sum())
         summary["residuals"] = RESIDUALS
     if case.motion.cycle_percent is not None:
         percent, time = case.motion.cycle_percent, case.motion.time
@@ -84,28 +92,45 @@ def summary_of(
     return summary
 
 
+@lru_cache(maxsize=1)
+def _versions() -> dict[str, str]:
+    own = {"python": sys.version.split()[0], "tkamb": version("tkamb")}
+    return own | {name: version(name) for name in LIBRARIES}
+
+
 def scene_hash(case: Case) -> str:
     """Return the SHA-256 of the validated scene."""
     return hashlib.sha256(case.scene.model_dump_json().encode()).hexdigest()
 
 
 def run_identity(case: Case, frames: range) -> dict[str, Any]:
-    """Return what makes two runs the same: scene, what its files hold, frames, version."""
+    """Return what makes two runs the same: scene, what its files hold, frames, version, code."""
     return {
         "scene": scene_hash(case),
         "content of a file": files_hash(case),
         "choice of frames": [frames.start, frames.stop, frames.step],
         "version of tkamb": version("tkamb"),
+        "code of tkamb": code_identity(),
     }
 
 
 def files_hash(case: Case) -> str:
     """Return the SHA-256 of the files that the run reads: no mesh that nothing asks for."""
     digest = hashlib.sha256()
-    unread = {"output"} | ({"implant"} if case.femoral is None else set())
-    for path in _paths(case.scene.model_dump(exclude=unread)):
+    for path in _files_read(case):
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def input_hashes(case: Case, scene: Path | None) -> dict[str, str]:
+    """Return path -> SHA-256 of the scene file, if there is one, and of the files it has read."""
+    paths = [*([] if scene is None else [scene.absolute()]), *_files_read(case)]
+    return {str(path): sha256_of(path) for path in paths}
+
+
+def _files_read(case: Case) -> list[Path]:
+    unread = {"output"} | ({"implant"} if case.femoral is None else set())
+    return _paths(case.scene.model_dump(exclude=unread))
 
 
 def _paths(value: Any) -> list[Path]:
@@ -153,7 +178,9 @@ def assumptions(case: Case) -> list[str]:
             f"{', '.join(scene.generic_ligaments.ligaments)}: a generic set scaled to the "
             "implant, not this patient's; look at the strains."
         )
-    if not scene.tibia:
+    if case.motion.markers:
+        said.append(_marker_reading(case))
+    elif not scene.tibia:
         said.append("No [tibia]: the shank stands upright and still.")
     if scene.ground_reaction and scene.ground_reaction.applied == "ankle":
         said.append("The ground reaction acts at the ankle centre, without moment (the source).")
@@ -164,6 +191,23 @@ def assumptions(case: Case) -> list[str]:
     if scene.patient.side == "left":
         said.append("A left knee is computed as its mirror image: z is lateral.")
     return said
+
+
+def _marker_reading(case: Case) -> str:
+    """Return which reading of the skin markers is used, and how far the other one is off."""
+    markers = case.motion.markers
+    assert markers is not None and case.scene.motion.markers is not None
+    used = {"segments": "rigid fits of shank and thigh", "chain": "a chain with joints"}
+    taken = ", ".join(case.scene.motion.markers.coordinates)
+    time = case.motion.time
+    off = markers.at(np.nan_to_num(markers.centre_distance), time).max() / MILLIMETRE
+    turned = np.abs(markers.flexion["segments"] - markers.flexion["chain"])
+    turned = markers.at(np.nan_to_num(turned), time).max() / DEGREE
+    return (
+        f"Shank and {taken} are those of skin markers, by {used[markers.method]}: the knee "
+        f"centres of shank and thigh markers are up to {off:.0f} mm apart, and the two readings' "
+        f"flexions differ by up to {turned:.1f} deg."
+    )
 
 
 def _agreement(table: ContactTable) -> str:

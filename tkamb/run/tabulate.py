@@ -5,16 +5,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tkamb.body.dome_sensitivity import dome_sensitivity
 from tkamb.case import Case
-from tkamb.geometry.frames import KNEE_COORDINATES, knee_coordinates
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates
 from tkamb.mechanics.mechanics import FrameLoads
+from tkamb.run.agreement import normal_force, share_by_equilibrium, split_determined
 from tkamb.run.columns import ligament_column
 from tkamb.run.status import FAILED
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.body.slip import CondyleSlip
-    from tkamb.equilibrium.contact_side import FrameContact
+    from tkamb.equilibrium.frame_contact import FrameContact
+    from tkamb.inputs.marker_motion import MarkerKinematics
 
 NAN = float("nan")
 
@@ -47,6 +50,8 @@ def frame_row(
     if contact is not None:
         row |= _contact_row(contact, case.scene.output.yield_stress_MPa * MEGAPASCAL)
         row |= _pose_row(contact)
+        row["medial_force_per_adduction_N_per_deg"] = contact.sensitivity * DEGREE
+        row["split_determined"] = split_determined(body, contact)
     row |= {"body_seconds": body.seconds, "query_seconds": body.query_seconds}
     return {name: float(value) for name, value in row.items()} | {"status": status}
 
@@ -76,6 +81,17 @@ def _motion_row(case: Case, k: int) -> dict[str, Any]:
         row["cycle_percent"] = motion.cycle_percent[k]
     for name in ("flexion", "adduction", "axial_rotation"):
         row[f"{name}_deg"] = coordinates[name] / DEGREE
+    if motion.markers is not None:
+        row |= _marker_row(motion.markers, motion.time[k : k + 1])
+    return row
+
+
+def _marker_row(markers: "MarkerKinematics", time: Array) -> dict[str, Any]:
+    row: dict[str, Any] = {}
+    for method in ("segments", "chain"):
+        row[f"marker_rms_{method}_mm"] = markers.at(markers.rms[method], time)[0] / MILLIMETRE
+        row[f"flexion_{method}_deg"] = markers.at(markers.flexion[method], time)[0] / DEGREE
+    row["knee_centre_distance_mm"] = markers.at(markers.centre_distance, time)[0] / MILLIMETRE
     return row
 
 
@@ -83,7 +99,7 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
     loads, values = frame.loads, frame.loads.values
     on_insert = -loads.contact_force
     total = float(np.linalg.norm(on_insert))
-    normal = {side: _normal(frame, side) for side in ("medial", "lateral")}
+    normal = {side: normal_force(frame, side) for side in ("medial", "lateral")}
     row = {
         "force_si_N": -on_insert[1],
         "force_ap_N": on_insert[0],
@@ -92,7 +108,7 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
         "force_total_BW": total / case.body_weight,
         "medial_force_equilibrium_N": normal["medial"],
         "lateral_force_equilibrium_N": normal["lateral"],
-        "medial_share_equilibrium": _share(normal["medial"], normal["lateral"]),
+        "medial_share_equilibrium": share_by_equilibrium(frame),
         "quadriceps_wrap_deg": frame.wrap / DEGREE,
         "external_flexion_moment_Nm": loads.external_flexion,
         "external_adduction_moment_Nm": loads.external_adduction,
@@ -112,23 +128,15 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
     row["residual_axial_Nm"] = values.get("residual_axial", NAN)
     row["residual_coronal_Nm"] = values.get("residual_coronal", NAN)
     row["residual_flexion_Nm"] = values.get("residual_flexion", NAN)
+    friction = case.scene.contact.friction if case.scene.contact else 0.0
+    dome = {} if loads.problems else dome_sensitivity(frame.geometry, friction)
+    row |= {f"{name}_per_dome_mm_N": slope * MILLIMETRE for name, slope in dome.items()}
     if frame.geometry.ground:
         ground = frame.geometry.ground.forces[0]
         row |= {
             f"ground_reaction_{a}_N": g for a, g in zip(("ap", "si", "ml"), ground, strict=True)
         }
     return row | {ligament_column(name): tension for name, tension in frame.tensions.items()}
-
-
-def _normal(frame: FrameLoads, side: str) -> float:
-    if side in frame.loads.lifted and not np.isnan(frame.loads.contact_force).any():
-        return 0.0
-    return frame.loads.values.get(f"{side}_normal", NAN)
-
-
-def _share(medial: float, lateral: float) -> float:
-    total = medial + lateral
-    return medial / total if total > 0 else NAN
 
 
 def _contact_row(frame: "FrameContact", yield_stress: float) -> dict[str, float]:

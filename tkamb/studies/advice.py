@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from statistics import median
 
 from tkamb.studies.quantities import SIDES
-from tkamb.studies.tradeoff import KEYS, Row
+from tkamb.studies.row import KEYS, Row
 
 LIMITS = {
     "approach": (0.05,),

@@ -11,18 +11,20 @@ import time as clock
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tkamb.case import load_case
 from tkamb.errors import InputError, TkambError
 from tkamb.geometry.frames import Array
-from tkamb.results import Results
 from tkamb.scene import load_scene
 from tkamb.simulation import simulate
 from tkamb.studies.kept_rows import KeptRows, row_key
 from tkamb.studies.recordings import copied_scene, thin_out
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
 RECORDED = 101
 STEP = 10
@@ -111,7 +113,7 @@ def run_body_trade(kept: KeptRows | None = None) -> Iterator[BodyRow]:
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    results: Results
+    results: "Results"
     derivatives: dict[str, Array]
     seconds: float
 

@@ -24,9 +24,10 @@ from tkamb.contact.lattice.covered import covered_areas
 from tkamb.contact.lattice.femoral import FemoralFloor
 from tkamb.contact.lattice.grid import Lattice, build_grid
 from tkamb.contact.lattice.pressure_map import ContactMap, Indices, contact_map
-from tkamb.contact.model import ContactPair, ContactResult
+from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import pose_at_approach
 from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactResult
 from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
 from tkamb.errors import ComputationError
 from tkamb.geometry.condyles import condyle_split
@@ -39,7 +40,7 @@ from tkamb.studies.cases import StudyCase
 from tkamb.studies.measures import Job, Measure
 from tkamb.studies.quantities import quantities, raster_map
 from tkamb.studies.references import Reference
-from tkamb.studies.tradeoff import Row, compared
+from tkamb.studies.row import Row, compared
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 Mask = NDArray[np.bool_]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tkamb.contact.lattice.grid import Lattice
 from tkamb.contact.materials import LinearElastic, Material, RambergOsgood
-from tkamb.contact.model import Bearing
+from tkamb.contact.pair import Bearing
 from tkamb.errors import InputError
 from tkamb.geometry.surface import Surface
 from tkamb.units import MEGAPASCAL, MILLIMETRE

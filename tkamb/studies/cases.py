@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactPair
+from tkamb.contact.pair import ContactPair
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.studies.bodies import balls, block, dishes, flat

@@ -28,7 +28,18 @@ def add_tradeoff(commands: Any) -> None:
 
 
 def _tradeoff(options: argparse.Namespace) -> int:
-    from tkamb.output.atomic import claim_directory, write_text
+    from tkamb.output.claim import claimed_directory
+
+    if options.peer:
+        from tkamb.studies.calculix_run import find_program
+
+        find_program()
+    with claimed_directory(options.out) as directory:
+        return _study_tradeoff(options, directory)
+
+
+def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
+    from tkamb.output.atomic import write_text
     from tkamb.studies import tradeoff as study
     from tkamb.studies.advice import DEFAULT, comparison, recommendations
     from tkamb.studies.body_trade import CHANGES, BodyRow, body_json, body_table, run_body_trade
@@ -36,12 +47,7 @@ def _tradeoff(options: argparse.Namespace) -> int:
     from tkamb.studies.matrix import expected_seconds, jobs
     from tkamb.studies.tradeoff_report import picture, table
 
-    if options.peer:
-        from tkamb.studies.calculix_run import find_program
-
-        find_program()
     wanted = jobs(options.quick, options.scene, options.full)
-    directory = claim_directory(options.out)
     cases = study.cases_of(wanted)
     kept = KeptRows(directory, options.resume)
     references = study.references_for(cases, options.recompute, _announce, kept)
@@ -84,12 +90,17 @@ def add_stability(commands: Any) -> None:
 
 
 def _stability(options: argparse.Namespace) -> int:
-    from tkamb.output.atomic import claim_directory
+    from tkamb.output.claim import claimed_directory
+
+    with claimed_directory(options.out) as directory:
+        return _study_stability(options, directory)
+
+
+def _study_stability(options: argparse.Namespace, directory: Path) -> int:
     from tkamb.studies import stability as study
     from tkamb.studies.kept_rows import KeptRows
     from tkamb.studies.stability_report import picture, table
 
-    directory = claim_directory(options.out)
     cases = study.stability_cases(options.quick)
     kept = KeptRows(directory, options.resume)
     judged = study.run_stability(cases, kept=kept, workers=max(1, options.workers))
@@ -100,7 +111,7 @@ def _stability(options: argparse.Namespace) -> int:
     print(text if options.json else "\n".join([*lines, f"picture: {directory / 'stability.png'}"]))
     if not whole:
         raise KeyboardInterrupt(_goes_on(directory))
-    return 1 if any(v.kind in study.FAILED_KINDS for v in verdicts) else 0
+    return 1 if any(verdict.failed for verdict in verdicts) else 0
 
 
 def gather(found: Iterable[T], costs: Sequence[float]) -> tuple[list[T], bool]:

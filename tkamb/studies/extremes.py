@@ -3,18 +3,27 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Literal
 
 import numpy as np
+import trimesh
 
 from tkamb.contact.materials import material
-from tkamb.contact.model import Bearing, ContactPair
+from tkamb.contact.pair import Bearing, ContactPair
+from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.geometry.surface import Surface
-from tkamb.studies.bodies import balls, block, dishes, flat
+from tkamb.studies.bodies import Height, balls, block, dishes, flat
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 SECTORS = 48
 """Of the condyles' rings: what is compared is on one mesh."""
+
+
+Shape = Literal["usual", "swapped", "lip", "spike", "subdivided", "slivers"]
+"""Of the two bodies: as they are meant; one for the other; with a steep rim of 6 mm in front; with
+a vertex of the femoral component pulled out by 3 mm; with each femoral triangle in four; with
+needles for triangles (one vertex of each ring moved almost onto the next)."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +50,7 @@ class Extreme:
         bearing: "fixed" or "mobile".
         rough_mm: noise on the femoral vertices.
         facet_deg: distance of the rings of femoral vertices.
+        shape: what is unusual about the bodies, see `SHAPES`.
         model: contact model.
     """
 
@@ -63,6 +73,7 @@ class Extreme:
     bearing: Bearing = "fixed"
     rough_mm: float = 0.0
     facet_deg: float = 0.6
+    shape: Shape = "usual"
     model: str = "lattice"
 
     @property
@@ -73,11 +84,16 @@ class Extreme:
         height = flat(thick)
         if self.conformity > 0:
             height = dishes(thick, radius / self.conformity, apart)
+        if self.shape == "lip":
+            height = _lipped(height)
         size = (26e-3 * self.aspect, 46e-3 if apart else 26e-3)
         insert = block(height, size, 1e-3)
         femoral = _roughened(
             balls(radius, apart, self.waist, self.facet_deg, SECTORS), self.rough_mm
         )
+        femoral = _shaped(femoral, self.shape)
+        if self.shape == "swapped":
+            femoral, insert = insert, femoral.moved(insert_placement(femoral))
         name = "polyethylene-linear" if self.linear else "polyethylene"
         chosen = material(name, young_modulus=self.modulus_MPa * MEGAPASCAL, poisson_ratio=self.nu)
         return ContactPair(femoral, insert, chosen, self.bearing)
@@ -95,6 +111,24 @@ class Extreme:
         return ", ".join(f"{k}={v}" for k, v in own.items() if v != base[k]) or "base case"
 
 
+def _lipped(height: Height) -> Height:
+    """Return the surface with a rim of 6 mm that rises within 1 mm, 9 mm in front of the dishes."""
+    return lambda x, z: height(x, z) + 6 * MILLIMETRE * np.clip(x / MILLIMETRE - 9.0, 0.0, 1.0)
+
+
+def _shaped(surface: Surface, shape: Shape) -> Surface:
+    """Return the femoral component in an unusual shape or mesh."""
+    vertices, faces = surface.vertices.copy(), surface.faces
+    if shape == "spike":
+        vertices[np.argmin(vertices[:, 1])] -= [0.0, 3 * MILLIMETRE, 0.0]
+    elif shape == "slivers":
+        first = np.arange(1, len(vertices) - SECTORS - 1, SECTORS)
+        vertices[first] += 0.98 * (vertices[first + 1] - vertices[first])
+    elif shape == "subdivided":
+        vertices, faces = trimesh.remesh.subdivide(vertices, faces)
+    return Surface(np.asarray(vertices), np.asarray(faces, np.int64), surface.name)
+
+
 def _roughened(surface: Surface, noise_mm: float) -> Surface:
     if noise_mm == 0:
         return surface
@@ -105,10 +139,10 @@ def _roughened(surface: Surface, noise_mm: float) -> Surface:
 
 ALONE: dict[str, tuple[object, ...]] = {
     "load_N": (0.01, 1.0, 10.0, 100.0, 500.0, 3000.0, 5000.0, 8000.0, 15000.0, 50000.0),
-    "thickness_mm": (2.1, 3.0, 4.0, 6.0, 12.0, 20.0, 30.0),
+    "thickness_mm": (0.01, 0.1, 0.5, 1.0, 2.1, 3.0, 4.0, 6.0, 12.0, 20.0, 30.0),
     "resolution_mm": (0.9, 1.3, 1.7, 2.5, 3.0, 4.0, 6.0, 9.0),
     "aspect": (0.4, 0.6, 1.5, 2.5, 4.0),
-    "nu": (0.0, 0.1, 0.3, 0.4, 0.48, 0.49, 0.495, 0.499),
+    "nu": (0.0, 0.1, 0.3, 0.4, 0.48, 0.49, 0.495, 0.499, 0.4999),
     "modulus_MPa": (0.1, 1.0, 10.0, 100.0, 2000.0, 2e4, 2e5),
     "linear": (True,),
     "radius_mm": (3.0, 6.0, 12.0, 40.0, 80.0, 300.0),
@@ -123,6 +157,7 @@ ALONE: dict[str, tuple[object, ...]] = {
     "bearing": ("mobile",),
     "rough_mm": (0.001, 0.01, 0.05, 0.1),
     "facet_deg": (0.2, 2.0, 5.0, 11.0),
+    "shape": ("swapped", "lip", "spike", "subdivided", "slivers"),
 }
 """One thing at a time; `TOGETHER`: two at a time."""
 
@@ -171,8 +206,26 @@ HARDEST: tuple[dict[str, object], ...] = (
     {"flexion_deg": 160.0},
     {"rough_mm": 0.1},
     {"bearing": "mobile"},
+    {"thickness_mm": 0.01},
+    {"nu": 0.4999},
+    {"shape": "swapped"},
+    {"shape": "lip", "ap_mm": 8.0},
+    {"shape": "spike"},
+    {"shape": "subdivided"},
 )
 """On which the other models are tried."""
+
+BESIDE_CALCULIX: tuple[dict[str, object], ...] = (
+    {"linear": True},
+    {},
+    {"linear": True, "varus_deg": 0.5},
+    {"linear": True, "conformity": 0.9},
+    {"linear": True, "nu": 0.3},
+    {"linear": True, "load_N": 10000.0},
+    {"linear": True, "thickness_mm": 4.0},
+    {"linear": True, "modulus_MPa": 2000.0},
+)
+"""Of which CalculiX's answers are stored, for the lattice and `fe`, on cells of 3 mm."""
 
 
 def extremes() -> Iterator[Extreme]:
@@ -194,4 +247,12 @@ def _all() -> Iterator[Extreme]:
         for first, second in product(firsts, seconds):
             yield replace(base, **{one: first, other: second})  # type: ignore[arg-type]
     for model, changes in product(OTHER_MODELS, HARDEST):
+        yield replace(base, model=model, **changes)  # type: ignore[arg-type]
+    yield from beside_calculix()
+
+
+def beside_calculix() -> Iterator[Extreme]:
+    """Return the extremes whose answers by CalculiX are stored."""
+    base = replace(Extreme(), resolution_mm=3.0)
+    for changes, model in product(BESIDE_CALCULIX, ("lattice", "fe")):
         yield replace(base, model=model, **changes)  # type: ignore[arg-type]

@@ -1,24 +1,22 @@
 """Rows of a study, kept one by one as they are measured, so that it can be stopped and go on.
 
-Each row is one line of JSON, appended and flushed at once: {"key": ..., "row": ...}. The key is
-the SHA-256 of what was measured and of the code that measured it; a line cut short by a kill
-counts as absent.
+Each row is one line of JSON, appended and flushed at once: {"key": ..., "row": ..., "sha256": ...}.
+The key is the SHA-256 of what was measured and of the code that measured it, "sha256" that of key
+and row; a line cut short by a kill, or changed, counts as absent.
 """
 
 import hashlib
 import json
 import threading
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
+from tkamb.files import TABLE_LIMIT, read_bytes
 from tkamb.output.atomic import write_text
 
 FILE_NAME = "rows.jsonl"
-PACKAGE = Path(__file__).parents[1]
-NO_NUMBERS = ("output", "view")
-"""Subpackages that change how results look, not what they are."""
 
 Row = dict[str, Any]
 
@@ -37,7 +35,7 @@ class KeptRows:
     def __init__(self, directory: Path, resume: bool) -> None:
         self.path = directory / FILE_NAME
         self._rows = _whole_rows(self.path) if resume else {}
-        self._lock = threading.Lock()
+        self._lock, self._before_next = threading.Lock(), ""
         write_text(self.path, "".join(_line(key, row) for key, row in self._rows.items()))
 
     def get(self, key: str) -> Row | None:
@@ -50,25 +48,33 @@ class KeptRows:
             self._rows[key] = row
             try:
                 with open(self.path, "a", encoding="utf-8") as file:
-                    file.write(_line(key, row))
+                    file.write(self._before_next + _line(key, row))
+                self._before_next = ""
             except OSError as error:
+                self._before_next = "\n"  # a full disk may have cut this line short
                 raise InputError(f"cannot be written ({error.strerror})", self.path) from None
 
 
 def _line(key: str, row: Row) -> str:
-    return json.dumps({"key": key, "row": row}) + "\n"
+    return json.dumps({"key": key, "row": row, "sha256": _row_hash(key, row)}) + "\n"
+
+
+def _row_hash(key: str, row: Row) -> str:
+    return hashlib.sha256(json.dumps([key, row], sort_keys=True).encode()).hexdigest()
 
 
 def _whole_rows(path: Path) -> dict[str, Row]:
-    """Return key -> row of the lines that are whole."""
+    """Return key -> row of the lines that are whole and as they were written."""
     if not path.exists():
         return {}
     found: dict[str, Row] = {}
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in read_bytes(path, TABLE_LIMIT).decode(errors="replace").splitlines():
         try:
             content = json.loads(line)
-            found[str(content["key"])] = dict(content["row"])
-        except (ValueError, KeyError, TypeError):
+            key, row = str(content["key"]), dict(content["row"])
+            if content["sha256"] == _row_hash(key, row):
+                found[key] = row
+        except (ValueError, KeyError, TypeError, RecursionError):
             continue
     return found
 
@@ -81,15 +87,3 @@ def row_key(*what: Any) -> str:
     """
     text = json.dumps([code_identity(), *what], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-@lru_cache(maxsize=1)
-def code_identity() -> str:
-    """Return the SHA-256 of the package's source, but for what only shows results."""
-    digest = hashlib.sha256()
-    for path in sorted(PACKAGE.rglob("*.py")):
-        name = path.relative_to(PACKAGE)
-        shows = name.parts[0] in NO_NUMBERS or name.stem in ("cli", "command")
-        if not shows and not name.stem.endswith("_report"):
-            digest.update(name.as_posix().encode() + path.read_bytes())
-    return digest.hexdigest()

@@ -16,9 +16,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from tkamb.contact.model import ContactModel, ContactResult, ContactStatus
+from tkamb.contact.model import ContactModel
 from tkamb.contact.registry import contact_class, contact_model
+from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import TkambError
+from tkamb.known_errors import setting_label
 from tkamb.studies.cases import StudyCase, study_case
 from tkamb.studies.quantities import Quantities, quantities, raster_map
 
@@ -53,8 +55,7 @@ class Job:
     @property
     def label(self) -> str:
         """The model with its options: "lattice[tolerance=0.01]"."""
-        given = ",".join(f"{key}={value}" for key, value in self.options.items())
-        return f"{self.contact}[{given}]" if given else self.contact
+        return setting_label(self.contact, self.options)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
-from tkamb.contact.model import ContactResult
+from tkamb.contact.result import ContactResult
 from tkamb.geometry.frames import Array
 from tkamb.units import MILLIMETRE
 

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tkamb.contact.model import ContactStatus
 from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactStatus
 from tkamb.errors import ComputationError, InputError
 from tkamb.output.atomic import write_text
 from tkamb.studies.cases import Sphere, StudyCase

@@ -15,19 +15,22 @@ import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import trimesh
 
 from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array
-from tkamb.results import Results
 from tkamb.run.status import FAILED
 from tkamb.studies.cases import SHIPPED_SCENE
 from tkamb.studies.recordings import change_recording, copied_scene, stretch_time
 from tkamb.studies.verdict import WRONG, Verdict
 
+if TYPE_CHECKING:
+    from tkamb.results import Results
+
+CONTACT = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
 FRAMES = slice(20, 101, 40)
 TIME_SCALES = (1e-3, 1e-2, 0.1, 0.3, 3.0, 20.0, 1e4)
 SLOW = 10.0
@@ -39,7 +42,7 @@ ARMS_MM = (-20.0, -60.0, -90.0, -98.0, -101.0, -104.0, -108.0, -120.0)
 -98 to -108, by flexion) and past it."""
 DEFECTS = ("hole", "flipped", "doubled", "sliver", "nan", "empty", "tiny")
 
-Check = Callable[[Results, Path], float]
+Check = Callable[["Results", Path], float]
 
 
 @dataclass(frozen=True)
@@ -96,11 +99,11 @@ def judge_scene(extreme: SceneExtreme) -> Verdict:
     return Verdict(extreme.says, "run", kind, reason, known, seconds)
 
 
-def _run(scene: Path, overrides: dict[str, Any]) -> Results:
+def _run(scene: Path, overrides: dict[str, Any]) -> "Results":
     from tkamb.scene import load_scene
     from tkamb.simulation import simulate
 
-    return simulate(load_scene(scene, {"contact.resolution_mm": 2.0} | overrides), frames=FRAMES)
+    return simulate(load_scene(scene, CONTACT | overrides), frames=FRAMES)
 
 
 def _drive(extreme: SceneExtreme, folder: Path) -> dict[str, Any]:
@@ -122,7 +125,7 @@ def _drive(extreme: SceneExtreme, folder: Path) -> dict[str, Any]:
     return {}
 
 
-def _apart(extreme: SceneExtreme, results: Results, folder: Path) -> float:
+def _apart(extreme: SceneExtreme, results: "Results", folder: Path) -> float:
     """Return how far (relative) the results are from what they must be."""
     assert results.maps is not None
     demanded = results["force_si_N"]

@@ -9,16 +9,21 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 from tkamb.errors import ComputationError, TkambError
-from tkamb.studies.extremes import Extreme, extremes
+from tkamb.studies.closed_forms import ClosedForm, closed_forms
+from tkamb.studies.extremes import Extreme, Shape, beside_calculix, extremes
 from tkamb.studies.kept_rows import KeptRows, row_key
 from tkamb.studies.measures import ONE_THREAD
 from tkamb.studies.scene_extremes import SceneExtreme, judge_scene, scene_extremes
-from tkamb.studies.verdict import KINDS, Verdict, judge
+from tkamb.studies.verdict import KINDS, Verdict, judge, judge_closed_form
 
-Case = Extreme | SceneExtreme
+Case = Extreme | ClosedForm | SceneExtreme
+
+STORED = Path(__file__).with_name("verdicts.json")
+"""Verdict on each case, as last accepted; `scripts/make_stability_verdicts` writes it."""
 
 LONGEST_SECONDS = 120.0
 """A case whose model takes longer hangs."""
@@ -27,20 +32,31 @@ LONGEST_REFERENCE_SECONDS = 900.0
 PRESSED = "pressed"
 """What a process says once the model has answered."""
 WORKERS = 2
-QUICK_SHARE = 9
+QUICK_SHARE = 13
 QUICK_GRID_MM = 3.0
-"""The quick study takes one contact case in so many, no finer than this, and no runs: a tenth of
-all, those that are the same at this cell size counted once."""
-FAILED_KINDS = ("unflagged_wrong", "unverified", "exception", "hang")
+QUICK_SHAPES: tuple[Shape, ...] = ("swapped", "lip", "spike")
+QUICK_PEERED = 4
+"""The quick study takes one extreme in so many, no finer than this; unusual shapes; the first
+cases beside CalculiX; the first closed forms; no runs."""
 
 
 def stability_cases(quick: bool) -> list[Case]:
     """Return the cases of the study."""
     if not quick:
-        return [*extremes(), *scene_extremes()]
+        return [*closed_forms(False), *extremes(), *scene_extremes()]
     coarse = (replace(c, resolution_mm=max(c.resolution_mm, QUICK_GRID_MM)) for c in extremes())
-    some: list[Case] = [*dict.fromkeys(coarse)]
-    return some[::QUICK_SHARE]
+    some = [*dict.fromkeys(coarse)][::QUICK_SHARE]
+    shapes = [Extreme(resolution_mm=QUICK_GRID_MM, shape=shape) for shape in QUICK_SHAPES]
+    peered = list(beside_calculix())[:QUICK_PEERED]
+    return [*closed_forms(True), *dict.fromkeys((*peered, *shapes, *some))]
+
+
+def stored_verdicts(path: Path = STORED) -> dict[str, str]:
+    """Return case -> kind as last accepted; nothing if there is no file."""
+    if not path.exists():
+        return {}
+    content: dict[str, str] = json.loads(path.read_text(encoding="utf-8"))
+    return content
 
 
 def run_stability(
@@ -57,10 +73,11 @@ def run_stability(
         kept: rows of an earlier study that are taken as they are; new ones are added.
         workers: cases at a time.
     """
-    asked = _Asked(longest, kept)
+    asked, stored = _Asked(longest, kept), stored_verdicts()
     pool = ThreadPoolExecutor(workers)
     try:
-        yield from pool.map(asked.verdict, cases)
+        for verdict in pool.map(asked.verdict, cases):
+            yield replace(verdict, expected=stored.get(verdict.key))
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
         asked.stop()
@@ -181,7 +198,11 @@ def _ended(case: Case, kind: str, reason: str) -> Verdict:
 def judge_safely(case: Case, pressed: Callable[[], None] = lambda: None) -> Verdict:
     """Return the verdict on a case; an exception that is no clean error is a verdict too."""
     try:
-        return judge(case, pressed) if isinstance(case, Extreme) else judge_scene(case)
+        if isinstance(case, Extreme):
+            return judge(case, pressed)
+        if isinstance(case, ClosedForm):
+            return judge_closed_form(case, pressed)
+        return judge_scene(case)
     except TkambError as error:
         return _ended(case, "flagged", str(error))
     except Exception as error:
@@ -199,12 +220,14 @@ def summary(verdicts: Sequence[Verdict]) -> dict[str, Any]:
         "unverified": counts["unverified"],
         "exceptions": counts["exception"],
         "hangs": counts["hang"],
+        "worse": sum(verdict.worse for verdict in verdicts),
+        "failed": sum(verdict.failed for verdict in verdicts),
         "rows": [verdict.as_dict() for verdict in verdicts],
     }
 
 
 def _answers() -> Iterator[Verdict]:
-    kinds = {"Extreme": Extreme, "SceneExtreme": SceneExtreme}
+    kinds = {kind.__name__: kind for kind in (Extreme, ClosedForm, SceneExtreme)}
     for line in sys.stdin:
         kind, fields = json.loads(line)
         yield judge_safely(kinds[kind](**fields), lambda: print(PRESSED, flush=True))

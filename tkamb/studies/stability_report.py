@@ -17,14 +17,19 @@ def table(verdicts: Sequence[Verdict]) -> list[str]:
         some = [v for v in verdicts if model in (v.contact, "all")]
         counts = [sum(v.kind == kind for v in some) for kind in KINDS]
         lines.append(f"{model:18s} {len(some):5d} " + " ".join(f"{n:15d}" for n in counts))
-    failed = [v for v in verdicts if v.kind not in COLOURS]
-    lines += ["", f"failed: {len(failed)}", *(_line(v) for v in failed)]
-    flagged = [v for v in verdicts if v.kind == "flagged"]
-    return [*lines, "", f"flagged: {len(flagged)}", *(_line(v) for v in flagged)]
+    flagged = [v for v in verdicts if v.kind == "flagged" and not v.failed]
+    better = [v for v in verdicts if v.kind == "converged" and v.expected not in (None, v.kind)]
+    unknown = [v for v in verdicts if v.expected is None]
+    groups = {"failed": [v for v in verdicts if v.failed], "flagged": flagged}
+    groups |= {"better than stored": better, "no stored verdict": unknown}
+    for title, some in groups.items():
+        lines += ["", f"{title}: {len(some)}", *(_line(v) for v in some)]
+    return lines
 
 
 def _line(verdict: Verdict) -> str:
-    return f"  {verdict.contact}, {verdict.case}: {verdict.kind}: {verdict.reason}"
+    was = f" (was {verdict.expected})" if verdict.expected not in (None, verdict.kind) else ""
+    return f"  {verdict.contact}, {verdict.case}: {verdict.kind}{was}: {verdict.reason}"
 
 
 def picture(verdicts: Sequence[Verdict]) -> Figure:

@@ -1,9 +1,12 @@
 """The trade-off as blocks of Markdown between two markers, made from the study's JSON alone."""
 
+import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from statistics import median
 
 from tkamb.errors import InputError
+from tkamb.known_errors import KnownError
 from tkamb.studies.advice import (
     Setting,
     bodies_of,
@@ -15,7 +18,7 @@ from tkamb.studies.advice import (
 )
 from tkamb.studies.body_trade import HEADS as BODY_HEADS
 from tkamb.studies.body_trade import BodyRow
-from tkamb.studies.tradeoff import KEYS, Row
+from tkamb.studies.row import KEYS, Row
 
 MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
 HEADS = ("approach", "condyle force", "mean p", "peak p", "area", "map L2")
@@ -46,6 +49,49 @@ def block(rows: Sequence[Row]) -> list[str]:
         *(f"- {line[0].upper()}{line[1:]}" for line in recommendations(rows)),
     ]
     return lines
+
+
+SHORT = (
+    ("hertz", 1.0),
+    ("foundation", 1.0),
+    ("lattice-linear", 1.0),
+    ("lattice", 1.0),
+    ("calculix C3D8I", 1.0),
+)
+"""Settings of the README's five rows."""
+
+
+def short_block(rows: Sequence[Row]) -> list[str]:
+    """Return the README's few lines: time of a position, and the largest errors, of `SHORT`."""
+    settings = _settings(rows)
+    lines = [
+        "| contact, 1 mm | ms a position | condyle force % | peak pressure % | area % |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    for setting in SHORT:
+        some = settings[setting]
+        warm = milliseconds(median(warm_by_bodies(some)))
+        keys = ("force", "peak_pressure", "area")
+        cells = " | ".join(_percent([row.errors[key] for row in some]) for key in keys)
+        lines.append(f"| {setting[0]} | {warm} | {cells} |")
+    return lines
+
+
+def known_errors_json(rows: Sequence[Row]) -> str:
+    """Return the text of `tkamb/known_errors.json`: the table's errors, setting by setting.
+
+    Settings that failed on a case, or that belong to another program, are left out: nothing is
+    known of them that would hold for every run.
+    """
+    names = [name for name in KnownError.__dataclass_fields__ if name != "cases"]
+    found = []
+    for (label, resolution), some in _settings(rows).items():
+        if label.startswith("calculix") or not all(row.errors for row in some):
+            continue
+        worst = {name: max(row.errors[name] for row in some) for name in names}
+        error = asdict(KnownError(**worst, cases=len(some)))
+        found.append({"contact": label, "resolution_mm": resolution} | error)
+    return json.dumps(found, indent=1, allow_nan=False) + "\n"
 
 
 def _settings(rows: Sequence[Row]) -> dict[Setting, list[Row]]:

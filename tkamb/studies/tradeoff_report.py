@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from tkamb.output.style import CYCLE, GREY, new_figure, settings
 from tkamb.studies.front import NOISE
 from tkamb.studies.references import Reference
-from tkamb.studies.tradeoff import FRONT_ERRORS, KEYS, Row
+from tkamb.studies.row import FRONT_ERRORS, KEYS, Row
 
 MARKERS = "osD^vPX*<>"
 UNLABELLED_MM = 2.0

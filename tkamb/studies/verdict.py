@@ -1,8 +1,14 @@
-"""One extreme judged: converged, flagged, or failed, against full Newton on the same grid.
+"""One case judged: converged, flagged, or failed.
 
-- converged: status ok and within 2 % of the reference in approach, condyle force and peak.
+An extreme is judged by what every answer must obey (`audit`), by CalculiX where its answer is
+stored (`peer_answers`), and by full Newton on the same grid, which finds what is the solver's
+alone. A closed form is judged by its formula (`closed_forms`). What a case was judged before is
+stored as well: converged once, it may not become flagged.
+
+- converged: status ok, no complaint, and within 2 % of the reference in approach, condyle force and
+  peak.
 - flagged: no answer or a doubtful one, and a reason that says so.
-- unflagged_wrong: status ok, no flag, and farther than 2 % from the reference.
+- unflagged_wrong: status ok, no flag, and a complaint or farther from a reference than it may be.
 - unverified: status ok, but the reference did not converge; counts as failed.
 - exception: anything but the library's own clean errors; hang: the model beyond its time limit.
 """
@@ -13,21 +19,26 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from tkamb.contact.model import ContactModel, ContactResult, ContactStatus
+from tkamb.contact.model import ContactModel
 from tkamb.contact.pressing import press_by_search
 from tkamb.contact.registry import contact_class, contact_model
+from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import ComputationError, TkambError
+from tkamb.studies.audit import complaints
+from tkamb.studies.closed_forms import TOLERANCES, ClosedForm, apart, press_closed_form
 from tkamb.studies.extremes import Extreme
+from tkamb.studies.peer_answers import FARTHEST, peer_distances
 from tkamb.studies.quantities import errors, quantities
 
 WRONG = 0.02
 """Relative distance from the reference that counts as wrong."""
 JUDGED = ("approach", "force", "peak_pressure")
-TOLERANCES = (1e-6, 1e-4, 1e-3)
+NEWTON_TOLERANCES = (1e-6, 1e-4, 1e-3)
 """Of the reference: the tightest that Newton's method reaches."""
 LOAD_STEPS = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85, 1.0)
 """Shares of the load in which Newton's method goes where it does not get at once."""
 KINDS = ("converged", "flagged", "unflagged_wrong", "unverified", "exception", "hang")
+PASSED_KINDS = ("converged", "flagged")
 
 
 @dataclass(frozen=True)
@@ -42,6 +53,7 @@ class Verdict:
         error: largest relative distance from the reference; None if there is nothing to compare.
         seconds: of preparing and pressing, without the reference.
         iterations: of the model's solver.
+        expected: the stored kind; None where there is none.
     """
 
     case: str
@@ -51,6 +63,22 @@ class Verdict:
     error: float | None = None
     seconds: float = 0.0
     iterations: int = 0
+    expected: str | None = None
+
+    @property
+    def key(self) -> str:
+        """Name under which the verdict is stored."""
+        return f"{self.contact}: {self.case}"
+
+    @property
+    def worse(self) -> bool:
+        """Whether what was converged is flagged now."""
+        return self.kind == "flagged" and self.expected == "converged"
+
+    @property
+    def failed(self) -> bool:
+        """Whether the study fails by it."""
+        return self.worse or self.kind not in PASSED_KINDS
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as JSON."""
@@ -75,13 +103,62 @@ def judge(extreme: Extreme, pressed: Callable[[], None] = lambda: None) -> Verdi
     seconds = clock.perf_counter() - start
     pressed()
     if result.status is not ContactStatus.OK:
-        reason = "; ".join((result.status.value.replace("_", " "), *result.flags))
-        return _verdict(extreme, "flagged", reason, None, seconds, result)
+        return _verdict(extreme, "flagged", _words(result), None, seconds, result)
     try:
+        wrong = [*_audited(extreme.model, result, extreme.load_N), *_beside_peer(extreme, result)]
+        if wrong:
+            kind, reason = _judged(result, wrong)
+            return _verdict(extreme, kind, reason, None, seconds, result)
         reference = _reference(extreme, state, result)
     except TkambError as error:
         return _verdict(extreme, "unverified", str(error), None, seconds, result)
     return compared(extreme, result, reference, seconds)
+
+
+def judge_closed_form(case: ClosedForm, pressed: Callable[[], None] = lambda: None) -> Verdict:
+    """Press a closed form and compare; see `judge`."""
+    start = clock.perf_counter()
+    result, _ = press_closed_form(case)
+    seconds = clock.perf_counter() - start
+    pressed()
+    if result.status is not ContactStatus.OK:
+        return _verdict(case, "flagged", _words(result), None, seconds, result)
+    found = apart(case, result)
+    bounds = dict(zip(found, TOLERANCES[case.kind], strict=True))
+    wrong = [
+        f"{name} {100 * value:.3g} % from the closed form"
+        for name, value in found.items()
+        if not value <= bounds[name]
+    ]
+    wrong += _audited(case.model, result, case.load_N)
+    kind, reason = _judged(result, wrong)
+    return _verdict(case, kind, reason, max(found.values()), seconds, result)
+
+
+def _judged(result: ContactResult, wrong: list[str]) -> tuple[str, str]:
+    """Return kind and reason of an answer with complaints in words."""
+    kind = "converged" if not wrong else "flagged" if result.flags else "unflagged_wrong"
+    return kind, "; ".join((*result.flags, *wrong))
+
+
+def _words(result: ContactResult) -> str:
+    return "; ".join((result.status.value.replace("_", " "), *result.flags))
+
+
+def _audited(model: str, result: ContactResult, load: float) -> list[str]:
+    """Return what an answer does not obey, in words."""
+    fields = getattr(contact_class(model), "__dataclass_fields__", {})
+    rule = fields["pressure_rule"].default if "pressure_rule" in fields else None
+    return complaints(result, load, "newton" in fields, rule == "source")
+
+
+def _beside_peer(extreme: Extreme, result: ContactResult) -> list[str]:
+    """Return in words where an answer is too far from CalculiX's."""
+    return [
+        f"{name.replace('_', ' ')} {100 * value:.3g} % from CalculiX"
+        for name, value in peer_distances(extreme, result).items()
+        if not value <= FARTHEST[name]
+    ]
 
 
 def compared(
@@ -89,26 +166,24 @@ def compared(
 ) -> Verdict:
     """Return the verdict on a result that calls itself ok."""
     found = errors(quantities(result), quantities(reference))
-    apart = max(found[key] for key in JUDGED)
-    right = math.isfinite(apart) and apart <= WRONG
+    distance = max(found[key] for key in JUDGED)
+    right = math.isfinite(distance) and distance <= WRONG
     flags = "; ".join(result.flags)
     kind = "converged" if right else "flagged" if flags else "unflagged_wrong"
-    reason = flags if right or flags else f"{100 * apart:.3g} % from the reference"
-    return _verdict(extreme, kind, reason, apart, seconds, result)
+    reason = flags if right or flags else f"{100 * distance:.3g} % from the reference"
+    return _verdict(extreme, kind, reason, distance, seconds, result)
 
 
 def _verdict(
-    extreme: Extreme,
+    case: Extreme | ClosedForm,
     kind: str,
     reason: str,
-    apart: float | None,
+    distance: float | None,
     seconds: float,
     result: ContactResult,
 ) -> Verdict:
-    known = apart if apart is not None and math.isfinite(apart) else None
-    return Verdict(
-        extreme.says, extreme.model, kind, reason, known, seconds, int(result.iterations)
-    )
+    known = distance if distance is not None and math.isfinite(distance) else None
+    return Verdict(case.says, case.model, kind, reason, known, seconds, int(result.iterations))
 
 
 def _model(extreme: Extreme, **options: Any) -> ContactModel:
@@ -126,7 +201,7 @@ def _reference(extreme: Extreme, state: Any, result: ContactResult) -> ContactRe
         if searched.status is not ContactStatus.OK:
             raise ComputationError("the generic search finds no such load", "reference")
         return searched
-    for tolerance in TOLERANCES:
+    for tolerance in NEWTON_TOLERANCES:
         newton = _model(extreme, newton=True, tolerance=tolerance)
         for shares, start in (((1.0,), None), (LOAD_STEPS, None), ((1.0,), result)):
             found = _by_steps(newton, extreme, state, shares, start)

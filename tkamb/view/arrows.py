@@ -1,16 +1,19 @@
 """The forces of a drawing: magnitudes from results.csv, lines of action from the geometry."""
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tkamb.body.knee import KneeGeometry
 from tkamb.body.load import PointForces
 from tkamb.geometry.frames import Array
-from tkamb.results import Results
 from tkamb.units import MILLIMETRE
 from tkamb.view.colours import BLACK, FORCE
 from tkamb.view.drawing import Arrow, Marker
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
 NOTHING = np.full(3, np.nan)
 CONTACT_POINT = 0.6 * MILLIMETRE
@@ -18,7 +21,7 @@ CONTACT_POINT = 0.6 * MILLIMETRE
 
 
 def force_arrows(
-    results: Results, geometries: Sequence[KneeGeometry], friction: float
+    results: "Results", geometries: Sequence[KneeGeometry], friction: float
 ) -> tuple[Arrow, ...]:
     """Return the forces on the leg that are modelled.
 
@@ -90,7 +93,7 @@ def _hip(geometry: KneeGeometry) -> Array:
     return geometry.state.point("hip", np.zeros(3))
 
 
-def _extensor(results: Results, geometries: Sequence[KneeGeometry]) -> list[Arrow]:
+def _extensor(results: "Results", geometries: Sequence[KneeGeometry]) -> list[Arrow]:
     """Return the tendons' pulls, and what the femur presses on the patella."""
     made = []
     for name, column, meaning in (
@@ -132,7 +135,9 @@ def _patella(geometry: KneeGeometry) -> tuple[Array, Array, Array]:
     return extensor.contact_normal, tangent, extensor.contact_point
 
 
-def _condyles(results: Results, geometries: Sequence[KneeGeometry], friction: float) -> list[Arrow]:
+def _condyles(
+    results: "Results", geometries: Sequence[KneeGeometry], friction: float
+) -> list[Arrow]:
     if not any(one.condyles for one in geometries):
         forces = np.stack(
             [
@@ -163,5 +168,5 @@ def _condyle_point(geometry: KneeGeometry, side: str) -> Array:
     return geometry.condyles[side].point if side in geometry.condyles else NOTHING
 
 
-def _vector(results: Results, pattern: str) -> Array:
+def _vector(results: "Results", pattern: str) -> Array:
     return np.stack([results[pattern.format(axis)] for axis in ("ap", "si", "ml")], axis=1)

@@ -45,6 +45,20 @@ def find_browser() -> str | None:
     return next((found for name in NAMES if (found := shutil.which(name))), None)
 
 
+def require_browser() -> str:
+    """Return the path of a Chromium-like browser.
+
+    Raises:
+        ComputationError: there is none.
+    """
+    program = find_browser()
+    if program is None:
+        raise ComputationError(
+            "no browser found", mend="install chromium (Debian: apt install chromium)"
+        )
+    return program
+
+
 class HeadlessBrowser:
     """One page of a headless Chromium with software graphics.
 
@@ -62,11 +76,7 @@ class HeadlessBrowser:
     """
 
     def __init__(self, width: int = 1400, height: int = 900, seconds: float = 60.0) -> None:
-        program = find_browser()
-        if program is None:
-            raise ComputationError(
-                "no browser found", mend="install chromium (Debian: apt install chromium)"
-            )
+        program = require_browser()
         self.problems: list[str] = []
         self.requests: list[str] = []
         self._seconds, self._number, self._rest = seconds, 0, b""

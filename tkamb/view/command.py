@@ -1,11 +1,16 @@
 """`tkamb view`: arguments in, exit status out."""
 
 import argparse
+import os
 import sys
 from pathlib import Path
 from typing import Any
 
+from tkamb.errors import InputError
+from tkamb.view.browser import require_browser
 from tkamb.view.cameras import CAMERAS
+
+HIGHEST_PORT = 65535
 
 
 def add_view(commands: Any) -> None:
@@ -38,11 +43,14 @@ def _view(options: argparse.Namespace) -> int:
     def announce(line: str) -> None:
         print(f"tkamb: {line}", file=sys.stderr, flush=True)
 
+    _check(options)
     announce(f"reading {', '.join(map(str, options.runs))}")
     from tqdm import tqdm
 
-    from tkamb.view.run import open_run
+    from tkamb.view.run import check_frame, open_run
     from tkamb.view.show import Show
+
+    check_frame(options.runs, options.frame)
 
     def progress(frames: Any) -> Any:
         return tqdm(frames, "drawing", unit="frame", disable=None)
@@ -66,3 +74,32 @@ def _view(options: argparse.Namespace) -> int:
     if not (options.html or options.png):
         show.open(announce, options.port)
     return 0
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Refuse what is wrong whatever the runs hold, before they are read.
+
+    Raises:
+        InputError: an option that cannot be, or a file that cannot be written.
+        ComputationError: a picture is wanted and there is no browser.
+    """
+    if not 0 <= options.port <= HIGHEST_PORT:
+        raise InputError(f"no port {options.port}", "--port", f"give 0 (any) to {HIGHEST_PORT}")
+    if options.camera not in CAMERAS:
+        mend = f"there are: {', '.join(CAMERAS)}"
+        raise InputError(f"no view '{options.camera}'", "--camera", mend)
+    if options.contact:
+        from tkamb.contact.registry import contact_class
+
+        for name in options.contact:
+            contact_class(name)
+        for path in options.runs:
+            if path.is_dir():
+                raise InputError(
+                    "has its own contact model", path, "give the scene to choose another"
+                )
+    for path in (options.html, options.png):
+        if path is not None and not os.access(path.absolute().parent, os.W_OK):
+            raise InputError("cannot be written (no such folder, or not yours)", path)
+    if options.png:
+        require_browser()

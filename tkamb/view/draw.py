@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tkamb.case import Case
 from tkamb.output.axis import horizontal_axis
 from tkamb.output.metrics import map_rows
-from tkamb.results import Results
 from tkamb.units import MEGAPASCAL
 from tkamb.view.arrows import contact_markers, force_arrows
 from tkamb.view.drawing import Drawing, PressureMap
@@ -24,6 +24,9 @@ from tkamb.view.strands import (
     ligament_strands,
     path_strands,
 )
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 
@@ -91,7 +94,7 @@ def _title(run: Run) -> str:
     return f"{name}, contact: {contact.model} at {contact.resolution_mm:g} mm"
 
 
-def _pressure_map(results: Results, rows: list[int]) -> PressureMap | None:
+def _pressure_map(results: "Results", rows: list[int]) -> PressureMap | None:
     maps = results.maps
     if maps is None or all(row < 0 for row in rows):
         return None

@@ -11,13 +11,15 @@ from typing import Any
 import meshcat
 
 from tkamb.output.atomic import write_text
+from tkamb.output.policy import sources
 
 SCRIPTS = ("scene.js", "moving.js", "controls.js", "start.js")
 POLICY = (
-    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-    "img-src data: blob:; connect-src {}"
+    "default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; "
+    "img-src data: blob:; connect-src {connect}; base-uri 'none'; form-action 'none'"
 )
-"""The browser itself refuses any request to another place."""
+"""The browser itself refuses any request to another place and any script but the page's own, by
+their hashes; meshcat's viewer adds styles as it runs."""
 
 
 def page_html(
@@ -42,14 +44,16 @@ def page_html(
     if packed is not None:
         text = base64.b64encode(packed).decode()
         data = f'<script type="application/octet-stream" id="data">{text}</script>'
+    scripts = [_escaped(text) for text in (_meshcat(), *map(_own, SCRIPTS))]
+    connect = "'none'" if live is None else "'self'"
     return _filled(
         _own("page.html"),
         title=escape(title),
-        policy=POLICY.format("'none'" if live is None else "'self'"),
+        policy=POLICY.format(scripts=sources(*scripts), connect=connect),
         style=_own("style.css"),
         asked=json.dumps(asked).replace("<", "\\u003c"),
         data=data,
-        scripts="\n".join(_script(text) for text in (_meshcat(), *map(_own, SCRIPTS))),
+        scripts="\n".join(f"<script>{text}</script>" for text in scripts),
     )
 
 
@@ -84,5 +88,6 @@ def _meshcat() -> str:
     return (root / "viewer" / "dist" / "main.min.js").read_text(encoding="utf-8")
 
 
-def _script(text: str) -> str:
-    return "<script>\n" + text.replace("</script", "<\\/script") + "</script>"
+def _escaped(text: str) -> str:
+    """Return a script as it may stand between its tags."""
+    return "\n" + text.replace("</script", "<\\/script")

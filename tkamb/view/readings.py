@@ -1,15 +1,19 @@
 """The numbers of a frame in words, as the viewer shows them."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis
 from tkamb.output.metrics import body_weight, medial_share
-from tkamb.results import Results
 from tkamb.view.drawing import Reading
 
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
-def readings(results: Results, axis: HorizontalAxis) -> tuple[Reading, ...]:
+
+def readings(results: "Results", axis: HorizontalAxis) -> tuple[Reading, ...]:
     """Return the lines of numbers; what no frame has is left out."""
     weight = body_weight(results)
     hip = np.sqrt(sum(results[f"hip_force_{a}_N"] ** 2 for a in ("ap", "si", "ml")))
@@ -69,7 +73,7 @@ def _turned(name: str, angles: Array, positive: str, negative: str) -> Reading:
 
 
 def _both(
-    name: str, results: Results, pattern: str, unit: str, digits: int, scale: float = 1.0
+    name: str, results: "Results", pattern: str, unit: str, digits: int, scale: float = 1.0
 ) -> Reading:
     """Return medial and lateral values in one line."""
     medial, lateral = (scale * results[pattern.format(side)] for side in ("medial", "lateral"))

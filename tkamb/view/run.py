@@ -1,6 +1,6 @@
 """What there is to see: a results folder and its scene, or a scene that is run first."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,7 +41,8 @@ class Run:
         contact = self.case.scene.contact
         if contact is None or (contact.coupling == "none" and not contact.released):
             return [self.mechanics.frame(k) for k in progress(self.frames)]
-        from tkamb.equilibrium.contact_side import ContactSide, FrameContact
+        from tkamb.equilibrium.contact_side import ContactSide
+        from tkamb.equilibrium.frame_contact import FrameContact
 
         side, found = ContactSide(self.case, self.mechanics), []
         touched: list[FrameContact] = []
@@ -90,6 +91,33 @@ def open_run(
             return joined(case, results)
     announce("running the scene (keep its results with `tkamb run`)")
     return joined(case, simulate(scene, scene_path=path, progress=progress))
+
+
+def check_frame(paths: Sequence[Path], frame: int) -> None:
+    """Refuse a frame that none of the runs has, before any is run or drawn.
+
+    Args:
+        paths: folders that `tkamb run` wrote, or scene files.
+        frame: row of the results; negative ones count from the end.
+
+    Raises:
+        InputError: no run has it, or one cannot be read.
+    """
+    if frame in (0, -1):
+        return
+    most = 0
+    for path in paths:
+        if path.is_dir():
+            most = max(most, len(read_results(path)))
+        else:
+            most = max(most, len(load_case(load_scene(path)).motion.time))
+    if not -most <= frame < most:
+        raise no_frame(frame, most)
+
+
+def no_frame(frame: int, most: int) -> InputError:
+    """Return the refusal of a frame where the longest run has `most`."""
+    return InputError(f"there is no frame {frame}", "--frame", f"0 to {most - 1}")
 
 
 def joined(case: Case, results: Results) -> Run:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tkamb.errors import InputError
 from tkamb.output.atomic import replaced_file
@@ -19,8 +20,11 @@ from tkamb.view.drawing import Drawing
 from tkamb.view.live import ContactSwitch
 from tkamb.view.page import page_html, write_page
 from tkamb.view.payload import pack, peak_pressure
-from tkamb.view.run import Run
+from tkamb.view.run import Run, no_frame, run_of
 from tkamb.view.server import ViewServer
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 Line = Callable[[str], None]
@@ -102,7 +106,7 @@ class Show:
     def _checked(self, frame: int, camera: str) -> tuple[int, str]:
         most = max(len(run.frames) for run in self.runs)
         if not -most <= frame < most:
-            raise InputError(f"there is no frame {frame}", "--frame", f"0 to {most - 1}")
+            raise no_frame(frame, most)
         if camera not in CAMERAS:
             raise InputError(f"no view '{camera}'", "--camera", f"there are: {', '.join(CAMERAS)}")
         return frame % most, camera
@@ -146,3 +150,16 @@ def serve_in_background(server: ViewServer) -> threading.Thread:
     thread = threading.Thread(target=server.serve, daemon=True)
     thread.start()
     return thread
+
+
+def show(results: "Results", frame: int = 0) -> Show:
+    """Return a run to look at and turn around, which notebooks show.
+
+    Args:
+        results: of a run.
+        frame: shown first.
+
+    Raises:
+        InputError: the scene is not there, or no longer what was run.
+    """
+    return Show([run_of(results)], frame=frame)

@@ -12,7 +12,7 @@ import trimesh
 
 from tkamb.body.chain import ChainState
 from tkamb.case import Case
-from tkamb.geometry.frames import Array, inverse, pose
+from tkamb.geometry.frames import Array, inverse, pose, transform
 from tkamb.geometry.surface import Surface
 from tkamb.mechanics.extensor import quadriceps_bone
 from tkamb.output.maps_file import ContactMaps
@@ -127,8 +127,10 @@ def _patella(case: Case) -> Surface:
     """Return an ellipsoid from the tendon's insertion to the ligament's origin."""
     scene = case.scene
     assert scene.quadriceps is not None and scene.patellar_ligament is not None
-    top = np.array(scene.quadriceps.insertion.point_mm) * MILLIMETRE
-    bottom = np.array(scene.patellar_ligament.proximal.point_mm) * MILLIMETRE
+    top, bottom = (
+        transform(case.chain.link_in(end.link, "patella"), np.array(end.point_mm) * MILLIMETRE)
+        for end in (scene.quadriceps.insertion, scene.patellar_ligament.proximal)
+    )
     ball = trimesh.creation.icosphere(subdivisions=3)
     along = top - bottom
     half = 0.5 * float(np.linalg.norm(along))

@@ -1,6 +1,7 @@
 """The lines of a drawing: ligament bundles, tendons, and the paths of the centres of pressure."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,10 +14,12 @@ from tkamb.geometry.surface import Surface
 from tkamb.mechanics.mechanics import Mechanics
 from tkamb.output.metrics import stretches
 from tkamb.output.style import SIDE_COLOURS
-from tkamb.results import Results
 from tkamb.units import MILLIMETRE
 from tkamb.view.colours import TENDON, WRAPPED, Colours, rgb, strain_colours
 from tkamb.view.drawing import Marker, Strand
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
 BUNDLE, TENDON_RADIUS, PATH = 1.0 * MILLIMETRE, 1.5 * MILLIMETRE, 0.35 * MILLIMETRE
 """m, radii; bundles are thinner where a ligament has many."""
@@ -82,7 +85,7 @@ def _coloured(path: TautPath | None) -> tuple[Array, Colours]:
     return points, colours
 
 
-def centres_of_pressure(results: Results, insert: Surface) -> dict[str, Array]:
+def centres_of_pressure(results: "Results", insert: Surface) -> dict[str, Array]:
     """Return side -> (f, 3) m, on the undeformed insert; NaN beside it."""
     rays, top = RayCaster(insert), float(insert.bounds[1, 1]) + MILLIMETRE
     found = {}

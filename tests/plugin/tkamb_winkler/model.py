@@ -6,8 +6,10 @@ from typing import ClassVar
 import numpy as np
 
 from tkamb.contact.bed import Bed, sample_bed
-from tkamb.contact.model import ContactModel, ContactPair, ContactResult, PreparedContact
+from tkamb.contact.model import ContactModel
+from tkamb.contact.pair import ContactPair, PreparedContact
 from tkamb.contact.pressing import approach_at
+from tkamb.contact.result import ContactResult
 from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import inverse, rotate, transform

@@ -55,6 +55,10 @@ class BbarHexahedra(Solid):
         shear = np.einsum("sg,sgri,sgrj->sij", self.weights, self.shear, self.shear, optimize=True)
         return self.material.shear_modulus * shear + self._bulk
 
+    def linear_force(self, displacement: Array) -> Array:
+        """Return K u, N, (n, 3); see `Solid`."""
+        return self._cells_force(self.shape_stiffness(), displacement)
+
     def lost(self, displacement: Array, chosen: Indices | None = None) -> Array:
         """Return the Gauss points' (mu - mu_s) times unit shear forces, N, (k, 24)."""
         strain, equivalent = self._state(displacement, chosen)

@@ -54,6 +54,24 @@ class ResponsePool:
         place = np.searchsorted(nodes, wanted)
         return ContactResponse(half, place, _taken(_taken(compliance, place, 1), place, 3))
 
+    def moved(self, nodes: Indices, pushed: Indices, force: Array) -> Array:
+        """Return the displacement (m, 3), m, of contact nodes under forces on contact nodes.
+
+        Args:
+            nodes: (m,) increasing.
+            pushed: (k,) increasing.
+            force: (k, 3) N.
+        """
+        with self._lock:
+            wanted = np.union1d(nodes, pushed)
+            if not np.isin(wanted, self.nodes, assume_unique=True).all():
+                both = np.union1d(wanted, self.nodes)
+                self._take(both if len(both) <= MOST_STORED else wanted)
+            here, there = np.searchsorted(self.nodes, nodes), np.searchsorted(self.nodes, pushed)
+            axes = np.arange(3)
+            compliance = self.compliance[np.ix_(axes, here, axes, there)]
+        return np.asarray(np.einsum("aibj,jb->ia", compliance, force))
+
     def _take(self, nodes: Indices) -> None:
         """Take nodes, with what is known of their compliance already."""
         half = self.whole.among(unknowns_of(nodes))

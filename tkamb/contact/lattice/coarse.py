@@ -39,3 +39,10 @@ def surrounded(triangles: NDArray[np.int64], touched: NDArray[np.bool_]) -> NDAr
     within = touched.copy()
     within[edge] = False
     return within
+
+
+def beside(triangles: NDArray[np.int64], touched: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which nodes (n,) share a triangle with one in contact and are not in contact."""
+    found = np.zeros_like(touched)
+    found[triangles[touched[triangles].any(axis=1)]] = True
+    return found & ~touched

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from threading import Lock
 
 from tkamb.contact.lattice.region import Region
-from tkamb.contact.model import ContactResult
+from tkamb.contact.result import ContactResult
 from tkamb.geometry.frames import Array
 
 MOST_KEPT = 4

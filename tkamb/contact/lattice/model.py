@@ -7,25 +7,29 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.cache import cached_operator, operator_key
+from tkamb.contact.lattice.cache import cached_operator
 from tkamb.contact.lattice.candidates import ResponsePool, choose_start, guessed_depth
 from tkamb.contact.lattice.femoral import FemoralFloor
 from tkamb.contact.lattice.grid import Lattice, build_grid
 from tkamb.contact.lattice.memory import Memory, Remembered
+from tkamb.contact.lattice.memory_need import TooLittleMemoryError, check_assembly_memory
 from tkamb.contact.lattice.newton import solve_by_newton
 from tkamb.contact.lattice.operator import ElasticOperator, fixed_unknowns, prepare_operator
 from tkamb.contact.lattice.pressure_map import ContactMap, contact_map
 from tkamb.contact.lattice.problem import ContactProblem, Direction, Footing, undeformed
-from tkamb.contact.lattice.report import PressureRule, result_of, untouched
+from tkamb.contact.lattice.report import PressureRule, result_of, unseen_flags, untouched
 from tkamb.contact.lattice.response import SINGLE
 from tkamb.contact.lattice.solid import Solid
 from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve
 from tkamb.contact.materials import Material
-from tkamb.contact.model import ContactModel, ContactPair, ContactResult, PreparedContact
-from tkamb.contact.pressing import check_load, failed_result, pose_at_approach
-from tkamb.errors import ComputationError
+from tkamb.contact.model import ContactModel
+from tkamb.contact.pair import ContactPair, PreparedContact
+from tkamb.contact.pressing import check_load, failed_result, pose_at_approach, within_insert
+from tkamb.contact.result import ContactResult
+from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import Array
+from tkamb.units import MILLIMETRE
 
 MOST_GROWTHS = 8
 """How often the candidate set may grow before it counts as saturated."""
@@ -122,14 +126,27 @@ class CellContact(ContactModel):
         held: NDArray[np.bool_],
         nodes: NDArray[np.int64],
     ) -> ElasticOperator:
-        """Return the operator, from disk if it was made before."""
+        """Return the operator, from disk if it was made before.
+
+        Raises:
+            InputError: it does not fit into the memory that is left.
+        """
 
         def make() -> ElasticOperator:
-            return prepare_operator(solid.stiffness, lattice.index, held, nodes, SINGLE)
+            try:
+                check_assembly_memory(len(lattice.cells))
+                return prepare_operator(solid.stiffness, lattice.index, held, nodes, SINGLE)
+            except TooLittleMemoryError as short:
+                size = f"{self.resolution / MILLIMETRE:g} mm"
+                raise InputError(
+                    f"cells of {size} do not fit: {short.what}",
+                    "contact.resolution_mm",
+                    short.hint(self.resolution),
+                ) from None
 
         if not self.cache:
             return make()
-        return cached_operator(operator_key(solid, held, nodes), make, int((~held).sum()))
+        return cached_operator(solid, held, nodes, make)
 
     def evaluate(
         self, state: LatticeState, pose: Array, guess: ContactResult | None = None
@@ -201,6 +218,9 @@ class CellContact(ContactModel):
                 earlier = Remembered(solution.lost, moved, below, solution.region)
             if covered or reached <= start.reach:
                 result = result_of(state, pose, load, gaps, solution, self.pressure_rule)
+                if load is not None:
+                    sunk = solution.forces.approach + max(-float(gaps.min()), 0.0)
+                    result = within_insert(state, result, *unseen_flags(state, result, sunk))
                 if solution.converged and earlier is not None:
                     state.memory.keep(result, earlier)
                 return result

@@ -54,6 +54,10 @@ class CalibratedNetwork(Solid):
         """Return mu K_d + K V g gᵀ of each shape (s, 24, 24), N/m."""
         return self.material.shear_modulus * self.deviatoric + self._bulk
 
+    def linear_force(self, displacement: Array) -> Array:
+        """Return K u, N, (n, 3); see `Solid`."""
+        return self._cells_force(self.shape_stiffness(), displacement)
+
     def lost(self, displacement: Array, chosen: NDArray[np.int64] | None = None) -> Array:
         """Return (mu - mu_s) K_d u of the cells, N, (k, 24); see `Solid`."""
         force, equivalent = self._state(displacement, chosen)

@@ -8,9 +8,10 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from tkamb.contact.lattice.dissection import dissect
+from tkamb.contact.lattice.memory_need import check_memory, factor_memory
 from tkamb.contact.lattice.multifrontal import CholeskyFactor, factorise
 from tkamb.contact.lattice.response import HalfResponse, half_response
-from tkamb.contact.model import Bearing
+from tkamb.contact.pair import Bearing
 from tkamb.geometry.frames import Array
 
 Indices = NDArray[np.int64]
@@ -112,6 +113,10 @@ def prepare_operator(
         held: (3n,) unknowns that are zero.
         contact_nodes: (c,).
         precision: in which the numbers are kept; they are worked out in float64.
+
+    Raises:
+        TooLittleMemoryError: they do not fit into the memory that is left.
+        ComputationError: the matrix is not positive definite.
     """
     free = ~held
     number = np.cumsum(free) - 1
@@ -121,7 +126,10 @@ def prepare_operator(
         (np.ones(len(joined.indices), np.int8), joined.indices, joined.indptr),
         (len(index), len(index)),
     )
-    tree = dissect(index[some], joined[some][:, some])
+    joined = joined[some][:, some]
+    tree = dissect(index[some], joined)
+    touched = np.isin(some, contact_nodes)
+    check_memory(factor_memory(tree, joined, touched, np.dtype(precision).itemsize))
     unknowns = []
     for own in tree.own:
         wanted = (3 * some[own][:, None] + np.arange(3)).ravel()

@@ -1,5 +1,6 @@
 """From a solution of the lattice to the contract's result: pressures, sums, flags."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Literal
@@ -7,14 +8,17 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.coarse import coarse_flags
+from tkamb.contact.lattice.coarse import beside, coarse_flags
 from tkamb.contact.lattice.covered import covered_areas
 from tkamb.contact.lattice.edges import edge_flags
+from tkamb.contact.lattice.problem import STEEPEST, Indices, footing
 from tkamb.contact.lattice.solver import Solution
-from tkamb.contact.model import ContactResult, ContactStatus
 from tkamb.contact.pressing import approach_at, failed_result
+from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
+from tkamb.contact.validity import HALF, peak_flags
 from tkamb.geometry.frames import Array
+from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.contact.lattice.model import LatticeState
@@ -24,6 +28,8 @@ PressureRule = Literal["tributary", "source"]
 
 STRAIN_FLAG = -0.4
 """Principal strain below which a result is flagged: the law has no barrier at -100 %."""
+MOST_UNSEEN = 0.2e-3
+"""m; a node of a 3 mm cell misses the bottom of a ball of 15 mm by 0.15 mm."""
 COLLAPSE = -1.0
 """Principal strain at which a cell is compressed to nothing: out of range."""
 
@@ -89,9 +95,9 @@ def _carried(
     state: "LatticeState", pose: Array, gaps: Array, solution: Solution, rule: PressureRule
 ) -> ContactResult:
     """Return the map and its sums; gaps (c,) are those of the undeformed insert at the pose."""
-    surface, gap = state.map, gaps.copy()
-    gap[solution.candidates] = solution.forces.gap
+    surface = state.map
     force, pressure, stood_on = _pressures(state, gaps, solution, rule)
+    gap = _gaps(state, pose, gaps, force, solution)
     area = stood_on
     if rule == "tributary":
         area = covered_areas(
@@ -137,6 +143,49 @@ def _pressures(
     return force, size / area, area
 
 
+def _gaps(
+    state: "LatticeState", pose: Array, gaps: Array, force: Array, solution: Solution
+) -> Array:
+    """Return the gaps (c,), m: of the deformed insert in and beside the contact and where the
+    undeformed bodies overlap, of the undeformed one elsewhere.
+
+    Which nodes are candidates depends on how the solution began, so that a node beside the
+    contact may be none; the edge of contact lies by its gap all the same.
+
+    Args:
+        state: prepared contact.
+        pose: (4, 4) final.
+        gaps: (c,) vertical gaps of the undeformed insert there, m.
+        force: (c, 3) N.
+        solution: what the solver found.
+    """
+    loaded: Mask = np.asarray(force.any(axis=1), bool)
+    close = beside(state.map.triangles, loaded) | loaded | (gaps < 0)
+    own = solution.candidates[close[solution.candidates]]
+    gap = gaps.copy()
+    gap[own] = solution.forces.gap[close[solution.candidates]]
+    close[own] = False
+    rest = np.flatnonzero(close)
+    if rest.size:
+        gap[rest] = _gaps_of_others(state, pose, rest, force, solution)
+    return gap
+
+
+def _gaps_of_others(
+    state: "LatticeState", pose: Array, nodes: Indices, force: Array, solution: Solution
+) -> Array:
+    """Return the gaps (m,), m, of deformed nodes that are no candidates; inf: nothing above."""
+    problem = state.problem
+    if solution.field is not None:
+        moved = solution.field[problem.contact_nodes[nodes]]
+    else:
+        pushed = np.flatnonzero(force.any(axis=1))
+        moved = state.pool.moved(nodes, pushed, force[pushed])
+    positions = problem.surface_points[nodes] + moved
+    foot = footing(problem, positions, pose, None)
+    return np.where(foot.lean < STEEPEST, foot.gap(positions), np.inf)
+
+
 def _areas(state: "LatticeState", gaps: Array, loaded: Mask, rule: PressureRule) -> Array:
     """Return the area (c,) that each node's force stands on, m².
 
@@ -161,6 +210,7 @@ def _peak_flags(state: "LatticeState", carried: ContactResult) -> tuple[str, ...
     }
     floor, spacing = state.problem.floor, state.lattice.spacing
     return (
+        *peak_flags(carried.medial, carried.lateral),
         *coarse_flags(state.map.triangles, carried.pressure > 0, sides),
         *edge_flags(floor, carried.pose, spacing, peaks),
     )
@@ -172,6 +222,23 @@ def _unsettled(solution: Solution) -> str:
         f"the solver has not converged: {100 * solution.residual:.2g} % of the force or of the way "
         f"to the femoral surface is left after {solution.passes} passes; is the femoral mesh rough?"
     )
+
+
+def unseen_flags(state: "LatticeState", result: ContactResult, depth: float) -> Iterator[str]:
+    """Yield a flag where much of the approach is seen by no node.
+
+    Args:
+        state: prepared contact.
+        result: of a press.
+        depth: m, how far the femoral component went below the first contact node.
+    """
+    unseen = result.approach - depth
+    if unseen > max(MOST_UNSEEN, HALF * result.approach):
+        yield (
+            f"the meshes first touch {unseen / MILLIMETRE:.2g} mm before any node does (cells of "
+            f"{state.lattice.spacing.max() / MILLIMETRE:.2g} mm); the approach counts from there: "
+            "is there a spike or a ridge in a mesh?"
+        )
 
 
 def _strain_flags(state: "LatticeState", solution: Solution) -> tuple[tuple[str, ...], bool]:

@@ -84,6 +84,18 @@ class Solid(ABC):
         linear = (self.stiffness @ displacement.ravel()).reshape(-1, 3)
         return np.asarray(linear - self.correction(displacement))
 
+    @abstractmethod
+    def linear_force(self, displacement: Array) -> Array:
+        """Return K u, N, (n, 3), summed member by member: no matrix is assembled."""
+
+    def _cells_force(self, matrices: Array, displacement: Array) -> Array:
+        """Return K u, N, (n, 3), from the stiffness of each shape (s, 24, 24)."""
+        local = self.scatter.gather(displacement)
+        common, others = self.kinds
+        force = local @ matrices[common]
+        force[others] = np.einsum("cij,cj->ci", matrices[self.shape_of_cell[others]], local[others])
+        return self.scatter.sum(force)
+
     def least_principal_strain(self, displacement: Array) -> float:
         """Return the smallest principal strain of the cells' mean gradients.
 

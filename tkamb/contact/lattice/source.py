@@ -71,6 +71,14 @@ class SourceNetwork(Solid):
         k = np.full(len(self.springs), self.material.young_modulus * self.factor)
         return self._assembled(k, self.lines / self.lengths[:, None])
 
+    def linear_force(self, displacement: Array) -> Array:
+        """Return K u, N, (n, 3); see `Solid`."""
+        a, b = self.springs.T
+        straight = self.lines / self.lengths[:, None]
+        longer = np.einsum("sd,sd->s", straight, displacement[b] - displacement[a])
+        pull = (self.material.young_modulus * self.factor * longer)[:, None] * straight
+        return self.scatter.sum(np.hstack([-pull, pull]))
+
     def lost(self, displacement: Array, chosen: NDArray[np.int64] | None = None) -> Array:
         """Return linear forces minus those of the springs as they lie, N, (k, 6)."""
         springs = slice(None) if chosen is None else chosen

@@ -1,0 +1,248 @@
+"""Inputs that no sound program makes, from a seed: what `scripts/study_abuse` feeds to tkamb.
+
+Each kind is a function (folder, chance) -> arguments of the command line. The folder is empty
+when it begins; what stands there when it returns is the input.
+"""
+
+import json
+import os
+import random
+import shutil
+import tomllib
+from pathlib import Path
+
+MODEL = Path(__file__).resolve().parents[1] / "models" / "deep_knee_bend"
+MESHES = ("femoral_component.stl", "insert.stl")
+TABLES = ("motion.csv", "tibia.csv", "ground_reaction.csv")
+
+NUMBERS = ["0", "-1", "1e308", "-1e-320", "nan", "inf", "1e9", "99999999999999999999", "0.5"]
+WORDS = ["", " ", "é", "\x1b[31m", "\t", "true", "[]", "{}", "'", '"', "=", "../..", "/dev/zero",
+         "\ud800", "a" * 5000, "%s%n", "${HOME}", "-", "--", "None", "\\"]  # fmt: skip
+VALUES = ["0", "-1", "1e308", "nan", "inf", "true", "[]", "{}", '""', '"x"', "[1, 2]",
+          "1979-05-27", "[[1]]", '"../../.."', '"/dev/zero"', '"/"', "99999999999999999999",
+          "{a = 1}", '"\\u0000"']  # fmt: skip
+RUN = ("--frames", "0:1")
+
+
+def arguments(folder: Path, chance: random.Random) -> list[str]:
+    """A sound command line with words changed, doubled, dropped or put in."""
+    commands = [
+        ["run", str(MODEL / "scene.toml"), "--out", str(folder / "out"), *RUN],
+        ["press", *(str(MODEL / name) for name in MESHES), "--load", "10", "--resolution", "9"],
+        ["mesh", "check", str(MODEL / "insert.stl")],
+        ["mesh", "lattice", str(MODEL / "insert.stl"), "--resolution", "9"],
+        ["view", str(folder / "nothing"), "--port", "-1"],
+        ["contact", "list"],
+        ["scene", "--schema"],
+        ["verify", str(folder)],
+        ["report", str(folder)],
+    ]
+    given = list(chance.choice(commands))
+    for _ in range(chance.randint(1, 3)):
+        word = chance.choice([*NUMBERS, *WORDS, "--json", "--set", "--pose", "--axes", "--units"])
+        place = chance.randint(0, len(given))
+        how = chance.randint(0, 2)
+        if how == 0 and place < len(given):
+            given[place] = word
+        elif how == 1 and place < len(given):
+            del given[place]
+        else:
+            given.insert(place, word)
+    return [word.encode("utf-8", "surrogatepass").decode("utf-8", "replace") for word in given]
+
+
+def odd_files(folder: Path, chance: random.Random) -> list[str]:
+    """Something that is no file where a file should be."""
+    path = folder / "odd.stl"
+    kind = chance.randint(0, 6)
+    if kind == 0:
+        os.mkfifo(path)
+    elif kind == 1:
+        path.mkdir()
+    elif kind == 2:
+        path.symlink_to(path)
+    elif kind == 3:
+        path = Path(chance.choice(["/dev/zero", "/dev/null", "/dev/tty", "/proc/self/mem"]))
+    elif kind == 4:
+        path = folder / ("n" * chance.choice([200, 255, 256, 5000]))
+    elif kind == 5:
+        path = folder / chance.choice(["a\0b", "\udcff\udcfe.toml", "new\nline"])
+    else:
+        os.truncate(os.open(path, os.O_CREAT | os.O_WRONLY), chance.choice([2**31, 2**40]))
+    name, out = str(path), str(folder / "out")
+    setting = f"{chance.choice(['patient.urdf', 'motion.file', 'implant.insert.mesh'])}={name}"
+    return chance.choice(
+        [
+            ["run", name, "--out", out],
+            ["run", str(MODEL / "scene.toml"), "--out", out, *RUN, "--set", setting],
+            ["press", name, str(MODEL / MESHES[1]), "--load", "10"],
+            ["press", *(str(MODEL / m) for m in MESHES), "--load", "1", "--pose-file", name],
+            ["mesh", "check", name],
+            ["mesh", "lattice", name, "--out", str(folder / "l.vtu")],
+            ["verify", name],
+            ["report", name],
+            ["view", name, "--html", str(folder / "v.html")],
+        ]
+    )
+
+
+def scenes(folder: Path, chance: random.Random) -> list[str]:
+    """The shipped scene with keys of other values, lines lost, or bytes changed."""
+    scene = copied(folder) / "scene.toml"
+    if chance.random() < 0.3:
+        scene.write_bytes(spoilt(scene.read_bytes(), chance))
+        return run(folder)
+    content = tomllib.loads(scene.read_text(encoding="utf-8"))
+    tables = [name for name, table in content.items() if isinstance(table, dict)]
+    given = run(folder)
+    for _ in range(chance.randint(1, 2)):
+        table = chance.choice([*tables, "nothing", ""])
+        key = chance.choice([*content.get(table, {"x": 1}), "x", ""])
+        given += ["--set", f"{table}.{key}={chance.choice(VALUES)}"]
+    return given
+
+
+def tables(folder: Path, chance: random.Random) -> list[str]:
+    """A recording with cells, rows, columns or bytes changed."""
+    path = copied(folder) / chance.choice(TABLES)
+    if chance.random() < 0.3:
+        path.write_bytes(spoilt(path.read_bytes(), chance))
+        return run(folder)
+    rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
+    for _ in range(chance.randint(1, 4)):
+        row = chance.choice(rows)
+        how = chance.randint(0, 4)
+        if how == 0:
+            row[chance.randrange(len(row))] = chance.choice([*NUMBERS, *WORDS])
+        elif how == 1:
+            rows.remove(row)
+        elif how == 2:
+            rows.insert(chance.randrange(len(rows)), list(row))
+        elif how == 3:
+            row.append(chance.choice(NUMBERS))
+        else:
+            chance.shuffle(rows)
+        rows = rows or [[""]]
+        rows = [row or [""] for row in rows]
+    text = "\n".join(",".join(row) for row in rows)
+    path.write_text(text, encoding="utf-8", errors="replace")
+    return run(folder)
+
+
+def urdfs(folder: Path, chance: random.Random) -> list[str]:
+    """A patient with elements lost, doubled, nested or of other numbers."""
+    path = copied(folder) / "patient.urdf"
+    text = path.read_text(encoding="utf-8")
+    for _ in range(chance.randint(1, 3)):
+        how, lines = chance.randint(0, 4), text.splitlines()
+        if how == 0:
+            path.write_bytes(spoilt(text.encode(), chance))
+            return run(folder)
+        if how == 1:
+            lines.pop(chance.randrange(len(lines)))
+        elif how == 2:
+            lines.insert(chance.randrange(len(lines)), chance.choice(lines))
+        elif how == 3:
+            number = chance.randrange(len(lines))
+            parts = lines[number].split('"')
+            parts[chance.randrange(len(parts))] = chance.choice([*NUMBERS, *WORDS, "0 0 0", "1 1"])
+            lines[number] = '"'.join(parts)
+        else:
+            depth = chance.choice([50, 500, 50_000])
+            lines.insert(chance.randrange(len(lines)), "<a>" * depth + "</a>" * depth)
+        text = "\n".join(lines) or " "
+    path.write_text(text, encoding="utf-8", errors="replace")
+    return run(folder)
+
+
+def meshes(folder: Path, chance: random.Random) -> list[str]:
+    """A mesh cut short, of changed bytes, or of another kind than its name says."""
+    copied(folder)
+    name = chance.choice(MESHES)
+    path = folder / name
+    content = path.read_bytes()
+    how = chance.randint(0, 3)
+    if how == 0:
+        path.write_bytes(content[: chance.randrange(len(content))])
+    elif how == 1:
+        path.write_bytes(spoilt(content, chance))
+    elif how == 2:
+        count = chance.choice([0, 1, 2**32 - 1]).to_bytes(4, "little")
+        path.write_bytes(content[:80] + count + content[84:])
+    else:
+        other = path.with_suffix(chance.choice([".obj", ".ply", ".off", ".glb", ".xyz", ""]))
+        path.rename(other)
+        path = other
+    if chance.random() < 0.6:
+        return ["mesh", "check", str(path)]
+    files = [str(path if part == name else folder / part) for part in MESHES]
+    return ["press", *files, "--load", "100", "--resolution", "5", "--contact", "foundation"]
+
+
+def folders(folder: Path, chance: random.Random) -> list[str]:
+    """A folder of results in which files were changed, lost, swapped or put in."""
+    out = folder / "out"
+    shutil.copytree(os.environ["TKAMB_ABUSE_RESULTS"], out)
+    names = ["results.csv", "summary.json", "contact.h5", ".tkamb", ".tkamb-commit", ".frames"]
+    for _ in range(chance.randint(1, 3)):
+        path, how = out / chance.choice(names), chance.randint(0, 5)
+        if how == 0 and path.is_file():
+            path.write_bytes(spoilt(path.read_bytes(), chance))
+        elif how == 1:
+            path.unlink(missing_ok=True)
+        elif how == 2 and not path.exists():
+            chance.choice([path.mkdir, path.touch, lambda p=path: os.mkfifo(p)])()
+        elif how == 3 and not path.is_symlink() and not path.is_dir():
+            path.unlink(missing_ok=True)
+            path.symlink_to(chance.choice(["/dev/zero", "/", str(out / "results.csv")]))
+        elif how == 4 and path.name == ".tkamb-commit" and not path.exists():
+            journal = {"written": {chance.choice(WORDS): "x"}, "removed": [chance.choice(WORDS)]}
+            path.write_text(json.dumps(journal))
+        elif path.is_file():
+            path.write_text(
+                chance.choice(["{}", "[]", "[" * 99_999, "", "null", "time_s,status\n"])
+            )
+    scene = str(MODEL / "scene.toml")
+    return chance.choice(
+        [
+            ["verify", str(out)],
+            ["report", str(out)],
+            ["run", scene, "--out", str(out), *RUN, "--contact", "foundation", "--resume"],
+            ["view", str(out), "--html", str(folder / "v.html")],
+        ]
+    )
+
+
+KINDS = {
+    kind.__name__: kind for kind in (arguments, odd_files, scenes, tables, urdfs, meshes, folders)
+}
+
+
+def copied(folder: Path) -> Path:
+    """Copy the shipped patient into the folder."""
+    shutil.copytree(MODEL, folder, dirs_exist_ok=True)
+    return folder
+
+
+def run(folder: Path) -> list[str]:
+    """Return a run of the folder's scene, its body alone being the quickest."""
+    out = str(folder / "out")
+    return ["run", str(folder / "scene.toml"), "--out", out, *RUN, "--contact", "hertz"]
+
+
+def spoilt(content: bytes, chance: random.Random) -> bytes:
+    """Return bytes cut short, flipped, doubled or put in."""
+    spoilt = bytearray(content)
+    for _ in range(chance.choice([1, 1, 5, 50])):
+        if not spoilt:
+            break
+        place, how = chance.randrange(len(spoilt)), chance.randint(0, 3)
+        if how == 0:
+            spoilt[place] ^= 1 << chance.randint(0, 7)
+        elif how == 1:
+            del spoilt[place : place + chance.choice([1, 100, len(spoilt)])]
+        elif how == 2:
+            spoilt[place:place] = bytes(chance.randrange(256) for _ in range(chance.randint(1, 9)))
+        else:
+            spoilt[place:place] = spoilt[place : place + 200]
+    return bytes(spoilt)

@@ -1,0 +1,50 @@
+"""A pytest plugin: which functions of the package each test calls, and how long it takes.
+
+    python -m pytest -p called_functions --called out/called.jsonl tests/test_x.py
+
+One line of JSON a test: its name, seconds, and the functions as "file:Class.function".
+"""
+
+import json
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = str(ROOT / "tkamb")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--called", type=Path, help="where the lines go")
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_protocol(item):
+    path = item.config.getoption("--called")
+    codes = set()
+
+    def trace(frame, event, argument):
+        codes.add(frame.f_code)
+
+    start = time.perf_counter()
+    threading.settrace(trace)
+    sys.settrace(trace)
+    yield
+    sys.settrace(None)
+    threading.settrace(None)
+    names = sorted(
+        f"{Path(code.co_filename).relative_to(ROOT).as_posix()}:{function_of(code)}"
+        for code in codes
+        if code.co_filename.startswith(PACKAGE)
+    )
+    row = {"test": item.nodeid, "seconds": time.perf_counter() - start, "called": names}
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
+
+
+def function_of(code):
+    """Return "Class.function" of a code object; a lambda or loop belongs to its function."""
+    return code.co_qualname.split(".<locals>")[0].split(".<lambda>")[0]

@@ -1,0 +1,175 @@
+"""Free-body balance of one leg: shank and foot, patella, thigh. numpy alone, nothing of tkamb."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from raw_leg import STEP
+
+FRICTION = 0.05
+STANDSTILL = 1e-3
+"""m/s; friction has no direction below it and fades, as the product documents."""
+
+
+@dataclass
+class Lent:
+    """Geometry taken from the product, insert frame: no load, no mass, no rate.
+
+    Args:
+        condyles: side -> (point (3,), unit normal (3,) into the femur).
+        unloaded: sides that do not carry.
+        slack: the extensor mechanism does not carry.
+        quadriceps: (link, point (3,), force (3,) per newton of tension), wraps included.
+        patellar_ligament: likewise.
+        patellofemoral: (point (3,), unit normal (3,) into the patella).
+    """
+
+    condyles: dict
+    unloaded: tuple
+    slack: bool
+    quadriceps: list
+    patellar_ligament: list
+    patellofemoral: tuple
+
+
+class FreeBodies:
+    """The leg at one instant, cut into shank with foot, patella, and thigh.
+
+    Args:
+        leg: a `raw_leg.Leg`.
+        t: s.
+        lent: geometry of contact and muscle line.
+    """
+
+    def __init__(self, leg, t, lent):
+        self.leg, self.t, self.lent = leg, t, lent
+        insert = leg.insert_in_laboratory(t)
+        self.axes, self.origin = insert[:3, :3], insert[:3, 3]
+        self.strands = leg.ligaments(t)
+
+    def loads(self):
+        """Return the unknowns by name, N and N·m, insert axes.
+
+        Shank with foot (6): ligament tension, both condyles, residual forces on the tibia
+        along insert x and z at the middle of the condyles' points, residual moment about
+        insert y. A condyle that does not carry is replaced by a moment about insert x, a
+        slack extensor mechanism by one about insert z. Patella (3, in the femur's sagittal
+        plane): quadriceps, patellofemoral force along its normal and across it. Thigh and
+        patella (6): force and moment at the hip, on the femur.
+        """
+        columns = self._on_shank()
+        known = self.leg.ground(self.t) + self._ligaments(1)
+        right = self.leg.needed("tibia", self.t) - known
+        values = dict(
+            zip(columns, np.linalg.solve(np.stack([*columns.values()], 1), right), strict=True)
+        )
+        shank = sum(value * columns[name] for name, value in values.items())
+        patellar = values.get("patellar_ligament", 0.0)
+        if not self.lent.slack:
+            values.update(self._patella(patellar))
+        on_thigh = (
+            self._ligaments(0)
+            - shank
+            + patellar
+            * (
+                self._line(self.lent.patellar_ligament, "tibia")
+                + self._line(self.lent.patellar_ligament, "patella")
+            )
+        )
+        needed = self.leg.needed("femur", self.t) + self.leg.needed("patella", self.t)
+        hip = needed - on_thigh
+        centre = self.leg.in_laboratory("hip", self.t)[:3, 3]
+        values["hip_force"] = hip[:3] @ self.axes
+        values["hip_moment"] = (hip[3:] - np.cross(centre, hip[:3])) @ self.axes
+        return values
+
+    def _on_shank(self):
+        """Return name -> wrench (6,) on the shank of one newton (newton metre)."""
+        lent, columns = self.lent, {}
+        for side, (point, normal) in lent.condyles.items():
+            if side not in lent.unloaded:
+                push = self._out(normal) - FRICTION * self._slip(point, normal)
+                columns[f"{side}_normal"] = -wrench(self._to(point), push)
+        middle = self._to(np.mean([point for point, _ in lent.condyles.values()], axis=0))
+        x, y, z = self.axes.T
+        columns["residual_ap"], columns["residual_ml"] = wrench(middle, x), wrench(middle, z)
+        columns["residual_axial"] = np.append(np.zeros(3), y)
+        if lent.unloaded:
+            columns["residual_coronal"] = np.append(np.zeros(3), x)
+        if lent.slack:
+            columns["residual_flexion"] = np.append(np.zeros(3), z)
+        else:
+            columns["patellar_ligament"] = self._line(lent.patellar_ligament, "tibia")
+        return columns
+
+    def _patella(self, patellar):
+        """Return quadriceps and patellofemoral force by the patella's sagittal balance."""
+        lent, femur = self.lent, self.leg.in_laboratory("femur", self.t)
+        point, normal = lent.patellofemoral
+        across = np.cross(femur[:3, 2] @ self.axes, normal)
+        columns = [
+            self._line(lent.quadriceps, "patella"),
+            wrench(self._to(point), self._out(normal)),
+            wrench(self._to(point), self._out(across)),
+        ]
+        right = self.leg.needed("patella", self.t)
+        right = right - patellar * self._line(lent.patellar_ligament, "patella")
+        # moments about an axis through the patella: about the laboratory's origin they are large
+        here = self.leg.in_laboratory("patella", self.t)[:3, 3]
+        rows = np.array([self._sagittal(w, femur, here) for w in (*columns, right)])
+        names = ("quadriceps", "patellofemoral", "patellofemoral_tangential")
+        return dict(zip(names, np.linalg.solve(rows[:3].T, rows[3]), strict=True))
+
+    @staticmethod
+    def _sagittal(w, femur, here):
+        """Return the forces along the femur's x and y, and the moment about its z (3,)."""
+        moment = w[3:] - np.cross(here, w[:3])
+        return np.array([w[:3] @ femur[:3, 0], w[:3] @ femur[:3, 1], moment @ femur[:3, 2]])
+
+    def _slip(self, point, normal):
+        """Return the direction in which the femur slides there, fading below `STANDSTILL`."""
+        femur, tibia = (
+            [self.leg.in_laboratory(link, self.t + d) for d in (-STEP, 0.0, STEP)]
+            for link in ("femur", "tibia")
+        )
+        here = self._to(point)
+        velocity = carried(femur, here) - carried(tibia, here)
+        normal = self._out(normal)
+        velocity = velocity - velocity @ normal * normal
+        return velocity / np.hypot(np.linalg.norm(velocity), STANDSTILL)
+
+    def _ligaments(self, end):
+        """Return the bundles' wrench on the femur (end 0) or the tibia (end 1)."""
+        total = np.zeros(6)
+        for force, *ends in self.strands:
+            pull = ends[1 - end] - ends[end]
+            total += wrench(ends[end], force * pull / np.linalg.norm(pull))
+        return total
+
+    def _line(self, loads, body):
+        """Return the wrench of a unit tension on a segment."""
+        parts = [
+            wrench(self._to(point), self._out(force))
+            for link, point, force in loads
+            if self.leg.body(link) == body
+        ]
+        return sum(parts, np.zeros(6))
+
+    def _to(self, point):
+        return self.axes @ point + self.origin
+
+    def _out(self, vector):
+        return self.axes @ vector
+
+
+def wrench(point, force):
+    """Return force and moment about the laboratory's origin (6,) of a force at a point."""
+    return np.concatenate([force, np.cross(point, force)])
+
+
+def carried(poses, point):
+    """Return the velocity (3,) of a body's point, by central difference of its poses."""
+    before, here, after = poses
+    own = here[:3, :3].T @ (point - here[:3, 3])
+    places = [pose[:3, :3] @ own + pose[:3, 3] for pose in (before, after)]
+    return (places[1] - places[0]) / (2 * STEP)

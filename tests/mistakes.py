@@ -1,0 +1,193 @@
+"""A bench for mistakes: edit a copy of a scene and see whether the product notices.
+
+The body side alone is run, for a few frames; meshes, and what is built from them, are read once
+and kept, since nothing here but their placement changes.
+"""
+
+import csv
+import hashlib
+import re
+import shutil
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from scenes import MODEL, as_toml
+from tkamb.case import load_case
+from tkamb.contact.materials import material
+from tkamb.contact.registry import contact_model
+from tkamb.errors import TkambError
+from tkamb.mechanics.mechanics import Mechanics
+from tkamb.plausibility.plausibility import Plausibility
+from tkamb.run.status import frame_status
+from tkamb.scene import load_scene
+
+DM = MODEL.parent / "dm"
+DATA = MODEL.parents[2] / "shared" / "data" / "dm"
+NUMBER = re.compile(r"-?\d[\d.]*(e[+-]?\d+)?")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a scene: refused with a message, or words about it and forces."""
+
+    refused: str
+    words: frozenset[str]
+    forces: np.ndarray
+
+    def notices(self, untouched):
+        """Say whether a reader is told: refused, or a question or flag the untouched has not."""
+        return bool(self.refused) or bool(self.words - untouched.words)
+
+    def same(self, untouched):
+        """Say whether all forces are the untouched scene's to 1e-9."""
+        if self.refused or self.forces.shape != untouched.forces.shape:
+            return False
+        return np.allclose(self.forces, untouched.forces, rtol=1e-9, atol=1e-9, equal_nan=True)
+
+
+def kept(factory, store):
+    """Return a factory that makes the same thing from the same surfaces and words once."""
+
+    def made(*arguments, **named):
+        key = (factory.__name__, *map(_key, arguments), *map(_key, sorted(named.items())))
+        if key not in store:
+            store[key] = factory(*arguments, **named)
+        return store[key]
+
+    return made
+
+
+def _key(value):
+    vertices = getattr(value, "vertices", None)
+    return str(value) if vertices is None else hashlib.sha1(vertices.tobytes()).hexdigest()
+
+
+def keep_meshes(monkeypatch):
+    """Have meshes, their repair and their search trees made once."""
+    store = {}
+    for module, name in (
+        ("tkamb.inputs.meshes", "load_surface"),
+        ("tkamb.geometry.closest", "ClosestPointQuery"),
+        ("tkamb.mechanics.extensor", "PatellofemoralContact"),
+    ):
+        place = __import__(module, fromlist=[name])
+        monkeypatch.setattr(place, name, kept(getattr(place, name), store))
+
+
+class Bench:
+    """A scene in a folder of its own, edited again and again.
+
+    Args:
+        folder: where the files are; `files` of them may be edited.
+        content: the scene as plain values.
+        frames: to look at.
+    """
+
+    def __init__(self, folder, content, frames):
+        self.folder, self.content, self.frames = Path(folder), content, frames
+        self.files = sorted(self.folder.glob("*"))
+        self.texts = {path.name: path.read_text(encoding="utf-8") for path in self.files}
+        self.untouched = self.outcome()
+
+    def outcome(self, edit=None):
+        """Return what comes of an edit: a function of (scene content, file name -> text)."""
+        content, texts = tomllib.loads(as_toml(self.content)), dict(self.texts)
+        if edit is not None:
+            edit(content, texts)
+        for name, text in texts.items():
+            path = self.folder / name
+            if path.read_text(encoding="utf-8") != text:
+                path.write_text(text, encoding="utf-8")
+        scene = self.folder / "scene.toml"
+        scene.write_text(as_toml(content), encoding="utf-8")
+        try:
+            return self._run(scene)
+        except TkambError as error:
+            return Outcome(str(error), frozenset(), np.zeros(0))
+
+    def _run(self, scene):
+        case = load_case(load_scene(scene))
+        contact = case.scene.contact
+        if contact is not None:  # what the contact side, which is not run, would refuse
+            contact_model(contact.model, contact.resolution_mm, **contact.options)
+            material(contact.material)
+        mechanics = Mechanics(case)
+        plausibility = Plausibility(mechanics)
+        words = {NUMBER.sub("#", question.text) for question in plausibility.questions}
+        forces = []
+        for k in self.frames:
+            body = mechanics.frame(k)
+            status = frame_status(case, k, body, None, plausibility.flags(k, body))
+            flags = [] if status == "ok" else status.split("; ")
+            words |= {f"{k}: {NUMBER.sub('#', word)}" for word in flags}
+            values = {**body.loads.values, **body.tensions}
+            forces += [*body.loads.contact_force, *(values[name] for name in sorted(values))]
+        return Outcome("", frozenset(words), np.array(forces))
+
+
+def shipped_bench(folder):
+    """Return the shipped knee, its motion at five times."""
+    for path in MODEL.iterdir():
+        if path.suffix in (".csv", ".urdf"):
+            shutil.copy(path, folder)
+    content = tomllib.loads((MODEL / "scene.toml").read_text(encoding="utf-8"))
+    for part in content["implant"].values():
+        part["mesh"] = str(MODEL / part["mesh"])
+    content["motion"]["frames"] = 5
+    return Bench(folder, content, (0, 2, 4))
+
+
+def dm_bench(folder):
+    """Return subject DM without the patella, its recordings cut to the stride and thinned."""
+    shutil.copy(DM / "patient.urdf", folder)
+    content = tomllib.loads((DM / "scene.toml").read_text(encoding="utf-8"))
+    for name in ("patella", "quadriceps", "patellar_ligament"):
+        del content[name]
+    del content["implant"]["patella"]
+    for part in content["implant"].values():
+        part["mesh"] = str((DM / part["mesh"]).resolve())
+    for table, every in (("motion", 1), ("ground_reaction", 10), ("tibia", 1)):
+        path = (DM / content[table]["file"]).resolve()
+        text = path.read_text(encoding="utf-8")
+        (folder / path.name).write_text(text if table == "motion" else _cut(text, every))
+        content[table]["file"] = path.name
+    content["motion"]["frames"] = 21
+    return Bench(folder, content, (4, 9, 17))
+
+
+def _cut(text, every):
+    """Return a recording's rows between 3 and 6.5 s, each `every`-th, with its header."""
+    header, rows, column = [], [], None
+    for line in filter(str.strip, text.splitlines()):
+        cells = line.split("\t") if "\t" in line else line.split()
+        if column is None or not cells[0].strip().lstrip("-").replace(".", "").isdigit():
+            header.append(line)
+            if any(cell.strip().lower() == "time" for cell in cells):
+                column = [cell.strip().lower() for cell in cells].index("time")
+        elif 3.0 <= float(cells[column]) <= 6.5:
+            rows.append(line)
+    return "\n".join([*header, *rows[::every]]) + "\n"
+
+
+def cells_of(text, separator=","):
+    """Return a CSV's rows."""
+    return list(csv.reader(text.splitlines(), delimiter=separator))
+
+
+def text_of(rows, separator=","):
+    """Return rows as CSV text."""
+    return "\n".join(separator.join(row) for row in rows) + "\n"
+
+
+def set_key(content, dotted, value):
+    """Set a key of the scene, tables separated by dots; None takes it out."""
+    *tables, key = dotted.split(".")
+    for name in tables:
+        content = content[int(name)] if isinstance(content, list) else content.setdefault(name, {})
+    if value is None:
+        content.pop(key)
+    else:
+        content[key] = value

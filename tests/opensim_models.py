@@ -1,0 +1,34 @@
+"""OpenSim models for the tests: two small ones of our own, and those of the data folder."""
+
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from tkamb.opensim.kinematics import Kinematics
+from tkamb.opensim.model import OpenSimModel
+from tkamb.opensim.read import read_osim
+
+HERE = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[2] / "shared" / "data"
+OWN = {name: HERE / f"{name}.osim" for name in ("old_layout", "new_layout")}
+PUBLISHED = {
+    "DM": DATA / "dm" / "DM.osim",
+    "JW": DATA / "jw" / "JW.osim",
+    "gait2392": DATA / "opensim" / "gait2392.osim",
+    "Rajagopal2016": DATA / "opensim" / "Rajagopal2016.osim",
+}
+
+
+@cache
+def kinematics(name: str) -> Kinematics:
+    """Return a model's kinematics; skips where its file is absent."""
+    path = (OWN | PUBLISHED)[name]
+    if not path.is_file():
+        pytest.skip(f"{name}'s file is absent from ../shared/data")
+    return Kinematics(read_osim(path))
+
+
+def model(name: str) -> OpenSimModel:
+    """Return a model; skips where its file is absent."""
+    return kinematics(name).model

@@ -1,0 +1,30 @@
+"""What OpenSim computes: kept in tests/data, or made now where OpenSim is at hand.
+
+TKAMB_OPENSIM_PYTHON may name a Python that has `opensim`; the numbers are then made anew.
+"""
+
+import json
+import os
+import subprocess
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+WEIGHTS = np.sin(1.0 + np.arange(12.0)).reshape(3, 4)
+"""Of a pose's upper twelve entries in its sum, as in scripts/make_opensim_references."""
+
+
+@cache
+def references() -> dict:
+    """Return model name -> what OpenSim says of it."""
+    python = os.environ.get("TKAMB_OPENSIM_PYTHON")
+    if python is None:
+        return json.loads((ROOT / "tests" / "data" / "opensim_references.json").read_text())
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "references.json"
+        script = ROOT / "scripts" / "make_opensim_references"
+        subprocess.run([python, str(script), str(out), "--sets", "50"], check=True)
+        return json.loads(out.read_text())

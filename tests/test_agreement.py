@@ -1,0 +1,129 @@
+"""Estimates that contradict each other are flagged; the split's sensitivity to adduction."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from joints import HALF, flat_joint
+from scenes import write_scene
+from tkamb import simulate
+from tkamb.case import load_case
+from tkamb.contact.registry import contact_model
+from tkamb.equilibrium.contact_side import ContactSide
+from tkamb.equilibrium.split_sensitivity import split_sensitivity
+from tkamb.geometry.frames import KNEE_COORDINATES, knee_pose
+from tkamb.mechanics.mechanics import Mechanics
+from tkamb.output.axis import horizontal_axis
+from tkamb.output.headline import cards
+from tkamb.run.agreement import contradictions
+from tkamb.scene import load_scene
+from tkamb.studies.recordings import change_recording
+
+DM = Path(__file__).parents[1] / "models" / "dm" / "scene.toml"
+DATA = Path(__file__).parents[2] / "shared" / "data" / "dm"
+FRAMES = slice(20, 101, 40)
+COARSE = {"contact__resolution_mm": 2.0}
+
+
+def share_card(results):
+    (card,) = [c for c in cards(results, horizontal_axis(results)) if "share" in c.title]
+    return card
+
+
+@pytest.fixture(scope="module")
+def shipped(tmp_path_factory):
+    return simulate(write_scene(tmp_path_factory.mktemp("shipped"), **COARSE), frames=FRAMES)
+
+
+@pytest.mark.parametrize("name", ["foundation-linear", "lattice-linear"])
+def test_two_spheres_share_by_their_stiffness(name):
+    """A layer carries F = c d^2 under a sphere: dF/dd = 2F/d, half the width apart per radian.
+
+    An elastic body carries F = c d^(3/2) (Hertz).
+    """
+    power, load = {"foundation-linear": (2.0, 1000.0), "lattice-linear": (1.5, 1000.0)}[name]
+    pair = flat_joint()
+    model = contact_model(name, 1.0)
+    state = model.prepare(pair)
+    result = model.press(state, load, knee_pose(np.zeros(6)))
+    expected = power * (load / 2) / result.approach * HALF
+    assert split_sensitivity(model, state, result) == pytest.approx(expected, rel=0.1)
+
+
+def test_sensitivity_is_the_slope_of_presses_farther_apart(tmp_path):
+    """Of the run's own column: 0.05 deg to either side, at the load of the equations."""
+    case = load_case(load_scene(write_scene(tmp_path)))
+    side = ContactSide(case, Mechanics(case))
+    body, contact = side.frame(60)
+    medial = []
+    for angle in np.radians([-0.05, 0.05]):
+        place = case.motion.coordinates[60].copy()
+        place[KNEE_COORDINATES.index("adduction")] += angle
+        load = float(body.loads.contact_force[1])
+        medial.append(side.model.press(side.state, load, knee_pose(place)).medial.force)
+    slope = np.diff(medial)[0] / np.radians(0.1)
+    assert contact.sensitivity == pytest.approx(slope, rel=0.03)
+    assert slope > 0  # varus loads the medial condyle
+
+
+def test_the_shipped_knee_agrees_with_itself_and_says_what_half_a_degree_does(shipped):
+    assert shipped.status == ["ok"] * len(shipped)
+    moved = 0.5 * shipped["medial_force_per_adduction_N_per_deg"]
+    assert (moved > 0.25 * shipped["force_si_N"]).all()
+    assert (shipped["split_determined"] == 0).all()
+    assert shipped.summary["split_not_determined_frames"] == len(shipped)
+    card = share_card(shipped)
+    assert card.warning
+    assert "deformation is not determined in every frame: ± 0.5 deg" in card.detail
+    assert card.detail.startswith("by equilibrium")
+
+
+def test_with_adduction_released_nothing_hangs_on_the_recorded_one(tmp_path):
+    path = write_scene(tmp_path, contact__released=["adduction"], **COARSE)
+    results = simulate(path, frames=slice(60, 61))
+    assert np.isnan(results["medial_force_per_adduction_N_per_deg"]).all()
+    assert np.isnan(results["split_determined"]).all()
+    assert "0.5 deg" not in share_card(results).detail
+
+
+def test_an_insert_turned_back_to_front_is_flagged(tmp_path):
+    path = write_scene(tmp_path, implant__insert__axes="-x,+y,-z", **COARSE)
+    results = simulate(path, frames=FRAMES)
+    for status in results.status:
+        assert "by deformation contradicts" in status
+        assert "carries nothing by deformation" in status
+    assert share_card(results).warning
+    assert (results["split_determined"] == 0).all()
+
+
+def test_an_axial_rotation_of_the_wrong_sign_is_flagged(tmp_path, shipped):
+    path = write_scene(tmp_path, **COARSE)
+
+    def turned(head, rows):
+        rows[:, head.index("axial_rotation_deg")] *= -1
+        return rows
+
+    change_recording(path.parent / "motion.csv", turned)
+    results = simulate(path, frames=FRAMES)
+    wrong = np.abs(shipped["axial_rotation_deg"]) > 2.0
+    assert wrong.any()
+    for k in np.flatnonzero(wrong):
+        assert "by deformation contradicts" in results.status[k], k
+
+
+@cache
+def dm_side():
+    changes = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
+    case = load_case(load_scene(DM, changes))
+    return case, ContactSide(case, Mechanics(case))
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="needs subject DM's files beside the project")
+@pytest.mark.parametrize("k", [27, 28, 29, 30, 31, 69, 86, 90, 94])
+def test_subject_dms_contradicting_frames_are_flagged(k):
+    case, side = dm_side()
+    words = contradictions(case, *side.frame(k))
+    assert any("by deformation contradicts" in word for word in words)
+    assert any("carries nothing by deformation" in word for word in words)

@@ -1,0 +1,229 @@
+"""Output folders: whose they are, one writer at a time, and files that change together."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tkamb.errors import InputError
+from tkamb.output import atomic
+from tkamb.output.atomic import JOURNAL, MARKER, folder_token, replaced_file, replaced_together
+from tkamb.output.claim import claimed_directory, settle
+
+ROOT = Path(__file__).parents[1]
+
+HOLD = """
+import sys
+from tkamb.output.claim import claimed_directory
+with claimed_directory(sys.argv[1]):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def names(folder):
+    return {path.name for path in folder.iterdir()}
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """Another process that holds the folder `out`."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path / "out")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        cwd=ROOT,
+    )
+    assert process.stdout.readline() == b"held\n"
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def test_one_process_at_a_time(tmp_path, holder):
+    with (
+        pytest.raises(InputError, match="another tkamb is writing"),
+        claimed_directory(tmp_path / "out"),
+    ):
+        pass
+    assert names(tmp_path / "out") == {MARKER}
+    holder.kill()  # -9: no lock is left behind
+    holder.wait()
+    with claimed_directory(tmp_path / "out") as folder:
+        assert folder_token(folder)
+
+
+def test_a_thread_may_claim_again_what_it_holds(tmp_path):
+    with claimed_directory(tmp_path / "out") as outer, claimed_directory(tmp_path / "out") as inner:
+        assert outer == inner
+
+
+def test_a_foreign_folder_is_refused_without_force(tmp_path):
+    (tmp_path / "thesis.tex").write_text("mine")
+    refused = pytest.raises(InputError, match=r"not tkamb's own .*thesis.tex.*--force")
+    with refused, claimed_directory(tmp_path):
+        pass
+    assert names(tmp_path) == {"thesis.tex"}
+    with claimed_directory(tmp_path, force=True):
+        pass
+    with claimed_directory(tmp_path):  # from now on it is tkamb's
+        pass
+    assert (tmp_path / "thesis.tex").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "ours"),
+    [
+        ("summary.json", '{"versions": {"tkamb": "0.0.9"}}', True),
+        (".frames/run.json", '{"version of tkamb": "0.0.9"}', True),
+        ("rows.jsonl", '{"key": "a", "row": {}}\n', True),
+        ("summary.json", '{"versions": {"opensim": "4.6"}}', False),
+        ("summary.json", "[" * 100_000, False),
+        ("results.csv", "time_s\n", False),
+        (".frames/holiday.jpg", "", False),
+    ],
+)
+def test_folders_of_earlier_releases_are_known(tmp_path, name, text, ours):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    if ours:
+        with claimed_directory(tmp_path):
+            pass
+        return
+    with pytest.raises(InputError, match="not tkamb's own"), claimed_directory(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_bad_input_leaves_nothing(tmp_path, there):
+    out = tmp_path / "a" / "out"
+    if there:
+        out.mkdir(parents=True)
+    with pytest.raises(InputError), claimed_directory(out):
+        raise InputError("bad")
+    assert names(tmp_path) == ({"a"} if there else set())
+    assert not there or not names(out)
+
+
+def test_only_own_temporaries_go(tmp_path):
+    with claimed_directory(tmp_path) as folder:
+        token = folder_token(folder)
+    own = tmp_path / f".tkamb-{token}-12ab.part"
+    others = [".results.csv.12.part", ".tkamb-0123456789abcdef-12ab.part", ".backup.part"]
+    for name in (own.name, *others):
+        (tmp_path / name).write_text("x")
+    link = tmp_path / f".tkamb-{token}-link.part"
+    link.symlink_to(tmp_path / ".backup.part")
+    with claimed_directory(tmp_path):
+        assert names(tmp_path) == {MARKER, link.name, *others}
+
+
+@pytest.mark.parametrize("kind", ["link", "fifo", "folder"])
+def test_a_marker_that_is_no_file_is_refused(tmp_path, kind):
+    out = tmp_path / "out"
+    out.mkdir()
+    marker = out / MARKER
+    if kind == "link":
+        (tmp_path / "precious").write_text("mine")
+        marker.symlink_to(tmp_path / "precious")
+    elif kind == "fifo":
+        os.mkfifo(marker)
+    else:
+        marker.mkdir()
+    with pytest.raises(InputError), claimed_directory(out):
+        pass
+    assert kind != "link" or (tmp_path / "precious").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "nul\0"])
+def test_names_that_no_folder_can_have(tmp_path, name):
+    with pytest.raises(InputError, match="cannot be written"), claimed_directory(tmp_path / name):
+        pass
+    assert not names(tmp_path)
+
+
+def write_two(folder, text):
+    with replaced_together(folder) as files:
+        for name in ("a.csv", "b.json"):
+            files.path(name).write_text(text)
+        files.remove("c.html")
+
+
+def test_files_change_together(tmp_path):
+    (tmp_path / "c.html").write_text("old")
+    write_two(tmp_path, "new")
+    assert names(tmp_path) == {"a.csv", "b.json"}
+
+    def half():
+        with replaced_together(tmp_path) as files:
+            files.path("a.csv").write_text("newer")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        half()
+    assert names(tmp_path) == {"a.csv", "b.json"} and (tmp_path / "a.csv").read_text() == "new"
+
+
+def test_a_kill_between_the_renames_is_mended_by_the_next(tmp_path, monkeypatch):
+    """The process is gone after any number of renames: the new state comes, whole."""
+    for renames in range(1, 4):
+        folder = tmp_path / str(renames)
+        folder.mkdir()
+        write_two(folder, "old")
+        (folder / "c.html").write_text("old")
+        left = [renames]
+        replace = os.replace
+
+        def dying(source, target, left=left, replace=replace):
+            if left[0] == 0:
+                raise SystemExit
+            left[0] -= 1
+            replace(source, target)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(atomic.os, "replace", dying)
+            with pytest.raises(SystemExit) if renames < 3 else pytest.MonkeyPatch.context():
+                write_two(folder, "new")
+        settle(folder)
+        assert {name: (folder / name).read_text() for name in ("a.csv", "b.json")} == {
+            "a.csv": "new",
+            "b.json": "new",
+        }
+        assert not (folder / "c.html").exists() and not (folder / JOURNAL).exists()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "{}",
+        "[]",
+        "no JSON",
+        json.dumps({"written": {"../x": "y"}, "removed": []}),
+        json.dumps({"written": {}, "removed": ["/etc/passwd"]}),
+        json.dumps({"written": {"a": "b/c"}, "removed": []}),
+        json.dumps({"written": {"a": 1}, "removed": []}),
+    ],
+)
+def test_a_journal_of_somebody_else_is_refused(tmp_path, content):
+    (tmp_path / JOURNAL).write_text(content)
+    with pytest.raises(InputError, match=r"journal|outside"):
+        settle(tmp_path)
+
+
+def test_a_long_name_can_be_written(tmp_path):
+    path = tmp_path / ("n" * 250 + ".html")
+    with replaced_file(path) as temporary:
+        temporary.write_text("x")
+    assert path.read_text() == "x"
+    with pytest.raises(InputError, match="cannot be written"):
+        atomic.write_text(tmp_path / ("n" * 256), "x")
+    assert names(tmp_path) == {path.name}
+
+
+def test_names_that_are_not_utf8_can_be_written_down(tmp_path):
+    atomic.write_text(tmp_path / "a.json", json.dumps({"f": "\udcff"}, ensure_ascii=False))
+    assert json.loads((tmp_path / "a.json").read_text()) == {"f": "\udcff"}

@@ -1,0 +1,36 @@
+"""What a millimetre of the button's place does to quadriceps and patellofemoral force."""
+
+import numpy as np
+import pytest
+
+from test_load_states import FRICTION, UP, knee, loaded  # noqa: F401
+from tkamb.body.dome_sensitivity import dome_sensitivity
+from tkamb.body.knee import solve_knee
+
+
+def test_quadriceps_follows_the_arms_about_the_shifted_contact(knee):  # noqa: F811
+    """Moments about the contact point: Q a_Q = PL a_PL, the patella's weight left out."""
+    geometry = loaded(knee, 700 * UP, [-0.06, -0.45, 0.0])
+    loads, state, extensor = solve_knee(geometry, FRICTION), geometry.state, geometry.extensor
+    ligament = loads.values["patellar_ligament"]
+    femur, up = state.pose("femur")[:3, :3], state.pose("patella")[:3, 1]
+
+    def quadriceps(point):
+        arms = [
+            np.cross(pull.points[0] - point, pull.forces[0]) @ femur[:, 2]
+            for pull in (extensor.quadriceps[1], extensor.patellar_ligament[0])
+        ]
+        return -ligament * arms[1] / arms[0]
+
+    step = 0.5e-3
+    point = extensor.contact_point
+    slope = (quadriceps(point + step * up) - quadriceps(point - step * up)) / (2 * step)
+    found = dome_sensitivity(geometry, FRICTION)
+    assert loads.values["quadriceps"] == pytest.approx(quadriceps(point), rel=0.01)
+    assert found["quadriceps"] == pytest.approx(slope, rel=0.02)
+    assert abs(slope) > 0.005e3 * loads.values["quadriceps"]  # more than 0.5 % per mm
+
+
+def test_a_slack_quadriceps_has_no_sensitivity(knee):  # noqa: F811
+    geometry = loaded(knee, 700 * UP, [0.08, -0.45, 0.0])
+    assert dome_sensitivity(geometry, FRICTION) == {"quadriceps": 0.0, "patellofemoral": 0.0}

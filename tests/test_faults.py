@@ -1,0 +1,169 @@
+"""Every open, write, flush, sync and rename fails in turn: the old state or the new, one line."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from faults import ERRORS, Faults
+from lattice_blocks import block
+from scenes import write_scene
+from tkamb.cli import main
+from tkamb.errors import InputError
+from tkamb.output.vtk import write_hexahedra
+from tkamb.results import Results, read_results
+from tkamb.scene import Scene
+from tkamb.studies.kept_rows import KeptRows
+from tkamb.verify import verify_results
+from tkamb.view.page import write_page
+
+MOST = 400
+"""More calls than a run of two frames makes."""
+
+
+@pytest.fixture(autouse=True)
+def plain_report(monkeypatch):
+    """The report's drawing takes a second and writes nothing."""
+    monkeypatch.setattr("tkamb.output.report.report_html", lambda results: "<html></html>")
+
+
+@pytest.fixture
+def quick_case(monkeypatch):
+    """Scenes are read, and their bodies built, once."""
+    import tkamb.simulation as simulation
+
+    for name, key_of in (("load_case", Scene.model_dump_json), ("Mechanics", id)):
+        kept = {}
+
+        make = getattr(simulation, name)
+
+        def known(given, make=make, key_of=key_of, kept=kept):
+            key = key_of(given)
+            if key not in kept:
+                kept[key] = make(given)
+            return kept[key]
+
+        monkeypatch.setattr(simulation, name, known)
+
+
+def snapshot(out):
+    """Return what stands in a folder for its users: name -> content."""
+    if not out.exists():
+        return {}
+    return {p.name: p.read_bytes() for p in out.iterdir() if not p.name.startswith(".")}
+
+
+def check_old_or_new(out, before, frames):
+    """The folder holds what it held, or results that are whole and agree with each other."""
+    if snapshot(out) == before:
+        return "old"
+    verdict = verify_results(out)
+    assert not verdict.differs, verdict.lines()
+    results = read_results(out)
+    assert len(results) == frames
+    done = [not status.startswith("failed: not computed") for status in results.status]
+    assert np.isfinite(results["hip_force_si_N"][done]).all()
+    return "new"
+
+
+def test_a_run_survives_any_fault(tmp_path, monkeypatch, capfd, quick_case):
+    """The folder holds an earlier run; a fault in the next one leaves it, or the next one whole."""
+    scene = write_scene(tmp_path / "scene", ("contact",))
+    out = tmp_path / "out"
+    first, second = (["run", str(scene), "--out", str(out), "--frames", f] for f in ("0:1", "0:2"))
+    assert main(second) == 0
+    wanted = read_results(out).columns["hip_force_si_N"]
+    assert main(first) == 0
+    shutil.move(out, tmp_path / "earlier")
+    seen, kinds = set(), set()
+    for number in range(MOST):
+        shutil.rmtree(out, ignore_errors=True)
+        shutil.copytree(tmp_path / "earlier", out)
+        capfd.readouterr()
+        before, faults = snapshot(out), Faults(out, number, ERRORS[number % 3])
+        with faults.injected(monkeypatch):
+            status = main(second)
+        if len(faults.calls) <= number:
+            assert status == 0
+            break
+        kinds.add(faults.calls[number][0])
+        check_said(status, capfd.readouterr().err, faults.calls[number])
+        state = check_old_or_new(out, before, 2)
+        seen.add(state)
+        if number % 9:  # each is a whole run
+            continue
+        more = ["--resume"] if state == "new" else []
+        assert main([*second, *more]) == 0, (faults.calls[number], capfd.readouterr().err)
+        assert np.array_equal(read_results(out).columns["hip_force_si_N"], wanted)
+        assert {p.name for p in out.iterdir() if p.name.startswith(".")} == {".tkamb"}
+    else:
+        pytest.fail("the run never ended")
+    assert seen == {"old", "new"}
+    assert kinds >= {"open", "write", "flush", "fsync", "replace", "mkdir"}
+
+
+def said_by(call):
+    """Return what a call says when it fails; None if it does not."""
+    try:
+        call()
+    except InputError as error:
+        return str(error)
+    return None
+
+
+def test_a_study_keeps_its_rows(tmp_path, monkeypatch):
+    """A row that could not be written is said; those before it, and those after, are there."""
+    for number in range(MOST):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        kept = KeptRows(folder, False)
+        kept.put("a", {"x": 1.0})
+        faults = Faults(folder, number, ERRORS[number % 3])
+        with faults.injected(monkeypatch):
+            said = said_by(lambda kept=kept: kept.put("b", {"x": 2.0}))
+            assert said is None or "cannot be written" in said
+        kept.put("c", {"x": 3.0})
+        again = KeptRows(folder, True)
+        assert again.get("a") == {"x": 1.0} and again.get("c") == {"x": 3.0}
+        assert again.get("b") in (None, {"x": 2.0})
+        if len(faults.calls) <= number:
+            break
+    assert number > 1
+
+
+def test_a_row_that_was_changed_counts_as_absent(tmp_path):
+    KeptRows(tmp_path, False).put("a", {"x": 1.5})
+    path = tmp_path / "rows.jsonl"
+    path.write_text(path.read_text().replace("1.5", "1.6"))
+    assert KeptRows(tmp_path, True).get("a") is None
+
+
+@pytest.mark.parametrize("export", ["lattice", "page", "csv"])
+def test_an_export_is_old_or_new(tmp_path, monkeypatch, export):
+    path = tmp_path / "export"
+    nodes, _, cells, _ = block((2, 1, 2), np.full(3, 1e-3), 0.0)
+    write = {
+        "lattice": lambda: write_hexahedra(path, nodes, cells, {}, {}),
+        "page": lambda: write_page(path, "<html></html>"),
+        "csv": lambda: Results({"time_s": [0.0], "status": ["ok"]}).write_csv(path),
+    }[export]
+    write()
+    new = path.read_bytes()
+    for number in range(MOST):
+        path.write_bytes(b"old")
+        faults = Faults(tmp_path, number, ERRORS[number % 3])
+        with faults.injected(monkeypatch):
+            said = said_by(write)
+            assert said is None or "cannot be written" in said
+        if len(faults.calls) <= number:
+            break
+        assert path.read_bytes() in (b"old", new)
+        assert [p.name for p in tmp_path.iterdir()] == ["export"]
+    assert number > 1 and path.read_bytes() == new
+
+
+def check_said(status, said, call):
+    """A failure is one line that was thought of; what can be done without is no failure."""
+    assert status in (0, 1, 2), call
+    assert said.count("\n") == bool(status), (call, said)
+    assert "not foreseen" not in said and "Traceback" not in said, (call, said)

@@ -1,0 +1,137 @@
+"""The product's loads against free bodies that were written from the raw files alone.
+
+Own here (`raw_files`, `raw_leg`, `free_body`: numpy and scipy, no import of tkamb): reading of
+scene, URDF, tables, markers and STL; the documented smoothing spline; the rigid fit of the
+shank; poses of all segments by the URDF's joints; accelerations and spins by differences of
+those poses; masses and inertias; the ground reaction as a wrench; ligament lengths and
+tensions; direction of sliding; the equations themselves (shank with foot 6, patella 3, thigh
+with patella 6, in the laboratory, instead of the product's 15 generalised ones).
+
+Shared, all of it geometry: the condyles' contact points and normals, the lines of action of
+quadriceps and patellar ligament with what they wrap, patellofemoral point and normal, which
+condyle carries nothing and whether the quadriceps is slack. For DM also where the insert's
+mesh lies in the insert frame (the rectangle around a noisy flat) and the solved places of
+the patella. Where a line wraps nothing, it is compared with the scene's own two points.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from free_body import FreeBodies, Lent
+from raw_leg import Leg
+from tkamb.case import load_case
+from tkamb.geometry.flat_bottom import insert_placement
+from tkamb.geometry.frames import pose
+from tkamb.inputs.meshes import axes_rotation, load_surface
+from tkamb.mechanics.mechanics import Mechanics
+from tkamb.scene import load_scene
+
+MODELS = Path(__file__).parents[1] / "models"
+DATA = Path(__file__).parents[2] / "shared" / "data" / "dm"
+SHIPPED, DM = MODELS / "deep_knee_bend" / "scene.toml", MODELS / "dm" / "scene.toml"
+SHIPPED_FRAMES = (8, 22, 40, 58, 76, 93)
+DM_FRAMES = (2, 5, 9, 12, 14, 16)
+"""Of 21 frames, one every 5 % of the cycle: both condyles, one alone, quadriceps slack, swing."""
+FORCE, MOMENT = 1.0, 0.1
+"""N and N·m within which the two must agree."""
+
+
+needs_dm = pytest.mark.skipif(
+    not (DATA / "DM.osim").is_file(), reason="subject DM's files (../shared/data/dm) are absent"
+)
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    case = load_case(load_scene(SHIPPED))
+    return Leg(SHIPPED), Mechanics(case), case.motion.time
+
+
+@pytest.fixture(scope="module")
+def dm():
+    scene = load_scene(DM)
+    scene = scene.model_copy(update={"motion": scene.motion.model_copy(update={"frames": 21})})
+    case = load_case(scene)
+    mechanics, time = Mechanics(case), case.motion.time
+    patella = np.array([state.coordinates for state in mechanics.extensor.states])
+    table = scene.implant.insert
+    surface = load_surface(table.mesh, table.unit, table.axes, name="insert")
+    turn = axes_rotation(table.axes)
+    mesh = insert_placement(surface, turn) @ pose(turn, np.zeros(3))
+    return Leg(DM, mesh, (time, patella)), mechanics, time
+
+
+@pytest.mark.parametrize("k", SHIPPED_FRAMES)
+def test_the_shipped_knee_is_in_balance_on_free_bodies(shipped, k):
+    leg, mechanics, time = shipped
+    assert_same_loads(leg, mechanics.frame(k), time[k])
+
+
+@needs_dm
+@pytest.mark.parametrize("k", DM_FRAMES)
+def test_dm_is_in_balance_on_free_bodies(dm, k):
+    leg, mechanics, time = dm
+    assert_same_loads(leg, mechanics.frame(k), time[k])
+
+
+def assert_same_loads(leg, frame, t):
+    """Assert that product and free bodies agree on every load that both know."""
+    assert not frame.loads.problems
+    own = FreeBodies(leg, t, lent(frame)).loads()
+    for k, axis in enumerate(("ap", "si", "ml")):
+        own[f"hip_force_{axis}"] = own["hip_force"][k]
+        own[f"hip_moment_{axis}"] = own["hip_moment"][k]
+    del own["hip_force"], own["hip_moment"]
+    product = frame.loads.values
+    assert set(own) >= {name for name in product if "rest" not in name and product[name] != 0.0}
+    apart = {name: product[name] - value for name, value in own.items()}
+    moments = ("moment", "axial", "coronal", "flexion")
+    limit = {name: MOMENT if any(word in name for word in moments) else FORCE for name in apart}
+    assert not {name: d for name, d in apart.items() if abs(d) > limit[name]}
+
+
+def lent(frame):
+    """Return what the free bodies take from the product."""
+    geometry, loads = frame.geometry, frame.loads
+    quadriceps, ligament = (
+        [(load.link, *pair) for load in line for pair in zip(load.points, load.forces, strict=True)]
+        for line in (geometry.extensor.quadriceps, geometry.extensor.patellar_ligament)
+    )
+    return Lent(
+        {side: (condyle.point, condyle.normal) for side, condyle in geometry.condyles.items()},
+        tuple(loads.lifted),
+        loads.slack,
+        quadriceps,
+        ligament,
+        (geometry.extensor.contact_point, geometry.extensor.contact_normal),
+    )
+
+
+def test_lines_that_wrap_nothing_run_between_the_scenes_points(shipped):
+    leg, mechanics, time = shipped
+    for k in SHIPPED_FRAMES:
+        extensor, wrap = mechanics.frame(k).geometry.extensor, mechanics.frame(k).wrap
+        lines = {"patellar_ligament": extensor.patellar_ligament}
+        if wrap == 0.0:
+            lines["quadriceps"] = extensor.quadriceps
+        back = np.linalg.inv(leg.insert_in_laboratory(time[k]))
+        for name, loads in lines.items():
+            for (end, place), load in zip(leg.ends(name, time[k]), loads, strict=True):
+                assert load.link in (end, leg.body(end))
+                assert np.allclose(load.points[0], (back @ np.append(place, 1.0))[:3], atol=1e-9)
+
+
+def test_the_free_bodies_notice_a_load_that_is_wrong_by_one_per_cent(shipped):
+    """One per cent of the ground reaction is more than the tolerance: the test can fail."""
+    leg, mechanics, time = shipped
+    k, ground = SHIPPED_FRAMES[3], leg.ground
+    own = FreeBodies(leg, time[k], lent(mechanics.frame(k))).loads()
+    leg.ground = lambda t: 1.01 * ground(t)
+    try:
+        more = FreeBodies(leg, time[k], lent(mechanics.frame(k))).loads()
+    finally:
+        leg.ground = ground
+    assert abs(more["quadriceps"] - own["quadriceps"]) > 10 * FORCE
+    assert np.abs(more["hip_moment"] - own["hip_moment"]).max() > 5 * MOMENT

@@ -1,0 +1,171 @@
+"""Whatever happens, a user sees one line: streams that are gone, odd files, what nobody foresaw."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from scenes import MODEL, write_scene
+from tkamb import files
+from tkamb.cli import main
+from tkamb.errors import InputError
+from tkamb.files import read_bytes, read_xml
+from tkamb.inputs.tables import read_table
+
+ROOT = Path(__file__).parents[1]
+MESHES = [str(MODEL / name) for name in ("femoral_component.stl", "insert.stl")]
+
+
+def shell(command, cwd):
+    """Run a shell line in which TKAMB is the program; return status, stdout and stderr."""
+    line = command.replace("TKAMB", f"{sys.executable} -m tkamb.cli")
+    kept = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    ran = subprocess.run(
+        ["bash", "-c", line], cwd=cwd, env=kept, capture_output=True, text=True, timeout=120
+    )
+    return ran.returncode, ran.stdout, ran.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "status", "lines"),
+    [
+        ("TKAMB contact list > /dev/full", 1, 1),
+        ("TKAMB --version > /dev/full", 1, 1),
+        ("TKAMB scene --schema > /dev/full", 1, 1),
+        ("TKAMB contact list >&-", 1, 1),
+        ("TKAMB contact list 2>&-", 0, 0),
+        ("TKAMB contact list <&- >&- 2>&-", 1, 0),
+        ("TKAMB run nothing.toml 2> /dev/full", 2, 0),
+        ("TKAMB run nothing.toml 2>&-", 2, 0),
+        ("TKAMB run nothing.toml >&-", 2, 1),
+        ("PYTHONIOENCODING=ascii TKAMB contact list", 0, 0),
+        ("set -o pipefail; TKAMB scene --schema | head -1", 0, 0),
+        ("TKAMB run $'no\\xffsuch.toml'", 2, 1),
+        ("TKAMB run $'a\\x1b[31m.toml'", 2, 1),
+    ],
+)
+def test_streams(tmp_path, command, status, lines):
+    ended, _, said = shell(command, tmp_path)
+    assert ended == status, said
+    assert said.count("\n") == lines and "Traceback" not in said, said
+    assert "\x1b" not in said
+    assert not list(tmp_path.iterdir())
+
+
+def refused(capfd, *arguments):
+    assert main([str(argument) for argument in arguments]) == 2
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1 and said.startswith("tkamb: ")
+    return said
+
+
+@pytest.mark.parametrize("kind", ["fifo", "device", "folder", "socketless link", "nul", "long"])
+def test_files_that_are_none(tmp_path, capfd, kind):
+    path = tmp_path / "odd"
+    if kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "device":
+        path = Path("/dev/zero")
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "socketless link":
+        path.symlink_to(path)
+    else:
+        path = tmp_path / ("a\0b" if kind == "nul" else "n" * 256)
+    assert "odd" in refused(capfd, "run", path, "--out", tmp_path / "o") or kind != "fifo"
+    refused(capfd, "press", path, MESHES[1], "--load", 100)
+    refused(capfd, "press", *MESHES, "--load", 100, "--pose-file", path)
+    refused(capfd, "mesh", "check", path)
+    refused(capfd, "verify", path)
+    refused(capfd, "report", path)
+    refused(
+        capfd, "run", MODEL / "scene.toml", "--set", f"patient.urdf='{path}'".replace("\0", "x")
+    )
+    refused(capfd, "run", MODEL / "scene.toml", "--set", f"motion.file='{path}'".replace("\0", "x"))
+    assert not (tmp_path / "o").exists()
+
+
+def test_large_files_are_not_read(tmp_path, capfd):
+    """Two gigabytes of nothing: the size is looked at before a byte is read."""
+    for name in ("scene.toml", "motion.csv", "mesh.stl", "leg.urdf"):
+        os.truncate(os.open(tmp_path / name, os.O_CREAT | os.O_WRONLY), 2_000_000_000)
+    assert "MB large" in refused(capfd, "run", tmp_path / "scene.toml")
+    assert "MB large" in refused(capfd, "press", tmp_path / "mesh.stl", MESHES[1], "--load", 1)
+    for key, name in (("motion.file", "motion.csv"), ("patient.urdf", "leg.urdf")):
+        setting = f"{key}='{tmp_path / name}'"
+        assert "MB large" in refused(capfd, "run", MODEL / "scene.toml", "--set", setting)
+
+
+def test_a_hundred_thousand_columns(tmp_path):
+    path = tmp_path / "wide.csv"
+    names = [f"c{k}" for k in range(100_000)]
+    path.write_text(",".join(names) + "\n" + ",".join("1" for _ in names) + "\n")
+    assert read_table(path).columns["c99999"] == [1.0]
+    path.write_text(",".join([*names, "c5"]) + "\n" + ",".join("1" for _ in [*names, ""]) + "\n")
+    with pytest.raises(InputError, match="two columns named 'c5'"):
+        read_table(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("<a>" * 100_000 + "</a>" * 100_000, "nests elements"),
+        ("<robot>" + "<link>" * 200 + "</link>" * 200 + "</robot>", "nests elements"),
+        ("", "not a readable"),
+        ("<robot>", "not a readable"),
+        ('<?xml version="1.0" encoding="no-such"?><robot/>', "not a readable"),
+    ],
+)
+def test_xml_that_nests_or_ends(tmp_path, text, words):
+    path = tmp_path / "a.xml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_xml(path)
+
+
+def test_a_scene_that_nests(tmp_path, capfd):
+    path = tmp_path / "scene.toml"
+    path.write_text("a = " + "[" * 100_000)
+    assert "not TOML" in refused(capfd, "run", path)
+
+
+def test_a_file_that_grows_too_large_by_one_byte(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(bytes(11))
+    assert len(read_bytes(path, 11)) == 11
+    with pytest.raises(InputError, match="large"):
+        read_bytes(path, 10)
+    assert files.sha256_of(path) == files.hashlib.sha256(bytes(11)).hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (ZeroDivisionError("float division"), "not foreseen: ZeroDivisionError: float division"),
+        (MemoryError(), "not enough memory"),
+        (RecursionError("too deep"), "RecursionError"),
+        (OSError(5, "Input/output error"), "Input/output error"),
+        (KeyError("many\nlines"), "KeyError"),
+    ],
+)
+def test_what_nobody_foresaw_is_one_line_and_a_log(tmp_path, monkeypatch, capfd, error, words):
+    def fails(*_):
+        raise error
+
+    monkeypatch.setattr("tkamb.simulation.load_case", fails)
+    scene = write_scene(tmp_path / "scene", ("contact",))
+    assert main(["run", str(scene), "--out", str(tmp_path / "out")]) == 1
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1 and words in said
+    (log,) = (tmp_path / "out").glob("tkamb-error-*.log")
+    assert str(log) in said
+    assert "Traceback" in log.read_text() and "load_case" in log.read_text()
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.startswith("tkamb ")

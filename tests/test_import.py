@@ -1,0 +1,456 @@
+"""`tkamb import`: a model, a recording and meshes to a scene, and what is refused."""
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tkamb
+from recordings import write_c3d
+from tkamb.cli import main
+from tkamb.errors import InputError
+from tkamb.geometry.frames import inverse
+from tkamb.importing.anatomy import find_leg
+from tkamb.importing.links import find_links, quarter_turn
+from tkamb.importing.model_fit import ModelChain, fit_model
+from tkamb.importing.soft_tissue import soft_tissue
+from tkamb.importing.urdf import link_inertias, patient_urdf
+from tkamb.inputs.labels import matched_labels
+from tkamb.inputs.meshes import load_surface
+from tkamb.inputs.tables import read_table
+from tkamb.opensim.read import read_osim
+from tkamb.output.storage import write_storage, write_trc
+from tkamb.scene import load_scene
+
+ROOT = Path(__file__).parents[1]
+DATA = ROOT.parent / "shared" / "data"
+JW, DM = DATA / "jw", DATA / "dm"
+needs_jw = pytest.mark.skipif(
+    not JW.is_dir(), reason="subject JW's files are not beside the project"
+)
+needs_dm = pytest.mark.skipif(
+    not DM.is_dir(), reason="subject DM's files are not beside the project"
+)
+AXES = "-x,+y,-z"
+
+
+def pendulum_osim(path: Path, changes: dict[str, str] | None = None) -> Path:
+    """Write a leg of four bodies: pelvis (free), femur, tibia, foot, with markers."""
+    joints = [
+        ("FreeJoint", "root", "/ground", "/bodyset/pelvis", "0 0 0", 6),
+        ("BallJoint", "hip_r", "/bodyset/pelvis", "/bodyset/femur_r", "-0.04 -0.1 0.08", 3),
+        ("PinJoint", "knee_r", "/bodyset/femur_r", "/bodyset/tibia_r", "0 -0.4 0", 1),
+        ("PinJoint", "ankle_r", "/bodyset/tibia_r", "/bodyset/foot_r", "0 -0.42 0", 1),
+    ]
+    masses = {"pelvis": 40.0, "femur_r": 9.0, "tibia_r": 3.5, "foot_r": 1.0}
+    bodies = "".join(
+        f'<Body name="{n}"><mass>{m}</mass><mass_center>0 -0.1 0</mass_center>'
+        "<inertia>0.1 0.05 0.1 0 0 0</inertia></Body>"
+        for n, m in masses.items()
+    )
+    sets = "".join(_joint(*joint) for joint in joints)
+    rng = np.random.default_rng(5)
+    markers = ""
+    for body, count in (("pelvis", 4), ("femur_r", 3), ("tibia_r", 3), ("foot_r", 4)):
+        for k in range(count):
+            place = " ".join(f"{v:.4f}" for v in rng.normal(0, 0.06, 3) - [0, 0.1, 0])
+            markers += (
+                f'<Marker name="M.{body}.{k}"><socket_parent_frame>/bodyset/{body}'
+                f"</socket_parent_frame><location>{place}</location></Marker>"
+            )
+    text = (
+        '<?xml version="1.0"?><OpenSimDocument Version="40000"><Model name="leg">'
+        f'<gravity>0 -9.80665 0</gravity><BodySet name="b"><objects>{bodies}</objects></BodySet>'
+        f'<JointSet name="j"><objects>{sets}</objects></JointSet>'
+        f'<MarkerSet name="m"><objects>{markers}</objects></MarkerSet></Model></OpenSimDocument>'
+    )
+    for old, new in (changes or {}).items():
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text)
+    return path
+
+
+def _joint(kind: str, name: str, parent: str, child: str, place: str, count: int) -> str:
+    coordinates = "".join(
+        f'<Coordinate name="{name}_{k}"><default_value>0</default_value>'
+        "<range>-3 3</range><clamped>false</clamped><locked>false</locked></Coordinate>"
+        for k in range(count)
+    )
+    frames = "".join(
+        f'<PhysicalOffsetFrame name="{name}_{end}"><socket_parent>{body}</socket_parent>'
+        f"<translation>{at}</translation><orientation>0 0 0</orientation></PhysicalOffsetFrame>"
+        for end, body, at in (("p", parent, place), ("c", child, "0 0 0"))
+    )
+    return (
+        f'<{kind} name="{name}"><socket_parent_frame>{name}_p</socket_parent_frame>'
+        f"<socket_child_frame>{name}_c</socket_child_frame>"
+        f"<coordinates>{coordinates}</coordinates><frames>{frames}</frames></{kind}>"
+    )
+
+
+def moving_leg(osim: Path, frames: int = 60) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return coordinates (n, 11) of a knee bend and the markers there, ground axes."""
+    model = read_osim(osim)
+    chain = ModelChain(model, list(model.markers))
+    q = chain.default(frames)
+    names = list(model.coordinates)
+    q[:, names.index("knee_r_0")] = -np.linspace(0.1, 1.2, frames)
+    q[:, names.index("hip_r_2")] = np.linspace(0.0, 0.5, frames)
+    q[:, names.index("ankle_r_0")] = 0.2
+    q[:, names.index("root_4")] = 0.95
+    places = chain.places(q)
+    return q, dict(zip(model.markers, np.moveaxis(places, 1, 0), strict=True))
+
+
+def recorded_leg(tmp_path: Path, **changes) -> list[str]:
+    """Write model and recording, and return the arguments of an import without implant."""
+    osim = pendulum_osim(tmp_path / "leg.osim", changes.pop("osim", None))
+    _, markers = moving_leg(pendulum_osim(tmp_path / "plain.osim"))
+    rename = changes.pop("rename", lambda name: "S:" + name.replace(".", ""))
+    write_trc(
+        tmp_path / "leg.trc",
+        np.arange(60) / 60.0,
+        {rename(name): path * changes.get("stretch", 1.0) for name, path in markers.items()},
+        60.0,
+    )
+    arguments = {
+        "--trc": tmp_path / "leg.trc",
+        "--side": "right",
+        "--mass-kg": "53.5",
+        "--out": tmp_path / "out",
+    }
+    return ["import", str(osim), *(str(v) for pair in arguments.items() for v in pair)]
+
+
+def test_a_model_without_implant_becomes_a_scene_that_loads_and_bends(tmp_path, capsys):
+    assert main(recorded_leg(tmp_path)) == 0
+    said = capsys.readouterr().out
+    scene = load_scene(tmp_path / "out" / "scene.toml")
+    assert scene.contact is None and scene.motion.markers is not None
+    assert "not scaled" in said and "+x,+y,+z" in said and "no implant" in said
+    assert "flexion 5.7 to 67.7 deg" in said  # 0.1 rad to 1.2 less one frame in sixty
+
+
+def test_a_run_on_markers_holds_both_readings_frame_by_frame(tmp_path):
+    assert main(recorded_leg(tmp_path)) == 0
+    results = tkamb.simulate(tmp_path / "out" / "scene.toml")
+    for method in ("segments", "chain"):
+        assert results[f"marker_rms_{method}_mm"].max() < 1e-3  # the file has 1e-5 mm
+        bend = np.radians(results[f"flexion_{method}_deg"])
+        np.testing.assert_allclose(bend, np.linspace(0.1, 1.2, 60)[::2], atol=1e-6)
+    assert results["knee_centre_distance_mm"].max() < 1e-2
+    np.testing.assert_allclose(results["time_s"], np.arange(60)[::2] / 60.0, atol=1e-8)
+    assert "skin markers" in " ".join(results.summary["assumptions"])
+
+
+def test_what_is_inferred_stands_in_the_scene(tmp_path):
+    assert main(recorded_leg(tmp_path)) == 0
+    text = (tmp_path / "out" / "scene.toml").read_text()
+    for key in ("laboratory_axes", "interval_s", "neutral_mm", "markers_mm", "method"):
+        assert key in text
+    assert '"S:' not in text  # the subject's prefix is not part of a marker's name
+
+
+def test_the_models_own_chain_gives_the_coordinates_back(tmp_path):
+    osim = pendulum_osim(tmp_path / "leg.osim")
+    q, markers = moving_leg(osim)
+    write_trc(tmp_path / "leg.trc", np.arange(60) / 60.0, markers, 60.0)
+    _, fit = fit_model(read_osim(osim), read_table(tmp_path / "leg.trc"))
+    assert fit.solved.all()
+    np.testing.assert_allclose(fit.state, q, atol=1e-6)  # the file has 1e-8 m
+
+
+def test_the_models_normal_equations_are_those_of_its_markers(tmp_path):
+    model = read_osim(pendulum_osim(tmp_path / "leg.osim"))
+    chain = ModelChain(model, list(model.markers))
+    rng = np.random.default_rng(2)
+    q = rng.normal(0.0, 0.3, (3, len(model.coordinates)))
+    target = chain.places(q) + rng.normal(0.0, 0.02, (3, 14, 3))
+    weights = rng.uniform(0.5, 2.0, (3, 14))
+    jacobian = np.zeros((3, 14, 3, len(chain.free)))
+    for k in range(len(chain.free)):
+        step = np.zeros((3, len(chain.free)))
+        step[:, k] = 1e-6
+        ahead, behind = (chain.places(chain.moved(q, s * step)) for s in (1, -1))
+        jacobian[..., k] = (ahead - behind) / 2e-6
+    found = chain.normal(q, target, weights)
+    off = target - chain.places(q)
+    np.testing.assert_allclose(found.cost, np.einsum("fm,fmi,fmi->f", weights, off, off))
+    right = np.einsum("fm,fmin,fmi->fn", weights, jacobian, off)
+    np.testing.assert_allclose(found.right, right, atol=1e-8)
+    matrix = np.einsum("fm,fmin,fmik->fnk", weights, jacobian, jacobian)
+    np.testing.assert_allclose(found.matrix, matrix, atol=1e-8)
+
+
+def test_a_motion_in_the_models_coordinates_is_read_through_its_kinematics(tmp_path, capsys):
+    osim = pendulum_osim(tmp_path / "leg.osim")
+    q, _ = moving_leg(osim)
+    names = list(read_osim(osim).coordinates)
+    columns = {name: q[:, k] for k, name in enumerate(names)}
+    write_storage(tmp_path / "leg.mot", {"time": np.arange(60) / 60.0} | columns, in_degrees=False)
+    arguments = ["import", str(osim), "--motion", str(tmp_path / "leg.mot"), "--side", "right"]
+    assert main([*arguments, "--mass-kg", "53.5", "--out", str(tmp_path / "out")]) == 0
+    table = read_table(tmp_path / "out" / "motion.csv")
+    np.testing.assert_allclose(
+        np.radians(table.columns["flexion_deg"]), np.linspace(0.1, 1.2, 60), atol=1e-8
+    )
+    ankle = np.array([table.columns[f"tibia_translation_{k}_mm"] for k in (1, 2, 3)]).T
+    model = read_osim(osim)
+    poses = ModelChain(model, list(model.markers)).kinematics.poses(q)
+    tibia = poses[:, ["ground", *model.bodies].index("tibia_r")]
+    np.testing.assert_allclose(ankle * 1e-3, tibia[:, :3, :3] @ [0, -0.42, 0] + tibia[:, :3, 3])
+
+
+def bomb(path: Path) -> None:
+    entities = "".join(f'<!ENTITY a{k} "{"".join([f"&a{k - 1};"] * 10)}">' for k in range(1, 9))
+    head = f'<!DOCTYPE x [<!ENTITY a0 "x">{entities}]>'
+    path.write_text(f"{head}<OpenSimDocument>&a8;</OpenSimDocument>")
+
+
+def changed(arguments: list[str], **options: str | None) -> list[str]:
+    """Return the arguments with options replaced, added or (None) dropped."""
+    result = list(arguments)
+    for name, value in options.items():
+        option = "--" + name.replace("_", "-")
+        if option in result:
+            at = result.index(option)
+            del result[at : at + 2]
+        if value is not None:
+            result += [f"{option}={value}"]
+    return result
+
+
+MISTAKES = {
+    "no such model": (lambda a, d: [a[0], str(d / "none.osim"), *a[2:]], "no such"),
+    "model is text": (lambda a, d: spoil(a, d, "leg.osim", "hello"), "leg.osim"),
+    "model is an XML bomb": (lambda a, d: bomb(d / "leg.osim") or a, "leg.osim"),
+    "model cut short": (lambda a, d: halve(a, d, "leg.osim"), "leg.osim"),
+    "other side": (lambda a, d: changed(a, side="left"), "left knee"),
+    "knee that is not there": (lambda a, d: changed(a, knee="knee_x"), "no joint 'knee_x'"),
+    "hip as knee": (lambda a, d: changed(a, knee="hip_r"), "--knee"),
+    "pounds": (lambda a, d: changed(a, mass_kg="118"), "--mass-kg"),
+    "no mass": (lambda a, d: changed(a, mass_kg="0"), "--mass-kg"),
+    "mass is a word": (lambda a, d: changed(a, mass_kg="heavy"), "mass-kg"),
+    "negative cut-off": (lambda a, d: changed(a, cutoff_hz="-1"), "--cutoff-hz"),
+    "cut-off beyond the rate": (lambda a, d: changed(a, cutoff_hz="40"), "cut-off"),
+    "no recording": (lambda a, d: changed(a, trc=None), "required"),
+    "recording not there": (lambda a, d: changed(a, trc=str(d / "no.trc")), "no such file"),
+    "recording is text": (lambda a, d: spoil(a, d, "leg.trc", "hello"), ".trc"),
+    "recording is empty": (lambda a, d: spoil(a, d, "leg.trc", ""), ".trc"),
+    "c3d is a trc": (lambda a, d: changed(a, trc=None, c3d=str(rename(d))), "not a C3D"),
+    "two recordings": (lambda a, d: changed(a, c3d=str(d / "x.c3d")), "not allowed"),
+    "one mesh alone": (lambda a, d: changed(a, femoral=str(d / "f.stl")), "both or none"),
+    "button alone": (lambda a, d: changed(a, patella=str(d / "f.stl")), "--patella"),
+    "no mesh unit": (
+        lambda a, d: changed(a, femoral="f.stl", insert="i.stl", mesh_axes=AXES),
+        "--mesh-unit",
+    ),
+    "no mesh axes": (
+        lambda a, d: changed(a, femoral="f.stl", insert="i.stl", mesh_unit="mm"),
+        "--mesh-axes",
+    ),
+    "mesh not there": (
+        lambda a, d: changed(
+            a, femoral="f.stl", insert="i.stl", mesh_unit="mm", mesh_axes="+x,+y,+z"
+        ),
+        "no such mesh",
+    ),
+    "left-handed laboratory": (lambda a, d: changed(a, laboratory_axes="+x,+y,-z"), "left-handed"),
+    "laboratory axes of two letters": (lambda a, d: changed(a, laboratory_axes="+x,+y"), "axes"),
+    "interval outside": (lambda a, d: changed(a, interval="5:6"), "--interval"),
+    "interval backwards": (lambda a, d: changed(a, interval="0.9:0.1"), "--interval"),
+    "interval of words": (lambda a, d: changed(a, interval="start:end"), "interval"),
+    "plates of words": (lambda a, d: changed(a, plates="left"), "plates"),
+    "ground reaction not there": (lambda a, d: changed(a, grf=str(d / "g.mot")), "no such file"),
+    "ground reaction of no foot": (lambda a, d: changed(a, grf=str(nobodys(d))), "which force"),
+    "standing trial not there": (lambda a, d: changed(a, static=str(d / "s.c3d")), "no such file"),
+    "unknown method": (lambda a, d: changed(a, method="magic"), "method"),
+    "out is a file": (lambda a, d: changed(a, out=str(d / "leg.trc")), "leg.trc"),
+}
+SPOILT = {
+    "no markers in common": ({"rename": lambda n: n[::-1]}, "markers of the shank"),
+    "markers ten times too far": ({"stretch": 10.0}, "fit only to"),
+    "no hip": ({"osim": {"BallJoint": "WeldJoint"}}, ""),
+    "model of no mass": ({"osim": {"<mass>40.0</mass>": "<mass>-40.0</mass>"}}, "mass"),
+    "mass that is a word": ({"osim": {"<mass>9.0</mass>": "<mass>nine</mass>"}}, "number"),
+    "joint that cannot be read": ({"osim": {"PinJoint": "ScrewJoint"}}, "ScrewJoint"),
+    "socket to nowhere": ({"osim": {"/bodyset/tibia_r<": "/bodyset/shank<"}}, "knee_r"),
+    "tibia twice": ({"osim": {'Body name="foot_r"': 'Body name="tibia_r"'}}, "tibia_r"),
+    "old version": ({"osim": {'Version="40000"': 'Version="10000"'}}, "Version"),
+    "other root": ({"osim": {"OpenSimDocument": "OpenSimModel"}}, "not an OpenSim model"),
+    "location of two numbers": ({"osim": {"-0.04 -0.1 0.08": "-0.04 -0.1"}}, "numbers"),
+}
+
+
+def spoil(arguments: list[str], folder: Path, name: str, text: str) -> list[str]:
+    (folder / name).write_text(text)
+    return arguments
+
+
+def halve(arguments: list[str], folder: Path, name: str) -> list[str]:
+    text = (folder / name).read_text()
+    return spoil(arguments, folder, name, text[: len(text) // 2])
+
+
+def rename(folder: Path) -> Path:
+    path = folder / "leg.c3d"
+    path.write_bytes((folder / "leg.trc").read_bytes())
+    return path
+
+
+def nobodys(folder: Path) -> Path:
+    time = np.arange(60) / 60.0
+    names = [f"plate{k}_v{a}" for k in (1, 2) for a in "xyz"]
+    write_storage(folder / "g.mot", {"time": time} | dict.fromkeys(names, 0 * time), False)
+    return folder / "g.mot"
+
+
+@pytest.mark.parametrize("mistake", [*MISTAKES, *SPOILT])
+def test_a_mistake_is_one_line_and_nothing_is_written(tmp_path, capsys, mistake):
+    if mistake in MISTAKES:
+        change, words = MISTAKES[mistake]
+        arguments = change(recorded_leg(tmp_path), tmp_path)
+    else:
+        changes, words = SPOILT[mistake]
+        arguments = recorded_leg(tmp_path, **changes)
+    try:
+        status = main(arguments)
+    except SystemExit as refused:  # argparse
+        status = refused.code
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
+    assert status == 2, lines
+    assert len(lines) == 1 and words in lines[0], lines
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_scene_that_is_there_is_kept(tmp_path, capsys):
+    arguments = recorded_leg(tmp_path)
+    assert main(arguments) == 0
+    before = (tmp_path / "out" / "scene.toml").read_text()
+    assert main(arguments) == 2
+    assert "is there already" in capsys.readouterr().err
+    assert (tmp_path / "out" / "scene.toml").read_text() == before
+
+
+def test_quarter_turns():
+    turn = np.array([[0.1, -0.99, 0.05], [-0.99, -0.1, 0.02], [0.0, 0.05, -1.0]])
+    axes, _ = quarter_turn(turn)
+    np.testing.assert_array_equal(axes, [[0, -1, 0], [-1, 0, 0], [0, 0, -1]])
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="no shared data beside the project")
+@pytest.mark.parametrize("name", ["gait2392", "Rajagopal2016"])
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_widely_used_models_have_legs_too(name, side):
+    leg = find_leg(read_osim(DATA / "opensim" / f"{name}.osim"), side)
+    links = find_links(leg, None, "+x,+y,+z", {}, False)
+    assert leg.knee.name.endswith("_" + side[0]) and leg.flexion == f"knee_angle_{side[0]}"
+    assert 0.3 < links.insert_in_tibia[1, 3] < 0.5  # m, from the ankle up to the knee
+    assert 0.3 < links.hip[1] < 0.5  # and from there to the hip
+    ElementTree.fromstring(patient_urdf(links, 1.0, ""))
+
+
+@needs_dm
+def test_dms_urdf_is_the_one_that_was_made_by_hand():
+    model = read_osim(DM / "DM.osim")
+    mesh = load_surface(DM / "geometry/tibial_insert.stl", "m", AXES, name="insert")
+    links = find_links(find_leg(model, "right"), mesh, AXES, {}, True)
+    made = joints_of(ElementTree.fromstring(patient_urdf(links, 1.0, "")))
+    byhand = joints_of(ElementTree.parse(ROOT / "models/dm/patient.urdf").getroot())
+    for name, values in byhand.items():
+        if name != "hip_mount":  # its axes: nothing reads them
+            np.testing.assert_allclose(made[name], values, atol=1e-8, err_msg=name)
+    assert len(soft_tissue(links).bundles) == 88
+    assert soft_tissue(links).ligament_length == pytest.approx(0.075986, abs=1e-6)
+
+
+def joints_of(robot: ElementTree.Element) -> dict[str, np.ndarray]:
+    found = {}
+    for joint in robot.findall("joint"):
+        origin = joint.find("origin")
+        found[joint.get("name")] = np.array(
+            [float(v) for key in ("xyz", "rpy") for v in origin.get(key).split()]
+        )
+    return found
+
+
+@needs_jw
+def test_jws_links_are_where_the_data_page_says():
+    model = read_osim(JW / "JW.osim")
+    mesh = load_surface(JW / "geometry/tibial_insert.stl", "m", AXES, name="insert")
+    links = find_links(find_leg(model, "right"), mesh, AXES, {}, True)
+    np.testing.assert_allclose(links.hip * 1e3, [-23.0, 392.0, 23.0], atol=0.05)
+    assert links.patella is not None  # x distal, y posterior, z medial
+    np.testing.assert_array_equal(links.patella[:3, :3], [[0, -1, 0], [-1, 0, 0], [0, 0, -1]])
+    assert soft_tissue(links).ligament_length == pytest.approx(0.0502)
+    assert soft_tissue(links).bundles == ()
+    assert links.leg.knee.backwards
+    scale = 66.7 / model.mass_kg
+    inertias = link_inertias(links, scale)
+    shank = sum(model.bodies[b].mass_kg for b in (*links.leg.tibia, *links.leg.foot))
+    assert inertias["tibia"].mass == pytest.approx(scale * shank)
+    np.testing.assert_allclose(links.body_in_link("tibia")[1], inverse(links.tibia), atol=1e-12)
+
+
+@needs_jw
+def test_jws_markers_fit_no_worse_than_opensims_tool():
+    recorded = read_table(JW / "motion/jw_ngait_og3.c3d")
+    turn = np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]])
+    model = read_osim(JW / "JW.osim")
+    part = {"time": recorded.columns["time"][:120:12]}
+    labels = [c[:-2] for c in recorded.columns if c.endswith("_x")]
+    for label in matched_labels(model.markers, labels).values():
+        path = np.stack([recorded.columns[f"{label}_{a}"] for a in "xyz"], axis=1) @ turn.T
+        part |= {f"{label}_{a}": path[:120:12, k] for k, a in enumerate("xyz")}
+    _, fit = fit_model(model, type(recorded)(recorded.path, part, "m"))
+    assert fit.solved.all()
+    # OpenSim 4.6, InverseKinematicsTool on the same model, markers and weights, ranges not
+    # clamped, accuracy 1e-5: mm at these frames
+    tool = [11.774, 10.274, 9.1, 9.46, 12.928, 14.196, 13.894, 14.78, 12.918, 11.831]
+    assert np.all(fit.rms < 1e-3 * (np.array(tool) + 0.002))
+    assert fit.rms.mean() < 1e-3 * np.mean(tool)
+
+
+@needs_jw
+def test_the_script_writes_the_scenes_that_are_shipped(tmp_path):
+    from importlib.machinery import SourceFileLoader
+    from importlib.util import module_from_spec, spec_from_loader
+
+    loader = SourceFileLoader("make_jw_scenes", str(ROOT / "scripts/make_jw_scenes"))
+    script = module_from_spec(spec_from_loader("make_jw_scenes", loader))
+    loader.exec_module(script)
+    from tkamb.importing.patient import import_patient
+
+    patient = import_patient(script.request(JW, "ngait_og3"), ROOT / "models/jw")
+    assert patient.scene.text() == (ROOT / "models/jw/ngait_og3.toml").read_text()
+    assert patient.urdf == (ROOT / "models/jw/patient.urdf").read_text()
+    said = "\n".join(patient.report)
+    assert "force plate 2: right" in said and "force plate 1: left" in said
+    assert patient.scene.ground is not None and patient.scene.ground.plates == (2, 3)
+
+
+def test_a_recording_without_plates_asks_for_the_ground_reaction(tmp_path, capsys):
+    arguments = recorded_leg(tmp_path)
+    _, markers = moving_leg(tmp_path / "plain.osim")
+    path = write_c3d(tmp_path / "leg.c3d", markers)
+    assert main(changed(arguments, trc=None, c3d=str(path))) == 2
+    assert "no force plates" in capsys.readouterr().err
+
+
+def test_storage_and_trc_come_back_as_written(tmp_path):
+    time = np.arange(5) / 50.0
+    write_storage(tmp_path / "a.sto", {"time": time, "x": time**2}, in_degrees=True)
+    table = read_table(tmp_path / "a.sto")
+    np.testing.assert_allclose(table.columns["x"], time**2)
+    assert table.in_degrees is True
+    places = np.random.default_rng(0).normal(0, 1, (5, 3))
+    places[2] = np.nan
+    write_trc(tmp_path / "a.trc", time, {"A": places, "B": places + 1}, 50.0)
+    back = read_table(tmp_path / "a.trc")
+    found = np.stack([back.columns[f"B_{a}"] for a in "xyz"], axis=1)
+    np.testing.assert_allclose(found * 1e-3, places + 1, atol=1e-8)
+    np.testing.assert_allclose(back.columns["time"], time)
+    with pytest.raises(InputError, match="blank"):
+        write_storage(tmp_path / "b.sto", {"time": time, "a b": time}, in_degrees=False)

@@ -1,0 +1,111 @@
+"""The lattice's answer depends on pose and load alone, not on where the solution began."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from scenes import MODEL
+from tkamb.case import load_case
+from tkamb.contact.materials import material
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.registry import contact_model
+from tkamb.contact.summary import area_above, medial_points
+from tkamb.geometry.frames import knee_pose
+from tkamb.scene import load_scene
+
+FRAMES, FAR = (12, 36, 84), 60
+LOADS = {11: 700.0, 12: 750.0, 35: 1400.0, 36: 1450.0, 60: 2000.0, 83: 2150.0, 84: 2200.0}
+"""N."""
+
+
+@lru_cache
+def shipped():
+    """Return the shipped knee's bodies and its poses."""
+    case = load_case(load_scene(MODEL / "scene.toml"))
+    bodies = ContactPair(case.femoral, case.insert, material("polyethylene"))
+    return bodies, [knee_pose(place) for place in case.motion.coordinates]
+
+
+@lru_cache
+def prepared(name):
+    """Return a model of 2 mm cells, prepared for the shipped knee."""
+    model = contact_model(name, 2.0)
+    return model, model.prepare(shipped()[0])
+
+
+def columns(state, result):
+    """Return what a results table says of a contact."""
+    medial = medial_points(result.points, result.pose, state.split)
+    found = {"approach": result.approach, "lowest gap": result.gap[result.pressure == 0].min()}
+    for side, own in (("medial", medial), ("lateral", ~medial)):
+        condyle = getattr(result, side)
+        carried = np.where(own, result.pressure, 0.0)
+        found |= {
+            f"{side} force": condyle.force,
+            f"{side} area": condyle.area,
+            f"{side} mean pressure": condyle.mean_pressure,
+            f"{side} peak pressure": condyle.peak_pressure,
+            f"{side} area above": area_above(result.points, state.triangles, carried, 10e6),
+            f"{side} centre x": condyle.centre_of_pressure[0] + 1.0,
+            f"{side} centre z": condyle.centre_of_pressure[2] + 1.0,
+        }
+    return found
+
+
+@pytest.mark.parametrize("name", ["lattice", "lattice-linear", "fe"])
+@pytest.mark.parametrize("frame", FRAMES)
+def test_answers_do_not_depend_on_the_guess(name, frame):
+    """Cold, from the frame before, from a far frame, and from a frame that was read back.
+
+    Centres of pressure within 5 µm, all else within 0.5 %.
+    """
+    (model, state), (_, poses) = prepared(name), shipped()
+    cold = model.press(state, LOADS[frame], poses[frame])
+    wanted = columns(state, cold)
+    before = model.press(state, LOADS[frame - 1], poses[frame - 1])
+    far = model.press(state, LOADS[FAR], poses[FAR])
+    for guess in (before, far, replace(before), replace(far, approach=3.0 * far.approach)):
+        found = columns(state, model.press(state, LOADS[frame], poses[frame], guess))
+        for key, value in found.items():
+            near = {"abs": 5e-6} if "centre" in key else {"rel": 5e-3, "abs": 2e-7}
+            assert value == pytest.approx(wanted[key], **near), key
+
+
+def test_the_gap_beside_the_contact_is_that_of_the_deformed_insert():
+    """Seen with few candidates and with all of them: the same nodes, the same gap."""
+    (model, state), (_, poses) = prepared("lattice-linear"), shipped()
+    few = model.press(state, 2000.0, poses[84])
+    many = model.press(state, 2000.0, poses[84], replace(few, approach=20.0 * few.approach))
+    assert few.gap == pytest.approx(many.gap, rel=5e-3, abs=2e-7)
+    assert (few.gap >= 0).all()
+
+
+@pytest.mark.parametrize("level", [0.3, 0.6, 0.9])
+def test_area_above_a_level_is_that_of_the_pressure(level):
+    """Hertz: 1 - (level / p0)² of the circle, to 3 % at a fifth of its radius."""
+    for size in (0.2, 0.1, 0.05):
+        ticks = np.arange(-round(2 / size), round(2 / size) + 1) * size
+        x, z = (grid.ravel() for grid in np.meshgrid(ticks, ticks, indexing="ij"))
+        number = np.arange(x.size).reshape(len(ticks), -1)
+        a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+        triangles = np.concatenate(
+            [np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, b, c), (a, c, d))]
+        )
+        pressure = np.sqrt(np.maximum(1.0 - (x - 0.07) ** 2 - (z - 0.03) ** 2, 0.0))
+        points = np.stack([x, 0 * x, z], axis=1)
+        found = area_above(points, triangles, pressure, level) / np.pi
+        assert found == pytest.approx(1 - level**2, abs=0.7 * size**2 + 1e-3)
+
+
+def test_area_above_a_level_grows_steadily():
+    """A pressure that passes the level at one node changes nothing by a step."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1], [1, 0, 1.0]])
+    triangles = np.array([[0, 1, 2], [1, 2, 3]])
+    pressure = np.array([1.0, 2.0, 3.0, 4.0])
+    levels = np.linspace(0.5, 4.5, 401)
+    areas = [area_above(points, triangles, pressure, level) for level in levels]
+    assert areas[0] == pytest.approx(1.0)
+    assert areas[-1] == 0.0
+    assert np.abs(np.diff(areas)).max() < 0.012

@@ -1,0 +1,74 @@
+"""Memory is counted before it is taken, and the resolution that fits is named."""
+
+import re
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from lattice_blocks import block
+from lattice_bodies import box_insert, pair, sphere_cap
+from tkamb import memory
+from tkamb.contact.lattice import memory_need, operator
+from tkamb.contact.lattice.network import CalibratedNetwork
+from tkamb.contact.lattice.operator import fixed_unknowns, prepare_operator
+from tkamb.contact.lattice.response import SINGLE
+from tkamb.contact.materials import material
+from tkamb.contact.registry import contact_model
+from tkamb.errors import InputError
+
+LINEAR = material("polyethylene-linear")
+
+
+@pytest.mark.parametrize("counts", [(12, 6, 12), (30, 8, 20)])
+def test_the_count_bounds_what_is_taken(counts, monkeypatch):
+    """At least what numpy asks for at its peak, and less than three times as much."""
+    nodes, index, cells, _ = block(counts, np.full(3, 1e-3), 0.3)
+    stiffness = CalibratedNetwork(nodes, cells, np.full(3, 1e-3), LINEAR).stiffness
+    held = fixed_unknowns(nodes, np.flatnonzero(index[:, 1] == 0), "fixed")
+    top = np.flatnonzero(index[:, 1] == counts[1])
+    needs = []
+    monkeypatch.setattr(operator, "check_memory", needs.append)
+    tracemalloc.start()
+    prepare_operator(stiffness, index, held, top, SINGLE)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < memory_need.SPARE * needs[0] < 3 * peak
+
+
+@pytest.mark.parametrize("left", [2e8, 6e7, 1.5e7])
+def test_what_does_not_fit_is_refused_with_what_does(monkeypatch, left):
+    bodies = pair(sphere_cap(22e-3), box_insert(0.04, 0.01, 0.06), LINEAR)
+    monkeypatch.setattr(memory_need, "available_memory", lambda: left)
+    with pytest.raises(InputError, match=r"GB are left; take .* mm or coarser") as refused:
+        contact_model("lattice-linear", 0.5 if left > 1e8 else 1.0, cache=False).prepare(bodies)
+    fits = float(re.search(r"take ([\d.]+) mm", str(refused.value))[1])
+    contact_model("lattice-linear", fits, cache=False).prepare(bodies)
+
+
+def test_no_size_helps_when_nothing_is_left(monkeypatch):
+    bodies = pair(sphere_cap(22e-3), box_insert(0.02, 0.01, 0.02), LINEAR)
+    monkeypatch.setattr(memory_need, "available_memory", lambda: 1e3)
+    with pytest.raises(InputError, match="free some memory"):
+        contact_model("lattice-linear", 2.0, cache=False).prepare(bodies)
+
+
+def test_available_memory_is_the_least_of_three(tmp_path, monkeypatch):
+    statistics = tmp_path / "meminfo"
+    statistics.write_text("MemTotal: 9000 kB\nMemAvailable: 4000 kB\n")
+    monkeypatch.setattr(memory, "STATISTICS", statistics)
+    monkeypatch.setattr(memory, "GROUP", tmp_path)
+    unlimited = (memory.resource.RLIM_INFINITY,) * 2
+    monkeypatch.setattr(memory.resource, "getrlimit", lambda which: unlimited)
+    assert memory.available_memory() == 4000 * 1024
+    (tmp_path / "memory.current").write_text("1000000\n")
+    (tmp_path / "memory.max").write_text("max\n")
+    assert memory.available_memory() == 4000 * 1024
+    (tmp_path / "memory.max").write_text("3000000\n")
+    assert memory.available_memory() == 2_000_000
+    own = tmp_path / "statm"
+    own.write_text("10 5 1\n")
+    monkeypatch.setattr(memory, "OWN", own)
+    page = memory.os.sysconf("SC_PAGE_SIZE")
+    monkeypatch.setattr(memory.resource, "getrlimit", lambda which: (15 * page, 15 * page))
+    assert memory.available_memory() == 5 * page

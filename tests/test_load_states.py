@@ -1,0 +1,153 @@
+"""Six sets of loads at one knee: which acts is told by where the ground reaction passes."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from knees import leg
+from tkamb.body.chain import ChainMotion
+from tkamb.body.knee import Extensor, KneeGeometry, solve_knee
+from tkamb.body.load import PointForces
+from tkamb.body.unknowns import CondylePoint
+from tkamb.geometry.frames import pose, transform
+
+FRICTION = 0.05
+FLEXION = np.radians(30.0)
+UP = np.array([0.0, 1.0, 0.0])
+HALF = 0.024
+"""m: half the distance of the condyles' contact points."""
+CARRIED = ("medial_normal", "lateral_normal", "quadriceps", "patellar_ligament", "patellofemoral")
+
+
+@pytest.fixture(scope="module")
+def knee():
+    """Return a leg at rest, upright, 30 deg bent, with all its lines and no ground reaction."""
+    chain = leg()
+    joints = np.zeros((3, 9))
+    joints[0] = [0.0, 0.03, 0.0, 0.0, 0.0, FLEXION, 0.045, 0.01, -0.3]
+    state = chain.at(ChainMotion(pose(np.eye(3), np.zeros(3)), np.zeros(6), np.zeros(6), joints))
+    at = {
+        "origin": transform(state.pose("femur"), np.array([0.03, 0.2, 0.0])),
+        "insertion": transform(state.pose("patella"), np.array([0.008, 0.02, 0.0])),
+        "proximal": transform(state.pose("patella"), np.array([0.006, -0.02, 0.0])),
+        "tuberosity": np.array([0.04, -0.04, 0.0]),
+        "contact": transform(state.pose("patella"), np.array([-0.006, 0.0, 0.0])),
+    }
+    extensor = Extensor(
+        line("femur", at["origin"], "patella", at["insertion"]),
+        line("patella", at["proximal"], "tibia", at["tuberosity"]),
+        at["contact"],
+        state.pose("patella")[:3, 0],
+    )
+    condyles = {
+        side: CondylePoint(np.array([0.0, 0.0, z]), UP, np.array([0.02, 0.0, 0.0]), 0.0)
+        for side, z in (("medial", -HALF), ("lateral", HALF))
+    }
+    return KneeGeometry(state, None, (), condyles, frozenset(), extensor)
+
+
+def line(link, start, other, end):
+    """Return a newton of tension between two points."""
+    pull = ((end - start) / np.linalg.norm(end - start))[None]
+    return PointForces(link, start[None], pull), PointForces(other, end[None], -pull)
+
+
+def loaded(knee, force, point, moment=(0.0, 0.0, 0.0)):
+    """Return the knee with a ground reaction on the tibia, insert frame."""
+    moment = np.asarray(moment, float)
+    return replace(knee, ground=PointForces("tibia", np.array([point]), np.array([force]), moment))
+
+
+AHEAD = {"taut": -0.06, "slack": 0.08}
+ASIDE = {"none": 0.0, "medial": 0.12, "lateral": -0.12}
+
+
+@pytest.mark.parametrize(("ahead", "lifted"), list(product(AHEAD, ASIDE)))
+def test_each_of_the_six_sets_is_found_where_the_ground_reaction_wants_it(knee, ahead, lifted):
+    """Behind the knee it wants the quadriceps, beside the condyles it lifts the far one."""
+    x, z = AHEAD[ahead], ASIDE[lifted]
+    loads = solve_knee(loaded(knee, 700 * UP, [x, -0.45, z]), FRICTION)
+    assert loads.problems == ()
+    assert loads.lifted == frozenset(() if lifted == "none" else (lifted,))
+    assert loads.slack == (ahead == "slack")
+    assert not loads.ambiguous
+    assert min(loads.values.get(name, 0.0) for name in CARRIED) >= 0.0
+    if loads.slack:
+        assert loads.values["residual_flexion"] < 0.0  # on the tibia: flexors
+    if loads.lifted:
+        # on the tibia, about x forwards: the pull of the lifted condyle at its own side
+        assert loads.values["residual_coronal"] * {"medial": -HALF, "lateral": HALF}[lifted] < 0.0
+
+
+def test_a_slack_quadriceps_adds_nothing_to_the_contact_force(knee):
+    """Then the contact carries ground reaction less the weight of the shank, by hand."""
+    force = solve_knee(loaded(knee, 700 * UP, [0.08, -0.45, 0.0]), FRICTION).contact_force
+    state = knee.state
+    gravity = 9.80665 * 4.2
+    lean = state.pose("tibia")[:3, :3] @ UP
+    assert force[1] == pytest.approx(700 - gravity * lean[1], abs=1.0)
+
+
+@pytest.mark.parametrize("off", ["medial", "lateral"])
+def test_a_condyle_that_the_recorded_gap_lifts_stays_lifted(knee, off):
+    for x in AHEAD.values():
+        geometry = replace(loaded(knee, 700 * UP, [x, -0.45, 0.0]), lifted=frozenset({off}))
+        loads = solve_knee(geometry, FRICTION)
+        assert loads.lifted == {off}
+        assert f"{off}_normal" not in loads.values
+
+
+def test_a_knee_that_is_pulled_apart_fails_with_the_reason_of_every_set(knee):
+    loads = solve_knee(loaded(knee, -400 * UP, [-0.01, -0.45, 0.0]), FRICTION)
+    (problem,) = loads.problems
+    assert "no load state has all signs right" in problem
+    labels = ("all loaded", "quadriceps slack", "medial lifted", "lateral lifted")
+    assert all(label in problem for label in labels)
+    assert loads.values == {}
+    assert np.isnan(loads.contact_force).all()
+
+
+def test_a_patella_that_would_have_to_pull_fails_the_frame(knee):
+    """The quadriceps is needed: a slack one would balance the signs, without the load."""
+    turned = replace(knee.extensor, contact_normal=-knee.extensor.contact_normal)
+    geometry = replace(loaded(knee, 700 * UP, [-0.06, -0.45, 0.0]), extensor=turned)
+    (problem,) = solve_knee(geometry, FRICTION).problems
+    assert "patellofemoral" in problem
+    assert "extension moment" in problem
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.tuples(*[st.floats(-300, 300)] * 3),
+    st.floats(-500, 1500),
+    st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
+    st.tuples(*[st.floats(-20, 20)] * 3),
+)
+def test_no_random_load_is_answered_with_a_wrong_sign(knee, aside, up, place, moment):
+    """Signs hold, what is left out is asked for what it cannot do, and the shank balances."""
+    force = np.array([aside[0], up, aside[2]])
+    geometry = loaded(knee, force, [place[0], -0.45, place[1]], moment)
+    loads = solve_knee(geometry, FRICTION)
+    if loads.problems:
+        assert loads.values == {}
+        return
+    values = loads.values
+    assert min(values.get(name, 0.0) for name in CARRIED) >= -1e-6
+    if loads.slack:
+        assert values["residual_flexion"] <= 0.25
+    for side in loads.lifted:
+        assert values["residual_coronal"] * (-1 if side == "medial" else 1) <= 1e-6
+    assert np.allclose(shank_imbalance(geometry, loads), 0.0, atol=1e-6)
+
+
+def shank_imbalance(geometry, loads):
+    """Return the force (3,) left over on the shank, insert frame."""
+    values, state = loads.values, geometry.state
+    weight = -9.80665 * 4.2 * (state.pose("tibia")[:3, :3] @ UP)
+    residual = np.array([values["residual_ap"], 0.0, values["residual_ml"]])
+    ligament = values["patellar_ligament"] * geometry.extensor.patellar_ligament[1].forces[0]
+    return weight + geometry.ground.forces[0] + residual + ligament - loads.contact_force

@@ -1,0 +1,253 @@
+"""No mistake passes for an answer: refused with the right words, flagged, or without effect."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from mistakes import DATA, dm_bench, keep_meshes, set_key, shipped_bench
+from random_mistakes import random_mistakes
+from scenes import MODEL, write_scene
+from tkamb.cli import main
+from tkamb.errors import InputError
+from tkamb.results import Results
+
+needs_dm = pytest.mark.skipif(not DATA.is_dir(), reason="needs the data of subject DM")
+
+
+@pytest.fixture(scope="module")
+def meshes_kept():
+    with pytest.MonkeyPatch.context() as patch:
+        keep_meshes(patch)
+        yield
+
+
+@pytest.fixture(scope="module")
+def knee(meshes_kept, tmp_path_factory):
+    return shipped_bench(tmp_path_factory.mktemp("knee"))
+
+
+@pytest.fixture(scope="module")
+def dm(meshes_kept, tmp_path_factory):
+    return dm_bench(tmp_path_factory.mktemp("dm"))
+
+
+def urdf(old, new):
+    """Return an edit that replaces a text of the URDF."""
+
+    def edit(content, texts):
+        assert old in texts["patient.urdf"]
+        texts["patient.urdf"] = texts["patient.urdf"].replace(old, new, 1)
+
+    return edit
+
+
+def key(dotted, value):
+    """Return an edit that sets a key of the scene."""
+    return lambda content, texts: set_key(content, dotted, value)
+
+
+def cells(name, column, change, row=None):
+    """Return an edit that changes one cell of a column, or all of them."""
+
+    def edit(content, texts):
+        rows = list(csv.reader(texts[name].splitlines()))
+        k = rows[0].index(column)
+        for cell in rows[1:] if row is None else [rows[row]]:
+            cell[k] = change if isinstance(change, str) else repr(float(change(float(cell[k]))))
+        texts[name] = "\n".join(",".join(cells) for cells in rows) + "\n"
+
+    return edit
+
+
+def both(*edits):
+    """Return an edit that makes several."""
+
+    def edit(content, texts):
+        for one in edits:
+            one(content, texts)
+
+    return edit
+
+
+def text(name, change):
+    """Return an edit of a whole file."""
+    return lambda content, texts: texts.update({name: change(texts[name])})
+
+
+INNER = '<parent link="knee_ap_link"/><child link="knee_si_link"/><origin xyz="'
+MASS = '<inertial><mass value="2"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+LINES = '<limit lower="-0.2" upper="0.2" effort="1e6" velocity="1e3"/>'
+
+REFUSED = {
+    "continuous": (urdf('"knee_flexion" type="revolute"', '"knee_flexion" type="continuous"'),
+                   "'knee_flexion' is continuous .* must be revolute"),
+    "inner origin": (urdf(INNER + "0 0 0", INNER + "0 0.003 0"), "'knee_si' has an origin"),
+    "inner rpy": (urdf(INNER + '0 0 0"', INNER + '0 0 0" rpy="0.05 0 0"'),
+                  "'knee_si' has an origin .* in the chain"),
+    "inner mass": (urdf('<link name="knee_ml_link"/>',
+                        f'<link name="knee_ml_link">{MASS}</inertial></link>'),
+                   "link 'knee_ml_link' has a mass"),
+    "order": (both(urdf('"knee_axial_rotation" type', '"spare" type'),
+                   urdf('"knee_adduction" type', '"knee_axial_rotation" type'),
+                   urdf('"spare" type', '"knee_adduction" type'),
+                   urdf('xyz="0 -1 0"', 'xyz="spare"'),
+                   urdf('xyz="-1 0 0"', 'xyz="0 -1 0"'),
+                   urdf('xyz="spare"', 'xyz="-1 0 0"')),
+              "hangs on .*the order is tibia, knee_ap, knee_si, knee_ml, knee_axial_rotation"),
+    "hip on patella": (urdf('<parent link="femur"/><child link="hip"/>',
+                            '<parent link="patella"/><child link="hip"/>'),
+                       "link 'hip' is not fixed to 'femur'"),
+    "hip far": (urdf("0 0.424383 0", "0 100 0"), "the hip is at .*is it in metres?"),
+    "hip in mm": (urdf("0 0.424383 0", "0 424.383 0"), "the hip is at .*is it in metres?"),
+    "inertia term": (urdf(' iyz="0"', ""), "has no iyz; give all six"),
+    "no limits": (urdf(LINES, ""), "'knee_ap' has no complete <limit>"),
+    "misspelt attribute": (urdf('<origin xyz="0 0.411838 0"', '<origin xzy="0 0.411838 0"'),
+                           "unknown attribute xzy of <origin>; did you mean xyz"),
+    "1e308": (cells("motion.csv", "flexion_deg", "1e308", 40), "which nothing measures"),
+    "1e5": (cells("motion.csv", "flexion_deg", "1e5", 40), "flexion runs .* no knee does"),
+    "+360": (cells("motion.csv", "flexion_deg", lambda v: v + 360, 40), "no knee does"),
+    "patella": (cells("motion.csv", "patella_rotation_deg", lambda v: v + 360, 40),
+                "patella_rotation runs .* no knee does"),
+    "lean of 210": (cells("tibia.csv", "lean_deg", "210", 30), "angle runs .* no shank does"),
+    "milliseconds": (cells("motion.csv", "time_s", lambda v: 1e-3 * v), "time not in seconds"),
+    "underscore": (cells("motion.csv", "flexion_deg", "1_000", 40), "plain decimal"),
+    "Arabic digits": (cells("motion.csv", "flexion_deg", "٣٠", 40), "plain decimal"),
+    "semicolons": (text("motion.csv", lambda t: t.replace(",", ";")), "semicolons"),
+    "decimal commas": (text("motion.csv", lambda t: t.replace(".", ",")), "decimal commas"),
+    "semicolons and commas": (
+        text("tibia.csv", lambda t: t.replace(",", ";").replace(".", ",")), "semicolons"),
+    "stiffness": (key("ligament.0.stiffness_N_per_mm", 91250.0), "is it in N/m?"),
+    "true": (key("patient.mass_kg", True), "true is none"),
+    "in quotes": (key("patient.mass_kg", "75"), '"75" in quotes is none'),
+    "mass of 500": (key("patient.mass_kg", 500.0), "not within 20 to 300; is it in kilograms?"),
+    "mass of 0.075": (key("patient.mass_kg", 0.075), "not within 20 to 300"),
+    "height in m": (key("patient.height_mm", 1.75), "not within 1000 to 2300; is it in milli"),
+    "femur too low": (key("implant.femoral.position_mm", [0.0, -8.0, 0.0]), "is near the insert"),
+    "strain in per cent": (both(key("ligament.0.slack_length_mm", None),
+                                key("ligament.0.reference_strain", 2.0)), "in per cent?"),
+    "exchanged meshes": (both(key("implant.femoral.mesh", str(MODEL / "insert.stl")),
+                              key("implant.insert.mesh", str(MODEL / "femoral_component.stl"))),
+                         "exchanged?"),
+    "side": (key("patient.side", "left"), "those of a right knee; is .* side = 'left' right?"),
+    "left-handed": (key("ground_reaction.laboratory_axes", "+x,+y,-z"), "left-handed"),
+    "left-handed mesh": (key("implant.femoral.axes", "+x,+y,-z"), "left-handed"),
+    "unknown key": (both(key("motion.length_unit", None), key("motion.lenght_unit", "mm")),
+                    "unknown key 'motion.lenght_unit'; did you mean length_unit"),
+    "unknown table": (both(key("motin", {}), key("motion", None)),
+                      "unknown key 'motin'; did you mean motion"),
+    "key of another table": (key("contact.mass_kg", 75.0), r"'mass_kg' is a key of \[patient\]"),
+    "model": (key("contact.model", "latice"), "did you mean lattice"),
+    "material": (key("contact.material", "polyetylene"), "did you mean polyethylene"),
+    "column": (key("motion.columns.flexion", "flexion"),
+               "no column 'flexion'; did you mean flexion_deg.* its header: time_s, flexion_deg"),
+    "role": (key("motion.columns.flxion", "flexion_deg"), "unknown role 'flxion'.*did you mean"),
+    "link": (key("quadriceps.origin.link", "femurr"), "did you mean femur"),
+}  # fmt: skip
+
+FLAGGED = {
+    "centre in metres": (
+        both(*(cells("ground_reaction.csv", f"point_{a}_mm", lambda v: 1e-3 * v) for a in "xyz")),
+        "is it in centimetres or metres?"),
+    "centre's sign": (cells("ground_reaction.csv", "point_x_mm", lambda v: -v),
+                      "where no foot is .*is its sign"),
+    "point in metres": (key("ligament.0.proximal.point_mm", [0.0015, 0.0005, -0.042]),
+                        "is point_mm in metres?"),
+    "pounds": (key("patient.mass_kg", 165.3), "pounds?"),
+    "body weights": (
+        both(*(cells("ground_reaction.csv", f"force_{a}_N", lambda v: v / 736) for a in "xyz")),
+        "is it in body weights"),
+    "radians": (cells("motion.csv", "flexion_deg", np.deg2rad), "flexion runs .*in radians?"),
+    "slack length": (key("ligament.0.slack_length_mm", 70.0), "would strain beyond"),
+    "one sample": (cells("motion.csv", "axial_rotation_deg", lambda v: v + 3, 60),
+                   "off its neighbours' curve"),
+    "URDF in pounds": (urdf("10.620000", "23.413"), "pounds?"),
+    "centimetres": (key("patient.height_mm", 1200.0), "of the body height"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refused(knee, name):
+    edit, words = REFUSED[name]
+    outcome = knee.outcome(edit)
+    with pytest.raises(InputError, match=words):
+        raise InputError(outcome.refused)
+
+
+@pytest.mark.parametrize("name", FLAGGED)
+def test_flagged_in_every_frame_it_concerns(knee, name):
+    import re
+
+    edit, words = FLAGGED[name]
+    outcome = knee.outcome(edit)
+    assert not outcome.refused
+    assert any(re.search(words, word) for word in outcome.words), outcome.words
+    if name != "one sample":
+        assert {word.partition(":")[0] for word in outcome.words} >= {"0", "2", "4"}
+
+
+def test_the_shipped_knee_raises_no_question(knee):
+    assert not knee.untouched.refused
+    assert not knee.untouched.words
+
+
+def assert_none_passes(bench, rng, counts):
+    silent = []
+    for name, edit in random_mistakes(bench, rng, *counts):
+        outcome = bench.outcome(edit)
+        assert "\n" not in outcome.refused
+        if not outcome.notices(bench.untouched) and not outcome.same(bench.untouched):
+            silent.append(name)
+    assert not silent
+
+
+def test_no_random_mistake_passes(knee):
+    assert_none_passes(knee, np.random.default_rng(0), (20, 20))
+
+
+@needs_dm
+def test_no_random_mistake_passes_on_dm(dm):
+    assert_none_passes(dm, np.random.default_rng(1), (6, 6))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_no_mistake_of_many_passes(knee, seed):
+    assert_none_passes(knee, np.random.default_rng(100 + seed), (40, 60))
+
+
+@needs_dm
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_no_mistake_of_many_passes_on_dm(dm, seed):
+    assert_none_passes(dm, np.random.default_rng(200 + seed), (20, 30))
+
+
+def test_a_question_is_asked_everywhere(tmp_path, capfd):
+    """On stderr, in the summary, on the report, and in every frame's status."""
+    scene = write_scene(tmp_path / "scene", ("contact", "ligament"), patient__mass_kg=165.3)
+    out = tmp_path / "out"
+    assert main(["run", str(scene), "--out", str(out), "--frames", "0:100:50"]) == 0
+    said = capfd.readouterr().err
+    assert "tkamb: question: " in said
+    assert "in pounds?" in said
+    summary = json.loads((out / "summary.json").read_text())
+    assert any("in pounds?" in question for question in summary["questions"])
+    assert summary["flagged_frames"] == 2
+    report = (out / "report.html").read_text()
+    assert '<div class="card warning"><h3>Questions to answer' in report
+    with (out / "results.csv").open() as file:
+        assert all("disagree" in row["status"] for row in csv.DictReader(file))
+
+
+def test_a_key_of_the_command_line_is_named(tmp_path, capfd):
+    scene = write_scene(tmp_path)
+    assert main(["run", str(scene), "--set", "contact.fricton=0.1"]) == 2
+    assert "--set contact.fricton: unknown key" in capfd.readouterr().err
+
+
+def test_a_misspelt_column_of_the_results():
+    results = Results({"time_s": [0.0], "status": ["ok"]})
+    with pytest.raises(InputError, match="no column 'forse_total_N'; did you mean force_total_N"):
+        results["forse_total_N"]

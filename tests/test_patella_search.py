@@ -1,0 +1,118 @@
+"""The patella in a whole scene: links that carry its attachments, guesses, frames that are lost."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenes import MODEL, write_scene
+from test_patella import INSERTION, knee_at, mechanism  # noqa: F401
+from tkamb import simulate
+from tkamb.body.patella import ExtensorMechanism, PatellaStatus, solve_patella
+from tkamb.case import load_case
+from tkamb.mechanics import extensor
+from tkamb.mechanics.mechanics import Mechanics
+from tkamb.scene import load_scene
+
+FEW = {"motion.frames": 11, "patella.motion": "solved", "contact.resolution_mm": 3.0}
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return mechanics_of(MODEL / "scene.toml")
+
+
+def mechanics_of(path):
+    return Mechanics(load_case(load_scene(path, FEW)))
+
+
+def turned_about_y(point):
+    return [-point[0], point[1], -point[2]]
+
+
+def test_attachments_on_a_link_that_is_turned_on_the_patella_stay_where_they_are(plain, tmp_path):
+    """A link turned by 180 deg about y and the same points in its axes: the same numbers."""
+    points = {
+        "quadriceps__insertion": [8.0, 20.0, 0.0],
+        "patellar_ligament__proximal": [6.0, -21.0, 0.0],
+    }
+    path = write_scene(
+        tmp_path,
+        **{
+            key: {"link": "patella_back", "point_mm": turned_about_y(point)}
+            for key, point in points.items()
+        },
+    )
+    urdf = path.parent / "patient.urdf"
+    link = (
+        '<link name="patella_back"/><joint name="patella_back_mount" type="fixed">'
+        '<parent link="patella"/><child link="patella_back"/>'
+        f'<origin xyz="0 0 0" rpy="0 {np.pi!r} 0"/></joint></robot>'
+    )
+    urdf.write_text(urdf.read_text(encoding="utf-8").replace("</robot>", link), encoding="utf-8")
+    turned = mechanics_of(path)
+    for k in (2, 5, 8):
+        one, other = plain.frame(k).loads, turned.frame(k).loads
+        assert not one.problems
+        assert not other.problems
+        for name, value in one.values.items():
+            assert other.values[name] == pytest.approx(value, rel=1e-6, abs=1e-5)
+
+
+@pytest.mark.parametrize("wild", [[0.0, 0.0, 2.5], [0.045, 0.3, -3.0]])
+def test_a_guess_that_leads_nowhere_does_not_lose_the_patella(mechanism, wild):  # noqa: F811
+    """All rotations are searched then: the place is that of a search without a guess."""
+    cold = solve_patella(mechanism, knee_at(25.0))
+    warm = solve_patella(mechanism, knee_at(25.0), np.array(wild))
+    assert warm.status is PatellaStatus.OK
+    assert np.allclose(warm.coordinates, cold.coordinates, atol=1e-6)
+
+
+def test_a_guess_inside_the_outline_of_the_femur_does_not_lose_the_patella(mechanism):  # noqa: F811
+    """There the quadriceps cannot run; the search that follows finds the place."""
+    angle = np.linspace(0.0, 2 * np.pi, 181)[:-1]
+    outline = 0.026 * np.column_stack([np.cos(angle), np.sin(angle)])
+    wrapped = ExtensorMechanism(**{**vars(mechanism), "femoral_outline": outline})
+    inside = np.append(-INSERTION[:2], 0.0)  # the insertion on the axis of the trochlea
+    cold, warm = (solve_patella(wrapped, knee_at(25.0), guess) for guess in (None, inside))
+    assert warm.status is PatellaStatus.OK
+    assert np.allclose(warm.coordinates, cold.coordinates, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "conditions"),
+    [
+        ({"ligament_length": 0.005}, (PatellaStatus.NO_CONTACT, PatellaStatus.LIGAMENT)),
+        ({"ligament_length": 0.4}, (PatellaStatus.NO_CONTACT,)),
+        ({"quadriceps_origin": np.array([0.028, -0.22, 0.0])}, (PatellaStatus.MOMENT,)),
+    ],
+)
+def test_the_condition_that_fails_is_named(mechanism, change, conditions):  # noqa: F811
+    state = solve_patella(ExtensorMechanism(**{**vars(mechanism), **change}), knee_at(20.0))
+    assert state.status in conditions
+    assert np.isnan(state.coordinates).all()
+
+
+def test_a_frame_that_loses_the_patella_fails_and_the_run_goes_on(plain, monkeypatch):
+    """Frame 5 of 11 is lost: it has a reason with its flexion; its neighbours hardly notice."""
+    scene = load_scene(MODEL / "scene.toml", FEW | {"contact.model": "foundation"})
+    seen = []
+
+    def losing(parts, pose, guess=None):
+        seen.append(pose)
+        found = solve_patella(parts, pose, guess)
+        if len(seen) != 6:
+            return found
+        return replace(found, coordinates=np.full(3, np.nan), status=PatellaStatus.MOMENT)
+
+    monkeypatch.setattr(extensor, "solve_patella", losing)
+    results = simulate(scene)
+    status = results["status"]
+    flexion = results["flexion_deg"][5]
+    assert re.match(rf"failed: patella lost at {flexion:.1f} deg of flexion: moment", status[5])
+    assert np.isnan(results["force_total_N"][5])
+    others = [k for k in range(11) if k != 5]
+    assert not any(status[k].startswith("failed") for k in others)
+    quadriceps = [plain.frame(k).loads.values["quadriceps"] for k in others]
+    assert np.allclose(results["quadriceps_N"][others], quadriceps, atol=0.5)

@@ -1,0 +1,199 @@
+"""Results that can be verified: what was changed, mixed or lost since a run is said."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from scenes import write_scene
+from tkamb.cli import main
+from tkamb.errors import InputError
+from tkamb.output.shards import Shard, Shards
+from tkamb.results import read_results
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A scene and its results."""
+    folder = tmp_path_factory.mktemp("finished")
+    scene = write_scene(folder / "scene", contact__resolution_mm=3.0, contact__model="foundation")
+    assert main(["run", str(scene), "--out", str(folder / "out"), "--frames", "0:9:4"]) == 0
+    return folder
+
+
+@pytest.fixture
+def run(finished, tmp_path):
+    """A copy of the results; the scene stays where it was read."""
+    shutil.copytree(finished / "out", tmp_path / "out")
+    return finished / "scene", tmp_path / "out"
+
+
+def verified(out, capfd):
+    capfd.readouterr()
+    status = main(["verify", str(out)])
+    said = capfd.readouterr()
+    return status, said.out + said.err
+
+
+def test_untouched_results_are_fine(run, capfd):
+    status, said = verified(run[1], capfd)
+    assert status == 0 and "input file(s) are as they were" in said
+    assert main(["report", str(run[1])]) == 0
+    assert verified(run[1], capfd)[0] == 0
+
+
+def swap_cell(out):
+    path = out / "results.csv"
+    header, first, *rest = path.read_text().splitlines()
+    cells = first.split(",")
+    cells[5] = repr(float(cells[5]) * 1.05)
+    path.write_text("\n".join([header, ",".join(cells), *rest]) + "\n")
+
+
+def flip_map(out):
+    path = out / "contact.h5"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+
+
+def change_summary(out):
+    path = out / "summary.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content | {"body_mass_kg": content["body_mass_kg"] + 1}))
+
+
+CHANGES = [
+    (swap_cell, "results.csv has changed"),
+    (flip_map, "contact.h5 has changed"),
+    (change_summary, "summary.json has changed"),
+    (lambda out: (out / "contact.h5").unlink(), "contact.h5 is missing"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), CHANGES)
+def test_what_differs_is_said_by_all_who_read(run, capfd, change, words):
+    scene, out = run
+    change(out)
+    status, said = verified(out, capfd)
+    assert status == 1 and words in said
+    again = ["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:9:4", "--resume"]
+    for command in (["report", str(out)], again, ["view", str(out), "--html", str(out / "v.html")]):
+        assert main(command) == 2
+        assert words in capfd.readouterr().err
+    with pytest.raises(InputError, match=words):
+        read_results(out)
+
+
+def test_inputs_that_changed_are_named(finished, tmp_path, capfd):
+    shutil.copytree(finished, tmp_path / "moved")
+    out, motion = tmp_path / "moved" / "out", finished / "scene" / "motion.csv"
+    before = motion.read_text()
+    try:
+        motion.write_text(before + "\n")
+        status, said = verified(out, capfd)
+        assert status == 1 and f"{motion} has changed since it was read" in said
+        motion.unlink()
+        status, said = verified(out, capfd)
+        assert status == 1 and f"{motion}: no such file" in said
+    finally:
+        motion.write_text(before)
+
+
+def test_other_code_is_a_note(run, capfd, monkeypatch):
+    monkeypatch.setattr("tkamb.verify.code_identity", lambda: "other")
+    status, said = verified(run[1], capfd)
+    assert status == 0 and "computed by other code" in said
+
+
+def test_other_code_is_not_resumed(run, capfd, monkeypatch):
+    monkeypatch.setattr("tkamb.run.summary.code_identity", lambda: "other")
+    scene, out = run
+    given = ["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:9:4", "--resume"]
+    assert main(given) == 2
+    assert "another code of tkamb" in capfd.readouterr().err
+
+
+def test_what_is_no_result_folder(tmp_path, capfd):
+    for name, text in (("summary.json", "{}"), ("summary.json", "[1]"), ("notes.txt", "x")):
+        folder = tmp_path / f"{name}{len(text)}"
+        folder.mkdir()
+        (folder / name).write_text(text)
+        status, said = verified(folder, capfd)
+        assert status == 2 and said.count("\n") == 1
+    assert verified(tmp_path / "nothing", capfd)[0] == 2
+
+
+def test_results_without_a_record_cannot_be_verified(run, capfd):
+    path = run[1] / "summary.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({k: v for k, v in content.items() if k != "files"}))
+    status, said = verified(run[1], capfd)
+    assert status == 1 and "no SHA-256" in said
+
+
+def test_frames_of_another_run_or_place_count_as_absent(tmp_path):
+    mine, other = (Shards(tmp_path / name, {"scene": name}, False) for name in "ab")
+    for shards in (mine, other):
+        shards.folder.parent.mkdir()
+        for frame in range(2):
+            shards.put(frame, Shard({"time_s": float(frame)}, {"pressure": np.ones(3)}))
+    first, second = (mine.folder / f"00000{k}.frame" for k in range(2))
+    assert mine.get(0) is not None
+    shutil.copy(other.folder / first.name, first)
+    assert mine.get(0) is None
+    shutil.copy(second, first)
+    assert mine.get(0) is None and mine.get(1) is not None
+
+
+def test_a_frames_folder_that_is_a_link_is_not_followed(tmp_path):
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    (precious / "000000.frame").write_text("mine")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".frames").symlink_to(precious)
+    with pytest.raises(InputError, match="symbolic link"):
+        Shards(tmp_path / "out", {}, False)
+    assert (precious / "000000.frame").read_text() == "mine"
+
+
+def test_one_of_two_runs_at_once_is_refused(run, capfd):
+    from tkamb.output import claim
+
+    scene, out = run
+    descriptor = claim._lock(out)  # as another process would hold it
+    try:
+        assert main(["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:1"]) == 2
+    finally:
+        claim.os.close(descriptor)
+    said = capfd.readouterr().err
+    assert "another tkamb is writing" in said and said.count("\n") == 1
+    assert verified(out, capfd)[0] == 0
+
+
+def test_a_foreign_folder_is_not_written_into(finished, tmp_path, capfd, monkeypatch):
+    (tmp_path / "results.csv").write_text("mine\n")
+    given = [
+        "run",
+        str(finished / "scene" / "scene.toml"),
+        "--frames",
+        "0:1",
+        "--out",
+        str(tmp_path),
+    ]
+    assert main(given) == 2
+    assert "--force" in capfd.readouterr().err
+    assert (tmp_path / "results.csv").read_text() == "mine\n"
+    (tmp_path / "results.csv").rename(tmp_path / "other.csv")
+    assert main([*given, "--force"]) == 0
+    assert (tmp_path / "other.csv").read_text() == "mine\n"
+
+
+def test_an_unknown_link_leaves_nothing(finished, tmp_path, capfd):
+    link = ("--set", "quadriceps.origin.link=nowhere")
+    out = tmp_path / "out"
+    scene = str(finished / "scene" / "scene.toml")
+    assert main(["run", scene, "--frames", "0:2", "--out", str(out), *link]) == 2
+    assert capfd.readouterr().err.count("\n") == 1
+    assert not out.exists()

@@ -1,0 +1,178 @@
+"""Flat subdivision undone: the coarser triangles whose halved edges a surface is made of.
+
+Halving every edge of a mesh changes no point of it, but its new vertices have the normals of
+two triangles at most: the curved surface that the triangles stand for can be seen from the
+coarser ones alone.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from tkamb.geometry.boundary import edge_use
+from tkamb.geometry.frames import Array
+from tkamb.geometry.surface import Surface
+
+Indices = NDArray[np.int64]
+
+ROUNDING = 1e-6
+"""Of the surface's size: how far a halved edge's middle may be from its line, as files round."""
+MOST_LEVELS = 8
+MOST_PARTS = 100
+"""Parts of a surface beyond which it is left as it is: no implant has as many."""
+
+
+@dataclass(frozen=True, eq=False)
+class Coarsened:
+    """A surface and its triangles' places on a finer one.
+
+    Args:
+        surface: the coarser triangles.
+        parent: (k,) the one that each finer triangle is part of.
+        corners: (k, 3, 3) barycentric coordinates there of each finer triangle's corners.
+    """
+
+    surface: Surface
+    parent: Indices
+    corners: Array
+
+
+def coarsened(surface: Surface) -> Coarsened | None:
+    """Return the surface of which this one is a flat subdivision, as often as it was done.
+
+    Parts of a surface are looked at one by one; a part is undone as a whole or not at all.
+    None where nothing is to be undone.
+    """
+    found: Coarsened | None = None
+    for _ in range(MOST_LEVELS):
+        step = _coarsened_once(surface if found is None else found.surface)
+        if step is None:
+            break
+        if found is None:
+            found = step
+        else:
+            corners = found.corners @ step.corners[found.parent]
+            found = Coarsened(step.surface, step.parent[found.parent], corners)
+    return found
+
+
+def _coarsened_once(surface: Surface) -> Coarsened | None:
+    faces = surface.faces
+    across = _across(faces)
+    count, part = _parts(across)
+    if count > MOST_PARTS:
+        return None
+    search = _Search(surface, across)
+    middles = [search.middles_of(np.flatnonzero(part == number)) for number in range(count)]
+    middle = np.concatenate(middles) if middles else np.zeros(0, np.int64)
+    if not middle.size:
+        return None
+    own = np.arange(len(middle))
+    parent = np.full(len(faces), -1)
+    parent[middle] = own
+    parent[across[middle]] = own[:, None]
+    rest = np.flatnonzero(parent < 0)
+    parent[rest] = len(middle) + np.arange(len(rest))
+    tips = np.concatenate([search.tips(middle), faces[rest]])
+    halves = np.concatenate([faces[middle], np.full((len(rest), 3), -1)])
+    at_tip = faces[:, :, None] == tips[parent][:, None]
+    at_half = faces[:, :, None] == halves[parent][:, None]
+    corners = at_tip + 0.5 * (at_half.any(axis=2, keepdims=True) & ~at_half)
+    return Coarsened(Surface(surface.vertices, tips, surface.name), parent, corners)
+
+
+class _Search:
+    """Looks for the middle ones of the four triangles that one was cut into.
+
+    A middle triangle's corners are the middles of the edges between the tips of its three
+    neighbours. From one of them the next are found across the neighbours' tips.
+    """
+
+    def __init__(self, surface: Surface, across: Indices) -> None:
+        self._faces, self._points, self._across = surface.faces, surface.vertices, across
+        self._near = ROUNDING * float(np.linalg.norm(np.ptp(surface.bounds, axis=0)))
+        order = np.argsort(surface.faces.ravel(), kind="stable")
+        self._around = order // 3
+        self._corner = order % 3
+        self._first = np.searchsorted(
+            surface.faces.ravel()[order], np.arange(len(surface.vertices) + 1)
+        )
+
+    def tips(self, middle: Indices) -> Indices:
+        """Return the vertices (m, 3) of the neighbours across from each corner's edge."""
+        others, own = self._faces[self._across[middle]], self._faces[middle]
+        shared = (others[:, :, :, None] == own[:, None, None]).any(axis=3)
+        return np.take_along_axis(others, np.argmin(shared, axis=2)[..., None], axis=2)[..., 0]
+
+    def middles_of(self, part: Indices) -> Indices:
+        """Return the middle triangles of a part (faces that hang together); none: not cut."""
+        first = part[0]
+        starts = [[first], *([face] for face in self._across[first])]
+        if len(part) % 4 == 0:
+            for start in starts:
+                found = self._spread(np.array(start))
+                if found is not None and 4 * len(found) == len(part):
+                    return found
+        return np.zeros(0, np.int64)
+
+    def _spread(self, start: Indices) -> Indices | None:
+        """Return all middle triangles that follow from one; None where they contradict."""
+        kind = np.zeros(len(self._faces), np.int8)  # 1: middle, 2: at a tip
+        even = np.zeros(len(self._points), bool)
+        new, found = start, []
+        while new.size:
+            if not self._are_middles(new) or (kind[new] == 2).any():
+                return None
+            kind[new] = 1
+            found.append(new)
+            if (kind[self._across[new]] == 1).any():
+                return None
+            kind[self._across[new]] = 2
+            tips = np.unique(self.tips(new))
+            tips = tips[~even[tips]]
+            even[tips] = True
+            new = self._beyond(tips)
+            new = new[kind[new] != 1] if (new >= 0).all() else np.array([-1])
+        every = np.concatenate(found)
+        return None if even[self._faces[every]].any() else every
+
+    def _are_middles(self, faces: Indices) -> bool:
+        """Say whether the corners of faces halve the edges between their neighbours' tips."""
+        if (faces < 0).any() or (self._across[faces] < 0).any():
+            return False
+        a, b, c = np.moveaxis(self._points[self.tips(faces)], 1, 0)
+        halves = 0.5 * np.stack([b + c, c + a, a + b], axis=1)
+        return bool(np.abs(halves - self._points[self._faces[faces]]).max() <= self._near)
+
+    def _beyond(self, tips: Indices) -> Indices:
+        """Return the faces across from each tip of all the faces around it."""
+        count = self._first[tips + 1] - self._first[tips]
+        begins = np.repeat(self._first[tips] - np.cumsum(count) + count, count)
+        place = begins + np.arange(count.sum())
+        return np.unique(self._across[self._around[place], self._corner[place]])
+
+
+def _across(faces: Indices) -> Indices:
+    """Return the face (k, 3) across the edge opposite each corner; -1: none, or several."""
+    edge, count = edge_use(faces)
+    order = np.argsort(edge, kind="stable")
+    first = np.cumsum(count) - count
+    pair = np.full((len(count), 2), -1)
+    two = count == 2
+    pair[two] = order[first[two][:, None] + [0, 1]] // 3
+    here = pair[edge].reshape(-1, 3, 2)
+    own = np.arange(len(faces))[:, None]
+    other = np.where(here[..., 0] == own, here[..., 1], here[..., 0])
+    return np.asarray(np.roll(other, -1, axis=1))
+
+
+def _parts(across: Indices) -> tuple[int, Indices]:
+    """Return how many parts hang together across edges, and whose each face is (k,)."""
+    face, corner = np.nonzero(across >= 0)
+    ones = np.ones(len(face), np.int8)
+    graph = coo_array((ones, (face, across[face, corner])), shape=(len(across),) * 2)
+    count, part = connected_components(graph.tocsr(), directed=False)
+    return int(count), part.astype(np.int64)

@@ -1,0 +1,149 @@
+"""What stands between a command and its user: one line for whatever goes wrong.
+
+A command ends with a status: 0 done, 1 nothing computed, 2 bad input, 130 interrupted. What
+nobody foresaw is one line too; its traceback goes into a file beside the output.
+"""
+
+import argparse
+import io
+import logging
+import os
+import sys
+import tempfile
+import traceback
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TextIO
+
+from tkamb.errors import TkambError
+
+
+def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
+    """Run a command and return its exit status; nothing but a line ever reaches the user.
+
+    Args:
+        command: returns its own status.
+        options: of the command line, as far as they are known when something goes wrong.
+    """
+    open_streams()
+    try:
+        with warnings.catch_warnings():
+            if not sys.warnoptions:
+                warnings.simplefilter("ignore")  # they are for whoever writes the code
+            try:
+                return command()
+            finally:  # also when argparse exits: what it printed must have arrived
+                sys.stdout.flush()
+    except TkambError as error:
+        say(str(error))
+        if isinstance(error, StreamError):
+            _silence(sys.stdout)
+        return error.exit_status
+    except BrokenPipeError:  # the reader of a pipe has gone, `tkamb ... | head`
+        _silence(sys.stdout)
+        return 0
+    except KeyboardInterrupt as interrupt:
+        say(f"interrupted: {interrupt or 'nothing is kept'}")
+        return 130
+    except Exception as error:
+        return _unforeseen(error, options)
+
+
+class StreamError(TkambError):
+    """Standard output cannot be written: what was computed has not arrived."""
+
+
+def say(line: str) -> None:
+    """Print a line on standard error; where that is gone there is nobody to tell."""
+    plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    with suppress(OSError, ValueError):
+        print(f"tkamb: {plain}", file=sys.stderr, flush=True)
+
+
+def open_streams() -> None:
+    """Have the three standard streams there, whatever the process was started with.
+
+    A stream that is closed would leave its number to the next file that is opened, and what is
+    printed would end in it. Standard output is opened for reading then: printing fails, as it
+    should, when there is something to print.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:  # the lowest free number is given: this one
+            os.open(os.devnull, os.O_RDONLY if number == 1 else os.O_RDWR)
+    if sys.stdout is None:
+        sys.stdout = sys.__stdout__ = open(1, "w", encoding="utf-8", closefd=False)  # type: ignore[misc]  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+    try:
+        os.write(2, b"")  # nothing, but /dev/full says so
+    except OSError:
+        _silence(sys.stderr)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # Names of files may hold what the encoding does not have.
+        sys.stdout.reconfigure(errors="backslashreplace")
+        if sys.stdout is sys.__stdout__ and "write" not in vars(sys.stdout):
+            _watch(sys.stdout)
+    logging.raiseExceptions = False
+
+
+def _watch(stream: TextIO) -> None:
+    """Have a stream say `StreamError` when it cannot be written, as on a full disk."""
+    for name in ("write", "flush"):
+        inner = getattr(stream, name)
+
+        def call(*given: str, inner: Callable[..., object] = inner) -> object:
+            try:
+                return inner(*given)
+            except BrokenPipeError:
+                raise
+            except OSError as error:
+                what = f"standard output cannot be written ({error.strerror})"
+                raise StreamError(what) from None
+
+        setattr(stream, name, call)
+
+
+def _silence(stream: object) -> None:
+    """Lead a standard stream to nowhere, so that the interpreter's last flush does not fail."""
+    with suppress(OSError, ValueError, AttributeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # type: ignore[attr-defined]
+
+
+def _unforeseen(error: Exception, options: argparse.Namespace) -> int:
+    name = type(error).__name__
+    reason = " ".join(str(error).split())[:200]
+    what = "not enough memory: take a coarser resolution or fewer frames"
+    if not isinstance(error, MemoryError):
+        what = f"this was not foreseen: {name}{': ' if reason else ''}{reason}"
+    log = _write_log(error, options)
+    say(f"{what}; {'no log could be written' if log is None else f'details are in {log}'}")
+    return 1
+
+
+def _write_log(error: Exception, options: argparse.Namespace) -> Path | None:
+    """Write the traceback beside the output, else here, else where temporary files go."""
+    text = "".join(
+        (
+            f"tkamb {version('tkamb')}, {datetime.now(UTC).isoformat(timespec='seconds')}\n",
+            f"{sys.argv}\n",
+            *traceback.format_exception(error),
+        )
+    )
+    for folder in _log_folders(getattr(options, "out", None)):
+        with suppress(OSError, ValueError):
+            handle, name = tempfile.mkstemp(".log", "tkamb-error-", folder)
+            with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
+                file.write(text)
+            return Path(name)
+    return None
+
+
+def _log_folders(out: Path | None) -> list[Path]:
+    beside = [] if out is None else [out, out.parent]
+    return [*(path for path in beside if path.is_dir()), Path.cwd(), Path(tempfile.gettempdir())]

@@ -1,0 +1,1 @@
+"""A patient from an OpenSim model, a recording and meshes: what `tkamb import` does."""

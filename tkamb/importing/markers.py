@@ -1,0 +1,180 @@
+"""The leg's markers in a recording: matched to the model's, and what they say of the laboratory."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, transform
+from tkamb.importing.anatomy import Leg, find_leg
+from tkamb.importing.links import Links
+from tkamb.inputs.labels import matched_labels
+from tkamb.inputs.markers import fit_seen, marker_trajectories
+from tkamb.inputs.tables import Table, read_table
+from tkamb.units import DEGREE
+
+
+@dataclass(frozen=True, eq=False)
+class ModelSegment:
+    """A segment's markers that the recording holds.
+
+    Args:
+        name: "shank", "thigh", "foot" or "pelvis".
+        points: label in the recording -> (3,) m in the segment's link (shank, thigh) or body.
+        missing: markers of the model that the recording does not hold.
+        joined_to: "shank" or "thigh" for a neighbour.
+        joint: (3,) m, the ball joint in that segment's link.
+        centre: (3,) m, the same in the neighbour's body.
+    """
+
+    name: str
+    points: dict[str, Array]
+    missing: tuple[str, ...]
+    joined_to: str = ""
+    joint: Array | None = None
+    centre: Array | None = None
+
+
+def model_segments(links: Links, recorded: Table) -> list[ModelSegment]:
+    """Return shank, thigh, and of foot and pelvis those with three markers or more.
+
+    Raises:
+        InputError: shank or thigh with fewer than three markers in the recording.
+    """
+    leg = links.leg
+    foot = _with_most_markers(leg, leg.foot)
+    body, ankle = leg.ankle_centre
+    in_foot = transform(leg.in_body(body, foot), ankle)
+    hip_body, hip = leg.hip_centre
+    in_pelvis = transform(leg.in_body(hip_body, leg.pelvis), hip)
+    wanted = [
+        ("shank", leg.tibia, "", None, None),
+        ("thigh", leg.femur, "", None, None),
+        ("foot", (foot,), "shank", np.zeros(3), in_foot),
+        ("pelvis", (leg.pelvis,), "thigh", links.hip, in_pelvis),
+    ]
+    labels = recorded_labels(recorded)
+    found = []
+    for name, bodies, joined_to, joint, centre in wanted:
+        own = {m.name: m for m in leg.model.markers.values() if m.body in bodies}
+        match = matched_labels(own, labels)
+        points = {
+            match[m]: own[m].location
+            if joined_to
+            else links.point_in_link(own[m].body, own[m].location)[1]
+            for m in own
+            if m in match
+        }
+        missing = tuple(m for m in own if m not in match)
+        found.append(ModelSegment(name, points, missing, joined_to, joint, centre))
+    for segment in found[:2]:
+        if len(segment.points) < 3:
+            raise InputError(
+                f"the model and the recording share {len(segment.points)} markers of the "
+                f"{segment.name}, three are needed",
+                recorded.path,
+                f"the model has {', '.join(segment.missing) or 'no others'}; "
+                f"the recording {', '.join(labels[:12])}, …",
+            )
+    return [segment for segment in found if len(segment.points) >= 3]
+
+
+def segments_of(recording: Path, segments: list[ModelSegment]) -> list[ModelSegment]:
+    """Return the segments with the labels of another recording, those that it holds."""
+    labels = recorded_labels(read_table(recording))
+    found = []
+    for segment in segments:
+        match = matched_labels(segment.points, labels)
+        points = {match[name]: p for name, p in segment.points.items() if name in match}
+        found.append(replace(segment, points=points))
+    return found
+
+
+def recorded_labels(recorded: Table) -> list[str]:
+    """Return the labels of a table of markers."""
+    return [column[:-2] for column in recorded.columns if column.endswith("_x")]
+
+
+def _with_most_markers(leg: Leg, bodies: tuple[str, ...]) -> str:
+    counts = {b: sum(m.body == b for m in leg.model.markers.values()) for b in bodies}
+    return max(counts, key=lambda b: counts[b])
+
+
+@dataclass(frozen=True)
+class Facing:
+    """Which of a recording's axes point where, and how far the subject is from them.
+
+    Args:
+        axes: those that point forward, up and to the right, like "-x,+z,+y".
+        up_deg: between the mean upward axis of shank, thigh and pelvis and the file's.
+        forward_deg: between the mean forward axis and the file's, in the horizontal plane.
+    """
+
+    axes: str
+    up_deg: float
+    forward_deg: float
+
+
+def facing(segments: list[ModelSegment], recorded: Table) -> Facing:
+    """Return the laboratory's axes from how thigh, shank and pelvis stand in the recording.
+
+    The segments' own y axes point up, their x axes forward; both are averaged over frames and
+    taken to the nearest axis of the file.
+
+    Raises:
+        InputError: the segments do not stand, or face no direction.
+    """
+    upright = [s for s in segments if s.name in ("shank", "thigh", "pelvis")]
+    turns = []
+    for segment in upright:
+        points = marker_trajectories(recorded, list(segment.points), 1.0)
+        reference = np.array(list(segment.points.values()))
+        scale = recorded.unit_scale(None, "length_unit")
+        poses, _ = fit_seen(points * scale, reference, np.ones(len(reference)), segment.name)
+        known = np.isfinite(poses[:, 0, 3])
+        if known.any():
+            turns.append(poses[known][:, :3, :3].mean(axis=0))
+    mean = np.mean(turns, axis=0) if turns else np.zeros((3, 3))
+    up, up_angle = _nearest_axis(mean[:, 1])
+    level = mean[:, 0] * (np.abs(up) < 0.5)
+    forward, forward_angle = _nearest_axis(level)
+    if up_angle > 40.0 or np.linalg.norm(level) < 0.3 or forward_angle > 50.0:
+        raise InputError(
+            "the subject does not stand upright and face one way on average",
+            recorded.path,
+            "give --laboratory-axes, the file's axes that point forward, up and right",
+        )
+    right = np.cross(forward, up)
+    names = ",".join(_axis_name(axis) for axis in (forward, up, right))
+    return Facing(names, up_angle, forward_angle)
+
+
+def _nearest_axis(vector: Array) -> tuple[Array, float]:
+    """Return the signed axis nearest to a vector (3,), and the angle (deg) between them."""
+    k = int(np.argmax(np.abs(vector)))
+    axis = np.zeros(3)
+    axis[k] = np.sign(vector[k])
+    cosine = abs(vector[k]) / max(float(np.linalg.norm(vector)), 1e-12)
+    return axis, float(np.arccos(np.clip(cosine, -1.0, 1.0)) / DEGREE)
+
+
+def _axis_name(axis: Array) -> str:
+    k = int(np.argmax(np.abs(axis)))
+    return f"{'+' if axis[k] > 0 else '-'}{'xyz'[k]}"
+
+
+def feet(leg: Leg, recorded: Table, other: str) -> dict[str, list[str]]:
+    """Return side -> labels of the recording on that side's foot; the other side if there."""
+    labels = recorded_labels(recorded)
+    found = {leg.side: _foot_labels(leg, labels)}
+    try:
+        found[other] = _foot_labels(find_leg(leg.model, other), labels)
+    except InputError:
+        found[other] = []  # a model of one leg
+    return found
+
+
+def _foot_labels(leg: Leg, labels: list[str]) -> list[str]:
+    own = [m.name for m in leg.model.markers.values() if m.body in leg.foot]
+    return list(matched_labels(own, labels).values())

@@ -1,0 +1,119 @@
+"""A motion in a model's coordinates (`.mot`, `.sto`) as the scene's knee and shank."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import (
+    KNEE_COORDINATES,
+    Array,
+    inverse,
+    knee_coordinates,
+    mirrored_pose,
+)
+from tkamb.importing.links import Links
+from tkamb.inputs.tables import Table
+from tkamb.opensim.kinematics import Kinematics
+from tkamb.units import DEGREE, MILLIMETRE
+
+MOTION_FILE = "motion.csv"
+COLUMNS = (
+    *("ap_mm", "si_mm", "ml_mm", "axial_rotation_deg", "adduction_deg", "flexion_deg"),
+    *(f"tibia_rotation_{k}_deg" for k in (1, 2, 3)),
+    *(f"tibia_translation_{k}_mm" for k in (1, 2, 3)),
+)
+"""Of `motion.csv`, after time_s: the knee's coordinates and the tibia link in the model's ground,
+rotations intrinsic x-y-z."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelMotion:
+    """Knee and shank of a motion.
+
+    Args:
+        time: (n,) s.
+        values: (n, 12) of `COLUMNS`.
+        missing: coordinates of the model that the file does not hold: at their defaults.
+    """
+
+    time: Array
+    values: Array
+    missing: tuple[str, ...]
+
+    def text(self) -> str:
+        """Return the table as CSV."""
+        rows = np.column_stack([self.time, self.values])
+        lines = [",".join(f"{value:.9g}" for value in row) for row in rows]
+        return "\n".join([",".join(("time_s", *COLUMNS)), *lines, ""])
+
+
+def model_motion(links: Links, recorded: Table) -> ModelMotion:
+    """Return the knee and the shank of a motion in the model's coordinates.
+
+    Args:
+        links: of the leg.
+        recorded: with a column per coordinate, named as in the model or by its path.
+
+    Raises:
+        InputError: no coordinate of the knee, or angles of unknown unit.
+    """
+    leg, model = links.leg, links.leg.model
+    kinematics = Kinematics(model)
+    time = recorded.time()
+    q = np.tile(kinematics.vector({}), (len(time), 1))
+    missing = []
+    for name, coordinate in model.coordinates.items():
+        column = next((c for c in recorded.columns if name in (c, *c.split("/")[-2:-1])), None)
+        if column is None:
+            missing.append(name)
+            continue
+        values = recorded.complete_column(column)
+        if coordinate.rotational:
+            if recorded.in_degrees is None:
+                raise InputError("does not say inDegrees", recorded.path, "add it to its header")
+            values = values * (DEGREE if recorded.in_degrees else 1.0)
+        q[:, kinematics.coordinates[name]] = values
+    if leg.flexion is None or leg.flexion in missing:
+        raise InputError(f"has no column '{leg.flexion}' for the knee's flexion", recorded.path)
+    poses = kinematics.poses(kinematics.coupled(q))
+    tibia = poses[:, kinematics.bodies[leg.tibia[0]]] @ links.tibia
+    femur = poses[:, kinematics.bodies[leg.femur[0]]] @ links.femur
+    knee_pose = inverse(tibia @ links.insert_in_tibia) @ femur
+    left = leg.side == "left"
+    knee = knee_coordinates(mirrored_pose(knee_pose) if left else knee_pose)
+    knee[:, 2] *= -1.0 if left else 1.0  # the file's ML points to the right on both sides
+    turns = np.unwrap(Rotation.from_matrix(tibia[:, :3, :3]).as_euler("XYZ"), axis=0)
+    values = np.concatenate(
+        [
+            knee[:, :3] / MILLIMETRE,
+            knee[:, 3:] / DEGREE,
+            turns / DEGREE,
+            tibia[:, :3, 3] / MILLIMETRE,
+        ],
+        axis=1,
+    )
+    return ModelMotion(time, values, tuple(missing))
+
+
+def motion_tables(flexion_alone: bool) -> list[str]:
+    """Return the scene's [motion] columns, of flexion or all six, and [tibia] for `motion.csv`."""
+    columns = dict(zip(KNEE_COORDINATES, COLUMNS, strict=False))
+    taken = ("flexion",) if flexion_alone else KNEE_COORDINATES
+    lines = ["[motion.columns]", 'time = "time_s"']
+    lines += [f'{role} = "{columns[role]}"' for role in taken]
+    lines += [
+        "",
+        "[tibia]",
+        'kind = "pose"',
+        f'file = "{MOTION_FILE}"',
+        'sequence = "XYZ"',
+        'angle_unit = "deg"',
+        'length_unit = "mm"',
+        "",
+        "[tibia.columns]",
+        'time = "time_s"',
+    ]
+    kinds = [f"{kind}_{k}" for kind in ("rotation", "translation") for k in (1, 2, 3)]
+    return lines + [f'{role} = "{name}"' for role, name in zip(kinds, COLUMNS[6:], strict=True)]

@@ -1,0 +1,228 @@
+"""A patient brought in: model, recording and meshes to a URDF and a scene that runs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.case import Case, load_case
+from tkamb.errors import InputError
+from tkamb.importing.anatomy import Leg, find_leg
+from tkamb.importing.links import Links, find_links
+from tkamb.importing.markers import (
+    recorded_labels,
+)
+from tkamb.importing.model_motion import MOTION_FILE
+from tkamb.importing.request import ImportRequest
+from tkamb.importing.scene_text import SceneText
+from tkamb.importing.soft_tissue import soft_tissue
+from tkamb.importing.standing import with_static_markers
+from tkamb.importing.trial import from_coordinates, from_markers
+from tkamb.importing.urdf import patient_urdf
+from tkamb.inputs.meshes import load_surface
+from tkamb.inputs.tables import read_table
+from tkamb.opensim.read import read_osim
+from tkamb.output.atomic import claim_directory, write_text
+from tkamb.scene import load_scene
+from tkamb.units import DEGREE, MILLIMETRE
+
+SAME_MASS = 0.01
+"""A model whose mass is within this share of the subject's is not scaled."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedPatient:
+    """What an import gives.
+
+    Args:
+        urdf: text of patient.urdf.
+        scene: the scene, to be written as text.
+        motion: text of motion.csv; None where markers are read from the recording.
+        report: lines on what was understood and assumed.
+    """
+
+    urdf: str
+    scene: SceneText
+    motion: str | None
+    report: tuple[str, ...]
+
+
+def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
+    """Return a patient's URDF and scene.
+
+    Args:
+        request: files and what is known.
+        folder: where the scene will stand.
+
+    Raises:
+        InputError: whatever cannot be used, in one line.
+    """
+    model = read_osim(request.model)
+    leg = find_leg(model, request.side, request.knee)
+    meshes = request.meshes
+    insert = (
+        load_surface(meshes.insert, meshes.unit, meshes.axes, name="insert", closed=True)
+        if meshes
+        else None
+    )
+    links = find_links(
+        leg,
+        insert,
+        meshes.axes if meshes else "+x,+y,+z",
+        request.frames,
+        bool(meshes and meshes.patella),
+    )
+    scale, weighed = _mass_scale(request, leg)
+    tissue = soft_tissue(links)
+    recorded = read_table(request.recording)
+    found = (
+        from_markers(request, leg, links, recorded)
+        if recorded_labels(recorded)
+        else from_coordinates(request, leg, links, recorded)
+    )
+    scene = SceneText(
+        _title(request),
+        folder,
+        request.side,
+        request.mass_kg,
+        "patient.urdf",
+        request.cutoff_Hz,
+        links,
+        found.markers,
+        found.ground,
+        meshes,
+        tissue,
+        _notes(scale, found.ground is not None, bool(tissue.bundles), meshes is not None),
+    )
+    report = [*_leg_lines(leg), weighed, *links.said, *_patella_line(links)]
+    report += [*found.said, *tissue.said]
+    if request.static is not None and found.markers is not None:
+        scene, line = with_static_markers(scene, request.static, list(found.markers.segments))
+        report.append(line)
+    comment = f"Made by tkamb import from {request.model.name}, {request.side} leg (m, kg)"
+    motion = found.motion.text() if found.motion else None
+    return ImportedPatient(patient_urdf(links, scale, comment), scene, motion, tuple(report))
+
+
+def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[str, ...]:
+    """Write URDF and scene, load them as a run would, and return what the markers say.
+
+    Nothing is left behind where that fails.
+
+    Raises:
+        InputError: the folder cannot be written, holds a scene of that name already, or the
+            scene does not load.
+    """
+    urdf, scene = folder / patient.scene.urdf, folder / name
+    if scene.exists():
+        raise InputError("is there already", scene, "choose another --out, or remove it")
+    files = {urdf: patient.urdf, scene: patient.scene.text()}
+    if patient.motion is not None:
+        files[folder / MOTION_FILE] = patient.motion
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    claim_directory(folder)
+    before = {p: p.read_text(encoding="utf-8") if p.is_file() else None for p in files}
+    try:
+        for path, text in files.items():
+            write_text(path, text)
+        case = load_case(load_scene(scene))
+    except InputError:
+        for path, old in before.items():
+            path.unlink(missing_ok=True) if old is None else write_text(path, old)
+        for place in made:
+            place.rmdir()
+        raise
+    return marker_lines(case)
+
+
+def marker_lines(case: Case) -> tuple[str, ...]:
+    """Return how well the markers fit, by both readings, and how far the knee centres are apart."""
+    found = case.motion.markers
+    if found is None:
+        return ()
+    lines = []
+    for method, words in (("segments", "rigid fits of shank and thigh"), ("chain", "the chain")):
+        rms = found.at(found.rms[method], case.motion.time) / MILLIMETRE  # type: ignore[index]
+        flexion = found.at(found.flexion[method], case.motion.time) / DEGREE  # type: ignore[index]
+        used = ", used" if found.method == method else ""
+        lines.append(
+            f"markers, {words}{used}: rms {np.nanmedian(rms):.1f} mm (at most {np.nanmax(rms):.1f})"
+            f", flexion {np.nanmin(flexion):.1f} to {np.nanmax(flexion):.1f} deg"
+        )
+    apart = found.at(found.centre_distance, case.motion.time) / MILLIMETRE
+    turned = found.at(found.flexion["segments"] - found.flexion["chain"], case.motion.time) / DEGREE
+    lines.append(
+        f"knee centres of shank and thigh markers: {np.nanmedian(apart):.1f} mm apart (at most "
+        f"{np.nanmax(apart):.1f}); flexions differ by at most {np.nanmax(np.abs(turned)):.1f} deg"
+    )
+    return tuple(lines)
+
+
+def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
+    """Return the factor on the model's masses, and a line on it."""
+    ratio = request.mass_kg / leg.model.mass_kg
+    scaled = abs(ratio - 1.0) > SAME_MASS if request.scale_mass is None else request.scale_mass
+    said = f"mass: the model's bodies sum to {leg.model.mass_kg:.2f} kg, the subject is "
+    said += f"{request.mass_kg:g} kg: "
+    if not 0.5 < ratio < 2.0:
+        raise InputError(
+            f"weighs {leg.model.mass_kg:.1f} kg, the subject {request.mass_kg:g} kg",
+            request.model,
+            "is --mass-kg in kilograms? else scale the model first",
+        )
+    return (ratio, said + f"scaled by {ratio:.4f}") if scaled else (1.0, said + "not scaled")
+
+
+def _leg_lines(leg: Leg) -> list[str]:
+    backwards = ", which runs backwards, from shank to thigh" if leg.knee.backwards else ""
+    return [
+        f"{leg.side} leg of '{leg.model.name}': knee '{leg.knee.name}'{backwards}, hip "
+        f"'{leg.hip.name}', ankle '{leg.ankle.name}'",
+        f"thigh = {', '.join(leg.femur)}; shank = {', '.join((*leg.tibia, *leg.foot))} (foot at "
+        "its neutral angles); patella = " + (leg.patella or "none"),
+    ]
+
+
+def _patella_line(links: Links) -> list[str]:
+    if links.patella is None:
+        return []
+    turn = links.patella[:3, :3]
+    names = ("anterior", "superior", "right")
+    axes = []
+    for k, axis in enumerate("xyz"):
+        j = int(np.argmax(np.abs(turn[k])))
+        axes.append(f"{axis} {'' if turn[k, j] > 0 else '-'}{names[j]}")
+    return [
+        f"patella's axes: {', '.join(axes)} (within {links.patella_error / DEGREE:.0f} deg at the "
+        "neutral pose); its mass is 0.1 kg, not the model's"
+    ]
+
+
+def _title(request: ImportRequest) -> tuple[str, ...]:
+    return (
+        f"The {request.side} knee of {request.model.name}, {request.recording.name}.",
+        "Written by `tkamb import`; what it inferred stands here as given. The recording and the",
+        "meshes are read where they lie.",
+    )
+
+
+def _notes(scale: float, ground: bool, own: bool, implant: bool) -> tuple[str, ...]:
+    notes = [
+        "Only the quadriceps acts: where hamstrings and gastrocnemius act too, the contact force "
+        "is too low and the quadriceps force is what the joint moment needs at least.",
+        "Shank and flexion come from skin markers; the columns marker_rms_*, flexion_* and "
+        "knee_centre_distance_mm say how far the skin has moved.",
+        "Foot and shank are one body with the ankle at its neutral angle.",
+    ]
+    if implant:
+        notes.append(
+            "Adduction, axial rotation, AP and ML of the femur are where contact, ligaments and "
+            "muscle line leave them; nobody recorded them."
+        )
+    if implant and not own:
+        notes.append("The ligaments are a generic set scaled to the implant, nobody's own.")
+    if scale != 1.0:
+        notes.append(f"Segment masses are the model's times {scale:.4f}.")
+    if not ground:
+        notes.append("No ground reaction: the shank hangs in the air.")
+    return tuple(notes)

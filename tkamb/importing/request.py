@@ -1,0 +1,47 @@
+"""What an import is asked for."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tkamb.importing.scene_text import Meshes
+
+
+@dataclass(frozen=True)
+class ImportRequest:
+    """What is to be imported; None: to be inferred, or not there.
+
+    Args:
+        model: the .osim file.
+        side: of the knee.
+        mass_kg: of the subject.
+        recording: .c3d or .trc; .mot or .sto of the model's coordinates.
+        grf: table of ground reactions, beside a .trc.
+        static: recording of a standing trial, from which the markers' places are calibrated.
+        meshes: the implant's.
+        knee: the femorotibial joint's name.
+        frames: part -> frame of its mesh.
+        plates: under the foot.
+        interval: s, the part of the recording.
+        laboratory_axes: the file's that point forward, up and right.
+        scale_mass: whether the model's masses are scaled to the subject's.
+        method: reading of the markers that is used.
+        cutoff_Hz: of markers and plates.
+        scene_name: of the scene file.
+    """
+
+    model: Path
+    side: str
+    mass_kg: float
+    recording: Path
+    grf: Path | None = None
+    static: Path | None = None
+    meshes: Meshes | None = None
+    knee: str | None = None
+    frames: dict[str, str | None] = field(default_factory=dict)
+    plates: tuple[int, ...] | None = None
+    interval: tuple[float, float] | None = None
+    laboratory_axes: str | None = None
+    scale_mass: bool | None = None
+    method: str = "segments"
+    cutoff_Hz: float = 6.0
+    scene_name: str = "scene.toml"

@@ -1,0 +1,276 @@
+"""The scene file that an import writes: TOML with what was inferred, as given."""
+
+import json
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from tkamb.geometry.frames import Array
+from tkamb.importing.links import Links
+from tkamb.importing.markers import ModelSegment
+from tkamb.importing.model_motion import MOTION_FILE, motion_tables
+from tkamb.importing.soft_tissue import End, SoftTissue
+from tkamb.units import DEGREE
+
+
+@dataclass(frozen=True)
+class Meshes:
+    """The implant's files, their unit and axes."""
+
+    femoral: Path
+    insert: Path
+    patella: Path | None
+    unit: str
+    axes: str
+
+
+@dataclass(frozen=True, eq=False)
+class GroundFile:
+    """Where the ground reaction stands: plates of a C3D file, or columns of a table."""
+
+    path: Path
+    axes: str
+    plates: tuple[int, ...] = ()
+    columns: tuple[tuple[str, str], ...] = ()
+    length_unit: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerFile:
+    """A recording of markers and how they are read."""
+
+    path: Path
+    axes: str
+    segments: tuple[ModelSegment, ...]
+    method: str
+    knee: str
+    interval: tuple[float, float] | None
+    frames: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SceneText:
+    """Everything that the scene says.
+
+    Args:
+        title: comment lines at the top.
+        folder: where the scene will stand; paths are relative to it.
+        side: of the knee.
+        mass_kg: of the subject.
+        urdf: name of the URDF beside the scene.
+        cutoff_Hz: of markers and plates.
+        links: of the leg.
+        markers: the recording; None: the model's own coordinates, in `motion.csv`.
+        ground: the ground reaction; None without.
+        meshes: the implant; None without.
+        tissue: muscles and ligaments.
+        notes: for the report.
+    """
+
+    title: tuple[str, ...]
+    folder: Path
+    side: str
+    mass_kg: float
+    urdf: str
+    cutoff_Hz: float
+    links: Links
+    markers: MarkerFile | None
+    ground: GroundFile | None
+    meshes: Meshes | None
+    tissue: SoftTissue
+    notes: tuple[str, ...]
+
+    def text(self) -> str:
+        """Return the TOML."""
+        tables = [
+            [f"# {line}" for line in self.title],
+            self._patient(),
+            self._motion(),
+            *(_segment(s) for s in (self.markers.segments if self.markers else ())),
+            self._ground(),
+            *self._implant(),
+            self._muscles(),
+            self._ligaments(),
+            self._contact(),
+            self._output(),
+        ]
+        return "\n\n".join("\n".join(lines) for lines in tables if lines) + "\n"
+
+    def _path(self, path: Path) -> str:
+        return _text(Path(os.path.relpath(path.absolute(), self.folder.absolute())).as_posix())
+
+    def _patient(self) -> list[str]:
+        return [
+            "[patient]",
+            f"urdf = {_text(self.urdf)}",
+            f'side = "{self.side}"',
+            f"mass_kg = {self.mass_kg:g}",
+        ]
+
+    def _motion(self) -> list[str]:
+        m, neutral = self.markers, self.links.neutral
+        if m is None:
+            head = ["[motion]", f'file = "{MOTION_FILE}"', 'interpretation = "coordinates"']
+            head += ['angle_unit = "deg"', 'length_unit = "mm"', f"cutoff_Hz = {self.cutoff_Hz:g}"]
+            return [*head, "", *motion_tables(self.meshes is not None)]
+        lines = ["[motion]", f"file = {self._path(m.path)}", 'interpretation = "markers"']
+        lines.append(f"cutoff_Hz = {self.cutoff_Hz:g}")
+        if m.interval:
+            lines.append("# the part in which all that the foot stands on was measured, own clock")
+            lines.append(f"interval_s = [{m.interval[0]:.9f}, {m.interval[1]:.9f}]")
+        if m.frames:
+            lines.append(
+                "# every so many frames of the recording: five times the cut-off is enough"
+            )
+            lines.append(f"frames = {m.frames}")
+        coordinates = ["flexion"] if self.meshes else _ALL
+        lines += [
+            "",
+            "[motion.markers]",
+            f'method = "{m.method}"  # "segments": shank and thigh each by itself; or "chain"',
+            f'knee = "{m.knee}"',
+            f"coordinates = {json.dumps(coordinates)}",
+            "# where the model keeps the straight knee",
+            f"neutral_mm = {_mm(neutral[:3])}",
+            f"neutral_deg = {_numbers(neutral[3:5] / DEGREE)}",
+            f'laboratory_axes = "{m.axes}"',
+        ]
+        return lines
+
+    def _ground(self) -> list[str]:
+        g = self.ground
+        if g is None:
+            return []
+        lines = ["[ground_reaction]", f"file = {self._path(g.path)}"]
+        lines += [f"plates = {list(g.plates)}"] if g.plates else []
+        lines += [f'length_unit = "{g.length_unit}"'] if g.length_unit else []
+        lines += [
+            f'laboratory_axes = "{g.axes}"',
+            f"cutoff_Hz = {self.cutoff_Hz:g}",
+            "unloaded_N = 40.0",
+        ]
+        if g.columns:
+            lines += ["", "[ground_reaction.columns]"]
+            lines += [f"{role} = {_text(column)}" for role, column in g.columns]
+        return lines
+
+    def _implant(self) -> list[list[str]]:
+        m = self.meshes
+        if m is None:
+            return []
+        parts: list[list[str]] = []
+        for name, path in (("femoral", m.femoral), ("insert", m.insert), ("patella", m.patella)):
+            if path is None:
+                continue
+            lines = [f"[implant.{name}]", f"mesh = {self._path(path)}", f'unit = "{m.unit}"']
+            lines.append(f'axes = "{m.axes}"')
+            if name == "insert":
+                lines.append('bearing = "fixed"')
+            if name == "patella":
+                lines += _button(self.links.button_in_patella)
+            parts.append(lines)
+        return parts
+
+    def _muscles(self) -> list[str]:
+        t = self.tissue
+        if not self._with_patella:
+            return []
+        assert t.quadriceps is not None and t.patellar_ligament is not None
+        return [
+            "[quadriceps]",
+            _end("origin", t.quadriceps[0]),
+            _end("insertion", t.quadriceps[1]),
+            "",
+            "[patellar_ligament]",
+            _end("proximal", t.patellar_ligament[0]),
+            _end("distal", t.patellar_ligament[1]),
+            f"length_mm = {t.ligament_length * 1e3:.3f}",
+            "",
+            "[patella]",
+            'motion = "solved"',
+        ]
+
+    @property
+    def _with_patella(self) -> bool:
+        t, m = self.tissue, self.meshes
+        return bool(m and m.patella and t.quadriceps and t.patellar_ligament)
+
+    def _ligaments(self) -> list[str]:
+        if self.tissue.bundles:
+            lines: list[str] = []
+            for b in self.tissue.bundles:
+                lines += ["", "[[ligament]]", f"name = {_text(b.name)}", 'law = "quadratic-toe"']
+                lines += [_end("proximal", b.proximal), _end("distal", b.distal)]
+                lines.append(f"stiffness_N_per_strain = {b.stiffness_N:g}")
+                lines.append(f"slack_length_mm = {b.slack_length_m * 1e3:.4f}")
+            return lines[1:]
+        if self.meshes is None:
+            return []
+        return [
+            "# The model has none: a generic set, nobody's, scaled to the implant.",
+            "[generic_ligaments]",
+            'ligaments = ["MCL", "LCL", "PCL"]',
+        ]
+
+    def _contact(self) -> list[str]:
+        if self.meshes is None:
+            return []
+        return [
+            "[contact]",
+            'model = "foundation"',
+            "resolution_mm = 1.0",
+            'material = "polyethylene"',
+            "# nobody recorded these: contact, ligaments and muscle line find them",
+            'released = ["adduction", "axial_rotation", "ap", "ml"]',
+        ]
+
+    def _output(self) -> list[str]:
+        lines = ["[output]", 'axis = "time"', "notes = ["]
+        return [*lines, *(f"    {_text(note)}," for note in self.notes), "]"]
+
+
+_ALL = ["flexion", "adduction", "axial_rotation", "ap", "si", "ml"]
+
+
+def _segment(segment: ModelSegment) -> list[str]:
+    lines = ["[[motion.markers.segment]]", f'name = "{segment.name}"']
+    if segment.joint is not None and segment.centre is not None:
+        lines += [
+            f'joined_to = "{segment.joined_to}"',
+            f"joint_mm = {_mm(segment.joint)}",
+            f"centre_mm = {_mm(segment.centre)}",
+        ]
+    points = [f"{_key(name)} = {_mm(point)}" for name, point in segment.points.items()]
+    return [*lines, f"markers_mm = {{ {', '.join(points)} }}"]
+
+
+def _button(in_patella: Array | None) -> list[str]:
+    from scipy.spatial.transform import Rotation
+
+    if in_patella is None:
+        return []
+    angles = Rotation.from_matrix(in_patella[:3, :3]).as_euler("XYZ") / DEGREE
+    return [f"position_mm = {_mm(in_patella[:3, 3])}", f"rotation_deg = {_numbers(angles)}"]
+
+
+def _end(key: str, end: End) -> str:
+    return f"{key} = {{ link = {_text(end.link)}, point_mm = {_mm(end.point)} }}"
+
+
+def _key(label: str) -> str:
+    """Return a marker's label without the subject's prefix, quoted where TOML wants it."""
+    plain = label.rpartition(":")[2]
+    return plain if re.fullmatch(r"[A-Za-z0-9_-]+", plain) else _text(plain)
+
+
+def _text(value: str) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _mm(point: Array) -> str:
+    return _numbers(point * 1e3)
+
+
+def _numbers(values: Array) -> str:
+    return "[" + ", ".join(f"{round(float(v), 3) + 0.0:.3f}" for v in values) + "]"

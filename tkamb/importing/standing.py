@@ -1,0 +1,93 @@
+"""Markers put where a standing trial has them."""
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from tkamb.geometry.frames import MIRROR, Array, inverse, mirrored_pose, transform
+from tkamb.importing.markers import ModelSegment, facing, segments_of
+from tkamb.importing.scene_text import SceneText
+from tkamb.inputs.labels import matched_labels, plain_label
+from tkamb.inputs.leg_chain import LegChain
+from tkamb.inputs.marker_motion import both_fits, leg_segments, neutral_coordinates
+from tkamb.inputs.tables import read_table
+from tkamb.scene import Scene
+from tkamb.scene_tables import MarkersTable
+
+
+def with_static_markers(
+    scene: SceneText, static: Path, segments: list[ModelSegment]
+) -> tuple[SceneText, str]:
+    """Return the scene with its markers where they sit in a standing trial, and a line on it."""
+    assert scene.markers is not None
+    known = Scene.model_validate(tomllib.loads(scene.text())).motion.markers
+    assert known is not None
+    own = facing(segments_of(static, segments), read_table(static)).axes
+    known = known.model_copy(update={"laboratory_axes": own})
+    side: Literal["right", "left"] = "left" if scene.side == "left" else "right"
+    insert = scene.links.insert_in_tibia
+    if side == "left":
+        insert = mirrored_pose(insert)
+    places = calibrated_markers(known, static, side, insert)
+    moved, farthest = [], 0.0
+    for segment in segments:
+        there = {plain_label(k): v for k, v in places[segment.name].items()}
+        points = {k: there.get(plain_label(k), v) for k, v in segment.points.items()}
+        shifts = [np.linalg.norm(points[k] - v) for k, v in segment.points.items()]
+        farthest = max(farthest, float(np.max(shifts)))
+        moved.append(replace(segment, points=points))
+    markers = replace(scene.markers, segments=tuple(moved))
+    line = (
+        f"markers' places are those of the standing trial {static.name}, at most "
+        f"{farthest * 1e3:.1f} mm from the model's"
+    )
+    return replace(scene, markers=markers), line
+
+
+def calibrated_markers(
+    table: MarkersTable,
+    file: Path,
+    side: Literal["right", "left"],
+    pose_insert_in_tibia: Array,
+) -> dict[str, dict[str, Array]]:
+    """Return where the markers sit on a subject who stands: segment -> marker -> (3,) m.
+
+    The chain is fitted to the standing trial with the markers as the table has them; each
+    marker's mean place in its fitted segment is its calibrated one. So the chain decides how
+    the bones stand, and the markers follow.
+
+    Args:
+        table: markers and joints; those that the trial does not hold are left as they are.
+        file: the standing trial.
+        side: of the leg.
+        pose_insert_in_tibia: (4, 4), of the (mirrored) patient.
+
+    Raises:
+        InputError: the trial cannot be read, or its markers do not fit.
+    """
+    recorded = read_table(file)
+    labels = [column[:-2] for column in recorded.columns if column.endswith("_x")]
+    there = [
+        own.model_copy(
+            update={
+                "markers_mm": {
+                    k: v for k, v in own.markers_mm.items() if matched_labels([k], labels)
+                }
+            }
+        )
+        for own in table.segment
+    ]
+    table = table.model_copy(update={"segment": tuple(there)})
+    segments, measured = leg_segments(table, recorded, None, side)
+    chain = LegChain(segments, pose_insert_in_tibia, table.knee == "free")
+    neutral = neutral_coordinates(table, side)
+    _, whole = both_fits(chain, segments, measured, neutral, recorded)
+    mirror = MIRROR if side == "left" else np.eye(3)
+    found = {}
+    for name, poses in chain.poses(whole.state).items():
+        own_axes = np.nanmean(transform(inverse(poses), measured[name]), axis=0) @ mirror
+        found[name] = dict(zip(chain.segments[name].labels, own_axes, strict=True))
+    return found

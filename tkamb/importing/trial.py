@@ -1,0 +1,208 @@
+"""A trial: markers or coordinates, which way the subject faces, which plates bear the foot."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.importing.anatomy import OTHER, Leg
+from tkamb.importing.links import Links
+from tkamb.importing.markers import Facing, ModelSegment, facing, feet, model_segments
+from tkamb.importing.model_motion import MOTION_FILE, ModelMotion, model_motion
+from tkamb.importing.plates import Load, known_interval, own_plates, plate_loads, unmeasured
+from tkamb.importing.request import ImportRequest
+from tkamb.importing.scene_text import GroundFile, MarkerFile
+from tkamb.inputs.c3d import Recording, read_c3d
+from tkamb.inputs.tables import Table, read_table
+
+FRAMES_PER_CUTOFF = 5.0
+"""Frames per period of the cut-off: what is low-passed holds nothing between them."""
+
+ON_A_STEP = 0.15
+"""m; the middle of a foot's markers is some 50 mm above what it stands on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What a recording gives: markers or coordinates, ground reaction, and lines on them."""
+
+    markers: MarkerFile | None
+    motion: ModelMotion | None
+    ground: GroundFile | None
+    said: tuple[str, ...]
+
+
+def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> Trial:
+    """Return a recording of markers: C3D with its plates, or markers and a table of forces.
+
+    Raises:
+        InputError: markers, plates or interval that cannot be used.
+    """
+    segments = model_segments(links, recorded)
+    seen = _facing(request, segments, recorded)
+    ground, interval, stood = _ground(request, leg, recorded, seen.axes)
+    interval, frames, thinned = _thinned(recorded.time(), interval, request.cutoff_Hz)
+    markers = MarkerFile(
+        request.recording, seen.axes, tuple(segments), request.method, "hinge", interval, frames
+    )
+    matched = [_segment_line(segment) for segment in segments]
+    said = (*matched, _facing_line(request, seen), *stood, thinned)
+    return Trial(markers, None, ground, said)
+
+
+def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> Trial:
+    """Return a motion in the model's own coordinates.
+
+    Raises:
+        InputError: no flexion of the knee in it, or a ground reaction of no foot.
+    """
+    motion = model_motion(links, recorded)
+    said = [f"motion: the model's coordinates in {recorded.path.name}, into {MOTION_FILE}"]
+    if motion.missing:
+        said.append(f"not in the motion, so at their defaults: {', '.join(motion.missing)}")
+    ground = None
+    if request.grf is not None:
+        ground, line = _table_ground(request.grf, leg.side, "+x,+y,+z")
+        said.append(line + "; laboratory: the model's ground, x forward, y up")
+    else:
+        said.append("no ground reaction given: none is modelled")
+    return Trial(None, motion, ground, tuple(said))
+
+
+def _facing(request: ImportRequest, segments: list[ModelSegment], recorded: Table) -> Facing:
+    if request.laboratory_axes is not None:
+        return Facing(request.laboratory_axes, np.nan, np.nan)
+    return facing(segments, recorded)
+
+
+def _facing_line(request: ImportRequest, seen: Facing) -> str:
+    line = f"laboratory: forward, up, right are the file's {seen.axes}"
+    if request.laboratory_axes is not None:
+        return line + ", as given"
+    return line + (
+        f" (the subject faces {seen.forward_deg:.0f} deg off that axis and leans by "
+        f"{seen.up_deg:.0f} deg, on average)"
+    )
+
+
+def _segment_line(segment: ModelSegment) -> str:
+    missing = f"; not recorded: {', '.join(segment.missing)}" if segment.missing else ""
+    return f"markers of the {segment.name}: {', '.join(segment.points)}{missing}"
+
+
+def _ground(
+    request: ImportRequest, leg: Leg, recorded: Table, axes: str
+) -> tuple[GroundFile | None, tuple[float, float] | None, list[str]]:
+    """Return the ground reaction, the interval in which it is known, and lines on both."""
+    if request.recording.suffix.lower() != ".c3d":
+        if request.grf is None:
+            return None, request.interval, ["no ground reaction given: none is modelled"]
+        ground, line = _table_ground(request.grf, leg.side, axes)
+        return ground, request.interval, [line]
+    recording = read_c3d(request.recording)
+    if not recording.plates:
+        raise InputError(
+            "holds no force plates", request.recording, "give the ground reaction with --grf"
+        )
+    sides = feet(leg, recorded, OTHER[leg.side])
+    if request.plates is not None:
+        return (
+            GroundFile(request.recording, axes, request.plates),
+            request.interval,
+            [f"force plates {_listed(request.plates)} under the {leg.side} foot, as given"],
+        )
+    loads = plate_loads(recording, axes, sides)
+    plates = own_plates(loads, leg.side, recording)
+    interval = request.interval or known_interval(loads, plates, recording)
+    lines = [*(_load_line(load) for load in loads), _interval_line(request, interval)]
+    lines += _unmeasured_line(loads, plates, recording, sides[leg.side], interval)
+    return GroundFile(request.recording, axes, plates), interval, lines
+
+
+def _thinned(
+    time: Array, interval: tuple[float, float] | None, cutoff_Hz: float
+) -> tuple[tuple[float, float], int | None, str]:
+    """Return interval and number of frames at about five times the cut-off, and a line on it.
+
+    The frames are every k-th of the recording, at its own times.
+    """
+    start, end = interval or (float(time[0]), float(time[-1]))
+    inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
+    if len(inside) < 2:
+        raise InputError(
+            f"has no two frames between {start:g} and {end:g} s", "--interval", "choose another"
+        )
+    rate = 1.0 / float(np.median(np.diff(inside)))
+    every = max(int(rate / (FRAMES_PER_CUTOFF * cutoff_Hz) + 1e-9), 1)
+    count = (len(inside) - 1) // every + 1
+    even = np.ptp(np.diff(inside)) < 1e-6
+    if every == 1 or not even or count < 8:
+        return (float(inside[0]), float(inside[-1])), None, f"frames: all {len(inside)}"
+    last = float(inside[(count - 1) * every])
+    line = f"frames: every {every}th of the recording, {count} at {rate / every:g} Hz"
+    return (float(inside[0]), last), count, line
+
+
+def _load_line(load: Load) -> str:
+    other = "" if np.isnan(load.other) else f", {load.other * 1e3:.0f} mm from the other's"
+    step = (
+        f"; the foot is {load.height * 1e3:.0f} mm above it: a step stands on the plate, whose "
+        "wrench is taken as it is, with its point at the plate's level"
+        if load.height > ON_A_STEP
+        else ""
+    )
+    return (
+        f"force plate {load.plate}: {load.side} foot from {load.start:.3f} to {load.end:.3f} s "
+        f"(centre of pressure {load.distance * 1e3:.0f} mm from that foot's markers{other}){step}"
+    )
+
+
+def _interval_line(request: ImportRequest, interval: tuple[float, float]) -> str:
+    why = "as given" if request.interval else "from the first to the last load on these plates"
+    return f"interval: {interval[0]:.4f} to {interval[1]:.4f} s of the recording's clock, {why}"
+
+
+def _unmeasured_line(
+    loads: list[Load],
+    plates: tuple[int, ...],
+    recording: Recording,
+    labels: list[str],
+    interval: tuple[float, float],
+) -> list[str]:
+    times = unmeasured(loads, plates, recording, labels, interval)
+    if not len(times):
+        return []
+    return [
+        f"ATTENTION: off its plates the foot is nearly still in {len(times)} frames, first at "
+        f"{times[0]:.3f} s: does it stand on something that was not measured?"
+    ]
+
+
+def _table_ground(path: Path, side: str, axes: str) -> tuple[GroundFile, str]:
+    """Return the columns of one foot's ground reaction in a table of OpenSim's style."""
+    table = read_table(path)
+    stems = [n[:-2] for n in table.columns if n.endswith("vy") and f"{n[:-2]}vx" in table.columns]
+    own = [s for s in stems if re.search(rf"(^|_){side[0]}(_|$)|{side}", s.lower())]
+    if len(own) != 1:
+        raise InputError(
+            f"does not say which force is the {side} foot's (it has {', '.join(stems) or 'none'})",
+            path,
+            f"name its columns after the foot, like ground_force_{side[0]}_vx",
+        )
+    stem = own[0]
+    columns = [("time", "time")]
+    columns += [(f"force_{k}", f"{stem}v{a}") for k, a in enumerate("xyz", 1)]
+    columns += [(f"point_{k}", f"{stem}p{a}") for k, a in enumerate("xyz", 1)]
+    torque = stem.replace("force", "torque").rstrip("_")
+    found = [f"{torque}_{a}" for a in "xyz"]
+    if all(name in table.columns for name in found):
+        columns += [(f"moment_{k}", name) for k, name in enumerate(found, 1)]
+    ground = GroundFile(path, axes, (), tuple(columns), "m")
+    return ground, f"ground reaction: columns {stem}v*, {stem}p* of {path.name}, m"
+
+
+def _listed(numbers: tuple[int, ...]) -> str:
+    return ", ".join(map(str, numbers))

@@ -1,0 +1,154 @@
+"""Inverse kinematics: where a chain of segments brings its markers closest to those seen.
+
+Per frame, with measured markers p_m, weights w_m (zero for a marker that is missing) and the
+chain's markers x_m(q),
+
+    min_q  sum_m w_m |x_m(q) - p_m|²
+
+by Gauss-Newton with Levenberg's damping and analytic Jacobians. Frames are independent of each
+other and solved all at once: every array has the frames as its first axis. Bounds are not
+imposed: a coordinate that wants to leave its range is a finding.
+
+Reference: Lu & O'Connor, J Biomech 32:129 (1999), doi:10.1016/S0021-9290(98)00158-4.
+"""
+
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.geometry.frames import Array
+
+SETTLED = 1e-6
+"""Step (m and rad) below which a frame is solved."""
+MOST_STEPS = 60
+
+State = TypeVar("State")
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """The least squares of f frames, linearised where they stand.
+
+    Args:
+        cost: (f,) m², sum of weighted squared distances.
+        matrix: (f, n, n) Jᵀ W J.
+        right: (f, n) Jᵀ W (p - x).
+    """
+
+    cost: Array
+    matrix: Array
+    right: Array
+
+    def replaced(self, frames: Index, part: "NormalEquations") -> "NormalEquations":
+        """Return the equations with some frames as in `part`."""
+        return NormalEquations(
+            put(self.cost, frames, part.cost),
+            put(self.matrix, frames, part.matrix),
+            put(self.right, frames, part.right),
+        )
+
+
+class MarkerChain(Protocol[State]):
+    """What the least squares need of a chain with n freedoms and m markers."""
+
+    def places(self, state: State) -> Array:
+        """Return the markers (f, m, 3) m."""
+
+    def normal(self, state: State, target: Array, weights: Array) -> NormalEquations:
+        """Return the least squares to markers (f, m, 3) m with weights (f, m)."""
+
+    def moved(self, state: State, step: Array) -> State:
+        """Return the state after a step (f, n)."""
+
+    def chosen(self, state: State, frames: Index) -> State:
+        """Return the state of some frames."""
+
+    def replaced(self, state: State, frames: Index, part: State) -> State:
+        """Return the state with some frames as in `part`."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChainFit(Generic[State]):
+    """A chain fitted to markers.
+
+    Args:
+        state: where it stands.
+        rms: (f,) m, over the markers that were seen; NaN where none was.
+        distance: (f, m) m, of each marker; NaN where missing.
+        solved: (f,) whether the last step was below `SETTLED`.
+        steps: of the iteration.
+    """
+
+    state: State
+    rms: Array
+    distance: Array
+    solved: np.ndarray
+    steps: int
+
+
+def fit_chain(
+    chain: MarkerChain[State], measured: Array, weights: Array, start: State
+) -> ChainFit[State]:
+    """Return the weighted least-squares fit of a chain, all frames at once.
+
+    Args:
+        chain: the chain.
+        measured: (f, m, 3) m, gaps NaN.
+        weights: (m,) of the squared distances.
+        start: where the iteration begins.
+    """
+    seen = np.isfinite(measured).all(axis=2)
+    target, each = np.nan_to_num(measured), np.where(seen, weights, 0.0)
+    damping = np.full(len(measured), 1e-6)
+    left, steps = np.arange(len(measured)), 0
+    state, here = start, chain.normal(start, target, each)
+    while steps < MOST_STEPS and len(left):
+        step = _step(here, left, damping[left])
+        trial = chain.moved(chain.chosen(state, left), step)
+        there = chain.normal(trial, target[left], each[left])
+        # a frame that would get worse stays where it is
+        better = there.cost <= here.cost[left] * (1.0 + 1e-12) + 1e-24
+        taken, kept = left[better], np.flatnonzero(better)
+        state = chain.replaced(state, taken, chain.chosen(trial, kept))
+        part = NormalEquations(there.cost[kept], there.matrix[kept], there.right[kept])
+        here = here.replaced(taken, part)
+        damping[left] = np.clip(damping[left] * np.where(better, 0.1, 10.0), 1e-12, 1e6)
+        left = left[np.abs(step).max(axis=1) >= SETTLED]
+        steps += 1
+    distance = np.where(seen, np.linalg.norm(chain.places(state) - target, axis=2), np.nan)
+    count = seen.sum(axis=1)
+    rms = np.sqrt(np.nansum(distance**2, axis=1) / np.maximum(count, 1))
+    solved = np.ones(len(measured), np.bool_)
+    solved[left] = False
+    return ChainFit(state, np.where(count > 0, rms, np.nan), distance, solved, steps)
+
+
+def _step(equations: NormalEquations, frames: Index, damping: Array) -> Array:
+    """Return the damped Gauss-Newton steps (f, n) of some frames."""
+    matrix = equations.matrix[frames].copy()
+    diagonal = np.einsum("fii->fi", matrix)
+    # the floor keeps what no marker sees where it is
+    floor = 1e-9 * diagonal.max(axis=1, keepdims=True, initial=1e-12)
+    each = np.arange(matrix.shape[1])
+    matrix[:, each, each] += damping[:, None] * diagonal + floor
+    return np.asarray(np.linalg.solve(matrix, equations.right[frames][:, :, None])[:, :, 0])
+
+
+def put(values: Array, frames: Index, part: Array) -> Array:
+    """Return values with some frames as in `part`."""
+    result = values.copy()
+    result[frames] = part
+    return result
+
+
+def skew(vectors: Array) -> Array:
+    """Return the matrices (..., 3, 3) of a ↦ v × a for vectors v (..., 3)."""
+    result = np.zeros((*vectors.shape, 3))
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    result[..., 0, 1], result[..., 0, 2] = -z, y
+    result[..., 1, 0], result[..., 1, 2] = z, -x
+    result[..., 2, 0], result[..., 2, 1] = -y, x
+    return result

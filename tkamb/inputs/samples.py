@@ -1,0 +1,138 @@
+"""Samples that cannot be, and samples that do not fit their neighbours: typing mistakes, mostly.
+
+A sample is odd where it lies off the cubic through its two neighbours on either side by more
+than `floor` and by more than many times what the samples around it do. Noise of any level is
+no oddity: the neighbourhood is the measure, by its median, which the odd sample cannot move.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+
+AROUND = 12
+"""Samples on either side that show what is usual."""
+MANY_TIMES = 8.0
+"""Of the usual: normal noise reaches it once in 10 million samples."""
+SLOWEST = 5.0
+"""s: samples farther apart than this are no record of a movement."""
+AT_THE_ENDS = 4.0
+"""A cubic carried on by one sample errs by so much more than one between samples."""
+
+
+@dataclass(frozen=True)
+class OddSample:
+    """A sample off its neighbours' curve.
+
+    Args:
+        path: of the file.
+        what: the quantity, like "flexion".
+        time: s.
+        away: by how much, in `unit`.
+        unit: for the reader.
+    """
+
+    path: Path
+    what: str
+    time: float
+    away: float
+    unit: str
+
+
+def odd_samples(
+    path: Path, what: str, time: Array, values: Array, floor: float, scale: float, unit: str
+) -> tuple[OddSample, ...]:
+    """Return the odd samples of one quantity.
+
+    Args:
+        path: of the file, for the reader.
+        what: the quantity, for the reader.
+        time: (n,) s, rising.
+        values: (n,) SI.
+        floor: SI; what is nearer to the curve is never odd.
+        scale: SI per `unit`.
+        unit: for the reader.
+    """
+    if len(time) < 6:
+        return ()
+    away = np.abs(values - neighbours_curve(time, values))
+    ends = np.ones(len(time))
+    ends[[0, 1, -2, -1]] = AT_THE_ENDS
+    limit = np.maximum(floor, MANY_TIMES * _usual(away / ends)) * ends
+    # An odd sample bends the curve of the four around it by two thirds and a sixth of itself.
+    odd = [k for k in np.flatnonzero(away > limit) if away[k] >= away[max(k - 2, 0) : k + 3].max()]
+    return tuple(OddSample(path, what, float(time[k]), float(away[k] / scale), unit) for k in odd)
+
+
+def neighbours_curve(time: Array, values: Array) -> Array:
+    """Return at each sample the cubic (n,) through the four nearest others, at most two a side."""
+    n = len(time)
+    first = np.clip(np.arange(n) - 2, 0, n - 5)
+    others = first[:, None] + np.arange(5)
+    others = others[others != np.arange(n)[:, None]].reshape(n, 4)
+    t, here = time[others], time[:, None]
+    weights = np.ones((n, 4))
+    for i in range(4):
+        for j in range(4):
+            if i != j:
+                weights[:, i] *= (here[:, 0] - t[:, j]) / (t[:, i] - t[:, j])
+    return np.asarray((weights * values[others]).sum(axis=1))
+
+
+def _usual(away: Array) -> Array:
+    """Return the running median (n,) of the distances around each sample."""
+    width = min(2 * AROUND + 1, len(away))
+    windows = np.lib.stride_tricks.sliding_window_view(away, width)
+    start = np.clip(np.arange(len(away)) - width // 2, 0, len(windows) - 1)
+    return np.asarray(np.median(windows, axis=1)[start])
+
+
+def check_spacing(path: Path, time: Array) -> None:
+    """Raise an InputError where the samples at (n,) s are too far apart to be a movement."""
+    spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if spacing > SLOWEST:
+        raise InputError(
+            f"samples are {spacing:g} s apart, too far to be a movement",
+            path,
+            "is the time in seconds?",
+        )
+
+
+def check_steps(
+    path: Path, what: str, time: Array, values: Array, fastest: float, scale: float, unit: str
+) -> None:
+    """Raise an InputError where a quantity (n,) changes faster than `fastest` (SI per second)."""
+    if len(time) < 2:
+        return
+    rate = np.abs(np.diff(values)) / np.diff(time)
+    k = int(np.argmax(rate))
+    if rate[k] > fastest:
+        raise InputError(
+            f"{what} steps from {values[k] / scale:.4g} to {values[k + 1] / scale:.4g} {unit} "
+            f"between {time[k]:g} and {time[k + 1]:g} s, which nobody does",
+            path,
+            "is a cell mistyped, or the time not in seconds?",
+        )
+
+
+def check_range(
+    path: Path, what: str, values: Array, limits: tuple[float, float], unit: str, question: str
+) -> None:
+    """Raise an InputError where values (n,) leave `limits`, all in `unit`.
+
+    `what` begins with the part of the body that does it, like "knee: flexion".
+    """
+    low, high = limits
+    outside: NDArray[np.bool_] = ~((values >= low) & (values <= high))
+    if outside.any():
+        body, _, quantity = what.partition(": ")
+        raise InputError(
+            f"{quantity} runs from {values.min():.4g} to {values.max():.4g} {unit}, which no "
+            f"{body} does ({low:g} to {high:g}; first in data row {int(np.argmax(outside)) + 1})",
+            path,
+            question,
+        )

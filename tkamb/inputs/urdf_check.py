@@ -1,0 +1,291 @@
+"""What a patient's URDF must be: parsed numbers, one tree, the exact knee chain, real bodies.
+
+Parsers of URDF drop what they do not know and fill in what is missing, silently: a misspelt
+attribute becomes zero, a joint without limits another type. Here each is an error.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from tkamb.errors import InputError, names_near
+from tkamb.geometry.frames import Array
+
+Axis = tuple[int, int, int]
+
+KNEE_JOINTS: dict[str, tuple[str, Axis]] = {
+    "knee_ap": ("prismatic", (1, 0, 0)),
+    "knee_si": ("prismatic", (0, 1, 0)),
+    "knee_ml": ("prismatic", (0, 0, 1)),
+    "knee_axial_rotation": ("revolute", (0, -1, 0)),
+    "knee_adduction": ("revolute", (-1, 0, 0)),
+    "knee_flexion": ("revolute", (0, 0, 1)),
+}
+"""Knee joints of a right knee, tibia to femur; a left one has (0 1 0) and (1 0 0) instead."""
+
+PATELLA_JOINTS: dict[str, tuple[str, Axis]] = {
+    "patella_ap": ("prismatic", (1, 0, 0)),
+    "patella_si": ("prismatic", (0, 1, 0)),
+    "patella_rotation": ("revolute", (0, 0, 1)),
+}
+
+CHAINS = (("tibia", KNEE_JOINTS, "femur"), ("femur", PATELLA_JOINTS, "patella"))
+"""Where each chain of joints begins and ends."""
+
+_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_ATTRIBUTES = {
+    "origin": {"xyz": 3, "rpy": 3},
+    "axis": {"xyz": 3},
+    "mass": {"value": 1},
+    "inertia": dict.fromkeys(_INERTIA, 1),
+    "limit": dict.fromkeys(("lower", "upper", "effort", "velocity"), 1),
+}
+"""Element -> attribute -> how many numbers it holds."""
+_CHILDREN = {
+    "joint": {"parent", "child", "origin", "axis", "limit", "calibration", "dynamics"}
+    | {"safety_controller", "mimic"},
+    "link": {"inertial", "visual", "collision"},
+    "inertial": {"origin", "mass", "inertia"},
+}
+_MANY = {"visual", "collision"}
+_ANKLE_JOINT = "ankle"
+_MOST_TURNS = 8.0 * np.pi
+"""rad: angles are below one turn; a larger number is in degrees."""
+
+
+def check_elements(robot: ElementTree.Element, path: Path) -> None:
+    """Raise an InputError where an element is misspelt, doubled or not numbers."""
+    for parent in (*robot.iter("joint"), *robot.iter("link"), *robot.iter("inertial")):
+        where = f"{path}: {parent.tag} '{parent.get('name', '')}'"
+        counts = Counter(child.tag for child in parent if isinstance(child.tag, str))
+        for tag, count in counts.items():
+            if tag not in _CHILDREN[parent.tag]:
+                near = names_near(tag, sorted(_CHILDREN[parent.tag]))
+                raise InputError(f"unknown element <{tag}>", where, near)
+            if count > 1 and tag not in _MANY:
+                raise InputError(f"has {count} elements <{tag}>", where, "keep one")
+        for child in parent:
+            if child.tag in _ATTRIBUTES:
+                _check_attributes(child, where)
+    names = Counter(str(joint.get("name")) for joint in robot.findall("joint"))
+    if twice := [name for name, count in names.items() if count > 1]:
+        raise InputError(f"has two joints '{twice[0]}'", path, "rename one")
+
+
+def _check_attributes(element: ElementTree.Element, where: str) -> None:
+    """Raise where a place, an axis or an inertia is misspelt or not numbers."""
+    known = _ATTRIBUTES[element.tag]
+    for key, text in element.attrib.items():
+        if key not in known:
+            raise InputError(
+                f"unknown attribute {key} of <{element.tag}>", where, names_near(key, known)
+            )
+        if not _finite(text, known[key]):
+            numbers = "a number" if known[key] == 1 else f"{known[key]} numbers"
+            raise InputError(f'<{element.tag} {key}="{text}"> is not {numbers}', where)
+        if key == "rpy" and np.abs(numbers_of(element, key)).max() > _MOST_TURNS:
+            mend = "rpy is in radians: is it in degrees?"
+            raise InputError(f'<origin rpy="{text}"> turns by several turns', where, mend)
+
+
+def _finite(text: str, count: int) -> bool:
+    try:
+        values = [float(part) for part in text.split()]
+    except ValueError:
+        return False
+    return len(values) == count and bool(np.isfinite(values).all())
+
+
+def numbers_of(element: ElementTree.Element | None, key: str, default: str = "0 0 0") -> Array:
+    """Return the numbers of an attribute."""
+    text = default if element is None else element.get(key, default)
+    return np.array([float(part) for part in text.split()])
+
+
+def check_links(robot: ElementTree.Element, path: Path, with_patella: bool) -> None:
+    """Raise an InputError unless the links are there that everything is measured from."""
+    links = [str(link.get("name")) for link in robot.findall("link")]
+    for name in ("tibia", "femur", "hip") + (("patella",) if with_patella else ()):
+        if name not in links:
+            raise InputError(f"has no link '{name}'", path, f"{names_near(name, links)} {_PAGE}")
+
+
+def check_tree(robot: ElementTree.Element, path: Path) -> None:
+    """Raise an InputError unless the joints make one tree of all the links."""
+    links = [str(link.get("name")) for link in robot.findall("link")]
+    parents: dict[str, str] = {}
+    for joint in robot.findall("joint"):
+        parent, child = ends_of(joint)
+        where = f"{path}: joint '{joint.get('name')}'"
+        for end in (parent, child):
+            if end not in links:
+                mend = f"add it, or {names_near(end, links)}"
+                raise InputError(f"names a link '{end}' that is not there", where, mend)
+        if child in parents:
+            raise InputError(f"link '{child}' hangs on a second joint", where, "keep one")
+        parents[child] = parent
+    if repeated := sorted({name for name in links if links.count(name) > 1}):
+        raise InputError(f"has two links '{repeated[0]}'", path, "rename one")
+    roots = [name for name in links if name not in parents]
+    if len(roots) != 1:
+        found = f"{len(roots)} roots ({', '.join(roots)})" if roots else "a loop and no root"
+        raise InputError(f"has {found}", path, "a leg is one tree: docs/patient.md")
+    for name in links:
+        place, steps = name, 0
+        while place in parents and steps <= len(links):
+            place, steps = parents[place], steps + 1
+        if place != roots[0]:
+            raise InputError(f"link '{name}' hangs in a loop", path, "a leg is one tree")
+
+
+def ends_of(joint: ElementTree.Element) -> tuple[str, str]:
+    """Return the names of a joint's parent and child."""
+    parent, child = joint.find("parent"), joint.find("child")
+    return (
+        "" if parent is None else parent.get("link", ""),
+        "" if child is None else child.get("link", ""),
+    )
+
+
+def check_chain(
+    robot: ElementTree.Element, path: Path, side: Literal["right", "left"], with_patella: bool
+) -> None:
+    """Raise an InputError unless the joints are those of docs/patient.md, exactly.
+
+    Type, axis, limits, order and identity origins of the six knee joints (and the patella's
+    three), links between them without mass, and nothing else that moves.
+
+    Args:
+        robot: a right leg, or a left one mirrored; a tree.
+        path: of the file, for messages.
+        side: as declared, for messages.
+        with_patella: whether the patella is needed; if not, it is checked where it is there.
+    """
+    joints = {str(joint.get("name")): joint for joint in robot.findall("joint")}
+    for start, wanted, end in CHAINS:
+        if end == "patella" and not with_patella and not set(wanted) & set(joints):
+            continue
+        for name in wanted:
+            if name not in joints:
+                near = f"{names_near(name, joints)} {_PAGE}"
+                raise InputError(f"has no joint '{name}'", path, near)
+        _check_axes(joints, wanted, path, side)
+        _check_order(robot, joints, list(wanted), (start, end), path)
+    known = [_ANKLE_JOINT, *KNEE_JOINTS, *PATELLA_JOINTS]
+    for name, joint in joints.items():
+        if joint.get("type") in ("revolute", "prismatic"):
+            _check_limit(joint, path)
+        if name not in known and joint.get("type") != "fixed":
+            raise InputError(
+                f"joint '{name}' is {joint.get('type')}",
+                path,
+                f"only ankle and knee move: make it fixed, or {names_near(name, known)}",
+            )
+
+
+_PAGE = "(docs/patient.md)"
+
+
+def _check_axes(
+    joints: dict[str, ElementTree.Element],
+    wanted: dict[str, tuple[str, Axis]],
+    path: Path,
+    side: str,
+) -> None:
+    """Raise unless each joint has its type, its axis and limits."""
+    axes = {name: numbers_of(joints[name].find("axis"), "xyz", "1 0 0") for name in wanted}
+    turned = [
+        name
+        for name, (kind, axis) in wanted.items()
+        if kind == "revolute" and np.allclose(axes[name], -np.array(axis), atol=1e-9)
+    ]
+    if {"knee_axial_rotation", "knee_adduction"} <= set(turned) and len(turned) == 2:
+        other = "left" if side == "right" else "right"
+        raise InputError(
+            f"its axes of knee_axial_rotation and knee_adduction are those of a {other} knee",
+            path,
+            f"is [patient] side = '{side}' right?",
+        )
+    for name, (kind, axis) in wanted.items():
+        joint = joints[name]
+        if joint.get("type") != kind or not np.allclose(axes[name], axis, atol=1e-9):
+            about = " ".join(f"{value:g}" for value in axes[name])
+            mirrored = "after mirroring " if side == "left" else ""
+            raise InputError(
+                f"joint '{name}' is {joint.get('type')} about {about}",
+                path,
+                f"{mirrored}it must be {kind} about {' '.join(map(str, axis))}",
+            )
+        if joint.find("mimic") is not None:
+            raise InputError(f"joint '{name}' mimics another", path, "take <mimic> out")
+
+
+def _check_limit(joint: ElementTree.Element, path: Path) -> None:
+    """Raise unless a joint states all its limits, in order; they bound nothing here."""
+    limit, name = joint.find("limit"), joint.get("name")
+    if limit is None or not {"lower", "upper", "effort", "velocity"} <= set(limit.keys()):
+        mend = "give lower, upper, effort and velocity"
+        raise InputError(f"joint '{name}' has no complete <limit>", path, mend)
+    low, high = (float(numbers_of(limit, key)[0]) for key in ("lower", "upper"))
+    if low >= high:
+        raise InputError(f"joint '{name}' has limits {low:g} to {high:g}", path, "exchange them")
+
+
+def _check_order(
+    robot: ElementTree.Element,
+    joints: dict[str, ElementTree.Element],
+    names: list[str],
+    between: tuple[str, str],
+    path: Path,
+) -> None:
+    """Raise unless the joints follow each other, at one place and without mass between them."""
+    masses = {str(link.get("name")): link.find("inertial/mass") for link in robot.findall("link")}
+    order = f"the order is {between[0]}, {', '.join(names)}, {between[1]}"
+    place = between[0]
+    for name in names:
+        parent, child = ends_of(joints[name])
+        if parent != place:
+            raise InputError(f"joint '{name}' hangs on '{parent}', not '{place}'", path, order)
+        place = child
+        origin = joints[name].find("origin")
+        moved = np.concatenate([numbers_of(origin, "xyz"), numbers_of(origin, "rpy")])
+        if name != names[0] and moved.any():
+            shown = " ".join(f"{value:g}" for value in moved)
+            mend = f"only '{names[0]}' is placed: give it the identity"
+            raise InputError(f"joint '{name}' has an origin {shown} in the chain", path, mend)
+        mass = masses.get(child)
+        if name != names[-1] and mass is not None and numbers_of(mass, "value", "0").any():
+            mend = "links inside the chain have none: put it on tibia or femur"
+            raise InputError(f"link '{child}' has a mass", path, mend)
+    if place != between[1]:
+        raise InputError(f"joint '{names[-1]}' leads to '{place}'", path, order)
+
+
+def check_inertia(link: ElementTree.Element, path: Path, needed: bool) -> None:
+    """Raise an InputError unless the mass is positive and the tensor is that of a real body."""
+    inertial = link.find("inertial")
+    if inertial is None:
+        return
+    where = f"{path}: link '{link.get('name')}'"
+    mass, tensor = inertial.find("mass"), inertial.find("inertia")
+    if mass is None or tensor is None or mass.get("value") is None:
+        raise InputError("has an incomplete <inertial>", where, "give <mass> and <inertia>")
+    if missing := [key for key in _INERTIA if tensor.get(key) is None]:
+        raise InputError(f"has no {', '.join(missing)}", where, "give all six terms of <inertia>")
+    kilograms = float(numbers_of(mass, "value")[0])
+    rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
+    matrix = np.array([[numbers_of(tensor, key)[0] for key in row] for row in rows])
+    if not needed and kilograms == 0 and not matrix.any():
+        return
+    principal = np.linalg.eigvalsh(matrix)
+    is_body = principal[0] > 0 and principal[2] <= (principal[0] + principal[1]) * (1 + 1e-9)
+    if not (kilograms > 0 and is_body):
+        moments = ", ".join(f"{p:.3g}" for p in principal)
+        raise InputError(
+            f"singular inertia: mass {kilograms:g} kg, principal moments {moments} kg·m²",
+            where,
+            "a body needs mass > 0 and moments > 0, none larger than the sum of the others",
+        )

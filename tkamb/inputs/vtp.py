@@ -1,0 +1,165 @@
+"""Triangles from VTK's XML PolyData (.vtp): text, base64 or raw, in place or appended.
+
+The format: VTK User's Guide, "VTK XML file formats". Arrays are preceded by their length in
+bytes, or, compressed by zlib, by the number and sizes of their blocks.
+"""
+
+import base64
+import re
+import zlib
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.errors import InputError
+from tkamb.files import MESH_LIMIT, parse_xml, read_bytes
+from tkamb.geometry.frames import Array
+
+Indices = NDArray[np.int64]
+
+_TYPES = {"Float32": "f4", "Float64": "f8"} | {
+    f"{sign}Int{bits}": f"{letter}{bits // 8}"
+    for sign, letter in (("", "i"), ("U", "u"))
+    for bits in (8, 16, 32, 64)
+}
+_AGAIN = "save it again as ASCII .vtp, .stl or .ply"
+_RAW = re.compile(rb"<AppendedData[^>]*encoding=[\"']raw[\"'][^>]*>\s*_")
+
+
+def read_vtp(path: str | Path) -> tuple[Array, Indices]:
+    """Return the points (n, 3) and triangles (k, 3) of a .vtp file, in file units.
+
+    Polygons of more than three corners become fans; vertices, lines and data are left out.
+
+    Raises:
+        InputError: no such file, not PolyData, cut short, strips, or another encoding.
+    """
+    content = read_bytes(path, MESH_LIMIT, what="mesh file")
+    try:
+        return _PolyData(content, path).triangles()
+    except (ValueError, KeyError, OverflowError, zlib.error) as error:  # base64's is a ValueError
+        reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise InputError(f"cannot be read as VTK PolyData ({reason})", path, _AGAIN) from None
+
+
+class _PolyData:
+    """The pieces of a file, and where its arrays are."""
+
+    def __init__(self, content: bytes, path: str | Path) -> None:
+        self._appended = b""
+        self._raw = False
+        if raw := _RAW.search(content):  # bytes that no XML parser takes
+            self._raw, self._appended = True, content[raw.end() :]
+            content = content[: raw.end() - 1] + b"</AppendedData></VTKFile>"
+        self._root = parse_xml(content, path, what="mesh file")
+        if self._root.tag != "VTKFile" or self._root.get("type") != "PolyData":
+            raise ValueError(f"it is {self._root.get('type') or self._root.tag}")
+        compressor = self._root.get("compressor")
+        if compressor not in (None, "vtkZLibDataCompressor"):
+            raise ValueError(f"compressed by {compressor}")
+        self._compressed = compressor is not None
+        self._order = ">" if self._root.get("byte_order") == "BigEndian" else "<"
+        header = self._root.get("header_type", "UInt32")
+        if header not in ("UInt32", "UInt64"):
+            raise ValueError(f"header type '{header}'")
+        self._header = np.dtype(self._order + _TYPES[header])
+        block = self._root.find("AppendedData")
+        if block is not None and not self._raw:
+            self._appended = "".join((block.text or "").split()).removeprefix("_").encode()
+
+    def triangles(self) -> tuple[Array, Indices]:
+        """Return points and triangles of all pieces."""
+        points, faces, start = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
+        for piece in self._root.iter("Piece"):
+            if int(piece.get("NumberOfStrips", 0)):
+                raise ValueError("it holds triangle strips")
+            if int(piece.get("NumberOfPoints", -1)) == 0:
+                continue
+            corners = self._array(piece.find("Points/DataArray"), "points").reshape(-1, 3)
+            if int(piece.get("NumberOfPoints", len(corners))) != len(corners):
+                raise ValueError("the number of points is not as announced")
+            if int(piece.get("NumberOfPolys", 0)):
+                faces.append(self._fans(piece, len(corners)) + start)
+            points.append(corners.astype(float))
+            start += len(corners)
+        return np.concatenate(points), np.concatenate(faces)
+
+    def _fans(self, piece: Element, points: int) -> Indices:
+        """Return the polygons of a piece as triangles (k, 3)."""
+        named = {array.get("Name"): array for array in piece.iterfind("Polys/DataArray")}
+        index = self._array(named["connectivity"], "connectivity").astype(np.int64)
+        ends = self._array(named["offsets"], "offsets").astype(np.int64)
+        if len(ends) != int(piece.get("NumberOfPolys", 0)):
+            raise ValueError("the number of polygons is not as announced")
+        starts = np.concatenate([[0], ends[:-1]])
+        if (ends < starts).any() or ends[-1] != len(index):
+            raise ValueError("offsets and connectivity do not agree")
+        if len(index) and not (index.min() >= 0 and index.max() < points):
+            raise ValueError("a polygon has a corner that is no point")
+        fans = np.maximum(ends - starts - 2, 0)
+        first = np.repeat(starts, fans)
+        step = np.arange(fans.sum()) - np.repeat(np.cumsum(fans) - fans, fans)
+        return np.stack([index[first], index[first + step + 1], index[first + step + 2]], axis=1)
+
+    def _array(self, array: Element | None, name: str) -> NDArray:
+        if array is None:
+            raise KeyError(name)
+        dtype = np.dtype(self._order + _TYPES[array.attrib["type"]])
+        form = array.get("format")
+        if form == "ascii":
+            return np.array((array.text or "").split(), dtype)
+        if form == "binary":
+            source = "".join((array.text or "").split()).encode()
+        elif form == "appended":
+            offset = int(array.attrib["offset"])
+            if not 0 <= offset < len(self._appended):
+                raise ValueError("it is cut short")
+            source = self._appended[offset:]
+        else:
+            raise ValueError(f"format '{form}'")
+        raw = form == "appended" and self._raw
+        return np.frombuffer(self._decoded(source, raw), dtype)
+
+    def _decoded(self, source: bytes, raw: bool) -> bytes:
+        """Return the bytes of an array after its header."""
+        size = self._header.itemsize
+        if not self._compressed:
+            header, rest = self._taken(source, size, raw)
+            return self._taken_joined(source, header, rest, raw)
+        header, _ = self._taken(source, size, raw)
+        count = int(np.frombuffer(header, self._header)[0])
+        header, rest = self._taken(source, (3 + count) * size, raw)
+        _, whole, last, *sizes = (int(n) for n in np.frombuffer(header, self._header))
+        if count == 0:
+            return b""
+        if whole * (count - 1) + (last or whole) > MESH_LIMIT:
+            raise ValueError("it unpacks to more than is read")
+        packed, _ = self._taken(rest, sum(sizes), raw)
+        blocks, start = [], 0
+        for number, length in enumerate(sizes):
+            most = last if last and number == count - 1 else whole
+            block = zlib.decompressobj().decompress(packed[start : start + length], most)
+            if len(block) != most:
+                raise ValueError("a compressed block is cut short")
+            blocks.append(block)
+            start += length
+        return b"".join(blocks)
+
+    def _taken_joined(self, source: bytes, header: bytes, rest: bytes, raw: bool) -> bytes:
+        """Return an uncompressed array: in base64 its header may be encoded with it or apart."""
+        size, length = len(header), int(np.frombuffer(header, self._header)[0])
+        coded = source[: 4 * -(-size // 3)]
+        if raw or (size % 3 and coded.endswith(b"=")):
+            return self._taken(rest, length, raw)[0]
+        return self._taken(source, size + length, raw)[0][size:]
+
+    def _taken(self, source: bytes, count: int, raw: bool) -> tuple[bytes, bytes]:
+        """Return the first `count` bytes of a raw or base64 text, and what comes after."""
+        length = count if raw else 4 * -(-count // 3)
+        piece = source[:length]
+        taken = piece if raw else base64.b64decode(piece, validate=True)
+        if len(taken) < count:
+            raise ValueError("it is cut short")
+        return taken[:count], source[length:]

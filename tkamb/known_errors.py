@@ -1,0 +1,96 @@
+"""By how much each contact model is known to err: the trade-off study's largest errors.
+
+`known_errors.json` is written by `scripts/make_tradeoff_table` from the same rows as the
+README's table. Errors are relative, against converged references, the largest over the cases on
+which a setting was measured. What was not measured is said to be so, never interpolated.
+"""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+STORED = Path(__file__).with_name("known_errors.json")
+MEASURED_MATERIAL = "polyethylene"
+LARGE = 0.10
+"""A known error above this is shown in colour."""
+NOT_MEASURED = "not measured"
+SAME_ANSWER = ("cache",)
+"""Options that change the time of an answer, not the answer."""
+
+
+@dataclass(frozen=True)
+class KnownError:
+    """Largest relative errors of one setting.
+
+    Args:
+        approach: of the travel since first touch.
+        force: of a condyle's force, relative to the load.
+        mean_pressure: of a condyle.
+        peak_pressure: of a condyle.
+        area: of a condyle.
+        cases: on how many cases it was measured.
+    """
+
+    approach: float
+    force: float
+    mean_pressure: float
+    peak_pressure: float
+    area: float
+    cases: int
+
+
+def setting_label(model: str, options: Mapping[str, Any]) -> str:
+    """Return a model's name with those of its options that are given, as the study writes it."""
+    own = ",".join(f"{key}={value}" for key, value in options.items() if key not in SAME_ANSWER)
+    return f"{model}[{own}]" if own else model
+
+
+@cache
+def known_errors() -> dict[tuple[str, float], KnownError]:
+    """Return (label, resolution in mm) -> known error."""
+    rows = json.loads(STORED.read_text(encoding="utf-8"))
+    return {
+        (row.pop("contact"), float(row.pop("resolution_mm"))): KnownError(**row) for row in rows
+    }
+
+
+def known_error(
+    model: str, resolution_mm: float, material: str, options: Mapping[str, Any] | None = None
+) -> KnownError | None:
+    """Return by how much a setting is known to err; None where it was not measured.
+
+    Args:
+        model: name of the contact model; another package's was not measured.
+        resolution_mm: spacing of its map points; only those of the study were measured.
+        material: of the insert; the study's is polyethylene.
+        options: the model's own.
+    """
+    if material != MEASURED_MATERIAL:
+        return None
+    return known_errors().get((setting_label(model, options or {}), float(resolution_mm)))
+
+
+def as_json(error: KnownError | None) -> dict[str, float] | str:
+    """Return what summary.json and `tkamb press --json` say under `known_error`."""
+    return NOT_MEASURED if error is None else asdict(error)
+
+
+def known_error_words(said: Mapping[str, Any] | str, names: Iterable[str]) -> str:
+    """Return in words what `as_json` made, for some of its quantities.
+
+    Args:
+        said: what summary.json holds under `known_error`.
+        names: quantities, fields of `KnownError`.
+    """
+    if isinstance(said, str):
+        return f"error of this setting: {said}"
+    parts = ", ".join(f"{100 * said[name]:.2g} % in {name.replace('_', ' ')}" for name in names)
+    return f"known to be off by up to {parts} ({said['cases']} reference cases)"
+
+
+def is_large(said: Mapping[str, Any] | str, names: Iterable[str]) -> bool:
+    """Return whether one of the quantities is known to be off by more than 10 %."""
+    return not isinstance(said, str) and any(said[name] > LARGE for name in names)

@@ -1,0 +1,60 @@
+"""How much memory this process may still take: the machine's, its group's and its own limit."""
+
+import os
+import resource
+from pathlib import Path
+
+GROUP = Path("/sys/fs/cgroup")
+STATISTICS = Path("/proc/meminfo")
+OWN = Path("/proc/self/statm")
+
+
+def available_memory() -> float:
+    """Return the bytes that this process may still take.
+
+    The least of: what the machine has left without swapping, what the limit of its control
+    group leaves (cgroup 2 or 1), and what its own limit of address space leaves. Where none of
+    them is known, all of the machine's memory, or inf.
+    """
+    return min(_machine(), _group(), _address_space())
+
+
+def _machine() -> float:
+    """Return what the machine has left, what it can drop from its caches counted."""
+    try:
+        for line in STATISTICS.read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return 1024.0 * float(line.split()[1])
+    except OSError:
+        pass  # not Linux
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (ValueError, OSError):
+        return float("inf")
+
+
+def _group() -> float:
+    """Return what the control group's limit leaves; inf without one."""
+    pairs = (
+        ("memory.max", "memory.current"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+    )
+    for limit, used in pairs:
+        try:
+            most, taken = ((GROUP / name).read_text().strip() for name in (limit, used))
+            return float("inf") if most == "max" else float(most) - float(taken)
+        except (OSError, ValueError):
+            continue
+    return float("inf")
+
+
+def _address_space() -> float:
+    """Return what the limit of address space (`ulimit -v`) leaves; inf without one."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if soft == resource.RLIM_INFINITY:
+        return float("inf")
+    try:
+        pages = int(OWN.read_text().split()[0])
+    except (OSError, ValueError):
+        return float(soft)
+    return float(soft - pages * os.sysconf("SC_PAGE_SIZE"))

@@ -1,0 +1,158 @@
+"""OpenSim's functions of one variable: values, slopes and curvatures.
+
+Every function takes an array of any shape and returns one of the same shape.
+
+Reference: Forsythe, Malcolm & Moler, Computer Methods for Mathematical Computations (1977),
+chapter 4, for the spline's end conditions.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.interpolate import PPoly
+
+from tkamb.geometry.frames import Array
+
+
+class Function(Protocol):
+    """A function of one variable with its first two derivatives."""
+
+    def __call__(self, x: Array) -> Array:
+        """Return the values at x."""
+        ...
+
+    def slope(self, x: Array) -> Array:
+        """Return the first derivatives at x."""
+        ...
+
+    def curvature(self, x: Array) -> Array:
+        """Return the second derivatives at x."""
+        ...
+
+
+@dataclass(frozen=True)
+class Linear:
+    """f(x) = gradient x + offset; a constant has gradient 0."""
+
+    gradient: float
+    offset: float
+
+    def __call__(self, x: Array) -> Array:
+        """Return the values at x."""
+        return self.gradient * x + self.offset
+
+    def slope(self, x: Array) -> Array:
+        """Return the first derivatives at x."""
+        return np.full_like(x, self.gradient)
+
+    def curvature(self, x: Array) -> Array:
+        """Return the second derivatives at x."""
+        return np.zeros_like(x)
+
+
+@dataclass(frozen=True, eq=False)
+class Polynomial:
+    """f(x) = c_0 xⁿ + … + c_n.
+
+    Args:
+        coefficients: (n+1,), of the highest power first.
+    """
+
+    coefficients: Array
+
+    def __call__(self, x: Array) -> Array:
+        """Return the values at x."""
+        return np.asarray(np.polyval(self.coefficients, x), float)
+
+    def slope(self, x: Array) -> Array:
+        """Return the first derivatives at x."""
+        return np.asarray(np.polyval(np.polyder(self.coefficients), x))
+
+    def curvature(self, x: Array) -> Array:
+        """Return the second derivatives at x."""
+        return np.asarray(np.polyval(np.polyder(self.coefficients, 2), x))
+
+
+class Piecewise:
+    """A piecewise polynomial, continued beyond its ends along the tangents there.
+
+    Args:
+        pieces: polynomials between the knots.
+    """
+
+    def __init__(self, pieces: PPoly) -> None:
+        self._value, self._slope = pieces, pieces.derivative()
+        self._curvature = pieces.derivative(2)
+        self.first, self.last = float(pieces.x[0]), float(pieces.x[-1])
+
+    def __call__(self, x: Array) -> Array:
+        """Return the values at x."""
+        inside = np.clip(x, self.first, self.last)
+        return self._value(inside) + self._slope(inside) * (x - inside)
+
+    def slope(self, x: Array) -> Array:
+        """Return the first derivatives at x."""
+        return self._slope(np.clip(x, self.first, self.last))
+
+    def curvature(self, x: Array) -> Array:
+        """Return the second derivatives at x; zero beyond the ends."""
+        return np.where((x < self.first) | (x > self.last), 0.0, self._curvature(x))
+
+
+@dataclass(frozen=True)
+class Scaled:
+    """f(x) = factor · inner(x): OpenSim's MultiplierFunction."""
+
+    inner: Function
+    factor: float
+
+    def __call__(self, x: Array) -> Array:
+        """Return the values at x."""
+        return self.factor * self.inner(x)
+
+    def slope(self, x: Array) -> Array:
+        """Return the first derivatives at x."""
+        return self.factor * self.inner.slope(x)
+
+    def curvature(self, x: Array) -> Array:
+        """Return the second derivatives at x."""
+        return self.factor * self.inner.curvature(x)
+
+
+def piecewise_linear(x: Array, y: Array) -> Piecewise:
+    """Return straight lines through the points (n,), n at least 2, x increasing."""
+    return Piecewise(PPoly(np.stack([np.diff(y) / np.diff(x), y[:-1]]), x))
+
+
+def simm_spline(x: Array, y: Array) -> Piecewise:
+    """Return SIMM's cubic spline through the points (n,), n at least 2, x increasing.
+
+    Its third derivative in the first interval is that of the cubic through the first four
+    points, and likewise at the last; with three points it is zero there, with two the
+    spline is a straight line. (A natural spline has no curvature at its ends instead.)
+    """
+    if len(x) == 2:
+        return piecewise_linear(x, y)
+    h, n = np.diff(x), len(x)
+    secants = np.diff(y) / h
+    # Unknowns: a sixth of the third derivative's integral, c = f''/6 at the knots.
+    matrix, right = np.zeros((n, n)), np.zeros(n)
+    rows = np.arange(1, n - 1)
+    matrix[rows, rows - 1], matrix[rows, rows + 1] = h[:-1], h[1:]
+    matrix[rows, rows] = 2.0 * (h[:-1] + h[1:])
+    right[1:-1] = np.diff(secants)
+    matrix[0, :2], matrix[-1, -2:] = (-1.0, 1.0), (-1.0, 1.0)
+    if n > 3:
+        right[0] = h[0] * _third_difference(x[:4], y[:4])
+        right[-1] = h[-1] * _third_difference(x[-4:], y[-4:])
+    c = np.linalg.solve(matrix, right)
+    slopes = secants - h * (2.0 * c[:-1] + c[1:])
+    return Piecewise(PPoly(np.stack([np.diff(c) / h, 3.0 * c[:-1], slopes, y[:-1]]), x))
+
+
+def _third_difference(x: Array, y: Array) -> float:
+    """Return the divided difference of four points: a sixth of their cubic's f'''."""
+    for order in (1, 2, 3):
+        y = np.diff(y) / (x[order:] - x[:-order])
+    return float(y[0])

@@ -1,0 +1,1 @@
+"""What of a case is possible but unlikely: questions, each with the likely mistake."""

@@ -1,0 +1,116 @@
+"""Questions about the ground reaction: its size, and whether it acts under the foot."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from tkamb.case import Case
+from tkamb.geometry.frames import knee_pose, transform
+from tkamb.plausibility.question import Question
+from tkamb.units import MILLIMETRE
+
+PEAK_LOAD = (0.4, 4.0)
+"""BW, the largest vertical ground reaction: one leg of two standing bears 0.5, a sprinter's 4."""
+
+FOOT_FORWARD = (-0.065, 0.23)
+"""m, of the centre of pressure from the ankle centre: from heel to toe of a foot 0.3 m long."""
+FOOT_ASIDE = 0.075
+"""m, either way: half the breadth of a shoe, and as much for an oblique foot."""
+ANKLE_ABOVE = (0.03, 0.32)
+"""m, of the ankle above the plate: barefoot and flat, to tiptoe in high heels."""
+WELL_LOADED = 0.2
+"""Of the peak force: below, the centre of pressure is a quotient of small numbers."""
+SWING = 0.03
+"""Of forward over upward: below, a force hardly leans and the sign of its lean says nothing."""
+AWAY = 0.03
+"""Of sideways over upward force, outwards: in standing, walking and squatting it is inwards."""
+AT_ANKLE = 0.015
+"""m: who stands has it 0.04 ahead; a path as near as this to the ankle is in another unit."""
+
+
+def load_questions(case: Case) -> Iterator[Question]:
+    """The largest vertical ground reaction in body weights."""
+    if case.ground is None:
+        return
+    peak = float(case.ground.force[:, 1].max())
+    share = peak / case.body_weight
+    if not PEAK_LOAD[0] <= share <= PEAK_LOAD[1]:
+        likely = "in body weights, " if peak < 10.0 else ""
+        yield Question(
+            f"the ground reaction peaks at {peak:.3g} N ({share:.2g} BW): is it {likely}in another "
+            "unit than N, or mass_kg in pounds?",
+            "ground reaction unlike the body's weight",
+        )
+
+
+def direction_questions(case: Case) -> Iterator[Question]:
+    """Whether the horizontal force points where it does in a leg that bears the body.
+
+    The ground reaction passes near the body's centre of mass, which rides near the hip: its
+    slope forward goes with that of the line from the centre of pressure to the hip, and it
+    points to the other leg, not away from it.
+    """
+    ground, tibia, table = case.ground, case.tibia, case.scene.ground_reaction
+    if ground is None or tibia is None or table is None or table.applied != "cop":
+        return
+    loaded = ground.loaded & (ground.force[:, 1] > WELL_LOADED * ground.force[:, 1].max())
+    if loaded.sum() < 5:
+        return
+    hip_in_femur = case.chain.link_in("hip", "femur")[:3, 3]
+    femur = tibia.pose @ case.chain.insert_in_tibia @ knee_pose(case.motion.coordinates)
+    leg = (transform(femur, hip_in_femur[None])[:, 0] - ground.point)[loaded]
+    force = ground.force[loaded]
+    forward = tibia.pose[loaded, :3, 0] * [1.0, 0.0, 1.0]
+    forward /= np.maximum(np.linalg.norm(forward, axis=1), 1e-9)[:, None]
+    slopes = [np.einsum("fi,fi->f", line, forward) / line[:, 1] for line in (force, leg)]
+    if min(np.std(slope) for slope in slopes) > SWING and np.corrcoef(slopes)[0, 1] < -0.5:
+        yield Question(
+            "the ground reaction leans forward where the leg leans back: is the sign of its "
+            "forward column turned, or are the columns left-handed?",
+            "ground reaction leans against the leg",
+        )
+    aside = float((force[:, 2] * forward[:, 0] - force[:, 0] * forward[:, 2]).sum())
+    if aside > AWAY * force[:, 1].sum():
+        yield Question(
+            f"the ground pushes the leg outwards with {100 * aside / force[:, 1].sum():.0f} % of "
+            "its upward force: is the sign of its sideways column turned, or are the columns "
+            "left-handed?",
+            "ground reaction points away from the other leg",
+        )
+
+
+def foot_questions(case: Case) -> Iterator[Question]:
+    """Whether the centre of pressure lies under the foot that the shank stands on."""
+    ground, tibia, table = case.ground, case.tibia, case.scene.ground_reaction
+    if ground is None or tibia is None or table is None or table.applied != "cop":
+        return
+    loaded = ground.loaded & (ground.force[:, 1] > WELL_LOADED * ground.force[:, 1].max())
+    if not loaded.any():
+        return
+    away = ground.point - tibia.pose[:, :3, 3]
+    nearest = float(np.linalg.norm(away[loaded][:, [0, 2]], axis=1).max())
+    if nearest < AT_ANKLE:
+        yield Question(
+            f"the centre of pressure stays within {nearest / MILLIMETRE:.2g} mm of the ankle, "
+            "seen from above: is it in centimetres or metres?",
+            "centre of pressure stays under the ankle",
+        )
+    forward = tibia.pose[:, :3, 0] * [1.0, 0.0, 1.0]
+    forward /= np.maximum(np.linalg.norm(forward, axis=1), 1e-9)[:, None]
+    ahead = np.einsum("fi,fi->f", away, forward)
+    aside = away[:, 2] * forward[:, 0] - away[:, 0] * forward[:, 2]
+    places = (
+        ("ahead of", ahead, FOOT_FORWARD),
+        ("to the right of", aside, (-FOOT_ASIDE, FOOT_ASIDE)),
+        ("below", -away[:, 1], ANKLE_ABOVE),
+    )
+    for word, place, (low, high) in places:
+        off = loaded & ((place < low) | (place > high))
+        if off.any():
+            k = int(np.argmax(np.where(off, np.maximum(low - place, place - high), -np.inf)))
+            yield Question(
+                f"the centre of pressure lies {place[k] / MILLIMETRE:.0f} mm {word} the ankle at "
+                f"{case.motion.time[k]:.4g} s, where no foot is ({low / MILLIMETRE:.0f} to "
+                f"{high / MILLIMETRE:.0f}): is its sign, unit or axis another one, or the ankle's?",
+                "centre of pressure not under the foot",
+            )

@@ -1,0 +1,204 @@
+"""Questions about lines of action: where they end, how stiff and how far stretched they are."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.case import Case
+from tkamb.geometry.frames import Array, inverse, transform
+from tkamb.plausibility.question import Question, some
+from tkamb.scene_tables import Attachment
+from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.body.ligaments import Ligament
+
+STRAIN = 0.15
+"""Ligaments of the knee tear at 12 to 20 % (Kennedy et al. 1976, Butler et al. 1986)."""
+SLACK = -0.4
+"""A bundle that is never nearer to being taut has no task in this movement."""
+STIFFNESS_PER_MM, STIFFNESS_PER_STRAIN = (2.0, 500.0), (20.0, 30000.0)
+"""N/mm and N: from a tenth of a capsule's bundle to more than a whole cruciate ligament
+(347 N/mm: Race & Amis 1994; 18 kN for both PCL bundles: Blankevoort & Huiskes 1996)."""
+FARTHEST_ATTACHMENT = 0.16
+"""m from the insert's centre: the superficial MCL, the farthest, ends 0.06 to 0.12 below it."""
+BEYOND = 0.03
+"""m, of a tibial end above the insert's bottom, or of a femoral one below the flexion axis."""
+TENDON = (0.025, 0.085)
+"""m, of the patellar ligament's length."""
+PATELLA_AWAY = (0.015, 0.08)
+"""m, of the patella's origin from the flexion axis."""
+QUADRICEPS = (0.08, 0.55)
+"""m, of the quadriceps' origin above the flexion axis: within the thigh."""
+TUBEROSITY = (0.01, 0.11)
+"""m, of the patellar ligament's distal end from the insert's centre; it lies below and ahead."""
+ON_PATELLA = 0.06
+"""m, of both lines' ends from the patella's origin: the patella is 0.045 long."""
+TENDON_CHANGE = 0.15
+"""Of its mean, the change of the patellar ligament's length between recorded ends: it strains by
+a few per cent."""
+
+
+def attachment_questions(case: Case) -> Iterator[Question]:
+    """Points in metres called millimetres, and bundles that end far from the knee."""
+    scene = case.scene
+    ends = [
+        (f"{t.name} {side}", getattr(t, side))
+        for t in scene.ligament
+        for side in ("proximal", "distal")
+    ]
+    far = [name for name, end in ends if not _belongs(*_placed(case, end))]
+    if far:
+        yield Question(
+            f"{some(far)} ends more than {FARTHEST_ATTACHMENT / MILLIMETRE:.0f} mm from the knee, "
+            "or beyond the joint: is its point_mm, sign or link another one?",
+            "attachment far from its place",
+        )
+    if scene.quadriceps and scene.patellar_ligament:
+        ends += [
+            ("[quadriceps] origin", scene.quadriceps.origin),
+            ("[quadriceps] insertion", scene.quadriceps.insertion),
+            ("[patellar_ligament] proximal", scene.patellar_ligament.proximal),
+            ("[patellar_ligament] distal", scene.patellar_ligament.distal),
+        ]
+    tiny = [name for name, end in ends if 0.0 < np.abs(end.point_mm).max() < 1.0]
+    if tiny:
+        yield Question(
+            f"{some(tiny)} lies within 1 mm of its link's origin: is point_mm in metres?",
+            "attachment within 1 mm of its link's origin",
+        )
+
+
+def _placed(case: Case, end: Attachment) -> tuple[str, Array]:
+    """Return the link that carries an attachment, and where on it that is (3,) m.
+
+    On the tibia in the insert frame, on femur or patella in that link's own.
+    """
+    chain = case.chain
+    carrier = chain.carrier(end.link)
+    place = transform(chain.link_in(end.link, carrier), np.array(end.point_mm) * MILLIMETRE)
+    if carrier == "tibia":
+        place = transform(inverse(chain.insert_in_tibia), place)
+    return carrier, place
+
+
+def _belongs(carrier: str, place: Array) -> bool:
+    """Say whether a ligament may end at a place (3,) m, as `_placed` gives it."""
+    beyond = {"tibia": place[1], "femur": -place[1]}.get(carrier, 0.0)
+    return float(np.linalg.norm(place)) <= FARTHEST_ATTACHMENT and beyond <= BEYOND
+
+
+def stiffness_questions(case: Case) -> Iterator[Question]:
+    """Bundles stiffer or softer than any ligament."""
+    for key, (low, high), unit in (
+        ("stiffness_N_per_mm", STIFFNESS_PER_MM, "N/mm"),
+        ("stiffness_N_per_strain", STIFFNESS_PER_STRAIN, "N per unit strain"),
+    ):
+        values = {t.name: k for t in case.scene.ligament if (k := getattr(t, key)) is not None}
+        if odd := [name for name, k in values.items() if not low <= k <= high]:
+            yield Question(
+                f"{some(odd)}: {values[odd[0]]:g} {unit} is no ligament's stiffness ({low:g} to "
+                f"{high:g}): is it in another unit?",
+                "stiffness of no ligament",
+            )
+
+
+def torn_bundles(ligaments: "Sequence[Ligament]", tensions: Mapping[str, float]) -> list[str]:
+    """Return the bundles whose tension (N) is above that of the strain they bear."""
+    return [
+        bundle.name
+        for bundle in ligaments
+        if tensions.get(bundle.name, 0.0)
+        > float(bundle.force((1.0 + STRAIN) * bundle.slack_length))
+    ]
+
+
+def strain_questions(
+    ligaments: "Sequence[Ligament]", strains: Mapping[str, Array], time: Array
+) -> Iterator[Question]:
+    """Bundles that would tear, and bundles that never come near to being taut.
+
+    Args:
+        ligaments: the bundles.
+        strains: name -> strain (f,) of the recorded poses.
+        time: (f,) s.
+    """
+    if not ligaments:
+        return
+    table = np.array([strains[bundle.name] for bundle in ligaments])
+    most = table.max(axis=1)
+    torn = [bundle.name for bundle, strain in zip(ligaments, most, strict=True) if strain > STRAIN]
+    if torn:
+        i, k = divmod(int(np.argmax(table)), table.shape[1])
+        yield Question(
+            f"{some(torn)} would strain beyond {100 * STRAIN:.0f} %, {ligaments[i].name} by "
+            f"{100 * table[i, k]:.0f} % at {time[k]:.4g} s: is an attachment, a slack length or "
+            "the recorded pose wrong?",
+            "",
+        )
+    loose = [bundle.name for bundle, strain in zip(ligaments, most, strict=True) if strain < SLACK]
+    if loose:
+        yield Question(
+            f"{some(loose)} is never within {-100 * SLACK:.0f} % of being taut: is an attachment "
+            "or slack_length_mm in another unit?",
+            "ligament far from taut throughout",
+        )
+
+
+def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Question]:
+    """Ends of quadriceps and patellar ligament, and the length between recorded ends.
+
+    Args:
+        case: the case.
+        poses: link -> pose_link_in_insert (f, 4, 4).
+    """
+    quadriceps, ligament = case.scene.quadriceps, case.scene.patellar_ligament
+    if quadriceps is None or ligament is None:
+        return
+    off = []
+    _, origin = _placed(case, quadriceps.origin)
+    if not QUADRICEPS[0] <= origin[1] <= QUADRICEPS[1] or np.hypot(origin[0], origin[2]) > 0.12:
+        off.append("[quadriceps] origin")
+    _, distal = _placed(case, ligament.distal)
+    away = float(np.linalg.norm(distal))
+    if not TUBEROSITY[0] <= away <= TUBEROSITY[1] or distal[0] < 0 or distal[1] > 0.01:
+        off.append("[patellar_ligament] distal")
+    for name, end, sign in (
+        ("[quadriceps] insertion", quadriceps.insertion, 1.0),
+        ("[patellar_ligament] proximal", ligament.proximal, -1.0),
+    ):
+        _, place = _placed(case, end)
+        if np.linalg.norm(place) > ON_PATELLA or sign * place[1] < 0.0:
+            off.append(name)
+    if off:
+        yield Question(
+            f"{some(off)} lies where no such line ends: is its point_mm, sign or link another one?",
+            "extensor line ends off its bone",
+        )
+    ends = [
+        transform(poses[end.link], np.array(end.point_mm) * MILLIMETRE)
+        for end in (ligament.proximal, ligament.distal)
+    ]
+    lengths = np.linalg.norm(ends[0] - ends[1], axis=1)
+    yield from _tendon(lengths[np.isfinite(lengths)], ligament.length_mm)
+
+
+def _tendon(lengths: Array, declared_mm: float | None) -> Iterator[Question]:
+    """The patellar ligament's lengths (f,) m between its ends, and the declared one."""
+    if not len(lengths):
+        return
+    low, high = float(lengths.min()), float(lengths.max())
+    mean = float(lengths.mean())
+    if not TENDON[0] <= mean <= TENDON[1] or high - low > TENDON_CHANGE * mean:
+        yield Question(
+            f"the patellar ligament is {low / MILLIMETRE:.0f} to {high / MILLIMETRE:.0f} mm long: "
+            "is one of its ends, or the patella's motion, wrong in sign or unit?",
+            "patellar ligament of odd length",
+        )
+    elif declared_mm is not None and abs(declared_mm * MILLIMETRE / mean - 1) > TENDON_CHANGE:
+        yield Question(
+            f"the patellar ligament is {mean / MILLIMETRE:.0f} mm between its ends, but length_mm "
+            f"is {declared_mm:g}: which is right?",
+            "patellar ligament of odd length",
+        )

@@ -1,0 +1,79 @@
+"""Questions about the recorded movement: ranges, rates, samples off their neighbours' curve."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from tkamb.case import Case
+from tkamb.geometry.frames import KNEE_COORDINATES
+from tkamb.inputs.samples import OddSample
+from tkamb.plausibility.question import Question
+from tkamb.units import DEGREE
+
+FLEXION_RADIANS = 3.3
+"""deg: a bend of more than 10 deg, in radians and called degrees, stays below this."""
+USUAL_DEG = {"flexion": (-15, 160), "adduction": (-12, 12), "axial_rotation": (-40, 40)}
+"""A kneeling, a dislocated and a rotating-platform knee reach these."""
+USUAL_RATE = {"flexion": 20.0, "adduction": 6.0, "axial_rotation": 10.0}
+"""rad/s: a kick's flexion; the others in a pivoting jump."""
+BRIEFEST = 0.15
+"""s: no movement of a leg is over sooner."""
+
+
+def motion_questions(case: Case) -> Iterator[Question]:
+    """Ranges and rates of the recorded angles, and how long the motion lasts."""
+    motion = case.motion
+    angles = dict(zip(KNEE_COORDINATES, motion.coordinates.T, strict=True))
+    rates = dict(zip(KNEE_COORDINATES, motion.velocity.T, strict=True))
+    flexion = angles["flexion"] / DEGREE
+    if np.ptp(flexion) > 0.2 and np.abs(flexion).max() < FLEXION_RADIANS:
+        yield Question(
+            f"flexion runs from {flexion.min():.2g} to {flexion.max():.2g} deg: is it in radians?",
+            "flexion hardly changes",
+        )
+    for name, (low, high) in USUAL_DEG.items():
+        angle = angles[name] / DEGREE
+        far = (angle < low) | (angle > high)
+        if far.any():
+            worst = angle[int(np.argmax(np.maximum(low - angle, angle - high)))]
+            yield Question(
+                f"{name} reaches {worst:.0f} deg, where few knees go ({low} to {high}): is its "
+                "column, sign or axis another one?",
+                f"{name} of {worst:.0f} deg",
+                far,
+            )
+        fast = np.abs(rates[name]) > USUAL_RATE[name]
+        if fast.any():
+            k = int(np.argmax(np.abs(rates[name])))
+            yield Question(
+                f"{name} changes by {abs(rates[name][k]) / DEGREE:.0f} deg/s at "
+                f"{motion.time[k]:.4g} s: is the time in seconds, or is it noise?",
+                f"{name} changes too fast",
+                fast,
+            )
+    lasting = float(motion.time[-1] - motion.time[0])
+    if lasting < BRIEFEST:
+        yield Question(
+            f"the motion lasts {lasting:.3g} s: is its time in seconds?", "motion too brief"
+        )
+
+
+def sample_questions(case: Case) -> Iterator[Question]:
+    """Recorded samples that lie off their neighbours' curve, one question a file."""
+    parts = (case.motion, case.tibia, case.ground)
+    time = case.motion.time
+    reach = float(np.ptp(time)) / max(len(time) - 1, 1)
+    for samples in (part.odd for part in parts if part is not None and part.odd):
+        worst = max(samples, key=lambda sample: sample.away)
+        near = np.zeros(len(time), bool)
+        for sample in samples:
+            near |= np.abs(time - sample.time) <= 3.0 * reach
+        yield Question(_odd_text(samples, worst), "recorded sample off its neighbours' curve", near)
+
+
+def _odd_text(samples: Sequence[OddSample], worst: OddSample) -> str:
+    more = f" and {len(samples) - 1} more" if len(samples) > 1 else ""
+    return (
+        f"{worst.path.name}: {worst.what} at {worst.time:.4g} s{more} lies {worst.away:.3g} "
+        f"{worst.unit} off its neighbours' curve: is a cell mistyped, or is it noise?"
+    )

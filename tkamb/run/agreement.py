@@ -1,0 +1,101 @@
+"""Do the two sides of a frame agree: what contradicts the recorded pose, and how well it is known.
+
+Two estimates of the medial/lateral split stand side by side, by deformation (the contact model
+at the recorded rotation) and by coronal equilibrium. Where they differ by much, where balance
+needs a large force that nothing modelled gives, or where a condyle carries nothing though nobody
+asked for that, something in the input is wrong or unknown: the frame is flagged.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.units import DEGREE
+
+if TYPE_CHECKING:
+    from tkamb.case import Case
+    from tkamb.equilibrium.frame_contact import FrameContact
+    from tkamb.mechanics.mechanics import FrameLoads
+
+SHARES_APART = 0.25
+"""Two estimates of the medial share that differ by more contradict each other."""
+LARGE_RESIDUAL = 0.10
+"""Of the superior-inferior contact force: a larger AP and ML residual is flagged."""
+UNLOADED = 0.01
+"""Of the load: a condyle that carries less carries nothing."""
+ADDUCTION_KNOWN = 0.5 * DEGREE
+"""How well fluoroscopy knows the adduction."""
+MOVED_SHARE = 0.25
+"""Of the load: where the adduction's error moves more, the split by deformation is not
+determined by the recorded pose."""
+
+NAN = float("nan")
+
+
+def contradictions(case: "Case", body: "FrameLoads", contact: "FrameContact | None") -> list[str]:
+    """Return what contradicts itself in a frame, in words; empty for a frame without numbers."""
+    if body.loads.problems:
+        return []
+    words = []
+    values = body.loads.values
+    load = abs(float(body.loads.contact_force[1]))
+    residual = float(np.hypot(values.get("residual_ap", 0.0), values.get("residual_ml", 0.0)))
+    if residual > LARGE_RESIDUAL * load:
+        words.append(f"residual AP and ML force is {_percent(residual, load)} of the contact force")
+    if contact is None or contact.result is None or case.split is None:
+        return words
+    share, balanced = share_by_deformation(contact), share_by_equilibrium(body)
+    if abs(share - balanced) > SHARES_APART:
+        words.append(
+            f"medial share {share:.2f} by deformation contradicts {balanced:.2f} by equilibrium"
+        )
+    for side, own in (("medial", share), ("lateral", 1.0 - share)):
+        if own < UNLOADED and side not in body.loads.lifted:
+            words.append(f"{side} condyle carries nothing by deformation")
+    return words
+
+
+def share_by_deformation(contact: "FrameContact") -> float:
+    """Return medial / (medial + lateral) of the contact model; NaN where nothing is carried."""
+    result = contact.result
+    if result is None:
+        return NAN
+    return share(*(side.force if side else 0.0 for side in (result.medial, result.lateral)))
+
+
+def share_by_equilibrium(body: "FrameLoads") -> float:
+    """Return medial / (medial + lateral) of the equations; NaN where they are not solved."""
+    return share(normal_force(body, "medial"), normal_force(body, "lateral"))
+
+
+def normal_force(body: "FrameLoads", side: str) -> float:
+    """Return a condyle's normal force by the equations, N: zero where it is lifted."""
+    if side in body.loads.lifted and not np.isnan(body.loads.contact_force).any():
+        return 0.0
+    return body.loads.values.get(f"{side}_normal", NAN)
+
+
+def share(medial: float, lateral: float) -> float:
+    """Return medial / (medial + lateral); NaN where nothing is carried."""
+    total = medial + lateral
+    return medial / total if total > 0 else NAN
+
+
+def split_determined(body: "FrameLoads", contact: "FrameContact") -> float:
+    """Return 1 where the recorded adduction determines the split by deformation, else 0.
+
+    It does not where 0.5 deg moves more than a quarter of the load from one condyle to the
+    other, or where one condyle carries all of it and equilibrium says otherwise. NaN where there is
+    no sensitivity.
+    """
+    if np.isnan(contact.sensitivity):
+        return NAN
+    moved = abs(contact.sensitivity) * ADDUCTION_KNOWN
+    load = abs(float(body.loads.contact_force[1]))
+    share, balanced = share_by_deformation(contact), share_by_equilibrium(body)
+    alone = min(share, 1.0 - share) < UNLOADED < abs(share - balanced)
+    return float(moved <= MOVED_SHARE * load and not alone)
+
+
+def _percent(part: float, whole: float) -> str:
+    return f"{100 * part / whole:.0f} %" if whole > 0 else "more than all"

@@ -1,0 +1,62 @@
+"""What every answer must obey, whatever model gave it; found from the answer alone.
+
+- The nodal forces carry the load.
+- The pressures, over the areas that they stand on, carry it too.
+- Nothing pulls, and nothing that is solved for passes through the femoral component.
+- What the condyles are said to carry is what the map under them carries.
+"""
+
+import math
+
+import numpy as np
+
+from tkamb.contact.result import ContactResult
+
+CARRIED = 0.005
+"""Relative: forces, pressures and condyles against the load."""
+PASSED = 5e-3
+"""Of the approach: how far a node may be inside the femoral component, a few times the solver's
+tolerance."""
+
+
+def complaints(result: ContactResult, load: float, solved: bool, source_rule: bool) -> list[str]:
+    """Return in words what an answer does not obey.
+
+    Args:
+        result: that calls itself ok.
+        load: N, along -y.
+        solved: the gaps are those of deformed nodes; else penetration is the model's measure.
+        source_rule: pressure is the force along the insert's normal over an even area; else
+            the force over the node's own area.
+    """
+    force = np.linalg.norm(result.nodal_force, axis=1)
+    along_y = -result.nodal_force[:, 1]
+    expected = force
+    if source_rule:
+        expected = np.maximum(-np.einsum("ij,ij->i", result.nodal_force, result.normals), 0.0)
+    share = np.divide(along_y, expected, out=np.zeros_like(force), where=expected > 0)
+    by_pressure = float((result.pressure * result.area * share).sum())
+    sides = [side for side in (result.medial, result.lateral) if side is not None]
+    peak, highest = max((s.peak_pressure for s in sides), default=0.0), result.pressure.max()
+    by_sides = sum(side.force for side in sides)
+    found = [
+        _off("the nodal forces sum to", float(along_y.sum()), load),
+        _off("the pressures integrate to", by_pressure, load),
+        _off("mean pressure times area is", sum(s.mean_pressure * s.area for s in sides), by_sides),
+    ]
+    if result.pressure.min() < 0:
+        found.append("a pressure is negative")
+    if by_sides < (1 - CARRIED) * load or by_sides > (1 + CARRIED) * force.sum():
+        found.append(f"the condyles carry {by_sides:.4g} N of {load:.4g} N")
+    if solved and abs(peak - highest) > CARRIED * highest:
+        found.append(f"the condyles' peak is {peak / highest:.4g} of the map's")
+    deepest = -float(np.nanmin(result.gap))
+    if solved and deepest > PASSED * result.approach:
+        found.append(f"a node is {1e6 * deepest:.3g} µm inside the femoral component")
+    return [words for words in found if words]
+
+
+def _off(what: str, found: float, wanted: float) -> str:
+    if math.isclose(found, wanted, rel_tol=CARRIED):
+        return ""
+    return f"{what} {found / wanted:.4f} of what they must"

@@ -1,0 +1,286 @@
+"""Contacts with a solution in closed form, on which every family of models is judged.
+
+Nothing here calls the models' own physics: the formulas are written out once more.
+
+- plate: a rigid flat plate on a block of height h and area A whose nu is 0. Stress is F/A
+  everywhere, the approach is h eps(F/A), with the material's curve eps(sigma) = sigma/E +
+  alpha (sigma0/E) (sigma/sigma0)^n. Exact on any grid while the curve's share is small (what
+  yields widens, and the bottom is glued). The bed of an elastic foundation has its own law of
+  the column, p = sigma(-ln(1 - d/h)), here d = h (1 - exp(-eps)).
+- slide: the same on a mobile bearing, any nu and strain. Two nodes of its bottom are held
+  against rigid motion, also from each other: that makes it stiffer by up to 2 %.
+- kept: the same with prepared operators kept on disk, after another modulus was kept there: each
+  has its own.
+- layer: a rigid sphere on a layer bonded to a rigid base (`elastic_layer`), linear.
+- bed: the sphere on a bed of springs, F = 2 pi R h int_0^(d/h) p(e) de (paraboloid).
+- hertz: the sphere on a half-space, a³ = 3 F R / (4 E*), d = a²/R, p0 = 3 F / (2 pi a²).
+
+References: Johnson, Contact Mechanics (1985), sections 3.4, 4.2, 4.3 and 5.8,
+doi:10.1017/CBO9781139171731; Ramberg & Osgood, NACA TN 902 (1943).
+"""
+
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from scipy.integrate import quad
+from scipy.optimize import brentq
+
+from tkamb.contact.materials import Material, material
+from tkamb.contact.pair import Bearing, ContactPair
+from tkamb.contact.registry import contact_class, contact_model
+from tkamb.contact.result import ContactResult
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Array
+from tkamb.geometry.surface import Surface
+from tkamb.studies.bodies import balls, block, flat
+from tkamb.studies.elastic_layer import sphere_on_layer
+from tkamb.units import MEGAPASCAL, MILLIMETRE
+
+CURVE = {"alpha": 0.0389, "reference_stress": 8.4194 * MEGAPASCAL, "exponent": 4.5485}
+"""Of the polyethylene of these cases, as published; see `docs/contact.md`."""
+SIDE_MM = 24.0
+"""Of the block under the plate: divides by the cells of 2 and 3 mm."""
+KEPT_GRID_MM = 0.9
+"""Cells small enough that the operator of the block is worth a file."""
+SOURCE_APPROACH = 0.6808
+"""Approach of the source's springs under the plate over that of the solid they stand for: nu is
+0.35 whatever the material, and they are too stiff at free sides. A number of its own, kept so
+that a change is seen."""
+TOLERANCES: dict[str, tuple[float, float]] = {
+    "plate": (5e-3, 0.01),
+    "kept": (5e-3, 0.01),
+    "slide": (0.03, 0.03),
+    "layer": (0.03, 0.09),
+    "bed": (0.01, 0.06),
+    "hertz": (0.01, 0.01),
+}
+"""Largest relative distances of approach and pressure: for plates a few times the solver's
+tolerance, else what the cells leave, measured and half as much again."""
+
+
+@dataclass(frozen=True)
+class ClosedForm:
+    """A contact whose answer is known.
+
+    Args:
+        kind: "plate", "slide", "kept", "layer", "bed" or "hertz".
+        model: contact model.
+        load_N: along -y.
+        thickness_mm: height of the block.
+        modulus_MPa: Young's modulus.
+        nu: Poisson's ratio; 0 under a plate.
+        linear: Hooke's law instead of Ramberg-Osgood.
+        radius_mm: of the sphere; 0 under a plate.
+        resolution_mm: cell size.
+    """
+
+    kind: str
+    model: str
+    load_N: float = 5000.0
+    thickness_mm: float = 8.0
+    modulus_MPa: float = 561.5
+    nu: float = 0.0
+    linear: bool = False
+    radius_mm: float = 0.0
+    resolution_mm: float = 3.0
+
+    @property
+    def says(self) -> str:
+        """The case in words: "plate: load_N=1"."""
+        base = vars(ClosedForm(self.kind, self.model))
+        changed = [f"{k}={v}" for k, v in vars(self).items() if v != base[k]]
+        return f"closed form, {self.kind}: {', '.join(changed) or 'as it is'}"
+
+    @property
+    def material(self) -> Material:
+        """What the block is made of."""
+        given = {"young_modulus": self.modulus_MPa * MEGAPASCAL, "poisson_ratio": self.nu}
+        if self.linear:
+            return material("polyethylene-linear", **given)
+        return material("polyethylene", **given, **CURVE)
+
+    @property
+    def pair(self) -> ContactPair:
+        """The two bodies."""
+        thick = self.thickness_mm * MILLIMETRE
+        side = SIDE_MM * MILLIMETRE if self.plate else 2.5 * self.radius_mm**0.5 * 1.6e-3 + 6e-3
+        side = 6e-3 * round(side / 6e-3)
+        insert = block(flat(thick), (side, side), 3e-3)
+        femoral = _plate(2 * side) if self.plate else balls(self.radius_mm * MILLIMETRE, 0.0)
+        bearing: Bearing = "mobile" if self.kind == "slide" else "fixed"
+        return ContactPair(femoral, insert, self.material, bearing)
+
+    @property
+    def plate(self) -> bool:
+        """Whether the femoral component is a plate."""
+        return self.kind in ("plate", "slide", "kept")
+
+
+def press_closed_form(case: ClosedForm) -> tuple[ContactResult, ContactPair]:
+    """Press a case; "kept" ones after another modulus in one folder of operators.
+
+    Raises:
+        ComputationError: there, each modulus has no operator of its own.
+    """
+    pair = case.pair
+    options = {"cache": case.kind == "kept"} if _has_cache(case.model) else {}
+    model = contact_model(case.model, case.resolution_mm, **options)
+    if case.kind != "kept":
+        return model.press(model.prepare(pair), case.load_N, np.eye(4)), pair
+    with _operators_kept_apart() as folder:
+        model.prepare(replace(case, modulus_MPa=0.5 * case.modulus_MPa).pair)
+        state = model.prepare(pair)
+        files = len(list(folder.glob("*.operator")))
+        if files != 2:
+            raise ComputationError(f"{files} operators are kept of two materials", case.says)
+        return model.press(state, case.load_N, np.eye(4)), pair
+
+
+def apart(case: ClosedForm, result: ContactResult) -> dict[str, float]:
+    """Return relative distances from the closed form: approach and pressure."""
+    approach, pressure = solution(case)
+    if case.model == "lattice-source":
+        found = result.pressure.mean()  # its rule gives every node the same area
+    elif case.plate:
+        found = np.median(result.pressure[_inner(result)])
+    else:
+        found = max(side.peak_pressure for side in (result.medial, result.lateral) if side)
+    if case.kind == "hertz" and result.medial is not None:
+        mean = 1.5 * result.medial.mean_pressure  # two thirds of the peak
+        found = max(found, mean, key=lambda value: abs(value / pressure - 1.0))
+    return {
+        "approach": abs(result.approach / approach - 1.0),
+        "pressure": abs(float(found) / pressure - 1.0),
+    }
+
+
+def solution(case: ClosedForm) -> tuple[float, float]:
+    """Return approach (m) and pressure (Pa): mean under a plate, peak under a sphere."""
+    load, thick = case.load_N, case.thickness_mm * MILLIMETRE
+    young, radius = case.modulus_MPa * MEGAPASCAL, case.radius_mm * MILLIMETRE
+    if case.plate:
+        stress = load / (SIDE_MM * MILLIMETRE) ** 2
+        strain = _strain(case, stress)
+        if case.model == "foundation":
+            strain = 1.0 - np.exp(-strain)
+        if case.model == "lattice-source":
+            strain *= SOURCE_APPROACH
+        return thick * strain, stress
+    if case.kind == "layer":
+        layer = sphere_on_layer(radius, thick, load, young, case.nu)
+        return layer.approach, float(layer.pressure.max())
+    if case.kind == "hertz":
+        contact = (0.75 * load * radius * (1 - case.nu**2) / young) ** (1 / 3)
+        return contact**2 / radius, 1.5 * load / (np.pi * contact**2)
+    column = _column(case)
+
+    def excess(strain: float) -> float:
+        return float(2 * np.pi * radius * thick * quad(column, 0.0, strain)[0]) - load
+
+    strain = float(brentq(excess, 1e-9, 0.49, xtol=1e-12))
+    return thick * strain, column(strain)
+
+
+def closed_forms(quick: bool) -> Iterator[ClosedForm]:
+    """Return the cases; the quick ones judge each family on each thing that it can do wrong."""
+    solids = ("lattice", "lattice-linear", "fe")
+    for model in (*solids, "lattice-source", "foundation", "foundation-linear"):
+        yield ClosedForm("plate", model)
+    yield ClosedForm("slide", "lattice", 10000.0, nu=0.45)
+    yield ClosedForm("kept", "lattice-linear", resolution_mm=KEPT_GRID_MM)
+    yield ClosedForm("hertz", "hertz", 100.0, 10.0, nu=0.45, radius_mm=22.0, resolution_mm=1.0)
+    yield _wide("layer", "lattice-linear", linear=True)
+    for model in ("foundation", "foundation-linear"):
+        yield _wide("bed", model)
+    if not quick:
+        yield from _more_closed_forms(solids)
+
+
+def _wide(
+    kind: str, model: str, load_N: float = 3000.0, nu: float = 0.3, **given: bool
+) -> ClosedForm:
+    """Return a sphere that presses as wide as the layer is thick: several cells of 3 mm."""
+    return ClosedForm(kind, model, load_N, 12.0, nu=nu, radius_mm=300.0, **given)
+
+
+def _more_closed_forms(solids: tuple[str, ...]) -> Iterator[ClosedForm]:
+    """Return the extremes of each case: load, thickness, modulus, Poisson's ratio."""
+    for model, load in product(solids, (0.01, 1.0, 100.0, 2000.0)):
+        yield ClosedForm("plate", model, load)
+    yield ClosedForm("plate", "lattice-linear", 50000.0, modulus_MPa=2000.0)
+    for model, nu in product(("lattice", "fe"), (0.0, 0.3, 0.49, 0.4999)):
+        yield ClosedForm("slide", model, 10000.0, nu=nu)
+    for model, thick in product(solids, (1.0, 3.0, 30.0)):
+        yield ClosedForm("plate", model, thickness_mm=thick)
+    for model, young in product(solids, (100.0, 2000.0, 2e5)):
+        yield ClosedForm("plate", model, modulus_MPa=young, linear=True)
+    for model, nu in product(("lattice-linear", "fe"), (0.0, 0.45, 0.49, 0.4999)):
+        yield _wide("layer", model, nu=nu, linear=True)
+    for model, load in product(("foundation", "foundation-linear"), (1000.0, 10000.0)):
+        yield _wide("bed", model, load)
+    for load, nu in product((100.0, 1000.0), (0.0, 0.4999)):
+        yield ClosedForm("hertz", "hertz", load, 30.0, nu=nu, radius_mm=22.0, resolution_mm=1.0)
+    yield ClosedForm("kept", "fe", resolution_mm=KEPT_GRID_MM)
+
+
+def _strain(case: ClosedForm, stress: float) -> float:
+    """Return the uniaxial strain of a stress (Pa), Ramberg-Osgood."""
+    young = case.modulus_MPa * MEGAPASCAL
+    strain = stress / young
+    if case.linear or case.model.endswith("linear"):
+        return strain
+    reference = CURVE["reference_stress"]
+    plastic = CURVE["alpha"] * reference / young * (stress / reference) ** CURVE["exponent"]
+    return strain + plastic
+
+
+def _column(case: ClosedForm) -> Callable[[float], float]:
+    """Return the pressure (Pa) of a column of the bed at d/h: M d/h, or the curve at
+    (M/E) -ln(1 - d/h), M = E (1 - nu)/((1 + nu)(1 - 2 nu))."""
+    nu, young = case.nu, case.modulus_MPa * MEGAPASCAL
+    confined = (1 - nu) / ((1 + nu) * (1 - 2 * nu))
+    if case.model == "foundation-linear":
+        return lambda strain: young * confined * strain
+
+    def pressure(strain: float) -> float:
+        wanted = -confined * np.log1p(-strain)
+        highest = young * wanted + 1.0
+        return float(brentq(lambda s: _strain(case, s) - wanted, 0.0, highest))
+
+    return pressure
+
+
+def _inner(result: ContactResult) -> Array:
+    """Return the points a fifth of the block's side away from its edges."""
+    return np.asarray((np.abs(result.points[:, [0, 2]]) < 0.3 * SIDE_MM * MILLIMETRE).all(axis=1))
+
+
+def _plate(side: float) -> Surface:
+    """Return a box whose lower face lies in y = 0."""
+    box = block(flat(10 * MILLIMETRE), (side, side), side / 2)
+    return Surface(box.vertices, box.faces, "plate")
+
+
+def _has_cache(name: str) -> bool:
+    return "cache" in getattr(contact_class(name), "__dataclass_fields__", {})
+
+
+@contextmanager
+def _operators_kept_apart() -> Iterator[Path]:
+    """Keep prepared operators in a folder that is gone afterwards."""
+    before = os.environ.get("TKAMB_CACHE_DIR")
+    with tempfile.TemporaryDirectory(prefix="tkamb-stability-") as folder:
+        os.environ["TKAMB_CACHE_DIR"] = folder
+        try:
+            yield Path(folder)
+        finally:
+            if before is None:
+                del os.environ["TKAMB_CACHE_DIR"]
+            else:
+                os.environ["TKAMB_CACHE_DIR"] = before
