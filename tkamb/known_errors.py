@@ -1,7 +1,7 @@
 """By how much each contact model is known to err: the trade-off study's largest errors.
 
-`known_errors.json` is written by `scripts/make_tradeoff_table` from the same rows as the
-README's table. Errors are relative, against converged references, the largest over the cases on
+`known_errors.json` is written by `scripts/make_tradeoff_table` from the same rows as the table
+of docs/studies.md. Errors are relative, against converged references, the largest over the cases on
 which a setting was measured. What was not measured is said to be so, never interpolated.
 """
 
