@@ -18,9 +18,9 @@ from tkamb.inputs.labels import matched_labels
 from tkamb.inputs.markers import marker_trajectories
 from tkamb.inputs.tables import Table
 from tkamb.opensim.kinematics import Kinematics, cross
-from tkamb.opensim.model import OpenSimModel
+from tkamb.opensim.model import Joint, OpenSimModel
 
-BLOCK = 64
+BLOCK = 128
 """Frames that are fitted at once."""
 COARSE = 8
 """Frames between those that are fitted first."""
@@ -41,7 +41,6 @@ class ModelChain:
         self.kinematics = Kinematics(model)
         self._at = [self.kinematics.bodies[model.markers[name].body] for name in markers]
         self._points = np.array([model.markers[name].location for name in markers])
-        self._carries, self._above = _tree(self.kinematics, self._at)
         index = self.kinematics.coordinates
         followers = {coupler.dependent for coupler in model.couplers}
         self.free = [
@@ -52,6 +51,19 @@ class ModelChain:
         self._couplers = [
             (index[c.dependent], index[c.independent], c.function) for c in model.couplers
         ]
+        # what moves: the free ones first, then what follows them
+        follow = [d for d, i, _ in self._couplers if i in self.free]
+        self._moving = [*self.free, *follow]
+        self._after = [
+            (self._moving.index(d), self._moving.index(i), i, f)
+            for d, i, f in self._couplers
+            if d in follow
+        ]
+        carries, above = _tree(self.kinematics, self._at)
+        self._carries, self._above = (
+            carries[self._moving],
+            above[np.ix_(self._moving, self._moving)],
+        )
 
     def default(self, frames: int) -> Array:
         """Return the coordinates (f, n) at their defaults."""
@@ -82,6 +94,7 @@ class ModelChain:
         left out of the curvature.
         """
         poses, twists = self.kinematics.joint_twists(state)
+        twists = twists[:, self._moving]
         x = self._markers_at(poses)
         off = target - x
         pull = weights[:, :, None] * off
@@ -132,14 +145,13 @@ class ModelChain:
 
         What follows a free coordinate is added to it, by the chain rule.
         """
-        square = values.shape[1] == values.shape[2]
-        for dependent, independent, function in self._couplers:
-            slope = function.slope(state[:, independent])[:, None]
+        square, free = values.shape[1] == values.shape[2], len(self.free)
+        for dependent, independent, coordinate, function in self._after:
+            slope = function.slope(state[:, coordinate])[:, None]
             values[:, independent] += slope * values[:, dependent]
             if square:
                 values[:, :, independent] += slope * values[:, :, dependent]
-        rows = values[:, self.free]
-        return rows[:, :, self.free] if square else rows
+        return values[:, :free, :free] if square else values[:, :free]
 
     def moved(self, state: Array, step: Array) -> Array:
         """Return the coordinates (f, n) after a step (f, free) of the free ones."""
@@ -164,7 +176,7 @@ def _tree(kinematics: Kinematics, at: Sequence[int]) -> tuple[Array, Array]:
     is passed backwards the order is turned round.
     """
     model, bodies = kinematics.model, kinematics.bodies
-    hanging = {}  # joint -> bodies outboard of it
+    hanging: dict[Joint, set[int]] = {}  # bodies outboard of each joint
     for joint in reversed(model.joints):  # from the ends inwards
         own = {bodies[joint.outboard]}
         own.update(*(h for j, h in hanging.items() if j.inboard == joint.outboard))

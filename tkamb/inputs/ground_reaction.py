@@ -80,6 +80,12 @@ def load_ground_reaction(
     if from_plates:
         stamps, force, point, moment = _of_plates(table)
     else:
+        if table.surface_mm:
+            raise InputError(
+                "is for plates of a .c3d: a table states its points itself",
+                "[ground_reaction] surface_mm",
+                "leave it out",
+            )
         recorded = read_table(table.file, table.format)
         stamps = recorded.time(table.columns.get("time", "time"))
         force, point, moment = _recorded(table, recorded)
@@ -182,7 +188,8 @@ def _of_plates(table: GroundReactionTable) -> tuple[Array, Array, Array, Array]:
     """Return times (k,) s, force, point and free moment, each (k, 3), of a recording's plates.
 
     The wrenches are summed about the laboratory's origin and kept: the point lies on the level
-    of the plates' surface, carried over in time while the vertical force is below `unloaded_N`.
+    of the plates' surface or that of a step on them, `surface_mm` above it, and is carried over
+    in time while the vertical force is below `unloaded_N`.
     """
     recording = read_c3d(table.file)
     check_roles(table.columns, (), table.file, "ground_reaction")
@@ -204,7 +211,8 @@ def _of_plates(table: GroundReactionTable) -> tuple[Array, Array, Array, Array]:
         raise InputError("the plates lie at different levels", table.file, "give them one by one")
     point = np.full_like(force, np.nan)
     loaded = force[:, 1] >= table.unloaded_N
-    point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], levels[0])
+    level = levels[0] + table.surface_mm * MILLIMETRE
+    point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], level)
     point = _held(recording.analog_time, point, loaded, table.file)
     return recording.analog_time, force, point, about_origin - np.cross(point, force)
 

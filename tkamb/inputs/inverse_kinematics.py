@@ -144,7 +144,7 @@ def fit_chain(
     return ChainFit(state, np.where(count > 0, rms, np.nan), distance, solved, steps)
 
 
-def _step(equations: NormalEquations, damping: Array, near: Array) -> Array:
+def _step(equations: NormalEquations, damping: Array, near: NDArray[np.bool_]) -> Array:
     """Return the damped steps (f, n) of some frames: Newton's where `near`, else Gauss-Newton's.
 
     A Newton step that would not descend is replaced.
