@@ -5,7 +5,7 @@ from pathlib import Path
 import trimesh
 
 from tkamb.errors import InputError
-from tkamb.geometry.bodies import separate_bodies
+from tkamb.geometry.topology import separate_bodies
 from tkamb.inputs.mesh_check import mended_mesh
 from tkamb.output.atomic import replaced_file
 

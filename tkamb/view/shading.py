@@ -6,7 +6,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.geometry.corner_normals import corner_normals
 from tkamb.geometry.surface import Surface
 from tkamb.view.thinning import thinned
 
@@ -36,7 +35,7 @@ class Shaded:
 def shaded(surface: Surface, most_triangles: int = MOST_TRIANGLES) -> Shaded:
     """Return a surface for drawing; vertices on sharp edges are doubled."""
     surface, error = thinned(surface, most_triangles)
-    normals = corner_normals(surface)
+    normals = surface.corner_normals
     flat = np.repeat(surface.face_normals[:, None], 3, axis=1)
     normals = np.where(np.linalg.norm(normals, axis=-1, keepdims=True) > 0, normals, flat)
     key = np.round(normals.reshape(-1, 3) * 127.0).astype(np.int64)

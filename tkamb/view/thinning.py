@@ -3,7 +3,6 @@
 import numpy as np
 from fast_simplification import simplify
 
-from tkamb.geometry.nearest import NearestPoints
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
@@ -32,7 +31,7 @@ def thinned(surface: Surface, most_triangles: int) -> tuple[Surface, float]:
 def _distance(one: Surface, other: Surface) -> float:
     """Return the largest distance (m) of vertices and triangle centres to the other surface."""
     return max(
-        float(NearestPoints(to).at(points).distance.max())
+        float(to.nearest.at(points).distance.max())
         for of, to in ((one, other), (other, one))
         for points in (of.vertices, of.triangles.mean(axis=1))
     )
