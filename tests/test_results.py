@@ -13,9 +13,9 @@ import pytest
 
 from synthetic_run import make_run
 from tkamb.errors import InputError
-from tkamb.output.maps_file import ContactMaps, MapWriter, read_maps, write_maps
+from tkamb.output.maps import ContactMaps, MapWriter, read_maps, write_maps
 from tkamb.results import Results, claim_directory, read_results, write_results
-from tkamb.run.columns import COLUMNS, columns_as_markdown, is_ligament, ligament_of
+from tkamb.columns import COLUMNS, columns_as_markdown, is_ligament, ligament_of
 
 ROOT = Path(__file__).parents[1]
 
@@ -151,7 +151,7 @@ def test_failed_frame_is_nan_in_the_maps(tmp_path):
 
 WRITER = """
 import sys, numpy as np
-from tkamb.output.maps_file import MapWriter
+from tkamb.output.maps import MapWriter
 n = 500
 rng = np.random.default_rng(1)
 noise = rng.normal(size=n)

@@ -6,7 +6,7 @@ import pytest
 from scenes import fast_scene, write_scene
 from tkamb import load_scene, simulate
 from tkamb.errors import InputError
-from tkamb.run.columns import COLUMNS
+from tkamb.columns import COLUMNS
 
 EVERY_TENTH = slice(0, 101, 10)
 

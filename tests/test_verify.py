@@ -9,7 +9,7 @@ import pytest
 from scenes import write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.output.shards import Shard, Shards
+from tkamb.run.shards import Shard, Shards
 from tkamb.results import read_results
 
 
@@ -159,7 +159,7 @@ def test_a_frames_folder_that_is_a_link_is_not_followed(tmp_path):
 
 
 def test_one_of_two_runs_at_once_is_refused(run, capfd):
-    from tkamb.output import claim
+    from tkamb import claim
 
     scene, out = run
     descriptor = claim._lock(out)  # as another process would hold it

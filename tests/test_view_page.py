@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import tkamb
-from tkamb.output.maps_file import read_maps
+from tkamb.output.maps import read_maps
 from tkamb.results import read_results
 from tkamb.view.browser import HeadlessBrowser, find_browser
 from tkamb.view.run import open_run

@@ -151,7 +151,7 @@ def _run(options: argparse.Namespace) -> int:
 
     profile = Profile() if options.profile else None
     from tkamb.output.axis import horizontal_axis
-    from tkamb.output.claim import claimed_directory
+    from tkamb.claim import claimed_directory
     from tkamb.output.headline import cards
     from tkamb.results import write_results
     from tkamb.run.status import FAILED
@@ -217,7 +217,7 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from tkamb.output.claim import claimed_directory
+    from tkamb.claim import claimed_directory
     from tkamb.output.report import write_report
     from tkamb.results import REPORT_NAME, read_results
 

@@ -7,7 +7,7 @@ import trimesh
 from tkamb.errors import InputError
 from tkamb.geometry.bodies import separate_bodies
 from tkamb.inputs.mesh_check import mended_mesh
-from tkamb.output.atomic import replaced_file
+from tkamb.atomic import replaced_file
 
 FORMATS = (".stl", ".ply", ".obj")
 

@@ -13,21 +13,21 @@ import numpy as np
 from tkamb.errors import InputError, names_near
 from tkamb.files import MEGABYTE, read_json, sha256_of
 from tkamb.geometry.frames import Array
-from tkamb.output.atomic import (
+from tkamb.atomic import (
     Replacement,
     claim_directory,
     replaced_together,
     write_synced,
     write_text,
 )
-from tkamb.output.claim import claimed_directory, settle
+from tkamb.claim import claimed_directory, settle
 from tkamb.output.results_csv import csv_text, read_csv
-from tkamb.run.columns import COLUMNS, KINDS, ordered_names
+from tkamb.columns import COLUMNS, KINDS, ordered_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tkamb.output.maps_file import ContactMaps
+    from tkamb.output.maps import ContactMaps
 
 __all__ = ["COLUMNS", "Results", "claim_directory", "read_results", "write_results"]
 
@@ -137,7 +137,7 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
     summary = read_summary(directory)
     maps = None
     if (directory / MAPS_NAME).exists():
-        from tkamb.output.maps_file import read_maps
+        from tkamb.output.maps import read_maps
 
         maps = read_maps(directory / MAPS_NAME)
     if check and (found := differences(directory, summary)):
@@ -183,7 +183,7 @@ def write_results(results: Results, directory: str | Path, *, force: bool = Fals
     """Write results.csv, summary.json, contact.h5 and report.html: all of them or none.
 
     Without maps, a contact.h5 of an earlier run in that folder is removed, since it would pass
-    for this run's. The shards of a run under way (`tkamb.output.shards`) have served and go.
+    for this run's. The shards of a run under way (`tkamb.run.shards`) have served and go.
 
     Args:
         results: what to write.
@@ -191,10 +191,10 @@ def write_results(results: Results, directory: str | Path, *, force: bool = Fals
         force: write even into a folder that holds things that are not tkamb's.
 
     Raises:
-        InputError: the folder cannot be claimed (`tkamb.output.claim`) or written.
+        InputError: the folder cannot be claimed (`tkamb.claim`) or written.
     """
     from tkamb.output.report import report_html
-    from tkamb.output.shards import remove_shards
+    from tkamb.run.shards import remove_shards
 
     with claimed_directory(directory, force) as folder:
         with replaced_together(folder) as files:
@@ -272,6 +272,6 @@ def _put_maps(maps: "ContactMaps | None", files: Replacement) -> None:
         and maps.source.absolute() == files.current(MAPS_NAME).absolute()
     ):
         return
-    from tkamb.output.maps_file import write_maps
+    from tkamb.output.maps import write_maps
 
     write_maps(maps, files.path(MAPS_NAME))

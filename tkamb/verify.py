@@ -9,7 +9,7 @@ from typing import Any
 from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
 from tkamb.files import sha256_of
-from tkamb.output.claim import settle
+from tkamb.claim import settle
 from tkamb.results import SUMMARY_NAME, differences, read_results, read_summary
 
 

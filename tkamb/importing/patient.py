@@ -22,7 +22,7 @@ from tkamb.importing.urdf import patient_urdf
 from tkamb.inputs.meshes import load_surface
 from tkamb.inputs.tables import read_table
 from tkamb.opensim.read import read_osim
-from tkamb.output.atomic import claim_directory, write_text
+from tkamb.atomic import claim_directory, write_text
 from tkamb.scene import load_scene
 from tkamb.units import DEGREE, MILLIMETRE
 

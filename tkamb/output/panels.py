@@ -17,7 +17,7 @@ from tkamb.output.metrics import (
 )
 from tkamb.output.panel import Line, Panel, without_empty_lines
 from tkamb.output.style import BLACK, BLUE, GREEN, GREY, PURPLE, SIDE_COLOURS, VERMILLION
-from tkamb.run.columns import is_ligament, ligament_of
+from tkamb.columns import is_ligament, ligament_of
 
 if TYPE_CHECKING:
     from tkamb.results import Results

@@ -4,7 +4,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tkamb.output.atomic import write_text
+from tkamb.atomic import write_text
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
 from tkamb.output.cursor import SCRIPT, cursor_bar
 from tkamb.output.headline import cards

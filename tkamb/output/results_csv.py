@@ -11,7 +11,7 @@ import numpy as np
 
 from tkamb.errors import InputError, names_near
 from tkamb.files import TABLE_LIMIT, read_text
-from tkamb.run.columns import KINDS, is_ligament
+from tkamb.columns import KINDS, is_ligament
 
 
 def read_csv(path: str | Path) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tkamb.contact.lattice.cells import scaled_jacobians
 from tkamb.contact.lattice.grid import Lattice
 from tkamb.geometry.frames import Array
-from tkamb.output.atomic import replaced_file
+from tkamb.atomic import replaced_file
 
 HEXAHEDRON = 12
 """VTK's number for a cell of eight nodes."""

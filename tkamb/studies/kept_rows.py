@@ -14,7 +14,7 @@ from typing import Any
 from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
 from tkamb.files import TABLE_LIMIT, read_bytes
-from tkamb.output.atomic import write_text
+from tkamb.atomic import write_text
 
 FILE_NAME = "rows.jsonl"
 

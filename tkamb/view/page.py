@@ -10,7 +10,7 @@ from typing import Any
 
 import meshcat
 
-from tkamb.output.atomic import write_text
+from tkamb.atomic import write_text
 from tkamb.output.policy import sources
 
 SCRIPTS = ("scene.js", "moving.js", "controls.js", "start.js")

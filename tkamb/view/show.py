@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tkamb.errors import InputError
-from tkamb.output.atomic import replaced_file
+from tkamb.atomic import replaced_file
 from tkamb.view.browser import take_picture
 from tkamb.view.cameras import CAMERAS
 from tkamb.view.draw import draw

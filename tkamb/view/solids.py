@@ -15,7 +15,7 @@ from tkamb.case import Case
 from tkamb.geometry.frames import Array, inverse, pose, transform
 from tkamb.geometry.surface import Surface
 from tkamb.mechanics.extensor import quadriceps_bone
-from tkamb.output.maps_file import ContactMaps
+from tkamb.output.maps import ContactMaps
 from tkamb.units import MILLIMETRE
 from tkamb.view.colours import BONE, BUTTON, INSERT, METAL, RECORDED
 from tkamb.view.drawing import Solid

@@ -20,7 +20,7 @@ from typing import Any
 
 from tkamb.errors import InputError
 from tkamb.files import TABLE_LIMIT, read_json, read_text
-from tkamb.output.atomic import (
+from tkamb.atomic import (
     MARKER,
     claim_directory,
     finish_replacement,

@@ -21,7 +21,7 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.files import read_bytes, read_json
 from tkamb.geometry.frames import Array
-from tkamb.output.atomic import replaced_file, write_text
+from tkamb.atomic import replaced_file, write_text
 
 FOLDER = ".frames"
 IDENTITY_NAME = "run.json"
