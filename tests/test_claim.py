@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from tkamb.errors import InputError
 from tkamb import atomic
 from tkamb.atomic import JOURNAL, MARKER, folder_token, replaced_file, replaced_together
 from tkamb.claim import claimed_directory, settle
+from tkamb.errors import InputError
 
 ROOT = Path(__file__).parents[1]
 

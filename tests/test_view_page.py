@@ -5,7 +5,7 @@ import pytest
 
 import tkamb
 from tkamb.output.maps import read_maps
-from tkamb.results import read_results
+from tkamb.results_folder import read_results
 from tkamb.view.browser import HeadlessBrowser, find_browser
 from tkamb.view.run import open_run
 from tkamb.view.show import Show, serve_in_background

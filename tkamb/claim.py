@@ -18,8 +18,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tkamb.errors import InputError
-from tkamb.files import TABLE_LIMIT, read_json, read_text
 from tkamb.atomic import (
     MARKER,
     claim_directory,
@@ -27,6 +25,8 @@ from tkamb.atomic import (
     folder_token,
     replacement_pending,
 )
+from tkamb.errors import InputError
+from tkamb.files import TABLE_LIMIT, read_json, read_text
 
 CHOOSE = "choose another folder with --out"
 LONGEST_WAIT = 5.0

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tkamb.case import Case, load_case
+from tkamb.claim import claimed_directory
 from tkamb.errors import InputError
 from tkamb.mechanics.mechanics import Mechanics
-from tkamb.claim import claimed_directory
 from tkamb.plausibility.plausibility import Plausibility
 from tkamb.results import Results
 from tkamb.run.recorder import FolderRecorder, Recorder, finished_results

@@ -17,9 +17,9 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tkamb.atomic import replaced_file
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.atomic import replaced_file
 
 FILE_NAME = "contact.h5"
 UNITS = "SI: m, s, Pa, N; poses 4x4"

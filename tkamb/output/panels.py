@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tkamb.columns import is_ligament, ligament_of
 from tkamb.known_errors import is_large, known_error_words
 from tkamb.output import style
 from tkamb.output.metrics import (
@@ -17,7 +18,6 @@ from tkamb.output.metrics import (
 )
 from tkamb.output.panel import Line, Panel, without_empty_lines
 from tkamb.output.style import BLACK, BLUE, GREEN, GREY, PURPLE, SIDE_COLOURS, VERMILLION
-from tkamb.columns import is_ligament, ligament_of
 
 if TYPE_CHECKING:
     from tkamb.results import Results

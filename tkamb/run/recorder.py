@@ -18,8 +18,7 @@ from tkamb.geometry.frames import Array
 from tkamb.run.shards import Row, Shard, Shards, check_same_run
 
 if TYPE_CHECKING:
-    from tkamb.output.maps import ContactMaps, MapWriter
-    from tkamb.output.maps import MapMemory
+    from tkamb.output.maps import ContactMaps, MapMemory, MapWriter
     from tkamb.results import Results
 
 MAPS = ("pressure", "gap", "nodal_force", "pose")
@@ -165,7 +164,7 @@ class FolderRecorder(Recorder):
         """Put results.csv, summary.json and contact.h5 in their places together; a report goes."""
         from tkamb.atomic import replaced_together
         from tkamb.output.maps import FILE_NAME
-        from tkamb.results import REPORT_NAME, put_numbers
+        from tkamb.results_folder import REPORT_NAME, put_numbers
 
         start = clock.perf_counter()
         with interrupt_later(), replaced_together(self._directory) as files:
@@ -202,7 +201,7 @@ def finished_results(directory: Path, identity: Mapping[str, Any]) -> "Results |
     Raises:
         InputError: they are another run's, or no longer what was written.
     """
-    from tkamb.results import SUMMARY_NAME, read_results
+    from tkamb.results_folder import SUMMARY_NAME, read_results
 
     if not (directory / SUMMARY_NAME).exists():
         return None

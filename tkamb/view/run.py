@@ -7,7 +7,8 @@ from pathlib import Path
 from tkamb.case import Case, load_case
 from tkamb.errors import InputError
 from tkamb.mechanics.mechanics import FrameLoads, Mechanics
-from tkamb.results import SUMMARY_NAME, Results, read_results
+from tkamb.results import Results
+from tkamb.results_folder import SUMMARY_NAME, read_results
 from tkamb.run.summary import files_hash, scene_hash
 from tkamb.scene import Scene, load_scene
 from tkamb.simulation import simulate

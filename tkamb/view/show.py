@@ -11,8 +11,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tkamb.errors import InputError
 from tkamb.atomic import replaced_file
+from tkamb.errors import InputError
 from tkamb.view.browser import take_picture
 from tkamb.view.cameras import CAMERAS
 from tkamb.view.draw import draw
