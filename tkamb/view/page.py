@@ -11,7 +11,7 @@ from typing import Any
 import meshcat
 
 from tkamb.atomic import write_text
-from tkamb.output.policy import sources
+from tkamb.output.pages import policy_sources
 
 SCRIPTS = ("scene.js", "moving.js", "controls.js", "start.js")
 POLICY = (
@@ -49,7 +49,7 @@ def page_html(
     return _filled(
         _own("page.html"),
         title=escape(title),
-        policy=POLICY.format(scripts=sources(*scripts), connect=connect),
+        policy=POLICY.format(scripts=policy_sources(*scripts), connect=connect),
         style=_own("style.css"),
         asked=json.dumps(asked).replace("<", "\\u003c"),
         data=data,
