@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from headless import Page
 from synthetic_run import MASS_KG, make_run
 from tkamb.errors import InputError
 from tkamb.output import metrics
@@ -19,7 +20,6 @@ from tkamb.output.pressure_maps import draw_maps, mapped_frames, top_view
 from tkamb.output.report import report_html, write_report
 from tkamb.output.tables import flag_rows, motion_table, reasons
 from tkamb.results import Results
-from tkamb.view.browser import HeadlessBrowser, find_browser
 
 VOID = {"meta", "br", "input", "img", "link", "hr"}
 
@@ -351,29 +351,13 @@ def test_notebooks_show_headline_and_plots(bend):
         bend.plot(axis="angle")
 
 
-@pytest.fixture(scope="module")
-def browser():
-    if find_browser() is None:
-        pytest.skip("no chromium here (Debian: apt install chromium)")
-    with HeadlessBrowser() as browser:
-        yield browser
-
-
-def opened(browser, path, ready):
-    """Open a file and wait until an expression holds."""
-    browser.problems.clear()
-    browser.command("Page.navigate", {"url": path.as_uri()})
-    until = f"new Promise((done) => {{ const t = setInterval(() => {{ if ({ready}) {{"
-    browser.evaluate(until + "clearInterval(t); done(true); } }, 20); })")
-
-
 LIVE = "document.body && document.body.classList.contains('live')"
 
 
-def test_slider_moves_the_cursor_and_the_numbers(bend, page, tmp_path, browser):
+def test_slider_moves_the_cursor_and_the_numbers(bend, page, tmp_path, chromium):
     path = tmp_path / "report.html"
     path.write_text(page, encoding="utf-8")
-    opened(browser, path, LIVE)
+    browser = Page(chromium).open(path.as_uri(), LIVE)
     browser.evaluate(
         "(() => { const slider = document.getElementById('frame'); slider.value = 50;"
         "slider.dispatchEvent(new Event('input')); })()"
@@ -393,7 +377,7 @@ def test_slider_moves_the_cursor_and_the_numbers(bend, page, tmp_path, browser):
     assert browser.evaluate(joined) == "round"
 
 
-def test_a_script_that_is_not_the_report_s_own_does_not_run(page, tmp_path, browser):
+def test_a_script_that_is_not_the_report_s_own_does_not_run(page, tmp_path, chromium):
     path = tmp_path / "report.html"
     foreign = (
         "<script>document.title = 'foreign'</script>"
@@ -402,7 +386,7 @@ def test_a_script_that_is_not_the_report_s_own_does_not_run(page, tmp_path, brow
     )
     (tmp_path / "other.js").write_text("document.title = 'foreign'")
     path.write_text(page.replace("</body>", foreign), encoding="utf-8")
-    opened(browser, path, LIVE)
+    browser = Page(chromium).open(path.as_uri(), LIVE)
     assert browser.evaluate("document.title") != "foreign"
     refused = [told for told in browser.problems if "Content Security Policy" in told]
     assert len(refused) >= 3
