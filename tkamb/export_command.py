@@ -16,7 +16,7 @@ def add_export(commands: Any) -> None:
 
 def _export(options: argparse.Namespace) -> int:
     from tkamb.output.storage import write_results_storage
-    from tkamb.results import read_results
+    from tkamb.results_folder import read_results
 
     results = read_results(options.folder)
     print(f"{options.sto}: {write_results_storage(results, options.sto)}")

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tkamb.atomic import write_text
+from tkamb.columns import KINDS
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.output.atomic import write_text
-from tkamb.run.columns import KINDS
-from tkamb.run.status import FAILED
+from tkamb.output.metrics import failed, flagged
 
 if TYPE_CHECKING:
     from tkamb.results import Results
@@ -75,11 +75,11 @@ def write_results_storage(results: "Results", path: Path) -> str:
     time = numbers.pop("time_s")
     if not (np.diff(time) > 0).all():
         raise InputError("holds times that do not rise, as OpenSim wants them", results.directory)
-    status = [0.0 if s == "ok" else 2.0 if s.startswith(FAILED) else 1.0 for s in results.status]
-    write_storage(path, {"time": time, **numbers, "status": np.array(status)}, in_degrees=True)
-    failed, flagged = status.count(2.0), status.count(1.0)
+    lost, doubtful = failed(results), flagged(results)
+    status = np.where(lost, 2.0, np.where(doubtful, 1.0, 0.0))
+    write_storage(path, {"time": time, **numbers, "status": status}, in_degrees=True)
     return (
-        f"{len(status)} frames ({flagged} to be read with care, {failed} failed: nan), "
+        f"{len(status)} frames ({doubtful.sum()} to be read with care, {lost.sum()} failed: nan), "
         f"{len(numbers) + 2} columns"
     )
 
