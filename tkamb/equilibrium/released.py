@@ -39,7 +39,8 @@ SETTLED = 2e-6
 """m: the knee moves less than this when the patella is found anew."""
 SETTLED_FORCE = 0.1
 """N: neither does the contact force."""
-MOST_PASSES = 8
+MOST_PASSES = 20
+"""Passes by which knee and patella settle; each halves what is left where the knee is soft."""
 TINY = 1e-7
 """m: step of the finite differences of axes and ligaments."""
 
@@ -143,7 +144,9 @@ class ReleasedKnee:
         balance = forces.balance(before.balance.stiffness if before else None)
         contact, problem = forces.contact(balance), "; ".join(placed.problems)
         if balance.status is not BalanceStatus.OK:
-            problem = problem or f"released: {balance.status.value}"
+            problem = problem or f"released: {balance.status.value}" + (
+                " (quadriceps slack, flexors not modelled)" if slack else ""
+            )
         knee = SettledKnee(
             forces.at(balance),
             placed,
