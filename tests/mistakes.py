@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from scenes import MODEL, as_toml
-from tkamb.case import load_case
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.errors import TkambError
@@ -23,6 +22,7 @@ from tkamb.mechanics.mechanics import Mechanics
 from tkamb.plausibility.plausibility import Plausibility
 from tkamb.run.status import frame_status
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 DM = MODEL.parent / "dm"
 DATA = MODEL.parents[2] / "shared" / "data" / "dm"

@@ -5,12 +5,12 @@ import pytest
 
 from scenes import fast_scene, write_scene
 from tkamb import load_scene, simulate
-from tkamb.case import load_case
 from tkamb.errors import InputError
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import knee_pose
 from tkamb.mechanics.mechanics import Mechanics
 from tkamb.output.tables import strain_table
+from tkamb.scene.case import load_case
 
 FEW = {"motion.frames": 26}
 FRAMES = slice(10, 91, 40)

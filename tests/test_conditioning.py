@@ -11,11 +11,11 @@ from tkamb import simulate
 from tkamb.body.inverse_dynamics import LARGEST_CONDITION
 from tkamb.body.knee import solve_knee
 from tkamb.body.load import PointForces
-from tkamb.case import load_case
 from tkamb.geometry.frames import transform
 from tkamb.mechanics.mechanics import FrameLoads, Mechanics
 from tkamb.run.status import FAILED, frame_status
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 MIDDLE = 60
 

@@ -243,8 +243,8 @@ def test_ground_reaction_fits_a_whole_body_in_balance(motion):
 
 
 def test_package_finds_the_patella_where_the_script_put_it(motion):
-    from tkamb.case import load_case
     from tkamb.mechanics.extensor import ExtensorFrames
+    from tkamb.scene.case import load_case
 
     case = load_case(load_scene(MODEL / "scene.toml", {"patella.motion": "solved"}))
     frames = np.arange(0, 101, 5)

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tkamb.case import load_case
 from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.errors import InputError
 from tkamb.geometry.first_touch import FirstTouch
@@ -14,6 +13,7 @@ from tkamb.geometry.lowest import LowestPoints
 from tkamb.inputs.tables import read_table
 from tkamb.mechanics.mechanics import Mechanics
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 BEND = Path(__file__).parents[1] / "models" / "deep_knee_bend"
 ALL = ["ap", "ml", "axial_rotation", "adduction"]

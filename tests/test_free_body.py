@@ -21,12 +21,12 @@ import pytest
 
 from free_body import FreeBodies, Lent
 from raw_leg import Leg
-from tkamb.case import load_case
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import pose
 from tkamb.inputs.meshes import axes_rotation, load_surface
 from tkamb.mechanics.mechanics import Mechanics
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 MODELS = Path(__file__).parents[1] / "models"
 DATA = Path(__file__).parents[2] / "shared" / "data" / "dm"

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from scenes import MODEL, write_scene
 from tkamb.body import knee, patellofemoral, unknowns
 from tkamb.body.chain import Chain
-from tkamb.case import Case, load_case
 from tkamb.geometry import close_region, condyles
 from tkamb.geometry.frames import pose
 from tkamb.geometry.nearest import NearestPoints
@@ -21,6 +20,7 @@ from tkamb.geometry.surface import Surface
 from tkamb.inputs.patient import load_urdf
 from tkamb.mechanics.mechanics import FrameLoads, Mechanics
 from tkamb.scene import Scene, load_scene
+from tkamb.scene.case import Case, load_case
 
 FEW = 26
 FRAMES = (0, 9, 15, 23)

@@ -16,12 +16,12 @@ from tkamb.body.ligaments import (
     two_line_force,
 )
 from tkamb.body.load import total_wrench
-from tkamb.case import load_case
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, knee_pose
 from tkamb.geometry.surface import Surface
 from tkamb.scene import load_scene
-from tkamb.scene_tables import LigamentTable
+from tkamb.scene.case import load_case
+from tkamb.scene.tables import LigamentTable
 
 SLACK = 0.05
 FLEXION = np.deg2rad(np.arange(0.0, 101.0, 5.0))

@@ -16,11 +16,11 @@ from tkamb.body.patella import (
     solve_patella,
 )
 from tkamb.body.patellofemoral import PatellofemoralContact
-from tkamb.case import load_case
 from tkamb.geometry.frames import Array, inverse, knee_pose, transform
 from tkamb.geometry.surface import Surface
 from tkamb.mechanics.extensor import ExtensorFrames
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 TROCHLEA, DOME = 0.025, 0.02
 CENTRE = np.array([0.004, 0.0, 0.0])

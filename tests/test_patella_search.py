@@ -10,10 +10,10 @@ from scenes import MODEL, write_scene
 from test_patella import INSERTION, knee_at, mechanism  # noqa: F401
 from tkamb import simulate
 from tkamb.body.patella import ExtensorMechanism, PatellaStatus, solve_patella
-from tkamb.case import load_case
 from tkamb.mechanics import extensor
 from tkamb.mechanics.mechanics import Mechanics
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 FEW = {"motion.frames": 11, "patella.motion": "solved", "contact.resolution_mm": 3.0}
 

@@ -8,7 +8,6 @@ import pytest
 
 from tkamb.body.demand import external_wrench
 from tkamb.body.load import total_wrench
-from tkamb.case import load_case
 from tkamb.contact.probe import condyle_wrenches
 from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.contact_side import ContactSide
@@ -16,6 +15,7 @@ from tkamb.equilibrium.released import SCALE
 from tkamb.geometry.frames import knee_pose
 from tkamb.mechanics.mechanics import Mechanics
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 ROOT = Path(__file__).parents[1]
 BEND = ROOT / "models" / "deep_knee_bend" / "scene.toml"

@@ -7,13 +7,13 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from tkamb.case import load_case
 from tkamb.geometry.frames import inverse, transform
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 from tkamb.mechanics.mechanics import Mechanics
 from tkamb.output.metrics import JUMP
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 from tkamb.view.draw import draw
 from tkamb.view.foot import standing
 from tkamb.view.run import open_run

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tkamb.case import Case, load_case
 from tkamb.errors import InputError
 from tkamb.mechanics.mechanics import Mechanics
 from tkamb.output.claim import claimed_directory
@@ -18,6 +17,7 @@ from tkamb.run.status import frame_status
 from tkamb.run.summary import input_hashes, run_identity, scene_hash, summary_of
 from tkamb.run.tabulate import frame_row, join_rows
 from tkamb.scene import Scene, load_scene
+from tkamb.scene.case import Case, load_case
 
 if TYPE_CHECKING:
     from tkamb.equilibrium.contact_side import ContactSide

@@ -17,7 +17,7 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, transform
 from tkamb.geometry.surface import Surface
-from tkamb.scene_tables import Attachment, LigamentTable
+from tkamb.scene.tables import Attachment, LigamentTable
 from tkamb.units import MILLIMETRE
 
 PREFIX = "generic_"

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from tkamb.body.load import PointForces
 from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array, transform
-from tkamb.scene_tables import Attachment, LigamentTable
+from tkamb.scene.tables import Attachment, LigamentTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 TOE_STRAIN = 0.03

@@ -18,7 +18,6 @@ import numpy as np
 
 from tkamb.body.knee import solve_knee, unsolved
 from tkamb.body.unknowns import CondylePoint
-from tkamb.case import Case
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import first_touch_height, within_insert
@@ -33,6 +32,7 @@ from tkamb.equilibrium.split_sensitivity import split_sensitivity
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.mechanics.mechanics import FrameLoads, Mechanics
+from tkamb.scene.case import Case
 
 if TYPE_CHECKING:
     from tkamb.equilibrium.released import ReleasedKnee, SettledKnee

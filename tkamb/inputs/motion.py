@@ -27,7 +27,7 @@ from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import angle_scale, check_roles, poses_of_columns
 from tkamb.inputs.samples import OddSample, check_range, check_spacing, check_steps, odd_samples
 from tkamb.inputs.tables import Table, read_table
-from tkamb.scene_tables import MotionTable
+from tkamb.scene.tables import MotionTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:

@@ -23,12 +23,12 @@ from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.geometry.sections import sagittal_outline
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.meshes import BONE_SIZE, load_surface, mirrored
-from tkamb.scene_tables import Attachment
+from tkamb.scene.tables import Attachment
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
-    from tkamb.case import Case
     from tkamb.geometry.surface import Surface
+    from tkamb.scene.case import Case
 
 
 class ExtensorFrames:

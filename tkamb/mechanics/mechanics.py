@@ -9,10 +9,10 @@ import numpy as np
 from tkamb.body.chain import ChainMotion, ChainState
 from tkamb.body.knee import KneeGeometry, KneeLoads, solve_knee, unsolved
 from tkamb.body.load import PointForces
-from tkamb.case import Case
 from tkamb.errors import ComputationError, InputError, TkambError
 from tkamb.geometry.frames import Array, knee_pose, knee_twist
 from tkamb.mechanics.touching import FARTHEST_GAP, NOWHERE, Touching, nearest_gap, touching
+from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:

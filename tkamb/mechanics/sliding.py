@@ -11,8 +11,8 @@ import numpy as np
 
 from tkamb.body.slip import CondyleSlip, sliding_velocity
 from tkamb.body.unknowns import CondylePoint
-from tkamb.case import Case
 from tkamb.geometry.frames import Array, knee_pose, knee_twist, transform
+from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
 
 

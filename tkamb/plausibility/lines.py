@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.case import Case
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.plausibility.question import Question, some
-from tkamb.scene_tables import Attachment
+from tkamb.scene.case import Case
+from tkamb.scene.tables import Attachment
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.case import Case
 from tkamb.mechanics.mechanics import FrameLoads
 from tkamb.run.agreement import contradictions
+from tkamb.scene.case import Case
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:

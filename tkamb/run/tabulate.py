@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.body.dome_sensitivity import dome_sensitivity
-from tkamb.case import Case
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates
 from tkamb.mechanics.mechanics import FrameLoads
 from tkamb.run.agreement import normal_force, share_by_equilibrium, split_determined
 from tkamb.run.columns import ligament_column
 from tkamb.run.status import FAILED
+from tkamb.scene.case import Case
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 if TYPE_CHECKING:

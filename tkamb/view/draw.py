@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.case import Case
 from tkamb.output.axis import horizontal_axis
 from tkamb.output.metrics import map_rows
+from tkamb.scene.case import Case
 from tkamb.units import MEGAPASCAL
 from tkamb.view.arrows import contact_markers, force_arrows
 from tkamb.view.drawing import Drawing, PressureMap

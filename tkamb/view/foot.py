@@ -10,9 +10,9 @@ import numpy as np
 import trimesh
 
 from tkamb.body.knee import KneeGeometry
-from tkamb.case import Case
 from tkamb.geometry.frames import Array, inverse, pose, transform
 from tkamb.geometry.surface import Surface
+from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
 from tkamb.view.arrows import centre_of_pressure
 from tkamb.view.colours import BLACK, BONE, FLOOR

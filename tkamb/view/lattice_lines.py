@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from tkamb.case import Case
 from tkamb.contact.lattice.cells import FACES
 from tkamb.contact.lattice.grid import build_grid
 from tkamb.geometry.frames import Array
+from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
 
 

@@ -11,11 +11,11 @@ import numpy as np
 import trimesh
 
 from tkamb.body.chain import ChainState
-from tkamb.case import Case
 from tkamb.geometry.frames import Array, inverse, pose, transform
 from tkamb.geometry.surface import Surface
 from tkamb.mechanics.extensor import quadriceps_bone
 from tkamb.output.maps_file import ContactMaps
+from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
 from tkamb.view.colours import BONE, BUTTON, INSERT, METAL, RECORDED
 from tkamb.view.drawing import Solid

@@ -13,7 +13,7 @@ from tkamb.geometry.frames import Array, pose
 from tkamb.inputs.motion import KneeMotion, load_motion
 from tkamb.inputs.patient import load_urdf
 from tkamb.scene import Scene
-from tkamb.scene_tables import Attachment, FemoralImplantTable, PatellarImplantTable
+from tkamb.scene.tables import Attachment, FemoralImplantTable, PatellarImplantTable
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:

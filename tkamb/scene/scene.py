@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 
 from tkamb.errors import InputError, names_near
 from tkamb.files import read_text
-from tkamb.scene_tables import (
+from tkamb.scene.tables import (
     ContactTable,
     GenericLigamentsTable,
     GroundReactionTable,
