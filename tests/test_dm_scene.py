@@ -212,7 +212,7 @@ def test_ligaments_are_near_their_slack_length_in_stance():
     }
     bundles: dict[str, list] = {}
     total = np.zeros(len(femur))
-    for strand in build_ligaments(case().scene.ligament, poses, motion.coordinates[:, 5]):
+    for strand in build_ligaments(case().ligaments, poses, motion.coordinates[:, 5]):
         length = strand.length(poses)
         bundles.setdefault(re.sub(r"\d+$", "", strand.name), []).append(strand.strain(length))
         total += strand.force(length)

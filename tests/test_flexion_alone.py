@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from tkamb.equilibrium.contact_side import ContactSide
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.lowest import LowestPoints
 from tkamb.inputs.tables import read_table
-from tkamb.mechanics.mechanics import Mechanics
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
 

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tkamb.body.demand import external_wrench
+from tkamb.body.joint_equilibrium import external_wrench
 from tkamb.body.load import total_wrench
 from tkamb.contact.probe import condyle_wrenches
 from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.contact_side import ContactSide
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.equilibrium.released import SCALE
 from tkamb.geometry.frames import knee_pose
-from tkamb.mechanics.mechanics import Mechanics
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
 
@@ -51,10 +51,10 @@ def settled(bend):
 def test_the_shank_is_in_equilibrium(bend, settled):
     """Ground, weight and inertia, ligaments, patellar ligament and contact add up to nothing."""
     for k, (body, contact) in settled.items():
-        placed = contact.settled.placed
-        total = external_wrench(placed.geometry, contact.settled.coordinates)
-        shank = [load for load in placed.geometry.ligaments if load.link.startswith("tibia")]
-        pull = [p for p in placed.geometry.extensor.patellar_ligament if p.link == "tibia"]
+        geometry = contact.settled.geometry
+        total = external_wrench(geometry, contact.settled.coordinates)
+        shank = [load for load in geometry.ligaments if load.link.startswith("tibia")]
+        pull = [p for p in geometry.extensor.patellar_ligament if p.link == "tibia"]
         total = total + total_wrench(shank, np.zeros(3))
         total = total + body.loads.values["patellar_ligament"] * total_wrench(pull, np.zeros(3))
         for name, condyle in body.geometry.condyles.items():

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
-from tkamb.mechanics.mechanics import Mechanics
 from tkamb.output.claim import claimed_directory
 from tkamb.plausibility.plausibility import Plausibility
 from tkamb.results import Results

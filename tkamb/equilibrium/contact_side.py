@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tkamb.body.contact_points import CondylePoint
 from tkamb.body.knee import solve_knee, unsolved
-from tkamb.body.unknowns import CondylePoint
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import first_touch_height, within_insert
@@ -28,10 +28,10 @@ from tkamb.contact.summary import medial_points
 from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.frame_contact import FrameContact
+from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.equilibrium.split_sensitivity import split_sensitivity
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import Array, knee_pose
-from tkamb.mechanics.mechanics import FrameLoads, Mechanics
 from tkamb.scene.case import Case
 
 if TYPE_CHECKING:
@@ -218,8 +218,7 @@ class ContactSide:
     def _settled_loads(
         self, k: int, settled: "SettledKnee", contact: FrameContact, points: dict[str, Array]
     ) -> FrameLoads:
-        start, placed = clock.perf_counter(), settled.placed
-        geometry = placed.geometry
+        start, geometry = clock.perf_counter(), settled.geometry
         if contact.result is None:
             loads = unsolved([contact.problem])
         else:
@@ -232,7 +231,7 @@ class ContactSide:
             )
             loads = solve_knee(geometry, self.mechanics.friction)
         seconds = clock.perf_counter() - start
-        return FrameLoads(geometry, loads, placed.tensions, placed.wrap, None, 0.0, seconds)
+        return FrameLoads(geometry, loads, None, 0.0, seconds)
 
     def _resultants(self, k: int, place: Array, result: ContactResult) -> dict[str, CondylePoint]:
         """Return the contact's resultants as the contact points of the equations."""

@@ -14,7 +14,7 @@ from tkamb.units import DEGREE
 
 if TYPE_CHECKING:
     from tkamb.equilibrium.frame_contact import FrameContact
-    from tkamb.mechanics.mechanics import FrameLoads
+    from tkamb.equilibrium.mechanics import FrameLoads
     from tkamb.scene.case import Case
 
 SHARES_APART = 0.25

@@ -20,7 +20,7 @@ from tkamb.equilibrium.released import SettledKnee
 from tkamb.geometry.frames import Array
 
 if TYPE_CHECKING:
-    from tkamb.mechanics.mechanics import Mechanics
+    from tkamb.equilibrium.mechanics import Mechanics
 
 RESULT_ARRAYS = ("pose", "normals", "pressure", "area", "gap", "nodal_force", "wrench_on_insert")
 
@@ -66,7 +66,7 @@ def _settled(mechanics: "Mechanics", frame: int, arrays: Mapping[str, Array]) ->
     place, nan = arrays["settled_coordinates"], float("nan")
     return SettledKnee(
         coordinates=place,
-        placed=mechanics.placed(frame, place, patella),
+        geometry=mechanics.geometry(frame, place, patella),
         patella=patella,
         contact=ProbedContact({}),
         balance=Balance(

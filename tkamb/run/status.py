@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.mechanics.mechanics import FrameLoads
+from tkamb.equilibrium.mechanics import FrameLoads
 from tkamb.run.agreement import contradictions
 from tkamb.scene.case import Case
 from tkamb.units import DEGREE, MILLIMETRE

@@ -156,7 +156,7 @@ def _shipped(name: str) -> StudyCase:
 
 
 def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
-    from tkamb.mechanics.mechanics import Mechanics
+    from tkamb.equilibrium.mechanics import Mechanics
     from tkamb.scene import load_scene
     from tkamb.scene.case import load_case
 

@@ -79,8 +79,7 @@ def draw(run: Run, progress: Progress = lambda frames: frames, lattice: bool = F
 
 
 def _stand_ins(case: Case, foot: bool) -> tuple[str, ...]:
-    meshed = case.scene.quadriceps is not None and case.scene.quadriceps.bone is not None
-    words = STAND_INS.format("Tibia and patella are" if meshed else "Bones are")
+    words = STAND_INS.format("Tibia and patella are" if case.bone else "Bones are")
     return (words, FOOT) if foot else (words,)
 
 

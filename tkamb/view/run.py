@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.errors import InputError
-from tkamb.mechanics.mechanics import FrameLoads, Mechanics
 from tkamb.results import SUMMARY_NAME, Results, read_results
 from tkamb.run.summary import files_hash, scene_hash
 from tkamb.scene import Scene, load_scene

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tkamb.body.contact_points import CondylePoint
 from tkamb.body.knee import KneeLoads
-from tkamb.body.unknowns import CondylePoint
 from tkamb.units import MILLIMETRE
 
 FAR = 5.0 * MILLIMETRE
