@@ -45,7 +45,7 @@ def test_flexion_alone_finds_the_state_of_the_whole_recording(tmp_path):
     for k in (30, 75):
         contacts = [side.frame(k)[1] for side in sides]
         assert not any(contact.problem for contact in contacts)
-        places = [contact.settled.coordinates for contact in contacts]
+        places = [contact.equilibrium.coordinates for contact in contacts]
         apart = np.abs(places[0] - places[1])
         assert apart[:3].max() < 2e-4, k
         assert np.degrees(apart[3:]).max() < 0.3, k

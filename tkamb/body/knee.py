@@ -215,7 +215,7 @@ class _System:
         self.solution = solve(self.names, self._columns, self._right)
 
     @property
-    def touching(self) -> list[str]:
+    def carrying(self) -> list[str]:
         """Sides that carry load."""
         return [side for side in self.geometry.condyles if side not in self.lifted]
 
@@ -242,7 +242,7 @@ class _System:
             return np.array([values[f"knee_force_{axis}"] for axis in unknowns.AXES])
         forces = [
             values[f"{side}_normal"] * self.geometry.condyles[side].direction(self.friction)
-            for side in self.touching
+            for side in self.carrying
         ]
         return np.asarray(np.sum(forces, axis=0))
 
@@ -306,7 +306,7 @@ class _System:
                 axes["flexion"] = unknowns.AXES["ml"]
             return unknowns.intersegmental(geometry.state.pose("femur")[:3, 3], axes)
         normals = [
-            unknowns.condyle(side, geometry.condyles[side], self.friction) for side in self.touching
+            unknowns.condyle(side, geometry.condyles[side], self.friction) for side in self.carrying
         ]
         middle = np.mean([contact.point for contact in geometry.condyles.values()], axis=0)
         return normals + unknowns.residuals(middle, len(normals) < 2, balanced)

@@ -57,8 +57,8 @@ def load_states(
         off: sides that the recorded gap keeps off the insert.
         extensors: names of the extensor muscles; none: the mechanism is not modelled.
     """
-    touching = [side for side in sides if side not in off]
-    lifted = [off, *(off | {side} for side in touching if len(touching) == 2)]
+    near = [side for side in sides if side not in off]
+    lifted = [off, *(off | {side} for side in near if len(near) == 2)]
     slack = dict.fromkeys([frozenset[str](), frozenset(extensors)])
     states = [LoadState(*state) for state in product(lifted, slack)]
     return sorted(

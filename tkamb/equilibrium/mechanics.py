@@ -17,7 +17,7 @@ from tkamb.body.contact_points import (
 from tkamb.body.knee import KneeGeometry, KneeLoads, solve_knee, unsolved
 from tkamb.body.load import PointForces
 from tkamb.errors import ComputationError, InputError, TkambError
-from tkamb.geometry.frames import Array, knee_pose, knee_twist
+from tkamb.geometry.frames import SIDES, Array, knee_pose, knee_twist
 from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
 
@@ -108,7 +108,7 @@ class Mechanics:
         """
         start = clock.perf_counter()
         if adjustment is None:
-            adjustment, problems = self._adjusted(k)
+            adjustment, problems = self._adjust(k)
         else:
             problems = ()
         pose = adjustment.pose if adjustment else self.poses[k]
@@ -172,7 +172,7 @@ class Mechanics:
         from tkamb.body.slip import condyle_slip
 
         found = condyle_slip(case.femoral, case.insert, case.split, case.motion.coordinates)
-        sides = zip(("medial", "lateral"), found, strict=True)
+        sides = zip(SIDES, found, strict=True)
         return {side: slip for side, slip in sides if slip is not None}
 
     def _chain_motion(
@@ -199,7 +199,7 @@ class Mechanics:
             return state.ground_reaction(ground.force[k], tibia.pose[k][:3, 3], np.zeros(3))
         return state.ground_reaction(ground.force[k], ground.point[k], ground.moment[k])
 
-    def _adjusted(self, k: int) -> "tuple[Adjustment | None, tuple[str, ...]]":
+    def _adjust(self, k: int) -> "tuple[Adjustment | None, tuple[str, ...]]":
         """Return the femoral adjustment, if asked for, and why it is not possible."""
         contact = self.case.scene.contact
         if self.query is None or contact is None or not contact.adjust:

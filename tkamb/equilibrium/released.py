@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 LEVER = 0.025
 """m: half the usual distance of the condyles; makes rotations comparable to translations."""
 SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
-SETTLED = 2e-6
+KNEE_CHANGE = 2e-6
 """m: the knee moves less than this when the patella is found anew."""
-SETTLED_FORCE = 0.1
+FORCE_CHANGE = 0.1
 """N: neither does the contact force."""
 MOST_PASSES = 8
 TINY = 1e-7
@@ -50,12 +50,12 @@ TINY = 1e-7
 Sliding = Callable[[Array, Array], Array]
 
 
-def _at_rest(place: Array, point: Array) -> Array:
+def _no_sliding(place: Array, point: Array) -> Array:
     return np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False)
-class SettledKnee:
+class KneeEquilibrium:
     """One frame with its released coordinates at rest.
 
     Args:
@@ -100,13 +100,13 @@ class ReleasedKnee:
         self.released = released_indices(names)
         self._rows = list(self.released)
 
-    def settle(
+    def find(
         self,
         k: int,
         start: Array,
         points: dict[str, Array] | None = None,
-        before: SettledKnee | None = None,
-    ) -> SettledKnee:
+        before: KneeEquilibrium | None = None,
+    ) -> KneeEquilibrium:
         """Return frame k at rest.
 
         Args:
@@ -129,14 +129,14 @@ class ReleasedKnee:
             shift = np.abs(middle - last).max() if self._keeps else 0.0
             if pushes:
                 slack = True
-            elif knee.problem or (max(moved, shift) < SETTLED and change < SETTLED_FORCE):
+            elif knee.problem or (max(moved, shift) < KNEE_CHANGE and change < FORCE_CHANGE):
                 return knee
         assert knee is not None
         return replace(knee, problem="knee and patella do not settle together")
 
     def _pass(
-        self, k: int, place: Array, middle: Array, slack: bool, before: SettledKnee | None
-    ) -> tuple[SettledKnee, bool]:
+        self, k: int, place: Array, middle: Array, slack: bool, before: KneeEquilibrium | None
+    ) -> tuple[KneeEquilibrium, bool]:
         """Return the knee at rest with the patella as at `place`, and whether it would push."""
         patella = self._patella(k, place, before.patella if before else None)
         geometry = self._mechanics.geometry(k, place, patella)
@@ -145,7 +145,7 @@ class ReleasedKnee:
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
         if balance.status is not BalanceStatus.OK:
             problem = problem or f"released: {balance.status.value}"
-        knee = SettledKnee(
+        knee = KneeEquilibrium(
             forces.at(balance),
             geometry,
             patella,
@@ -205,7 +205,7 @@ class ReleasedForces:
         probe: "Probe",
         place: Array,
         friction: float = 0.0,
-        sliding: Sliding = _at_rest,
+        sliding: Sliding = _no_sliding,
     ) -> None:
         self._joint, self._probe, self._place = joint, probe, np.array(place, float)
         self._friction, self._sliding = friction, sliding
@@ -227,7 +227,7 @@ class ReleasedForces:
         contact = self.seen[x.tobytes()] = self._probe.at(knee_pose(place))
         if not contact.known:
             return Trial(np.full(len(x), np.nan))
-        wrench, stiffness = self._rubbing(place, contact)
+        wrench, stiffness = self._with_friction(place, contact)
         if stiffness is None:
             return Trial(self._joint.imbalance(place, wrench) / self._scale)
         steps = np.zeros((len(x) + 1, 6))
@@ -247,7 +247,7 @@ class ReleasedForces:
         if self._joint.line is None:
             return False
         place = self.at(balance)
-        wrench, _ = self._rubbing(place, self.contact(balance))
+        wrench, _ = self._with_friction(place, self.contact(balance))
         return bool(self._joint.kept(place, wrench)[-1] < 0)
 
     def _with(self, x: Array) -> Array:
@@ -255,7 +255,7 @@ class ReleasedForces:
         place[self._rows] = x / self._scale
         return place
 
-    def _rubbing(self, place: Array, contact: "ProbedContact") -> tuple[Array, Array | None]:
+    def _with_friction(self, place: Array, contact: "ProbedContact") -> tuple[Array, Array | None]:
         """Return wrench (6,) on the insert with friction, and its stiffness (6, 6) if known."""
         wrench, stiffness = np.zeros(6), np.zeros((6, 6))
         for condyle in contact.condyles.values():

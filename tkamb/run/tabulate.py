@@ -7,7 +7,7 @@ import numpy as np
 
 from tkamb.body.knee import dome_sensitivity
 from tkamb.equilibrium.mechanics import FrameLoads
-from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates
+from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, knee_coordinates
 from tkamb.run.agreement import normal_force, share_by_equilibrium, split_determined
 from tkamb.run.columns import ligament_column
 from tkamb.run.status import FAILED
@@ -98,7 +98,7 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
     loads, values, extensor = frame.loads, frame.loads.values, frame.geometry.extensor
     on_insert = -loads.contact_force
     total = float(np.linalg.norm(on_insert))
-    normal = {side: normal_force(frame, side) for side in ("medial", "lateral")}
+    normal = {side: normal_force(frame, side) for side in SIDES}
     row = {
         "force_si_N": -on_insert[1],
         "force_ap_N": on_insert[0],
@@ -180,7 +180,7 @@ def _contact_row(frame: "FrameContact", yield_stress: float) -> dict[str, float]
         row["adjust_translation_mm"] = frame.adjustment.translation / MILLIMETRE
         row["adjust_coronal_deg"] = frame.adjustment.coronal_angle / DEGREE
         row["adjust_restored"] = float(frame.adjustment.restored)
-    for side in ("medial", "lateral"):
+    for side in SIDES:
         row |= _condyle_row(side, frame, yield_stress)
     return row
 
@@ -193,15 +193,16 @@ def _pose_row(frame: "FrameContact") -> dict[str, float]:
     if frame.iterations:
         row["coupling_iterations"] = frame.iterations
         row["coupling_change_N"] = frame.load_change
-    if frame.settled is None:
+    if frame.equilibrium is None:
         return row | {"coupling_change_mm": frame.point_change / MILLIMETRE}
     angles = ("adduction", "axial_rotation")
     return (
         row
         | {f"{angle}_deg": named[angle] / DEGREE for angle in angles}
         | {
-            "contact_trials": frame.settled.trials,
-            "softest_N_per_mm": frame.settled.balance.softest * MILLIMETRE,
+            "contact_trials": frame.equilibrium.trials,
+            "smallest_stiffness_N_per_mm": frame.equilibrium.balance.smallest_stiffness
+            * MILLIMETRE,
         }
     )
 

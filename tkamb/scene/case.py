@@ -213,7 +213,7 @@ class _Parts:
                 raise InputError(error.what, error.where, question) from None
             raise
         self.insert_mesh_in_insert = placement @ pose(axes_rotation(table.axes), np.zeros(3))
-        self.insert = self._sided(surface.moved(placement))
+        self.insert = self._right(surface.moved(placement))
 
     def _could_be_insert(self, table: FemoralImplantTable) -> bool:
         """Say whether the mesh that the scene calls femoral has an insert's flat bottom."""
@@ -238,9 +238,9 @@ class _Parts:
         turn = Rotation.from_euler("XYZ", table.rotation_deg, degrees=True).as_matrix()
         placement = pose(turn, np.array(table.position_mm) * MILLIMETRE)
         mesh_in_link = placement @ pose(axes_rotation(table.axes), np.zeros(3))
-        return self._sided(surface.moved(placement)), mesh_in_link
+        return self._right(surface.moved(placement)), mesh_in_link
 
-    def _sided(self, surface: "Surface") -> "Surface":
+    def _right(self, surface: "Surface") -> "Surface":
         from tkamb.inputs.meshes import mirrored
 
         return mirrored(surface) if self._left else surface
