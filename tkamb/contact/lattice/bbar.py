@@ -83,10 +83,6 @@ class BbarHexahedra(Solid):
             matrices += scale[:, None, None] * force[:, :, None] * force[:, None, :]
         return self.pattern.assemble(matrices)
 
-    def equivalent_strain(self, displacement: Array) -> Array:
-        """Return the largest equivalent strain of each cell's Gauss points (c,)."""
-        return np.asarray(self._state(displacement)[1].max(axis=1))
-
     @cached_property
     def _bulk(self) -> Array:
         g = self.dilatation

@@ -23,9 +23,6 @@ from tkamb.contact.lattice.cells import CORNERS, PAIRS
 from tkamb.contact.lattice.hexahedron import PAIR_AXES, mean_gradient
 from tkamb.geometry.frames import Array
 
-EDGE_RATIO_LIMIT = 1.4
-"""Longest over shortest edge up to which all springs can be kept non-negative."""
-
 
 def spring_families(edges: Array, body_diagonal: float) -> Array:
     """Return what one cell owns of its 28 springs, per unit shear modulus, m.

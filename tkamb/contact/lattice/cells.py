@@ -103,12 +103,6 @@ def join_springs(cells: Index, node_count: int) -> Springs:
     return Springs(ends, (used % len(DIRECTIONS)).astype(np.int8), owners[used], of_cell)
 
 
-def spring_count(cells_x: int, cells_y: int, cells_z: int) -> int:
-    """Return the number of springs in a full block of cells (28 for one, 158 for 2 x 2 x 2)."""
-    nodes = np.array([cells_x, cells_y, cells_z]) + 1
-    return int(sum(np.prod(nodes - np.abs(direction)) for direction in DIRECTIONS))
-
-
 def scaled_jacobians(points: Array) -> Array:
     """Return the least scaled Jacobian (c,) of cells (c, 8, 3): 1 for a box, <= 0 inverted."""
     result = np.full(len(points), np.inf)

@@ -30,7 +30,6 @@ class NodeField:
     Args:
         lines: x and z coordinates (m) of the grid lines along y.
         spacing: (3,) m.
-        bottom_layer: j of the layer that lies in the flat bottom.
         points: (nx, ny, nz, 3) m.
         member: belongs to the part.
         lower_end: lower end of an interval of its line.
@@ -44,7 +43,6 @@ class NodeField:
 
     lines: tuple[Array, Array]
     spacing: Array
-    bottom_layer: int
     points: Array
     member: Mask
     lower_end: Mask
@@ -88,7 +86,7 @@ def settle_columns(surface: Surface, spacing: Array) -> NodeField:
     levels = follow_top(top, surface.bounds[0, 1], spacing)
     low, high = levels.position(intervals.lower, i, k), levels.position(intervals.upper, i, k)
     intervals, low, high, closed = _without_narrow_gaps(intervals, low, high)
-    field = _empty_field((x, z), spacing, levels.heights(), levels.below)
+    field = _empty_field((x, z), spacing, levels.heights())
     field.mended, field.closed_gaps = intervals.mended, closed
     _admit(field, intervals, interval_ends(low, high, levels.count))
     return field
@@ -131,9 +129,7 @@ def _grid_line(surface: Surface, axis: int, spacing: float) -> Array:
     return np.asarray(line)
 
 
-def _empty_field(
-    lines: tuple[Array, Array], spacing: Array, heights: Array, below: int
-) -> NodeField:
+def _empty_field(lines: tuple[Array, Array], spacing: Array, heights: Array) -> NodeField:
     x, z = lines
     points = np.empty((*heights.shape, 3))
     points[..., 0], points[..., 2] = x[:, None, None], z[None, None, :]
@@ -141,7 +137,6 @@ def _empty_field(
     return NodeField(
         lines=lines,
         spacing=spacing,
-        bottom_layer=below,
         points=points,
         member=np.zeros(heights.shape, bool),
         lower_end=np.zeros(heights.shape, bool),

@@ -47,7 +47,7 @@ class LostBalance:
         region: Region | None = None,
     ) -> None:
         self._problem, self._response, self._tolerance = problem, response, tolerance
-        self.region = Region.everywhere(problem) if region is None else region.within(problem)
+        self.region = Region.everywhere(problem) if region is None else region
         self.lost = np.zeros_like(problem.solid.nodes)
         if lost is not None:
             self.lost[self.region.nodes] = lost[self.region.nodes]
@@ -93,8 +93,7 @@ class LostBalance:
     def _look(self, region: Region) -> None:
         """Find the imbalance of a region; of the whole, also which members count."""
         solid = self._problem.solid
-        every = region.whole and solid.softening is None
-        forces = solid.lost(self.field, None if every else region.members)
+        forces = solid.lost(self.field, None if region.whole else region.members)
         value = self._summed(forces, region)
         self.residual = float(np.linalg.norm(value - self._taken)) / self._size
         if region.whole:

@@ -206,8 +206,7 @@ class CellContact(ContactModel):
         touched = None if guess is None else guess.pressure > 0
         for _ in range(MOST_GROWTHS):
             start = choose_start(state.pool, gaps, foot, depth, load is None, touched, earlier)
-            problem = self._posed(state.problem, gaps, start)
-            solution = self._solution(problem, pose, load, start, tolerance)
+            solution = self._solution(state.problem, pose, load, start, tolerance)
             covered = load is None or len(start.candidates) == np.isfinite(gaps).sum()
             below = -min(float(gaps.min()), 0.0)
             reached = solution.forces.approach * REACH + below
@@ -226,10 +225,6 @@ class CellContact(ContactModel):
                 return result
             depth, touched = 1.1 * solution.forces.approach, None
         return failed_result(state, pose, "the set of candidate nodes is saturated")
-
-    def _posed(self, problem: ContactProblem, gaps: Array, start: Start) -> ContactProblem:
-        """Return the problem as it is solved at one pose; gaps (c,) are vertical, m."""
-        return problem
 
     def _solution(
         self,

@@ -1,12 +1,10 @@
 """The calibrated lattice as a solid: one secant shear modulus per cell, elastic bulk."""
 
-from copy import copy
 from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from tkamb.contact.lattice.calibrated import deviatoric_matrices
 from tkamb.contact.lattice.curve import ShearCurve
@@ -28,22 +26,6 @@ class CalibratedNetwork(Solid):
         super().__init__(nodes, cells, spacing, material)
         self.deviatoric, self.dilatation, self.volume = deviatoric_matrices(self.shapes, spacing)
         self.curve = ShearCurve.of(material)
-
-    def softening_within(self, points: Array, distance: float) -> "CalibratedNetwork":
-        """Return the same solid whose cells are linear farther from points (m, 3) than a distance.
-
-        What counts is the cell's middle; both in m.
-        """
-        low, high = points.min(axis=0) - distance, points.max(axis=0) + distance
-        near = np.flatnonzero(((self._middles >= low) & (self._middles <= high)).all(axis=1))
-        away = cKDTree(points).query(self._middles[near], distance_upper_bound=distance)[0]
-        limited = copy(self)
-        limited.softening = near[np.isfinite(away)]
-        return limited
-
-    @cached_property
-    def _middles(self) -> Array:
-        return np.asarray(self.nodes[self.cells].mean(axis=1))
 
     @cached_property
     def stiffness(self) -> sparse.csr_matrix:
@@ -68,18 +50,11 @@ class CalibratedNetwork(Solid):
         """Return d f / d u (3n, 3n): mu_s K_d + mu_s'/(3 V e) (K_d u)(K_d u)ᵀ + bulk."""
         force, equivalent = self._state(displacement)
         shape = self.shape_of_cell
-        if self.softening is not None:
-            linear = np.setdiff1d(np.arange(len(self.cells)), self.softening, assume_unique=True)
-            equivalent[linear] = 0.0
         secant, softening = self.curve.modulus(equivalent), self.curve.softening(equivalent)
         scale = softening / (3 * self.volume[shape])
         matrices = secant[:, None, None] * self.deviatoric[shape] + self._bulk[shape]
         matrices += scale[:, None, None] * force[:, :, None] * force[:, None, :]
         return self.pattern.assemble(matrices)
-
-    def equivalent_strain(self, displacement: Array) -> Array:
-        """Return e of each cell (c,)."""
-        return self._state(displacement)[1]
 
     @cached_property
     def _bulk(self) -> Array:

@@ -21,7 +21,7 @@ class Region:
         members: (k,) increasing.
         nodes: (m,) their nodes that are not held.
         fronts: (f,) what of the factor these nodes need, increasing.
-        whole: these are all that may lose forces.
+        whole: these are all members.
     """
 
     members: Indices
@@ -36,23 +36,13 @@ class Region:
         touched = np.zeros(scatter.nodes, bool)
         touched[scatter.members[members]] = True
         nodes = np.flatnonzero(touched & ~problem.held.reshape(-1, 3).all(axis=1))
-        softening = problem.solid.softening
-        whole = len(members) == len(scatter.members if softening is None else softening)
+        whole = len(members) == len(scatter.members)
         return cls(members, nodes, problem.operator.members_of(nodes), whole)
 
     @classmethod
     def everywhere(cls, problem: ContactProblem) -> "Region":
-        """Return the region of all members that may lose forces."""
-        solid = problem.solid
-        every = np.arange(len(solid.scatter.members))
-        return cls.of(problem, every if solid.softening is None else solid.softening)
-
-    def within(self, problem: ContactProblem) -> "Region":
-        """Return the part of the region that may lose forces in another problem."""
-        softening = problem.solid.softening
-        if softening is None or np.isin(self.members, softening, assume_unique=True).all():
-            return self
-        return Region.of(problem, np.intersect1d(self.members, softening, assume_unique=True))
+        """Return the region of all members."""
+        return cls.of(problem, np.arange(len(problem.solid.scatter.members)))
 
 
 def members_that_count(size: Array, allowed: float) -> Indices:

@@ -25,14 +25,9 @@ class Solid(ABC):
         spacing: (3,) m, edges of the lattice's box cell.
         material: its E, nu and stress-strain law.
 
-    Attributes:
-        softening: (k,) members of `scatter` that may lose forces, increasing; None: all.
-
     Raises:
         InputError: a cell is turned inside out.
     """
-
-    softening: Indices | None = None
 
     def __init__(self, nodes: Array, cells: Indices, spacing: Array, material: Material) -> None:
         self.nodes, self.cells, self.spacing, self.material = nodes, cells, spacing, material
@@ -69,15 +64,11 @@ class Solid(ABC):
         """Return h = K u - f(u), N, (n, 3): linear forces minus the material's own."""
         if self.material.is_linear:
             return np.zeros_like(displacement)
-        return self.scatter.sum(self.lost(displacement, self.softening), self.softening)
+        return self.scatter.sum(self.lost(displacement))
 
     @abstractmethod
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n), N/m."""
-
-    @abstractmethod
-    def equivalent_strain(self, displacement: Array) -> Array:
-        """Return each cell's (largest) equivalent deviatoric strain (c,)."""
 
     def internal_force(self, displacement: Array) -> Array:
         """Return nodal internal forces f(u), N, (n, 3)."""

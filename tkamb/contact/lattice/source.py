@@ -101,13 +101,6 @@ class SourceNetwork(Solid):
         strain, direction = self._state(displacement)
         return self._assembled(self.material.tangent(strain) * self.factor, direction)
 
-    def equivalent_strain(self, displacement: Array) -> Array:
-        """Return the largest magnitude of strain among the springs, for every cell (c,)."""
-        strain = np.abs(self._state(displacement)[0])
-        worst = np.zeros(len(self.nodes))
-        np.maximum.at(worst, self.springs.ravel(), np.repeat(strain, 2))
-        return np.asarray(worst[self.cells].max(axis=1))
-
     @cached_property
     def _spring_pattern(self) -> Pattern:
         return Pattern.of(self.springs, len(self.nodes))
