@@ -8,10 +8,11 @@ import pytest
 
 from scenes import MODEL
 from tkamb.case import load_case
+from tkamb.contact.area import area_above
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
-from tkamb.contact.summary import area_above, medial_points
+from tkamb.contact.result import medial_points
 from tkamb.geometry.frames import knee_pose
 from tkamb.scene import load_scene
 

@@ -6,8 +6,8 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.memory import Remembered
 from tkamb.contact.lattice.problem import ContactProblem, Footing
+from tkamb.contact.lattice.region import Region
 from tkamb.contact.lattice.response import SINGLE, ContactResponse, HalfResponse, unknowns_of
 from tkamb.contact.lattice.solver import Start
 from tkamb.geometry.frames import Array
@@ -20,6 +20,25 @@ SPARE = 1.6
 """The stored response covers nodes down to this many times the depth asked for."""
 MOST_STORED = 1500
 """Nodes of the stored response: 80 MB of compliance."""
+
+
+@dataclass(frozen=True, eq=False)
+class WarmStart:
+    """Where a solution ended: what a result carries for the next solution of the same problem.
+
+    Args:
+        problem: whose solution it was; it serves no other.
+        lost: (n, 3) h, N, or None for a linear material.
+        moved: (c, 3) m, displacement of the contact nodes that were candidates, else 0.
+        depth: m, how far the femoral component went below the lowest contact node.
+        region: outside of which `lost` is zero, or None.
+    """
+
+    problem: ContactProblem
+    lost: Array | None
+    moved: Array
+    depth: float
+    region: Region | None
 
 
 @dataclass
@@ -120,7 +139,7 @@ def choose_start(
     depth: float,
     at_pose: bool,
     touched: NDArray[np.bool_] | None,
-    earlier: Remembered | None,
+    earlier: WarmStart | None,
 ) -> Start:
     """Return candidates, their response and a first active set.
 

@@ -1,33 +1,31 @@
 """Contact models on a lattice of cells: the contract's prepare, evaluate and press."""
 
 from abc import abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.contact.lattice.cache import cached_operator
-from tkamb.contact.lattice.candidates import ResponsePool, choose_start, guessed_depth
+from tkamb.contact.lattice.candidates import ResponsePool, WarmStart, choose_start, guessed_depth
 from tkamb.contact.lattice.femoral import FemoralFloor
 from tkamb.contact.lattice.grid import Lattice, build_grid
-from tkamb.contact.lattice.memory import Memory, Remembered
 from tkamb.contact.lattice.memory_need import TooLittleMemoryError, check_assembly_memory
 from tkamb.contact.lattice.newton import solve_by_newton
 from tkamb.contact.lattice.operator import ElasticOperator, fixed_unknowns, prepare_operator
 from tkamb.contact.lattice.pressure_map import ContactMap, contact_map
 from tkamb.contact.lattice.problem import ContactProblem, Direction, Footing, undeformed
-from tkamb.contact.lattice.report import PressureRule, result_of, unseen_flags, untouched
+from tkamb.contact.lattice.report import PressureRule, result_of, unseen_flags
 from tkamb.contact.lattice.response import SINGLE
 from tkamb.contact.lattice.solid import Solid
 from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve
 from tkamb.contact.materials import Material
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import ContactPair, PreparedContact
-from tkamb.contact.pressing import check_load, failed_result, pose_at_approach, within_insert
+from tkamb.contact.pressing import check_load, within_insert
 from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError, InputError
-from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import Array
 from tkamb.units import MILLIMETRE
 
@@ -42,30 +40,15 @@ class LatticeState(PreparedContact):
     """What depends on geometry and material alone.
 
     Args:
-        pair: the two bodies.
         lattice: the insert's grid.
         problem: solid, factorised operator and femoral component.
-        map: contact surface.
-        split: z between the condyles in the femoral frame, m, or None.
+        pool: compliance of the contact nodes asked for last; it changes no answer.
     """
 
-    pair: ContactPair
+    surface: ContactMap
     lattice: Lattice
     problem: ContactProblem
-    map: ContactMap
-    split: float | None
     pool: ResponsePool
-    memory: Memory = field(default_factory=Memory)
-
-    @property
-    def points(self) -> Array:  # type: ignore[override]
-        """Map points (n, 3) m, insert frame: the undeformed contact nodes."""
-        return self.map.points
-
-    @property
-    def triangles(self) -> NDArray[np.int64]:  # type: ignore[override]
-        """Map triangles (k, 3)."""
-        return self.map.triangles
 
     @property
     def node_count(self) -> int:
@@ -116,8 +99,7 @@ class CellContact(ContactModel):
             solid, operator, lattice.index, held, floor, self.direction, surface.lift
         )
         _rehearse(problem, pair)
-        pool = ResponsePool(operator.half)
-        return LatticeState(pair, lattice, problem, surface, condyle_split(pair.femoral), pool)
+        return LatticeState(pair, surface, lattice, problem, ResponsePool(operator.half))
 
     def _operator(
         self,
@@ -154,11 +136,11 @@ class CellContact(ContactModel):
         """Return the contact at a pose; see `ContactModel`."""
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
-            return failed_result(state, pose, "the pose is not finite")
+            return ContactResult.failed(state, pose, "the pose is not finite")
         gaps, foot = undeformed(state.problem, pose)
         deepest = -float(gaps.min())
         if deepest <= 0:
-            return untouched(state, pose, gaps)
+            return ContactResult.of(state, pose, np.zeros(len(gaps)), gaps)
         return self._solved(state, pose, None, (gaps, foot), deepest, guess)
 
     def press(
@@ -168,23 +150,26 @@ class CellContact(ContactModel):
         check_load(load)
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
-            return failed_result(state, pose, "the pose is not finite")
+            return ContactResult.failed(state, pose, "the pose is not finite")
         gaps, foot = undeformed(state.problem, pose)
         lowest = float(gaps.min())
         if not np.isfinite(lowest):
-            return failed_result(state, pose, "the femoral component does not lie over the insert")
+            return ContactResult.failed(
+                state, pose, "the femoral component does not lie over the insert"
+            )
         if load == 0:
-            pose = pose_at_approach(state.pair, pose, 0.0)
-            return untouched(state, pose, undeformed(state.problem, pose)[0])
+            pose = state.pair.pose_at_approach(pose, 0.0)
+            gaps, _ = undeformed(state.problem, pose)
+            return ContactResult.of(state, pose, np.zeros(len(gaps)), gaps)
         pose[1, 3] -= lowest
         gaps, foot = gaps - lowest, foot.raised(-lowest)
-        earlier = state.memory.of(guess)
-        if earlier is not None:
-            depth = earlier.depth
+        warm = warm_start_of(state, guess)
+        if warm is not None:
+            depth = warm.depth
         elif guess is not None and guess.approach > 0:
             depth = guess.approach
         else:
-            depth = guessed_depth(state.problem, gaps, state.map.area, load)
+            depth = guessed_depth(state.problem, gaps, state.surface.area, load)
         return self._solved(state, pose, load, (gaps, foot), depth, guess)
 
     def _solved(
@@ -202,29 +187,27 @@ class CellContact(ContactModel):
         """
         gaps, foot = rest
         tolerance = Tolerance(self.tolerance)
-        earlier = state.memory.of(guess)
-        touched = None if guess is None else guess.pressure > 0
+        warm = warm_start_of(state, guess)
+        touched = guess.pressure > 0 if guess and len(guess.pressure) == len(gaps) else None
         for _ in range(MOST_GROWTHS):
-            start = choose_start(state.pool, gaps, foot, depth, load is None, touched, earlier)
+            start = choose_start(state.pool, gaps, foot, depth, load is None, touched, warm)
             solution = self._solution(state.problem, pose, load, start, tolerance)
             covered = load is None or len(start.candidates) == np.isfinite(gaps).sum()
             below = -min(float(gaps.min()), 0.0)
             reached = solution.forces.approach * REACH + below
             if solution.converged:
-                moved = np.zeros_like(state.map.points)
+                moved = np.zeros_like(state.surface.points)
                 moved[solution.candidates] = solution.displacement
                 below += solution.forces.approach
-                earlier = Remembered(solution.lost, moved, below, solution.region)
+                warm = WarmStart(state.problem, solution.lost, moved, below, solution.region)
             if covered or reached <= start.reach:
                 result = result_of(state, pose, load, gaps, solution, self.pressure_rule)
                 if load is not None:
                     sunk = solution.forces.approach + max(-float(gaps.min()), 0.0)
                     result = within_insert(state, result, *unseen_flags(state, result, sunk))
-                if solution.converged and earlier is not None:
-                    state.memory.keep(result, earlier)
-                return result
+                return replace(result, warm_start=warm) if solution.converged else result
             depth, touched = 1.1 * solution.forces.approach, None
-        return failed_result(state, pose, "the set of candidate nodes is saturated")
+        return ContactResult.failed(state, pose, "the set of candidate nodes is saturated")
 
     def _solution(
         self,
@@ -246,10 +229,17 @@ class CellContact(ContactModel):
             return solution
 
 
+def warm_start_of(state: LatticeState, guess: ContactResult | None) -> WarmStart | None:
+    """Return where the solver may begin; None unless the guess is a result of this state."""
+    warm = None if guess is None else guess.warm_start
+    mine = isinstance(warm, WarmStart) and warm.problem is state.problem
+    return warm if mine else None
+
+
 def _rehearse(problem: ContactProblem, pair: ContactPair) -> None:
     """Have built now what the first rays and the first look at the cells would build."""
     undeformed(problem, np.eye(4))
-    pair.first_touch.travel(np.eye(4))
+    pair.touch_at(np.eye(4))
     if not problem.solid.material.is_linear:
         still = np.zeros_like(problem.solid.nodes)
         problem.solid.lost(still)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.contact.lattice.grid import Lattice
+from tkamb.contact.pair import ContactSurface
 from tkamb.geometry.curved import CurvedSurface
 from tkamb.geometry.frames import Array
 from tkamb.geometry.rays import RayCaster
@@ -21,25 +22,18 @@ ON_MESH = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class ContactMap:
-    """The contact surface of a lattice.
+class ContactMap(ContactSurface):
+    """The contact surface of a lattice: its undeformed contact nodes.
+
+    Normals are area-weighted over the triangles, a node's area is a third of each of its
+    triangles.
 
     Args:
-        points: (c, 3) m, undeformed contact nodes.
-        normals: (c, 3) outward unit normals, area-weighted over the triangles.
-        area: (c,) m², tributary: a third of each triangle at the node.
-        thickness: (c,) m, insert below the node along y.
         lift: (c,) m along y, from the node on the mesh to the smooth surface that the mesh
             stands for; the contact sees the node there.
-        triangles: (k, 3) positions among the contact nodes.
     """
 
-    points: Array
-    normals: Array
-    area: Array
-    thickness: Array
     lift: Array
-    triangles: Indices
 
     @cached_property
     def triangle_area(self) -> Array:
@@ -62,7 +56,7 @@ def contact_map(lattice: Lattice, insert: Surface) -> tuple[Indices, ContactMap]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     rays = RayCaster(insert)
     thickness, lift = _thickness(points, rays, lattice.spacing), _lift(points, rays)
-    return nodes.astype(np.int64), ContactMap(points, normals, area, thickness, lift, triangles)
+    return nodes.astype(np.int64), ContactMap(points, normals, area, thickness, triangles, lift)
 
 
 def _thickness(points: Array, rays: RayCaster, spacing: Array) -> Array:

@@ -2,21 +2,18 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.contact.area import covered_areas
 from tkamb.contact.lattice.coarse import beside, coarse_flags
-from tkamb.contact.lattice.covered import covered_areas
 from tkamb.contact.lattice.edges import edge_flags
 from tkamb.contact.lattice.problem import STEEPEST, Indices, footing
 from tkamb.contact.lattice.solver import Solution
-from tkamb.contact.pressing import approach_at, failed_result
-from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
-from tkamb.contact.validity import HALF, peak_flags
+from tkamb.contact.pressing import HALF
+from tkamb.contact.result import ContactResult, ContactStatus, medial_points
 from tkamb.geometry.frames import Array
 from tkamb.units import MILLIMETRE
 
@@ -32,24 +29,6 @@ MOST_UNSEEN = 0.2e-3
 """m; a node of a 3 mm cell misses the bottom of a ball of 15 mm by 0.15 mm."""
 COLLAPSE = -1.0
 """Principal strain at which a cell is compressed to nothing: out of range."""
-
-
-def untouched(state: "LatticeState", pose: Array, gaps: Array) -> ContactResult:
-    """Return a result without contact; gaps (c,) are vertical, m."""
-    nothing = np.zeros(len(gaps))
-    return ContactResult(
-        pose=pose,
-        points=state.map.points,
-        normals=state.map.normals,
-        pressure=nothing,
-        area=state.map.area,
-        gap=gaps,
-        nodal_force=np.zeros((len(gaps), 3)),
-        wrench_on_insert=np.zeros(6),
-        medial=None,
-        lateral=None,
-        approach=0.0,
-    )
 
 
 def result_of(
@@ -74,53 +53,28 @@ def result_of(
     pose = pose.copy()
     pose[1, 3] -= depth
     if solution.field is not None and not np.isfinite(solution.field).all():
-        return failed_result(state, pose, "the solver left the range of numbers")
+        return ContactResult.failed(state, pose, "the solver left the range of numbers")
     flags, collapsed = _strain_flags(state, solution)
     if collapsed:
-        return failed_result(state, pose, *flags)
+        return ContactResult.failed(state, pose, *flags)
     if not solution.converged:
         flags = (*flags, _unsettled(solution))
-    carried = _carried(state, pose, gaps - depth, solution, rule)
-    return replace(
-        carried,
-        status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
-        iterations=solution.passes,
-        residual=solution.residual,
-        flags=(*flags, *_peak_flags(state, carried)),
-        approach=partial(approach_at, state.pair, pose),  # type: ignore[arg-type]
-    )
-
-
-def _carried(
-    state: "LatticeState", pose: Array, gaps: Array, solution: Solution, rule: PressureRule
-) -> ContactResult:
-    """Return the map and its sums; gaps (c,) are those of the undeformed insert at the pose."""
-    surface = state.map
-    force, pressure, stood_on = _pressures(state, gaps, solution, rule)
-    gap = _gaps(state, pose, gaps, force, solution)
-    area = stood_on
+    force, pressure, area = _pressures(state, gaps - depth, solution, rule)
+    gap = _gaps(state, pose, gaps - depth, force, solution)
+    surface, covered = state.surface, area
     if rule == "tributary":
-        area = covered_areas(
+        covered = covered_areas(
             surface.points, surface.triangles, surface.triangle_area,
             pressure, gap, state.pair.material,
         )  # fmt: skip
-    medial, lateral = summarise_condyles(
-        medial_points(surface.points, pose, state.split),
-        surface.points, pressure, area, force, surface.thickness,
+    result = ContactResult.of(
+        state, pose, pressure, gap, force, area, covered,
+        status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
+        iterations=solution.passes,
+        residual=solution.residual,
+        flags=flags,
     )  # fmt: skip
-    return ContactResult(
-        pose=pose,
-        points=surface.points,
-        normals=surface.normals,
-        pressure=pressure,
-        area=stood_on,
-        gap=gap,
-        nodal_force=force,
-        wrench_on_insert=wrench_of(surface.points, force),
-        medial=medial,
-        lateral=lateral,
-        approach=0.0,
-    )
+    return replace(result, flags=(*result.flags, *_unresolved_flags(state, result)))
 
 
 def _pressures(
@@ -134,12 +88,12 @@ def _pressures(
         solution: what the solver found.
         rule: how a nodal force becomes a pressure.
     """
-    force, size = np.zeros_like(state.map.points), np.zeros(len(gaps))
+    force, size = np.zeros_like(state.surface.points), np.zeros(len(gaps))
     force[solution.candidates] = solution.forces.force[:, None] * solution.footing.normals
     size[solution.candidates] = solution.forces.force
     area = _areas(state, gaps, size > 0, rule)
     if rule == "source":
-        size = np.maximum(-np.einsum("ij,ij->i", force, state.map.normals), 0.0)
+        size = np.maximum(-np.einsum("ij,ij->i", force, state.surface.normals), 0.0)
     return force, size / area, area
 
 
@@ -160,7 +114,7 @@ def _gaps(
         solution: what the solver found.
     """
     loaded: Mask = np.asarray(force.any(axis=1), bool)
-    close = beside(state.map.triangles, loaded) | loaded | (gaps < 0)
+    close = beside(state.surface.triangles, loaded) | loaded | (gaps < 0)
     own = solution.candidates[close[solution.candidates]]
     gap = gaps.copy()
     gap[own] = solution.forces.gap[close[solution.candidates]]
@@ -193,14 +147,14 @@ def _areas(state: "LatticeState", gaps: Array, loaded: Mask, rule: PressureRule)
     contact; the pressure is then the force along the insert's normal over it.
     """
     if rule == "tributary" or not loaded.any():
-        return state.map.area
-    overlap = float(state.map.area[gaps < 0].sum())
-    return np.where(loaded, overlap / loaded.sum(), state.map.area)
+        return state.surface.area
+    overlap = float(state.surface.area[gaps < 0].sum())
+    return np.where(loaded, overlap / loaded.sum(), state.surface.area)
 
 
-def _peak_flags(state: "LatticeState", carried: ContactResult) -> tuple[str, ...]:
+def _unresolved_flags(state: "LatticeState", carried: ContactResult) -> tuple[str, ...]:
     """Return the flags of peaks that the cells do not resolve."""
-    medial = medial_points(carried.points, carried.pose, state.split)
+    medial = medial_points(carried.points, carried.pose, state.pair.split)
     sides = {"medial": medial, "lateral": ~medial}
     pressures = {side: np.where(own, carried.pressure, 0.0) for side, own in sides.items()}
     peaks = {
@@ -210,8 +164,7 @@ def _peak_flags(state: "LatticeState", carried: ContactResult) -> tuple[str, ...
     }
     floor, spacing = state.problem.floor, state.lattice.spacing
     return (
-        *peak_flags(carried.medial, carried.lateral),
-        *coarse_flags(state.map.triangles, carried.pressure > 0, sides),
+        *coarse_flags(state.surface.triangles, carried.pressure > 0, sides),
         *edge_flags(floor, carried.pose, spacing, peaks),
     )
 
@@ -247,7 +200,7 @@ def _strain_flags(state: "LatticeState", solution: Solution) -> tuple[tuple[str,
         least = state.problem.solid.least_principal_strain(solution.field)
         kind = "principal strain"
     else:
-        sunk = solution.displacement[:, 1] / state.map.thickness[solution.candidates]
+        sunk = solution.displacement[:, 1] / state.surface.thickness[solution.candidates]
         least, kind = float(sunk.min(initial=0.0)), "mean strain of a column"
     if least <= COLLAPSE:
         return (f"{kind} {least:.2f}: the insert is compressed to nothing",), True
