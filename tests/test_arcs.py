@@ -7,7 +7,7 @@ from scipy.integrate import quad
 
 from inserts import DATA, raised, real_insert
 from shapes import torus_condyle, trough
-from tkamb.contact.lattice.grid import build_grid
+from tkamb.contact.lattice.meshing.grid import build_grid
 from tkamb.errors import InputError
 from tkamb.geometry.arcs import arc_lengths, draw_uv_lines
 from tkamb.geometry.profiles import condyle_profile

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from inserts import dished, raised, real_insert, shipped_insert, volume
-from tkamb.contact.lattice.cells import (
+from tkamb.contact.lattice.meshing.cells import (
     DIRECTIONS,
     FAMILY_SHARE,
     PAIRS,
@@ -21,8 +21,8 @@ from tkamb.contact.lattice.cells import (
     join_springs,
     scaled_jacobians,
 )
-from tkamb.contact.lattice.columns import interval_ends
-from tkamb.contact.lattice.grid import (
+from tkamb.contact.lattice.meshing.columns import interval_ends
+from tkamb.contact.lattice.meshing.grid import (
     BOTTOM,
     CONTACT,
     INTERNAL,
@@ -30,8 +30,8 @@ from tkamb.contact.lattice.grid import (
     build_grid,
     grid_spacing,
 )
-from tkamb.contact.lattice.quality import measure_quality
-from tkamb.contact.lattice.walls import inside
+from tkamb.contact.lattice.meshing.quality import measure_quality
+from tkamb.contact.lattice.meshing.walls import inside
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import pose

@@ -12,8 +12,8 @@ from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.cells import scaled_jacobians
-from tkamb.contact.lattice.grid import Lattice
+from tkamb.contact.lattice.meshing.cells import scaled_jacobians
+from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.geometry.frames import Array
 from tkamb.output.atomic import replaced_file
 

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tkamb.contact.area import covered_areas
-from tkamb.contact.lattice.femoral import FemoralFloor
-from tkamb.contact.lattice.grid import Lattice, build_grid
-from tkamb.contact.lattice.pressure_map import ContactMap, Indices, contact_map
+from tkamb.contact.lattice.meshing.contact_map import ContactMap, Indices, contact_map
+from tkamb.contact.lattice.meshing.grid import Lattice, build_grid
+from tkamb.contact.lattice.problem import SurfaceFromBelow
 from tkamb.contact.pair import ContactPair, PreparedContact
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult
@@ -177,7 +177,7 @@ class _Problem:
     lattice: Lattice
     nodes: Indices
     map: ContactMap
-    floor: FemoralFloor
+    floor: SurfaceFromBelow
     pose: Array
     depth: float
     touchable: Mask
@@ -189,7 +189,7 @@ def _problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -> _Pr
     nodes, surface = contact_map(lattice, pair.insert)
     smooth = lattice.nodes.copy()
     smooth[nodes, 1] += surface.lift
-    floor = FemoralFloor(pair.femoral, RayCaster(pair.femoral))
+    floor = SurfaceFromBelow(pair.femoral, RayCaster(pair.femoral))
     guess = contact_model("foundation", grid_mm)
     depth = guess.press(guess.prepare(pair), load, pose).approach
     if not depth > 0:

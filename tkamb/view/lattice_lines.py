@@ -3,8 +3,8 @@
 import numpy as np
 
 from tkamb.case import Case
-from tkamb.contact.lattice.cells import FACES
-from tkamb.contact.lattice.grid import build_grid
+from tkamb.contact.lattice.meshing.cells import FACES
+from tkamb.contact.lattice.meshing.grid import build_grid
 from tkamb.geometry.frames import Array
 from tkamb.units import MILLIMETRE
 

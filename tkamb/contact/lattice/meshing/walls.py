@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.columns import NodeField
-from tkamb.contact.lattice.notches import fill_notches
-from tkamb.contact.lattice.refire import Nodes, inside, refired_inwards
+from tkamb.contact.lattice.meshing.columns import NodeField, Nodes, inside, refired_inwards
+from tkamb.contact.lattice.meshing.notches import fill_notches
 from tkamb.geometry.frames import Array
 from tkamb.geometry.height_field import inside_intervals
 from tkamb.geometry.rays import RayCaster

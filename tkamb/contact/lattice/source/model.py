@@ -13,16 +13,23 @@ The source leaves open what happens to nodes that would be pulled: here they are
 nodes that the femoral component would pass are caught.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
 
 import numpy as np
 import scipy.sparse as sparse
 
 from tkamb.contact.lattice.active_set import ContactForces
-from tkamb.contact.lattice.operator import prepare_operator
-from tkamb.contact.lattice.problem import ContactProblem, Footing, Indices, Mask
-from tkamb.contact.lattice.sliding import SlidingNodes
-from tkamb.contact.lattice.solver import Solution, Start, Tolerance
+from tkamb.contact.lattice.initial_guess import InitialGuess
+from tkamb.contact.lattice.linear.operator import prepare_operator
+from tkamb.contact.lattice.meshing.grid import Lattice
+from tkamb.contact.lattice.model import CellContact
+from tkamb.contact.lattice.problem import ContactProblem, Direction, Indices, Mask, TangentPlanes
+from tkamb.contact.lattice.report import PressureRule
+from tkamb.contact.lattice.solids.solid import Solid
+from tkamb.contact.lattice.solver import SlidingNodes, Solution, Tolerance
+from tkamb.contact.lattice.source.springs import SourceNetwork
+from tkamb.contact.materials import LinearElastic, Material
 from tkamb.geometry.frames import Array
 
 MOST_LOOPS = 60
@@ -30,6 +37,54 @@ MOST_STEPS = 30
 _NO_NODES = np.zeros(0, np.int64)
 FIRST_DEPTH = 0.5
 """First D, as a share of the depth that the candidates cover."""
+
+
+@dataclass(frozen=True)
+class SourceLattice(CellContact):
+    """26-neighbour springs of one stiffness k = E·C; see `tkamb.contact.lattice.source`.
+
+    Contact is vertical as in the source: nodes are pressed along y and slide freely in x and
+    z, so that no horizontal force arises. Kept for comparison: with free sides it is too
+    stiff (12 % on a cube of 12 cells), and its Poisson's ratio is 0.35 whatever the material.
+
+    Args:
+        law: "nonlinear" (the material's curve on every spring) or "linear".
+        loops: "stored" (one iteration on the stored response) or "source" (the source's own
+            displacement-driven loops; the same answer, slower).
+        pressure_rule: "source" by default.
+    """
+
+    name: ClassVar[str] = "lattice-source"
+    assumes: ClassVar[str] = (
+        "the source's springs k = E C (nu 0.35, too stiff at free sides), vertical contact"
+    )
+    needs: ClassVar[str] = "a closed insert; seconds to prepare, then tenths of a second"
+
+    pressure_rule: PressureRule = "source"
+    law: Literal["nonlinear", "linear"] = "nonlinear"
+    loops: Literal["stored", "source"] = "stored"
+
+    direction: ClassVar[Direction] = "vertical"
+
+    def solid(self, lattice: Lattice, material: Material) -> Solid:
+        """Return the network of equal springs."""
+        if self.law == "linear":
+            material = replace(material, law=LinearElastic())
+        return SourceNetwork(
+            lattice.nodes, lattice.cells, lattice.spacing, material, lattice.springs
+        )
+
+    def _solution(
+        self,
+        problem: ContactProblem,
+        pose: Array,
+        load: float | None,
+        guess: InitialGuess,
+        tolerance: Tolerance,
+    ) -> Solution:
+        if self.loops == "source":
+            return solve_by_loops(problem, pose, load, guess, tolerance)
+        return super()._solution(problem, pose, load, guess, tolerance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,44 +97,44 @@ class _Pressed:
     residual: float
 
 
-def solve_by_source(
+def solve_by_loops(
     problem: ContactProblem,
     pose: Array,
     load: float | None,
-    start: Start,
+    guess: InitialGuess,
     tolerance: Tolerance,
 ) -> Solution:
     """Return the contact at a pose under a load (N), or at approach 0 when load is None.
 
-    `start` gives candidates and how deep they reach; for the others see `solver.solve`. The
+    `guess` gives candidates and how deep they reach; for the others see `solver.solve`. The
     problem's `direction` is "vertical".
     """
-    nodes = problem.contact_nodes[start.candidates]
-    points = problem.surface_points[start.candidates]
-    sliding = SlidingNodes(problem, points, np.zeros_like(points), pose, start.foot)
-    depth = 0.0 if load is None else FIRST_DEPTH * float(start.reach)
+    nodes = problem.contact_nodes[guess.candidates]
+    points = problem.surface_points[guess.candidates]
+    sliding = SlidingNodes(problem, points, np.zeros_like(points), pose, guess.planes)
+    depth = 0.0 if load is None else FIRST_DEPTH * float(guess.reach)
     field, loops = np.zeros_like(problem.solid.nodes), 0
-    active, seen = sliding.foot.gap(points) < depth, []
+    active, seen = sliding.planes.gap(points) < depth, []
     while True:
         loops += 1
-        foot = sliding.foot
-        pressed = _press(problem, nodes, points, foot, active, depth, field, tolerance)
+        planes = sliding.planes
+        pressed = _press(problem, nodes, points, planes, active, depth, field, tolerance)
         field, moved = pressed.field, pressed.field[nodes]
         reaction = float(pressed.force.sum())
         missed = 0.0 if load is None else abs(reaction - load) / load
-        changed = _next_active(points + moved, foot, active, pressed.force, depth)
-        opening = np.where(active, 0.0, foot.gap(points + moved) - depth)
+        changed = _next_active(points + moved, planes, active, pressed.force, depth)
+        opening = np.where(active, 0.0, planes.gap(points + moved) - depth)
         force = np.where(active, np.maximum(pressed.force, 0), 0.0)
         forces = ContactForces(force, opening, depth, active, loops, True)
         settled = sliding.follow(moved, forces) <= tolerance.force
         still = bool((changed == active).all())
         done = still and settled and max(missed, pressed.residual) <= tolerance.force
         if done or loops == MOST_LOOPS:
-            return _solution(start, forces, foot, pressed, nodes, loops, missed, done)
+            return _solution(guess, forces, planes, pressed, nodes, loops, missed, done)
         if load is not None and still:
             seen.append((depth, reaction))
             depth = _next_depth(problem, seen, load, pressed.slope)
-            changed = changed | (sliding.foot.gap(points + moved) < depth) & ~active
+            changed = changed | (sliding.planes.gap(points + moved) < depth) & ~active
         active = changed
 
 
@@ -97,16 +152,18 @@ def _next_depth(
     return depth * float(np.clip(ratio, 0.25, 4.0))
 
 
-def _next_active(positions: Array, foot: Footing, active: Mask, force: Array, depth: float) -> Mask:
+def _next_active(
+    positions: Array, planes: TangentPlanes, active: Mask, force: Array, depth: float
+) -> Mask:
     """Return the set without nodes that are pulled, with nodes that would be passed."""
-    return np.asarray((active & (force >= 0)) | (~active & (foot.gap(positions) < depth)))
+    return np.asarray((active & (force >= 0)) | (~active & (planes.gap(positions) < depth)))
 
 
 def _press(
     problem: ContactProblem,
     nodes: Indices,
     points: Array,
-    foot: Footing,
+    planes: TangentPlanes,
     active: Mask,
     depth: float,
     field: Array,
@@ -121,7 +178,7 @@ def _press(
     chosen = 3 * nodes[active] + 1
     held[chosen] = True
     asked = np.zeros(len(held))
-    asked[chosen] = foot.places[active, 1] - depth - points[active, 1]
+    asked[chosen] = planes.points[active, 1] - depth - points[active, 1]
     asked[chosen] -= field.ravel()[chosen]
     u = field + _spread(solid.stiffness, problem, held, asked).reshape(-1, 3)
     force, residual, internal = _balance(problem, u, held, chosen)
@@ -171,9 +228,9 @@ def _spread(
 
 
 def _solution(
-    start: Start,
+    guess: InitialGuess,
     forces: ContactForces,
-    foot: Footing,
+    planes: TangentPlanes,
     pressed: _Pressed,
     nodes: Indices,
     loops: int,
@@ -185,5 +242,5 @@ def _solution(
     )
     residual = max(missed, pressed.residual)
     return Solution(
-        start.candidates, ended, foot, pressed.field[nodes], pressed.field, None, loops, residual
+        guess.candidates, ended, planes, pressed.field[nodes], pressed.field, None, loops, residual
     )

@@ -1,19 +1,99 @@
 """A solid made of cells: linear stiffness, what nonlinearity takes away, tangent."""
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.assembly import Pattern, Scatter
-from tkamb.contact.lattice.hexahedron import group_shapes, mean_gradient
+from tkamb.contact.lattice.meshing.cells import group_shapes, mean_gradient
 from tkamb.contact.materials import Material
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 
 Indices = NDArray[np.int64]
+
+DEVIATORIC = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
+DEVIATORIC[:3, :3] -= 2 / 3
+"""2 dev eps : dev eps as a form (6, 6) in [xx, yy, zz, 2xy, 2yz, 2zx]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """Where the node pairs of each element (cell or spring) go in the global matrix.
+
+    Args:
+        indptr: (n + 1,) start of each node's row.
+        indices: (b,) column node of each block.
+        slot: (c, p²) block of each ordered node pair of each element of p nodes.
+    """
+
+    indptr: Indices
+    indices: Indices
+    slot: Indices
+
+    @classmethod
+    def of(cls, elements: Indices, nodes: int) -> "Pattern":
+        """Return the pattern of elements (c, p) on so many nodes."""
+        count = elements.shape[1]
+        rows = np.repeat(elements, count, axis=1).ravel().astype(np.int64)
+        columns = np.tile(elements, (1, count)).ravel()
+        keys, slot = np.unique(rows * nodes + columns, return_inverse=True)
+        indptr = np.searchsorted(keys, np.arange(nodes + 1) * nodes)
+        return cls(indptr, keys % nodes, slot.reshape(len(elements), count**2))
+
+    @property
+    def nodes(self) -> int:
+        """How many nodes."""
+        return len(self.indptr) - 1
+
+    def assemble(self, matrices: Array, shape: Indices | None = None) -> sparse.csr_matrix:
+        """Return the sum (3n, 3n) of the elements' matrices.
+
+        Args:
+            matrices: (c, 3p, 3p), or (s, 3p, 3p) with `shape`.
+            shape: (c,) which matrix each element takes.
+        """
+        count = matrices.shape[1] // 3
+        blocks = matrices.reshape(-1, count, 3, count, 3).transpose(2, 4, 0, 1, 3)
+        blocks = blocks.reshape(9, -1, count**2)
+        data = np.empty((len(self.indices), 9))
+        flat = self.slot.ravel()
+        for entry in range(9):
+            values = blocks[entry] if shape is None else blocks[entry][shape]
+            data[:, entry] = np.bincount(flat, values.ravel(), len(self.indices))
+        return sparse.bsr_matrix(
+            (data.reshape(-1, 3, 3), self.indices, self.indptr), (3 * self.nodes, 3 * self.nodes)
+        ).tocsr()
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """Sums the elements' nodal vectors into global ones.
+
+    Args:
+        elements: (c, p) nodes of each element (cell or spring).
+        nodes: how many nodes.
+    """
+
+    elements: Indices
+    nodes: int
+
+    def gather(self, displacement: Array, chosen: Indices | None = None) -> Array:
+        """Return (k, 3p) of the chosen elements, by default of all, from nodal (n, 3)."""
+        elements = self.elements if chosen is None else self.elements[chosen]
+        return displacement[elements].reshape(len(elements), 3 * elements.shape[1])
+
+    def sum(self, forces: Array, chosen: Indices | None = None) -> Array:
+        """Return nodal (n, 3) from (k, 3p) of the chosen elements, by default of all."""
+        flat = (self.elements if chosen is None else self.elements[chosen]).ravel()
+        parts = forces.reshape(-1, 3)
+        total = np.zeros((self.nodes, 3))
+        for axis in range(3) if len(flat) else ():
+            total[:, axis] = np.bincount(flat, parts[:, axis], self.nodes)
+        return total
 
 
 class Solid(ABC):
@@ -52,19 +132,19 @@ class Solid(ABC):
         """Linear stiffness (3n, 3n), N/m."""
 
     @abstractmethod
-    def lost(self, displacement: Array, chosen: Indices | None = None) -> Array:
-        """Return linear forces minus the material's own, N, of members of `scatter` (k, 3p).
+    def nonlinear_residual(self, displacement: Array, chosen: Indices | None = None) -> Array:
+        """Return linear forces minus the material's own, N, of elements of `scatter` (k, 3p).
 
         Args:
-            displacement: (n, 3) m; only the chosen members' nodes are looked at.
-            chosen: (k,) members; all by default.
+            displacement: (n, 3) m; only the chosen elements' nodes are looked at.
+            chosen: (k,) elements; all by default.
         """
 
-    def correction(self, displacement: Array) -> Array:
+    def residual_force(self, displacement: Array) -> Array:
         """Return h = K u - f(u), N, (n, 3): linear forces minus the material's own."""
         if self.material.is_linear:
             return np.zeros_like(displacement)
-        return self.scatter.sum(self.lost(displacement))
+        return self.scatter.sum(self.nonlinear_residual(displacement))
 
     @abstractmethod
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
@@ -73,11 +153,11 @@ class Solid(ABC):
     def internal_force(self, displacement: Array) -> Array:
         """Return nodal internal forces f(u), N, (n, 3)."""
         linear = (self.stiffness @ displacement.ravel()).reshape(-1, 3)
-        return np.asarray(linear - self.correction(displacement))
+        return np.asarray(linear - self.residual_force(displacement))
 
     @abstractmethod
     def linear_force(self, displacement: Array) -> Array:
-        """Return K u, N, (n, 3), summed member by member: no matrix is assembled."""
+        """Return K u, N, (n, 3), summed element by element: no matrix is assembled."""
 
     def _cells_force(self, matrices: Array, displacement: Array) -> Array:
         """Return K u, N, (n, 3), from the stiffness of each shape (s, 24, 24)."""
@@ -122,3 +202,13 @@ class Solid(ABC):
         """The commonest shape, and the cells (k,) of all others."""
         common = int(np.bincount(self.shape_of_cell).argmax())
         return common, np.flatnonzero(self.shape_of_cell != common)
+
+
+def strain_matrix(gradients: Array) -> Array:
+    """Return B (..., 6, 24) with strain [xx, yy, zz, 2xy, 2yz, 2zx] = B u from (..., 8, 3)."""
+    matrix = np.zeros((*gradients.shape[:-2], 6, 8, 3))
+    for row, (k, m) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0)]):
+        matrix[..., row, :, k] += gradients[..., m]
+        if k != m:
+            matrix[..., row, :, m] += gradients[..., k]
+    return matrix.reshape(*gradients.shape[:-2], 6, 24)

@@ -32,11 +32,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.code_identity import code_identity
-from tkamb.contact.lattice.multifrontal import CholeskyFactor, Front
-from tkamb.contact.lattice.operator import ElasticOperator
-from tkamb.contact.lattice.operator_check import operator_error
-from tkamb.contact.lattice.response import Block, HalfResponse
-from tkamb.contact.lattice.solid import Solid
+from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor, Front
+from tkamb.contact.lattice.linear.operator import ElasticOperator, operator_error
+from tkamb.contact.lattice.linear.response import Block, HalfResponse
+from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.errors import InputError
 from tkamb.files import open_regular
 from tkamb.geometry.frames import Array

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tkamb.contact.lattice.cells import (
+from tkamb.contact.lattice.meshing.cells import (
     CORNERS,
     FACES,
     Springs,
@@ -20,8 +20,8 @@ from tkamb.contact.lattice.cells import (
     scaled_jacobians,
     shortest_edges,
 )
-from tkamb.contact.lattice.columns import NodeField, settle_columns
-from tkamb.contact.lattice.walls import inside, settle_walls
+from tkamb.contact.lattice.meshing.columns import NodeField, settle_columns
+from tkamb.contact.lattice.meshing.walls import inside, settle_walls
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.post import find_post

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.multifrontal import CholeskyFactor
+from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor
 from tkamb.geometry.frames import Array
 
 Indices = NDArray[np.int64]
@@ -110,61 +110,6 @@ class HalfResponse:
     def columns(self) -> int:
         """How many columns Z has."""
         return int((self.rank >= 0).sum())
-
-
-@dataclass(frozen=True, eq=False)
-class ContactResponse:
-    """What forces on candidate nodes do.
-
-    Args:
-        half: response of the candidates and perhaps of more nodes, p in all.
-        place: (m,) of the candidates among these.
-        compliance: (3, m, 3, m) m/N, of the candidates: component and node moved, component
-            and node pushed.
-    """
-
-    half: HalfResponse
-    place: Indices
-    compliance: Array
-
-    @classmethod
-    def of(cls, half: HalfResponse) -> "ContactResponse":
-        """Return the response of candidates that are all of the nodes of `half`."""
-        return cls(half, np.arange(len(half.rank) // 3), by_component(half.compliance()))
-
-    def push(self, force: Array, y: Array) -> None:
-        """Add L⁻¹ of forces (m, 3), N, to y (in elimination order)."""
-        self.half.apply(self._spread(force).ravel(), y)
-
-    def displacement(self, y: Array) -> Array:
-        """Return the candidates' displacement (m, 3), m, under the load whose L⁻¹ f is y."""
-        return np.asarray(self.half.project(y).reshape(-1, 3)[self.place])
-
-    def along(self, normals: Array) -> tuple[Array, Array]:
-        """Return the compliance along normals (m, 3), and all that forces along them move.
-
-        Returns:
-            (m, m) m/N, and (3, m, m) m/N for `moved`.
-        """
-        n = np.ascontiguousarray(normals.T, dtype=self.compliance.dtype)
-        pushed = np.einsum("aibj,bj->aij", self.compliance, n)
-        return np.einsum("aij,ai->ij", pushed, n).astype(np.float64), pushed
-
-    def moved(self, pushed: Array, force: Array) -> Array:
-        """Return the candidates' displacement (m, 3), m, under forces (m,), N, along normals."""
-        return np.asarray(np.einsum("aij,j->ia", pushed, force.astype(pushed.dtype)))
-
-    def _spread(self, values: Array) -> Array:
-        """Return candidates' values (m, 3) on all the nodes (p, 3)."""
-        spread = np.zeros((len(self.half.rank) // 3, 3))
-        spread[self.place] = values
-        return spread
-
-
-def by_component(matrix: Array) -> Array:
-    """Return a compliance (3p, 3p), ordered by node, as (3, p, 3, p)."""
-    count = len(matrix) // 3
-    return np.ascontiguousarray(matrix.reshape(count, 3, count, 3).transpose(1, 0, 3, 2))
 
 
 def unknowns_of(nodes: Indices) -> Indices:

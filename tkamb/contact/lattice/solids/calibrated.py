@@ -17,10 +17,16 @@ with B̄ the strain of the cell's mean gradient and P what the mean gradient doe
 On a box this is K_spr - (5/3) V g gᵀ; on a sheared cell it keeps the patch exact.
 """
 
-import numpy as np
+from functools import cached_property
 
-from tkamb.contact.lattice.cells import CORNERS, PAIRS
-from tkamb.contact.lattice.hexahedron import PAIR_AXES, mean_gradient
+import numpy as np
+import scipy.sparse as sparse
+from numpy.typing import NDArray
+
+from tkamb.contact.lattice.meshing.cells import CORNERS, PAIR_AXES, PAIRS, mean_gradient
+from tkamb.contact.lattice.solids.curve import ShearCurve
+from tkamb.contact.lattice.solids.solid import DEVIATORIC, Solid, strain_matrix
+from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array
 
 
@@ -94,21 +100,6 @@ def body_diagonal_stiffness(edges: Array) -> float:
     return float(candidates[np.linalg.eigvalsh(matrices)[:, 6].argmax()])
 
 
-def strain_matrix(gradients: Array) -> Array:
-    """Return B (..., 6, 24) with strain [xx, yy, zz, 2xy, 2yz, 2zx] = B u from (..., 8, 3)."""
-    matrix = np.zeros((*gradients.shape[:-2], 6, 8, 3))
-    for row, (k, m) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0)]):
-        matrix[..., row, :, k] += gradients[..., m]
-        if k != m:
-            matrix[..., row, :, m] += gradients[..., k]
-    return matrix.reshape(*gradients.shape[:-2], 6, 24)
-
-
-DEVIATORIC = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
-DEVIATORIC[:3, :3] -= 2 / 3
-"""2 dev eps : dev eps as a form (6, 6) in [xx, yy, zz, 2xy, 2yz, 2zx]."""
-
-
 def unexplained(corners: Array, gradients: Array) -> Array:
     """Return P (s, 24, 24): displacements minus the linear field of the cell's mean gradient."""
     linear = np.einsum("sia,sja->sij", corners, gradients)
@@ -134,3 +125,79 @@ def deviatoric_matrices(corners: Array, edges: Array) -> tuple[Array, Array, Arr
     rest = unexplained(corners, gradients)
     springs = np.swapaxes(rest, 1, 2) @ spring_matrix(corners, stiffness) @ rest
     return mean + springs, gradients.reshape(-1, 24), volume
+
+
+class CalibratedNetwork(Solid):
+    """Cells mu_s K_d + K V g gᵀ, with mu_s from the cell's equivalent strain.
+
+    e² = uᵀ K_d u / (3 V), 3 mu_s = q(e)/e: the forces derive from an energy, so the tangent
+    is symmetric. See `Solid` for the arguments.
+    """
+
+    def __init__(
+        self, nodes: Array, cells: NDArray[np.int64], spacing: Array, material: Material
+    ) -> None:
+        super().__init__(nodes, cells, spacing, material)
+        self.deviatoric, self.dilatation, self.volume = deviatoric_matrices(self.shapes, spacing)
+        self.curve = ShearCurve.of(material)
+
+    @cached_property
+    def stiffness(self) -> sparse.csr_matrix:
+        """Linear stiffness (3n, 3n), N/m."""
+        return self.pattern.assemble(self.shape_stiffness(), self.shape_of_cell)
+
+    def shape_stiffness(self) -> Array:
+        """Return mu K_d + K V g gᵀ of each shape (s, 24, 24), N/m."""
+        return self.material.shear_modulus * self.deviatoric + self._bulk
+
+    def linear_force(self, displacement: Array) -> Array:
+        """Return K u, N, (n, 3); see `Solid`."""
+        return self._cells_force(self.shape_stiffness(), displacement)
+
+    def nonlinear_residual(
+        self, displacement: Array, chosen: NDArray[np.int64] | None = None
+    ) -> Array:
+        """Return (mu - mu_s) K_d u of the cells, N, (k, 24); see `Solid`."""
+        force, equivalent = self._state(displacement, chosen)
+        lost = self.material.shear_modulus - self.curve.modulus(equivalent)
+        return lost[:, None] * force
+
+    def tangent(self, displacement: Array) -> sparse.csr_matrix:
+        """Return d f / d u (3n, 3n): mu_s K_d + mu_s'/(3 V e) (K_d u)(K_d u)ᵀ + bulk."""
+        force, equivalent = self._state(displacement)
+        shape = self.shape_of_cell
+        secant, softening = self.curve.modulus(equivalent), self.curve.softening(equivalent)
+        scale = softening / (3 * self.volume[shape])
+        matrices = secant[:, None, None] * self.deviatoric[shape] + self._bulk[shape]
+        matrices += scale[:, None, None] * force[:, :, None] * force[:, None, :]
+        return self.pattern.assemble(matrices)
+
+    @cached_property
+    def _bulk(self) -> Array:
+        g = self.dilatation
+        scale = self.material.bulk_modulus * self.volume
+        return np.asarray(scale[:, None, None] * g[:, :, None] * g[:, None, :])
+
+    @cached_property
+    def _others(self) -> tuple[Array, NDArray[np.int64]]:
+        """K_d of the cells that are not of the commonest shape, and where each cell's is; -1."""
+        others = self.kinds[1]
+        place = np.full(len(self.cells), -1)
+        place[others] = np.arange(len(others))
+        return self.deviatoric[self.shape_of_cell[others]], place
+
+    def _state(
+        self, displacement: Array, chosen: NDArray[np.int64] | None = None
+    ) -> tuple[Array, Array]:
+        """Return K_d u (k, 24) and the equivalent strain e (k,) of the chosen cells."""
+        local = self.scatter.gather(displacement, chosen)
+        cells = slice(None) if chosen is None else chosen
+        matrices, place = self._others
+        place = place[cells]
+        force = local @ self.deviatoric[self.kinds[0]]
+        others = np.flatnonzero(place >= 0)
+        matrices = matrices if chosen is None else matrices[place[others]]
+        force[others] = np.einsum("cij,cj->ci", matrices, local[others])
+        energy = np.einsum("ci,ci->c", local, force)
+        volume = self.volume[self.shape_of_cell[cells]]
+        return force, np.sqrt(np.maximum(energy, 0) / (3 * volume))

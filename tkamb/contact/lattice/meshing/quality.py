@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tkamb.contact.lattice.cells import EDGES, cell_volumes, scaled_jacobians
-from tkamb.contact.lattice.grid import Lattice
+from tkamb.contact.lattice.meshing.cells import EDGES, cell_volumes, scaled_jacobians
+from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.geometry.frames import Array
 from tkamb.geometry.post import Post, find_post
 from tkamb.geometry.surface import Surface

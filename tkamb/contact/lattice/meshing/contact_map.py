@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.grid import Lattice
+from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.pair import ContactSurface
 from tkamb.geometry.curved import CurvedSurface
 from tkamb.geometry.frames import Array

@@ -1,4 +1,8 @@
-"""Multifrontal Cholesky factorisation on a dissection tree, dense fronts by LAPACK.
+"""Nested dissection of a lattice, and multifrontal Cholesky factorisation on its tree.
+
+A plane of lattice nodes separates the nodes on its two sides, since only neighbours are
+joined: such planes are eliminated last. The insert is wide and thin, so planes across x and z
+leave small separators (George, SIAM J Numer Anal 10:345, 1973, doi:10.1137/0710032).
 
 Each tree member gathers its rows and its children's updates into a dense front, eliminates
 its own unknowns and hands the rest up (Duff & Reid, ACM TOMS 9:302, 1983,
@@ -18,11 +22,80 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-from tkamb.contact.lattice.dissection import Dissection
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
 
 Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Dissection:
+    """A tree of separators in the order of elimination (children before parents).
+
+    Args:
+        own: nodes that each tree member eliminates.
+        parent: index of the parent of each member, -1 for a root.
+    """
+
+    own: list[Indices]
+    parent: list[int]
+
+
+def dissect(index: Indices, joined: sparse.csr_matrix, leaf: int = 48) -> Dissection:
+    """Return the dissection of the nodes with lattice index (n, 3).
+
+    Args:
+        index: lattice position of each node.
+        joined: (n, n) pattern: which nodes are joined.
+        leaf: parts of at most so many nodes are not cut further.
+    """
+    own: list[Indices] = []
+    parent: list[int] = []
+
+    def cut(part: Indices) -> int:
+        """Append the members of a part; return the position of its topmost one."""
+        halves = None if len(part) <= leaf else _halves(index, joined, part)
+        if halves is None:
+            own.append(_along_columns(index, part))
+            parent.append(-1)
+            return len(own) - 1
+        low, high, separator = halves
+        tops = [cut(low), cut(high)]
+        own.append(_along_columns(index, separator))
+        parent.append(-1)
+        for top in tops:
+            parent[top] = len(own) - 1
+        return len(own) - 1
+
+    if len(index):
+        cut(np.arange(len(index)))
+    return Dissection(own, parent)
+
+
+def _halves(
+    index: Indices, joined: sparse.csr_matrix, part: Indices
+) -> tuple[Indices, Indices, Indices] | None:
+    """Return (low, high, separator), or None if no plane leaves two sides."""
+    position = index[part]
+    for axis in np.argsort(-np.ptp(position, axis=0), kind="stable"):
+        plane = int(np.median(position[:, axis]))
+        low, high = position[:, axis] < plane, position[:, axis] > plane
+        if low.any() and high.any():
+            break
+    else:
+        return None
+    across = joined[part[low]][:, part[high]]
+    if across.nnz:
+        low[np.flatnonzero(low)[np.unique(across.nonzero()[0])]] = False
+        if not low.any():
+            return None
+    return part[low], part[high], part[~(low | high)]
+
+
+def _along_columns(index: Indices, part: Indices) -> Indices:
+    """Return the part sorted so that a stretch of columns is a stretch of the list."""
+    i, j, k = index[part].T
+    return part[np.lexsort((j, k, i)) if np.ptp(i) >= np.ptp(k) else np.lexsort((j, i, k))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,33 +143,33 @@ class CholeskyFactor:
         result[self.order] = x
         return result
 
-    def forward(self, x: Array, members: Indices | None = None) -> None:
+    def forward(self, x: Array, fronts: Indices | None = None) -> None:
         """Turn x (n,) into L⁻¹ x in place, in elimination order.
 
         Args:
-            x: zero but on the members.
-            members: increasing, with everything above each of them; all by default.
+            x: zero but on the fronts.
+            fronts: increasing, with everything above each of them; all by default.
         """
-        for front in self._chosen(members):
+        for front in self._chosen(fronts):
             own = x[front.start : front.stop].astype(front.block.dtype)
             y = np.einsum("ij,j->i", front.block, own)
             x[front.start : front.stop] = y[: len(own)]
             x[front.boundary] -= y[len(own) :]
 
-    def backward(self, x: Array, members: Indices | None = None) -> None:
+    def backward(self, x: Array, fronts: Indices | None = None) -> None:
         """Turn x (n,) into L⁻ᵀ x in place, in elimination order.
 
         Args:
-            x: L⁻ᵀ x already on what lies above the members and is none of them.
-            members: increasing; all by default.
+            x: L⁻ᵀ x already on what lies above the fronts and is none of them.
+            fronts: increasing; all by default.
         """
-        for front in reversed(self._chosen(members)):
+        for front in reversed(self._chosen(fronts)):
             own = np.concatenate([x[front.start : front.stop], -x[front.boundary]])
             own = own.astype(front.block.dtype)
             x[front.start : front.stop] = np.einsum("ij,i->j", front.block, own)
 
-    def _chosen(self, members: Indices | None) -> list[Front]:
-        return self.fronts if members is None else [self.fronts[m] for m in members.tolist()]
+    def _chosen(self, fronts: Indices | None) -> list[Front]:
+        return self.fronts if fronts is None else [self.fronts[f] for f in fronts.tolist()]
 
 
 def factorise(

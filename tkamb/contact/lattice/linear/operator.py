@@ -7,14 +7,16 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.dissection import dissect
-from tkamb.contact.lattice.memory_need import check_memory, factor_memory
-from tkamb.contact.lattice.multifrontal import CholeskyFactor, factorise
-from tkamb.contact.lattice.response import HalfResponse, half_response
+from tkamb.contact.lattice.linear.memory_need import check_memory, factor_memory
+from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor, dissect, factorise
+from tkamb.contact.lattice.linear.response import HalfResponse, half_response
+from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.contact.pair import Bearing
 from tkamb.geometry.frames import Array
 
 Indices = NDArray[np.int64]
+
+SEED = 20_240_501
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,15 +41,15 @@ class ElasticOperator:
         self.factor.backward(y)
         return self.nodal(y)
 
-    def start(self, force: Array, members: Indices | None = None) -> Array:
+    def start(self, force: Array, fronts: Indices | None = None) -> Array:
         """Return y = L⁻¹ f in elimination order, for nodal forces (n, 3).
 
         Args:
-            force: N; zero but on the nodes that the members are for.
-            members: from `members_of`; all by default.
+            force: N; zero but on the nodes that the fronts are for.
+            fronts: from `fronts_of`; all by default.
         """
         y = force.ravel()[self.free][self.factor.order]
-        self.factor.forward(y, members)
+        self.factor.forward(y, fronts)
         return np.asarray(y)
 
     def nodal(self, x: Array) -> Array:
@@ -58,19 +60,19 @@ class ElasticOperator:
         result[self.free] = inner
         return result.reshape(-1, 3)
 
-    def members_of(self, nodes: Indices) -> Indices:
-        """Return the members of the factor that eliminate the nodes, and all above them."""
+    def fronts_of(self, nodes: Indices) -> Indices:
+        """Return the fronts of the factor that eliminate the nodes, and all above them."""
         fronts = self.factor.fronts
         needed = np.zeros(len(fronts) + 1, bool)
-        needed[self._member_of_node[nodes]] = True
+        needed[self._front_of_node[nodes]] = True
         for member, front in enumerate(fronts):
             if needed[member]:
                 needed[front.parent] = True
         return np.flatnonzero(needed[:-1])
 
     @cached_property
-    def _member_of_node(self) -> Indices:
-        """Member (n,) that eliminates each node; -1 for a node that is held."""
+    def _front_of_node(self) -> Indices:
+        """Front (n,) that eliminates each node; -1 for a node that is held."""
         fronts = self.factor.fronts
         member = np.repeat(np.arange(len(fronts)), [f.stop - f.start for f in fronts])
         unknown = np.flatnonzero(self.free)[self.factor.order]
@@ -139,3 +141,52 @@ def prepare_operator(
     place[np.flatnonzero(free)[factor.order]] = np.arange(len(factor.order))
     wanted = place[(3 * contact_nodes[:, None] + np.arange(3)).ravel()]
     return ElasticOperator(free, factor, contact_nodes, half_response(factor, wanted, precision))
+
+
+def operator_error(operator: ElasticOperator, solid: Solid) -> float:
+    """Return how far an operator is from its solid's stiffness K, relative.
+
+    The largest of
+
+        |K ũ - f| / |f|            f = K u of a random u, ũ = L⁻ᵀ L⁻¹ f
+        |fᵀũ - ũᵀK ũ| / fᵀũ        f pressing on every contact node
+        |Z g - L⁻¹ E g| / |L⁻¹ E g|    g random on the contact nodes
+
+    with K summed from the cells. A random u is as rough as the grid, so that f is as large as
+    K and u allow and float32 leaves 1e-6 of it whatever the condition of K; the second looks at
+    the soft, smooth displacements, and the third holds the stored response against the factor.
+    Nothing of factor or response is left out by random numbers.
+
+    Args:
+        operator: to be looked at.
+        solid: that it should be of.
+    """
+    chance = np.random.default_rng(SEED)
+    nodes, shape = operator.contact_nodes, solid.nodes.shape
+    pressed, touched = np.zeros(shape), np.zeros(shape)
+    pressed[nodes, 1] = -1.0
+    touched[nodes] = chance.normal(size=(len(nodes), 3))
+    moved = np.where(operator.free.reshape(-1, 3), chance.normal(size=shape), 0.0)
+    force = _carried(operator, solid, moved)
+    missing = _carried(operator, solid, operator.solve(force)) - force
+    sunk = operator.solve(pressed)
+    work, energy = (float((f * sunk).sum()) for f in (pressed, _carried(operator, solid, sunk)))
+    directly = operator.start(touched)
+    stored = np.zeros_like(directly)
+    operator.half.apply(touched[nodes].ravel(), stored)
+    return max(
+        _ratio(np.linalg.norm(missing), np.linalg.norm(force)),
+        _ratio(work - energy, work),
+        _ratio(np.linalg.norm(stored - directly), np.linalg.norm(directly)),
+    )
+
+
+def _carried(operator: ElasticOperator, solid: Solid, displacement: Array) -> Array:
+    """Return K u, N, (n, 3), on the free unknowns; 0 where held."""
+    return np.where(operator.free.reshape(-1, 3), solid.linear_force(displacement), 0.0)
+
+
+def _ratio(part: float | np.floating, whole: float | np.floating) -> float:
+    """Return |part / whole|; inf where that is no number, so that it passes no comparison."""
+    value = abs(float(part)) / max(abs(float(whole)), 1e-300)
+    return value if np.isfinite(value) else float("inf")

@@ -1,4 +1,7 @@
-"""Cells of eight nodes and the springs that join every node to its 26 neighbours."""
+"""Cells of eight nodes: corners, springs to the 26 neighbours, quality, shape functions.
+
+Corners are in VTK hexahedron order with the cell's own axes along x, y and z.
+"""
 
 from dataclasses import dataclass
 
@@ -26,6 +29,11 @@ CORNERS = np.array(
 
 PAIRS = np.array([(a, b) for a in range(8) for b in range(a + 1, 8)])
 """The 28 pairs of a cell's corners that are joined by springs."""
+
+PAIR_AXES = np.abs(np.diff(CORNERS[PAIRS], axis=1))[:, 0]
+"""Axes along which the ends of each pair differ (28, 3), 0 or 1: 1 edge, 2 face, 3 body."""
+
+_GAUSS = 0.5 + (CORNERS - 0.5) / np.sqrt(3.0)
 
 DIRECTIONS = np.array(
     [
@@ -134,23 +142,61 @@ def shortest_edges(points: Array) -> Array:
 
 def cell_volumes(points: Array) -> Array:
     """Return the exact volumes (c,) of trilinear cells (c, 8, 3), by 2 x 2 x 2 Gauss points."""
-    gauss = (1.0 + np.array([-1.0, 1.0]) / np.sqrt(3.0)) / 2.0
-    volume = np.zeros(len(points))
-    for u in gauss:
-        for v in gauss:
-            for w in gauss:
-                gradient = _shape_gradients(np.array([u, v, w]))
-                jacobian = np.einsum("ncx,nd->cdx", points.transpose(1, 0, 2), gradient)
-                volume += np.linalg.det(jacobian) / 8.0
-    return volume
+    return np.asarray(np.linalg.det(_jacobians(points)).sum(axis=1) / 8)
 
 
-def _shape_gradients(at: Array) -> Array:
-    """Return the gradients (8, 3) of the trilinear shape functions at a point of [0, 1]^3."""
-    factor = np.where(CORNERS == 1, at, 1.0 - at)
-    slope = np.where(CORNERS == 1, 1.0, -1.0)
-    columns = []
-    for axis in range(3):
-        others = [a for a in range(3) if a != axis]
-        columns.append(slope[:, axis] * factor[:, others].prod(axis=1))
-    return np.column_stack(columns)
+def shape_gradients(at: Array) -> Array:
+    """Return reference gradients (8, 3) of the trilinear shape functions at a point of [0, 1]³."""
+    factor = np.where(CORNERS == 1, at, 1 - at)
+    sign = np.where(CORNERS == 1, 1.0, -1.0)
+    return np.stack(
+        [sign[:, d] * factor[:, (d + 1) % 3] * factor[:, (d + 2) % 3] for d in range(3)], axis=1
+    )
+
+
+REFERENCE_GRADIENTS = np.stack([shape_gradients(at) for at in _GAUSS])
+"""(8 points, 8 nodes, 3) of the shape functions at the 2 x 2 x 2 Gauss points of [0, 1]³."""
+
+
+def _jacobians(corners: Array) -> Array:
+    """Return the Jacobians (s, 8 points, 3, 3), m, of cells (s, 8, 3)."""
+    return np.asarray(np.einsum("gnd,snx->sgdx", REFERENCE_GRADIENTS, corners))
+
+
+def gauss_gradients(corners: Array) -> tuple[Array, Array]:
+    """Return shape-function gradients and weights at the 2×2×2 Gauss points.
+
+    Args:
+        corners: (s, 8, 3) m.
+
+    Returns:
+        Gradients (s, 8 points, 8 nodes, 3), 1/m, and weights (s, 8), m³, whose sum is the
+        cell's volume. A weight that is not positive marks an inverted cell.
+    """
+    jacobian = _jacobians(corners)
+    weights = np.linalg.det(jacobian) / 8
+    gradients = np.einsum("sgxd,gnd->sgnx", np.linalg.inv(jacobian), REFERENCE_GRADIENTS)
+    return gradients, weights
+
+
+def mean_gradient(corners: Array) -> tuple[Array, Array]:
+    """Return the volume-averaged gradients (s, 8, 3), 1/m, and the volume (s,), m³.
+
+    They reproduce a linear field exactly: sum_i x_i g_i = identity
+    (Flanagan & Belytschko, Int J Numer Meth Eng 17:679, 1981).
+    """
+    gradients, weights = gauss_gradients(corners)
+    volume = weights.sum(axis=1)
+    return np.einsum("sg,sgnx->snx", weights, gradients) / volume[:, None, None], volume
+
+
+def group_shapes(corners: Array, tolerance: float = 1e-9) -> tuple[Array, NDArray[np.int64]]:
+    """Return the distinct cell shapes (s, 8, 3) and each cell's shape (c,).
+
+    Cells of a regular lattice repeat: what depends on shape alone is worked out once. Two
+    shapes are the same when their corners differ by less than about `tolerance` (m).
+    """
+    relative = corners - corners[:, :1]
+    keys = np.round(relative.reshape(len(corners), 24) / tolerance).astype(np.int64)
+    _, first, shape = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    return relative[first], shape.reshape(-1).astype(np.int64)

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.dissection import Dissection
+from tkamb.contact.lattice.linear.multifrontal import Dissection
 from tkamb.errors import ComputationError
 from tkamb.memory import available_memory
 from tkamb.units import MILLIMETRE

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.columns import NodeField
-from tkamb.contact.lattice.refire import Nodes, inside, refired
+from tkamb.contact.lattice.meshing.columns import NodeField, Nodes, inside, refired
 from tkamb.geometry.frames import Array
 from tkamb.geometry.rays import RayCaster
 

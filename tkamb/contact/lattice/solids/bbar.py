@@ -10,10 +10,9 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.calibrated import DEVIATORIC, strain_matrix
-from tkamb.contact.lattice.curve import ShearCurve
-from tkamb.contact.lattice.hexahedron import gauss_gradients, mean_gradient
-from tkamb.contact.lattice.solid import Indices, Solid
+from tkamb.contact.lattice.meshing.cells import gauss_gradients, mean_gradient
+from tkamb.contact.lattice.solids.curve import ShearCurve
+from tkamb.contact.lattice.solids.solid import DEVIATORIC, Indices, Solid, strain_matrix
 from tkamb.contact.materials import Material
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
@@ -59,7 +58,7 @@ class BbarHexahedra(Solid):
         """Return K u, N, (n, 3); see `Solid`."""
         return self._cells_force(self.shape_stiffness(), displacement)
 
-    def lost(self, displacement: Array, chosen: Indices | None = None) -> Array:
+    def nonlinear_residual(self, displacement: Array, chosen: Indices | None = None) -> Array:
         """Return the Gauss points' (mu - mu_s) times unit shear forces, N, (k, 24)."""
         strain, equivalent = self._state(displacement, chosen)
         lost = self.material.shear_modulus - self.curve.modulus(equivalent)

@@ -19,9 +19,8 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.assembly import Pattern, Scatter
-from tkamb.contact.lattice.cells import DIRECTIONS
-from tkamb.contact.lattice.solid import Solid
+from tkamb.contact.lattice.meshing.cells import DIRECTIONS
+from tkamb.contact.lattice.solids.solid import Pattern, Scatter, Solid
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array
 
@@ -79,7 +78,9 @@ class SourceNetwork(Solid):
         pull = (self.material.young_modulus * self.factor * longer)[:, None] * straight
         return self.scatter.sum(np.hstack([-pull, pull]))
 
-    def lost(self, displacement: Array, chosen: NDArray[np.int64] | None = None) -> Array:
+    def nonlinear_residual(
+        self, displacement: Array, chosen: NDArray[np.int64] | None = None
+    ) -> Array:
         """Return linear forces minus those of the springs as they lie, N, (k, 6)."""
         springs = slice(None) if chosen is None else chosen
         strain, direction = self._state(displacement, springs)
