@@ -83,7 +83,7 @@ class CellContact(ContactModel):
         tolerance: largest out-of-balance force relative to the contact force, and largest
             distance of an active node from the femoral surface relative to its displacement.
         pressure_rule: "tributary" (force over the node's own area) or "source" (force over
-            total area by number of nodes, section 4.5.6 of the source).
+            total area by number of nodes, Sharma 2008, section 4.5.6).
         newton: solve by full Newton steps (slow; the reference).
         cache: keep prepared operators on disk, see `tkamb.contact.lattice.linear.cache`.
     """

@@ -130,7 +130,7 @@ def _gaps_of_others(
 def _areas(state: "LatticeState", gaps: Array, loaded: Mask, rule: PressureRule) -> Array:
     """Return the area (c,) that each node's force stands on, m².
 
-    The source's rule: area that overlaps the undeformed insert, shared evenly by the nodes in
+    Sharma's rule: area that overlaps the undeformed insert, shared evenly by the nodes in
     contact; the pressure is then the force along the insert's normal over it.
     """
     if rule == "tributary" or not loaded.any():

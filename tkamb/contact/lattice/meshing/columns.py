@@ -1,4 +1,4 @@
-"""Which nodes of every vertical grid line belong to the insert, by the source's rules 7 to 9.
+"""Which nodes of every vertical grid line belong to the insert, by rules 7 to 9 of Sharma (2008).
 
 A line along y runs inside the part over a set of intervals. The node nearest an interval's end
 is moved onto the surface (half-cell rule); intervals thinner than a cell follow rules 8 and 9.

@@ -1,7 +1,7 @@
 """From any closed insert to a lattice: nodes, cells, springs and the contact surface.
 
-After the source's §4.1: a grid over the bounding box, as cubic as the box permits; rays along
-its lines; nodes moved onto the surface by at most half a cell; classes; connectivity.
+After Sharma (2008), section 4.1: a grid over the bounding box, as cubic as the box permits;
+rays along its lines; nodes moved onto the surface by at most half a cell; classes; connectivity.
 """
 
 import logging

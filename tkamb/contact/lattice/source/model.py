@@ -1,15 +1,15 @@
-"""The source's own loops: displacement-driven, one sparse solve per contact set.
+"""Sharma's own loops: displacement-driven, one sparse solve per contact set.
 
-Section 4.5.5 of the source. Nodes in contact are given the vertical displacement that the
+Sharma (2008), section 4.5.5. Nodes in contact are given the vertical displacement that the
 femoral component asks of them and slide freely in x and z; the others must carry no force.
 
 Linear: a unit dummy displacement of the nodes in contact gives the slope of the reaction, so
 that one correction of D reaches the load while the set stays. Nonlinear: at fixed D the free
 unknowns are iterated to zero force with the tangent springs, then D_new = D
-(F_load/F_reaction)^(1/m). The source has m = 1, which oscillates for ever where the reaction
+(F_load/F_reaction)^(1/m). Sharma (2008) has m = 1, which oscillates for ever where the reaction
 grows with the square of D or faster, as it does while nodes come in; from the second D on m is
 the growth seen between the last two.
-The source leaves open what happens to nodes that would be pulled: here they are let go, and
+Sharma (2008) leaves open what happens to nodes that would be pulled: here they are let go, and
 nodes that the femoral component would pass are caught.
 """
 
@@ -43,20 +43,20 @@ FIRST_DEPTH = 0.5
 class SourceLattice(CellContact):
     """26-neighbour springs of one stiffness k = E·C; see `tkamb.contact.lattice.source`.
 
-    Contact is vertical as in the source: nodes are pressed along y and slide freely in x and
+    Contact is vertical as in Sharma (2008): nodes are pressed along y and slide freely in x and
     z, so that no horizontal force arises. Kept for comparison: with free sides it is too
     stiff (12 % on a cube of 12 cells), and its Poisson's ratio is 0.35 whatever the material.
 
     Args:
         law: "nonlinear" (the material's curve on every spring) or "linear".
-        loops: "stored" (one iteration on the stored response) or "source" (the source's own
+        loops: "stored" (one iteration on the stored response) or "source" (Sharma's own
             displacement-driven loops; the same answer, slower).
         pressure_rule: "source" by default.
     """
 
     name: ClassVar[str] = "lattice-source"
     assumes: ClassVar[str] = (
-        "the source's springs k = E C (nu 0.35, too stiff at free sides), vertical contact"
+        "Sharma's springs k = E C (nu 0.35, too stiff at free sides), vertical contact"
     )
     needs: ClassVar[str] = "a closed insert; seconds to prepare, then tenths of a second"
 
@@ -171,7 +171,7 @@ def _press(
 ) -> _Pressed:
     """Give the active nodes their vertical displacement and bring the rest to zero force.
 
-    The first step spreads the change with the undeformed stiffness, as in the source; then
+    The first step spreads the change with the undeformed stiffness, as in Sharma (2008); then
     tangent steps, halved while they would raise the unbalanced force.
     """
     solid, held = problem.solid, problem.held.copy()

@@ -1,16 +1,16 @@
-"""The source's lattice: one stiffness k = E·C for every spring.
+"""Sharma's lattice: one stiffness k = E·C for every spring.
 
 Every node is joined to its 26 neighbours. C (m) makes the compliance of a uniformly strained
 cell in the superior-inferior direction 1/E: 13 springs belong to the volume of one cell, and
 
     C_ijkl = (k/V) sum over 13 springs of L² n_i n_j n_k n_l,   k = E / (E of unit k)
 
-(the source's sum runs over 26 springs per cell and counts each twice). On a cube of edge a
+(Sharma's sum runs over 26 springs per cell and counts each twice). On a cube of edge a
 this is k = E a/2.7, and Poisson's ratio is 0.35 whatever the material's. Springs on the surface
 have the same k though fewer cells own them: a patch with free sides is too stiff.
 
 Nonlinear: f = sigma(eps) C L0 along the spring as it lies now, eps from its true length.
-Reference: the source, sections 4.5.1 to 4.5.3.
+Reference: Sharma, PhD dissertation, University of Tennessee (2008), sections 4.5.1 to 4.5.3.
 """
 
 from functools import cached_property
@@ -29,7 +29,7 @@ VERTICAL = 1
 
 
 def source_factor(spacing: Array) -> float:
-    """Return C = k/E, m, of the source's calibration on box cells of edges (3,), m."""
+    """Return C = k/E, m, of Sharma's calibration on box cells of edges (3,), m."""
     lines = DIRECTIONS * spacing
     length = np.linalg.norm(lines, axis=1)
     n = lines / length[:, None]
@@ -93,7 +93,7 @@ class SourceNetwork(Solid):
         return np.hstack([-lost, lost])
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
-        """Return the springs' (d sigma/d eps) C n nᵀ, assembled as in the source (3n, 3n).
+        """Return the springs' (d sigma/d eps) C n nᵀ, assembled as in Sharma (2008) (3n, 3n).
 
         The turning of the loaded springs is left out: the forces are exact, the step is not.
         """
