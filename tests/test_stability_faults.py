@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tkamb.contact.lattice import cache, model, report, solver
+from tkamb.contact.lattice import model, report, solver
 from tkamb.contact.lattice.active_set import _forces_of, solve_contact
+from tkamb.contact.lattice.linear import cache
 from tkamb.contact.materials import RambergOsgood
 from tkamb.studies.audit import PEER_BOUNDS, complaints, peer_distances
 from tkamb.studies.closed_forms import KEPT_GRID_MM, ClosedForm, closed_forms, press_closed_form
@@ -80,12 +81,12 @@ def test_a_key_without_young_s_modulus_fails(monkeypatch):
 
 @pytest.mark.parametrize("case", PLATES, ids=lambda case: case.model)
 def test_the_weakest_node_dropped_fails(case, monkeypatch):
-    def dropping(compliance, gap, lean, load, active, approach=0.0):
-        found = solve_contact(compliance, gap, lean, load, active, approach)
+    def dropping(compliance, gap, normal_y, load, active, approach=0.0):
+        found = solve_contact(compliance, gap, normal_y, load, active, approach)
         kept = found.active.copy()
         kept[np.argmin(np.where(kept, found.force, np.inf))] = False
-        force, depth = _forces_of(compliance, gap, lean, load, kept, approach)
-        opening = np.where(kept, 0.0, gap + compliance @ force + depth * lean)
+        force, depth = _forces_of(compliance, gap, normal_y, load, kept, approach)
+        opening = np.where(kept, 0.0, gap + compliance @ force + depth * normal_y)
         return replace(found, force=force, gap=opening, approach=depth, active=kept)
 
     monkeypatch.setattr(solver, "solve_contact", dropping)

@@ -241,8 +241,8 @@ _POLYETHYLENE = {
     "reference_stress": 8.4194 * MEGAPASCAL,
     "exponent": 4.5485,
 }
-"""The source's fit (section 5.2) to the true stress-strain data of Halloran et al., J Biomech
-38:323 (2005), doi:10.1016/j.jbiomech.2004.02.046."""
+"""The fit of Sharma (2008), section 5.2, to the true stress-strain data of Halloran et al., J
+Biomech 38:323 (2005), doi:10.1016/j.jbiomech.2004.02.046."""
 
 MATERIALS = {
     "polyethylene": "Ramberg-Osgood fit to true stress-strain of UHMWPE, E 561.5 MPa, nu 0.45",

@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.contact.summary import medial_points, wrench_of
-from tkamb.geometry.condyles import condyle_split
+from tkamb.contact.result import ContactResult, ContactStatus, medial_points, wrench_of
 from tkamb.geometry.frames import Array
 
 if TYPE_CHECKING:
@@ -89,7 +87,6 @@ class Probe:
         self, model: "ContactModel", state: Any, guess: ContactResult | None = None
     ) -> None:
         self._model, self._state, self._guess = model, state, guess
-        self._split = condyle_split(state.pair.femoral)
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4)."""
@@ -97,7 +94,7 @@ class Probe:
         if result.status is not ContactStatus.OK:
             return ProbedContact({}, known=False)
         self._guess = result
-        return ProbedContact(condyle_wrenches(result, self._split))
+        return ProbedContact(condyle_wrenches(result, self._state.pair.split))
 
 
 def condyle_wrenches(result: ContactResult, split: float | None) -> dict[str, CondyleWrench]:
