@@ -155,7 +155,7 @@ def layer_slope(law: Law, material: Material, strain: Array) -> Array:
         return np.full_like(strain, material.confined_modulus)
     stiffening = material.confined_modulus / material.young_modulus
     tangent = material.tangent(-stiffening * np.log1p(-strain))
-    return np.asarray(tangent * stiffening / (1.0 - strain))
+    return tangent * stiffening / (1.0 - strain)
 
 
 class FoundationProbe:

@@ -173,7 +173,7 @@ def _cell_means(
     places = (samples.points[near] - contact.point)[:, None] + offset
     u, v = np.moveaxis(places @ contact.axes.T, -1, 0)
     inside = 1 - (u / patch.long_axis) ** 2 - (v / patch.short_axis) ** 2
-    return np.asarray(np.sqrt(np.maximum(inside, 0.0)).mean(axis=1))
+    return np.sqrt(np.maximum(inside, 0.0)).mean(axis=1)
 
 
 def _described(
