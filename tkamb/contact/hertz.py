@@ -12,7 +12,7 @@ from tkamb.contact.ellipse import ContactEllipse, contact_ellipse
 from tkamb.contact.model import ContactModel
 from tkamb.contact.result import CondyleContact, ContactResult, peak_flags, thickness_under
 from tkamb.contact.samples import STEEPEST, SampledContact, SurfaceSamples, gaps_along_normals
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import SIDES, Array
 
 SHORT_AXIS_SUB_CELLS = 10
 """Sub-cells on the ellipse's short semi-axis, over which the pressure is averaged."""
@@ -24,7 +24,6 @@ FLATTEST = 1e-6
 """Smallest ratio of the two relative curvatures that still makes an ellipse."""
 
 
-SIDES = ("medial", "lateral")
 CONFORMING = "conforms to the insert: no ellipse (relative curvature is not positive)"
 
 
@@ -198,7 +197,7 @@ def _collected(
     flags: tuple[str, ...],
 ) -> ContactResult:
     both = pressure.sum(axis=0)
-    gap = gaps_along_normals(state.surface, state.pair.femoral_rays, pose)
+    gap = gaps_along_normals(state.surface, state.pair.femoral, pose)
     result = ContactResult.of(state, pose, both, gap, medial=pressure[0] > 0)
     sides = {
         side: None
@@ -227,7 +226,7 @@ def _geometry(
         touching = pose.copy()
         touching[1, 3] = -touch.travel
         contact = osculate(
-            state.pair.insert_rays, state.pair.femoral_rays, touching, touch.point, patch_radius
+            state.pair.insert.rays, state.pair.femoral.rays, touching, touch.point, patch_radius
         )
         usable = contact is not None and contact.relative[0] > FLATTEST * contact.relative[1]
         found.append(CondyleGeometry(-touch.travel, contact if usable else None))

@@ -12,7 +12,6 @@ from tkamb.contact.materials import Material
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.first_touch import FirstTouch, Touch
 from tkamb.geometry.frames import Array
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
 Bearing = Literal["fixed", "mobile"]
@@ -35,16 +34,6 @@ class ContactPair:
     bearing: Bearing = "fixed"
 
     @cached_property
-    def femoral_rays(self) -> RayCaster:
-        """Rays against the femoral component, in its own frame."""
-        return RayCaster(self.femoral)
-
-    @cached_property
-    def insert_rays(self) -> RayCaster:
-        """Rays against the insert."""
-        return RayCaster(self.insert)
-
-    @cached_property
     def split(self) -> float | None:
         """z (m, femoral frame) between the condyles; None: one condyle, called medial."""
         return condyle_split(self.femoral)
@@ -52,8 +41,7 @@ class ContactPair:
     @cached_property
     def first_touch(self) -> FirstTouch:
         """How far the femoral component travels until each condyle touches."""
-        rays = self.femoral_rays, self.insert_rays
-        return FirstTouch(self.femoral, self.insert, self.split, rays)
+        return FirstTouch(self.femoral, self.insert, self.split)
 
     def touch_at(self, pose: Array) -> Touch | None:
         """Return the first touch of either condyle, whatever the pose's y; travel from y = 0.

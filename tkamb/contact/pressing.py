@@ -285,10 +285,10 @@ def thickness_near(pair: ContactPair, places: Array) -> Array:
     low, high = pair.insert.bounds[:, 1]
     columns = (places[:, None] + COLUMNS).reshape(-1, 3)
     columns[:, 1] = high + AROUND
-    enter, _ = pair.insert_rays.first(columns, DOWN)
+    enter, _ = pair.insert.rays.first(columns, DOWN)
     met = np.isfinite(enter)
     columns[met, 1] -= enter[met] + SKIN
-    leave, _ = pair.insert_rays.first(columns, DOWN)
+    leave, _ = pair.insert.rays.first(columns, DOWN)
     met &= np.isfinite(leave)
     thick = np.where(met, leave + SKIN, 0.0).reshape(len(places), -1)
     whole = met.reshape(thick.shape).all(axis=1)

@@ -29,7 +29,6 @@ from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 from tkamb.studies.calculix_deck import Deck
 from tkamb.studies.calculix_run import LONGEST_SECONDS, PeerRun, find_program, run_calculix
@@ -189,7 +188,7 @@ def _problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -> _Pr
     nodes, surface = contact_map(lattice, pair.insert)
     smooth = lattice.nodes.copy()
     smooth[nodes, 1] += surface.lift
-    floor = SurfaceFromBelow(pair.femoral, RayCaster(pair.femoral))
+    floor = SurfaceFromBelow(pair.femoral, pair.femoral.rays)
     guess = contact_model("foundation", grid_mm)
     depth = guess.press(guess.prepare(pair), load, pose).approach
     if not depth > 0:

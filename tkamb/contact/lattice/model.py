@@ -88,7 +88,7 @@ class CellContact(ContactModel):
         held = fixed_unknowns(lattice.nodes, lattice.bottom_nodes, pair.bearing)
         nodes, surface = contact_map(lattice, pair.insert)
         operator = self._operator(solid, lattice, held, nodes)
-        femoral = SurfaceFromBelow(pair.femoral, pair.femoral_rays)
+        femoral = SurfaceFromBelow(pair.femoral, pair.femoral.rays)
         problem = ContactProblem(
             solid, operator, lattice.index, held, femoral, self.direction, surface.lift
         )
