@@ -101,7 +101,8 @@ def test_calculix_s_answers_hold_the_lattice_and_notice_a_changed_case():
     found = contact.press(contact.prepare(PEERED.pair), PEERED.load_N, PEERED.pose)
     apart = peer_distances(PEERED, found)
     assert set(apart) == set(PEER_BOUNDS) and all(apart[key] < PEER_BOUNDS[key] for key in apart)
-    stiffer = replace(found, approach=found.approach / 1.05)
+    lifted = PEERED.pair.pose_at_approach(found.pose, found.approach / 1.05)
+    stiffer = replace(found, pose=lifted)
     assert peer_distances(PEERED, stiffer)["approach"] > PEER_BOUNDS["approach"]
     assert peer_distances(replace(PEERED, load_N=77.0), found) == {}
 

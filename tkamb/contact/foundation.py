@@ -77,7 +77,7 @@ class ElasticFoundation(ContactModel):
         if not np.isfinite(pose).all():
             return ContactResult.failed(state, pose, "the pose is not finite")
         samples = state.surface
-        gap = gaps_along_normals(samples, state.pair.femoral_rays, pose)
+        gap = gaps_along_normals(samples, state.pair.femoral, pose)
         strain = np.maximum(-gap, 0.0) / np.maximum(samples.thickness, THINNEST)
         if (strain >= DEEPEST).any():
             return ContactResult.failed(
@@ -127,10 +127,10 @@ class _NearColumns:
         samples, pair = self._state.surface, self._state.pair
         pose = pair.pose_at_approach(self._pose, approach)
         if approach > self._reach:
-            gap = gaps_along_normals(samples, self._state.pair.femoral_rays, pose)
+            gap = gaps_along_normals(samples, self._state.pair.femoral, pose)
             self._near, self._reach = samples.part(gap < NEAR), approach + NEAR / 2
         near = self._near
-        gap = gaps_along_normals(near, self._state.pair.femoral_rays, pose)
+        gap = gaps_along_normals(near, self._state.pair.femoral, pose)
         strain = np.maximum(-gap, 0.0) / np.maximum(near.thickness, THINNEST)
         if (strain >= DEEPEST).any():
             return np.inf
@@ -155,7 +155,7 @@ def layer_slope(law: Law, material: Material, strain: Array) -> Array:
         return np.full_like(strain, material.confined_modulus)
     stiffening = material.confined_modulus / material.young_modulus
     tangent = material.tangent(-stiffening * np.log1p(-strain))
-    return np.asarray(tangent * stiffening / (1.0 - strain))
+    return tangent * stiffening / (1.0 - strain)
 
 
 class FoundationProbe:
@@ -177,17 +177,17 @@ class FoundationProbe:
 
     def __init__(self, law: Law, state: SampledContact) -> None:
         self._law, self._state = law, state
-        self._corners = _corners(state.pair.femoral_rays.surface.bounds)
+        self._corners = _corners(state.pair.femoral.rays.surface.bounds)
         self._near, self._centre = state.surface, np.full((4, 4), np.nan)
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4), with its stiffness."""
         pose = np.asarray(pose, float)
         if not self._covers(pose):
-            gap = gaps_and_facets(self._state.surface, self._state.pair.femoral_rays, pose)[0]
+            gap = gaps_and_facets(self._state.surface, self._state.pair.femoral, pose)[0]
             self._near, self._centre = self._state.surface.part(gap < 2 * NEARBY), pose.copy()
         samples = self._near
-        gap, femoral_normal = gaps_and_facets(samples, self._state.pair.femoral_rays, pose)
+        gap, femoral_normal = gaps_and_facets(samples, self._state.pair.femoral, pose)
         loaded = gap < 0
         if not loaded.any():
             return ProbedContact({}, tangent=True)

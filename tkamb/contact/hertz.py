@@ -172,7 +172,7 @@ def _cell_means(
     places = (samples.points[near] - contact.point)[:, None] + offset
     u, v = np.moveaxis(places @ contact.axes.T, -1, 0)
     inside = 1 - (u / patch.long_axis) ** 2 - (v / patch.short_axis) ** 2
-    return np.asarray(np.sqrt(np.maximum(inside, 0.0)).mean(axis=1))
+    return np.sqrt(np.maximum(inside, 0.0)).mean(axis=1)
 
 
 def _described(
@@ -197,7 +197,7 @@ def _collected(
     flags: tuple[str, ...],
 ) -> ContactResult:
     both = pressure.sum(axis=0)
-    gap = gaps_along_normals(state.surface, state.pair.femoral_rays, pose)
+    gap = gaps_along_normals(state.surface, state.pair.femoral, pose)
     result = ContactResult.of(state, pose, both, gap, medial=pressure[0] > 0)
     sides = {
         side: None
@@ -226,7 +226,7 @@ def _geometry(
         touching = pose.copy()
         touching[1, 3] = -touch.travel
         contact = osculate(
-            state.pair.insert_rays, state.pair.femoral_rays, touching, touch.point, patch_radius
+            state.pair.insert.rays, state.pair.femoral.rays, touching, touch.point, patch_radius
         )
         usable = contact is not None and contact.relative[0] > FLATTEST * contact.relative[1]
         found.append(CondyleGeometry(-touch.travel, contact if usable else None))

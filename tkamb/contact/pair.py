@@ -12,7 +12,6 @@ from tkamb.contact.materials import Material
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.first_touch import FirstTouch, Touch
 from tkamb.geometry.frames import Array
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
 Bearing = Literal["fixed", "mobile"]
@@ -33,16 +32,6 @@ class ContactPair:
     insert: Surface
     material: Material
     bearing: Bearing = "fixed"
-
-    @cached_property
-    def femoral_rays(self) -> RayCaster:
-        """Rays against the femoral component, in its own frame."""
-        return self.femoral.rays
-
-    @cached_property
-    def insert_rays(self) -> RayCaster:
-        """Rays against the insert."""
-        return self.insert.rays
 
     @cached_property
     def split(self) -> float | None:

@@ -6,7 +6,7 @@ And where the answer stops being one: bodies pressed through each other.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -16,9 +16,6 @@ from tkamb.errors import InputError
 from tkamb.geometry.first_touch import Touch
 from tkamb.geometry.frames import Array
 from tkamb.units import MILLIMETRE
-
-if TYPE_CHECKING:
-    from tkamb.contact.model import ContactModel
 
 LOAD_TOLERANCE = 1e-6
 """Largest relative difference between reaction and load that counts as reached."""
@@ -46,6 +43,15 @@ DOWN = np.array([0.0, -1.0, 0.0])
 Reaction = Callable[[float], float]
 
 
+class Evaluates(Protocol):
+    """What the search needs of a contact model."""
+
+    def evaluate(
+        self, state: Any, pose: Array, guess: ContactResult | None = None
+    ) -> ContactResult:
+        """Return the contact at a pose."""
+
+
 @dataclass(frozen=True)
 class LoadSearch:
     """What the search for a load found.
@@ -70,7 +76,7 @@ def check_load(load: float) -> None:
 
 
 def press_by_search(
-    model: "ContactModel",
+    model: Evaluates,
     state: Any,
     load: float,
     pose: Array,
@@ -112,9 +118,9 @@ def press_by_search(
     found = search_load(reaction or seen.reaction, load, start)
     if not math.isfinite(found.approach):
         why = seen.at(found.deepest).flags
-        lost = f"a load of {load:g} N cannot be reached"
+        missed = f"a load of {load:g} N cannot be reached"
         return ContactResult.failed(
-            state, pose, lost, *why, iterations=found.evaluations, residual=found.residual
+            state, pose, missed, *why, iterations=found.evaluations, residual=found.residual
         )
     return within_insert(state, _carried(seen.at(found.approach), found, load))
 
@@ -136,7 +142,7 @@ class _Evaluations:
     """Evaluates a model at approaches and keeps the last result."""
 
     def __init__(
-        self, model: "ContactModel", state: Any, pose: Array, guess: ContactResult | None
+        self, model: Evaluates, state: Any, pose: Array, guess: ContactResult | None
     ) -> None:
         self._model, self._state, self._pose, self._guess = model, state, pose, guess
         self._approach = math.nan
@@ -214,7 +220,7 @@ def _between(low: float, low_value: float, high: float, high_value: float) -> fl
     return trial if low < trial < high else middle
 
 
-def unloaded_result(model: "ContactModel", state: Any, pose: Array) -> ContactResult:
+def unloaded_result(model: Evaluates, state: Any, pose: Array) -> ContactResult:
     """Return first touch: no pressure, no force."""
     touching = state.pair.pose_at_approach(pose, 0.0)
     gap = model.evaluate(state, touching).gap
@@ -279,10 +285,10 @@ def thickness_near(pair: ContactPair, places: Array) -> Array:
     low, high = pair.insert.bounds[:, 1]
     columns = (places[:, None] + COLUMNS).reshape(-1, 3)
     columns[:, 1] = high + AROUND
-    enter, _ = pair.insert_rays.first(columns, DOWN)
+    enter, _ = pair.insert.rays.first(columns, DOWN)
     met = np.isfinite(enter)
     columns[met, 1] -= enter[met] + SKIN
-    leave, _ = pair.insert_rays.first(columns, DOWN)
+    leave, _ = pair.insert.rays.first(columns, DOWN)
     met &= np.isfinite(leave)
     thick = np.where(met, leave + SKIN, 0.0).reshape(len(places), -1)
     whole = met.reshape(thick.shape).all(axis=1)

@@ -207,7 +207,7 @@ def medial_points(points: Array, pose: Array, split: float | None) -> Mask:
     """
     if split is None:
         return np.ones(len(points), bool)
-    return np.asarray(transform(inverse(pose), points)[:, 2] < split)
+    return transform(inverse(pose), points)[:, 2] < split
 
 
 def wrench_of(points: Array, nodal_force: Array) -> Array:

@@ -90,19 +90,17 @@ def sample_surface(insert: Surface, resolution: float) -> SurfaceSamples:
     return SurfaceSamples(points, normals, area, thickness, triangles, depth, resolution)
 
 
-def gaps_along_normals(samples: SurfaceSamples, femoral_rays: RayCaster, pose: Array) -> Array:
+def gaps_along_normals(samples: SurfaceSamples, femoral: Surface, pose: Array) -> Array:
     """Return the gap (n,) m along the insert's normals; negative = penetration.
 
     Rays start half-way through the insert, outside the femoral component, and go up along
     the normal; the first crossing counts. inf where no femoral surface lies above, -inf
     where the femoral component reaches deeper than where the rays start.
     """
-    return gaps_and_facets(samples, femoral_rays, pose)[0]
+    return gaps_and_facets(samples, femoral, pose)[0]
 
 
-def gaps_and_facets(
-    samples: SurfaceSamples, femoral_rays: RayCaster, pose: Array
-) -> tuple[Array, Array]:
+def gaps_and_facets(samples: SurfaceSamples, femoral: Surface, pose: Array) -> tuple[Array, Array]:
     """Return the gap (n,), see `gaps_along_normals`, and the normals (n, 3) of what is met.
 
     The normals are those of the femoral facets, in the insert frame.
@@ -111,8 +109,8 @@ def gaps_and_facets(
     normals = rotate(back, samples.normals)
     below = DEEPEST * np.minimum(samples.thickness, samples.depth)
     origins = transform(back, samples.points) - below[:, None] * normals
-    distance, face = femoral_rays.first(origins, normals)
-    met = femoral_rays.surface.face_normals[face]
+    distance, face = femoral.rays.first(origins, normals)
+    met = femoral.face_normals[face]
     facing = np.einsum("ij,ij->i", normals, met)
     gap = np.where((face >= 0) & (facing > 0), -np.inf, distance - below)
     return gap, rotate(pose, met)

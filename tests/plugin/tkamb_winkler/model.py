@@ -23,5 +23,5 @@ class Winkler(ContactModel):
 
     def evaluate(self, state, pose, guess=None):
         """Return the contact at a pose."""
-        gap = gaps_along_normals(state.surface, state.pair.femoral_rays, pose)
+        gap = gaps_along_normals(state.surface, state.pair.femoral, pose)
         return ContactResult.of(state, pose, self.modulus * np.maximum(-gap, 0.0), gap)

@@ -6,20 +6,16 @@ for the cells the peak is an average over more than the contact.
 """
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.problem import Indices, Mask, SurfaceFromBelow
+from tkamb.contact.lattice.problem import Indices, LatticeState, Mask, SurfaceFromBelow
 from tkamb.contact.lattice.solver import Solution
 from tkamb.contact.pressing import HALF
 from tkamb.contact.result import ContactResult, medial_points
 from tkamb.geometry.frames import Array
 from tkamb.units import DEGREE, MILLIMETRE
-
-if TYPE_CHECKING:
-    from tkamb.contact.lattice.model import LatticeState
 
 REACH = 2.0
 """Cells from the peak to where the normal is looked at: a peak lies just inside its edge."""
@@ -41,7 +37,7 @@ COLLAPSE = -1.0
 """Principal strain at which a cell is compressed to nothing: out of range."""
 
 
-def unresolved_flags(state: "LatticeState", result: ContactResult) -> tuple[str, ...]:
+def unresolved_flags(state: LatticeState, result: ContactResult) -> tuple[str, ...]:
     """Return the flags of peaks that the cells do not resolve."""
     medial = medial_points(result.points, result.pose, state.pair.split)
     sides = {"medial": medial, "lateral": ~medial}
@@ -127,7 +123,7 @@ def surrounded(triangles: Indices, touched: Mask) -> Mask:
     return within
 
 
-def strain_flags(state: "LatticeState", solution: Solution) -> tuple[tuple[str, ...], bool]:
+def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ...], bool]:
     """Return the flags and whether the insert is compressed to nothing."""
     if solution.field is not None:
         least = state.problem.solid.least_principal_strain(solution.field)
@@ -140,7 +136,7 @@ def strain_flags(state: "LatticeState", solution: Solution) -> tuple[tuple[str, 
     return ((f"{kind} {least:.2f} is below {STRAIN_FLAG}",) if least < STRAIN_FLAG else ()), False
 
 
-def unseen_flags(state: "LatticeState", result: ContactResult, depth: float) -> Iterator[str]:
+def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> Iterator[str]:
     """Yield a flag where much of the approach is seen by no node.
 
     Args:

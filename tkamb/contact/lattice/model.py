@@ -19,12 +19,13 @@ from tkamb.contact.lattice.linear.compliance import ComplianceCache
 from tkamb.contact.lattice.linear.memory_need import TooLittleMemoryError, check_assembly_memory
 from tkamb.contact.lattice.linear.operator import ElasticOperator, fixed_unknowns, prepare_operator
 from tkamb.contact.lattice.linear.response import SINGLE
-from tkamb.contact.lattice.meshing.contact_map import ContactMap, contact_map
+from tkamb.contact.lattice.meshing.contact_map import contact_map
 from tkamb.contact.lattice.meshing.grid import Lattice, build_grid
 from tkamb.contact.lattice.newton import solve_by_newton
 from tkamb.contact.lattice.problem import (
     ContactProblem,
     Direction,
+    LatticeState,
     SurfaceFromBelow,
     TangentPlanes,
     undeformed,
@@ -36,7 +37,7 @@ from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.contact.lattice.solver import Solution, Tolerance, solve
 from tkamb.contact.materials import LinearElastic, Material
 from tkamb.contact.model import ContactModel
-from tkamb.contact.pair import ContactPair, PreparedContact
+from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import check_load, within_insert
 from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError, InputError
@@ -47,27 +48,6 @@ MOST_GROWTHS = 8
 """How often the candidate set may grow before it counts as saturated."""
 REACH = 1.08
 """Candidates must cover this many times the approach that was found."""
-
-
-@dataclass(frozen=True, eq=False)
-class LatticeState(PreparedContact):
-    """What depends on geometry and material alone.
-
-    Args:
-        lattice: the insert's grid.
-        problem: solid, factorised operator and femoral component.
-        compliance: that of the contact nodes asked for last; it changes no answer.
-    """
-
-    surface: ContactMap
-    lattice: Lattice
-    problem: ContactProblem
-    compliance: ComplianceCache
-
-    @property
-    def node_count(self) -> int:
-        """Nodes of the grid."""
-        return len(self.lattice.nodes)
 
 
 @dataclass(frozen=True)
@@ -108,7 +88,7 @@ class CellContact(ContactModel):
         held = fixed_unknowns(lattice.nodes, lattice.bottom_nodes, pair.bearing)
         nodes, surface = contact_map(lattice, pair.insert)
         operator = self._operator(solid, lattice, held, nodes)
-        femoral = SurfaceFromBelow(pair.femoral, pair.femoral_rays)
+        femoral = SurfaceFromBelow(pair.femoral, pair.femoral.rays)
         problem = ContactProblem(
             solid, operator, lattice.index, held, femoral, self.direction, surface.lift
         )

@@ -7,8 +7,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.contact.lattice.linear.compliance import ComplianceCache
 from tkamb.contact.lattice.linear.operator import ElasticOperator
+from tkamb.contact.lattice.meshing.contact_map import ContactMap
+from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.lattice.solids.solid import Solid
+from tkamb.contact.pair import PreparedContact
 from tkamb.geometry.curved import CurvedSurface
 from tkamb.geometry.frames import Array, inverse, rotate, transform
 from tkamb.geometry.rays import RayCaster
@@ -126,7 +130,7 @@ class TangentPlanes:
 
     def gap(self, positions: Array) -> Array:
         """Return the gap (m,) of deformed nodes to the planes, m."""
-        return np.asarray(np.einsum("ij,ij->i", self.normals, positions - self.points))
+        return np.einsum("ij,ij->i", self.normals, positions - self.points)
 
     @property
     def normal_y(self) -> Array:
@@ -199,3 +203,24 @@ class Region:
     def everywhere(cls, problem: ContactProblem) -> "Region":
         """Return the region of all elements."""
         return cls.of(problem, np.arange(len(problem.solid.scatter.elements)))
+
+
+@dataclass(frozen=True, eq=False)
+class LatticeState(PreparedContact):
+    """What depends on geometry and material alone.
+
+    Args:
+        lattice: the insert's grid.
+        problem: solid, factorised operator and femoral component.
+        compliance: that of the contact nodes asked for last; it changes no answer.
+    """
+
+    surface: ContactMap
+    lattice: Lattice
+    problem: ContactProblem
+    compliance: ComplianceCache
+
+    @property
+    def node_count(self) -> int:
+        """Nodes of the grid."""
+        return len(self.lattice.nodes)

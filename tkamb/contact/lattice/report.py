@@ -1,25 +1,28 @@
 """From a solution of the lattice to the contract's result: pressures, sums, flags."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from tkamb.contact.area import covered_areas
 from tkamb.contact.lattice.flags import strain_flags, unresolved_flags, unsettled_flag
-from tkamb.contact.lattice.problem import LEAST_NORMAL_Y, Indices, Mask, tangent_planes
+from tkamb.contact.lattice.problem import (
+    LEAST_NORMAL_Y,
+    Indices,
+    LatticeState,
+    Mask,
+    tangent_planes,
+)
 from tkamb.contact.lattice.solver import Solution
 from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.geometry.frames import Array
-
-if TYPE_CHECKING:
-    from tkamb.contact.lattice.model import LatticeState
 
 PressureRule = Literal["tributary", "source"]
 
 
 def result_of(
-    state: "LatticeState",
+    state: LatticeState,
     pose: Array,
     load: float | None,
     gaps: Array,
@@ -65,7 +68,7 @@ def result_of(
 
 
 def _pressures(
-    state: "LatticeState", gaps: Array, solution: Solution, rule: PressureRule
+    state: LatticeState, gaps: Array, solution: Solution, rule: PressureRule
 ) -> tuple[Array, Array, Array]:
     """Return nodal forces (c, 3), pressures (c,) and the areas (c,) they stand on.
 
@@ -84,9 +87,7 @@ def _pressures(
     return force, size / area, area
 
 
-def _gaps(
-    state: "LatticeState", pose: Array, gaps: Array, force: Array, solution: Solution
-) -> Array:
+def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution: Solution) -> Array:
     """Return the gaps (c,), m: of the deformed insert in and beside the contact and where the
     undeformed bodies overlap, of the undeformed one elsewhere.
 
@@ -113,7 +114,7 @@ def _gaps(
 
 
 def _gaps_of_others(
-    state: "LatticeState", pose: Array, nodes: Indices, force: Array, solution: Solution
+    state: LatticeState, pose: Array, nodes: Indices, force: Array, solution: Solution
 ) -> Array:
     """Return the gaps (m,), m, of deformed nodes that are no candidates; inf: nothing above."""
     problem = state.problem
@@ -127,7 +128,7 @@ def _gaps_of_others(
     return np.where(planes.normal_y < LEAST_NORMAL_Y, planes.gap(positions), np.inf)
 
 
-def _areas(state: "LatticeState", gaps: Array, loaded: Mask, rule: PressureRule) -> Array:
+def _areas(state: LatticeState, gaps: Array, loaded: Mask, rule: PressureRule) -> Array:
     """Return the area (c,) that each node's force stands on, m².
 
     Sharma's rule: area that overlaps the undeformed insert, shared evenly by the nodes in

@@ -41,7 +41,7 @@ class ContactResponse:
 
     def displacement(self, y: Array) -> Array:
         """Return the candidates' displacement (m, 3), m, under the load whose L⁻¹ f is y."""
-        return np.asarray(self.half.project(y).reshape(-1, 3)[self.index])
+        return self.half.project(y).reshape(-1, 3)[self.index]
 
     def along(self, normals: Array) -> tuple[Array, Array]:
         """Return the compliance along normals (m, 3), and all that forces along them move.
@@ -55,7 +55,7 @@ class ContactResponse:
 
     def moved(self, pushed: Array, force: Array) -> Array:
         """Return the candidates' displacement (m, 3), m, under forces (m,), N, along normals."""
-        return np.asarray(np.einsum("aij,j->ia", pushed, force.astype(pushed.dtype)))
+        return np.einsum("aij,j->ia", pushed, force.astype(pushed.dtype))
 
     def _spread(self, values: Array) -> Array:
         """Return candidates' values (m, 3) on all the nodes (p, 3)."""
@@ -118,7 +118,7 @@ class ComplianceCache:
             here, there = np.searchsorted(self.nodes, nodes), np.searchsorted(self.nodes, pushed)
             axes = np.arange(3)
             compliance = self.compliance[np.ix_(axes, here, axes, there)]
-        return np.asarray(np.einsum("aibj,jb->ia", compliance, force))
+        return np.einsum("aibj,jb->ia", compliance, force)
 
     def _take(self, nodes: Indices) -> None:
         """Take nodes, with what is known of their compliance already."""

@@ -50,7 +50,7 @@ class ElasticOperator:
         """
         y = force.ravel()[self.free][self.factor.order]
         self.factor.forward(y, fronts)
-        return np.asarray(y)
+        return y
 
     def nodal(self, x: Array) -> Array:
         """Return nodal values (n, 3) of a vector in elimination order, 0 where held."""

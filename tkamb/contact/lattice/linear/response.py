@@ -114,7 +114,7 @@ class HalfResponse:
 
 def unknowns_of(nodes: Indices) -> Indices:
     """Return the three unknowns of each node (n,), one node after the other (3n,)."""
-    return np.asarray((3 * nodes[:, None] + np.arange(3)).ravel())
+    return (3 * nodes[:, None] + np.arange(3)).ravel()
 
 
 def half_response(

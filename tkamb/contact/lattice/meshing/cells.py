@@ -137,12 +137,12 @@ def _edges_at(points: Array, corner: int, offset: Index) -> list[Array]:
 def shortest_edges(points: Array) -> Array:
     """Return the length (c,) of the shortest edge of cells (c, 8, 3), m."""
     edges = points[:, EDGES[:, 1]] - points[:, EDGES[:, 0]]
-    return np.asarray(np.linalg.norm(edges, axis=2).min(axis=1))
+    return np.linalg.norm(edges, axis=2).min(axis=1)
 
 
 def cell_volumes(points: Array) -> Array:
     """Return the exact volumes (c,) of trilinear cells (c, 8, 3), by 2 x 2 x 2 Gauss points."""
-    return np.asarray(np.linalg.det(_jacobians(points)).sum(axis=1) / 8)
+    return np.linalg.det(_jacobians(points)).sum(axis=1) / 8
 
 
 def shape_gradients(at: Array) -> Array:
@@ -160,7 +160,7 @@ REFERENCE_GRADIENTS = np.stack([shape_gradients(at) for at in _GAUSS])
 
 def _jacobians(corners: Array) -> Array:
     """Return the Jacobians (s, 8 points, 3, 3), m, of cells (s, 8, 3)."""
-    return np.asarray(np.einsum("gnd,snx->sgdx", REFERENCE_GRADIENTS, corners))
+    return np.einsum("gnd,snx->sgdx", REFERENCE_GRADIENTS, corners)
 
 
 def gauss_gradients(corners: Array) -> tuple[Array, Array]:

@@ -136,7 +136,7 @@ def _grid_line(surface: Surface, axis: int, spacing: float) -> Array:
     values = surface.vertices[:, axis]
     line[0] = values[values <= lower + WALL * spacing].max()
     line[-1] = values[values >= upper - WALL * spacing].min()
-    return np.asarray(line)
+    return line
 
 
 def _empty_field(lines: tuple[Array, Array], spacing: Array, heights: Array) -> NodeField:
@@ -203,7 +203,7 @@ def _admit(field: NodeField, intervals: Intervals, ends: Ends) -> None:
 def inside(rays: RayCaster, points: Array) -> Mask:
     """Say which points (n, 3) lie in a closed surface, by counting crossings upwards."""
     ray, _, _ = rays.all(points, (0.0, 1.0, 0.0))
-    return np.asarray(np.bincount(ray, minlength=len(points)) % 2 == 1)
+    return np.bincount(ray, minlength=len(points)) % 2 == 1
 
 
 def refired_inwards(

@@ -39,7 +39,7 @@ class ContactMap(ContactSurface):
     def triangle_area(self) -> Array:
         """Areas of the triangles (k,), m²."""
         a, b, c = np.moveaxis(self.points[self.triangles], 1, 0)
-        return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+        return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
 def contact_map(lattice: Lattice, insert: Surface) -> tuple[Indices, ContactMap]:

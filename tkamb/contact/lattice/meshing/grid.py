@@ -164,7 +164,7 @@ def grid_spacing(extent: Array, target_size: float) -> Array:
         for size in (target_size / 1.01**percent, target_size * 1.01**percent):
             spacing = extent / np.maximum(np.round(extent / size), 1.0)
             if spacing.max() / spacing.min() <= MAX_EDGE_RATIO:
-                return np.asarray(spacing)
+                return spacing
     raise InputError(
         f"a box of {np.round(extent / MILLIMETRE, 3)} mm cannot be divided into near-cubic cells"
     )
@@ -196,7 +196,7 @@ def _bridges_gap(field: NodeField, cells: Index) -> Mask:
     """Say which cells have an upright edge whose ends lie in different intervals of a line."""
     number = field.interval.ravel()[cells]
     low, high = number[:, [0, 1, 4, 5]], number[:, [3, 2, 7, 6]]
-    return np.asarray(((low >= 0) & (high >= 0) & (low != high)).any(axis=1))
+    return ((low >= 0) & (high >= 0) & (low != high)).any(axis=1)
 
 
 def _largest_piece(cells: Index) -> Mask:
@@ -211,7 +211,7 @@ def _largest_piece(cells: Index) -> Mask:
     a, b = owner[:-1][shared], owner[1:][shared]
     graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(len(cells), len(cells)))
     label = connected_components(graph, directed=False)[1]
-    return np.asarray(label == np.bincount(label).argmax())
+    return label == np.bincount(label).argmax()
 
 
 def _assemble(field: NodeField, cells: Index, dropped_cells: int) -> Lattice:

@@ -54,14 +54,14 @@ class Levels:
         reference = self.reference[i, k]
         within = np.clip(height, 0.0, reference) * self.layers / reference
         outside = np.minimum(height, 0.0) + np.maximum(height - reference, 0.0)
-        return np.asarray(self.below + within + outside / self.spacing)
+        return self.below + within + outside / self.spacing
 
     def heights(self) -> Array:
         """Return the heights (nx, count, nz) of all grid nodes, m."""
         j = np.arange(self.count)[None, :, None] - self.below
         within = np.clip(j, 0, self.layers) * self.reference[:, None, :] / self.layers
         outside = np.minimum(j, 0) + np.maximum(j - self.layers, 0)
-        return np.asarray(within + outside * self.spacing)
+        return within + outside * self.spacing
 
 
 def follow_top(top: Array, lowest: float, spacing: Array) -> Levels:
@@ -155,4 +155,4 @@ def _filled(height: Array) -> Array:
     )
     result = height.ravel().copy()
     result[free] = spsolve(laplacian.tocsc(), weights[free][:, fixed] @ result[fixed])
-    return np.asarray(result.reshape(height.shape))
+    return result.reshape(height.shape)

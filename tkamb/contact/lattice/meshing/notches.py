@@ -52,7 +52,7 @@ def _shifted(mask: Mask, step: Index) -> Mask:
     """Return mask[i + di, j + dj, k + dk], False outside."""
     padded = np.pad(mask, 1)
     window = tuple(slice(1 + d, 1 + d + n) for d, n in zip(step, mask.shape, strict=True))
-    return np.asarray(padded[window])
+    return padded[window]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ def _towards(point: Array, other: Array, share: float, rise: Array | float) -> A
     """Return points moved sideways towards others by a share of the way, and up by `rise`."""
     result = point + share * (other - point)
     result[:, 1] = point[:, 1] + rise
-    return np.asarray(result)
+    return result
 
 
 def _settle(field: NodeField, notch: Notch, target: Array, keep: Mask, top: Mask) -> None:

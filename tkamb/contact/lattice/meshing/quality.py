@@ -91,7 +91,7 @@ def _spread(values: Array) -> tuple[float, float, float]:
 
 def _edge_ratios(points: Array) -> Array:
     lengths = np.linalg.norm(points[:, EDGES[:, 1]] - points[:, EDGES[:, 0]], axis=2)
-    return np.asarray(lengths.max(axis=1) / lengths.min(axis=1))
+    return lengths.max(axis=1) / lengths.min(axis=1)
 
 
 def _shear(points: Array) -> Array:

@@ -61,9 +61,9 @@ class BbarHexahedra(Solid):
     def nonlinear_residual(self, displacement: Array, chosen: Indices | None = None) -> Array:
         """Return the Gauss points' (mu - mu_s) times unit shear forces, N, (k, 24)."""
         strain, equivalent = self._state(displacement, chosen)
-        lost = self.material.shear_modulus - self.curve.modulus(equivalent)
+        softened = self.material.shear_modulus - self.curve.modulus(equivalent)
         cells = slice(None) if chosen is None else chosen
-        strain *= (lost * self.weights[self.shape_of_cell[cells]])[..., None]
+        strain *= (softened * self.weights[self.shape_of_cell[cells]])[..., None]
         return self._per_cell_forces(strain, chosen)
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
@@ -86,7 +86,7 @@ class BbarHexahedra(Solid):
     def _bulk(self) -> Array:
         g = self.dilatation
         scale = self.material.bulk_modulus * self.volume
-        return np.asarray(scale[:, None, None] * g[:, :, None] * g[:, None, :])
+        return scale[:, None, None] * g[:, :, None] * g[:, None, :]
 
     @cached_property
     def _others(self) -> tuple[Array, Array, Indices]:
@@ -122,4 +122,4 @@ class BbarHexahedra(Solid):
         matrix, others, matrices = self._sorted(chosen)
         force = flat @ matrix
         force[others] = np.einsum("crj,cr->cj", matrices, flat[others])
-        return np.asarray(force)
+        return force

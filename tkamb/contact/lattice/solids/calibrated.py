@@ -159,8 +159,8 @@ class CalibratedNetwork(Solid):
     ) -> Array:
         """Return (mu - mu_s) K_d u of the cells, N, (k, 24); see `Solid`."""
         force, equivalent = self._state(displacement, chosen)
-        lost = self.material.shear_modulus - self.curve.modulus(equivalent)
-        return lost[:, None] * force
+        softened = self.material.shear_modulus - self.curve.modulus(equivalent)
+        return softened[:, None] * force
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n): mu_s K_d + mu_s'/(3 V e) (K_d u)(K_d u)ᵀ + bulk."""
@@ -176,7 +176,7 @@ class CalibratedNetwork(Solid):
     def _bulk(self) -> Array:
         g = self.dilatation
         scale = self.material.bulk_modulus * self.volume
-        return np.asarray(scale[:, None, None] * g[:, :, None] * g[:, None, :])
+        return scale[:, None, None] * g[:, :, None] * g[:, None, :]
 
     @cached_property
     def _others(self) -> tuple[Array, NDArray[np.int64]]:

@@ -48,7 +48,7 @@ class ShearCurve:
         if self.spline is None:
             return np.full_like(equivalent, self.shear_modulus)
         floored = np.clip(equivalent, 1e-9, self.spline.x[-1])
-        return np.asarray(self.spline(floored) / (3 * floored))
+        return self.spline(floored) / (3 * floored)
 
     def softening(self, equivalent: Array) -> Array:
         """Return (d mu_s / d e) / e, Pa, at equivalent strains e >= 0: never positive."""

@@ -153,7 +153,7 @@ class Solid(ABC):
     def internal_force(self, displacement: Array) -> Array:
         """Return nodal internal forces f(u), N, (n, 3)."""
         linear = (self.stiffness @ displacement.ravel()).reshape(-1, 3)
-        return np.asarray(linear - self.residual_force(displacement))
+        return linear - self.residual_force(displacement)
 
     @abstractmethod
     def linear_force(self, displacement: Array) -> Array:
@@ -187,7 +187,7 @@ class Solid(ABC):
             for b in range(3):
                 along = np.einsum("cn,nc->c", local[others, a::3], gradients[:, b])
                 gradient[others, a, b] = along
-        return np.asarray((gradient + np.swapaxes(gradient, 1, 2)) / 2)
+        return (gradient + np.swapaxes(gradient, 1, 2)) / 2
 
     @cached_property
     def _mean_gradients(self) -> tuple[Array, Indices, Array]:

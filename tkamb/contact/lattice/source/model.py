@@ -156,7 +156,7 @@ def _next_active(
     positions: Array, planes: TangentPlanes, active: Mask, force: Array, depth: float
 ) -> Mask:
     """Return the set without nodes that are pulled, with nodes that would be passed."""
-    return np.asarray((active & (force >= 0)) | (~active & (planes.gap(positions) < depth)))
+    return (active & (force >= 0)) | (~active & (planes.gap(positions) < depth))
 
 
 def _press(

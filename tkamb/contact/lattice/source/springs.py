@@ -89,8 +89,8 @@ class SourceNetwork(Solid):
         longer = np.einsum("sd,sd->s", straight, displacement[b] - displacement[a])
         linear = self.material.young_modulus * longer[:, None] * straight
         now = (self.material.stress(strain) * self.lengths[springs])[:, None] * direction
-        lost = self.factor * (linear - now)
-        return np.hstack([-lost, lost])
+        softened = self.factor * (linear - now)
+        return np.hstack([-softened, softened])
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return the springs' (d sigma/d eps) C n nᵀ, assembled as in Sharma (2008) (3n, 3n).
