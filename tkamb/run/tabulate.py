@@ -7,10 +7,10 @@ import numpy as np
 
 from tkamb.body.dome_sensitivity import dome_sensitivity
 from tkamb.case import Case
+from tkamb.columns import ligament_column
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates
 from tkamb.mechanics.mechanics import FrameLoads
 from tkamb.run.agreement import normal_force, share_by_equilibrium, split_determined
-from tkamb.run.columns import ligament_column
 from tkamb.run.status import FAILED
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
