@@ -9,7 +9,7 @@ Fluoroscopy errs by about 0.5 mm and 0.5 deg, which is more than the deformation
    the turn that this takes would exceed 0.5 deg.
 3. It is always moved along y to first touch.
 
-The source does not say about which point it turns. Registration places the component's centre
+Sharma (2008) does not say about which point it turns. Registration places the component's centre
 better than any other point, so the centre stays where it was recorded. About the contact
 points, 25 mm below, 0.4 deg shift the component sideways by 0.2 mm, and in dishes little
 wider than the condyles the contact by 1.3 mm: enough to change the total force by 0.02 BW.

@@ -1,4 +1,4 @@
-"""The source's motion: rotations as recorded, AP from rolling plus slip, SI from contact."""
+"""Motion after Sharma (2008): rotations as recorded, AP from rolling plus slip, SI from contact."""
 
 from dataclasses import replace
 from typing import Literal
