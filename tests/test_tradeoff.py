@@ -1,6 +1,8 @@
 """The trade-off: references, errors, front, rows, table and picture."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from tkamb.case import load_case
 from tkamb.cli import main
 from tkamb.contact.registry import BUILT_IN, contact_model
 from tkamb.errors import InputError
+from tkamb.memory import peak_rss
 from tkamb.scene import load_scene
 from tkamb.studies import tradeoff
 from tkamb.studies.body_trade import CHANGES, body_table, run_body_trade
@@ -176,6 +179,14 @@ def test_a_measure_in_a_process_of_its_own():
     assert 30 < found.peak_rss_MB < 4000
     here = measure(Job("sphere", "foundation", 2.0))
     assert found.values == pytest.approx(here.values)
+
+
+def test_peak_memory_is_the_process_s_own():
+    """A parent that holds 400 MB starts a process that takes a tenth of it."""
+    held = np.ones(50_000_000)
+    asked = "from tkamb.memory import peak_rss; print(peak_rss())"
+    told = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
+    assert float(told.stdout) < 0.5 * held.nbytes / 1e6 < peak_rss()
 
 
 def test_what_cannot_be_measured_is_a_row_too():

@@ -27,6 +27,7 @@ from tkamb.contact.pair import Bearing
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface
+from tkamb.memory import peak_rss
 from tkamb.studies.measures import ONE_THREAD
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
@@ -211,7 +212,7 @@ def _wait(command: list[str], place: Path, longest: float) -> float:
     ):
         try:
             while process.poll() is None:
-                memory = _peak_rss(process.pid, memory)
+                memory = float(np.fmax(memory, peak_rss(process.pid)))  # NaN once it has ended
                 if clock.perf_counter() - start > longest:
                     raise ComputationError(f"stopped after {longest:g} s", "CalculiX")
                 with suppress(subprocess.TimeoutExpired):
@@ -221,19 +222,6 @@ def _wait(command: list[str], place: Path, longest: float) -> float:
     if process.returncode:
         raise ComputationError(f"stopped: {_last_words(place / OUTPUT_FILE)}", "CalculiX")
     return memory
-
-
-def _peak_rss(number: int, known: float) -> float:
-    """Return the peak resident memory (MB) of a process; `known` where the system does not say.
-
-    The usage that a finished child leaves behind starts from its parent's memory, and is not
-    its own.
-    """
-    with suppress(OSError):
-        for line in Path(f"/proc/{number}/status").read_text().splitlines():
-            if line.startswith("VmHWM"):
-                return float(line.split()[1]) * 1024 / 1e6
-    return known
 
 
 def _last_words(path: Path) -> str:
