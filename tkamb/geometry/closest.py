@@ -1,6 +1,7 @@
 """Closest points of the femoral condyles and the insert, and the gap between them."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import fcl
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tkamb.geometry.condyles import FACET_DEPTH, SAMPLE_SPACING, condyle_faces
+from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import Array, inverse, rotate, transform
 from tkamb.geometry.nearest import NearestPoints, sampled
 from tkamb.geometry.surface import Surface
@@ -81,6 +83,11 @@ class ClosestPointQuery:
         self._insert_tree = _tree(insert, np.arange(len(insert.faces)))
         medial, lateral = condyle_faces(femoral, split)
         self._condyles = [_Condyle(femoral, faces) for faces in (medial, lateral) if len(faces)]
+
+    @cached_property
+    def first_touch(self) -> FirstTouch:
+        """How far either condyle travels along -y until it touches."""
+        return FirstTouch(self.femoral, self.insert, self.split)
 
     def at(self, pose_femoral_in_insert: Array) -> CondyleGaps:
         """Return the gaps at a pose (4, 4)."""

@@ -120,4 +120,4 @@ def _lowest(pose: Array, vertices: Array, samples: Array, areas: Array) -> Array
     )
     across = rotate(pose, np.vstack([samples[near], lowest]) - lowest)
     step = weights @ across / weights.sum()
-    return np.asarray(transform(pose, lowest) + step * np.array([1.0, 0.0, 1.0]))
+    return transform(pose, lowest) + step * np.array([1.0, 0.0, 1.0])

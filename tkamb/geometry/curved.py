@@ -12,7 +12,7 @@ from tkamb.geometry.surface import Surface
 
 Indices = NDArray[np.int64]
 
-STEEPEST = 0.1
+SMALLEST_COSINE = 0.1
 """Smallest cosine between normal and direction that a shift is divided by: 84 deg."""
 
 
@@ -85,7 +85,7 @@ class CurvedSurface:
         height = 4.0 * np.einsum("ij,ij->i", around, sagittas)
         along = np.einsum("ij,ij->i", normals, planes)
         cosine = normals @ direction
-        steep = np.copysign(np.maximum(np.abs(cosine), STEEPEST), cosine)
+        steep = np.copysign(np.maximum(np.abs(cosine), SMALLEST_COSINE), cosine)
         return height * along / steep, normals
 
 
@@ -100,4 +100,4 @@ def _sagittas(surface: Surface, normals: Array) -> Array:
     coming = np.einsum("kij,kij->ki", end, edge)
     product, total = leaving * coming, leaving + coming
     alike = product > 0.0
-    return np.asarray(np.where(alike, 0.5 * product / np.where(alike, total, 1.0), 0.0))
+    return np.where(alike, 0.5 * product / np.where(alike, total, 1.0), 0.0)

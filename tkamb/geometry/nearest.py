@@ -129,7 +129,7 @@ def nearest_on_triangles(triangles: Array, points: Array) -> Array:
     on_edges = start + part[:, :, None] * along
     nearest = ((on_edges - target) ** 2).sum(axis=2).argmin(axis=1)
     feet[outside] = on_edges[np.arange(len(start)), nearest]
-    return np.asarray(feet)
+    return feet
 
 
 def _plane_weights(triangles: Array, points: Array) -> Array:
@@ -145,7 +145,7 @@ def _plane_weights(triangles: Array, points: Array) -> Array:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    return np.asarray(np.einsum("ij,ij->i", a, b))
+    return np.einsum("ij,ij->i", a, b)
 
 
 def _centres(n: int) -> Array:

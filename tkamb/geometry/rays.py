@@ -185,7 +185,7 @@ class RayCaster:
         offset = self._centre - points
         along = np.einsum("ij,ij->i", offset, directions)
         off_axis = np.linalg.norm(offset - along[:, None] * directions, axis=1)
-        return np.asarray((off_axis <= 1.01 * self._radius) & (along >= -self._radius))
+        return (off_axis <= 1.01 * self._radius) & (along >= -self._radius)
 
     def _intersect(self, origins: Array, directions: Array, face: Index) -> tuple[Array, Array]:
         """Return the distance to each triangle's plane and the barycentrics (n, 3) there."""

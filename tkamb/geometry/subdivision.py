@@ -19,7 +19,7 @@ from tkamb.geometry.topology import edge_use
 
 Indices = NDArray[np.int64]
 
-ROUNDING = 1e-6
+HALVING_TOLERANCE = 1e-6
 """Of the surface's size: how far a halved edge's middle may be from its line, as files round."""
 MOST_LEVELS = 8
 MOST_PARTS = 100
@@ -94,7 +94,7 @@ class _Search:
 
     def __init__(self, surface: Surface, across: Indices) -> None:
         self._faces, self._points, self._across = surface.faces, surface.vertices, across
-        self._near = ROUNDING * float(np.linalg.norm(np.ptp(surface.bounds, axis=0)))
+        self._near = HALVING_TOLERANCE * float(np.linalg.norm(np.ptp(surface.bounds, axis=0)))
         self._corners = Ragged.by_key(surface.faces.ravel(), len(surface.vertices))
 
     def tips(self, middle: Indices) -> Indices:
@@ -159,7 +159,7 @@ def _across(faces: Indices) -> Indices:
     here = pair[edge].reshape(-1, 3, 2)
     own = np.arange(len(faces))[:, None]
     other = np.where(here[..., 0] == own, here[..., 1], here[..., 0])
-    return np.asarray(np.roll(other, -1, axis=1))
+    return np.roll(other, -1, axis=1)
 
 
 def _parts(across: Indices) -> tuple[int, Indices]:

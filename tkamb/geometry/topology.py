@@ -125,7 +125,7 @@ def connected_parts(faces: Indices) -> Indices:
 def signed_volumes(vertices: Array, faces: Indices) -> Array:
     """Return the volume (k,) that each face spans with the centre of the vertices, m³."""
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
-    return np.asarray(np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
+    return np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
 
 
 @dataclass(frozen=True, eq=False)

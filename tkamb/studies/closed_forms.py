@@ -26,6 +26,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
@@ -34,7 +35,6 @@ from tkamb.contact.pair import Bearing, ContactPair
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError
-from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface
 from tkamb.studies.bodies import balls, block, flat
 from tkamb.studies.elastic_layer import sphere_on_layer
@@ -258,9 +258,11 @@ def _column(case: ClosedForm) -> Callable[[float], float]:
     return pressure
 
 
-def _inner(result: ContactResult) -> Array:
+def _inner(result: ContactResult) -> NDArray[np.bool_]:
     """Return the points a fifth of the block's side away from its edges."""
-    return np.asarray((np.abs(result.points[:, [0, 2]]) < 0.3 * SIDE_MM * MILLIMETRE).all(axis=1))
+    across = np.abs(result.points[:, [0, 2]]).max(axis=1)
+    inner: NDArray[np.bool_] = across < 0.3 * SIDE_MM * MILLIMETRE
+    return inner
 
 
 def _plate(side: float) -> Surface:
