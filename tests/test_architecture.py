@@ -12,28 +12,28 @@ KNOWN_TO_ALL = {
     *("command_options", "known_errors", "memory", "units"),
 }
 """Modules without knees: numbers, files, memory, messages."""
-KNEE = {"body", "case", "equilibrium", "geometry", "inputs", "mechanics", "scene"}
+KNEE = {"body", "contact", "equilibrium", "geometry", "scene"}
 SHOWN = {"columns", "output", "results", "results_folder"}
 DRAWING = {
     "datasets": set(),
     "starter": set(),
     "geometry": set(),
     "opensim": {"geometry"},
-    "inputs": {"geometry", "scene"},
-    "body": {"geometry", "scene"},
+    "body": {"geometry"},
     "contact": {"geometry"},
-    "mechanics": KNEE - {"equilibrium"},
-    "equilibrium": {*KNEE, "contact"} - {"inputs"},
-    "plausibility": {"case", "geometry", "inputs", "scene"},
-    "importing": {"case", "geometry", "inputs", "opensim", "scene"},
+    "inputs": {"geometry", "scene"},
+    "scene": {"body", "geometry", "inputs"},
+    "equilibrium": {"body", "contact", "geometry", "scene"},
+    "plausibility": {"geometry", "inputs", "scene"},
+    "importing": {"geometry", "inputs", "opensim", "scene"},
     "press": {"contact", "equilibrium", "geometry", "inputs"},
-    "run": {*KNEE, *SHOWN, "contact"} - {"inputs"},
+    "run": {*KNEE, *SHOWN} - {"results"},
     "output": {"columns", "contact", "geometry", "run"},
-    "view": {*KNEE, *SHOWN, "contact", "run", "simulation"} - {"inputs"},
-    "studies": {*KNEE, "contact", "output", "run", "simulation"} - {"body", "equilibrium"},
+    "view": {*KNEE, *SHOWN, "run", "simulation"} - {"columns"},
+    "studies": {*KNEE, "inputs", "output", "run", "simulation"} - {"body"},
 }
-"""Which folder knows which, folders and modules beside them: inputs → body → (equilibrium ⇄
-contact) → results → output, studies and view; scene_tables counts as scene."""
+"""Which folder knows which folders and which modules beside them: inputs → body → (equilibrium ⇄
+contact) → results → output, view and studies; the scene is where files become bodies."""
 SEES_BODY_AND_CONTACT = {"contact_side.py", "simulation.py"}
 
 
@@ -59,7 +59,7 @@ def imported(path):
 def part_of(name):
     """Return the folder, or the module beside the folders, that a dotted name belongs to."""
     parts = name.split(".")
-    return {"scene_tables": "scene"}.get(parts[1], parts[1]) if len(parts) > 1 else ""
+    return parts[1] if len(parts) > 1 else ""
 
 
 @pytest.mark.parametrize("folder", sorted(DRAWING))
@@ -76,17 +76,16 @@ def test_every_folder_is_in_the_drawing():
 
 
 def test_body_and_contact_know_geometry_alone():
-    assert DRAWING["contact"] == {"geometry"}
-    assert not DRAWING["body"] & {"contact", "equilibrium", "inputs", "run", "output"}
+    assert DRAWING["body"] == DRAWING["contact"] == {"geometry"}
 
 
 def test_the_layer_test_can_fail():
-    assert "tkamb.body.chain" in imported(PACKAGE / "mechanics" / "mechanics.py")
+    assert "tkamb.body.chain" in imported(PACKAGE / "equilibrium" / "mechanics.py")
     assert part_of("tkamb.body.chain") == "body"
 
 
 def test_only_two_files_see_body_and_contact():
-    folders = ("mechanics", "equilibrium", "run", "press")
+    folders = ("equilibrium", "run", "press", "scene")
     for path in [*PACKAGE.glob("*.py"), *(p for f in folders for p in (PACKAGE / f).glob("*.py"))]:
         names = imported(path)
         sees = {
@@ -95,7 +94,7 @@ def test_only_two_files_see_body_and_contact():
             for name in names
             if name.startswith(f"tkamb.{layer}.")
         }
-        through = {"tkamb.mechanics.mechanics": "body", "tkamb.mechanics.extensor": "body"}
+        through = {"tkamb.equilibrium.mechanics": "body"}
         sees |= {layer for module, layer in through.items() if module in names}
         if len(sees) == 2:
             assert path.name in SEES_BODY_AND_CONTACT, f"{path.name} sees {sees}"
