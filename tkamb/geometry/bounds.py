@@ -3,13 +3,10 @@
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.geometry.frames import Array, rotate, transform
+from tkamb.geometry.frames import Array, Index, rotate, transform
 from tkamb.geometry.ragged import Ragged
 from tkamb.geometry.surface import Surface
-
-Index = NDArray[np.int64]
 
 CELL_EDGE = 1e-3
 """m."""

@@ -4,13 +4,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.subdivision import Coarsened, coarsened
 from tkamb.geometry.surface import Surface
-
-Indices = NDArray[np.int64]
 
 SMALLEST_COSINE = 0.1
 """Smallest cosine between normal and direction that a shift is divided by: 84 deg."""
@@ -61,7 +58,7 @@ class CurvedSurface:
         """Corner normals, sagittas and plane's normal side by side (k, 15)."""
         return np.hstack([self.normals.reshape(-1, 9), self.sagittas, self.surface.face_normals])
 
-    def shift(self, faces: Indices, weights: Array, direction: Array) -> tuple[Array, Array]:
+    def shift(self, faces: Index, weights: Array, direction: Array) -> tuple[Array, Array]:
         """Return how far the patches are from points on their triangles along a direction.
 
         To first order in the patch's height.

@@ -3,15 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tkamb.geometry.bounds import HeightBound, Patches
-from tkamb.geometry.frames import Array, inverse, rotate, transform
+from tkamb.geometry.frames import Array, Index, Mask, inverse, rotate, transform
 from tkamb.geometry.ragged import Ragged
 from tkamb.geometry.surface import Surface
-
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 UP = np.array([0.0, 1.0, 0.0])
 EDGE_BAND = 0.03

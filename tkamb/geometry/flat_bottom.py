@@ -5,11 +5,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array, pose
+from tkamb.geometry.frames import Array, Index, Mask, pose
 from tkamb.geometry.surface import Surface
 
 FLATNESS = 5e-5
@@ -45,8 +44,8 @@ class FlatBottom:
     normal: Array
     centre: Array
     area: float
-    faces: NDArray[np.int64]
-    vertices: NDArray[np.int64]
+    faces: Index
+    vertices: Index
     noise: float
 
 
@@ -183,9 +182,7 @@ def _levelling(normal: Array) -> Array:
     return Rotation.from_rotvec(axis / sine * angle).as_matrix()
 
 
-def _largest_flat(
-    surface: Surface, normals: Array, area: Array, free: NDArray[np.bool_]
-) -> FlatBottom | None:
+def _largest_flat(surface: Surface, normals: Array, area: Array, free: Mask) -> FlatBottom | None:
     best: FlatBottom | None = None
     for seed in _peaks(normals[free], area[free]):
         flat = _grown(surface, normals, area, free, seed)
@@ -212,7 +209,7 @@ def _peaks(normals: Array, area: Array) -> list[Array]:
 
 
 def _grown(
-    surface: Surface, normals: Array, area: Array, free: NDArray[np.bool_], seed: Array
+    surface: Surface, normals: Array, area: Array, free: Mask, seed: Array
 ) -> FlatBottom | None:
     near = np.flatnonzero(free & (normals @ seed > math.cos(_CONE)))
     corners, weight = surface.triangles[near], area[near]

@@ -7,10 +7,9 @@ sideways. Contact along y, as modelled here, cannot see that.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, label
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Mask
 from tkamb.geometry.height_field import inside_intervals
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
@@ -75,7 +74,7 @@ def find_post(insert: Surface) -> Post | None:
     return None
 
 
-def _steep_share(top: Array, patch: NDArray[np.bool_]) -> float:
+def _steep_share(top: Array, patch: Mask) -> float:
     """Return the share of the columns around a patch that lie far below its edge."""
     near = binary_dilation(patch)
     around = binary_dilation(near, iterations=1) & ~near
@@ -83,5 +82,5 @@ def _steep_share(top: Array, patch: NDArray[np.bool_]) -> float:
     return float(np.mean(top[around] < edge - SIDE_DROP)) if around.any() else 0.0
 
 
-def _eroded(patch: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _eroded(patch: Mask) -> Mask:
     return ~binary_dilation(~patch)

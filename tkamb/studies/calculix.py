@@ -19,13 +19,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.grid import Lattice
 from tkamb.contact.materials import LinearElastic, Material, RambergOsgood
 from tkamb.contact.pair import Bearing
 from tkamb.errors import ComputationError, InputError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.surface import Surface
 from tkamb.memory import peak_rss
 from tkamb.studies.measures import ONE_THREAD
@@ -137,11 +136,11 @@ def _law(material: Material) -> list[str]:
     raise InputError("has no law that CalculiX knows", f"material '{material.name}'")
 
 
-def _numbered(first: int, members: NDArray[np.int64]) -> list[str]:
+def _numbered(first: int, members: Index) -> list[str]:
     return [f"{i},{','.join(str(v + 1) for v in row)}" for i, row in enumerate(members, first)]
 
 
-def _set(name: str, nodes: NDArray[np.int64]) -> list[str]:
+def _set(name: str, nodes: Index) -> list[str]:
     return [f"*NSET, NSET={name}", *(str(v + 1) for v in nodes)]
 
 

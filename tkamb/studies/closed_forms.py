@@ -26,7 +26,6 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
@@ -35,6 +34,7 @@ from tkamb.contact.pair import Bearing, ContactPair
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Mask
 from tkamb.geometry.surface import Surface
 from tkamb.studies.bodies import balls, block, flat
 from tkamb.studies.elastic_layer import sphere_on_layer
@@ -258,10 +258,10 @@ def _column(case: ClosedForm) -> Callable[[float], float]:
     return pressure
 
 
-def _inner(result: ContactResult) -> NDArray[np.bool_]:
+def _inner(result: ContactResult) -> Mask:
     """Return the points a fifth of the block's side away from its edges."""
     across = np.abs(result.points[:, [0, 2]]).max(axis=1)
-    inner: NDArray[np.bool_] = across < 0.3 * SIDE_MM * MILLIMETRE
+    inner: Mask = across < 0.3 * SIDE_MM * MILLIMETRE
     return inner
 
 

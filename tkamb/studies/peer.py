@@ -16,13 +16,12 @@ import time as clock
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tkamb.contact.lattice.covered import covered_areas
 from tkamb.contact.lattice.femoral import FemoralFloor
 from tkamb.contact.lattice.grid import Lattice, build_grid
-from tkamb.contact.lattice.pressure_map import ContactMap, Indices, contact_map
+from tkamb.contact.lattice.pressure_map import ContactMap, contact_map
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import pose_at_approach
 from tkamb.contact.registry import contact_model
@@ -30,15 +29,13 @@ from tkamb.contact.result import ContactResult
 from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
 from tkamb.errors import ComputationError
 from tkamb.geometry.condyles import condyle_split
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.surface import Surface
 from tkamb.studies.calculix import LONGEST_SECONDS, Deck, PeerRun, run_calculix
 from tkamb.studies.cases import StudyCase
 from tkamb.studies.measures import Measure
 from tkamb.studies.quantities import quantities, raster_map
 from tkamb.units import MEGAPASCAL, MILLIMETRE
-
-Mask = NDArray[np.bool_]
 
 ELEMENT = "C3D8I"
 TOUCHABLE_WITHIN = 2.0
@@ -146,7 +143,7 @@ class _Problem:
 
     pair: ContactPair
     lattice: Lattice
-    nodes: Indices
+    nodes: Index
     map: ContactMap
     floor: FemoralFloor
     pose: Array
