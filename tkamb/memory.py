@@ -1,12 +1,19 @@
-"""How much memory this process may still take: the machine's, its group's and its own limit."""
+"""How much memory this process has taken, and may still take: machine, group and own limit."""
 
 import os
 import resource
+import sys
 from pathlib import Path
 
 GROUP = Path("/sys/fs/cgroup")
 STATISTICS = Path("/proc/meminfo")
 OWN = Path("/proc/self/statm")
+
+
+def peak_rss() -> float:
+    """Return the largest resident memory so far, MB (1e6 bytes)."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
 def available_memory() -> float:

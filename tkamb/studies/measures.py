@@ -108,7 +108,7 @@ def measure_apart(job: Job, longest: float = LONGEST_SECONDS) -> Measure:
 
 def measure(job: Job) -> Measure:
     """Measure in this process."""
-    from tkamb.press.press import peak_rss
+    from tkamb.memory import peak_rss
 
     model = _model(job)
     (prepare, cold), (case, state, result) = _first(model, job)
