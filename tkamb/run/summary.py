@@ -36,7 +36,7 @@ def summary_of(
     path: Path | None,
     strains: Mapping[str, Sequence[float]],
 ) -> dict[str, Any]:
-    """Return the JSON-able summary of a run; `tkamb.output.provenance` lists its keys.
+    """Return the JSON-able summary of a run; docs/results.md lists its keys.
 
     Args:
         case: the case.

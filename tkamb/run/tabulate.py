@@ -171,7 +171,7 @@ def _pose_row(frame: "FrameContact") -> dict[str, float]:
         | {f"{angle}_deg": named[angle] / DEGREE for angle in angles}
         | {
             "contact_trials": frame.settled.trials,
-            "softest_N_per_mm": frame.settled.balance.softest * MILLIMETRE,
+            "smallest_stiffness_N_per_mm": frame.settled.balance.softest * MILLIMETRE,
         }
     )
 
