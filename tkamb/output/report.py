@@ -12,7 +12,7 @@ import numpy as np
 from tkamb.atomic import write_text
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import LABELS, HorizontalAxis, horizontal_axis
-from tkamb.output.headline import cards
+from tkamb.output.headline import cards, run_title
 from tkamb.output.metrics import body_weight, failed, flagged
 from tkamb.output.pages import asset, policy_sources, render
 from tkamb.output.panels import Panel, centre_panel, panels
@@ -55,7 +55,7 @@ def report_html(results: "Results") -> str:
         policy=POLICY.format(script=policy_sources(script), style=policy_sources(style)),
         style=style,
         script=script,
-        title=_title(results.summary),
+        title=run_title(results.summary),
         subtitle=_subtitle(results),
         cards=cards(results, axis),
         sentences=_sentences(results.summary),
@@ -78,18 +78,10 @@ def headline_html(results: "Results") -> str:
         PACKAGE,
         "notebook.html",
         style=asset(PACKAGE, "notebook.css"),
-        title=_title(results.summary),
+        title=run_title(results.summary),
         subtitle=_subtitle(results),
         cards=cards(results, horizontal_axis(results)),
     )
-
-
-def _title(summary: dict[str, Any]) -> str:
-    if summary.get("title"):
-        return str(summary["title"])
-    scene = Path(str(summary.get("scene", "tkamb run")))
-    name = scene.parent.name if scene.stem == "scene" and scene.parent.name else scene.stem
-    return name.upper() if len(name) <= 3 else name.replace("_", " ").capitalize()
 
 
 def _subtitle(results: "Results") -> str:
