@@ -8,9 +8,9 @@ import pytest
 from tkamb.case import load_case
 from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.errors import InputError
+from tkamb.geometry.condyles import LowestPoints
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import knee_pose
-from tkamb.geometry.lowest import LowestPoints
 from tkamb.inputs.tables import read_table
 from tkamb.mechanics.mechanics import Mechanics
 from tkamb.scene import load_scene

@@ -9,7 +9,6 @@ from scipy.spatial import cKDTree
 
 from tkamb.case import load_case
 from tkamb.geometry.frames import inverse, transform
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 from tkamb.mechanics.mechanics import Mechanics
 from tkamb.output.metrics import JUMP
@@ -123,7 +122,7 @@ def test_no_floor_where_the_reaction_is_put_at_the_ankle():
 
 
 def test_centres_of_pressure_lie_on_the_insert(run, drawing):
-    rays = RayCaster(run.case.insert)
+    rays = run.case.insert.rays
     found = [one for one in drawing.markers if "centre of pressure" in one.name][-2:]
     for marker in found:
         assert np.isfinite(marker.points).all()

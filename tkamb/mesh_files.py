@@ -11,8 +11,8 @@ from tkamb.contact.lattice.grid import Lattice, build_grid
 from tkamb.contact.lattice.quality import LatticeQuality, measure_quality
 from tkamb.contact.registry import COARSEST_MM
 from tkamb.errors import InputError
-from tkamb.geometry.bodies import separate_bodies
 from tkamb.geometry.flat_bottom import insert_placement
+from tkamb.geometry.topology import separate_bodies
 from tkamb.inputs.mesh_check import mended_mesh
 from tkamb.inputs.meshes import axes_rotation, load_surface, mirrored
 from tkamb.output.vtk import write_lattice

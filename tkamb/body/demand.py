@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from tkamb.body import unknowns
 from tkamb.body.knee import KneeGeometry
-from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_pose, transform
-from tkamb.geometry.knee_axes import knee_axes
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_axes, knee_pose, transform
 
 if TYPE_CHECKING:
     from tkamb.body.ligaments import Ligament

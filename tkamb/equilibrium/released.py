@@ -25,8 +25,7 @@ import numpy as np
 from tkamb.body.demand import KneeDemand, knee_demand
 from tkamb.body.unknowns import CondylePoint
 from tkamb.equilibrium.balance import Balance, BalanceStatus, Trial, find_balance
-from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
-from tkamb.geometry.knee_axes import knee_axes
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_axes, knee_pose
 from tkamb.mechanics.mechanics import Mechanics, PlacedKnee
 
 if TYPE_CHECKING:

@@ -99,7 +99,7 @@ def _stability(options: argparse.Namespace) -> int:
 def _study_stability(options: argparse.Namespace, directory: Path) -> int:
     from tkamb.studies import stability as study
     from tkamb.studies.kept_rows import KeptRows
-    from tkamb.studies.stability_report import picture, table
+    from tkamb.studies.stability import picture, table
 
     cases = study.stability_cases(options.quick)
     kept = KeptRows(directory, options.resume)

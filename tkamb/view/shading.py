@@ -7,8 +7,6 @@ import numpy as np
 from fast_simplification import simplify
 from numpy.typing import NDArray
 
-from tkamb.geometry.corner_normals import corner_normals
-from tkamb.geometry.nearest import NearestPoints
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
@@ -40,7 +38,7 @@ class Shaded:
 def shade(surface: Surface, most_triangles: int = MOST_TRIANGLES) -> Shaded:
     """Return a surface for drawing; vertices on sharp edges are doubled."""
     surface, error = decimate(surface, most_triangles)
-    normals = corner_normals(surface)
+    normals = surface.corner_normals
     flat = np.repeat(surface.face_normals[:, None], 3, axis=1)
     normals = np.where(np.linalg.norm(normals, axis=-1, keepdims=True) > 0, normals, flat)
     key = np.round(normals.reshape(-1, 3) * 127.0).astype(np.int64)
@@ -75,7 +73,7 @@ def decimate(surface: Surface, most_triangles: int) -> tuple[Surface, float]:
 def _distance(one: Surface, other: Surface) -> float:
     """Return the largest distance (m) of vertices and triangle centres to the other surface."""
     return max(
-        float(NearestPoints(to).at(points).distance.max())
+        float(to.nearest.at(points).distance.max())
         for of, to in ((one, other), (other, one))
         for points in (of.vertices, of.triangles.mean(axis=1))
     )
