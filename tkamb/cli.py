@@ -42,8 +42,8 @@ def _keep_to_one_thread() -> None:
     The lattice's solves wait for memory; further threads wait for each other, which on a
     busy machine takes several times as long.
     """
-    said = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    if "numpy" not in sys.modules and not any(name in os.environ for name in said):
+    limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    if "numpy" not in sys.modules and not any(name in os.environ for name in limits):
         os.environ["OMP_NUM_THREADS"] = "1"
 
 

@@ -134,7 +134,7 @@ def read_csv(path: str | Path) -> dict[str, Any]:
         if len(row) != len(header):
             raise InputError(f"line {number} has {len(row)} cells, not {len(header)}", path)
     cells = list(zip(*body, strict=True)) or [() for _ in header]
-    return {name: _parsed(name, values, path) for name, values in zip(header, cells, strict=True)}
+    return {name: _parse(name, values, path) for name, values in zip(header, cells, strict=True)}
 
 
 def csv_text(columns: Mapping[str, Any]) -> str:
@@ -158,7 +158,7 @@ def _cell(name: str, value: Any) -> str:
     return repr(float(value))
 
 
-def _parsed(name: str, cells: tuple[str, ...], path: Path) -> Any:
+def _parse(name: str, cells: tuple[str, ...], path: Path) -> Any:
     if KINDS.get(name) == "text":
         return list(cells)
     if name not in KINDS and not is_ligament(name):

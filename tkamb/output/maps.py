@@ -262,7 +262,7 @@ class ContactMaps:
         """Units, frame, model, version, scene hash."""
         if not isinstance(self.source, Path):
             return {"units": UNITS, **(self.given_attributes or {})}
-        with _opened(self.source) as file:
+        with _open(self.source) as file:
             return dict(file.attrs)
 
     def __len__(self) -> int:
@@ -271,7 +271,7 @@ class ContactMaps:
     def _array(self, name: str, frames: int | None = None) -> Any:
         if not isinstance(self.source, Path):
             return np.asarray(self.source[name])
-        with _opened(self.source) as file:
+        with _open(self.source) as file:
             if name not in file:
                 raise InputError(f"has no '{name}'", self.source, "is it a contact.h5 of tkamb?")
             return file[name][:frames]
@@ -304,7 +304,7 @@ def write_maps(maps: ContactMaps, path: Path) -> None:
             writer.append(time, *frame, maps.femoral_pose[k])
 
 
-def _opened(path: Path) -> Any:
+def _open(path: Path) -> Any:
     try:
         return h5py.File(path, "r")
     except FileNotFoundError:

@@ -157,8 +157,8 @@ def _provenance(summary: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _text(value: Any) -> str:
     if isinstance(value, dict):
-        kept = {str(k).replace("_", " "): v for k, v in value.items() if v not in (None, {}, [])}
-        return ", ".join(f"{name} {_text(item)}" for name, item in kept.items())
+        filled = {str(k).replace("_", " "): v for k, v in value.items() if v not in (None, {}, [])}
+        return ", ".join(f"{name} {_text(item)}" for name, item in filled.items())
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):
@@ -171,7 +171,7 @@ def _cursor_data(results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
     drawn = (*panels(results), centre_panel(results))
     name = axis.label.split(" (")[0]
     return {
-        "x": _rounded(axis.values),
+        "x": _round(axis.values),
         "place": [f"{name} {axis.at(k)}" for k in range(len(results))],
         "status": results.status,
         "panels": {panel.name: _cursor_lines(panel) for panel in drawn if panel.lines},
@@ -187,11 +187,11 @@ def _cursor_lines(panel: Panel) -> list[dict[str, Any]]:
             "label": line.label,
             "colour": line.colour,
             "digits": digits,
-            "values": _rounded(line.values),
+            "values": _round(line.values),
         }
         for line in panel.lines
     ]
 
 
-def _rounded(values: Array) -> list[float | None]:
+def _round(values: Array) -> list[float | None]:
     return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values]

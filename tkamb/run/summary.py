@@ -156,41 +156,45 @@ def not_modelled(case: Case) -> list[str]:
 def assumptions(case: Case) -> list[str]:
     """Return what the numbers rest on, in plain words."""
     scene = case.scene
-    said = [
+    sentences = [
         "Segments are rigid; the hip carries the force and moment of all that crosses it.",
     ]
     if scene.motion.cutoff_Hz == "none":
-        said.append("The motion is differentiated as given, unfiltered.")
+        sentences.append("The motion is differentiated as given, unfiltered.")
     else:
-        said.append(f"The motion is low-passed at {scene.motion.cutoff_Hz:g} Hz.")
+        sentences.append(f"The motion is low-passed at {scene.motion.cutoff_Hz:g} Hz.")
     if case.motion.unrecorded:
-        said.append(
+        sentences.append(
             f"Nobody recorded {', '.join(case.motion.unrecorded)}: they are found, and the rates "
             "that enter inertia and the direction of sliding are those of a first guess."
         )
     if scene.motion.motion == "roll-slip":
-        said.append(
+        sentences.append(
             "Roll-slip motion: AP from rolling plus "
             f"{scene.motion.slip_share:g} x the recorded slip, SI from first touch."
         )
     if scene.generic_ligaments:
-        said.append(
+        sentences.append(
             f"{', '.join(scene.generic_ligaments.ligaments)}: a generic set scaled to the "
             "implant, not this patient's; look at the strains."
         )
     if case.motion.markers:
-        said.append(_marker_reading(case))
+        sentences.append(_marker_reading(case))
     elif not scene.tibia:
-        said.append("No [tibia]: the shank stands upright and still.")
+        sentences.append("No [tibia]: the shank stands upright and still.")
     if scene.ground_reaction and scene.ground_reaction.applied == "ankle":
-        said.append("The ground reaction acts at the ankle centre, without moment (the source).")
+        sentences.append(
+            "The ground reaction acts at the ankle centre, without moment (the source)."
+        )
     if not scene.patella:
-        said.append("No muscles: the knee's flexion moment is carried by nothing (a residual).")
+        sentences.append(
+            "No muscles: the knee's flexion moment is carried by nothing (a residual)."
+        )
     if scene.contact:
-        said.append(_agreement(scene.contact))
+        sentences.append(_agreement(scene.contact))
     if scene.patient.side == "left":
-        said.append("A left knee is computed as its mirror image: z is lateral.")
-    return said
+        sentences.append("A left knee is computed as its mirror image: z is lateral.")
+    return sentences
 
 
 def _marker_reading(case: Case) -> str:
@@ -215,10 +219,10 @@ def _agreement(table: ContactTable) -> str:
     if table.released:
         names = ", ".join(sorted({*table.released, "si"}))
         return f"{names} are not the recorded ones: body and contact are at rest in them."
-    said = "The contact model presses in the superior-inferior force at the measured rotation; "
+    sentence = "The contact model presses in the superior-inferior force at the measured rotation; "
     if table.coupling == "points":
-        return said + "the deformed contact's resultants act in the body's equations."
-    return said + "it does not feed back into the body."
+        return sentence + "the deformed contact's resultants act in the body's equations."
+    return sentence + "it does not feed back into the body."
 
 
 def _first_wrapping(columns: dict[str, Any]) -> float | None:

@@ -60,7 +60,7 @@ class Block:
         self._size += len(padded)
         return span
 
-    def packed(self, header: dict[str, Any]) -> bytes:
+    def compress(self, header: dict[str, Any]) -> bytes:
         """Return header and arrays, compressed."""
         text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
@@ -74,7 +74,7 @@ def pack(drawings: Sequence[Drawing]) -> bytes:
     block = Block()
     peak = peak_pressure(drawings)
     limit = max(one.strain_limit for one in drawings)
-    return block.packed(
+    return block.compress(
         {
             "layers": list(LAYERS),
             "hidden": list(HIDDEN_AT_FIRST),
@@ -96,13 +96,13 @@ def peak_pressure(drawings: Sequence[Drawing]) -> float:
 def packed_map(found: PressureMap, peak: float, words: str) -> bytes:
     """Return one map alone, on the scale of a page that is open, with words about it."""
     block = Block()
-    return block.packed({"map": _map(block, found, peak), "words": words})
+    return block.compress({"map": _map(block, found, peak), "words": words})
 
 
 def packed_lattice(lines: Array) -> bytes:
     """Return the lines (s, 2, 3) m of a lattice alone."""
     block = Block()
-    return block.packed({"lattice": block.put(lines, "float32")})
+    return block.compress({"lattice": block.put(lines, "float32")})
 
 
 def _view(block: Block, number: int, drawing: Drawing, peak: float) -> dict[str, Any]:
