@@ -184,7 +184,7 @@ def assumptions(case: Case) -> list[str]:
         sentences.append("No [tibia]: the shank stands upright and still.")
     if scene.ground_reaction and scene.ground_reaction.applied == "ankle":
         sentences.append(
-            "The ground reaction acts at the ankle centre, without moment (the source)."
+            "The ground reaction acts at the ankle centre, without moment (Sharma 2008)."
         )
     if not scene.patella:
         sentences.append(
