@@ -22,6 +22,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 
 UNITS = "SI: m, s, Pa, N; poses 4x4"
+COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 PER_FRAME = ("pressure_Pa", "gap_m", "nodal_force_N", "femoral_pose", "time_s")
 
 
@@ -47,9 +48,9 @@ class MapWriter:
     ) -> None:
         self.path = None if path is None else Path(path)
         points = np.asarray(points, float)
-        where: dict[str, Any] = {"driver": "core", "backing_store": False}
+        options: dict[str, Any] = {} if path else {"driver": "core", "backing_store": False}
         with self._written():
-            self._file = h5py.File(path or "memory", "w", **({} if path else where))
+            self._file = h5py.File(path or "memory", "w", **options)
             self._begin(points, np.asarray(triangles, np.int64), attributes)
 
     def _begin(
@@ -74,9 +75,7 @@ class MapWriter:
             float,
             maxshape=(None, *shape),
             chunks=(1, *shape),
-            **(
-                {"compression": "gzip", "compression_opts": 1, "shuffle": True} if self.path else {}
-            ),
+            **(COMPRESSION if self.path else {}),
         )
 
     def append(
