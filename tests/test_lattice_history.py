@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from scenes import MODEL
-from tkamb.case import load_case
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.contact.summary import area_above, medial_points
 from tkamb.geometry.frames import knee_pose
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 FRAMES, FAR = (12, 36, 84), 60
 LOADS = {11: 700.0, 12: 750.0, 35: 1400.0, 36: 1450.0, 60: 2000.0, 83: 2150.0, 84: 2200.0}

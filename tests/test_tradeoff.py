@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from scenes import write_scene
-from tkamb.case import load_case
 from tkamb.cli import main
 from tkamb.contact.registry import BUILT_IN, contact_model
 from tkamb.errors import InputError
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 from tkamb.studies import matrix, tradeoff
 from tkamb.studies.body_trade import CHANGES, body_table, run_body_trade
 from tkamb.studies.cases import case_names, copied_scene, study_case, thin_out

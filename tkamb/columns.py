@@ -141,7 +141,9 @@ COLUMNS: tuple[Column, ...] = (
     Column("coupling_change_mm", "the same, in the centres of pressure", _POINTS),
     Column("contact_trials", "contacts computed to find the released pose", _FREE, "integer"),
     Column(
-        "smallest_stiffness_N_per_mm", "of the released pose, rotations at a lever of 25 mm", _FREE
+        "smallest_stiffness_N_per_mm",
+        "smallest stiffness of the released pose (lever 25 mm)",
+        _FREE,
     ),
     Column(
         "adjust_force_change_BW",

@@ -23,7 +23,7 @@ import numpy as np
 
 from tkamb.geometry.condyles import LowestPoints
 from tkamb.geometry.first_touch import FirstTouch
-from tkamb.geometry.frames import Array, inverse, knee_pose, rotate, transform
+from tkamb.geometry.frames import Array, inverse, knee_pose, knee_twist, rotate, transform
 from tkamb.geometry.surface import Surface
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -173,6 +173,23 @@ def sliding_velocity(velocity: Array, spin: Array, arm: Array, lever: Array) -> 
         lever: (f,) m, z from the component's geometric centre to the contact point.
     """
     return np.asarray((velocity + np.cross(spin, arm))[:, 0] - spin[:, 1] * lever)
+
+
+def forward_sliding(coordinates: Array, rates: Array, centre: Array, contact: Array) -> float:
+    """Return the forward sliding (m/s) at a contact point by rigid-body kinematics.
+
+    Args:
+        coordinates: (6,) knee coordinates, m and rad.
+        rates: (6,) their rates.
+        centre: (3,) m, geometric centre of the component, femoral frame.
+        contact: (3,) m, insert frame.
+    """
+    velocity, spin = knee_twist(coordinates, rates)
+    arm, lever = (
+        contact - coordinates[:3],
+        contact[2] - transform(knee_pose(coordinates), centre)[2],
+    )
+    return float(sliding_velocity(velocity[None], spin[None], arm[None], np.array([lever]))[0])
 
 
 def roll_slip_motion(

@@ -19,7 +19,7 @@ from tkamb.contact.summary import summarise_condyles, thickness_under, wrench_of
 from tkamb.contact.validity import peak_flags
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.first_touch import FirstTouch
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import SIDES, Array
 from tkamb.geometry.rays import RayCaster
 
 SHORT_AXIS_SUB_CELLS = 10
@@ -32,7 +32,6 @@ FLATTEST = 1e-6
 """Smallest ratio of the two relative curvatures that still makes an ellipse."""
 
 
-SIDES = ("medial", "lateral")
 CONFORMING = "conforms to the insert: no ellipse (relative curvature is not positive)"
 
 

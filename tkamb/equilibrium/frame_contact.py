@@ -11,7 +11,7 @@ from tkamb.contact.summary import area_above
 from tkamb.geometry.adjustment import Adjustment
 
 if TYPE_CHECKING:
-    from tkamb.equilibrium.released import SettledKnee
+    from tkamb.equilibrium.released import KneeEquilibrium
 
 NAN = float("nan")
 
@@ -30,7 +30,7 @@ class FrameContact:
         iterations: of body and contact, until they agreed; 0 if not coupled.
         load_change: N, by the last of them.
         point_change: m, likewise, of the centres of pressure.
-        settled: the search for the released coordinates, if there are any.
+        equilibrium: the search for the released coordinates, if there are any.
         sensitivity: N/rad, of the medial force to adduction (`split_sensitivity`); NaN where
             adduction is released, or there is one condyle.
         triangles: (k, 3) of the map.
@@ -45,7 +45,7 @@ class FrameContact:
     iterations: int = 0
     load_change: float = NAN
     point_change: float = NAN
-    settled: "SettledKnee | None" = None
+    equilibrium: "KneeEquilibrium | None" = None
     sensitivity: float = NAN
     triangles: NDArray[np.int64] | None = None
 

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.case import Case
 from tkamb.contact.lattice.cells import FACES
 from tkamb.contact.lattice.grid import build_grid
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import SIDES, Array
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
 from tkamb.output.headline import run_title
-from tkamb.output.metrics import SIDES, body_weight, map_rows, medial_share
+from tkamb.output.metrics import body_weight, map_rows, medial_share
+from tkamb.scene.case import Case
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 from tkamb.view.arrows import contact_markers, force_arrows
 from tkamb.view.drawing import Drawing, PressureMap, Reading
@@ -79,8 +79,7 @@ def draw(
 
 
 def _stand_ins(case: Case, foot: bool) -> tuple[str, ...]:
-    meshed = case.scene.quadriceps is not None and case.scene.quadriceps.bone is not None
-    words = STAND_INS.format("Tibia and patella are" if meshed else "Bones are")
+    words = STAND_INS.format("Tibia and patella are" if case.bone else "Bones are")
     return (words, FOOT) if foot else (words,)
 
 

@@ -4,13 +4,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tkamb.case import Case, load_case
+from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.errors import InputError
-from tkamb.mechanics.mechanics import FrameLoads, Mechanics
 from tkamb.results import Results
 from tkamb.results_folder import SUMMARY_NAME, read_results
 from tkamb.run.summary import files_hash, scene_hash
 from tkamb.scene import Scene, load_scene
+from tkamb.scene.case import Case, load_case
 from tkamb.simulation import simulate
 
 Progress = Callable[[Iterable[int]], Iterable[int]]

@@ -1,6 +1,6 @@
 """The rigid parts of a drawing: implant, patella, bones as plain solids, floor and foot.
 
-A scene holds no bone meshes but one that the quadriceps may wrap, which is drawn; the other
+A scene holds no bone meshes but one that a muscle may wrap, which is drawn; the other
 bones are stand-ins of about the right size between the joint centres: they orient the eye and
 carry no load. Nobody measured the foot: it hangs at the ankle, level with the floor and pointing
 where the shank does, so that the arrow of the ground reaction does not hang in the air.
@@ -13,11 +13,10 @@ import trimesh
 
 from tkamb.body.chain import ChainState
 from tkamb.body.knee import KneeGeometry
-from tkamb.case import Case
 from tkamb.geometry.frames import Array, inverse, pose, transform
 from tkamb.geometry.surface import Surface
-from tkamb.mechanics.extensor import quadriceps_bone
 from tkamb.output.maps import ContactMaps
+from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
 from tkamb.view.arrows import centre_of_pressure
 from tkamb.view.colours import BLACK, BONE, BUTTON, FLOOR, INSERT, METAL, RECORDED
@@ -114,8 +113,8 @@ def _contact_poses(recorded: Array, maps: ContactMaps | None, rows: Sequence[int
 
 
 def _femur(case: Case, states: Sequence[ChainState], poses: Array) -> Solid:
-    """Return the bone that the quadriceps may wrap, else a stand-in up to the hip."""
-    bone = quadriceps_bone(case)
+    """Return the bone that a muscle wraps, else a stand-in up to the hip."""
+    bone = case.bone
     if bone is not None:
         return Solid("femur", "bones", bone, BONE, 1.0, poses)
     hip = (inverse(poses[0]) @ np.append(states[0].point("hip", np.zeros(3)), 1.0))[:3]
@@ -145,12 +144,9 @@ def _shaft(end: Array, profile: tuple[tuple[float, float], ...], name: str) -> S
 
 def _patella(case: Case) -> Surface:
     """Return an ellipsoid from the tendon's insertion to the ligament's origin."""
-    scene = case.scene
-    assert scene.quadriceps is not None and scene.patellar_ligament is not None
-    top, bottom = (
-        transform(case.chain.link_in(end.link, "patella"), np.array(end.point_mm) * MILLIMETRE)
-        for end in (scene.quadriceps.insertion, scene.patellar_ligament.proximal)
-    )
+    assert case.patellar_ligament is not None
+    ends = (case.muscles[0].points[-1], case.patellar_ligament.proximal)
+    top, bottom = (transform(case.chain.link_in(end.link, "patella"), end.position) for end in ends)
     ball = trimesh.creation.icosphere(subdivisions=3)
     along = top - bottom
     half = 0.5 * float(np.linalg.norm(along))

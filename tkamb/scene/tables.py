@@ -444,28 +444,55 @@ class BoneTable(SceneTable):
     link: str = Field(description="link in whose frame the mesh stands")
 
 
-class QuadricepsTable(SceneTable):
-    """Quadriceps line: from the vastus intermedius origin to the patella.
+HALF_THICKNESS = "of the tendon, off the outline"
+BAND = (
+    "wraps the sections within this distance of its sagittal plane: as far as, on average, the "
+    "fibres of a lamina 20 mm wide; wider ones ride on the flanges"
+)
 
-    It wraps the sagittal outline of the femoral component, and of `bone` if given.
+
+class MuscleWrapTable(SceneTable):
+    """What a muscle wraps: the sagittal outline of the femoral component, and of `bone`.
+
+    It is the stretch of the path that leaves the femur which passes in front of it.
+    """
+
+    bone: BoneTable | None = None
+    half_thickness_mm: Number = Field(3.5, ge=0, le=20, description=HALF_THICKNESS)
+    band_mm: Number = Field(5.0, ge=0, le=50, description=BAND)
+
+
+class MuscleTable(SceneTable):
+    """A muscle: a line of action through points of the links.
+
+    One muscle can be balanced by equilibrium alone: it must run from the femur to the patella.
+    """
+
+    name: str = Field(pattern="^[A-Za-z0-9_]+$")
+    group: str = Field("", description="of muscles that are shown together; default: its own")
+    path: tuple[Attachment, ...] = Field(
+        min_length=2, description="from the origin, through any via points, to the insertion"
+    )
+    wrap: MuscleWrapTable | None = Field(None, description="default: straight between the points")
+    # Twice the strongest of the lower limb (soleus and vastus lateralis, some 6 kN).
+    force_N: Annotated[Number | None, _within(1, 15000, "is it in newtons?")] = Field(
+        None, description="maximal isometric force; no bound where it is not given"
+    )
+
+
+class QuadricepsTable(SceneTable):
+    """Quadriceps line, the short form of a [[muscle]] named quadriceps of two points.
+
+    It runs from the vastus intermedius origin to the patella and wraps the sagittal outline of
+    the femoral component, and of `bone` if given.
     """
 
     origin: Attachment
     insertion: Attachment
     wrap: Switch = True
     bone: BoneTable | None = None
-    half_thickness_mm: Number = Field(
-        3.5, ge=0, le=20, description="of the tendon, off the outline"
-    )
-    band_mm: Number = Field(
-        5.0,
-        ge=0,
-        le=50,
-        description=(
-            "wraps the sections within this distance of its sagittal plane: as far as, on "
-            "average, the fibres of a lamina 20 mm wide; wider ones ride on the flanges"
-        ),
-    )
+    half_thickness_mm: Number = Field(3.5, ge=0, le=20, description=HALF_THICKNESS)
+    band_mm: Number = Field(5.0, ge=0, le=50, description=BAND)
 
 
 class PatellarLigamentTable(SceneTable):

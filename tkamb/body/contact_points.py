@@ -1,10 +1,11 @@
-"""Where the condyles touch the insert: contact points, which of them are off, what is wrong."""
+"""Where the condyles meet the insert: contact points, which of them are off, what is wrong."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tkamb.body.unknowns import CondylePoint
+import numpy as np
+
 from tkamb.geometry.frames import Array
 from tkamb.units import DEGREE, MILLIMETRE
 
@@ -20,8 +21,39 @@ FARTHEST_GAP = 3e-3
 """m: a femoral component farther from the insert, or deeper in it, is misplaced."""
 
 
+STANDSTILL = 1e-3
+"""m/s: friction fades below this sliding speed, where its direction is not defined."""
+
+
 @dataclass(frozen=True, eq=False)
-class Touching:
+class CondylePoint:
+    """Where one condyle touches the insert.
+
+    Args:
+        point: (3,) m.
+        normal: (3,) unit, out of the insert into the femur.
+        sliding: (3,) m/s, velocity of the femur's point relative to the insert's.
+        gap: m, positive when apart.
+    """
+
+    point: Array
+    normal: Array
+    sliding: Array
+    gap: float
+
+    def direction(self, friction: float) -> Array:
+        """Return the contact force on the femur (3,) per unit normal force.
+
+        n - mu t, with t = v / sqrt(|v|² + v0²) for the tangential velocity v: Coulomb
+        friction against the sliding, fading below v0 = 1 mm/s.
+        """
+        tangential = self.sliding - (self.sliding @ self.normal) * self.normal
+        speed = np.sqrt(tangential @ tangential + STANDSTILL**2)
+        return np.asarray(self.normal - friction * tangential / speed)
+
+
+@dataclass(frozen=True, eq=False)
+class ContactPoints:
     """The femorotibial contact of one pose, as the equations take it.
 
     Args:
@@ -35,13 +67,13 @@ class Touching:
     problems: tuple[str, ...]
 
 
-NOWHERE = Touching({}, frozenset(), ())
+NO_CONTACT = ContactPoints({}, frozenset(), ())
 """Contact is not modelled."""
 
 
-def touching(
+def contact_points(
     query: "ClosestPointQuery", pose: Array, sliding: Callable[[Array], Array]
-) -> Touching:
+) -> ContactPoints:
     """Return the contact points of a pose.
 
     Args:
@@ -58,7 +90,7 @@ def touching(
     if abs(nearest) > FARTHEST_GAP:
         word = "apart" if nearest > 0 else "overlapping"
         problems = (f"condyles {word} by {abs(nearest) / MILLIMETRE:.1f} mm",)
-    return Touching(condyles, _lifted(condyles), problems)
+    return ContactPoints(condyles, _lifted(condyles), problems)
 
 
 def nearest_gap(gaps: "CondyleGaps") -> float:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tkamb.body.contact_points import CondylePoint
 from tkamb.body.knee import KneeLoads
-from tkamb.body.unknowns import CondylePoint
 from tkamb.units import MILLIMETRE
 
 FAR = 5.0 * MILLIMETRE
@@ -50,13 +50,13 @@ def adjustment_effect(
     total, before = (float(np.linalg.norm(one.contact_force)) for one in (adjusted, recorded))
     share = _share(adjusted, points_adjusted) - _share(recorded, points_recorded)
     carry, carried = (
-        _carrying(loads, points)
+        _name_carriers(loads, points)
         for loads, points in ((adjusted, points_adjusted), (recorded, points_recorded))
     )
     if carry != carried:
         cause = f"with it {carry}, without it {carried}"
     else:
-        cause = _moved(points_adjusted, points_recorded)
+        cause = _largest_move(points_adjusted, points_recorded)
     return AdjustmentEffect(total - before, share, cause)
 
 
@@ -66,12 +66,12 @@ def _share(loads: KneeLoads, points: Mapping[str, CondylePoint]) -> float:
     return normal["medial"] / total if total > 0 else float("nan")
 
 
-def _carrying(loads: KneeLoads, points: Mapping[str, CondylePoint]) -> str:
+def _name_carriers(loads: KneeLoads, points: Mapping[str, CondylePoint]) -> str:
     sides = [side for side in points if side not in loads.lifted]
     return "both condyles carry" if len(sides) > 1 else f"the {sides[0]} condyle alone carries"
 
 
-def _moved(now: Mapping[str, CondylePoint], before: Mapping[str, CondylePoint]) -> str:
+def _largest_move(now: Mapping[str, CondylePoint], before: Mapping[str, CondylePoint]) -> str:
     """Return which contact point moved most."""
     moved = {side: float(np.linalg.norm(now[side].point - before[side].point)) for side in now}
     side = max(moved, key=lambda name: moved[name])

@@ -7,21 +7,28 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tkamb.body.chain import ChainMotion, ChainState
+from tkamb.body.contact_points import (
+    FARTHEST_GAP,
+    NO_CONTACT,
+    ContactPoints,
+    contact_points,
+    nearest_gap,
+)
 from tkamb.body.knee import KneeGeometry, KneeLoads, solve_knee, unsolved
 from tkamb.body.load import PointForces
-from tkamb.case import Case
 from tkamb.errors import ComputationError, InputError, TkambError
-from tkamb.geometry.frames import Array, knee_pose, knee_twist
-from tkamb.mechanics.touching import FARTHEST_GAP, NOWHERE, Touching, nearest_gap, touching
+from tkamb.geometry.frames import SIDES, Array, knee_pose, knee_twist
+from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
+    from tkamb.body.adjustment_effect import AdjustmentEffect
+    from tkamb.body.extensor import ExtensorFrames
     from tkamb.body.ligaments import Ligament
     from tkamb.body.patella import PatellaState
     from tkamb.body.slip import CondyleSlip
     from tkamb.geometry.adjustment import Adjustment
     from tkamb.geometry.closest import ClosestPointQuery
-    from tkamb.mechanics.adjustment_effect import AdjustmentEffect
 
 STRAIN_FLEXIONS = (0.0, 60.0, 90.0)
 """deg: where the strains of the ligaments are shown."""
@@ -36,8 +43,6 @@ class FrameLoads:
     Args:
         geometry: what the equations worked on.
         loads: what they say.
-        tensions: ligament name -> N.
-        wrap: rad, by which the quadriceps wraps the femur; NaN if not modelled.
         adjustment: the femoral adjustment, if asked for and possible.
         query_seconds: computing time of the closest points on the meshes.
         seconds: computing time of the equations, contact points given.
@@ -47,31 +52,10 @@ class FrameLoads:
 
     geometry: KneeGeometry
     loads: KneeLoads
-    tensions: dict[str, float]
-    wrap: float
     adjustment: "Adjustment | None"
     query_seconds: float
     seconds: float
     effect: "AdjustmentEffect | None" = None
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedKnee:
-    """One frame with the knee at given coordinates: all that is known before the contact.
-
-    Args:
-        coordinates: (6,) knee coordinates, m and rad.
-        geometry: what the equations work on, without contact.
-        tensions: ligament name -> N.
-        wrap: rad, by which the quadriceps wraps the femur; NaN if not modelled.
-        problems: plain words; empty when all is well.
-    """
-
-    coordinates: Array
-    geometry: KneeGeometry
-    tensions: dict[str, float]
-    wrap: float
-    problems: tuple[str, ...]
 
 
 class Mechanics:
@@ -96,9 +80,7 @@ class Mechanics:
         self._check_near()
         self.extensor = None
         if case.scene.patella:
-            from tkamb.mechanics.extensor import ExtensorFrames
-
-            self.extensor = ExtensorFrames(case, self.poses)
+            self.extensor = extensor_frames(case, self.poses)
         self.ligaments, self.strains = self._build_ligaments()
 
     def _check_near(self) -> None:
@@ -126,33 +108,27 @@ class Mechanics:
         """
         start = clock.perf_counter()
         if adjustment is None:
-            adjustment, problems = self._adjusted(k)
+            adjustment, problems = self._adjust(k)
         else:
             problems = ()
         pose = adjustment.pose if adjustment else self.poses[k]
-        touch = NOWHERE if problems else self._touching(k, pose)
-        recorded = self._touching(k, self.poses[k]) if adjustment else None
+        points = NO_CONTACT if problems else self._contact_points(k, pose)
+        recorded = self._contact_points(k, self.poses[k]) if adjustment else None
         queried = clock.perf_counter()
-        placed = self.placed(k)
-        problems += touch.problems + placed.problems
-        geometry = replace(placed.geometry, condyles=touch.condyles, lifted=touch.lifted)
+        geometry = self.geometry(k)
+        problems += points.problems + geometry.problems
+        geometry = replace(
+            geometry, condyles=points.condyles, lifted=points.lifted, problems=problems
+        )
         loads = unsolved(problems) if problems else solve_knee(geometry, self.friction)
         done = clock.perf_counter()
-        return FrameLoads(
-            geometry,
-            loads,
-            placed.tensions,
-            placed.wrap,
-            adjustment,
-            queried - start,
-            done - queried,
-            self._effect(geometry, loads, recorded) if recorded else None,
-        )
+        effect = self._effect(geometry, loads, recorded) if recorded else None
+        return FrameLoads(geometry, loads, adjustment, queried - start, done - queried, effect)
 
-    def placed(
+    def geometry(
         self, k: int, coordinates: Array | None = None, patella: "PatellaState | None" = None
-    ) -> PlacedKnee:
-        """Return frame k with the knee at other coordinates (6,) than recorded.
+    ) -> KneeGeometry:
+        """Return frame k without its contact, perhaps at other coordinates than recorded.
 
         Rates and accelerations stay as recorded.
 
@@ -161,18 +137,21 @@ class Mechanics:
             coordinates: (6,) m and rad; None: as recorded.
             patella: where the patella is with the femur there; None: as recorded.
         """
-        place = self.case.motion.coordinates[k] if coordinates is None else coordinates
+        recorded = self.case.motion.coordinates[k]
+        place = recorded if coordinates is None else coordinates
         state = self.case.chain.at(self._chain_motion(k, place, patella))
         poses = {link: state.pose(link) for link in self._attachment_links()}
         tensions, known = self._pulls(poses)
-        extensor, wrap, problems = None, NAN, []
-        if self.extensor:
-            try:
-                extensor, wrap = self.extensor.at(k, state, patella)
-            except ComputationError as error:
-                problems.append(str(error))
-        geometry = KneeGeometry(state, self._ground(k, state), known, extensor=extensor)
-        return PlacedKnee(place, geometry, tensions, wrap, tuple(problems))
+        geometry = KneeGeometry(
+            state, self._ground(k, state), known, coordinates=place, tensions=tensions
+        )
+        if self.extensor is None:
+            return geometry
+        try:
+            extensor, muscle = self.extensor.at(k, recorded[5], state, patella)
+        except ComputationError as error:
+            return replace(geometry, problems=(str(error),))
+        return replace(geometry, extensor=extensor, muscles=(muscle,))
 
     def sliding(self, k: int, coordinates: Array, point: Array) -> Array:
         """Return the velocity (3,) m/s of the femur's point relative to the insert's.
@@ -193,7 +172,7 @@ class Mechanics:
         from tkamb.body.slip import condyle_slip
 
         found = condyle_slip(case.femoral, case.insert, case.split, case.motion.coordinates)
-        sides = zip(("medial", "lateral"), found, strict=True)
+        sides = zip(SIDES, found, strict=True)
         return {side: slip for side, slip in sides if slip is not None}
 
     def _chain_motion(
@@ -220,7 +199,7 @@ class Mechanics:
             return state.ground_reaction(ground.force[k], tibia.pose[k][:3, 3], np.zeros(3))
         return state.ground_reaction(ground.force[k], ground.point[k], ground.moment[k])
 
-    def _adjusted(self, k: int) -> "tuple[Adjustment | None, tuple[str, ...]]":
+    def _adjust(self, k: int) -> "tuple[Adjustment | None, tuple[str, ...]]":
         """Return the femoral adjustment, if asked for, and why it is not possible."""
         contact = self.case.scene.contact
         if self.query is None or contact is None or not contact.adjust:
@@ -232,20 +211,20 @@ class Mechanics:
         except TkambError as error:
             return None, (error.what,)
 
-    def _touching(self, k: int, pose: Array) -> Touching:
+    def _contact_points(self, k: int, pose: Array) -> ContactPoints:
         """Return where the condyles touch at a pose (4, 4), with the rates of frame k."""
         if self.query is None:
-            return NOWHERE
+            return NO_CONTACT
         place = self.case.motion.coordinates[k]
-        return touching(self.query, pose, lambda point: self.sliding(k, place, point))
+        return contact_points(self.query, pose, lambda point: self.sliding(k, place, point))
 
     def _effect(
-        self, geometry: KneeGeometry, loads: KneeLoads, recorded: Touching
+        self, geometry: KneeGeometry, loads: KneeLoads, recorded: ContactPoints
     ) -> "AdjustmentEffect | None":
         """Return what the adjustment changed; None where either pose has no solution."""
         if loads.problems or recorded.problems:
             return None
-        from tkamb.mechanics.adjustment_effect import adjustment_effect
+        from tkamb.body.adjustment_effect import adjustment_effect
 
         there = replace(geometry, condyles=recorded.condyles, lifted=recorded.lifted)
         before = solve_knee(there, self.friction)
@@ -267,27 +246,56 @@ class Mechanics:
         self,
     ) -> "tuple[tuple[Ligament, ...], dict[str, tuple[float, ...]]]":
         """Return the bundles, and their strains so that a wrong insertion is seen."""
-        if not self.case.scene.ligament:
+        if not self.case.ligaments:
             return (), {}
         from tkamb.body.ligaments import build_ligaments, strain_table
 
         poses = self.recorded_poses()
         flexion = self.case.motion.coordinates[:, 5]
-        bundles = build_ligaments(self.case.scene.ligament, poses, flexion)
+        bundles = build_ligaments(self.case.ligaments, poses, flexion)
         return bundles, strain_table(bundles, poses, flexion, STRAIN_FLEXIONS)
 
     def recorded_poses(self) -> dict[str, Array]:
         """Return link -> pose_link_in_insert (f, 4, 4) as recorded, of links with attachments."""
-        recorded, scene = self.case.motion.coordinates, self.case.scene
+        recorded, ligament = self.case.motion.coordinates, self.case.patellar_ligament
         states = [self.case.chain.at(self._chain_motion(k, x)) for k, x in enumerate(recorded)]
         links = self._attachment_links()
-        if scene.patellar_ligament:
-            links |= {scene.patellar_ligament.proximal.link, scene.patellar_ligament.distal.link}
+        if ligament is not None:
+            links |= {ligament.proximal.link, ligament.distal.link}
         return {link: np.stack([state.pose(link) for state in states]) for link in links}
 
     def _attachment_links(self) -> set[str]:
-        ends = [end for table in self.case.scene.ligament for end in (table.proximal, table.distal)]
-        return {end.link for end in ends}
+        bundles = self.case.ligaments
+        return {end.link for bundle in bundles for end in (bundle.proximal, bundle.distal)}
+
+
+def extensor_frames(case: Case, poses: Array) -> "ExtensorFrames":
+    """Return the extensor mechanism of a case with [patella].
+
+    Raises:
+        InputError: no patella was recorded, or see `ExtensorFrames`.
+    """
+    from tkamb.body.extensor import ExtensorFrames, ExtensorParts
+
+    assert case.patellar_ligament is not None and case.scene.patella is not None
+    assert case.femoral is not None and case.patella is not None
+    (muscle,) = case.muscles
+    parts = ExtensorParts(
+        muscle, case.patellar_ligament, case.chain, case.femoral, case.patella, case.insert
+    )
+    motion, recorded = case.motion, None
+    if case.scene.patella.motion == "recorded":
+        if motion.patella is None:
+            raise InputError(
+                "has no patella columns",
+                case.scene.motion.file,
+                "record patella_ap, patella_si, patella_rotation or set [patella] motion = "
+                "'solved'",
+            )
+        assert motion.patella_velocity is not None and motion.patella_acceleration is not None
+        rates = (motion.patella_velocity, motion.patella_acceleration)
+        recorded = np.stack([motion.patella, *rates], axis=1)
+    return ExtensorFrames(parts, motion.time, poses, recorded, case.rates)
 
 
 def _contact_query(case: Case) -> "ClosestPointQuery | None":

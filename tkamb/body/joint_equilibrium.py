@@ -1,4 +1,4 @@
-"""What the body asks of the knee joint at one frame, whatever its contact may be.
+"""Equilibrium of the knee joint at one frame, whatever its contact may be.
 
 Across the knee, femur and shank exchange one wrench: what ground, weight and inertia leave
 unbalanced on the shank. It does not depend on the knee coordinates, for the shank moves as
@@ -8,7 +8,7 @@ recorded. Contact, ligaments and the patellar ligament must add up to it:
 
 The columns B are the loads that may keep the prescribed coordinates in place: the patellar
 ligament's line (flexion), and the residuals of the equations of motion for the others. The
-quadriceps and the patellofemoral force are internal to the femur's side. What a released
+extensor muscle and the patellofemoral force are internal to the femur's side. What a released
 coordinate i is driven by is the generalised force
 
     r_i = -J_i(q) . R(q, y),   y such that the prescribed coordinates have none,
@@ -18,58 +18,18 @@ J of `knee_axes`: zero at equilibrium, and along +q_i where the femur wants to g
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.body import unknowns
 from tkamb.body.knee import KneeGeometry
+from tkamb.body.ligaments import BundleArrays, Ligament
+from tkamb.body.load import wrench_of
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_axes, knee_pose, transform
 
-if TYPE_CHECKING:
-    from tkamb.body.ligaments import Ligament
-
 
 @dataclass(frozen=True, eq=False)
-class LigamentSet:
-    """All bundles across the knee at once; those that do not cross it are left out.
-
-    Args:
-        on_femur: (m, 3) m, their ends on the femur's side, femur frame.
-        on_shank: (m, 3) m, their other ends, insert frame.
-        two_line: (m,) which law.
-        stiffness: (m,) N/m or N per unit strain, as the law takes it.
-        slack_length: (m,) m.
-    """
-
-    on_femur: Array
-    on_shank: Array
-    two_line: NDArray[np.bool_]
-    stiffness: Array
-    slack_length: Array
-
-    def wrench(self, poses: Array) -> Array:
-        """Return the wrench (..., 6) on the insert at poses (..., 4, 4) of the femur."""
-        if len(self.stiffness) == 0:
-            return np.zeros((*poses.shape[:-2], 6))
-        from tkamb.body.ligaments import quadratic_toe_force, two_line_force
-
-        femur = np.einsum("...ij,mj->...mi", poses[..., :3, :3], self.on_femur)
-        femur = femur + poses[..., None, :3, 3]
-        line = femur - self.on_shank
-        length = np.linalg.norm(line, axis=-1)
-        law = (self.slack_length, self.stiffness)
-        tension = np.where(
-            self.two_line, two_line_force(length, *law), quadratic_toe_force(length, *law)
-        )
-        pull = (tension / length)[..., None] * line
-        moment = np.cross(np.broadcast_to(self.on_shank, pull.shape), pull)
-        return np.concatenate([pull.sum(axis=-2), moment.sum(axis=-2)], axis=-1)
-
-
-@dataclass(frozen=True, eq=False)
-class LigamentLine:
+class PatellarLine:
     """The patellar ligament where it leaves the patella: a straight line to an anchor.
 
     Args:
@@ -83,13 +43,11 @@ class LigamentLine:
     def wrench(self, poses: Array) -> Array:
         """Return the wrench (..., 6) of a unit tension on the insert at poses (..., 4, 4)."""
         line = transform(poses, self.end) - self.anchor
-        line = line / np.linalg.norm(line, axis=-1, keepdims=True)
-        moment = np.cross(np.broadcast_to(self.anchor, line.shape), line)
-        return np.concatenate([line, moment], axis=-1)
+        return wrench_of(self.anchor, line / np.linalg.norm(line, axis=-1, keepdims=True))
 
 
 @dataclass(frozen=True, eq=False)
-class KneeDemand:
+class JointEquilibrium:
     """The equations of equilibrium of the released knee coordinates at one frame.
 
     Args:
@@ -101,8 +59,8 @@ class KneeDemand:
     """
 
     external: Array
-    ligaments: LigamentSet
-    line: LigamentLine | None
+    ligaments: BundleArrays
+    line: PatellarLine | None
     keeping: Array
     released: tuple[int, ...]
 
@@ -150,14 +108,14 @@ def _magnitudes(rows: Array, columns: Array, wrench: Array) -> Array:
     return np.asarray(-np.linalg.solve(rows @ columns, right[..., None])[..., 0])
 
 
-def knee_demand(
+def joint_equilibrium(
     geometry: KneeGeometry,
-    ligaments: "Sequence[Ligament]",
+    ligaments: Sequence[Ligament],
     coordinates: Array,
     released: tuple[int, ...],
     middle: Array,
     slack: bool,
-) -> KneeDemand:
+) -> JointEquilibrium:
     """Return what the body asks of the knee at one frame.
 
     Args:
@@ -168,15 +126,15 @@ def knee_demand(
         middle: (3,) m, where the residual forces act, insert frame.
         slack: the extensor mechanism carries nothing.
     """
-    line = None if slack or geometry.extensor is None else ligament_line(geometry, coordinates)
+    line = None if slack or geometry.extensor is None else patellar_line(geometry, coordinates)
     columns = [
         unit_keeper(name, middle)
         for i, name in enumerate(KNEE_COORDINATES)
         if i not in released and not (name == "flexion" and line)
     ]
-    return KneeDemand(
+    return JointEquilibrium(
         external_wrench(geometry, coordinates),
-        ligament_set(geometry, ligaments, coordinates),
+        crossing_bundles(geometry, ligaments, coordinates),
         line,
         np.array(columns).reshape(-1, 6).T,
         released,
@@ -193,11 +151,11 @@ def unit_keeper(name: str, middle: Array) -> Array:
         {"adduction": "ap", "axial_rotation": "si", "flexion": "ml"}.get(name, name)
     ]
     if name in unknowns.AXES:
-        return np.concatenate([axis, np.cross(middle, axis)])
+        return wrench_of(middle, axis)
     return np.concatenate([np.zeros(3), axis])
 
 
-def ligament_line(geometry: KneeGeometry, coordinates: Array) -> LigamentLine:
+def patellar_line(geometry: KneeGeometry, coordinates: Array) -> PatellarLine:
     """Return the patellar ligament's first straight stretch at coordinates (6,)."""
     extensor, chain = geometry.extensor, geometry.state.chain
     assert extensor is not None
@@ -205,7 +163,7 @@ def ligament_line(geometry: KneeGeometry, coordinates: Array) -> LigamentLine:
     free = [load for load in extensor.patellar_ligament if not chain.on_shank(load.link)]
     end, along = free[0].points[0], free[0].forces[0]
     away = min(float((load.points[0] - end) @ along) for load in shank)
-    return LigamentLine(transform(inverse(knee_pose(coordinates)), end), end + away * along)
+    return PatellarLine(transform(inverse(knee_pose(coordinates)), end), end + away * along)
 
 
 def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
@@ -220,33 +178,23 @@ def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
     return np.asarray(np.linalg.solve(knee_axes(coordinates), knee))
 
 
-def ligament_set(
-    geometry: KneeGeometry, ligaments: "Sequence[Ligament]", coordinates: Array
-) -> LigamentSet:
+def crossing_bundles(
+    geometry: KneeGeometry, ligaments: Sequence[Ligament], coordinates: Array
+) -> BundleArrays:
     """Return the bundles that cross the knee, their ends in the femur and insert frames.
 
     An end on the patella moves with the femur from where it stands.
     """
     state, chain = geometry.state, geometry.state.chain
     to_femur = inverse(knee_pose(coordinates))
-    femur, shank, rows = [], [], []
+    crossing, femur, shank = [], [], []
     for bundle in ligaments:
         ends = {
-            chain.on_shank(link): transform(state.pose(link), point)
-            for link, point in (
-                (bundle.proximal_link, bundle.proximal_point),
-                (bundle.distal_link, bundle.distal_point),
-            )
+            chain.on_shank(end.link): transform(state.pose(end.link), end.position)
+            for end in (bundle.proximal, bundle.distal)
         }
         if len(ends) == 2:
+            crossing.append(bundle)
             femur.append(transform(to_femur, ends[False]))
             shank.append(ends[True])
-            rows.append((bundle.law == "two-line", bundle.stiffness, bundle.slack_length))
-    table = np.array(rows, float).reshape(-1, 3)
-    return LigamentSet(
-        np.array(femur).reshape(-1, 3),
-        np.array(shank).reshape(-1, 3),
-        table[:, 0] > 0,
-        table[:, 1],
-        table[:, 2],
-    )
+    return BundleArrays.of(crossing, np.array(femur), np.array(shank))

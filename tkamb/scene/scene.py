@@ -14,13 +14,14 @@ from pydantic_core import ErrorDetails
 
 from tkamb.errors import InputError, names_near
 from tkamb.files import read_text
-from tkamb.scene_tables import (
+from tkamb.scene.tables import (
     ContactTable,
     GenericLigamentsTable,
     GroundReactionTable,
     ImplantTable,
     LigamentTable,
     MotionTable,
+    MuscleTable,
     OutputTable,
     PatellarLigamentTable,
     PatellaTable,
@@ -48,6 +49,7 @@ class Scene(SceneTable):
     implant: ImplantTable = ImplantTable()
     ligament: tuple[LigamentTable, ...] = ()
     generic_ligaments: GenericLigamentsTable | None = None
+    muscle: tuple[MuscleTable, ...] = ()
     quadriceps: QuadricepsTable | None = None
     patellar_ligament: PatellarLigamentTable | None = None
     patella: PatellaTable | None = None
@@ -63,10 +65,14 @@ class Scene(SceneTable):
         for name in names:
             if name.removeprefix("generic_").startswith(generic):
                 raise ValueError(f"'{name}' is in [generic_ligaments] and in [[ligament]]")
-        parts = (self.quadriceps, self.patellar_ligament, self.patella)
+        muscles = [muscle.name for muscle in self.muscle] + ["quadriceps"] * bool(self.quadriceps)
+        if len(muscles) != len(set(muscles)):
+            raise ValueError("two muscles have the same name; [quadriceps] is one of that name")
+        parts = (muscles, self.patellar_ligament, self.patella)
         if any(parts) and not all(parts):
             raise ValueError(
-                "[quadriceps], [patellar_ligament] and [patella] go together: give all or none"
+                "[quadriceps] (or [[muscle]]), [patellar_ligament] and [patella] go together: "
+                "give all or none"
             )
         ligament = self.patellar_ligament
         solved = self.patella is not None and self.patella.motion == "solved"
@@ -221,4 +227,6 @@ def _resolved(model: Any, folder: Path) -> Any:
             changed[name] = Path(os.path.abspath(folder / value))
         elif isinstance(value, SceneTable):
             changed[name] = _resolved(value, folder)
+        elif isinstance(value, tuple) and value and isinstance(value[0], SceneTable):
+            changed[name] = tuple(_resolved(one, folder) for one in value)
     return model.model_copy(update=changed) if changed else model

@@ -3,7 +3,7 @@
 import logging
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,10 +13,12 @@ from tkamb.geometry.frames import Array, pose
 from tkamb.inputs.motion import KneeMotion, load_motion
 from tkamb.inputs.patient import load_urdf
 from tkamb.scene import Scene
-from tkamb.scene_tables import Attachment, FemoralImplantTable, PatellarImplantTable
+from tkamb.scene.tables import FemoralImplantTable, PatellarImplantTable
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
+    from tkamb.body.ligaments import Ligament
+    from tkamb.body.muscles import Muscle, PatellarLigament
     from tkamb.geometry.surface import Surface
     from tkamb.inputs.ground_reaction import GroundReaction
     from tkamb.inputs.tibia import BodyMotion
@@ -29,7 +31,7 @@ class Case:
     """What a run works on. Absent in the scene: None.
 
     Args:
-        scene: the scene; of a left knee with its points mirrored.
+        scene: the scene, as its file has it.
         chain: the patient in Pinocchio.
         motion: knee (and recorded patella) coordinates per frame.
         tibia: the shank in the laboratory; None: upright and at rest.
@@ -37,6 +39,9 @@ class Case:
         femoral: femoral component in the femur link's frame.
         insert: insert in the insert frame.
         patella: patellar button in the patella link's frame.
+        ligaments: the bundles, generic ones among them; slack lengths where the scene has them.
+        muscles: the muscles.
+        patellar_ligament: the patellar ligament.
     """
 
     scene: Scene
@@ -47,6 +52,9 @@ class Case:
     femoral: "Surface | None"
     insert: "Surface | None"
     patella: "Surface | None"
+    ligaments: "tuple[Ligament, ...]" = ()
+    muscles: "tuple[Muscle, ...]" = ()
+    patellar_ligament: "PatellarLigament | None" = None
 
     @cached_property
     def split(self) -> float | None:
@@ -54,6 +62,18 @@ class Case:
         from tkamb.geometry.condyles import condyle_split
 
         return condyle_split(self.femoral) if self.femoral else None
+
+    def rates(self, time: Array, places: Array) -> tuple[Array, Array, Array]:
+        """Return places of the patella (n, 3) filtered as the recording is, and derivatives."""
+        from tkamb.inputs.filtering import differentiate_coordinates
+
+        cutoff = self.scene.motion.cutoff_Hz
+        return differentiate_coordinates(time, places, cutoff, name="places of the patella")
+
+    @property
+    def bone(self) -> "Surface | None":
+        """The bone that a muscle wraps, femur link; None without one."""
+        return next((m.wrap.bone for m in self.muscles if m.wrap and m.wrap.bone), None)
 
     @property
     def body_weight(self) -> float:
@@ -67,8 +87,6 @@ def load_case(scene: Scene) -> Case:
     Raises:
         InputError: whatever is wrong with them, in one line.
     """
-    if scene.patient.side == "left":
-        scene = _with_mirrored_attachments(scene)
     with_patella = scene.patella is not None
     chain = Chain(load_urdf(scene.patient, with_patella), with_patella)
     parts = _Parts(scene)
@@ -82,20 +100,18 @@ def load_case(scene: Scene) -> Case:
         chain.insert_in_tibia,
     )
     if motion.unrecorded:
-        from tkamb.mechanics.seat import seated_motion
+        from tkamb.scene.derived_motion import seated_motion
 
         assert parts.femoral is not None and parts.insert is not None
         motion = seated_motion(motion, parts.femoral, parts.insert, scene.motion.cutoff_Hz)
     if scene.motion.motion == "roll-slip":
-        from tkamb.mechanics.rolling import rolling_motion
+        from tkamb.scene.derived_motion import rolling_motion
 
         assert parts.femoral is not None and parts.insert is not None
         table = scene.motion
         motion = rolling_motion(
             motion, parts.femoral, parts.insert, table.slip_share, table.cutoff_Hz
         )
-    if scene.generic_ligaments:
-        scene = _with_generic_ligaments(scene, parts, chain.insert_in_tibia)
     tibia = ground = None
     if scene.tibia:
         from tkamb.inputs.tibia import load_tibia
@@ -110,39 +126,41 @@ def load_case(scene: Scene) -> Case:
         ground = load_ground_reaction(scene.ground_reaction, motion.time, scene.patient.side)
         if tibia and scene.ground_reaction.applied == "cop":
             check_under_foot(ground, tibia.pose[:, :3, 3], scene.ground_reaction.file)
-    return Case(scene, chain, motion, tibia, ground, parts.femoral, parts.insert, parts.patella)
+    muscles: tuple[Muscle, ...] = ()
+    patellar_ligament = None
+    if scene.patella:
+        from tkamb.scene import lines
 
-
-def _with_mirrored_attachments(scene: Scene) -> Scene:
-    """Return a left knee's scene with the points of lines and ligaments reflected in z."""
-
-    def mirrored(table: Any) -> Any:
-        ends = {
-            name: end.model_copy(update={"point_mm": (*end.point_mm[:2], -end.point_mm[2])})
-            for name, end in table
-            if isinstance(end, Attachment)
-        }
-        return table.model_copy(update=ends)
-
-    lines = {
-        name: mirrored(table)
-        for name in ("quadriceps", "patellar_ligament")
-        if (table := getattr(scene, name)) is not None
-    }
-    bundles = tuple(mirrored(table) for table in scene.ligament)
-    return scene.model_copy(update={**lines, "ligament": bundles})
-
-
-def _with_generic_ligaments(scene: Scene, parts: "_Parts", pose_insert_in_tibia: Array) -> Scene:
-    """Return the scene with the generic bundles it asks for among its own."""
-    from tkamb.body.generic_ligaments import generic_ligaments
-
-    assert scene.generic_ligaments is not None
-    assert parts.femoral is not None and parts.insert is not None
-    bundles = generic_ligaments(
-        parts.femoral, parts.insert, pose_insert_in_tibia, scene.generic_ligaments.ligaments
+        muscles, patellar_ligament = lines.muscles(scene, chain), lines.patellar_ligament(scene)
+    return Case(
+        scene,
+        chain,
+        motion,
+        tibia,
+        ground,
+        parts.femoral,
+        parts.insert,
+        parts.patella,
+        _ligaments(scene, parts, chain),
+        muscles,
+        patellar_ligament,
     )
-    return scene.model_copy(update={"ligament": scene.ligament + bundles})
+
+
+def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, ...]":
+    """Return the scene's bundles and the generic ones that it asks for."""
+    bundles: tuple[Ligament, ...] = ()
+    if scene.ligament:
+        from tkamb.scene import lines
+
+        bundles = lines.ligaments(scene)
+    if scene.generic_ligaments:
+        from tkamb.body.generic_ligaments import generic_ligaments
+
+        assert parts.femoral is not None and parts.insert is not None
+        wanted = scene.generic_ligaments.ligaments
+        bundles += generic_ligaments(parts.femoral, parts.insert, chain.insert_in_tibia, wanted)
+    return bundles
 
 
 class _Parts:
@@ -195,7 +213,7 @@ class _Parts:
                 raise InputError(error.what, error.where, question) from None
             raise
         self.insert_mesh_in_insert = placement @ pose(axes_rotation(table.axes), np.zeros(3))
-        self.insert = self._sided(surface.moved(placement))
+        self.insert = self._right(surface.moved(placement))
 
     def _could_be_insert(self, table: FemoralImplantTable) -> bool:
         """Say whether the mesh that the scene calls femoral has an insert's flat bottom."""
@@ -220,9 +238,9 @@ class _Parts:
         turn = Rotation.from_euler("XYZ", table.rotation_deg, degrees=True).as_matrix()
         placement = pose(turn, np.array(table.position_mm) * MILLIMETRE)
         mesh_in_link = placement @ pose(axes_rotation(table.axes), np.zeros(3))
-        return self._sided(surface.moved(placement)), mesh_in_link
+        return self._right(surface.moved(placement)), mesh_in_link
 
-    def _sided(self, surface: "Surface") -> "Surface":
+    def _right(self, surface: "Surface") -> "Surface":
         from tkamb.inputs.meshes import mirrored
 
         return mirrored(surface) if self._left else surface
