@@ -45,34 +45,11 @@ def summary_of(
         path: of the scene file, if it came from one.
         strains: ligament bundle -> strain at each of `STRAIN_FLEXIONS`.
     """
-    scene, statuses, times = case.scene, columns["status"], columns["time_s"]
-    left = scene.patient.side == "left"
-    summary: dict[str, Any] = {
-        "scene": None if path is None else str(path.absolute()),
-        "scene_sha256": scene_hash(case),
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": " ".join(["tkamb", *sys.argv[1:]]),
-        "versions": _versions(),
-        "seconds": seconds,
-        "side": scene.patient.side,
-        "frame": "insert frame: x anterior, y superior, z "
-        + ("lateral (a left knee, computed as its mirror image)" if left else "right (lateral)"),
-        "body_mass_kg": scene.patient.mass_kg,
-        "height_mm": scene.patient.height_mm,
-        "yield_stress_MPa": scene.output.yield_stress_MPa,
-        "axis": scene.output.axis,
-        "frames": len(statuses),
-        "failed_frames": [
-            {"frame": k, "time_s": float(times[k]), "status": status}
-            for k, status in enumerate(statuses)
-            if status.startswith(FAILED)
-        ],
-        "flagged_frames": sum(s != "ok" and not s.startswith(FAILED) for s in statuses),
-        "peak_force_total_BW": _peak(columns["force_total_BW"]),
-        "not_modelled": not_modelled(case),
-        "assumptions": assumptions(case),
-        "notes": list(scene.output.notes),
-    }
+    scene = case.scene
+    summary = _origin(case, path) | {"seconds": seconds} | _subject(case) | _counts(columns)
+    summary["not_modelled"] = not_modelled(case)
+    summary["assumptions"] = assumptions(case)
+    summary["notes"] = list(scene.output.notes)
     if strains:
         summary["ligament_strain"] = {"flexion_deg": STRAIN_FLEXIONS, "strain": strains}
     if scene.patella:
@@ -90,6 +67,47 @@ def summary_of(
         start = time[0] - percent[0] * slope
         summary["cycle_percent_s"] = [start, start + 100.0 * slope]
     return summary
+
+
+def _origin(case: Case, path: Path | None) -> dict[str, Any]:
+    """Return which scene was run, when, how and by what."""
+    return {
+        "scene": None if path is None else str(path.absolute()),
+        "scene_sha256": scene_hash(case),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": " ".join(["tkamb", *sys.argv[1:]]),
+        "versions": _versions(),
+    }
+
+
+def _subject(case: Case) -> dict[str, Any]:
+    """Return whose knee it is, in which frame, and how it is shown."""
+    patient, output = case.scene.patient, case.scene.output
+    left = "lateral (a left knee, computed as its mirror image)"
+    lateral = left if patient.side == "left" else "right (lateral)"
+    return {
+        "side": patient.side,
+        "frame": f"insert frame: x anterior, y superior, z {lateral}",
+        "body_mass_kg": patient.mass_kg,
+        "height_mm": patient.height_mm,
+        "yield_stress_MPa": output.yield_stress_MPa,
+        "axis": output.axis,
+    }
+
+
+def _counts(columns: dict[str, Any]) -> dict[str, Any]:
+    """Return how many frames there are, which failed, and the largest force."""
+    statuses, times = columns["status"], columns["time_s"]
+    return {
+        "frames": len(statuses),
+        "failed_frames": [
+            {"frame": k, "time_s": float(times[k]), "status": status}
+            for k, status in enumerate(statuses)
+            if status.startswith(FAILED)
+        ],
+        "flagged_frames": sum(s != "ok" and not s.startswith(FAILED) for s in statuses),
+        "peak_force_total_BW": _peak(columns["force_total_BW"]),
+    }
 
 
 @lru_cache(maxsize=1)
