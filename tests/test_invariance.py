@@ -21,6 +21,7 @@ from tkamb.geometry.surface import Surface
 from tkamb.inputs.patient import load_urdf
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.case import Case, load_case
+from tkamb.scene.si import in_si
 
 FEW = 26
 FRAMES = (0, 9, 15, 23)
@@ -171,7 +172,7 @@ def scaled_scene(scene: Scene) -> Scene:
 
 def scaled_chain(case: Case) -> Chain:
     """Return the chain with placements, inertias and gravity in the new units."""
-    chain = Chain(load_urdf(case.scene.patient, True), True)
+    chain = Chain(load_urdf(in_si(case.scene.patient), True), True)
     model = chain.model
     for joint in range(model.njoints):
         place, inertia = model.jointPlacements[joint], model.inertias[joint]

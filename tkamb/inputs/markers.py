@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, pose, transform
 from tkamb.inputs.labels import matched_labels
+from tkamb.inputs.recordings import ShankRecording
 from tkamb.inputs.tables import Table
-from tkamb.scene.tables import TibiaTable
 from tkamb.units import MILLIMETRE
 
 WRONG_MARKERS = 0.05
@@ -31,7 +31,7 @@ def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) 
     return np.moveaxis(np.array(columns), 2, 0) * metres_per_unit
 
 
-def shank_points(table: TibiaTable, recorded: Table) -> tuple[Array, Array]:
+def shank_points(source: ShankRecording, recorded: Table) -> tuple[Array, Array]:
     """Return the shank's markers and joint centres, measured and in the tibia link.
 
     A joint centre is carried by a rigid fit of the neighbouring segment's markers.
@@ -42,17 +42,17 @@ def shank_points(table: TibiaTable, recorded: Table) -> tuple[Array, Array]:
     Raises:
         InputError: no unit, unknown markers, or a neighbour's markers that do not fit.
     """
-    scale = recorded.unit_scale(table.length_unit, "length_unit")
-    points = [marker_trajectories(recorded, [name], scale) for name in table.markers_mm]
-    reference = list(table.markers_mm.values())
-    for joint in table.joint_centre:
-        measured = marker_trajectories(recorded, list(joint.markers_mm), scale)
-        own = np.array(list(joint.markers_mm.values())) * MILLIMETRE
+    scale = recorded.unit_scale(source.length_unit, "length_unit")
+    points = [marker_trajectories(recorded, [name], scale) for name in source.markers]
+    reference = list(source.markers.values())
+    for joint in source.joint_centre:
+        measured = marker_trajectories(recorded, list(joint.markers), scale)
+        own = np.array(list(joint.markers.values()))
         poses, residual = fit_rigid(measured, own, joint.name)
         check_fit(residual, f"the markers of joint centre '{joint.name}'", recorded)
-        points.append(transform(poses, np.array(joint.centre_mm) * MILLIMETRE)[:, None])
-        reference.append(joint.tibia_mm)
-    return np.concatenate(points, axis=1), np.array(reference) * MILLIMETRE
+        points.append(transform(poses, joint.centre)[:, None])
+        reference.append(joint.tibia)
+    return np.concatenate(points, axis=1), np.array(reference)
 
 
 def check_fit(residual: Array, what: str, recorded: Table) -> None:
