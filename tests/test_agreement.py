@@ -19,7 +19,7 @@ from tkamb.output.headline import cards
 from tkamb.run.agreement import contradictions
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
-from tkamb.studies.recordings import change_recording
+from tkamb.studies.cases import change_recording
 
 DM = Path(__file__).parents[1] / "models" / "dm" / "scene.toml"
 DATA = Path(__file__).parents[2] / "shared" / "data" / "dm"

@@ -25,8 +25,7 @@ from tkamb.contact.probe import Probe
 from tkamb.contact.registry import contact_model
 from tkamb.equilibrium.balance import BalanceStatus, Trial, find_balance
 from tkamb.equilibrium.released import SCALE, ReleasedForces
-from tkamb.geometry.frames import knee_pose, knee_twist
-from tkamb.geometry.knee_axes import knee_axes
+from tkamb.geometry.frames import knee_axes, knee_pose, knee_twist
 
 LOAD = 1000.0
 TOUCH = HEIGHT + BALL - 0.05e-3

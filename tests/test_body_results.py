@@ -56,8 +56,10 @@ def test_strains_and_first_wrapping_are_in_the_summary(bend):
     wrapped = bend["flexion_deg"][bend["quadriceps_wrap_deg"] > 0]
     assert bend.summary["first_wrapping_flexion_deg"] == wrapped.min()
     table = strain_table(bend.summary)
-    assert "PCL_anterolateral" in table
-    assert f"{100 * found['strain']['MCL_deep'][0]:.1f}" in table
+    shown = {name: cells for name, *cells in table.rows}
+    assert "PCL_anterolateral" in shown
+    drawn = f"{100 * found['strain']['MCL_deep'][0]:.1f}".replace("-", "−")
+    assert shown["MCL_deep"][0] == drawn
 
 
 def test_roll_slip_with_the_recorded_slip_is_the_recorded_motion():

@@ -8,9 +8,9 @@ import pytest
 from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
+from tkamb.geometry.condyles import LowestPoints
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import knee_pose
-from tkamb.geometry.lowest import LowestPoints
 from tkamb.inputs.tables import read_table
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case

@@ -14,7 +14,7 @@ from scenes import MODEL, write_scene
 from tkamb.body import knee, patellofemoral, unknowns
 from tkamb.body.chain import Chain
 from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
-from tkamb.geometry import close_region, condyles
+from tkamb.geometry import closest, condyles
 from tkamb.geometry.frames import pose
 from tkamb.geometry.nearest import NearestPoints
 from tkamb.geometry.surface import Surface
@@ -239,8 +239,8 @@ def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
     own_lengths = {
         knee: ("RESIDUAL_SHIFT",),
         patellofemoral: ("PATCH_DEPTH", "SAMPLE_SPACING", "REACH"),
-        close_region: ("RESOLUTION", "REACH", "_SPACING", "_DOUBT"),
-        condyles: ("NOTCH_DEPTH", "_STRIP", "_DEEPEST"),
+        closest: ("FACET_DEPTH", "REGION_RADIUS", "SAMPLE_SPACING", "ESTIMATE_ERROR"),
+        condyles: ("NOTCH_DEPTH", "STRIP_WIDTH", "_DEEPEST"),
     }
     for module, names in own_lengths.items():
         for name in names:

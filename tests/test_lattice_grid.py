@@ -37,7 +37,6 @@ from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import pose
 from tkamb.geometry.nearest import nearest_on_triangles
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.repair import repair
 from tkamb.geometry.surface import Surface
 from tkamb.inputs.meshes import axes_rotation
@@ -331,7 +330,7 @@ def test_ten_micrometres_of_jitter_leave_the_classes_right(name):
     kind, nodes = lattice.node_class, lattice.nodes
     on_top = distances(surface, nodes[kind == CONTACT]) < 3e-5
     on_bottom = np.abs(nodes[kind == BOTTOM, 1]) < 5e-5
-    within = inside(RayCaster(surface), nodes[kind == INTERNAL])
+    within = inside(surface.rays, nodes[kind == INTERNAL])
     near_wall = distances(surface, nodes[kind == OTHER], 2.5e-3) < 2.5e-3
     right = on_top.sum() + on_bottom.sum() + within.sum() + near_wall.sum()
     assert right >= 0.999 * len(nodes)

@@ -20,12 +20,13 @@ from tkamb.studies.kept_rows import KeptRows, row_key
 from tkamb.studies.scene_extremes import SceneExtreme, judge_scene, scene_extremes
 from tkamb.studies.stability import (
     judge_safely,
+    picture,
     run_stability,
     stability_cases,
     stored_verdicts,
     summary,
+    table,
 )
-from tkamb.studies.stability_report import picture, table
 from tkamb.studies.verdict import KINDS, PASSED_KINDS, Verdict, compared, judge
 
 ROOT = Path(__file__).parents[1]

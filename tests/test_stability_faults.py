@@ -12,10 +12,9 @@ import pytest
 from tkamb.contact.lattice import cache, model, report, solver
 from tkamb.contact.lattice.active_set import _forces_of, solve_contact
 from tkamb.contact.materials import RambergOsgood
-from tkamb.studies.audit import complaints
+from tkamb.studies.audit import PEER_BOUNDS, complaints, peer_distances
 from tkamb.studies.closed_forms import KEPT_GRID_MM, ClosedForm, closed_forms, press_closed_form
 from tkamb.studies.extremes import Extreme
-from tkamb.studies.peer_answers import FARTHEST, peer_distances
 from tkamb.studies.stability import judge_safely, stored_verdicts
 
 PLATES = [
@@ -100,14 +99,14 @@ def test_calculix_s_answers_hold_the_lattice_and_notice_a_changed_case():
     contact = model_of(PEERED)
     found = contact.press(contact.prepare(PEERED.pair), PEERED.load_N, PEERED.pose)
     apart = peer_distances(PEERED, found)
-    assert set(apart) == set(FARTHEST) and all(apart[key] < FARTHEST[key] for key in apart)
+    assert set(apart) == set(PEER_BOUNDS) and all(apart[key] < PEER_BOUNDS[key] for key in apart)
     stiffer = replace(found, approach=found.approach / 1.05)
-    assert peer_distances(PEERED, stiffer)["approach"] > FARTHEST["approach"]
+    assert peer_distances(PEERED, stiffer)["approach"] > PEER_BOUNDS["approach"]
     assert peer_distances(replace(PEERED, load_N=77.0), found) == {}
 
 
 def test_a_stored_answer_to_another_case_is_no_reference(monkeypatch):
-    monkeypatch.setattr("tkamb.studies.peer_answers.body_hash", lambda extreme: "another")
+    monkeypatch.setattr("tkamb.studies.audit.body_hash", lambda extreme: "another")
     verdict = judge_safely(PEERED)
     assert verdict.kind == "unverified" and "make_stability_answers" in verdict.reason
 

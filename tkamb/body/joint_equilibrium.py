@@ -25,8 +25,7 @@ from tkamb.body import unknowns
 from tkamb.body.knee import KneeGeometry
 from tkamb.body.ligaments import BundleArrays, Ligament
 from tkamb.body.load import wrench_of
-from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_pose, transform
-from tkamb.geometry.knee_axes import knee_axes
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_axes, knee_pose, transform
 
 
 @dataclass(frozen=True, eq=False)

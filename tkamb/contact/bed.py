@@ -9,7 +9,6 @@ from scipy.spatial import cKDTree
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.rays import RayCaster
-from tkamb.geometry.smooth_normals import smooth_normals
 from tkamb.geometry.surface import Surface
 
 DOWN = np.array([0.0, -1.0, 0.0])
@@ -28,7 +27,7 @@ class Bed:
 
     Args:
         points: (n, 3) m, insert frame, on the mesh itself.
-        normals: (n, 3) outward unit normals, see `smooth_normals`.
+        normals: (n, 3) outward unit normals, see `Surface.smooth_normals`.
         area: (n,) m², tributary area on the true surface: the part of the grid cell that
             the insert covers, divided by n_y. Under a uniform pressure the vertical force
             is exactly pressure times covered projection.
@@ -77,11 +76,11 @@ def sample_bed(insert: Surface, resolution: float) -> Bed:
         InputError: the insert is not closed, or the resolution does not suit its size.
     """
     centres, shape = _grid(insert, resolution)
-    caster = RayCaster(insert)
+    caster = insert.rays
     hit = np.isfinite(_first(caster, centres)[0])
     xz, covered, cell = _cells(caster, centres, hit.reshape(shape), resolution)
     points, face, thickness = _through(caster, xz, insert)
-    normals = smooth_normals(insert, points, face)
+    normals = insert.smooth_normals(points, face)
     area = covered * resolution**2 / np.maximum(normals[:, 1], STEEPEST)
     triangles = _grid_triangles(cell, shape)
     depth = SKIN + caster.first(points - SKIN * normals, -normals)[0]

@@ -119,8 +119,8 @@ class Hertz(ContactModel):
         return HertzState(
             pair,
             sample_bed(pair.insert, self.resolution),
-            RayCaster(pair.insert),
-            RayCaster(pair.femoral),
+            pair.insert.rays,
+            pair.femoral.rays,
             FirstTouch(pair.femoral, pair.insert, condyle_split(pair.femoral)),
         )
 

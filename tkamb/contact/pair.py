@@ -36,17 +36,17 @@ class ContactPair:
     @cached_property
     def femoral_rays(self) -> RayCaster:
         """Rays against the femoral component, in its own frame."""
-        return RayCaster(self.femoral)
+        return self.femoral.rays
 
     @cached_property
     def insert_rays(self) -> RayCaster:
         """Rays against the insert."""
-        return RayCaster(self.insert)
+        return self.insert.rays
 
     @cached_property
     def first_touch(self) -> FirstTouch:
         """How far the femoral component travels until either condyle touches."""
-        return FirstTouch(self.femoral, self.insert, rays=(self.femoral_rays, self.insert_rays))
+        return FirstTouch(self.femoral, self.insert)
 
 
 class PreparedContact(ABC):

@@ -28,8 +28,7 @@ from tkamb.body.knee import KneeGeometry
 from tkamb.body.load import wrench_of
 from tkamb.equilibrium.balance import Balance, BalanceStatus, Trial, find_balance
 from tkamb.equilibrium.mechanics import Mechanics
-from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
-from tkamb.geometry.knee_axes import knee_axes
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_axes, knee_pose
 
 if TYPE_CHECKING:
     from tkamb.body.patella import PatellaState

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.body.knee import dome_sensitivity
+from tkamb.columns import ligament_column
 from tkamb.equilibrium.mechanics import FrameLoads
 from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, knee_coordinates
 from tkamb.run.agreement import normal_force, share_by_equilibrium, split_determined
-from tkamb.run.columns import ligament_column
 from tkamb.run.status import FAILED
 from tkamb.scene.case import Case
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE

@@ -6,10 +6,9 @@ import numpy as np
 
 from tkamb.body.slip import condyle_slip, roll_slip_motion
 from tkamb.errors import InputError
-from tkamb.geometry.condyles import condyle_split
+from tkamb.geometry.condyles import LowestPoints, condyle_split
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
-from tkamb.geometry.lowest import LowestPoints
 from tkamb.geometry.surface import Surface
 from tkamb.inputs.filtering import Cutoff, differentiate_coordinates
 from tkamb.inputs.motion import KneeMotion

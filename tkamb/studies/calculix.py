@@ -32,7 +32,6 @@ from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
 from tkamb.errors import ComputationError
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import Array
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 from tkamb.studies.calculix_deck import Deck
 from tkamb.studies.calculix_run import LONGEST_SECONDS, PeerRun, find_program, run_calculix
@@ -192,7 +191,7 @@ def _problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -> _Pr
     nodes, surface = contact_map(lattice, pair.insert)
     smooth = lattice.nodes.copy()
     smooth[nodes, 1] += surface.lift
-    floor = FemoralFloor(pair.femoral, RayCaster(pair.femoral))
+    floor = FemoralFloor(pair.femoral, pair.femoral.rays)
     guess = contact_model("foundation", grid_mm)
     depth = guess.press(guess.prepare(pair), load, pose).approach
     if not depth > 0:

@@ -10,7 +10,6 @@ from tkamb.body.wrapping import TautPath
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 from tkamb.output.metrics import stretches
 from tkamb.output.style import SIDE_COLOURS
@@ -88,7 +87,7 @@ def _coloured(path: TautPath | None) -> tuple[Array, Colours]:
 
 def centres_of_pressure(results: "Results", insert: Surface) -> dict[str, Array]:
     """Return side -> (f, 3) m, on the undeformed insert; NaN beside it."""
-    rays, top = RayCaster(insert), float(insert.bounds[1, 1]) + MILLIMETRE
+    rays, top = insert.rays, float(insert.bounds[1, 1]) + MILLIMETRE
     found = {}
     for side in SIDE_COLOURS:
         x, z = (results[f"{side}_cop_{axis}_mm"] * MILLIMETRE for axis in ("ap", "ml"))

@@ -51,7 +51,7 @@ class Winkler(ContactModel):
     def prepare(self, pair):
         """Sample the articular surface."""
         bed = sample_bed(pair.insert, self.resolution)
-        return WinklerState(pair, bed, RayCaster(pair.femoral))
+        return WinklerState(pair, bed, pair.femoral.rays)
 
     def evaluate(self, state, pose, guess=None):
         """Return the contact at a pose."""

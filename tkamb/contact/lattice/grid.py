@@ -25,7 +25,6 @@ from tkamb.contact.lattice.walls import inside, settle_walls
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.post import find_post
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
@@ -182,7 +181,7 @@ def _sound_cells(field: NodeField, insert: Surface) -> tuple[Index, int]:
     points = field.points.reshape(-1, 3)
     cells = cells[scaled_jacobians(points[cells]) > LEAST_JACOBIAN]
     cells = cells[shortest_edges(points[cells]) > LEAST_EDGE * field.spacing.min()]
-    cells = cells[inside(RayCaster(insert), points[cells].mean(axis=1))]
+    cells = cells[inside(insert.rays, points[cells].mean(axis=1))]
     cells = cells[_largest_piece(cells)]
     return cells, found - len(cells)
 

@@ -60,7 +60,7 @@ def contact_map(lattice: Lattice, insert: Surface) -> tuple[Indices, ContactMap]
         np.add.at(area, triangles[:, corner], np.linalg.norm(cross, axis=1) / 6)
         np.add.at(normals, triangles[:, corner], cross)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    rays = RayCaster(insert)
+    rays = insert.rays
     thickness, lift = _thickness(points, rays, lattice.spacing), _lift(points, rays)
     return nodes.astype(np.int64), ContactMap(points, normals, area, thickness, lift, triangles)
 

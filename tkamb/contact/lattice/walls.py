@@ -38,7 +38,7 @@ class WallHits:
 
 def settle_walls(field: NodeField, surface: Surface) -> None:
     """Move nodes of `field` sideways onto the walls, and admit nodes outside (in place)."""
-    rays = RayCaster(surface)
+    rays = surface.rays
     before = field.points.copy()
     firing = _firing_points(field)
     hits = _walls_beside(field, firing, rays, surface)

@@ -1,26 +1,31 @@
-"""An upper bound of a surface's height over x and z, for sparing rays."""
+"""Bounds of two surfaces' heights that spare first touch most of its rays."""
 
 from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, rotate, transform
+from tkamb.geometry.ragged import Ragged
 from tkamb.geometry.surface import Surface
 
 Index = NDArray[np.int64]
 
-CELL = 1e-3
-"""m; edge of the cells."""
+CELL_EDGE = 1e-3
+"""m."""
 MOST_CELLS = 400
 """Cells along an edge of the grid; a larger surface gets larger ones."""
 WIDEST = 4
 """Cells along an edge; larger triangles are dealt with one by one."""
-STEEPEST = 3.0
-"""Largest slope of a plane."""
+LARGEST_SLOPE = 3.0
+"""Rise over run of a bound's planes."""
+PATCH_EDGE = 2e-3
+"""m; edge of the cubes that patches are cut by."""
+MOST_CUBES = 200
+"""Cubes along an edge of the surface's box; a larger surface gets larger ones."""
 
 
-class Ceiling:
+class HeightBound:
     """Planes over the cells of an x-z grid that the surface, seen from above, stays under.
 
         y <= c + g . (x, z)      for every upward triangle over the cell
@@ -37,22 +42,20 @@ class Ceiling:
     def __init__(self, surface: Surface, lift: Array | None = None) -> None:
         low, high = surface.bounds[:, [0, 2]]
         self._origin = low
-        self._edge = max(CELL, float((high - low).max()) / MOST_CELLS)
+        self._edge = max(CELL_EDGE, float((high - low).max()) / MOST_CELLS)
         self._last = ((high - low) // self._edge).astype(np.int64)
         self._planes = np.stack(self._all_planes(surface, lift))
         self._level = np.ceil(np.log2(np.arange(1, self._last.max() + 2))).astype(np.int64)
         number = np.ravel_multi_index(
             tuple(self._place(surface.vertices[:, [0, 2]]).T), tuple(self._last + 1)
         )
-        self._vertices = np.argsort(number, kind="stable")
-        count = int(np.prod(self._last + 1))
-        self._first = np.searchsorted(number[self._vertices], np.arange(count + 1))
+        self._vertices = Ragged.by_key(number, int(np.prod(self._last + 1)))
 
     def over(self, points: Array) -> Array:
         """Return a height (n,), m, that the surface over the points (n, 3) does not exceed."""
         xz = points[:, [0, 2]]
         plane = self._planes[0][tuple(self._place(xz).T)]
-        return np.asarray(np.einsum("ij,ij->i", plane[:, :2], xz) + plane[:, 2])
+        return np.einsum("ij,ij->i", plane[:, :2], xz) + plane[:, 2]
 
     def planes(self, low: Array, high: Array) -> Array:
         """Return planes g, c, c' (n, 4) that the surface over rectangles stays under, m.
@@ -69,7 +72,7 @@ class Ceiling:
         (x, z), (end_x, end_z) = self._origin, self._origin + (self._last + 1) * self._edge
         outside = (high[:, 0] < x) | (high[:, 1] < z) | (low[:, 0] > end_x) | (low[:, 1] > end_z)
         found[outside] = [0.0, 0.0, -np.inf, -np.inf]
-        return np.asarray(found)
+        return found
 
     def vertices_in_rectangles(self, low: Array, high: Array) -> Index:
         """Return the vertices of the surface that may lie in any of the rectangles."""
@@ -83,7 +86,7 @@ class Ceiling:
         ):
             np.add.at(count, (i[:, 0], j[:, 1]), sign)
         marked = count.cumsum(axis=0).cumsum(axis=1)[:-1, :-1].ravel() > 0
-        return rows_of(self._first, self._vertices, np.flatnonzero(marked))
+        return self._vertices.of(np.flatnonzero(marked))[1]
 
     def _place(self, xz: Array) -> Index:
         index = np.floor((xz - self._origin) / self._edge).astype(np.int64)
@@ -145,17 +148,10 @@ class Ceiling:
                 yield small[inside], (first[inside, 0] + i, first[inside, 1] + j)
 
 
-def rows_of(first: Index, items: Index, chosen: Index) -> Index:
-    """Return the items of the chosen rows, row r being items[first[r] : first[r + 1]]."""
-    count = first[chosen + 1] - first[chosen]
-    begin = np.repeat(first[chosen] - np.cumsum(count) + count, count)
-    return np.asarray(items[begin + np.arange(count.sum())])
-
-
 def _slopes(area: Array) -> Array:
     """Return the slopes (..., 2) along x and z of a mean area vector (..., 3)."""
     upward = np.maximum(area[..., 1:2], 1e-300)
-    return np.clip(-area[..., ::2] / upward, -STEEPEST, STEEPEST)
+    return np.clip(-area[..., ::2] / upward, -LARGEST_SLOPE, LARGEST_SLOPE)
 
 
 def _shifted(grid: Array, i: int, j: int, beyond: float) -> Array:
@@ -165,3 +161,56 @@ def _shifted(grid: Array, i: int, j: int, beyond: float) -> Array:
     rows, columns = max(grid.shape[0] - i, 0), max(grid.shape[1] - j, 0)
     result[:rows, :columns] = grid[i:, j:]
     return result
+
+
+class Patches:
+    """The triangles of a surface by the cube that holds their middle, each in a flat box.
+
+    Args:
+        surface: any surface.
+        reach: (n,) m, a margin of each vertex; `self.reach` (p,) is the largest of each patch.
+    """
+
+    def __init__(self, surface: Surface, reach: Array) -> None:
+        low, high = surface.bounds
+        edge = max(PATCH_EDGE, float((high - low).max()) / MOST_CUBES)
+        middle = np.maximum(surface.triangles.mean(axis=1) - low, 0.0)  # rounding may fall below
+        cube = np.floor(middle / edge).astype(np.int64)
+        key = np.ravel_multi_index(tuple(cube.T), tuple(cube.max(axis=0) + 1))
+        used, patch = np.unique(key, return_inverse=True)
+        self._faces = Ragged.by_key(patch.reshape(-1), len(used))
+        faces, begin = self._faces.items, self._faces.first[:-1]
+        self._axes = _frames(np.add.reduceat(surface.face_normals[faces], begin))
+        axes = np.repeat(self._axes, np.diff(self._faces.first), axis=0)
+        along = np.einsum("kij,kcj->kci", axes, surface.triangles[faces])
+        lowest = np.minimum.reduceat(along.min(axis=1), begin)
+        highest = np.maximum.reduceat(along.max(axis=1), begin)
+        self._centre = np.einsum("pij,pi->pj", self._axes, (lowest + highest) / 2)
+        self._half = (highest - lowest) / 2
+        self.reach = np.maximum.reduceat(reach[surface.faces].max(axis=1)[faces], begin)
+
+    def extent(self, pose: Array) -> tuple[Array, Array]:
+        """Return the corners low and high (p, 3), m, of a box about each patch at a pose (4, 4)."""
+        turned = np.abs(self._axes @ pose[:3, :3].T)
+        centre, half = transform(pose, self._centre), np.einsum("pij,pi->pj", turned, self._half)
+        return centre - half, centre + half
+
+    def least(self, pose: Array, chosen: Index, directions: Array) -> Array:
+        """Return a lower bound (n,) of d . x over chosen patches, for directions d (n, 3)."""
+        own = rotate(pose.T, directions)
+        across = np.abs(np.einsum("pij,pj->pi", self._axes[chosen], own))
+        middle = np.einsum("ij,ij->i", transform(pose, self._centre[chosen]), directions)
+        return middle - np.einsum("ij,ij->i", across, self._half[chosen])
+
+    def faces(self, chosen: Index) -> Index:
+        """Return the triangles of the chosen patches."""
+        return self._faces.of(chosen)[1]
+
+
+def _frames(normals: Array) -> Array:
+    """Return orthonormal axes (p, 3, 3), rows, the first along each normal (p, 3)."""
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    first = np.where(length > 0, normals / np.where(length > 0, length, 1.0), [0.0, 1.0, 0.0])
+    second = np.cross(first, np.eye(3)[np.abs(first).argmin(axis=1)])
+    second /= np.linalg.norm(second, axis=1, keepdims=True)
+    return np.stack([first, second, np.cross(first, second)], axis=1)

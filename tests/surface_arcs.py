@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from tkamb.geometry.frames import Array
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
 Index = NDArray[np.int64]
@@ -103,7 +102,7 @@ def _heights(surface: Surface, points: Array, side: float) -> Array:
     origins = points.copy()
     low, high = surface.bounds[:, 1]
     origins[:, 1] = high + 1e-3 if side > 0 else low - 1e-3
-    distance, _ = RayCaster(surface).first(origins, (0.0, -side, 0.0))
+    distance, _ = surface.rays.first(origins, (0.0, -side, 0.0))
     return np.where(np.isfinite(distance), origins[:, 1] - side * distance, np.nan)
 
 

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from tkamb.atomic import replaced_file, write_text
 from tkamb.errors import InputError
 from tkamb.files import read_bytes, read_json
 from tkamb.geometry.frames import Array
-from tkamb.output.atomic import replaced_file, write_text
 
 FOLDER = ".frames"
 IDENTITY_NAME = "run.json"

@@ -18,15 +18,15 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tkamb.errors import InputError
-from tkamb.files import TABLE_LIMIT, read_json, read_text
-from tkamb.output.atomic import (
+from tkamb.atomic import (
     MARKER,
     claim_directory,
     finish_replacement,
     folder_token,
     replacement_pending,
 )
+from tkamb.errors import InputError
+from tkamb.files import TABLE_LIMIT, read_json, read_text
 
 CHOOSE = "choose another folder with --out"
 LONGEST_WAIT = 5.0

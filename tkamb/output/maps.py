@@ -1,4 +1,4 @@
-"""contact.h5: the pressure maps of a run, written frame by frame.
+"""The pressure maps of a run: contact.h5, written frame by frame, or kept in memory.
 
 Per frame: the maps are appended and flushed, then the time. `/time_s` is therefore as long
 as the number of whole frames, also when the run was killed. Compressed chunks of one frame
@@ -17,9 +17,9 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tkamb.atomic import replaced_file
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.output.atomic import replaced_file
 
 FILE_NAME = "contact.h5"
 UNITS = "SI: m, s, Pa, N; poses 4x4"
@@ -153,6 +153,59 @@ class MapWriter:
         except InputError:
             if error is None:  # else the block has said it already
                 raise
+
+
+class MapMemory:
+    """Collects maps frame by frame without a file; the methods are `MapWriter`'s."""
+
+    def __init__(self, points: Array, triangles: Array, attributes: Mapping[str, Any]) -> None:
+        self._fixed = {"points_m": points, "triangles": triangles}
+        self._attributes = attributes
+        self._frames: dict[str, list[Array]] = {name: [] for name in PER_FRAME}
+
+    def append(
+        self,
+        time: float,
+        pressure: ArrayLike,
+        gap: ArrayLike,
+        nodal_force: ArrayLike,
+        femoral_pose: ArrayLike,
+    ) -> None:
+        """Add one frame."""
+        values = (pressure, gap, nodal_force, femoral_pose, time)
+        for name, value in zip(PER_FRAME, values, strict=True):
+            self._frames[name].append(np.array(value, float))
+
+    def append_failed(self, time: float) -> None:
+        """Add a frame without a result: NaN everywhere but the time."""
+        n, nan = len(self._fixed["points_m"]), np.nan
+        self.append(time, *(np.full(shape, nan) for shape in ((n,), (n,), (n, 3), (4, 4))))
+
+    @property
+    def maps(self) -> "ContactMaps":
+        """What was collected."""
+        frames = {name: np.stack(values) for name, values in self._frames.items()}
+        return ContactMaps(self._fixed | frames, self._attributes)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Nothing is to be closed."""
+
+
+def map_sink(
+    directory: str | Path | None, points: Array, triangles: Array, attributes: Mapping[str, Any]
+) -> MapWriter | MapMemory:
+    """Return what collects a run's maps: contact.h5 in a folder, or memory for None."""
+    if directory is None:
+        return MapMemory(points, triangles, attributes)
+    return MapWriter(Path(directory) / FILE_NAME, points, triangles, attributes)
 
 
 @dataclass(frozen=True, eq=False)
