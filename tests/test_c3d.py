@@ -9,7 +9,7 @@ from recordings import AMTI_CORNERS, standing_markers, write_c3d
 from tkamb.errors import InputError
 from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.ground_reaction import load_ground_reaction
-from tkamb.inputs.labels import matched_labels
+from tkamb.inputs.markers import matched_labels
 from tkamb.inputs.tables import read_table
 from tkamb.scene.si import in_si
 from tkamb.scene.tables import GroundReactionTable

@@ -7,13 +7,12 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from tkamb.body.chain import Chain, ChainState
-from tkamb.body.inverse_dynamics import Unknown
 from tkamb.body.knee import Extensor
 from tkamb.body.load import PointForces
 from tkamb.body.muscles import Line, Muscle, PatellarLigament, Wrap, muscle_line, off_femur
 from tkamb.body.patella import ExtensorMechanism, PatellaState, patella_at, solve_patella
 from tkamb.body.patellofemoral import PatellofemoralContact
-from tkamb.body.unknowns import muscle_load
+from tkamb.body.unknowns import Unknown, muscle_load
 from tkamb.body.wrapping import TautPath, is_inside
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, inverse, transform

@@ -18,14 +18,17 @@ J of `knee_axes`: zero at equilibrium, and along +q_i where the femur wants to g
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tkamb.body import unknowns
 from tkamb.body.knee import KneeGeometry
-from tkamb.body.ligaments import BundleArrays, Ligament
 from tkamb.body.load import wrench_of
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_axes, knee_pose, transform
+
+if TYPE_CHECKING:
+    from tkamb.body.ligaments import BundleArrays, Ligament
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +62,7 @@ class JointEquilibrium:
     """
 
     external: Array
-    ligaments: BundleArrays
+    ligaments: "BundleArrays"
     line: PatellarLine | None
     keeping: Array
     released: tuple[int, ...]
@@ -110,7 +113,7 @@ def _magnitudes(rows: Array, columns: Array, wrench: Array) -> Array:
 
 def joint_equilibrium(
     geometry: KneeGeometry,
-    ligaments: Sequence[Ligament],
+    ligaments: "Sequence[Ligament]",
     coordinates: Array,
     released: tuple[int, ...],
     middle: Array,
@@ -179,12 +182,14 @@ def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
 
 
 def crossing_bundles(
-    geometry: KneeGeometry, ligaments: Sequence[Ligament], coordinates: Array
-) -> BundleArrays:
+    geometry: KneeGeometry, ligaments: "Sequence[Ligament]", coordinates: Array
+) -> "BundleArrays":
     """Return the bundles that cross the knee, their ends in the femur and insert frames.
 
     An end on the patella moves with the femur from where it stands.
     """
+    from tkamb.body.ligaments import BundleArrays
+
     state, chain = geometry.state, geometry.state.chain
     to_femur = inverse(knee_pose(coordinates))
     crossing, femur, shank = [], [], []

@@ -17,10 +17,9 @@ import numpy as np
 from tkamb.body import unknowns
 from tkamb.body.chain import ChainState
 from tkamb.body.contact_points import CondylePoint
-from tkamb.body.inverse_dynamics import Unknown, solve
 from tkamb.body.load import PointForces
 from tkamb.body.load_state import LoadState, contradictions, load_states, wrong_signs
-from tkamb.body.unknowns import muscle_load
+from tkamb.body.unknowns import Unknown, muscle_load, solve
 from tkamb.geometry.frames import Array
 from tkamb.units import MILLIMETRE
 

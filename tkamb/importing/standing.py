@@ -10,9 +10,9 @@ import numpy as np
 from tkamb.geometry.frames import MIRROR, Array, inverse, mirrored_pose, transform
 from tkamb.importing.markers import ModelSegment, facing, segments_of
 from tkamb.importing.scene_text import SceneText
-from tkamb.inputs.labels import matched_labels, plain_label
 from tkamb.inputs.leg_chain import LegChain
 from tkamb.inputs.marker_motion import both_fits, leg_segments, neutral_coordinates
+from tkamb.inputs.markers import matched_labels, plain_label
 from tkamb.inputs.tables import read_table
 from tkamb.scene import Scene
 from tkamb.scene.si import in_si
