@@ -122,7 +122,7 @@ def test_the_case_leaves_the_scene_as_its_file_has_it(tmp_path):
     assert case.scene is scene
     assert [bundle.name[:11] for bundle in case.ligaments] == ["generic_MCL"] * 3
     left = scene.model_copy(update={"patient": scene.patient.model_copy(update={"side": "left"})})
-    (one,), (other,) = (lines.muscles(each, case.chain) for each in (scene, left))
-    for point, mirrored in zip(one.points, other.points, strict=True):
-        assert mirrored.position.tolist() == (MIRROR @ point.position).tolist()
-    assert left.quadriceps == scene.quadriceps
+    one, other = (lines.patellar_ligament(each).distal.position for each in (scene, left))
+    assert other.tolist() == (MIRROR @ one).tolist()
+    assert one[2] == pytest.approx(0.003)
+    assert left.patellar_ligament == scene.patellar_ligament

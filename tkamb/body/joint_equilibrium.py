@@ -74,19 +74,19 @@ class JointEquilibrium:
             coordinates: (..., 6) knee coordinates.
             contact: (6,) w_contact on the insert.
         """
-        axes, columns, wrench = self._loaded(coordinates, contact)
+        axes, columns, wrench = self._sum_loads(coordinates, contact)
         kept = _magnitudes(axes[..., self._prescribed, :], columns, wrench)
         left = wrench + np.einsum("...ij,...j->...i", columns, kept)
         return -np.einsum("...ij,...j->...i", axes[..., list(self.released), :], left)
 
     def kept(self, coordinates: Array, contact: Array) -> Array:
         """Return y (6 - n,): what keeps the prescribed coordinates, flexion last."""
-        axes, columns, wrench = self._loaded(coordinates, contact)
+        axes, columns, wrench = self._sum_loads(coordinates, contact)
         return _magnitudes(axes[..., self._prescribed, :], columns, wrench)
 
     def contact_gain(self, coordinates: Array) -> Array:
         """Return d r / d w_contact (n, 6) at coordinates (6,)."""
-        axes, columns, _ = self._loaded(coordinates, np.zeros(6))
+        axes, columns, _ = self._sum_loads(coordinates, np.zeros(6))
         rows = axes[self._prescribed]
         through = np.eye(6) - columns @ np.linalg.solve(rows @ columns, rows)
         return np.asarray(-axes[list(self.released)] @ through)
@@ -95,7 +95,7 @@ class JointEquilibrium:
     def _prescribed(self) -> list[int]:
         return [i for i in range(6) if i not in self.released]
 
-    def _loaded(self, coordinates: Array, contact: Array) -> tuple[Array, Array, Array]:
+    def _sum_loads(self, coordinates: Array, contact: Array) -> tuple[Array, Array, Array]:
         """Return axes (..., 6, 6), columns B (..., 6, 6 - n) and wrench (..., 6)."""
         poses = knee_pose(coordinates)
         wrench = self.external + contact + self.ligaments.wrench(poses)

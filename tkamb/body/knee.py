@@ -223,7 +223,7 @@ class _System:
         values = self.solution.values
         flexion, adduction = self.external_moments()
         return KneeLoads(
-            values | dict.fromkeys(self._unloaded(), 0.0),
+            values | dict.fromkeys(self._zero_loads(), 0.0),
             self.contact_force(values),
             flexion,
             adduction,
@@ -278,7 +278,7 @@ class _System:
         rows = self.geometry.state.chain.knee_columns()
         return -float(knee[rows[5]]), -float(knee[rows[4]])
 
-    def _unloaded(self) -> list[str]:
+    def _zero_loads(self) -> list[str]:
         """Return the loads of the extensor mechanism that are zero, where it is slack."""
         return [*map(muscle_load, self.slack), *PATELLAR] if self.slack else []
 

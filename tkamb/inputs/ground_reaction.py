@@ -75,16 +75,16 @@ def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> Gro
     """
     from_plates = (source.format or source.file.suffix.lower().lstrip(".")) == "c3d"
     if from_plates:
-        stamps, force, point, moment = _of_plates(source)
+        stamps, force, point, moment = _read_plates(source)
     else:
         recorded = read_table(source.file, source.format)
         stamps = recorded.time(source.columns.get("time", "time"))
-        force, point, moment = _recorded(source, recorded)
+        force, point, moment = _read_columns(source, recorded)
     path = source.file
     check_spacing(path, stamps)
     _check_upward(force, source)
     loaded = force[:, 1] >= source.unloaded
-    point = _held(stamps, point, loaded, path)
+    point = _hold_point(stamps, point, loaded, path)
     near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
     # of plates the wrench was recorded: their point is a quotient, which small forces shake
     points = None if from_plates else point[near]
@@ -145,7 +145,7 @@ def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
         )
 
 
-def _recorded(source: ForceRecording, recorded: Table) -> tuple[Array, Array, Array]:
+def _read_columns(source: ForceRecording, recorded: Table) -> tuple[Array, Array, Array]:
     """Return force (N), point (m) and free moment (N·m), each (n, 3), in the laboratory."""
     roles = [f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)]
     check_roles(source.columns, ("time", *roles), recorded.path, "ground_reaction")
@@ -173,7 +173,7 @@ def _recorded(source: ForceRecording, recorded: Table) -> tuple[Array, Array, Ar
     return force, point, moment
 
 
-def _of_plates(source: ForceRecording) -> tuple[Array, Array, Array, Array]:
+def _read_plates(source: ForceRecording) -> tuple[Array, Array, Array, Array]:
     """Return times (k,) s, force, point and free moment, each (k, 3), of a recording's plates.
 
     The wrenches are summed about the laboratory's origin and kept: the point lies on the level
@@ -200,7 +200,7 @@ def _of_plates(source: ForceRecording) -> tuple[Array, Array, Array, Array]:
     point = np.full_like(force, np.nan)
     loaded = force[:, 1] >= source.unloaded
     point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], levels[0])
-    point = _held(recording.analog_time, point, loaded, source.file)
+    point = _hold_point(recording.analog_time, point, loaded, source.file)
     return recording.analog_time, force, point, about_origin - np.cross(point, force)
 
 
@@ -226,7 +226,7 @@ def _check_upward(force: Array, source: ForceRecording) -> None:
         )
 
 
-def _held(stamps: Array, point: Array, loaded: np.ndarray, path: Path) -> Array:
+def _hold_point(stamps: Array, point: Array, loaded: np.ndarray, path: Path) -> Array:
     """Return the points with those of the unloaded plate carried over in time."""
     missing = loaded & ~np.isfinite(point).all(axis=1)
     if missing.any():

@@ -111,7 +111,7 @@ def load_marker_motion(
         ),
     }
     rms: dict[Method, Array] = {"segments": _joint_rms(fits, measured), "chain": whole.rms}
-    return _compared(source, recorded, time, readings, rms, chain, measured, neutral)
+    return _compare_readings(source, recorded, time, readings, rms, chain, measured, neutral)
 
 
 def both_fits(
@@ -184,7 +184,7 @@ def _check_fits(rms: dict[str, Array], recorded: Table) -> None:
             )
 
 
-def _compared(
+def _compare_readings(
     source: MotionRecording,
     recorded: Table,
     time: Array,

@@ -123,7 +123,7 @@ def fit_rigid(points: Array, reference: Array, name: str = "the tibia") -> tuple
     complete = np.isfinite(points.reshape(len(points), -1)).all(axis=1)
     result, residual = np.full((len(points), 4, 4), np.nan), np.full(len(points), np.nan)
     if complete.any():
-        result[complete], residual[complete] = _fitted(points[complete], reference)
+        result[complete], residual[complete] = _fit(points[complete], reference)
     return result, residual
 
 
@@ -184,7 +184,7 @@ def _nearest_rotation(h: Array) -> Array:
     return np.asarray((v * signs[:, None, :]) @ ut)
 
 
-def _fitted(points: Array, reference: Array) -> tuple[Array, Array]:
+def _fit(points: Array, reference: Array) -> tuple[Array, Array]:
     means, centre = points.mean(axis=1), reference.mean(axis=0)
     h = np.einsum("mi,nmj->nij", reference - centre, points - means[:, None])
     rotation = _nearest_rotation(h)

@@ -117,7 +117,7 @@ def load_motion(
         return _from_markers(source, side, pose_insert_in_tibia, released)
     recorded = read_table(source.file, source.format)
     _check_roles(source, recorded)
-    recorded = _with_signs_turned(recorded, source)
+    recorded = _turn_signs(recorded, source)
     unrecorded: tuple[str, ...] = ()
     time = recorded.time(source.columns.get("time", "time"))
     if source.interpretation == "pose":
@@ -128,16 +128,16 @@ def load_motion(
         poses = pose_insert_mesh_in_insert @ mesh @ inverse(pose_femoral_mesh_in_femur)
         knee = knee_coordinates(mirrored_pose(poses) if side == "left" else poses)
     else:
-        unrecorded = _unrecorded(recorded, source, released)
-        knee = _recorded_coordinates(recorded, source, KNEE_COORDINATES, unrecorded)
+        unrecorded = _find_unrecorded(recorded, source, released)
+        knee = _read_coordinates(recorded, source, KNEE_COORDINATES, unrecorded)
         if side == "left":
             knee[:, KNEE_COORDINATES.index("ml")] *= -1.0
     _check_knee(knee, recorded.path)
     named = [c for c in PATELLA_COORDINATES if c in source.columns or c in recorded.columns]
-    patella = _recorded_coordinates(recorded, source, PATELLA_COORDINATES) if named else None
+    patella = _read_coordinates(recorded, source, PATELLA_COORDINATES) if named else None
     if patella is not None:
         _check_patella(patella, recorded.path)
-    motion = _differentiated(time, knee, patella, source, recorded.path)
+    motion = _differentiate(time, knee, patella, source, recorded.path)
     return replace(motion, unrecorded=unrecorded)
 
 
@@ -161,11 +161,11 @@ def _from_markers(
     for name in unrecorded:
         knee[:, KNEE_COORDINATES.index(name)] = 0.0
     _check_knee(knee, source.file)
-    motion = _differentiated(found.time, knee, None, source, source.file)
+    motion = _differentiate(found.time, knee, None, source, source.file)
     return replace(motion, unrecorded=unrecorded, markers=found)
 
 
-def _unrecorded(
+def _find_unrecorded(
     recorded: Table, source: MotionRecording, released: Sequence[str]
 ) -> tuple[str, ...]:
     """Return the coordinates without a column, all of which must be released."""
@@ -185,7 +185,7 @@ def _unrecorded(
     return tuple(missing)
 
 
-def _recorded_coordinates(
+def _read_coordinates(
     recorded: Table,
     source: MotionRecording,
     roles: tuple[str, ...],
@@ -220,7 +220,7 @@ def _check_roles(source: MotionRecording, recorded: Table) -> None:
             )
 
 
-def _with_signs_turned(recorded: Table, source: MotionRecording) -> Table:
+def _turn_signs(recorded: Table, source: MotionRecording) -> Table:
     """Return the recording with the columns of the roles in `signs_turned` negated."""
     names = {source.columns.get(role, role) for role in source.signs_turned}
     turned = {name: -recorded.column(name) for name in names}
@@ -251,7 +251,7 @@ def _check_patella(patella: Array, path: Path) -> None:
         check_range(path, f"knee: {name}", values, limits, unit, question)
 
 
-def _checked_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, ...]:
+def _find_odd_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, ...]:
     """Return the odd samples of the coordinates (n, 6 or 9), none of which steps too fast."""
     odd: list[OddSample] = []
     for i, name in enumerate((*KNEE_COORDINATES, *PATELLA_COORDINATES)[: values.shape[1]]):
@@ -263,7 +263,7 @@ def _checked_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, .
     return tuple(odd)
 
 
-def _differentiated(
+def _differentiate(
     time: Array, knee: Array, patella: Array | None, source: MotionRecording, path: Path
 ) -> KneeMotion:
     """Return the filtered motion at the scene's frames."""
@@ -273,7 +273,7 @@ def _differentiated(
         cycle = Cycle.of(time, knee, source.cycle, source.cycle_offset_percent, path)
     sampled = cycle.seconds(time) if cycle else time
     check_spacing(path, sampled)
-    odd = _checked_steps(sampled, values, path)
+    odd = _find_odd_steps(sampled, values, path)
     at = _frames(sampled, source, cycle)
     inside = cycle.wrapped(at, sampled) if cycle else at
     closed = cycle is not None and cycle.closed

@@ -59,7 +59,7 @@ def load_urdf(patient: Patient, with_patella: bool) -> str:
         InputError: missing file, link or joint, wrong axis, singular inertia.
     """
     path = patient.urdf
-    robot = _parsed(path)
+    robot = _parse(path)
     check_elements(robot, path)
     check_links(robot, path, with_patella)
     check_tree(robot, path)
@@ -73,7 +73,7 @@ def load_urdf(patient: Patient, with_patella: bool) -> str:
     return ElementTree.tostring(robot, encoding="unicode")
 
 
-def _parsed(path: Path) -> ElementTree.Element:
+def _parse(path: Path) -> ElementTree.Element:
     robot = read_xml(path, what="URDF")
     if robot.tag != "robot":
         raise InputError(f"is not a URDF: its root is <{robot.tag}>, not <robot>", path)

@@ -83,9 +83,9 @@ def load_tibia(source: ShankRecording, time: Array, side: Side, cutoff_Hz: Cutof
     rotation = pose(laboratory_rotation(source.laboratory_axes, recorded.path), np.zeros(3))
     residual = None
     if source.kind == "markers":
-        stamps, poses, residual = _fitted(source, recorded, stamps, time)
+        stamps, poses, residual = _fit_markers(source, recorded, stamps, time)
     else:
-        poses = _recorded_poses(source, recorded)
+        poses = _read_poses(source, recorded)
     poses = rotation @ poses
     if side == "left":
         poses = mirrored_pose(poses)
@@ -141,7 +141,7 @@ def _sagittal(
     return BodyMotion(time, pose(rotation, ankle), velocity, acceleration, odd=odd)
 
 
-def _recorded_poses(source: ShankRecording, recorded: Table) -> Array:
+def _read_poses(source: ShankRecording, recorded: Table) -> Array:
     assert source.sequence is not None
     kinds = ("rotation", "translation")
     roles = tuple(f"{kind}_{k}" for kind in kinds for k in (1, 2, 3))
@@ -151,7 +151,7 @@ def _recorded_poses(source: ShankRecording, recorded: Table) -> Array:
     )
 
 
-def _fitted(
+def _fit_markers(
     source: ShankRecording, recorded: Table, stamps: Array, time: Array
 ) -> tuple[Array, Array, Array]:
     """Return times, poses and residuals of the marker fit, around the frames."""
