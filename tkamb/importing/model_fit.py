@@ -13,8 +13,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.importing.markers import recorded_labels
 from tkamb.inputs.inverse_kinematics import ChainFit, Index, NormalEquations, fit_chain, put, skew
-from tkamb.inputs.labels import matched_labels
-from tkamb.inputs.markers import marker_trajectories
+from tkamb.inputs.markers import marker_trajectories, matched_labels
 from tkamb.inputs.tables import Table
 from tkamb.opensim.kinematics import Kinematics
 from tkamb.opensim.model import OpenSimModel
