@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from tkamb.body.static_optimisation import LoadSharing, share_load
+from tkamb.muscles.static_optimisation import LoadSharing, share_load
 from tkamb.errors import ComputationError
 
 FREE = np.inf

@@ -33,7 +33,7 @@ class StraightParts:
         )
 
     @classmethod
-    def joined(cls, several: "Sequence[StraightParts]") -> "StraightParts":
+    def joined(cls, several: Sequence["StraightParts"]) -> "StraightParts":
         """Return the parts of several in one."""
         return cls(
             np.concatenate([parts.frame for parts in several]),

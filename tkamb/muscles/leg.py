@@ -1,0 +1,100 @@
+"""Which coordinates and muscles of a model belong to a leg."""
+
+from itertools import combinations
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.importing.anatomy import Leg
+from tkamb.opensim.lines import Muscle, PathPoint
+from tkamb.opensim.model import Joint
+
+SAME = 1e-6
+"""Relative or m: strengths, lengths and points that differ by less are the same."""
+
+
+def leg_bones(leg: Leg) -> dict[str, tuple[str, ...]]:
+    """Return femur, patella (if there is one), tibia and foot -> bodies, the bone's own first."""
+    bones = {"femur": leg.femur, "tibia": leg.tibia, "foot": leg.foot}
+    return bones if leg.patella is None else {**bones, "patella": (leg.patella,)}
+
+
+def leg_coordinates(leg: Leg) -> tuple[str, ...]:
+    """Return the coordinates that a leg's muscles balance.
+
+    Those of the hip, the knee's flexion, those of the ankle and of the joint next below it
+    (subtalar); none that is locked or follows another.
+
+    Raises:
+        InputError: a knee that does not bend.
+    """
+    if leg.flexion is None:
+        raise InputError(f"has a knee '{leg.knee.name}' without flexion", leg.model.name)
+    followers = {coupler.dependent for coupler in leg.model.couplers}
+
+    def own(joint: Joint) -> list[str]:
+        there = leg.model.coordinates.values()
+        found = [c for c in there if c.joint == joint.name]
+        return [c.name for c in found if not c.locked and c.name not in followers]
+
+    below = [joint for joint in leg.model.joints if joint.inboard == leg.ankle.outboard]
+    return (*own(leg.hip), leg.flexion, *own(leg.ankle), *(c for j in below for c in own(j)))
+
+
+def leg_muscles(leg: Leg) -> tuple[str, ...]:
+    """Return the enabled muscles that lead to or along a leg, twins left out.
+
+    A twin has another's strength, fibre length and first point and a shorter path: models hold
+    such copies to measure a length, not to pull.
+    """
+    bodies = {body for group in leg_bones(leg).values() for body in group}
+    found = [
+        muscle
+        for muscle in leg.model.muscles.values()
+        if muscle.enabled and any(point.body in bodies for point in muscle.path.points)
+    ]
+    twins = set()
+    for one, other in combinations(found, 2):
+        if _same_muscle(one, other):
+            twins.add(min(one, other, key=lambda muscle: len(muscle.path.points)).name)
+    return tuple(muscle.name for muscle in found if muscle.name not in twins)
+
+
+def check_extensors(leg: Leg, muscles: tuple[str, ...]) -> None:
+    """Raise where muscles end on a patella that does not follow the knee.
+
+    Their moment about the knee then passes through a patellar ligament, which is no muscle: the
+    patella's equilibrium has to be solved, and -dL/dq about the flexion is near zero.
+
+    Raises:
+        InputError: names them.
+    """
+    if leg.patella is None:
+        return
+    model = leg.model
+    joint = next((j for j in model.joints if leg.patella in (j.parent, j.child)), None)
+    own = {c.name for c in model.coordinates.values() if joint and c.joint == joint.name}
+    if own & {c.dependent for c in model.couplers if c.independent == leg.flexion}:
+        return
+    ending = [n for n in muscles if model.muscles[n].path.points[-1].body == leg.patella]
+    if ending:
+        raise InputError(
+            f"{', '.join(ending)} end on '{leg.patella}', which does not follow '{leg.flexion}'",
+            model.name,
+            "couple the patella to the knee, or leave the knee's flexion out of coordinates",
+        )
+
+
+def _same_muscle(one: Muscle, other: Muscle) -> bool:
+    strong, weak = (
+        np.array([m.max_isometric_force_N, m.optimal_fibre_length_m, m.tendon_slack_length_m])
+        for m in (one, other)
+    )
+    first, second = one.path.points[0], other.path.points[0]
+    return (
+        bool((np.abs(strong - weak) <= SAME * strong).all())
+        and isinstance(first, PathPoint)
+        and isinstance(second, PathPoint)
+        and first.body == second.body
+        and float(np.abs(first.location - second.location).max()) < SAME
+    )
