@@ -10,7 +10,8 @@ and the muscle pulls with
     F = (a f_l(l/l_o) f_v(dl/dt / (l_o v_max)) + f_p(l/l_o)) F_max cos(alpha),
 
 f_l a sum of three bells, f_v of one arsinh, f_p exponential beyond the optimal length. A path
-that is shorter than the tendon is slack: it does not pull.
+that is shorter than the tendon is slack: it does not pull. Where the path that pulls is longer
+than muscle and tendon, as one past the patella to the tibia, L is that of a twin in the model.
 
 Reference: De Groote et al., Ann Biomed Eng 44:2922 (2016), doi:10.1007/s10439-016-1591-9; the
 coefficients are those of the authors' code, with which f_l(1) = f_v(0) = 1.
@@ -33,6 +34,8 @@ VELOCITY = (-0.3211346127989808, -8.149, -0.374, 0.8825327733249912)
 PASSIVE_SHAPE = 4.0
 PASSIVE_STRAIN = 0.6
 """Strain beyond the optimal length at which the passive force is F_max."""
+LONGEST = 1.8
+"""Fibre length over the optimal one beyond which the curves say nothing (f_p(1.6) is 1)."""
 
 
 def active_force_length(length: Array) -> Array:
@@ -68,6 +71,9 @@ def rigid_tendon_strength(
         muscles: m muscles.
         lengths_m: (..., m) of their paths.
         speeds: (..., m) m/s, of their paths' lengths.
+
+    Returns:
+        Both NaN where fibres are longer than `LONGEST`.
     """
     optimal = np.array([muscle.optimal_fibre_length_m for muscle in muscles])
     slack = np.array([muscle.tendon_slack_length_m for muscle in muscles])
@@ -77,6 +83,6 @@ def rigid_tendon_strength(
     along = lengths_m - slack
     fibre = np.hypot(width, along)
     cosine = np.where(along > 0.0, along / np.maximum(fibre, 1e-300), 0.0)
-    length = fibre / optimal
+    length = np.where(fibre > LONGEST * optimal, np.nan, fibre / optimal)
     active = active_force_length(length) * force_velocity(cosine * speeds / fastest)
     return strength * cosine * active, strength * cosine * passive_force_length(length)

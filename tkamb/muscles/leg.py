@@ -7,7 +7,7 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.importing.anatomy import Leg
 from tkamb.opensim.lines import Muscle, PathPoint
-from tkamb.opensim.model import Joint
+from tkamb.opensim.model import Joint, OpenSimModel
 
 SAME = 1e-6
 """Relative or m: strengths, lengths and points that differ by less are the same."""
@@ -42,22 +42,28 @@ def leg_coordinates(leg: Leg) -> tuple[str, ...]:
 
 
 def leg_muscles(leg: Leg) -> tuple[str, ...]:
-    """Return the enabled muscles that lead to or along a leg, twins left out.
-
-    A twin has another's strength, fibre length and first point and a shorter path: models hold
-    such copies to measure a length, not to pull.
-    """
+    """Return the enabled muscles that lead to or along a leg, twins left out (`length_twins`)."""
     bodies = {body for group in leg_bones(leg).values() for body in group}
-    found = [
-        muscle
+    names = [
+        muscle.name
         for muscle in leg.model.muscles.values()
         if muscle.enabled and any(point.body in bodies for point in muscle.path.points)
     ]
-    twins = set()
-    for one, other in combinations(found, 2):
-        if _same_muscle(one, other):
-            twins.add(min(one, other, key=lambda muscle: len(muscle.path.points)).name)
-    return tuple(muscle.name for muscle in found if muscle.name not in twins)
+    twins = set(length_twins(leg.model).values())
+    return tuple(name for name in names if name not in twins)
+
+
+def length_twins(model: OpenSimModel) -> dict[str, str]:
+    """Return muscle -> its twin, where there is one.
+
+    A twin has another's strength, fibre and tendon length and first point and a shorter path.
+    Models hold such a copy where the path that pulls is longer than muscle and tendon, as one
+    past the patella to the tibia: the twin's length is that of muscle and tendon, and it must
+    not pull beside the other.
+    """
+    pairs = [p for p in combinations(model.muscles.values(), 2) if _same_muscle(*p)]
+    ordered = [sorted(pair, key=lambda muscle: len(muscle.path.points)) for pair in pairs]
+    return {whole.name: twin.name for twin, whole in ordered}
 
 
 def check_extensors(leg: Leg, muscles: tuple[str, ...]) -> None:

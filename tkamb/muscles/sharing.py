@@ -8,6 +8,7 @@ import numpy as np
 
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
+from tkamb.muscles.hill import LONGEST
 from tkamb.muscles.static_optimisation import LoadSharing, share_load
 from tkamb.opensim.lines import Muscle
 
@@ -34,7 +35,7 @@ class Sharing:
 
     muscles: tuple[str, ...] | None = None
     coordinates: tuple[str, ...] | None = None
-    reserve: float | Mapping[str, float] = 1.0
+    reserve: float | Mapping[str, float] = 10.0
     exponent: float = 2.0
     weights: Literal["volume", "equal"] = "volume"
     lowest: float = 0.0
@@ -90,11 +91,17 @@ class FrameProblems:
         return *nothing, np.nan, f"failed: {reason}"
 
     def _unknown(self, k: int) -> str | None:
+        """Return why frame k cannot be asked for, None if it can."""
         if not np.isfinite(self.moment[k]).all():
             return "an external load is not known"
-        lost = ~(np.isfinite(self.arms[k]).all(axis=1) & np.isfinite(self.active[k]))
-        names = [muscle.name for muscle, gone in zip(self.muscles, lost, strict=True) if gone]
-        return f"no taut path of {', '.join(names)}" if names else None
+        for lost, why in (
+            (~np.isfinite(self.arms[k]).all(axis=1), "no taut path of"),
+            (~np.isfinite(self.active[k]), f"fibres beyond {LONGEST:g} optimal lengths in"),
+        ):
+            if lost.any():
+                names = [self.muscles[i].name for i in np.flatnonzero(lost)]
+                return f"{why} {', '.join(names)}"
+        return None
 
     def _frame(self, k: int) -> LoadSharing:
         """Return the problem of frame k."""

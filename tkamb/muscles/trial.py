@@ -23,11 +23,16 @@ from tkamb.geometry.frames import Array
 from tkamb.importing.anatomy import find_leg
 from tkamb.muscles.bones import Bones
 from tkamb.muscles.hill import rigid_tendon_strength
-from tkamb.muscles.leg import check_extensors, leg_bones, leg_coordinates, leg_muscles
+from tkamb.muscles.leg import (
+    check_extensors,
+    leg_bones,
+    leg_coordinates,
+    leg_muscles,
+    length_twins,
+)
 from tkamb.muscles.sharing import FrameProblems, Sharing
 from tkamb.opensim.inverse_dynamics import required_wrenches
 from tkamb.opensim.kinematics import Kinematics
-from tkamb.opensim.lines import Muscle
 from tkamb.opensim.model import OpenSimModel
 from tkamb.opensim.motion import CoordinateMotion
 from tkamb.opensim.paths import LineSet, Pulls
@@ -132,8 +137,8 @@ def solve_trial(
     moment = np.einsum("fbin,fbi,fnc->fc", placed.twists, needed, own, optimize=True)
     pulls = LineSet(kinematics, names).pulls(q, list(groups.values()))
     arms = pulls.moment_arms @ own
+    active, passive = _strength(kinematics, motion, sharing, pulls)
     muscles = [model.muscles[name] for name in names]
-    active, passive = _strength(muscles, sharing, pulls, motion.rates)
     problem = FrameProblems(muscles, balanced, sharing, moment, arms, active, passive)
     frames = [problem.solved(k) for k in range(len(q))]
     activation, reserve, residual = (
@@ -158,15 +163,22 @@ def solve_trial(
 
 
 def _strength(
-    muscles: Sequence[Muscle], sharing: Sharing, pulls: Pulls, rates: Array
+    kinematics: Kinematics, motion: CoordinateMotion, sharing: Sharing, pulls: Pulls
 ) -> tuple[Array, Array]:
     """Return force at full activation and passive force (f, m), N."""
-    if sharing.law == "hill":
-        speeds = -np.einsum("fmn,fn->fm", pulls.moment_arms, rates)
-        return rigid_tendon_strength(muscles, pulls.lengths_m, speeds)
-    strength = np.array([muscle.max_isometric_force_N for muscle in muscles])
-    shape = pulls.lengths_m.shape
-    return np.broadcast_to(strength, shape), np.zeros(shape)
+    model = kinematics.model
+    muscles = [model.muscles[name] for name in pulls.names]
+    if sharing.law == "isometric":
+        strength = np.array([muscle.max_isometric_force_N for muscle in muscles])
+        shape = pulls.lengths_m.shape
+        return np.broadcast_to(strength, shape), np.zeros(shape)
+    lengths, arms = pulls.lengths_m.copy(), pulls.moment_arms.copy()
+    twins = length_twins(model)
+    measured = [k for k, name in enumerate(pulls.names) if name in twins]
+    if measured:
+        lines = LineSet(kinematics, [twins[pulls.names[k]] for k in measured]).at(motion.q)
+        lengths[:, measured], arms[:, measured] = lines.lengths_m, lines.moment_arms
+    return rigid_tendon_strength(muscles, lengths, -np.einsum("fmn,fn->fm", arms, motion.rates))
 
 
 def _check(
