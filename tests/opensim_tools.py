@@ -135,6 +135,21 @@ class Tools:
         seconds = self._analyse("so", analysis, first, last, every)
         return read_table(self.folder / "so_StaticOptimization_activation.sto").columns, seconds
 
+    def moment_arms(
+        self, coordinates: tuple[str, ...], first: float, last: float, every: int
+    ) -> dict[str, dict]:
+        """Return coordinate -> moment arms by muscle, constraints included."""
+        analysis = self.opensim.MuscleAnalysis()
+        analysis.setName("MuscleAnalysis")
+        analysis.setComputeMoments(True)
+        words = self.opensim.ArrayStr()
+        for name in coordinates:
+            words.append(name)
+        analysis.setCoordinates(words)
+        self._analyse("ma", analysis, first, last, every)
+        stem = str(self.folder / "ma_MuscleAnalysis_MomentArm_")
+        return {name: read_table(Path(f"{stem}{name}.sto")).columns for name in coordinates}
+
     def knee_reaction(self, first: float, last: float, every: int) -> tuple[dict, float]:
         """Return force and moment on the tibia at the tray's weld, in ground, with those forces."""
         analysis = self.opensim.JointReaction()

@@ -7,7 +7,7 @@ from jw_gait import gait, needs_jw
 from opensim_models import kinematics
 from plane_leg import muscle, plane_leg
 from tkamb.errors import InputError
-from tkamb.geometry.frames import inverse
+from tkamb.geometry.frames import inverse, rotate
 from tkamb.importing.anatomy import find_leg
 from tkamb.muscles import Sharing, solve_trial
 from tkamb.muscles.leg import leg_bones
