@@ -12,8 +12,8 @@ from tkamb.geometry.frames import Array
 from tkamb.importing.model_fit import fit_model
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.ground_reaction import GroundReaction, load_ground_reaction
-from tkamb.inputs.labels import matched_labels
-from tkamb.inputs.tables import Table, read_table
+from tkamb.inputs.tables import read_table
+from tkamb.muscles.leg import foot_loads
 from tkamb.opensim.kinematics import Kinematics
 from tkamb.opensim.motion import CoordinateMotion
 from tkamb.opensim.read import read_osim
@@ -21,14 +21,14 @@ from tkamb.scene_tables import GroundReactionTable
 
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw"
 AXES = "-x,+z,+y"
-PLATES = {"calcaneus": (2, 3), "calcaneus_l": (1,)}
+PLATES = {"right": (2, 3), "left": (1,)}
 CUTOFF_HZ = 6.0
 needs_jw = pytest.mark.skipif(not JW.is_dir(), reason="subject JW is absent from ../shared/data")
 
 
 @dataclass(frozen=True, eq=False)
 class Gait:
-    """A trial; loads by body as recorded at the frames, and as wrenches at ground's origin."""
+    """A trial; ground reactions by side; as loads, wrenches at ground's origin by body."""
 
     kinematics: Kinematics
     motion: CoordinateMotion
@@ -36,31 +36,28 @@ class Gait:
 
     @property
     def loads(self) -> dict[str, Array]:
-        return {
-            body: np.hstack([np.cross(r.point, r.force) + r.moment, r.force])
-            for body, r in self.reactions.items()
-        }
+        return foot_loads(self.kinematics.model, self.reactions)
 
 
 @cache
 def gait(start: float = 1.9, end: float = 4.2) -> Gait:
     path = JW / "motion" / "jw_ngait_og3.c3d"
     model = read_osim(JW / "JW.osim")
-    recorded = _turned(read_table(path), model.markers)
-    chain, fit = fit_model(model, recorded)
+    recorded = read_table(path)
+    chain, fit = fit_model(model, recorded, laboratory_axes=AXES)
     assert fit.solved.all()
     time = recorded.columns["time"]
     inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
     q = differentiate_coordinates(time, fit.state, CUTOFF_HZ, inside)[0]
     reactions = {
-        body: load_ground_reaction(
+        side: load_ground_reaction(
             GroundReactionTable(
                 file=path, plates=plates, laboratory_axes=AXES, cutoff_Hz=CUTOFF_HZ
             ),
             inside,
             "right",
         )
-        for body, plates in PLATES.items()
+        for side, plates in PLATES.items()
     }
     return Gait(chain.kinematics, natural_motion(inside, q), reactions)
 
@@ -70,14 +67,3 @@ def natural_motion(time: Array, q: Array) -> CoordinateMotion:
     ends = [(order, np.zeros(q.shape[1])) for order in (3, 4)]
     spline = make_interp_spline(time, q, 5, bc_type=(ends, ends))
     return CoordinateMotion(time, q, spline(time, 1), spline(time, 2))
-
-
-def _turned(recorded: Table, markers) -> Table:
-    """Return the model's markers of a recording in the model's ground, y up."""
-    turn = np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]])
-    columns = {"time": recorded.columns["time"]}
-    labels = [c[:-2] for c in recorded.columns if c.endswith("_x")]
-    for label in matched_labels(markers, labels).values():
-        path = np.stack([recorded.columns[f"{label}_{a}"] for a in "xyz"], axis=1) @ turn.T
-        columns |= {f"{label}_{a}": path[:, k] for k, a in enumerate("xyz")}
-    return Table(recorded.path, columns, "m")

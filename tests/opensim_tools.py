@@ -37,7 +37,7 @@ class Tools:
         columns = dict(zip(names, trial.motion.q.T, strict=True))
         write_storage(folder / "q.mot", {"time": time_s} | columns, in_degrees=False)
         loads = {"time": time_s}
-        for body, reaction in trial.reactions.items():
+        for body, reaction in zip(trial.loads, trial.reactions.values(), strict=True):
             for kind in ("force", "point", "moment"):
                 values = getattr(reaction, kind)
                 loads |= {f"{body}_{kind}_{a}": values[:, k] for k, a in enumerate("xyz")}
@@ -48,7 +48,7 @@ class Tools:
         document = ElementTree.Element("OpenSimDocument", Version="40000")
         loads = ElementTree.SubElement(document, "ExternalLoads", name="plates")
         objects = ElementTree.SubElement(loads, "objects")
-        for body in self.trial.reactions:
+        for body in self.trial.loads:
             force = ElementTree.SubElement(objects, "ExternalForce", name=body)
             for tag, text in (
                 ("applied_to_body", body),

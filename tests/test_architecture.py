@@ -13,6 +13,7 @@ FORBIDDEN = {
     "contact": ("body", "inputs", "mechanics", "equilibrium", "run", "output"),
     "inputs": ("body", "contact", "mechanics", "equilibrium", "run", "output"),
     "opensim": ("body", "contact", "mechanics", "equilibrium", "run", "output"),
+    "muscles": ("body", "contact", "mechanics", "equilibrium", "run", "output"),
     "mechanics": ("contact", "equilibrium", "run", "output"),
     "equilibrium": ("inputs", "run", "output", "studies", "view"),
     "output": ("body", "inputs"),

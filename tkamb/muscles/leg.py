@@ -1,11 +1,14 @@
-"""Which coordinates and muscles of a model belong to a leg."""
+"""Which coordinates and muscles of a model belong to a leg, and what loads its foot."""
 
+from collections.abc import Mapping
 from itertools import combinations
 
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.importing.anatomy import Leg
+from tkamb.geometry.frames import Array
+from tkamb.importing.anatomy import Leg, find_leg
+from tkamb.inputs.ground_reaction import GroundReaction
 from tkamb.opensim.lines import Muscle, PathPoint
 from tkamb.opensim.model import Joint, OpenSimModel
 
@@ -64,6 +67,23 @@ def length_twins(model: OpenSimModel) -> dict[str, str]:
     pairs = [p for p in combinations(model.muscles.values(), 2) if _same_muscle(*p)]
     ordered = [sorted(pair, key=lambda muscle: len(muscle.path.points)) for pair in pairs]
     return {whole.name: twin.name for twin, whole in ordered}
+
+
+def foot_loads(model: OpenSimModel, reactions: Mapping[str, GroundReaction]) -> dict[str, Array]:
+    """Return body -> (f, 6) moment above force on each foot, in ground at ground's origin.
+
+    The body is the heaviest below the ankle, so that talus and toes are held through it.
+
+    Args:
+        model: whose ground is the laboratory, x forward, y up, z right.
+        reactions: side -> ground reaction, none of them mirrored (loaded as of a right foot).
+    """
+    loads = {}
+    for side, reaction in reactions.items():
+        foot = max(find_leg(model, side).foot, key=lambda body: model.bodies[body].mass_kg)
+        moment = np.cross(reaction.point, reaction.force) + reaction.moment
+        loads[foot] = np.hstack([moment, reaction.force])
+    return loads
 
 
 def check_extensors(leg: Leg, muscles: tuple[str, ...]) -> None:
