@@ -5,6 +5,8 @@ optimiser sometimes stops at a point that balances but is not the least: 80 time
 frame of the trial here. Such frames are told by their cost and compared with nothing.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -68,10 +70,11 @@ class Compared:
         """Return the root mean square difference of activations (k, m) at the frames."""
         return float(np.sqrt(np.mean((activation - self.theirs)[self.optimal] ** 2)))
 
-    def own_reaction(self):
-        """Return the force on the tibia at the frames in ground (k, 3)."""
-        pose = self.own.bones.poses[:, self.own.bones.index("tibia"), :3, :3]
-        force = np.einsum("fij,fj->fi", pose, self.own.knee_reaction()[:, 3:])
+    def own_reaction(self, force_N=None):
+        """Return the force on the tibia at the frames in ground (k, 3), of any muscle forces."""
+        own = self.own if force_N is None else replace(self.own, force_N=force_N)
+        pose = own.bones.poses[:, own.bones.index("tibia"), :3, :3]
+        force = np.einsum("fij,fj->fi", pose, own.knee_reaction()[:, 3:])
         return force[self.frames]
 
 
@@ -99,8 +102,6 @@ def test_wrapped_lines_differ_by_their_moment_arms_alone(tools):
     arms = np.stack(
         [np.stack([theirs[c][m] for m in own.muscles], axis=1) for c in own.coordinates], axis=2
     )
-    muscles = [tools.trial.kinematics.model.muscles[name] for name in own.muscles]
-    strength = np.array([muscle.max_isometric_force_N for muscle in muscles])
     shape = len(both.frames), len(muscles)
     problems = FrameProblems(
         muscles,
