@@ -24,10 +24,10 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 from lattice_cases import two_condyles  # noqa: E402
+from tkamb.atomic import claim_directory, write_text  # noqa: E402
 from tkamb.contact.materials import material  # noqa: E402
 from tkamb.contact.pair import ContactPair  # noqa: E402
 from tkamb.contact.registry import contact_model  # noqa: E402
-from tkamb.output.atomic import claim_directory, write_text  # noqa: E402
 from tkamb.press.press import peak_rss  # noqa: E402
 from tkamb.studies.calculix import press_by_calculix  # noqa: E402
 from tkamb.studies.calculix_run import find_program  # noqa: E402

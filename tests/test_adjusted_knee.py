@@ -5,9 +5,9 @@ import pytest
 
 from scenes import write_scene
 from tkamb import load_scene, simulate
-from tkamb.case import load_case
 from tkamb.equilibrium.contact_side import ContactSide
-from tkamb.mechanics.mechanics import Mechanics
+from tkamb.equilibrium.mechanics import Mechanics
+from tkamb.scene.case import load_case
 
 FRAMES = slice(3, 26, 10)
 

@@ -11,7 +11,7 @@ from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.ground_reaction import load_ground_reaction
 from tkamb.inputs.labels import matched_labels
 from tkamb.inputs.tables import read_table
-from tkamb.scene_tables import GroundReactionTable
+from tkamb.scene.tables import GroundReactionTable
 
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw" / "motion"
 COUNT, RATIO = 20, 10

@@ -243,12 +243,12 @@ def test_ground_reaction_fits_a_whole_body_in_balance(motion):
 
 
 def test_package_finds_the_patella_where_the_script_put_it(motion):
-    from tkamb.case import load_case
-    from tkamb.mechanics.extensor import ExtensorFrames
+    from tkamb.equilibrium.mechanics import extensor_frames
+    from tkamb.scene.case import load_case
 
     case = load_case(load_scene(MODEL / "scene.toml", {"patella.motion": "solved"}))
     frames = np.arange(0, 101, 5)
-    found = ExtensorFrames(case, knee_pose(case.motion.coordinates)[frames]).states
+    found = extensor_frames(case, knee_pose(case.motion.coordinates)[frames]).states
     for k, state in zip(frames, found, strict=True):
         ap, si, rotation = state.coordinates
         assert ap * 1e3 == pytest.approx(motion["patella_ap_mm"][k], abs=0.03)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from tkamb.body.ligaments import build_ligaments, quadratic_toe_force
-from tkamb.case import Case, load_case
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
@@ -20,6 +19,7 @@ from tkamb.inputs.motion import load_motion
 from tkamb.inputs.tables import read_table
 from tkamb.inputs.tibia import load_tibia
 from tkamb.scene import load_scene
+from tkamb.scene.case import Case, load_case
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data" / "dm"
@@ -212,7 +212,7 @@ def test_ligaments_are_near_their_slack_length_in_stance():
     }
     bundles: dict[str, list] = {}
     total = np.zeros(len(femur))
-    for strand in build_ligaments(case().scene.ligament, poses, motion.coordinates[:, 5]):
+    for strand in build_ligaments(case().ligaments, poses, motion.coordinates[:, 5]):
         length = strand.length(poses)
         bundles.setdefault(re.sub(r"\d+$", "", strand.name), []).append(strand.strain(length))
         total += strand.force(length)

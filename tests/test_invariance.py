@@ -13,14 +13,14 @@ from scipy.spatial.transform import Rotation
 from scenes import MODEL, write_scene
 from tkamb.body import knee, patellofemoral, unknowns
 from tkamb.body.chain import Chain
-from tkamb.case import Case, load_case
-from tkamb.geometry import close_region, condyles
+from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
+from tkamb.geometry import closest, condyles
 from tkamb.geometry.frames import pose
 from tkamb.geometry.nearest import NearestPoints
 from tkamb.geometry.surface import Surface
 from tkamb.inputs.patient import load_urdf
-from tkamb.mechanics.mechanics import FrameLoads, Mechanics
 from tkamb.scene import Scene, load_scene
+from tkamb.scene.case import Case, load_case
 
 FEW = 26
 FRAMES = (0, 9, 15, 23)
@@ -48,8 +48,8 @@ def numbers(frame: FrameLoads) -> np.ndarray:
             loads.external_flexion,
             loads.external_adduction,
             loads.sensitivity,
-            *frame.tensions.values(),
-            frame.wrap,
+            *frame.geometry.tensions.values(),
+            frame.geometry.extensor.wrap,
         ]
     )
 
@@ -238,8 +238,8 @@ def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
     own_lengths = {
         knee: ("RESIDUAL_SHIFT",),
         patellofemoral: ("PATCH_DEPTH", "SAMPLE_SPACING", "REACH"),
-        close_region: ("RESOLUTION", "REACH", "_SPACING", "_DOUBT"),
-        condyles: ("NOTCH_DEPTH", "_STRIP", "_DEEPEST"),
+        closest: ("FACET_DEPTH", "REGION_RADIUS", "SAMPLE_SPACING", "ESTIMATE_ERROR"),
+        condyles: ("NOTCH_DEPTH", "STRIP_WIDTH", "_DEEPEST"),
     }
     for module, names in own_lengths.items():
         for name in names:
@@ -262,9 +262,13 @@ def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
             before.loads.external_flexion * FORCE * LENGTH, rel=1e-9, abs=1e-9
         )
         assert after.loads.sensitivity == pytest.approx(before.loads.sensitivity * FORCE, rel=1e-6)
-        assert after.wrap == pytest.approx(before.wrap, abs=1e-9)
-        for name, tension in before.tensions.items():
-            assert after.tensions[name] == pytest.approx(tension * FORCE, rel=1e-9, abs=1e-9)
+        assert after.geometry.extensor.wrap == pytest.approx(
+            before.geometry.extensor.wrap, abs=1e-9
+        )
+        for name, tension in before.geometry.tensions.items():
+            assert after.geometry.tensions[name] == pytest.approx(
+                tension * FORCE, rel=1e-9, abs=1e-9
+            )
 
 
 def resampled_scene(folder, rate, cutoff, start=1.0, stop=2.0):

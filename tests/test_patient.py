@@ -12,7 +12,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, mirrored_pose
 from tkamb.inputs.patient import load_urdf
 from tkamb.inputs.segments import segment_inertia
-from tkamb.scene_tables import PatientTable
+from tkamb.scene.tables import PatientTable
 
 LOOP = '<joint name="loop" type="fixed"><parent link="femur"/><child link="tibia"/></joint>'
 

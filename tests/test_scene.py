@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from scenes import MODEL, write_scene
-from tkamb.case import load_case
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 ROOT = Path(__file__).parents[1]
 

@@ -5,8 +5,8 @@ import pytest
 
 from scenes import fast_scene, write_scene
 from tkamb import load_scene, simulate
+from tkamb.columns import COLUMNS
 from tkamb.errors import InputError
-from tkamb.run.columns import COLUMNS
 
 EVERY_TENTH = slice(0, 101, 10)
 

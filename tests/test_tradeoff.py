@@ -8,20 +8,19 @@ import numpy as np
 import pytest
 
 from scenes import write_scene
-from tkamb.case import load_case
 from tkamb.cli import main
 from tkamb.contact.registry import BUILT_IN, contact_model
 from tkamb.errors import InputError
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 from tkamb.studies import matrix, tradeoff
 from tkamb.studies.body_trade import CHANGES, body_table, run_body_trade
-from tkamb.studies.cases import case_names, study_case
+from tkamb.studies.cases import case_names, copied_scene, study_case, thin_out
 from tkamb.studies.elastic_layer import sphere_on_layer
 from tkamb.studies.front import NOISE, moved, on_front
 from tkamb.studies.kept_rows import KeptRows
 from tkamb.studies.measures import Job, measure, measure_apart
 from tkamb.studies.quantities import common_limit, errors, map_error, quantities, raster_map
-from tkamb.studies.recordings import copied_scene, thin_out
 from tkamb.studies.references import (
     compute_reference,
     limits,

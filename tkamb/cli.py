@@ -150,10 +150,10 @@ def _run(options: argparse.Namespace) -> int:
     from tkamb.run.profiling import Profile, profile_lines
 
     profile = Profile() if options.profile else None
+    from tkamb.claim import claimed_directory
     from tkamb.output.axis import horizontal_axis
-    from tkamb.output.claim import claimed_directory
     from tkamb.output.headline import cards
-    from tkamb.results import write_results
+    from tkamb.results_folder import write_results
     from tkamb.run.status import FAILED
     from tkamb.simulation import simulate
 
@@ -209,7 +209,7 @@ def _default_directory(scene: Path) -> Path:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from tkamb.verify import verify_results
+    from tkamb.results_folder import verify_results
 
     verdict = verify_results(options.folder)
     print("\n".join(f"{options.folder}: {line}" for line in verdict.lines()))
@@ -217,9 +217,9 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from tkamb.output.claim import claimed_directory
+    from tkamb.claim import claimed_directory
     from tkamb.output.report import write_report
-    from tkamb.results import REPORT_NAME, read_results
+    from tkamb.results_folder import REPORT_NAME, read_results
 
     results = read_results(options.folder)  # before a folder is made or marked
     with claimed_directory(options.folder) as folder:

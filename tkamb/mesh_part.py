@@ -4,10 +4,10 @@ from pathlib import Path
 
 import trimesh
 
+from tkamb.atomic import replaced_file
 from tkamb.errors import InputError
-from tkamb.geometry.bodies import separate_bodies
+from tkamb.geometry.topology import separate_bodies
 from tkamb.inputs.mesh_check import mended_mesh
-from tkamb.output.atomic import replaced_file
 
 FORMATS = (".stl", ".ply", ".obj")
 

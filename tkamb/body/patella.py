@@ -5,9 +5,9 @@ and three equations of a massless patella without friction:
 
     gap to the femoral component = 0
     length of the patellar ligament = its given length
-    quadriceps, ligament and contact force meet in one point (moment balance in the plane)
+    muscle, ligament and contact force meet in one point (moment balance in the plane)
 
-By virtual work the third says that the quadriceps' length is stationary among all places
+By virtual work the third says that the muscle's length is stationary among all places
 that satisfy the first two; a stable patella sits at a minimum of it. So the search turns
 the patella in the direction of the unbalanced moment until that changes sign.
 """
@@ -49,11 +49,11 @@ class _Lost(ComputationError):
 
 @dataclass(frozen=True, eq=False)
 class _Balance:
-    """Forces on the patella per unit quadriceps tension, in the joint's frame."""
+    """Forces on the patella per unit tension of the muscle, in the joint's frame."""
 
     coordinates: Array
     contact: PatellarContact
-    quadriceps: TautPath
+    muscle: TautPath
     ligament: TautPath
     ligament_force: float
     normal_force: float
@@ -113,7 +113,7 @@ class _Frame:
         self.in_insert = np.asarray(pose_femur_in_insert, float) @ mechanism.pose_joint_in_femur
         self.insert = inverse(self.in_insert)
         self.femur = inverse(mechanism.pose_joint_in_femur)
-        self.origin = transform(self.femur, mechanism.quadriceps_origin)
+        self.origin = transform(self.femur, mechanism.muscle_origin)
         self.tuberosity = transform(self.insert, mechanism.ligament_distal)
 
     def balance(self, coordinates: Array) -> _Balance:
@@ -121,33 +121,33 @@ class _Frame:
         m = self.mechanism
         here = m.contact.pose(coordinates)
         contact = m.contact.at(coordinates)
-        quadriceps = path_in_link(
-            self.origin, transform(here, m.quadriceps_insertion), m.femoral_outline, self.femur
+        muscle = path_in_link(
+            self.origin, transform(here, m.muscle_insertion), m.femoral_outline, self.femur
         )
         ligament = path_in_link(
             transform(here, m.ligament_proximal), self.tuberosity, m.insert_outline, self.insert
         )
-        pull, hold = -quadriceps.end_direction[:2], ligament.start_direction[:2]
+        pull, hold = -muscle.end_direction[:2], ligament.start_direction[:2]
         sides = np.column_stack([hold, contact.normal[:2]])
         if abs(np.linalg.det(sides)) < 1e-6:
             raise ComputationError("the patellar ligament runs along the contact normal")
         ligament_force, normal_force = np.linalg.solve(sides, -pull)
         moment = (
-            _cross(quadriceps.points[-1], pull)
+            _cross(muscle.points[-1], pull)
             + ligament_force * _cross(ligament.points[0], hold)
             + normal_force * _cross(contact.point, contact.normal)
         )
         return _Balance(
             coordinates,
             contact,
-            quadriceps,
+            muscle,
             ligament,
             float(ligament_force),
             float(normal_force),
             float(moment),
         )
 
-    def settled(self, start: Array, rotation: float) -> _Balance:
+    def at_rotation(self, start: Array, rotation: float) -> _Balance:
         """Return the balance where gap and ligament length hold at a rotation (Newton).
 
         Raises:
@@ -174,11 +174,11 @@ class _Frame:
         Raises:
             ComputationError: there is none within `WIDEST_TURN`.
         """
-        here = self.settled(guess, float(guess[2]))
+        here = self.at_rotation(guess, float(guess[2]))
         step = FIRST_STEP
         while abs(here.coordinates[2] - guess[2]) < WIDEST_TURN:
             turn = here.coordinates[2] + np.sign(here.moment) * step
-            there = self.settled(here.coordinates, float(turn))
+            there = self.at_rotation(here.coordinates, float(turn))
             if there.moment * here.moment <= 0.0:
                 return self.between(here, there)
             here, step = there, 1.6 * step
@@ -190,7 +190,7 @@ class _Frame:
 
         def moment(rotation: float) -> float:
             nonlocal last
-            last = self.settled(last.coordinates, rotation)
+            last = self.at_rotation(last.coordinates, rotation)
             return last.moment
 
         ends = (here.coordinates[2], there.coordinates[2])
@@ -198,7 +198,7 @@ class _Frame:
         return last
 
     def scan(self) -> tuple[_Balance, bool]:
-        """Return the stable balance with the shortest quadriceps, and whether there are more.
+        """Return the stable balance with the shortest muscle, and whether there are more.
 
         Raises:
             _Lost: there is none; with the condition that the nearest miss did not meet.
@@ -223,7 +223,7 @@ class _Frame:
         if not found:
             misses += [PatellaStatus.MOMENT] * any(places)
             raise _Lost(max(misses, key=_CONDITIONS.index))
-        return min(found, key=lambda b: b.quadriceps.length), len(found) > 1
+        return min(found, key=lambda b: b.muscle.length), len(found) > 1
 
     def first_touch(self, rotation: float) -> _Balance:
         """Return the balance at a rotation, the patella swung in on its ligament from in front.
@@ -248,7 +248,7 @@ class _Frame:
         for _ in range(6):
             middle = 0.5 * (free + deep)
             free, deep = (free, middle) if m.contact.touches(place(middle)) else (middle, deep)
-        found = self.settled(place(free), rotation)
+        found = self.at_rotation(place(free), rotation)
         if np.linalg.norm((found.coordinates - place(free))[:2]) > NEAR:
             raise _Lost(PatellaStatus.GAP)
         return found

@@ -37,8 +37,8 @@ class PatellaState:
             plane, insert frame.
         contact_on_patella: (3,) m, the same point in the patella's frame.
         gap: m, positive when apart.
-        ligament_ratio: patellar ligament tension per quadriceps tension, massless patella.
-        patellofemoral_ratio: patellofemoral force per quadriceps tension, massless patella.
+        ligament_ratio: patellar ligament tension per tension of the muscle, massless patella.
+        patellofemoral_ratio: patellofemoral force per tension of the muscle, massless patella.
         shift: m along z, the mediolateral shift that is left out of the motion; first order.
         tilt: rad about y, likewise.
         status: how the search ended.
@@ -63,8 +63,8 @@ class ExtensorMechanism:
     Args:
         contact: button against femoral component, in the patellar joint's frame.
         pose_joint_in_femur: (4, 4), the patellar joint's frame on the femur link.
-        quadriceps_origin: (3,) m, femur link.
-        quadriceps_insertion: (3,) m, patella link.
+        muscle_origin: (3,) m, femur link; of the stretch that leaves the femur.
+        muscle_insertion: (3,) m, patella link.
         ligament_proximal: (3,) m, patella link.
         ligament_distal: (3,) m, insert frame.
         ligament_length: m.
@@ -74,8 +74,8 @@ class ExtensorMechanism:
 
     contact: PatellofemoralContact
     pose_joint_in_femur: Array
-    quadriceps_origin: Array
-    quadriceps_insertion: Array
+    muscle_origin: Array
+    muscle_insertion: Array
     ligament_proximal: Array
     ligament_distal: Array
     ligament_length: float

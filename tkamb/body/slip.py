@@ -21,11 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tkamb.geometry.condyles import LowestPoints
 from tkamb.geometry.first_touch import FirstTouch
-from tkamb.geometry.frames import Array, inverse, knee_pose, rotate, transform
-from tkamb.geometry.lowest import LowestPoints
-from tkamb.geometry.rays import RayCaster
-from tkamb.geometry.smooth_normals import smooth_normals
+from tkamb.geometry.frames import Array, inverse, knee_pose, knee_twist, rotate, transform
 from tkamb.geometry.surface import Surface
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -64,7 +62,7 @@ class InsertProfile:
     """
 
     def __init__(self, insert: Surface) -> None:
-        self._insert, self._rays = insert, RayCaster(insert)
+        self._insert = insert
         self._above = float(insert.bounds[1, 1]) + 1e-3
 
     def at(self, points: Array) -> tuple[Array, Array]:
@@ -75,13 +73,13 @@ class InsertProfile:
         """
         start = np.array(points, float)
         start[:, 1] = self._above
-        distance, face = self._rays.first(start, -UP)
+        distance, face = self._insert.rays.first(start, -UP)
         hit = face >= 0
         height, slope = np.full(len(start), np.nan), np.full(len(start), np.nan)
         height[hit] = self._above - distance[hit]
         feet = start[hit]
         feet[:, 1] = height[hit]
-        normal = smooth_normals(self._insert, feet, face[hit])
+        normal = self._insert.smooth_normals(feet, face[hit])
         slope[hit] = np.arctan2(-normal[:, 0], normal[:, 1])
         return height, slope
 
@@ -175,6 +173,23 @@ def sliding_velocity(velocity: Array, spin: Array, arm: Array, lever: Array) -> 
         lever: (f,) m, z from the component's geometric centre to the contact point.
     """
     return np.asarray((velocity + np.cross(spin, arm))[:, 0] - spin[:, 1] * lever)
+
+
+def forward_sliding(coordinates: Array, rates: Array, centre: Array, contact: Array) -> float:
+    """Return the forward sliding (m/s) at a contact point by rigid-body kinematics.
+
+    Args:
+        coordinates: (6,) knee coordinates, m and rad.
+        rates: (6,) their rates.
+        centre: (3,) m, geometric centre of the component, femoral frame.
+        contact: (3,) m, insert frame.
+    """
+    velocity, spin = knee_twist(coordinates, rates)
+    arm, lever = (
+        contact - coordinates[:3],
+        contact[2] - transform(knee_pose(coordinates), centre)[2],
+    )
+    return float(sliding_velocity(velocity[None], spin[None], arm[None], np.array([lever]))[0])
 
 
 def roll_slip_motion(

@@ -4,10 +4,9 @@ All points and directions are in the insert frame, SI. A pair of loads is equal 
 opposite, so that only the hip and the ground act on the leg from outside.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from tkamb.body.contact_points import CondylePoint
 from tkamb.body.inverse_dynamics import Unknown
 from tkamb.body.load import PointForces
 from tkamb.geometry.frames import Array
@@ -15,35 +14,8 @@ from tkamb.geometry.frames import Array
 AXES = {"ap": np.array([1.0, 0, 0]), "si": np.array([0, 1.0, 0]), "ml": np.array([0, 0, 1.0])}
 """Insert axes: x anterior, y superior, z to the right."""
 
-STANDSTILL = 1e-3
-"""m/s: friction fades below this sliding speed, where its direction is not defined."""
-
-
-@dataclass(frozen=True, eq=False)
-class CondylePoint:
-    """Where one condyle touches the insert.
-
-    Args:
-        point: (3,) m.
-        normal: (3,) unit, out of the insert into the femur.
-        sliding: (3,) m/s, velocity of the femur's point relative to the insert's.
-        gap: m, positive when apart.
-    """
-
-    point: Array
-    normal: Array
-    sliding: Array
-    gap: float
-
-    def direction(self, friction: float) -> Array:
-        """Return the contact force on the femur (3,) per unit normal force.
-
-        n - mu t, with t = v / sqrt(|v|² + v0²) for the tangential velocity v: Coulomb
-        friction against the sliding, fading below v0 = 1 mm/s.
-        """
-        tangential = self.sliding - (self.sliding @ self.normal) * self.normal
-        speed = np.sqrt(tangential @ tangential + STANDSTILL**2)
-        return np.asarray(self.normal - friction * tangential / speed)
+MUSCLE = "muscle_"
+"""Begins the names of the muscles' tensions."""
 
 
 def pair(link: str, other: str, point: Array, force: Array) -> tuple[PointForces, ...]:
@@ -60,6 +32,11 @@ def moment_pair(link: str, other: str, moment: Array) -> tuple[PointForces, ...]
         PointForces(link, nothing, nothing, moment),
         PointForces(other, nothing, nothing, -moment),
     )
+
+
+def muscle_load(name: str) -> str:
+    """Return the name of a muscle's tension among the unknown loads."""
+    return MUSCLE + name
 
 
 def hip(point: Array) -> list[Unknown]:
@@ -109,7 +86,7 @@ def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown
     ]
 
 
-def riding_patella(point: Array, femur_ml: Array) -> list[Unknown]:
+def unloaded_patella(point: Array, femur_ml: Array) -> list[Unknown]:
     """Return what carries the patella's own weight when the extensor mechanism is slack.
 
     Args:

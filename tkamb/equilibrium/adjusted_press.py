@@ -40,10 +40,10 @@ def press_adjusted(
         ComputationError: the femoral component does not lie over the insert.
     """
     result = model.press(state, load, adjustment.pose, guess)
-    settled = adjustment.coronal_angle == 0.0 or adjustment.restored
-    if result.status is not ContactStatus.OK or settled:
+    final = adjustment.coronal_angle == 0.0 or adjustment.restored
+    if result.status is not ContactStatus.OK or final:
         return result, replace(adjustment, penetration=float(result.approach))
-    checked = _checked(query, adjustment, result)
+    checked = _check(query, adjustment, result)
     exceeded = (
         checked.penetration > abs(checked.translation),
         abs(checked.final_angle) > abs(checked.coronal_angle),
@@ -56,7 +56,7 @@ def press_adjusted(
     return result, replace(checked, pose=restored, translation=-travel, restored=True)
 
 
-def _checked(query: ClosestPointQuery, adjustment: Adjustment, result: ContactResult) -> Adjustment:
+def _check(query: ClosestPointQuery, adjustment: Adjustment, result: ContactResult) -> Adjustment:
     medial, lateral = touches(query, result.pose)
     angle = (medial - lateral) / adjustment.intercondylar_distance
     return replace(adjustment, penetration=-min(medial, lateral), final_angle=angle)

@@ -6,7 +6,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.geometry.corner_normals import corner_normals
 from tkamb.geometry.frames import Array
 from tkamb.geometry.subdivision import Coarsened, coarsened
 from tkamb.geometry.surface import Surface
@@ -34,7 +33,7 @@ class CurvedSurface:
 
     Args:
         surface: its triangles share their vertices.
-        normals: (k, 3, 3) unit normals at the corners, see `corner_normals`.
+        normals: (k, 3, 3) unit normals at the corners, see `Surface.corner_normals`.
         sagittas: (k, 3) m, of the edge opposite each corner, along the triangle's normal.
         finer: the triangles that points are given on, and where they lie on the surface's;
             None: they are the surface's own.
@@ -54,7 +53,7 @@ class CurvedSurface:
         """Return the patches of a surface from its own corner normals."""
         finer = coarsened(surface)
         surface = surface if finer is None else finer.surface
-        normals = corner_normals(surface)
+        normals = surface.corner_normals
         return cls(surface, normals, _sagittas(surface, normals), finer)
 
     @cached_property

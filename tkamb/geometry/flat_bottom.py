@@ -58,10 +58,7 @@ def find_flats(surface: Surface) -> list[FlatBottom]:
     refitted with tolerances that follow the mesh's own noise. Its triangles are set aside
     and the search repeats while a flat of comparable area is found.
     """
-    corners = surface.triangles
-    normals = surface.face_normals
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = 0.5 * np.linalg.norm(cross, axis=1)
+    normals, area = surface.face_normals, surface.areas
     free = area > 0
     flats: list[FlatBottom] = []
     for _ in range(12):

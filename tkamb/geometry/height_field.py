@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
+from tkamb.geometry.ragged import counted
 from tkamb.geometry.surface import Surface
 
 Index = NDArray[np.int64]
@@ -114,8 +115,7 @@ def _crossings(
         np.searchsorted(second, high[:, 1], "right"),
     )
     count = (a1 - a0) * (b1 - b0)
-    face = np.repeat(np.arange(len(count)), count)
-    rank = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    face, rank = counted(count)
     width = (b1 - b0)[face]
     a, b = a0[face] + rank // np.maximum(width, 1), b0[face] + rank % np.maximum(width, 1)
     points = np.column_stack([first[a], second[b]])

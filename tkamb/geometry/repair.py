@@ -8,8 +8,16 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from tkamb.geometry.boundary import BoundaryLoop, boundary_loops, edge_use, half_edges, open_edges
 from tkamb.geometry.frames import Array
+from tkamb.geometry.topology import (
+    BoundaryLoop,
+    boundary_loops,
+    connected_parts,
+    edge_use,
+    half_edges,
+    open_edges,
+    signed_volumes,
+)
 
 Indices = NDArray[np.int64]
 
@@ -212,21 +220,6 @@ def _outward(vertices: Array, faces: Indices) -> tuple[Indices, int]:
 
 def _box(corners: Array) -> tuple[Array, Array]:
     return corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-
-
-def connected_parts(faces: Indices) -> Indices:
-    """Return for every face (k,) the number of the connected part that it belongs to."""
-    n = int(faces.max(initial=0)) + 1
-    edges = half_edges(faces)
-    graph = coo_matrix((np.ones(len(edges), bool), edges.T), shape=(n, n))
-    label = connected_components(graph, directed=False)[1]
-    return np.unique(label[faces[:, 0]], return_inverse=True)[1].reshape(-1)
-
-
-def signed_volumes(vertices: Array, faces: Indices) -> Array:
-    """Return the volume (k,) that each face spans with the centre of the vertices, m³."""
-    a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
-    return np.asarray(np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
 
 
 def _referenced(vertices: Array, faces: Indices) -> tuple[Array, Indices]:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tkamb.geometry.boundary import edge_use
 from tkamb.geometry.frames import Array
+from tkamb.geometry.ragged import Ragged
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.topology import edge_use
 
 Indices = NDArray[np.int64]
 
@@ -94,12 +95,7 @@ class _Search:
     def __init__(self, surface: Surface, across: Indices) -> None:
         self._faces, self._points, self._across = surface.faces, surface.vertices, across
         self._near = ROUNDING * float(np.linalg.norm(np.ptp(surface.bounds, axis=0)))
-        order = np.argsort(surface.faces.ravel(), kind="stable")
-        self._around = order // 3
-        self._corner = order % 3
-        self._first = np.searchsorted(
-            surface.faces.ravel()[order], np.arange(len(surface.vertices) + 1)
-        )
+        self._corners = Ragged.by_key(surface.faces.ravel(), len(surface.vertices))
 
     def tips(self, middle: Indices) -> Indices:
         """Return the vertices (m, 3) of the neighbours across from each corner's edge."""
@@ -149,10 +145,7 @@ class _Search:
 
     def _beyond(self, tips: Indices) -> Indices:
         """Return the faces across from each tip of all the faces around it."""
-        count = self._first[tips + 1] - self._first[tips]
-        begins = np.repeat(self._first[tips] - np.cumsum(count) + count, count)
-        place = begins + np.arange(count.sum())
-        return np.unique(self._across[self._around[place], self._corner[place]])
+        return np.unique(self._across.ravel()[self._corners.of(tips)[1]])
 
 
 def _across(faces: Indices) -> Indices:

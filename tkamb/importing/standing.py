@@ -15,7 +15,7 @@ from tkamb.inputs.leg_chain import LegChain
 from tkamb.inputs.marker_motion import both_fits, leg_segments, neutral_coordinates
 from tkamb.inputs.tables import read_table
 from tkamb.scene import Scene
-from tkamb.scene_tables import MarkersTable
+from tkamb.scene.tables import MarkersTable
 
 
 def with_static_markers(

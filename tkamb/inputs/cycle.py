@@ -7,7 +7,7 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.scene_tables import MotionTable
+from tkamb.scene.tables import MotionTable
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import check_roles, laboratory_rotation
 from tkamb.inputs.samples import OddSample, check_range, check_spacing, odd_samples
 from tkamb.inputs.tables import Table, read_table
-from tkamb.scene_tables import GroundReactionTable
+from tkamb.scene.tables import GroundReactionTable
 from tkamb.units import MILLIMETRE
 
 LEVEL_TOLERANCE = 0.01

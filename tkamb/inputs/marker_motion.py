@@ -30,7 +30,7 @@ from tkamb.inputs.leg_chain import FLEXION, LegChain, LegState, Segment
 from tkamb.inputs.markers import WRONG_MARKERS, fit_seen, marker_trajectories
 from tkamb.inputs.tables import Table, read_table
 from tkamb.inputs.tibia import BodyMotion
-from tkamb.scene_tables import MarkersTable, MotionTable
+from tkamb.scene.tables import MarkersTable, MotionTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 Method = Literal["segments", "chain"]

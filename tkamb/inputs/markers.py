@@ -7,7 +7,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, pose, transform
 from tkamb.inputs.labels import matched_labels
 from tkamb.inputs.tables import Table
-from tkamb.scene_tables import TibiaTable
+from tkamb.scene.tables import TibiaTable
 from tkamb.units import MILLIMETRE
 
 WRONG_MARKERS = 0.05

@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from tkamb.geometry.bodies import separate_bodies
-from tkamb.geometry.boundary import BoundaryLoop, boundary_loops
 from tkamb.geometry.flat_bottom import facing, find_flats
 from tkamb.geometry.frames import Array
 from tkamb.geometry.repair import Repair, connected_parts, repair
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.topology import BoundaryLoop, boundary_loops, separate_bodies
 from tkamb.inputs.meshes import BONE_SIZE, SHEET_WIDTH, Indices, plausible_units, read_triangles
 from tkamb.units import LENGTH
 

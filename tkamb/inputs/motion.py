@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from tkamb.errors import InputError
 from tkamb.geometry.frames import (
     KNEE_COORDINATES,
+    PATELLA_COORDINATES,
     Array,
     inverse,
     knee_coordinates,
@@ -27,13 +28,12 @@ from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import angle_scale, check_roles, poses_of_columns
 from tkamb.inputs.samples import OddSample, check_range, check_spacing, check_steps, odd_samples
 from tkamb.inputs.tables import Table, read_table
-from tkamb.scene_tables import MotionTable
+from tkamb.scene.tables import MotionTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.inputs.marker_motion import MarkerKinematics
 
-PATELLA_COORDINATES = ("patella_ap", "patella_si", "patella_rotation")
 LIMITS_DEG = {"axial_rotation": (-90, 90), "adduction": (-45, 45), "flexion": (-45, 180)}
 """Beyond these, columns, axes or units are mistaken; adduction also stays off its gimbal."""
 FARTHEST_MM = (-200, 200)

@@ -26,7 +26,7 @@ from tkamb.inputs.urdf_check import (
     check_tree,
     numbers_of,
 )
-from tkamb.scene_tables import PatientTable
+from tkamb.scene.tables import PatientTable
 
 PATELLA_MASS = 0.1
 """kg, at the patella link's origin unless the URDF says otherwise."""

@@ -21,7 +21,7 @@ from tkamb.inputs.laboratory import (
 from tkamb.inputs.markers import check_fit, complete_run, fit_rigid, shank_points
 from tkamb.inputs.samples import OddSample, check_range, check_spacing, check_steps, odd_samples
 from tkamb.inputs.tables import Table, read_table
-from tkamb.scene_tables import TibiaTable
+from tkamb.scene.tables import TibiaTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 MOST_LEAN_DEG = 150.0

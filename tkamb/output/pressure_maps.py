@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis
-from tkamb.output.maps_file import ContactMaps
+from tkamb.output.maps import ContactMaps
 from tkamb.output.metrics import map_rows, stretches
 from tkamb.output.panels import lateral_axis_name
 from tkamb.output.style import BLACK, GREY, PRESSURE_MAP, SIDE_COLOURS, new_figure, settings

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from tkamb.atomic import write_text
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.output.atomic import write_text
 
 
 def write_storage(path: Path, columns: Mapping[str, Array], in_degrees: bool) -> None:

@@ -1,6 +1,6 @@
 """What takes the frames of a run as they are finished: memory, or a folder that survives a kill.
 
-In a folder every finished frame is a file of its own (`tkamb.output.shards`) before the next
+In a folder every finished frame is a file of its own (`tkamb.run.shards`) before the next
 begins. contact.h5 grows beside them; about once a second a copy takes its place together with
 results.csv, which calls the other frames not computed, and summary.json.
 """
@@ -15,11 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tkamb.geometry.frames import Array
-from tkamb.output.shards import Row, Shard, Shards, check_same_run
+from tkamb.run.shards import Row, Shard, Shards, check_same_run
 
 if TYPE_CHECKING:
-    from tkamb.output.maps_file import ContactMaps, MapWriter
-    from tkamb.output.maps_memory import MapKeeper
+    from tkamb.output.maps import ContactMaps, MapMemory, MapWriter
     from tkamb.results import Results
 
 MAPS = ("pressure", "gap", "nodal_force", "pose")
@@ -38,12 +37,12 @@ class Recorder:
 
     def __init__(self) -> None:
         self.rows: dict[int, Row] = {}
-        self._sink: MapKeeper | MapWriter | None = None
+        self._sink: MapMemory | MapWriter | None = None
         self._stack = ExitStack()
 
     def begin_maps(self, points: Array, triangles: Array, labels: Mapping[str, Any]) -> None:
         """Make ready for pressure maps on these points; not called without contact."""
-        from tkamb.output.maps_memory import map_sink
+        from tkamb.output.maps import map_sink
 
         self._sink = map_sink(self._map_folder(), points, triangles, labels)
         self._stack.enter_context(self._sink)
@@ -101,7 +100,7 @@ class FolderRecorder(Recorder):
     Nothing in the folder changes before the first frame is finished.
 
     Args:
-        directory: a folder that this process has claimed (`tkamb.output.claim`).
+        directory: a folder that this process has claimed (`tkamb.claim`).
         identity: what makes two runs the same.
         resume: go on with the frames that an earlier run left there.
 
@@ -152,7 +151,7 @@ class FolderRecorder(Recorder):
     @property
     def maps(self) -> "ContactMaps | None":
         """See `Recorder`; as they stand in the output folder."""
-        from tkamb.output.maps_file import FILE_NAME, ContactMaps
+        from tkamb.output.maps import FILE_NAME, ContactMaps
 
         return None if self._sink is None else ContactMaps(self._directory / FILE_NAME)
 
@@ -163,9 +162,9 @@ class FolderRecorder(Recorder):
 
     def publish(self, results: "Results") -> None:
         """Put results.csv, summary.json and contact.h5 in their places together; a report goes."""
-        from tkamb.output.atomic import replaced_together
-        from tkamb.output.maps_file import FILE_NAME
-        from tkamb.results import REPORT_NAME, put_numbers
+        from tkamb.atomic import replaced_together
+        from tkamb.output.maps import FILE_NAME
+        from tkamb.results_folder import REPORT_NAME, put_numbers
 
         start = clock.perf_counter()
         with interrupt_later(), replaced_together(self._directory) as files:
@@ -202,7 +201,7 @@ def finished_results(directory: Path, identity: Mapping[str, Any]) -> "Results |
     Raises:
         InputError: they are another run's, or no longer what was written.
     """
-    from tkamb.results import SUMMARY_NAME, read_results
+    from tkamb.results_folder import SUMMARY_NAME, read_results
 
     if not (directory / SUMMARY_NAME).exists():
         return None

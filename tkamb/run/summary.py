@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from tkamb.case import Case
 from tkamb.code_identity import code_identity
+from tkamb.equilibrium.mechanics import STRAIN_FLEXIONS
 from tkamb.files import sha256_of
 from tkamb.known_errors import as_json, known_error
-from tkamb.mechanics.mechanics import STRAIN_FLEXIONS
 from tkamb.run.status import FAILED
-from tkamb.scene_tables import ContactTable
+from tkamb.scene.case import Case
+from tkamb.scene.tables import ContactTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 RESIDUALS = (

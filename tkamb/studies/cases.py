@@ -1,9 +1,13 @@
-"""What the trade-off is measured on: two bodies, a pose and a load."""
+"""What the studies are made on: two bodies, a pose and a load; the shipped knee bend, changed."""
 
+import csv
 import hashlib
 import json
+import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +20,8 @@ from tkamb.units import DEGREE, MILLIMETRE
 
 SHIPPED_SCENE = Path(__file__).parents[2] / "models" / "deep_knee_bend" / "scene.toml"
 KNEE_CASES = Path(__file__).with_name("knee_cases.json")
+RECORDINGS = ("motion.csv", "tibia.csv", "ground_reaction.csv")
+"""Of the shipped knee bend."""
 FLEXIONS_DEG = (15.0, 60.0, 105.0)
 """Of the shipped knee, and of a user's scene where it gets there."""
 
@@ -51,15 +57,8 @@ class StudyCase:
     @property
     def hash(self) -> str:
         """SHA-256 of bodies, material, pose and load."""
-        digest = hashlib.sha256()
         pair = self.pair
-        for array in (
-            *(pair.femoral.vertices, pair.femoral.faces, pair.insert.vertices, pair.insert.faces),
-            *(self.pose, np.array(self.load)),
-        ):
-            digest.update(np.ascontiguousarray(np.round(array, 12)).tobytes())
-        digest.update(repr((pair.material, pair.bearing)).encode())
-        return digest.hexdigest()
+        return content_hash(pair, [self.pose, np.array(self.load)], (pair.material, pair.bearing))
 
     def nearby(self, steps: float) -> Array:
         """Return the pose some frames later: each 0.06 mm back, 0.2 deg flexed, 0.06 deg turned."""
@@ -69,6 +68,16 @@ class StudyCase:
         pose[:3, :3] = moved[:3, :3] @ self.pose[:3, :3]
         pose[0, 3] += moved[0, 3]
         return pose
+
+
+def content_hash(pair: ContactPair, arrays: Sequence[Array], words: tuple[Any, ...]) -> str:
+    """Return the SHA-256 of two bodies, further arrays, and words as they are printed."""
+    digest = hashlib.sha256()
+    meshes = [a for body in (pair.femoral, pair.insert) for a in (body.vertices, body.faces)]
+    for array in (*meshes, *arrays):
+        digest.update(np.ascontiguousarray(np.round(array, 12)).tobytes())
+    digest.update(repr(words).encode())
+    return digest.hexdigest()
 
 
 def case_names(scene: Path | None = None) -> tuple[str, ...]:
@@ -156,9 +165,9 @@ def _shipped(name: str) -> StudyCase:
 
 
 def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
-    from tkamb.case import load_case
-    from tkamb.mechanics.mechanics import Mechanics
+    from tkamb.equilibrium.mechanics import Mechanics
     from tkamb.scene import load_scene
+    from tkamb.scene.case import load_case
 
     case = load_case(load_scene(path))
     table, insert = case.scene.contact, case.scene.implant.insert
@@ -172,3 +181,40 @@ def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
     pair = ContactPair(case.femoral, case.insert, material(table.material), insert.bearing)
     says = f"{path.parent.name} at {case.motion.coordinates[k, 5] / DEGREE:.0f} deg, {load:.0f} N"
     return StudyCase(name, says, pair, mechanics.poses[k], load)
+
+
+def copied_scene(folder: Path) -> Path:
+    """Copy the shipped knee bend into a folder and return its scene file there."""
+    shutil.copytree(SHIPPED_SCENE.parent, folder, dirs_exist_ok=True)
+    return folder / SHIPPED_SCENE.name
+
+
+def change_recording(path: Path, change: Callable[[list[str], Array], Array]) -> None:
+    """Write a recorded table anew.
+
+    Args:
+        path: a .csv file.
+        change: takes the columns' names and the rows (n, columns), returns the new rows.
+    """
+    with open(path, encoding="utf-8", newline="") as file:
+        lines = list(csv.reader(file))
+    rows = change(lines[0], np.array(lines[1:], float))
+    with open(path, "w", encoding="utf-8", newline="") as file:
+        csv.writer(file).writerows([lines[0], *([repr(float(v)) for v in row] for row in rows)])
+
+
+def thin_out(folder: Path, step: int) -> None:
+    """Leave only every `step`-th row of the recordings in a folder."""
+    for name in RECORDINGS:
+        change_recording(folder / name, lambda head, rows: rows[::step])
+
+
+def stretch_time(folder: Path, scale: float) -> None:
+    """Make the recordings in a folder take `scale` times as long."""
+
+    def stretched(head: list[str], rows: Array) -> Array:
+        rows[:, head.index("time_s")] *= scale
+        return rows
+
+    for name in RECORDINGS:
+        change_recording(folder / name, stretched)

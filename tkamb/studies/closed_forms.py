@@ -19,10 +19,8 @@ References: Johnson, Contact Mechanics (1985), sections 3.4, 4.2, 4.3 and 5.8,
 doi:10.1017/CBO9781139171731; Ramberg & Osgood, NACA TN 902 (1943).
 """
 
-import os
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -40,6 +38,7 @@ from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface
 from tkamb.studies.bodies import balls, block, flat
 from tkamb.studies.elastic_layer import sphere_on_layer
+from tkamb.studies.measures import environment
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 CURVE = {"alpha": 0.0389, "reference_stress": 8.4194 * MEGAPASCAL, "exponent": 4.5485}
@@ -133,10 +132,13 @@ def press_closed_form(case: ClosedForm) -> tuple[ContactResult, ContactPair]:
     model = contact_model(case.model, case.resolution_mm, **options)
     if case.kind != "kept":
         return model.press(model.prepare(pair), case.load_N, np.eye(4)), pair
-    with _operators_kept_apart() as folder:
+    with (
+        tempfile.TemporaryDirectory(prefix="tkamb-stability-") as folder,
+        environment({"TKAMB_CACHE_DIR": folder}),
+    ):
         model.prepare(replace(case, modulus_MPa=0.5 * case.modulus_MPa).pair)
         state = model.prepare(pair)
-        files = len(list(folder.glob("*.operator")))
+        files = len(list(Path(folder).glob("*.operator")))
         if files != 2:
             raise ComputationError(f"{files} operators are kept of two materials", case.says)
         return model.press(state, case.load_N, np.eye(4)), pair
@@ -269,18 +271,3 @@ def _plate(side: float) -> Surface:
 
 def _has_cache(name: str) -> bool:
     return "cache" in getattr(contact_class(name), "__dataclass_fields__", {})
-
-
-@contextmanager
-def _operators_kept_apart() -> Iterator[Path]:
-    """Keep prepared operators in a folder that is gone afterwards."""
-    before = os.environ.get("TKAMB_CACHE_DIR")
-    with tempfile.TemporaryDirectory(prefix="tkamb-stability-") as folder:
-        os.environ["TKAMB_CACHE_DIR"] = folder
-        try:
-            yield Path(folder)
-        finally:
-            if before is None:
-                del os.environ["TKAMB_CACHE_DIR"]
-            else:
-                os.environ["TKAMB_CACHE_DIR"] = before

@@ -28,7 +28,7 @@ def add_tradeoff(commands: Any) -> None:
 
 
 def _tradeoff(options: argparse.Namespace) -> int:
-    from tkamb.output.claim import claimed_directory
+    from tkamb.claim import claimed_directory
 
     if options.peer:
         from tkamb.studies.calculix_run import find_program
@@ -39,7 +39,7 @@ def _tradeoff(options: argparse.Namespace) -> int:
 
 
 def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
-    from tkamb.output.atomic import write_text
+    from tkamb.atomic import write_text
     from tkamb.studies import tradeoff as study
     from tkamb.studies.advice import DEFAULT, comparison, recommendations
     from tkamb.studies.body_trade import CHANGES, BodyRow, body_json, body_table, run_body_trade
@@ -90,7 +90,7 @@ def add_stability(commands: Any) -> None:
 
 
 def _stability(options: argparse.Namespace) -> int:
-    from tkamb.output.claim import claimed_directory
+    from tkamb.claim import claimed_directory
 
     with claimed_directory(options.out) as directory:
         return _study_stability(options, directory)
@@ -99,7 +99,7 @@ def _stability(options: argparse.Namespace) -> int:
 def _study_stability(options: argparse.Namespace, directory: Path) -> int:
     from tkamb.studies import stability as study
     from tkamb.studies.kept_rows import KeptRows
-    from tkamb.studies.stability_report import picture, table
+    from tkamb.studies.stability import picture, table
 
     cases = study.stability_cases(options.quick)
     kept = KeptRows(directory, options.resume)
@@ -151,7 +151,7 @@ def _goes_on(directory: Path) -> str:
 
 def _write(directory: Path, name: str, text: str, lines: list[str], figure: Any) -> None:
     """Write a study's JSON, table and picture, each whole or not at all."""
-    from tkamb.output.atomic import replaced_file, write_text
+    from tkamb.atomic import replaced_file, write_text
 
     write_text(directory / f"{name}.json", text + "\n")
     write_text(directory / f"{name}.txt", "\n".join(lines) + "\n")

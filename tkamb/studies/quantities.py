@@ -6,10 +6,9 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
 from tkamb.contact.result import ContactResult
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import SIDES, Array
 from tkamb.units import MILLIMETRE
 
-SIDES = ("medial", "lateral")
 PARTS = ("force", "mean_pressure", "peak_pressure", "area")
 RASTER = MILLIMETRE
 """m: spacing of the raster on which pressure maps are compared."""

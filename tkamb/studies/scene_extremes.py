@@ -23,8 +23,7 @@ import trimesh
 from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array
 from tkamb.run.status import FAILED
-from tkamb.studies.cases import SHIPPED_SCENE
-from tkamb.studies.recordings import change_recording, copied_scene, stretch_time
+from tkamb.studies.cases import SHIPPED_SCENE, change_recording, copied_scene, stretch_time
 from tkamb.studies.verdict import WRONG, Verdict
 
 if TYPE_CHECKING:
