@@ -116,6 +116,33 @@ def test_one_foot_on_two_plates_is_their_summed_wrench_at_one_centre_of_pressure
     assert ground.loaded.all()
 
 
+def test_on_a_step_the_point_moves_along_the_line_of_action(tmp_path):
+    """What the foot bears is the same wrench, given at the level that it stands on."""
+    path = two_plates(tmp_path)
+    both = {}
+    for surface in (0.0, 400.0):
+        table = GroundReactionTable(
+            file=path,
+            plates=(1, 2),
+            laboratory_axes="+x,+z,-y",
+            cutoff_Hz="none",
+            surface_mm=surface,
+        )
+        both[surface] = load_ground_reaction(table, np.array([0.05, 0.1]), "right")
+    flat, step = both.values()
+    np.testing.assert_allclose(step.force, flat.force)
+    np.testing.assert_allclose(step.point[:, 1] - flat.point[:, 1], 0.4)
+    shift = step.point - flat.point
+    np.testing.assert_allclose(np.cross(shift, flat.force)[:, [0, 2]], 0.0, atol=1e-9)
+    for found in both.values():
+        about = found.moment + np.cross(found.point, found.force)
+        np.testing.assert_allclose(about, flat.moment + np.cross(flat.point, flat.force), atol=1e-9)
+        np.testing.assert_allclose(found.moment[:, [0, 2]], 0.0, atol=1e-9)
+    table = GroundReactionTable(file=tmp_path / "x.mot", cutoff_Hz="none", surface_mm=1.0)
+    with pytest.raises(InputError, match="surface_mm"):
+        load_ground_reaction(table, np.array([0.05]), "right")
+
+
 def test_below_the_threshold_the_point_is_held_and_the_wrench_kept(tmp_path):
     path = two_plates(tmp_path)
     table = GroundReactionTable(

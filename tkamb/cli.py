@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from tkamb.datasets.command import add_data
+from tkamb.export_command import add_export
 from tkamb.guard import guarded
 from tkamb.importing.command import add_import
 from tkamb.mesh_command import add_contact, add_mesh, add_no_cache, add_press, without_cache
@@ -67,6 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_scene(commands)
     add_import(commands)
     add_data(commands)
+    add_export(commands)
     add_view(commands)
     add_tradeoff(commands)
     add_stability(commands)
