@@ -14,6 +14,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.importing.markers import recorded_labels
 from tkamb.inputs.inverse_kinematics import ChainFit, Index, NormalEquations, fit_chain, put
+from tkamb.inputs.laboratory import laboratory_rotation
 from tkamb.inputs.markers import marker_trajectories, matched_labels
 from tkamb.inputs.tables import Table
 from tkamb.opensim.kinematics import Kinematics, cross
