@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import root
 
 from deep_knee_bend import dimensions as d
-from deep_knee_bend.touch import touch
+from deep_knee_bend.implant import ARTICULATION
 
 KNOTS = np.radians([0.0, 6.0, 12.0, 24.0, 36.0, 60.0, 90.0, 120.0])
 
@@ -53,7 +53,7 @@ def _settled(flexion):
     rotation, wanted = axial_rotation_at(flexion), contact_path_at(flexion)
 
     def miss(place):
-        medial, lateral = touch(*place, rotation, flexion).points
+        medial, lateral = ARTICULATION.touch(*place, rotation, flexion).points
         inward = medial[2] + lateral[2]
         return [(medial[0] + lateral[0]) / 2.0 - wanted, inward]
 
@@ -69,7 +69,7 @@ def knee_motion():
     coordinates, contact, guess = [], [], 0.0
     for angle in flexion:
         (ap, ml), rotation = place_at(angle), float(axial_rotation_at(angle))
-        found = touch(ap, ml, rotation, angle, guess)
+        found = ARTICULATION.touch(ap, ml, rotation, angle, guess)
         guess = found.adduction
         coordinates.append([ap, found.si, ml, rotation, found.adduction, angle])
         contact.append(found.points)
