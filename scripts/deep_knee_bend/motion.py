@@ -48,12 +48,13 @@ def contact_path_at(flexion):
     return d.CONTACT_AP_START + (d.CONTACT_AP_END - d.CONTACT_AP_START) * s * (2.0 - s)
 
 
-def _settled(flexion):
+def _settled(articulation, flexion):
     """AP and ML (mm) at a flexion: mean contact on its path, ML slopes under it balanced."""
     rotation, wanted = axial_rotation_at(flexion), contact_path_at(flexion)
+    wanted += articulation.insert.low_point_ap - d.DISH_LOW_POINT_AP
 
     def miss(place):
-        medial, lateral = ARTICULATION.touch(*place, rotation, flexion).points
+        medial, lateral = articulation.touch(*place, rotation, flexion).points
         inward = medial[2] + lateral[2]
         return [(medial[0] + lateral[0]) / 2.0 - wanted, inward]
 
@@ -61,15 +62,15 @@ def _settled(flexion):
     return [round(float(x), 3) for x in found.x]
 
 
-def knee_motion():
-    """Return the KneeMotion of all frames."""
-    time = np.linspace(0.0, d.DURATION_S, d.FRAMES)
+def knee_motion(articulation=ARTICULATION, frames=d.FRAMES):
+    """Return the KneeMotion of all frames; the contact path starts at the dishes' low point."""
+    time = np.linspace(0.0, d.DURATION_S, frames)
     flexion = flexion_at(time)
-    place_at = CubicSpline(KNOTS, [_settled(f) for f in KNOTS], bc_type="natural")
+    place_at = CubicSpline(KNOTS, [_settled(articulation, f) for f in KNOTS], bc_type="natural")
     coordinates, contact, guess = [], [], 0.0
     for angle in flexion:
         (ap, ml), rotation = place_at(angle), float(axial_rotation_at(angle))
-        found = ARTICULATION.touch(ap, ml, rotation, angle, guess)
+        found = articulation.touch(ap, ml, rotation, angle, guess)
         guess = found.adduction
         coordinates.append([ap, found.si, ml, rotation, found.adduction, angle])
         contact.append(found.points)

@@ -78,12 +78,12 @@ class FemoralComponent:
 
     @cached_property
     def lateral_profile(self) -> SagittalProfile:
-        """Lateral J-curve; it starts at the medial one's top."""
+        """Lateral J-curve; it reaches as far distally and posteriorly as the medial one."""
         if self.lateral_arcs == self.medial_arcs:
             return self.profile
         start = SagittalProfile(self.lateral_arcs)
-        top = start.range[:1]
-        return start.moved((self.profile.point(top) - start.point(top))[0])
+        ends = np.radians([90.0, 0.0])
+        return start.moved(np.diag(self.profile.point(ends) - start.point(ends)))
 
     def ridge(self, phi: ArrayLike) -> Array:
         """Return the ML distance of the ridge (apex of the condyle) from the middle."""

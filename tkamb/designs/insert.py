@@ -138,6 +138,7 @@ class Insert:
     def _arc(self, x: Array, radii: tuple[float, float]) -> Array:
         s = x - self.low_point_ap
         radius = np.where(s > 0, *radii)
+        s = np.clip(s, -radius, radius)
         return np.asarray(radius - np.sqrt(radius**2 - s**2))
 
     def _coronal(self, z: Array) -> Array:

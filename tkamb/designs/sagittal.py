@@ -29,9 +29,7 @@ class SagittalProfile:
         InputError: arcs that leave a gap, turn back or have no radius.
     """
 
-    def __init__(
-        self, arcs: ArrayLike, origin: Sequence[float] = (0.0, 0.0)
-    ) -> None:
+    def __init__(self, arcs: ArrayLike, origin: Sequence[float] = (0.0, 0.0)) -> None:
         table = np.asarray(arcs, float)
         if table.ndim != 2 or table.shape[1] != 3 or not (table[:, 2] > 0.0).all():
             raise InputError("sagittal arcs are not (from, to, radius)", "sagittal_arcs_deg_mm")
