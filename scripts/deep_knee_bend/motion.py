@@ -58,8 +58,19 @@ def _settled(articulation, flexion):
         inward = medial[2] + lateral[2]
         return [(medial[0] + lateral[0]) / 2.0 - wanted, inward]
 
-    found = root(miss, [-5.0, 0.0], method="hybr", options={"eps": 1e-3, "xtol": 1e-6})
+    found = root(
+        miss,
+        [_start(articulation, flexion, wanted), 0.0],
+        method="hybr",
+        options={"eps": 1e-3, "xtol": 1e-6},
+    )
     return [round(float(x), 3) for x in found.x]
+
+
+def _start(articulation, flexion, wanted):
+    """AP place (mm) at which the medial ridge's lowest point is where contact is wanted."""
+    anterior, superior = articulation.femoral.profile.point(flexion)
+    return wanted - (anterior * np.cos(flexion) - superior * np.sin(flexion))
 
 
 def knee_motion(articulation=ARTICULATION, frames=d.FRAMES):

@@ -1,8 +1,8 @@
 """One cell of tables D-3 to D-6: a condyle of a design pressed at the table's own force.
 
 Each condyle is pressed alone, so that it carries the table's force whatever the split. What the
-source does not publish is an assumption with a range: flexion at a percentage of the bend, where the
-condyle stands on its dish, axial rotation of the femur on the insert, size of the implant.
+source does not publish is an assumption with a range: flexion at a percentage of the bend, where
+the condyle stands on its dish, axial rotation of the femur on the insert, size of the implant.
 """
 
 from collections.abc import Iterable
