@@ -16,7 +16,7 @@ from scipy.stats import qmc
 from tkamb.contact import materials
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
-from tkamb.contact.result import ContactStatus
+from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.designs.design import Design
 from tkamb.geometry.condyles import condyle_faces
 from tkamb.geometry.frames import Array, knee_pose
@@ -135,6 +135,13 @@ class PressedDesign:
         if overlap is None:
             return None
         return Cell(carried.area * square, overlap.area * square, carried.force * square)
+
+    def press_alone(
+        self, condyle: Condyle, flexion: float, load: float, axial_rotation: float = 0.0
+    ) -> ContactResult:
+        """Press one condyle at a flexion (rad) on its low point with `load` (N)."""
+        case = Assumption(flexion, flexion, 0.0, axial_rotation, 1.0)
+        return self.model.press(self._prepared(condyle), load, self._pose(condyle, 0.0, case))
 
     def _prepare(self, condyle: Condyle) -> Any:
         parts = [
