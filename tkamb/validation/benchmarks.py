@@ -107,11 +107,12 @@ def against_fe(designs: Path, name: str = "nkii_cp") -> Values:
     flexions = (15.0, 60.0, 105.0)
     fe = _pressed(design, "fe", flexions)
     found = {}
+    options: dict[str, Any]
     for model, key, options in (
         ("lattice-source", "source", {"pressure_rule": "source"}),
         ("lattice", "lattice", {}),
     ):
-        pairs = list(zip(_pressed(design, model, flexions, **options), fe, strict=True))
+        pairs = list(zip(_pressed(design, model, flexions, 1200.0, **options), fe, strict=True))
         found[f"{key}_approach"] = max(abs(a[0] - b[0]) for a, b in pairs) / MILLIMETRE
         area = max(abs(a[1].area - b[1].area) for a, b in pairs)
         found[f"{key}_area"] = area / MILLIMETRE**2
@@ -216,7 +217,9 @@ def _variant(designs: Path, dish: float, coronal: float, thickness: float = 9.0)
 
 
 def _peak(pressed: PressedDesign, flexion: float, load: float, turn: float = 0.0) -> float:
-    result = pressed.press_alone("medial", flexion * DEGREE, load, turn * DEGREE)
+    """Peak pressure (Pa); the femur is turned about the middle of the knee by `turn` deg."""
+    shift = pressed.design.femoral.ridge_half * MILLIMETRE * np.sin(turn * DEGREE)
+    result = pressed.press_alone("medial", flexion * DEGREE, load, turn * DEGREE, shift)
     return _only(result).peak_pressure
 
 
@@ -232,7 +235,7 @@ def conformity(designs: Path) -> Values:
         for f in (0, 60, 90)
     }
     rises = [_peak(p, 0, 1500.0, 10.0) / _peak(p, 0, 1500.0) - 1.0 for p in (high, low)]
-    return {**found, "malrotation": rises[0] / rises[1]}
+    return {**found, "malrotation": 100.0 * (rises[0] - rises[1])}
 
 
 def thickness_and_plane(designs: Path) -> Values:

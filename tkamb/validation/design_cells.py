@@ -137,11 +137,22 @@ class PressedDesign:
         return Cell(carried.area * square, overlap.area * square, carried.force * square)
 
     def press_alone(
-        self, condyle: Condyle, flexion: float, load: float, axial_rotation: float = 0.0
+        self,
+        condyle: Condyle,
+        flexion: float,
+        load: float,
+        axial_rotation: float = 0.0,
+        shift: float = 0.0,
     ) -> ContactResult:
-        """Press one condyle at a flexion (rad) on its low point with `load` (N)."""
+        """Press one condyle at a flexion (rad) with `load` (N).
+
+        It stands over its low point, turned about its own vertical by axial_rotation (rad) and
+        moved anteriorly by shift (m).
+        """
         case = Assumption(flexion, flexion, 0.0, axial_rotation, 1.0)
-        return self.model.press(self._prepared(condyle), load, self._pose(condyle, 0.0, case))
+        pose = self._pose(condyle, 0.0, case)
+        pose[0, 3] += shift
+        return self.model.press(self._prepared(condyle), load, pose)
 
     def _prepare(self, condyle: Condyle) -> Any:
         parts = [

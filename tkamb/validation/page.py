@@ -207,8 +207,8 @@ def _cells(rows: Sequence[Row]) -> list[str]:
         "",
         CELLS,
         "",
-        "| design | condyle | % | N | area: ours, contact | ours, overlap | table | pressure: ours, "
-        "contact | ours, overlap | table |",
+        "| design | condyle | % | N | area: contact | overlap | table "
+        "| pressure: contact | overlap | table |",
         "| --- | --- | ---: | ---: |" + " ---: |" * 6,
     ]
     percent = dissertation.table(1).percent.tolist()
