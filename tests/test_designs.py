@@ -99,18 +99,26 @@ def test_a_larger_size_is_the_same_problem_in_other_units():
     pressed = PressedDesign(design, 4.0)
     case = Assumption(0.5, 0.5, 0.0, 0.0, size)
     scaled = pressed.cell("medial", 0.0, load, case)
-    state = pressed._prepared("medial")
+    pair = pressed.pair("medial")
     femoral, insert = (
-        replace(body, vertices=body.vertices * size)
-        for body in (state.pair.femoral, state.pair.insert)
+        replace(body, vertices=body.vertices * size) for body in (pair.femoral, pair.insert)
     )
-    pose = pressed._pose("medial", 0.0, case)
+    pose = pressed.pose("medial", 0.0, case)
     pose[:3, 3] *= size
     model = contact_model("lattice", 4.0 * size, cache=False)
-    state = model.prepare(replace(state.pair, femoral=femoral, insert=insert))
+    state = model.prepare(replace(pair, femoral=femoral, insert=insert))
     direct = model.press(state, load, pose).medial
     assert scaled.area == pytest.approx(direct.area, rel=0.01)
     assert scaled.mean_pressure == pytest.approx(direct.mean_pressure, rel=0.01)
+
+
+def test_a_condyle_pressed_alone_carries_like_half_of_a_symmetric_pair():
+    pressed = PressedDesign(load_design(ROOT / "lps_flex"), 4.0)
+    alone = pressed.press_alone("medial", 1.0, 1000.0).medial
+    both = pressed.press_both(1.0, 2000.0)
+    assert both.medial.force == pytest.approx(both.lateral.force, rel=2e-3)
+    assert both.medial.area == pytest.approx(alone.area, rel=5e-3)
+    assert both.medial.peak_pressure == pytest.approx(alone.peak_pressure, rel=5e-3)
 
 
 def test_table_force_is_the_tables_body_weights_times_the_implied_mass():

@@ -6,8 +6,7 @@ the condyle stands on its dish, axial rotation of the femur on the insert, size 
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -120,12 +119,12 @@ class PressedDesign:
         self.source_rule = contact_model(
             "lattice", resolution_mm, cache=False, pressure_rule="source"
         )
-        self._prepared = lru_cache(maxsize=None)(self._prepare)
+        self._states: dict[str, Any] = {}
 
     def cell(self, condyle: Condyle, percent: float, load: float, case: Assumption) -> Cell | None:
         """Press one condyle with `load` (N); None where it cannot be carried."""
         state, square = self._prepared(condyle), case.size**2
-        result = self.model.press(state, load / square, self._pose(condyle, percent, case))
+        result = self.model.press(state, load / square, self.pose(condyle, percent, case))
         carried = result.medial or result.lateral
         if result.status is not ContactStatus.OK or carried is None:
             return None
@@ -149,25 +148,44 @@ class PressedDesign:
         It stands over its low point, turned about its own vertical by axial_rotation (rad) and
         moved anteriorly by shift (m).
         """
-        case = Assumption(flexion, flexion, 0.0, axial_rotation, 1.0)
-        pose = self._pose(condyle, 0.0, case)
+        pose = self.pose(condyle, 0.0, Assumption(flexion, flexion, 0.0, axial_rotation, 1.0))
         pose[0, 3] += shift
         return self.model.press(self._prepared(condyle), load, pose)
 
-    def _prepare(self, condyle: Condyle) -> Any:
-        parts = [
-            Surface(vertices * MILLIMETRE, faces)
-            for vertices, faces in (self.design.femoral.mesh(), self.design.insert.mesh())
-        ]
-        femoral, insert = parts
-        medial, lateral = condyle_faces(femoral, 0.0)
-        alone = femoral.faces[medial if condyle == "medial" else lateral]
-        used, faces = np.unique(alone, return_inverse=True)
-        femoral = Surface(femoral.vertices[used], faces.reshape(-1, 3), "femoral")
-        material = materials.material("polyethylene")
-        return self.model.prepare(ContactPair(femoral, insert, material, self.design.bearing))
+    def press_both(self, flexion: float, load: float) -> ContactResult:
+        """Press the whole component at a flexion (rad) with `load` (N) over its low points."""
+        if "both" not in self._states:
+            self._states["both"] = self.model.prepare(self.whole())
+        pose = self.pose("medial", 0.0, Assumption(flexion, flexion, 0.0, 0.0, 1.0))
+        return self.model.press(self._states["both"], load, pose)
 
-    def _pose(self, condyle: Condyle, percent: float, case: Assumption) -> Array:
+    def _prepared(self, condyle: Condyle) -> Any:
+        if condyle not in self._states:
+            self._states[condyle] = self.model.prepare(self.pair(condyle))
+        return self._states[condyle]
+
+    def pair(self, condyle: Condyle) -> ContactPair:
+        """Return one condyle, cut off in the middle and open there, and the insert, m."""
+        both = self.whole()
+        medial, lateral = condyle_faces(both.femoral, 0.0)
+        alone = both.femoral.faces[medial if condyle == "medial" else lateral]
+        used, faces = np.unique(alone, return_inverse=True)
+        femoral = Surface(both.femoral.vertices[used], faces.reshape(-1, 3), "femoral")
+        return replace(both, femoral=femoral)
+
+    def whole(self) -> ContactPair:
+        """Return the femoral component and the insert, m."""
+        femoral, insert = (
+            Surface(vertices * MILLIMETRE, faces, name)
+            for name, (vertices, faces) in (
+                ("femoral", self.design.femoral.mesh()),
+                ("insert", self.design.insert.mesh()),
+            )
+        )
+        material = materials.material("polyethylene")
+        return ContactPair(femoral, insert, material, self.design.bearing)
+
+    def pose(self, condyle: Condyle, percent: float, case: Assumption) -> Array:
         """Pose whose condyle touches its dish `ap` in front of the low point.
 
         On a dish of radius R a condyle of radius r touches where the normals agree: its centre
