@@ -25,9 +25,7 @@ def turned(axis, angles, centre):
 def history(path, pressure=1e6, normals=UP):
     """One point under constant pressure, over which a body translates along a path."""
     frames = len(path)
-    return SlidingHistory.of_cycle(
-        translated(path), np.full((frames, 1), pressure), POINT, normals
-    )
+    return SlidingHistory.of_cycle(translated(path), np.full((frames, 1), pressure), POINT, normals)
 
 
 def test_a_translation_slides_everywhere_by_its_tangential_part():

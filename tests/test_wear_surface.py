@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+
 import shapes
 from contact_bodies import dished_insert, flat_insert
-
 from tkamb.wear.refine import refined
 from tkamb.wear.worn_surface import ArticularSurface, volume
 

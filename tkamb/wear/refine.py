@@ -73,7 +73,9 @@ def _split(faces: NDArray[np.int64], middle: NDArray[np.int64], points: Array) -
         shorter = np.linalg.norm(points[a] - points[bc], axis=1) <= np.linalg.norm(
             points[b] - points[ca], axis=1
         )
-        one = np.stack([np.where(shorter, a, b), np.where(shorter, b, bc), np.where(shorter, bc, ca)])
+        one = np.stack(
+            [np.where(shorter, a, b), np.where(shorter, b, bc), np.where(shorter, bc, ca)]
+        )
         two = np.stack([a, np.where(shorter, bc, b), ca])
         parts += [one.T, two.T]
     rows = np.flatnonzero(many == 3)

@@ -1,7 +1,7 @@
 """Wear laws by name: the built-in ones and those of other packages.
 
-    [project.entry-points."tkamb.wear"]
-    my-law = "my_package.my_module:MyLaw"
+[project.entry-points."tkamb.wear"]
+my-law = "my_package.my_module:MyLaw"
 """
 
 from collections.abc import Mapping
