@@ -47,7 +47,7 @@ def test_a_wheel_that_rolls_does_not_slide_where_it_touches():
     radius, angle = 0.02, 1e-3
     centre = np.array([0.0, radius, 0.0])
     rotation = Rotation.from_rotvec([0, 0, -angle]).as_matrix()
-    rolled = pose(rotation, centre + [radius * angle, 0, 0] - rotation @ centre)
+    rolled = pose(rotation, np.array([radius * angle, radius, 0.0]) - rotation @ centre)
     sliding = step_sliding(np.stack([np.eye(4), rolled]), np.zeros((1, 3)), UP)
     assert np.linalg.norm(sliding) < radius * angle**2  # second order: the contact moves on
 

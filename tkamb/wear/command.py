@@ -70,11 +70,12 @@ def _wear(options: argparse.Namespace) -> int:
     )
     folder = options.out or Path("out") / f"{_stem(options.case)}_wear"
     with claimed_directory(folder, options.force) as claimed:
-        report = run.compute(
-            claimed,
-            resume=options.resume,
-            progress=lambda blocks: tqdm(blocks, "wearing", unit="update", disable=None),
-        )
+        with tqdm(total=options.cycles, desc="wearing", unit="cycle", disable=None) as bar:
+            report = run.compute(
+                claimed,
+                resume=options.resume,
+                progress=lambda cycles: bar.update(cycles - bar.n),
+            )
         report.write(claimed)
     for question in report.questions():
         print(f"tkamb: question: {question}", file=sys.stderr)

@@ -38,9 +38,9 @@ def keep_state(folder: Path, state: WearState, identity: str) -> None:
         InputError: the folder cannot be written.
     """
     arrays = {f.name: np.asarray(getattr(state, f.name)) for f in fields(state) if f.name != "rows"}
-    rows = json.dumps(state.rows)
+    rows = np.asarray(json.dumps(state.rows))
     with replaced_file(folder / STATE_NAME) as temporary, open(temporary, "wb") as file:
-        np.savez(file, identity=identity, rows=rows, **arrays)
+        np.savez(file, allow_pickle=False, identity=np.asarray(identity), rows=rows, **arrays)
 
 
 def kept_state(folder: Path, identity: str) -> WearState | None:
@@ -62,4 +62,4 @@ def kept_state(folder: Path, identity: str) -> WearState | None:
         raise InputError(what, path, "leave --resume out, or choose another folder with --out")
     rows = json.loads(str(content.pop("rows")))
     values = {name: value.item() if value.ndim == 0 else value for name, value in content.items()}
-    return WearState(rows=rows, **values)
+    return WearState(rows=tuple(rows), **values)

@@ -7,6 +7,7 @@ package's through the entry-point group `tkamb.wear`.
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
@@ -209,7 +210,7 @@ def _check_rising(values: Any, where: str) -> None:
         and len(values) >= 2
         and all(isinstance(v, int | float) and math.isfinite(v) for v in values)
         and values[0] >= 0
-        and all(a < b for a, b in zip(values, values[1:], strict=False))
+        and all(a < b for a, b in pairwise(values))
     )
     if not sound:
         raise InputError(f"cannot be {values}", where, "give at least two rising numbers from 0")

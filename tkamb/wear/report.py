@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 from tkamb.wear.kept import STATE_NAME
 from tkamb.wear.materials import WearMaterial
 from tkamb.wear.setup import WearSetup
-from tkamb.wear.simulation import WearCase, WearState
+from tkamb.wear.simulation import CycleWear, WearCase, WearState
 
 MILLION = 1e6
 DEAREST_CORRECTION = 0.05
@@ -41,6 +42,7 @@ class WearReport:
         case: what was worn, by what law.
         material: with sources.
         state: at the end.
+        last: what the next cycle would do.
         cycles: asked for.
         updates: asked for.
     """
@@ -49,21 +51,22 @@ class WearReport:
     case: WearCase
     material: WearMaterial
     state: WearState
+    last: CycleWear
     cycles: int
     updates: int
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `tkamb wear --json` prints; None stands for what is not modelled."""
         last = {key: _known(value) for key, value in self.state.rows[-1].items()}
-        million = self.state.cycles / MILLION
         law = self.case.law
         return {
             **last,
             "status": self.state.end or "ok",
             "cycles_asked": self.cycles,
             "updates": self.updates,
-            "volume_mm3_per_Mc": _known(last["volume_mm3"] / million) if million else None,
-            "mass_mg_per_Mc": _known(last["mass_mg"] / million) if million else None,
+            "blocks": len(self.state.rows) - 1,
+            "volume_mm3_per_Mc": self.rate,
+            "mass_mg_per_Mc": self.rate * self.case.density * 1e-3,
             "law": law.name,
             "law_parameters": vars(law),
             "material": self.material.name,
@@ -84,6 +87,12 @@ class WearReport:
             "code": code_identity(),
         }
 
+    @property
+    def rate(self) -> float:
+        """Volume per cycle, mm³ per million cycles."""
+        last = self.state.rows[-1]
+        return last["volume_mm3"] * MILLION / last["cycles"] if last["cycles"] else 0.0
+
     def questions(self) -> list[str]:
         """Return what a reader must know before using the numbers."""
         asked = [] if not self.material.caution else [self.material.caution]
@@ -92,12 +101,15 @@ class WearReport:
                 f"maps had to be scaled by up to {self.state.map_error:.0%} to carry their load: "
                 "take a finer resolution"
             )
-        million = self.state.cycles / MILLION
-        rate = self.state.rows[-1]["volume_mm3"] / million if million else 0.0
-        low, high = PUBLISHED_RATES
-        if rate and not low / FAR_FROM_PUBLISHED <= rate <= high * FAR_FROM_PUBLISHED:
+        if self.state.unsettled:
             asked.append(
-                f"{rate:.3g} mm3 per million cycles is far from a whole knee's {low:g} (ISO) to "
+                f"in {self.state.unsettled} blocks the pressure moved away from what it wore, "
+                "however short they were: take more --updates"
+            )
+        low, high = PUBLISHED_RATES
+        if not low / FAR_FROM_PUBLISHED <= self.rate <= high * FAR_FROM_PUBLISHED:
+            asked.append(
+                f"{self.rate:.3g} mm3 a million cycles is far from a whole knee's {low:g} (ISO) to "
                 f"{high:g} (in-vivo loads) mm3 (Dreyer 2023): does the wear factor suit it?"
             )
         if self.setup.engine.bearing == "mobile":
@@ -112,11 +124,11 @@ class WearReport:
         creep = found["creep_depth_mm"]
         said = "not modelled" if creep is None else f"{creep:.4g} mm deep"
         return [
-            f"{found['cycles']:.6g} cycles in {self.state.blocks} blocks, {found['law']}, "
+            f"{found['cycles']:.6g} cycles in {found['blocks']} blocks, {found['law']}, "
             f"{found['material']}: {found['status']}",
             f"worn off {found['volume_mm3']:.4g} mm3, {found['mass_mg']:.4g} mg, "
             f"{found['max_depth_mm']:.4g} mm deep at most, over {found['worn_area_mm2']:.4g} mm2",
-            f"rate {found['volume_mm3_per_Mc'] or 0:.4g} mm3 per million cycles; creep {said}",
+            f"rate {self.rate:.4g} mm3 per million cycles; creep {said}",
             *(f"note: {note}" for note in found["notes"]),
         ]
 
@@ -134,7 +146,7 @@ class WearReport:
             write_synced(files.path("wear.json"), json.dumps(self.as_dict(), indent=2) + "\n")
             write_triangles(files.path("wear.vtp"), surface.vertices, surface.faces, maps)
             in_mm = trimesh.Trimesh(surface.vertices / MILLIMETRE, surface.faces, process=False)
-            files.path("worn_insert.stl").write_bytes(in_mm.export(file_type="stl"))
+            in_mm.export(files.path("worn_insert.stl"), file_type="stl")
             draw_maps(surface, maps, files.path("wear.png"))
             files.remove(STATE_NAME)
 
@@ -151,9 +163,9 @@ class WearReport:
         named = {
             "wear_depth_mm": state.wear / MILLIMETRE,
             "creep_depth_mm": state.creep / MILLIMETRE,
-            "sliding_mm_per_cycle": state.sliding / MILLIMETRE,
-            "cross_shear_ratio": state.cross_shear,
-            "peak_pressure_MPa": state.pressure / MEGAPASCAL,
+            "sliding_mm_per_cycle": self.last.history.distance / MILLIMETRE,
+            "cross_shear_ratio": self.last.history.cross_shear,
+            "peak_pressure_MPa": self.last.peak_pressure / MEGAPASCAL,
         }
         maps = {}
         for name, values in named.items():
@@ -162,13 +174,13 @@ class WearReport:
         return maps
 
     def _mean_cross_shear(self) -> float:
-        """Return the mean of the cross-shear ratio over the last block's wear."""
-        weight = self.state.wear
+        """Return the mean cross-shear ratio, weighted by what the last cycle wears off."""
+        weight = self.last.rate * self.last.area
         total = float(weight.sum())
-        return float(weight @ self.state.cross_shear) / total if total else math.nan
+        return float(weight @ self.last.history.cross_shear) / total if total else math.nan
 
 
-def _table(rows: list[dict[str, float]]) -> str:
+def _table(rows: Sequence[dict[str, float]]) -> str:
     """Return the rows as CSV; NaN is an empty cell."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")

@@ -1,7 +1,7 @@
 """A wear simulation from what a user says to what is written."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,14 +37,14 @@ class WearRun:
         folder: Path | None = None,
         *,
         resume: bool = False,
-        progress: Callable[[range], Iterable[int]] = lambda blocks: blocks,
+        progress: Callable[[float], None] = lambda cycles: None,
     ) -> WearReport:
         """Simulate and return the report.
 
         Args:
             folder: where the state is kept after each block; None: nowhere.
             resume: go on with the state that the folder keeps.
-            progress: wraps the blocks.
+            progress: is told the cycles that are done.
 
         Raises:
             InputError: what the folder keeps is of another simulation, or no contact is found.
@@ -52,16 +52,17 @@ class WearRun:
         state = None
 
         def keep(done: WearState) -> None:
+            progress(done.cycles)
             if folder is not None:
                 keep_state(folder, done, identity)
 
         if folder is not None:
             identity = wear_identity(self.setup, self.case, self.cycles, self.updates)
             state = kept_state(folder, identity) if resume else None
-        state = simulate_wear(
-            self.case, self.cycles, self.updates, state=state, keep=keep, progress=progress
+        state, last = simulate_wear(self.case, self.cycles, self.updates, state=state, keep=keep)
+        return WearReport(
+            self.setup, self.case, self.material, state, last, self.cycles, self.updates
         )
-        return WearReport(self.setup, self.case, self.material, state, self.cycles, self.updates)
 
 
 def prepare_wear(

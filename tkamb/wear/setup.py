@@ -76,6 +76,7 @@ def wear_setup(
     if frames < 2:
         raise InputError(f"{frames} frames", "--frames-per-cycle", "give at least 2")
     path = Path(path)
+    motion: CycleMotion | None
     if path.is_dir() and simulator is None:
         case, motion = _of_results(path)
     else:

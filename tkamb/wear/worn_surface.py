@@ -22,10 +22,11 @@ SKIN = 1e-6
 class ArticularSurface:
     """The vertices of the insert that face upwards, and what of the surface each stands for.
 
-    A vertex owns a third of the area vectors of its triangles: its normal is their sum's
-    direction, its area their sum's length. A depth h along the normal is taken off by moving
-    the vertex down by h/n_y. x and z of no vertex change, and the volume of a closed surface is
-    linear in y then, so that
+    A vertex owns a third of each of its triangles. Its normal n is the direction of the summed
+    area vectors of those that face upwards, its area the sum of the y components of all over
+    n_y: a rim has the normal of the surface, not of the wall. A depth h along the normal is
+    taken off by moving the vertex down by h/n_y. x and z of no vertex change, and the volume of
+    a closed surface is linear in y then, so that
 
         volume removed = sum over vertices of h times area
 
@@ -55,9 +56,9 @@ class ArticularSurface:
             spacing,
             lambda s: s.face_normals[:, 1] > STEEPEST,
         )
-        vectors = area_vectors(surface)
-        length = np.linalg.norm(vectors, axis=1)
-        up = np.flatnonzero(vectors[:, 1] > STEEPEST * length)
+        upward, whole = area_vectors(surface)
+        length = np.linalg.norm(upward, axis=1)
+        up = np.flatnonzero((upward[:, 1] > STEEPEST * length) & (whole[:, 1] > 0))
         points = surface.vertices[up]
         caster = RayCaster(surface)
         above = points.copy()
@@ -78,22 +79,26 @@ class ArticularSurface:
 
     def normals_and_areas(self, lowered: Surface) -> tuple[Array, Array]:
         """Return unit normals (n, 3) and areas (n,) m² of the vertices of a lowered surface."""
-        vectors = area_vectors(lowered)[self.vertices]
-        area = np.linalg.norm(vectors, axis=1)
-        return vectors / area[:, None], area
+        upward, whole = (vectors[self.vertices] for vectors in area_vectors(lowered))
+        normals = upward / np.linalg.norm(upward, axis=1)[:, None]
+        return normals, whole[:, 1] / normals[:, 1]
 
 
-def area_vectors(surface: Surface) -> Array:
-    """Return a third of the sum of the area vectors of each vertex's triangles, (n, 3) m²."""
+def area_vectors(surface: Surface) -> tuple[Array, Array]:
+    """Return a third of the area vectors of each vertex's triangles, summed, (n, 3) m².
+
+    Returns:
+        The sums over those that face upwards, and over all.
+    """
     a, b, c = np.moveaxis(surface.triangles, 1, 0)
     vector = np.cross(b - a, c - a) / 6.0
-    total = np.zeros_like(surface.vertices)
-    for corner in range(3):
-        for axis in range(3):
-            total[:, axis] += np.bincount(
-                surface.faces[:, corner], vector[:, axis], len(surface.vertices)
-            )
-    return total
+    corners, count = surface.faces.T.ravel(), len(surface.vertices)
+
+    def summed(each: Array) -> Array:
+        return np.stack([np.bincount(corners, np.tile(v, 3), count) for v in each.T], axis=1)
+
+    up = surface.face_normals[:, 1] > STEEPEST
+    return summed(np.where(up[:, None], vector, 0.0)), summed(vector)
 
 
 def volume(surface: Surface) -> float:
