@@ -65,10 +65,12 @@ def plate_case(motion, law, under=always, creep=None, thickness=0.01, **more):
     return WearCase(Pressed(under, **more), articular, motion, law, DENSITY, creep)
 
 
-def ball_case(insert, radius, motion, wear_factor, resolution=1.0, contact="foundation"):
+def ball_case(insert, radius, motion, wear_factor, resolution=1.0, facets=3):
     """A sphere, by a contact model."""
     engine = ContactEngine(
-        contact_model(contact, resolution), shapes.sphere(radius, 5), material("polyethylene")
+        contact_model("foundation", resolution),
+        shapes.sphere(radius, facets),
+        material("polyethylene"),
     )
     articular = ArticularSurface.of_insert(insert, resolution * MM)
     return WearCase(engine, articular, motion, Archard(wear_factor), DENSITY)
