@@ -48,18 +48,30 @@ class WearRun:
 
         Raises:
             InputError: what the folder keeps is of another simulation, or no contact is found.
+            KeyboardInterrupt: with a folder, saying what is kept there.
         """
         state = None
 
+        kept = 0.0
+
         def keep(done: WearState) -> None:
+            nonlocal kept
             progress(done.cycles)
             if folder is not None:
                 keep_state(folder, done, identity)
+                kept = done.cycles
 
         if folder is not None:
             identity = wear_identity(self.setup, self.case, self.cycles, self.updates)
             state = kept_state(folder, identity) if resume else None
-        state, last = simulate_wear(self.case, self.cycles, self.updates, state=state, keep=keep)
+        try:
+            state, last = simulate_wear(
+                self.case, self.cycles, self.updates, state=state, keep=keep
+            )
+        except KeyboardInterrupt:
+            if not kept:
+                raise
+            raise KeyboardInterrupt(f"{kept:.6g} cycles are kept; go on with --resume") from None
         return WearReport(
             self.setup, self.case, self.material, state, last, self.cycles, self.updates
         )
