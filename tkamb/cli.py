@@ -19,6 +19,7 @@ from tkamb.mesh_command import add_contact, add_mesh, add_no_cache, add_press, w
 from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
 from tkamb.view.command import add_view
+from tkamb.wear.command import add_wear
 
 if TYPE_CHECKING:
     from tkamb.scene import Scene
@@ -72,6 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     add_view(commands)
     add_tradeoff(commands)
     add_stability(commands)
+    add_wear(commands)
     return parser
 
 
