@@ -64,7 +64,7 @@ def test_springs_come_to_rest_where_their_matrix_says():
         )
         assert end.status is BalanceStatus.OK
         assert np.allclose(end.coordinates, np.linalg.solve(stiffness, load), atol=2e-6)
-        assert end.softest == pytest.approx(np.linalg.eigvalsh(stiffness)[0], rel=1e-3)
+        assert end.smallest_stiffness == pytest.approx(np.linalg.eigvalsh(stiffness)[0], rel=1e-3)
 
 
 def test_energy_falls_in_every_step_through_a_stiffening_contact():

@@ -5,12 +5,12 @@ import pytest
 
 from scenes import fast_scene, write_scene
 from tkamb import load_scene, simulate
-from tkamb.case import load_case
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import knee_pose
-from tkamb.mechanics.mechanics import Mechanics
 from tkamb.output.tables import strain_table
+from tkamb.scene.case import load_case
 
 FEW = {"motion.frames": 26}
 FRAMES = slice(10, 91, 40)
@@ -126,6 +126,6 @@ def test_a_wider_band_wraps_sooner_and_further():
         mechanics = Mechanics(
             load_case(load_scene(fast_scene(), FEW | {"quadriceps.band_mm": band}))
         )
-        wraps.append([mechanics.placed(k).wrap for k in (12, 19, 25)])
+        wraps.append([mechanics.geometry(k).extensor.wrap for k in (12, 19, 25)])
     assert wraps[0][0] == 0.0
     assert (np.array(wraps[1]) > np.array(wraps[0])).all()

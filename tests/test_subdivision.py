@@ -7,7 +7,6 @@ import trimesh
 from contact_bodies import dished_insert
 from lattice_bodies import above, box_insert, condyles
 from scenes import MODEL
-from tkamb.case import load_case
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
@@ -17,6 +16,7 @@ from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.subdivision import coarsened
 from tkamb.geometry.surface import Surface
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 UP = np.array([0.0, 1.0, 0.0])
 LINEAR = material("polyethylene-linear")

@@ -7,12 +7,12 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from tkamb.case import load_case
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.frames import inverse, transform
 from tkamb.geometry.surface import Surface
-from tkamb.mechanics.mechanics import Mechanics
 from tkamb.output.metrics import JUMP
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 from tkamb.view.draw import draw
 from tkamb.view.run import open_run
 from tkamb.view.shading import MOST_TRIANGLES, decimate, shade
@@ -106,7 +106,7 @@ def test_the_foot_stands_on_the_floor_and_holds_the_ankle(run, drawing):
     foot = next(one for one in drawing.solids if one.name == "foot")
     floor = next(one for one in drawing.solids if one.name == "floor")
     for row, k in enumerate(run.frames):
-        ankle = run.mechanics.placed(k).geometry.state.point("tibia", np.zeros(3))
+        ankle = run.mechanics.geometry(k).state.point("tibia", np.zeros(3))
         sole = transform(inverse(floor.poses[row]) @ foot.poses[row], foot.surface.vertices)
         assert abs(sole[:, 1].min()) < 1e-3
         local = transform(inverse(foot.poses[row]), ankle)
@@ -148,7 +148,7 @@ def test_the_bone_that_the_scene_names_is_drawn():
     if not data.is_dir():
         pytest.skip("subject DM's data are not beside the project")
     mechanics = Mechanics(load_case(load_scene(DM, {"motion.frames": 26})))
-    states = [mechanics.placed(k).geometry.state for k in range(2)]
+    states = [mechanics.geometry(k).state for k in range(2)]
     made = solids(mechanics.case, mechanics.poses[:2], states, None, [-1] * 2)
     femur = next(one for one in made if one.name == "femur")
     given = trimesh.load(data / "geometry" / "bone_femur.stl")

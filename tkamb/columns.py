@@ -140,7 +140,11 @@ COLUMNS: tuple[Column, ...] = (
     Column("coupling_change_N", "by the last of these, in the contact force", _COUPLED),
     Column("coupling_change_mm", "the same, in the centres of pressure", _POINTS),
     Column("contact_trials", "contacts computed to find the released pose", _FREE, "integer"),
-    Column("softest_N_per_mm", "smallest stiffness of the released pose (lever 25 mm)", _FREE),
+    Column(
+        "smallest_stiffness_N_per_mm",
+        "smallest stiffness of the released pose (lever 25 mm)",
+        _FREE,
+    ),
     Column(
         "adjust_force_change_BW",
         "force_total_BW less what the equations give at the recorded pose",
@@ -175,6 +179,9 @@ COLUMNS: tuple[Column, ...] = (
         _MARKERS,
     ),
 )
+
+RENAMED = {"softest_N_per_mm": "smallest_stiffness_N_per_mm"}
+"""Names in results of earlier releases, and today's."""
 
 KINDS: dict[str, Kind] = {column.name: column.kind for column in COLUMNS}
 _PREFIX, _SUFFIX = LIGAMENT.split("<name>")

@@ -21,9 +21,20 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 KNEE_COORDINATES = ("ap", "si", "ml", "axial_rotation", "adduction", "flexion")
 """Order of the six knee coordinates: translations (m), then rotations (rad)."""
+
+KNEE_JOINT_NAMES = tuple(f"knee_{name}" for name in KNEE_COORDINATES)
+"""Their joints in the URDF, in the same order."""
+
+PATELLA_COORDINATES = PATELLA_JOINT_NAMES = ("patella_ap", "patella_si", "patella_rotation")
+"""The patella's in the femur's sagittal plane, and their joints: m, m, rad."""
+
+SIDES = ("medial", "lateral")
+"""The condyles."""
 
 
 def pose(rotation: ArrayLike, translation: ArrayLike) -> Array:

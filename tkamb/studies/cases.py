@@ -165,9 +165,9 @@ def _shipped(name: str) -> StudyCase:
 
 
 def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
-    from tkamb.case import load_case
-    from tkamb.mechanics.mechanics import Mechanics
+    from tkamb.equilibrium.mechanics import Mechanics
     from tkamb.scene import load_scene
+    from tkamb.scene.case import load_case
 
     case = load_case(load_scene(path))
     table, insert = case.scene.contact, case.scene.implant.insert

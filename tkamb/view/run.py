@@ -4,13 +4,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tkamb.case import Case, load_case
+from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.errors import InputError
-from tkamb.mechanics.mechanics import FrameLoads, Mechanics
 from tkamb.results import Results
 from tkamb.results_folder import SUMMARY_NAME, read_results
 from tkamb.run.summary import files_hash, scene_hash
 from tkamb.scene import Scene, load_scene
+from tkamb.scene.case import Case, load_case
 from tkamb.simulation import simulate
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
@@ -48,9 +48,9 @@ class CaseResults:
         side, found = ContactSide(self.case, self.mechanics), []
         touched: list[FrameContact] = []
         for k in progress(self.frames):
-            body, carried = side.frame(k, touched)
+            body, contact_of_frame = side.frame(k, touched)
             found.append(body)
-            touched.append(carried)
+            touched.append(contact_of_frame)
         return found
 
 
@@ -181,5 +181,5 @@ def _scene_of(results: Results) -> Scene:
             "put it back, or run it again",
         )
     contact = results.summary.get("contact") or {}
-    kept = {f"contact.{key}": value for key, value in contact.items() if value is not None}
-    return load_scene(path, kept)
+    overrides = {f"contact.{key}": value for key, value in contact.items() if value is not None}
+    return load_scene(path, overrides)

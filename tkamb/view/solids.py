@@ -1,6 +1,6 @@
 """The rigid parts of a drawing: implant, patella, bones as plain solids, floor and foot.
 
-A scene holds no bone meshes but one that the quadriceps may wrap, which is drawn; the other
+A scene holds no bone meshes but one that a muscle may wrap, which is drawn; the other
 bones are stand-ins of about the right size between the joint centres: they orient the eye and
 carry no load. Nobody measured the foot: it hangs at the ankle, level with the floor and pointing
 where the shank does, so that the arrow of the ground reaction does not hang in the air.
@@ -13,11 +13,10 @@ import trimesh
 
 from tkamb.body.chain import ChainState
 from tkamb.body.knee import KneeGeometry
-from tkamb.case import Case
 from tkamb.geometry.frames import Array, inverse, pose, transform
 from tkamb.geometry.surface import Surface
-from tkamb.mechanics.extensor import quadriceps_bone
 from tkamb.output.maps import ContactMaps
+from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
 from tkamb.view.arrows import centre_of_pressure
 from tkamb.view.colours import BLACK, BONE, BUTTON, FLOOR, INSERT, METAL, RECORDED
@@ -114,8 +113,8 @@ def _contact_poses(recorded: Array, maps: ContactMaps | None, rows: Sequence[int
 
 
 def _femur(case: Case, states: Sequence[ChainState], poses: Array) -> Solid:
-    """Return the bone that the quadriceps may wrap, else a stand-in up to the hip."""
-    bone = quadriceps_bone(case)
+    """Return the bone that a muscle wraps, else a stand-in up to the hip."""
+    bone = case.bone
     if bone is not None:
         return Solid("femur", "bones", bone, BONE, 1.0, poses)
     hip = (inverse(poses[0]) @ np.append(states[0].point("hip", np.zeros(3)), 1.0))[:3]
@@ -140,26 +139,21 @@ def _shaft(end: Array, profile: tuple[tuple[float, float], ...], name: str) -> S
     )
     mesh = trimesh.creation.revolve(outline, sections=28)
     turn = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], end / length)
-    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64), name).moved(turn)
+    return _surface(mesh, name).moved(turn)
 
 
 def _patella(case: Case) -> Surface:
     """Return an ellipsoid from the tendon's insertion to the ligament's origin."""
-    scene = case.scene
-    assert scene.quadriceps is not None and scene.patellar_ligament is not None
-    top, bottom = (
-        transform(case.chain.link_in(end.link, "patella"), np.array(end.point_mm) * MILLIMETRE)
-        for end in (scene.quadriceps.insertion, scene.patellar_ligament.proximal)
-    )
+    assert case.patellar_ligament is not None
+    ends = (case.muscles[0].points[-1], case.patellar_ligament.proximal)
+    top, bottom = (transform(case.chain.link_in(end.link, "patella"), end.position) for end in ends)
     ball = trimesh.creation.icosphere(subdivisions=3)
     along = top - bottom
     half = 0.5 * float(np.linalg.norm(along))
     radii = np.array([PATELLA_DEPTH, half, PATELLA_WIDTH])
     turn = trimesh.geometry.align_vectors([0.0, 1.0, 0.0], along / (2.0 * half))[:3, :3]
-    surface = Surface(
-        np.asarray(ball.vertices) * radii, np.asarray(ball.faces, np.int64), "patella"
-    )
-    return surface.moved(pose(turn, 0.5 * (top + bottom)))
+    ball.apply_scale(radii)
+    return _surface(ball, "patella").moved(pose(turn, 0.5 * (top + bottom)))
 
 
 def floor_and_foot(
@@ -205,16 +199,14 @@ def _floor_pose(geometry: KneeGeometry, tibia_in_laboratory: Array, floor: float
 def _floor_surface() -> Surface:
     box = trimesh.creation.box(PLATE)
     box.apply_translation([PLATE_CENTRE, -0.5 * PLATE[1], 0.0])
-    return Surface(np.asarray(box.vertices), np.asarray(box.faces, np.int64), "floor")
+    return _surface(box, "floor")
 
 
 def _foot_surface(height: float) -> Surface:
     """Return a foot whose ankle is `height` (m) above the sole."""
     ankle = (0.0, height / MILLIMETRE, 0.0, ANKLE_RADIUS)
     parts = [_hull((*SOLE, INSTEP)), _hull((INSTEP, ankle))]
-    first = len(parts[0].vertices)
-    vertices = np.concatenate([part.vertices for part in parts])
-    return Surface(vertices, np.concatenate([parts[0].faces, parts[1].faces + first]), "foot")
+    return _surface(parts[0] + parts[1], "foot")
 
 
 def _hull(balls: Sequence[tuple[float, ...]]) -> trimesh.Trimesh:
@@ -222,3 +214,7 @@ def _hull(balls: Sequence[tuple[float, ...]]) -> trimesh.Trimesh:
     ball = trimesh.creation.icosphere(subdivisions=3)
     points = [ball.vertices * radius + centre for *centre, radius in balls]
     return trimesh.convex.convex_hull(np.concatenate(points) * MILLIMETRE)
+
+
+def _surface(mesh: trimesh.Trimesh, name: str) -> Surface:
+    return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64), name)
