@@ -102,8 +102,8 @@ def area_above(points: Array, triangles: NDArray[np.int64], pressure: Array, lev
     near = np.zeros(len(points), bool)
     near[triangles[(pressure[triangles] > 0).any(axis=1)]] = True
     corners = triangles[near[triangles].any(axis=1)]
-    square, places = (pressure**2)[corners], points[corners]
-    edges = np.roll(places, -2, axis=1) - np.roll(places, -1, axis=1)  # opposite each corner
+    square, positions = (pressure**2)[corners], points[corners]
+    edges = np.roll(positions, -2, axis=1) - np.roll(positions, -1, axis=1)  # opposite each corner
     cross = np.cross(edges[:, 0], edges[:, 1])
     size = 0.5 * np.linalg.norm(cross, axis=1)
     across = np.cross(cross[:, None], edges)

@@ -169,8 +169,8 @@ def _cell_means(
     slope = -normals[:, [0, 2]] / np.maximum(normals[:, 1:2], STEEPEST)
     rise = slope[:, :1] * dx + slope[:, 1:] * dz
     offset = np.stack(np.broadcast_arrays(dx, rise, dz), axis=-1)
-    places = (samples.points[near] - contact.point)[:, None] + offset
-    u, v = np.moveaxis(places @ contact.axes.T, -1, 0)
+    positions = (samples.points[near] - contact.point)[:, None] + offset
+    u, v = np.moveaxis(positions @ contact.axes.T, -1, 0)
     inside = 1 - (u / patch.long_axis) ** 2 - (v / patch.short_axis) ** 2
     return np.sqrt(np.maximum(inside, 0.0)).mean(axis=1)
 

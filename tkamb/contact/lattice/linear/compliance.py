@@ -99,8 +99,8 @@ class ComplianceCache:
                 self._take(spare if len(spare) <= MOST_STORED else wanted)
             nodes, half, compliance = self.nodes, self.half, self.compliance
         assert half is not None
-        place = np.searchsorted(nodes, wanted)
-        return ContactResponse(half, place, _taken(_taken(compliance, place, 1), place, 3))
+        index = np.searchsorted(nodes, wanted)
+        return ContactResponse(half, index, _taken(_taken(compliance, index, 1), index, 3))
 
     def moved(self, nodes: Indices, pushed: Indices, force: Array) -> Array:
         """Return the displacement (m, 3), m, of contact nodes under forces on contact nodes.
@@ -127,7 +127,7 @@ class ComplianceCache:
         new = np.setdiff1d(np.arange(len(nodes)), here, assume_unique=True)
         compliance: Array = np.empty((3, len(nodes), 3, len(nodes)), SINGLE)
         axes = np.arange(3)
-        known, had = ((axes, places, axes, places) for places in (here, there))
+        known, had = ((axes, index, axes, index) for index in (here, there))
         compliance[np.ix_(*known)] = self.compliance[np.ix_(*had)]
         rows = half.compliance(unknowns_of(new)).reshape(len(new), 3, len(nodes), 3)
         compliance[:, new] = rows.transpose(1, 0, 3, 2)
@@ -135,6 +135,6 @@ class ComplianceCache:
         self.nodes, self.half, self.compliance = nodes, half, compliance
 
 
-def _taken(values: Array, places: Indices, axis: int) -> Array:
-    """Return some places along an axis; "clip" spares numpy a copy, all are in range."""
-    return np.take(values, places, axis=axis, mode="clip")
+def _taken(values: Array, index: Indices, axis: int) -> Array:
+    """Return some entries along an axis; "clip" spares numpy a copy, all are in range."""
+    return np.take(values, index, axis=axis, mode="clip")

@@ -193,13 +193,13 @@ def factorise(
     permuted = matrix[order][:, order].tocsc()
     permuted.sort_indices()
     updates: dict[int, list[tuple[Indices, Array]]] = {}
-    place = np.empty(len(order), np.int64)
+    row = np.empty(len(order), np.int64)
     fronts: list[Front] = []
     start = 0
     for member, own in enumerate(unknowns):
         stop = start + len(own)
         front, update = _eliminate(
-            permuted, start, stop, updates.pop(member, []), place, tree.parent[member]
+            permuted, start, stop, updates.pop(member, []), row, tree.parent[member]
         )
         block = np.ascontiguousarray(front.block, dtype=precision)
         fronts.append(replace(front, block=block))
@@ -214,7 +214,7 @@ def _eliminate(
     start: int,
     stop: int,
     children: list[tuple[Indices, Array]],
-    place: Indices,
+    row: Indices,
     parent: int,
 ) -> tuple[Front, Array]:
     """Return a member's front and the update for its parent."""
@@ -230,11 +230,11 @@ def _eliminate(
     own, mixed, rest = (np.zeros(size, order="F") for size in ((k, k), (m, k), (m, m)))
     inside = (rows >= start) & ~below
     own[rows[inside] - start, columns[inside]] = values[inside]
-    place[boundary] = np.arange(m)
-    mixed[place[rows[below]], columns[below]] = values[below]
+    row[boundary] = np.arange(m)
+    mixed[row[rows[below]], columns[below]] = values[below]
     for indices, update in children:
         split = int(np.searchsorted(indices, stop))
-        here, there = indices[:split] - start, place[indices[split:]]
+        here, there = indices[:split] - start, row[indices[split:]]
         _extend_add(own, here, here, update[:split, :split])
         _extend_add(mixed, there, here, update[split:, :split])
         _extend_add(rest, there, there, update[split:, split:])

@@ -111,7 +111,7 @@ def prepare_operator(
 
     Args:
         stiffness: symmetric, positive definite on the free unknowns.
-        index: (n, 3) place of each node in the lattice.
+        index: (n, 3) lattice index of each node.
         held: (3n,) unknowns that are zero.
         contact_nodes: (c,).
         precision: in which the numbers are kept; they are worked out in float64.
@@ -137,9 +137,9 @@ def prepare_operator(
         wanted = (3 * some[own][:, None] + np.arange(3)).ravel()
         unknowns.append(number[wanted[free[wanted]]])
     factor = factorise(stiffness[free][:, free], tree, unknowns, precision)
-    place = np.full(len(free), -1)
-    place[np.flatnonzero(free)[factor.order]] = np.arange(len(factor.order))
-    wanted = place[(3 * contact_nodes[:, None] + np.arange(3)).ravel()]
+    rank = np.full(len(free), -1)
+    rank[np.flatnonzero(free)[factor.order]] = np.arange(len(factor.order))
+    wanted = rank[(3 * contact_nodes[:, None] + np.arange(3)).ravel()]
     return ElasticOperator(free, factor, contact_nodes, half_response(factor, wanted, precision))
 
 

@@ -97,8 +97,8 @@ class HalfResponse:
                 part = block.values.astype(np.float64)
                 inner[a:b, block.first : block.last] += part[:, rows[a:b] - block.first].T @ part
         result = np.zeros((len(rank), len(self.rank)))
-        place = np.searchsorted(rows, rank[rank >= 0])
-        result[np.ix_(rank >= 0, live)] = inner[np.ix_(place, self.rank[live])]
+        index = np.searchsorted(rows, rank[rank >= 0])
+        result[np.ix_(rank >= 0, live)] = inner[np.ix_(index, self.rank[live])]
         return result
 
     @property

@@ -54,7 +54,7 @@ class Lattice:
 
     Args:
         nodes: (n, 3) m.
-        index: (n, 3) place (i, j, k) in the structured grid.
+        index: (n, 3) index (i, j, k) in the structured grid.
         node_class: (n,) INTERNAL, CONTACT, BOTTOM or OTHER.
         spacing: (3,) m, of the undistorted grid.
         origin: (3,) m, of the grid's node (0, 0, 0).

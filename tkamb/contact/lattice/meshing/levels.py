@@ -50,7 +50,7 @@ class Levels:
     count: int
 
     def position(self, height: Array, i: NDArray[np.int64], k: NDArray[np.int64]) -> Array:
-        """Return the place of heights (m,) among the layers of columns (i, k); a fraction."""
+        """Return the position of heights (m,) among the layers of columns (i, k); a fraction."""
         reference = self.reference[i, k]
         within = np.clip(height, 0.0, reference) * self.layers / reference
         outside = np.minimum(height, 0.0) + np.maximum(height - reference, 0.0)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tkamb.contact.lattice.meshing.cells import gauss_gradients, mean_gradient
 from tkamb.contact.lattice.solids.curve import ShearCurve
-from tkamb.contact.lattice.solids.solid import DEVIATORIC, Indices, Solid, strain_matrix
+from tkamb.contact.lattice.solids.solid import DEVIATORIC, CellSolid, Indices, strain_matrix
 from tkamb.contact.materials import Material
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
@@ -22,7 +22,7 @@ _ROOT = (_VECTORS * np.sqrt(np.maximum(_VALUES, 0))).T[_VALUES > 1e-12]
 """(5, 6) with rootᵀ root = the form 2 dev eps : dev eps."""
 
 
-class BbarHexahedra(Solid):
+class BbarHexahedra(CellSolid):
     """Mean-dilatation hexahedra, small strain, J2 deformation theory at the Gauss points.
 
     At each point e² = (2/3) dev eps : dev eps and 3 mu_s = q(e)/e; the bulk stays elastic.
@@ -44,19 +44,10 @@ class BbarHexahedra(Solid):
         self.dilatation = mean.reshape(-1, 24)
         self.curve = ShearCurve.of(material)
 
-    @cached_property
-    def stiffness(self) -> sparse.csr_matrix:
-        """Linear stiffness (3n, 3n), N/m."""
-        return self.pattern.assemble(self.shape_stiffness(), self.shape_of_cell)
-
     def shape_stiffness(self) -> Array:
         """Return the linear stiffness of each shape (s, 24, 24), N/m."""
         shear = np.einsum("sg,sgri,sgrj->sij", self.weights, self.shear, self.shear, optimize=True)
-        return self.material.shear_modulus * shear + self._bulk
-
-    def linear_force(self, displacement: Array) -> Array:
-        """Return K u, N, (n, 3); see `Solid`."""
-        return self._cells_force(self.shape_stiffness(), displacement)
+        return self.material.shear_modulus * shear + self.bulk
 
     def nonlinear_residual(self, displacement: Array, chosen: Indices | None = None) -> Array:
         """Return the Gauss points' (mu - mu_s) times unit shear forces, N, (k, 24)."""
@@ -71,7 +62,7 @@ class BbarHexahedra(Solid):
         strain, equivalent = self._state(displacement)
         shape = self.shape_of_cell
         secant, softening = self.curve.modulus(equivalent), self.curve.softening(equivalent)
-        matrices = self._bulk[shape]
+        matrices = self.bulk[shape]
         for point in range(8):
             weight, shear = self.weights[shape, point], self.shear[shape, point]
             matrices += (weight * secant[:, point])[:, None, None] * (
@@ -83,29 +74,18 @@ class BbarHexahedra(Solid):
         return self.pattern.assemble(matrices)
 
     @cached_property
-    def _bulk(self) -> Array:
-        g = self.dilatation
-        scale = self.material.bulk_modulus * self.volume
-        return scale[:, None, None] * g[:, :, None] * g[:, None, :]
-
-    @cached_property
-    def _others(self) -> tuple[Array, Array, Indices]:
-        """Shear matrices (40, 24) of the commonest shape and of other cells, and their places.
-
-        Of the latter, -1 for a cell of the commonest shape.
-        """
+    def _others(self) -> tuple[Array, Array]:
+        """Shear matrices (40, 24) of the commonest shape and of the cells of other shapes."""
         common, others = self.kinds
-        place = np.full(len(self.cells), -1)
-        place[others] = np.arange(len(others))
         flat = self.shear.reshape(-1, 40, 24)
-        return flat[common], flat[self.shape_of_cell[others]], place
+        return flat[common], flat[self.shape_of_cell[others]]
 
     def _sorted(self, chosen: Indices | None) -> tuple[Array, Indices, Array]:
         """Return the common matrix, which of the chosen cells are others, and their matrices."""
-        matrix, matrices, place = self._others
-        place = place if chosen is None else place[chosen]
-        others = np.flatnonzero(place >= 0)
-        return matrix, others, matrices if chosen is None else matrices[place[others]]
+        matrix, matrices = self._others
+        index = self.index_among_others if chosen is None else self.index_among_others[chosen]
+        others = np.flatnonzero(index >= 0)
+        return matrix, others, matrices if chosen is None else matrices[index[others]]
 
     def _state(self, displacement: Array, chosen: Indices | None = None) -> tuple[Array, Array]:
         """Return scaled deviatoric strain (k, 8, 5) and equivalent strain (k, 8)."""

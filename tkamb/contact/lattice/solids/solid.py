@@ -159,14 +159,6 @@ class Solid(ABC):
     def linear_force(self, displacement: Array) -> Array:
         """Return K u, N, (n, 3), summed element by element: no matrix is assembled."""
 
-    def _cells_force(self, matrices: Array, displacement: Array) -> Array:
-        """Return K u, N, (n, 3), from the stiffness of each shape (s, 24, 24)."""
-        local = self.scatter.gather(displacement)
-        common, others = self.kinds
-        force = local @ matrices[common]
-        force[others] = np.einsum("cij,cj->ci", matrices[self.shape_of_cell[others]], local[others])
-        return self.scatter.sum(force)
-
     def least_principal_strain(self, displacement: Array) -> float:
         """Return the smallest principal strain of the cells' mean gradients.
 
@@ -202,6 +194,49 @@ class Solid(ABC):
         """The commonest shape, and the cells (k,) of all others."""
         common = int(np.bincount(self.shape_of_cell).argmax())
         return common, np.flatnonzero(self.shape_of_cell != common)
+
+
+class CellSolid(Solid):
+    """A solid whose cells are a shear part and an elastic bulk K V g gᵀ, shape by shape.
+
+    Attributes:
+        dilatation: (s, 24) g, 1/m: the mean dilatation of a cell is g · u.
+        volume: (s,) V, m³.
+    """
+
+    dilatation: Array
+    volume: Array
+
+    @abstractmethod
+    def shape_stiffness(self) -> Array:
+        """Return the linear stiffness of each shape (s, 24, 24), N/m."""
+
+    @cached_property
+    def stiffness(self) -> sparse.csr_matrix:
+        """Linear stiffness (3n, 3n), N/m."""
+        return self.pattern.assemble(self.shape_stiffness(), self.shape_of_cell)
+
+    def linear_force(self, displacement: Array) -> Array:
+        """Return K u, N, (n, 3); see `Solid`."""
+        matrices, local = self.shape_stiffness(), self.scatter.gather(displacement)
+        common, others = self.kinds
+        force = local @ matrices[common]
+        force[others] = np.einsum("cij,cj->ci", matrices[self.shape_of_cell[others]], local[others])
+        return self.scatter.sum(force)
+
+    @cached_property
+    def bulk(self) -> Array:
+        """K V g gᵀ of each shape (s, 24, 24), N/m."""
+        g, scale = self.dilatation, self.material.bulk_modulus * self.volume
+        return scale[:, None, None] * g[:, :, None] * g[:, None, :]
+
+    @cached_property
+    def index_among_others(self) -> Indices:
+        """Index (c,) of each cell among those that are not of the commonest shape, or -1."""
+        others = self.kinds[1]
+        index = np.full(len(self.cells), -1)
+        index[others] = np.arange(len(others))
+        return index
 
 
 def strain_matrix(gradients: Array) -> Array:
