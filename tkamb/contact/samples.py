@@ -28,8 +28,8 @@ MOST_CELLS = 4_000_000
 class SurfaceSamples(ContactSurface):
     """Map points on the surface that rays from above see first, eminence and post included.
 
-    The points lie on the mesh itself, the normals are `smooth_normals`. A point's area is the
-    part of its grid cell that the insert covers, divided by n_y: under a uniform pressure the
+    The points lie on the mesh itself, the normals are `Surface.smooth_normals`. A point's area is
+    the part of its grid cell that the insert covers, divided by n_y: under a uniform pressure the
     vertical force is exactly pressure times covered projection.
 
     Args:

@@ -1,8 +1,6 @@
 """Contact alone: two meshes, a pose, a load; what `tkamb press` does."""
 
 import math
-import resource
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,6 +28,7 @@ from tkamb.geometry.frames import Array, mirrored_pose
 from tkamb.geometry.frames import pose as pose_matrix
 from tkamb.inputs.meshes import axes_rotation, load_surface, mirrored
 from tkamb.known_errors import known_error
+from tkamb.memory import peak_rss
 from tkamb.press.press_report import PressReport, Side
 from tkamb.units import DEGREE, LENGTH
 
@@ -192,9 +191,3 @@ def read_pose(path: str | Path) -> tuple[float, ...]:
 
 
 _SIX = "give a text file of six numbers: x y z (mesh units) rx ry rz (deg)"
-
-
-def peak_rss() -> float:
-    """Return the largest resident memory so far, MB (1e6 bytes)."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6

@@ -183,7 +183,7 @@ def assumptions(case: Case) -> list[str]:
     elif not scene.tibia:
         said.append("No [tibia]: the shank stands upright and still.")
     if scene.ground_reaction and scene.ground_reaction.applied == "ankle":
-        said.append("The ground reaction acts at the ankle centre, without moment (the source).")
+        said.append("The ground reaction acts at the ankle centre, without moment (Sharma 2008).")
     if not scene.patella:
         said.append("No muscles: the knee's flexion moment is carried by nothing (a residual).")
     if scene.contact:

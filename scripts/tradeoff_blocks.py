@@ -7,7 +7,10 @@ from statistics import median
 
 from tkamb.errors import InputError
 from tkamb.known_errors import KnownError
-from tkamb.studies.advice import (
+from tkamb.studies.body_trade import HEADS as BODY_HEADS
+from tkamb.studies.body_trade import BodyRow
+from tkamb.studies.row import KEYS, TIMING_NOISE, Row, beats, on_front
+from tkamb.studies.tradeoff_report import (
     Setting,
     bodies_of,
     comparison,
@@ -16,9 +19,6 @@ from tkamb.studies.advice import (
     setting_of,
     warm_by_bodies,
 )
-from tkamb.studies.body_trade import HEADS as BODY_HEADS
-from tkamb.studies.body_trade import BodyRow
-from tkamb.studies.row import KEYS, Row
 
 MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
 HEADS = ("approach", "condyle force", "mean p", "peak p", "area", "map L2")
@@ -161,3 +161,29 @@ def with_block(text: str, lines: Sequence[str], name: str = "tradeoff") -> str:
     before, rest = text.split(begin)
     after = rest.split(end)[1]
     return "\n".join([before + begin, "", *lines, "", end + after])
+
+
+def moved(first: Sequence[tuple[float, float]], second: Sequence[tuple[float, float]]) -> list[int]:
+    """Return which points changed between on and off the front though no tie explains it.
+
+    A tie explains it when the two points of every pair that decides lie within the noise of each
+    other in one of the two measurements.
+
+    Args:
+        first: (seconds, error) of each point.
+        second: the same points, measured again.
+    """
+    found = []
+    marks = on_front(first), on_front(second)
+    for i, (before, after) in enumerate(zip(*marks, strict=True)):
+        points = first if after else second
+        deciding = [j for j in range(len(points)) if beats(points[j], points[i])]
+        if before != after and not all(
+            _tied(first[i], first[j]) or _tied(second[i], second[j]) for j in deciding
+        ):
+            found.append(i)
+    return found
+
+
+def _tied(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    return max(one[0], other[0]) <= TIMING_NOISE * min(one[0], other[0])
