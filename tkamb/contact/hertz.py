@@ -5,14 +5,13 @@ from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.curvature import OsculatingContact, osculate
 from tkamb.contact.ellipse import ContactEllipse, contact_ellipse
 from tkamb.contact.model import ContactModel
 from tkamb.contact.result import CondyleContact, ContactResult, peak_flags, thickness_under
 from tkamb.contact.samples import STEEPEST, SampledContact, SurfaceSamples, gaps_along_normals
-from tkamb.geometry.frames import SIDES, Array
+from tkamb.geometry.frames import SIDES, Array, Index
 
 SHORT_AXIS_SUB_CELLS = 10
 """Sub-cells on the ellipse's short semi-axis, over which the pressure is averaged."""
@@ -156,7 +155,7 @@ def map_pressure(
 
 def _cell_means(
     samples: SurfaceSamples,
-    near: NDArray[np.int64],
+    near: Index,
     contact: OsculatingContact,
     patch: ContactEllipse,
 ) -> Array:

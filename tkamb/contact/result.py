@@ -8,13 +8,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.pair import ContactPair, PreparedContact
-from tkamb.geometry.frames import Array, inverse, transform
+from tkamb.geometry.frames import Array, Mask, inverse, transform
 from tkamb.units import MEGAPASCAL
-
-Mask = NDArray[np.bool_]
 
 HIGHEST_KNOWN = 100.0 * MEGAPASCAL
 """Peak pressure beyond which polyethylene's curves are extrapolated (they end at 40 to 60 MPa)."""

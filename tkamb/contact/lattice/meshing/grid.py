@@ -23,15 +23,13 @@ from tkamb.contact.lattice.meshing.cells import (
 from tkamb.contact.lattice.meshing.columns import NodeField, settle_columns
 from tkamb.contact.lattice.meshing.walls import inside, settle_walls
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.post import find_post
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
 _log = logging.getLogger("tkamb")
 
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 INTERNAL, CONTACT, BOTTOM, OTHER = 0, 1, 2, 3
 """Node classes: inside, top surface, flat bottom, any other surface (walls, underside)."""

@@ -8,14 +8,13 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.meshing.cells import gauss_gradients, mean_gradient
 from tkamb.contact.lattice.solids.curve import ShearCurve
-from tkamb.contact.lattice.solids.solid import DEVIATORIC, CellSolid, Indices, strain_matrix
+from tkamb.contact.lattice.solids.solid import DEVIATORIC, CellSolid, strain_matrix
 from tkamb.contact.materials import Material
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 
 _VALUES, _VECTORS = np.linalg.eigh(DEVIATORIC)
 _ROOT = (_VECTORS * np.sqrt(np.maximum(_VALUES, 0))).T[_VALUES > 1e-12]
@@ -32,9 +31,7 @@ class BbarHexahedra(CellSolid):
         InputError: the Jacobian is not positive at a Gauss point.
     """
 
-    def __init__(
-        self, nodes: Array, cells: NDArray[np.int64], spacing: Array, material: Material
-    ) -> None:
+    def __init__(self, nodes: Array, cells: Index, spacing: Array, material: Material) -> None:
         super().__init__(nodes, cells, spacing, material)
         gradients, self.weights = gauss_gradients(self.shapes)
         if not (self.weights > 0).all():
@@ -49,7 +46,7 @@ class BbarHexahedra(CellSolid):
         shear = np.einsum("sg,sgri,sgrj->sij", self.weights, self.shear, self.shear, optimize=True)
         return self.material.shear_modulus * shear + self.bulk
 
-    def nonlinear_residual(self, displacement: Array, chosen: Indices | None = None) -> Array:
+    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return the Gauss points' (mu - mu_s) times unit shear forces, N, (k, 24)."""
         strain, equivalent = self._state(displacement, chosen)
         softened = self.material.shear_modulus - self.curve.modulus(equivalent)
@@ -80,14 +77,14 @@ class BbarHexahedra(CellSolid):
         flat = self.shear.reshape(-1, 40, 24)
         return flat[common], flat[self.shape_of_cell[others]]
 
-    def _sorted(self, chosen: Indices | None) -> tuple[Array, Indices, Array]:
+    def _sorted(self, chosen: Index | None) -> tuple[Array, Index, Array]:
         """Return the common matrix, which of the chosen cells are others, and their matrices."""
         matrix, matrices = self._others
         index = self.index_among_others if chosen is None else self.index_among_others[chosen]
         others = np.flatnonzero(index >= 0)
         return matrix, others, matrices if chosen is None else matrices[index[others]]
 
-    def _state(self, displacement: Array, chosen: Indices | None = None) -> tuple[Array, Array]:
+    def _state(self, displacement: Array, chosen: Index | None = None) -> tuple[Array, Array]:
         """Return scaled deviatoric strain (k, 8, 5) and equivalent strain (k, 8)."""
         local = self.scatter.gather(displacement, chosen)
         matrix, others, matrices = self._sorted(chosen)
@@ -96,7 +93,7 @@ class BbarHexahedra(CellSolid):
         strain = flat.reshape(-1, 8, 5)
         return strain, np.sqrt(np.einsum("cgr,cgr->cg", strain, strain) / 3)
 
-    def _per_cell_forces(self, stress: Array, chosen: Indices | None) -> Array:
+    def _per_cell_forces(self, stress: Array, chosen: Index | None) -> Array:
         """Return (k, 24) from weighted scaled stresses (k, 8, 5)."""
         flat = stress.reshape(-1, 40)
         matrix, others, matrices = self._sorted(chosen)

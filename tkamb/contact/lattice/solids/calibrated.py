@@ -21,13 +21,12 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.meshing.cells import CORNERS, PAIR_AXES, PAIRS, mean_gradient
 from tkamb.contact.lattice.solids.curve import ShearCurve
 from tkamb.contact.lattice.solids.solid import DEVIATORIC, CellSolid, strain_matrix
 from tkamb.contact.materials import Material
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 
 
 def spring_families(edges: Array, body_diagonal: float) -> Array:
@@ -134,9 +133,7 @@ class CalibratedNetwork(CellSolid):
     is symmetric. See `Solid` for the arguments.
     """
 
-    def __init__(
-        self, nodes: Array, cells: NDArray[np.int64], spacing: Array, material: Material
-    ) -> None:
+    def __init__(self, nodes: Array, cells: Index, spacing: Array, material: Material) -> None:
         super().__init__(nodes, cells, spacing, material)
         self.deviatoric, self.dilatation, self.volume = deviatoric_matrices(self.shapes, spacing)
         self.curve = ShearCurve.of(material)
@@ -145,9 +142,7 @@ class CalibratedNetwork(CellSolid):
         """Return mu K_d + K V g gᵀ of each shape (s, 24, 24), N/m."""
         return self.material.shear_modulus * self.deviatoric + self.bulk
 
-    def nonlinear_residual(
-        self, displacement: Array, chosen: NDArray[np.int64] | None = None
-    ) -> Array:
+    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return (mu - mu_s) K_d u of the cells, N, (k, 24); see `Solid`."""
         force, equivalent = self._state(displacement, chosen)
         softened = self.material.shear_modulus - self.curve.modulus(equivalent)
@@ -168,9 +163,7 @@ class CalibratedNetwork(CellSolid):
         """K_d of the cells that are not of the commonest shape."""
         return self.deviatoric[self.shape_of_cell[self.kinds[1]]]
 
-    def _state(
-        self, displacement: Array, chosen: NDArray[np.int64] | None = None
-    ) -> tuple[Array, Array]:
+    def _state(self, displacement: Array, chosen: Index | None = None) -> tuple[Array, Array]:
         """Return K_d u (k, 24) and the equivalent strain e (k,) of the chosen cells."""
         local = self.scatter.gather(displacement, chosen)
         cells = slice(None) if chosen is None else chosen

@@ -6,14 +6,11 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.meshing.cells import group_shapes, mean_gradient
 from tkamb.contact.materials import Material
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array
-
-Indices = NDArray[np.int64]
+from tkamb.geometry.frames import Array, Index
 
 DEVIATORIC = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 DEVIATORIC[:3, :3] -= 2 / 3
@@ -30,12 +27,12 @@ class Pattern:
         slot: (c, p²) block of each ordered node pair of each element of p nodes.
     """
 
-    indptr: Indices
-    indices: Indices
-    slot: Indices
+    indptr: Index
+    indices: Index
+    slot: Index
 
     @classmethod
-    def of(cls, elements: Indices, nodes: int) -> "Pattern":
+    def of(cls, elements: Index, nodes: int) -> "Pattern":
         """Return the pattern of elements (c, p) on so many nodes."""
         count = elements.shape[1]
         rows = np.repeat(elements, count, axis=1).ravel().astype(np.int64)
@@ -49,7 +46,7 @@ class Pattern:
         """How many nodes."""
         return len(self.indptr) - 1
 
-    def assemble(self, matrices: Array, shape: Indices | None = None) -> sparse.csr_matrix:
+    def assemble(self, matrices: Array, shape: Index | None = None) -> sparse.csr_matrix:
         """Return the sum (3n, 3n) of the elements' matrices.
 
         Args:
@@ -78,15 +75,15 @@ class Scatter:
         nodes: how many nodes.
     """
 
-    elements: Indices
+    elements: Index
     nodes: int
 
-    def gather(self, displacement: Array, chosen: Indices | None = None) -> Array:
+    def gather(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return (k, 3p) of the chosen elements, by default of all, from nodal (n, 3)."""
         elements = self.elements if chosen is None else self.elements[chosen]
         return displacement[elements].reshape(len(elements), 3 * elements.shape[1])
 
-    def sum(self, forces: Array, chosen: Indices | None = None) -> Array:
+    def sum(self, forces: Array, chosen: Index | None = None) -> Array:
         """Return nodal (n, 3) from (k, 3p) of the chosen elements, by default of all."""
         flat = (self.elements if chosen is None else self.elements[chosen]).ravel()
         parts = forces.reshape(-1, 3)
@@ -109,7 +106,7 @@ class Solid(ABC):
         InputError: a cell is turned inside out.
     """
 
-    def __init__(self, nodes: Array, cells: Indices, spacing: Array, material: Material) -> None:
+    def __init__(self, nodes: Array, cells: Index, spacing: Array, material: Material) -> None:
         self.nodes, self.cells, self.spacing, self.material = nodes, cells, spacing, material
         self.shapes, self.shape_of_cell = group_shapes(nodes[cells])
         _, volume = mean_gradient(self.shapes)
@@ -132,7 +129,7 @@ class Solid(ABC):
         """Linear stiffness (3n, 3n), N/m."""
 
     @abstractmethod
-    def nonlinear_residual(self, displacement: Array, chosen: Indices | None = None) -> Array:
+    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return linear forces minus the material's own, N, of elements of `scatter` (k, 3p).
 
         Args:
@@ -182,7 +179,7 @@ class Solid(ABC):
         return (gradient + np.swapaxes(gradient, 1, 2)) / 2
 
     @cached_property
-    def _mean_gradients(self) -> tuple[Array, Indices, Array]:
+    def _mean_gradients(self) -> tuple[Array, Index, Array]:
         """Mean gradients of the commonest shape as (24, 9), the other cells, theirs (8, 3, k)."""
         gradients, (common, others) = mean_gradient(self.shapes)[0], self.kinds
         matrix = np.einsum("nb,ac->ncab", gradients[common], np.eye(3)).reshape(24, 9)
@@ -190,7 +187,7 @@ class Solid(ABC):
         return matrix, others, np.ascontiguousarray(theirs.transpose(1, 2, 0))
 
     @cached_property
-    def kinds(self) -> tuple[int, Indices]:
+    def kinds(self) -> tuple[int, Index]:
         """The commonest shape, and the cells (k,) of all others."""
         common = int(np.bincount(self.shape_of_cell).argmax())
         return common, np.flatnonzero(self.shape_of_cell != common)
@@ -231,7 +228,7 @@ class CellSolid(Solid):
         return scale[:, None, None] * g[:, :, None] * g[:, None, :]
 
     @cached_property
-    def index_among_others(self) -> Indices:
+    def index_among_others(self) -> Index:
         """Index (c,) of each cell among those that are not of the commonest shape, or -1."""
         others = self.kinds[1]
         index = np.full(len(self.cells), -1)
