@@ -19,6 +19,7 @@ DRAWING = {
     "starter": set(),
     "geometry": set(),
     "opensim": {"geometry"},
+    "muscles": {"geometry", "opensim"},
     "body": {"geometry"},
     "contact": {"geometry"},
     "inputs": {"geometry", "scene"},

@@ -127,7 +127,9 @@ class ReleasedKnee:
             middle = _middle(knee.contact, points, place)
             shift = np.abs(middle - last).max() if self._keeps else 0.0
             if pushes:
-                slack = True
+                # a line that pushes drives the knee away: slack, it begins where this began
+                slack, knee = True, before
+                place, middle, force = np.array(start, float), np.array(start[:3]), force * np.nan
             elif knee.problem or (max(moved, shift) < KNEE_CHANGE and change < FORCE_CHANGE):
                 return knee
         assert knee is not None
