@@ -42,7 +42,7 @@ class UVLines:
 
     @property
     def mean_line_normals(self) -> Array:
-        """The source's normals (n, 3): mean of the lines' own normals, for comparison only.
+        """Sharma's (2008) normals (n, 3): mean of the lines' own normals, for comparison only.
 
         On a slope that one line does not see it errs by half the slope.
         """

@@ -7,31 +7,33 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "tkamb"
 
-COMMON = {"atomic", "code_identity", "columns", "command_options", "defaults", "errors", "files"}
-COMMON |= {"known_errors", "memory", "units"}
-"""Modules of the top level that any folder may use."""
-RESULTS = {"results", "results_folder"}
-ALLOWED = {
+KNOWN_TO_ALL = {
+    *("atomic", "claim", "code_identity", "defaults", "errors", "files", "guard"),
+    *("command_options", "known_errors", "memory", "units"),
+}
+"""Modules without knees: numbers, files, memory, messages."""
+KNEE = {"body", "contact", "equilibrium", "geometry", "scene"}
+SHOWN = {"columns", "output", "results", "results_folder"}
+DRAWING = {
+    "datasets": set(),
+    "starter": set(),
     "geometry": set(),
-    "inputs": {"geometry"},
     "opensim": {"geometry"},
     "body": {"geometry"},
     "contact": {"geometry"},
-    "scene": {"geometry", "inputs", "body"},
-    "equilibrium": {"geometry", "body", "contact", "scene"},
-    "importing": {"geometry", "inputs", "opensim", "scene"},
+    "inputs": {"geometry", "scene"},
+    "scene": {"body", "geometry", "inputs"},
+    "equilibrium": {"body", "contact", "geometry", "scene"},
     "plausibility": {"geometry", "inputs", "scene"},
-    "run": {"geometry", "body", "contact", "equilibrium", "scene", "output"} | RESULTS,
-    "output": {"geometry", "contact", "run"} | RESULTS,
-    "view": {"geometry", "body", "contact", "equilibrium", "scene", "run", "output", "simulation"}
-    | RESULTS,
-    "press": {"geometry", "inputs", "contact", "equilibrium"},
-    "studies": {"geometry", "inputs", "contact", "equilibrium", "scene", "run", "output", "press"}
-    | {"claim", "simulation"},
-    "datasets": set(),
-    "starter": set(),
+    "importing": {"geometry", "inputs", "opensim", "scene"},
+    "press": {"contact", "equilibrium", "geometry", "inputs"},
+    "run": {*KNEE, *SHOWN} - {"results"},
+    "output": {"columns", "contact", "geometry", "run"},
+    "view": {*KNEE, *SHOWN, "run", "simulation"} - {"columns"},
+    "studies": {*KNEE, "inputs", "output", "run", "simulation"} - {"body"},
 }
-"""Folder -> what else of the package it may import; see docs/architecture.md."""
+"""Which folder knows which folders and which modules beside them: inputs → body → (equilibrium ⇄
+contact) → results → output, view and studies; the scene is where files become bodies."""
 SEES_BODY_AND_CONTACT = {"contact_side.py", "simulation.py"}
 
 
@@ -54,21 +56,32 @@ def imported(path):
     return {name for name in names if name.startswith("tkamb")}
 
 
-def test_every_folder_has_its_row():
-    folders = {path.parent.name for path in PACKAGE.glob("*/*.py")}
-    assert folders == set(ALLOWED)
+def part_of(name):
+    """Return the folder, or the module beside the folders, that a dotted name belongs to."""
+    parts = name.split(".")
+    return parts[1] if len(parts) > 1 else ""
 
 
-@pytest.mark.parametrize("layer", sorted(ALLOWED))
-def test_layers_import_only_downwards(layer):
-    for path in (PACKAGE / layer).rglob("*.py"):
-        others = {name.split(".")[1] for name in imported(path) if "." in name}
-        beyond = others - {layer} - ALLOWED[layer] - COMMON
-        assert not beyond, f"{path.name} imports {beyond}"
+@pytest.mark.parametrize("folder", sorted(DRAWING))
+def test_a_folder_knows_only_what_the_drawing_says(folder):
+    for path in (PACKAGE / folder).rglob("*.py"):
+        for name in imported(path):
+            allowed = DRAWING[folder] | KNOWN_TO_ALL | {folder, ""}
+            assert part_of(name) in allowed, f"{path.name} imports {name}"
+
+
+def test_every_folder_is_in_the_drawing():
+    folders = {path.name for path in PACKAGE.iterdir() if any(path.glob("*.py"))}
+    assert folders <= set(DRAWING)
+
+
+def test_body_and_contact_know_geometry_alone():
+    assert DRAWING["body"] == DRAWING["contact"] == {"geometry"}
 
 
 def test_the_layer_test_can_fail():
     assert "tkamb.body.chain" in imported(PACKAGE / "equilibrium" / "mechanics.py")
+    assert part_of("tkamb.body.chain") == "body"
 
 
 def test_only_two_files_see_body_and_contact():

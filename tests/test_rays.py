@@ -1,5 +1,7 @@
 """Rays: exact distances, no leaks, every crossing once."""
 
+import pickle
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -161,3 +163,14 @@ def test_intervals_agree_with_embree_on_random_grids(seed):
     np.testing.assert_array_equal(ray[::2], found.first * 20 + found.second)
     np.testing.assert_allclose(low[axis] - 0.01 + distance[::2], found.lower, atol=1e-12)
     np.testing.assert_allclose(low[axis] - 0.01 + distance[1::2], found.upper, atol=1e-12)
+
+
+def test_a_surface_builds_its_rays_and_normals_once_and_keeps_them_to_itself():
+    """What is derived stays with the surface; only the triangles go to another process."""
+    ball = sphere(0.02, 3, (0.0, 0.0, 0.0))
+    assert ball.rays is ball.rays and ball.nearest is ball.nearest
+    assert ball.corner_normals is ball.corner_normals
+    sent = pickle.loads(pickle.dumps(ball))
+    assert set(vars(sent)) == {"vertices", "faces", "name"}
+    origins, up = np.array([[0.0, -1.0, 0.0]]), (0.0, 1.0, 0.0)
+    assert sent.rays.first(origins, up)[0] == ball.rays.first(origins, up)[0]

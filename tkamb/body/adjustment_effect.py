@@ -1,6 +1,6 @@
 """What the femoral adjustment does to the forces: the same equations at the recorded pose.
 
-The adjustment is meant to mend the split of the load and to leave the total alone (the source,
+The adjustment is meant to mend the split of the load and to leave the total alone (Sharma 2008,
 5.2.2: less than 0.001 BW). Where it does not, the frame's forces hang on a rotation and a
 translation that are smaller than fluoroscopy's error, and a reader has to know.
 """

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 LIFT_OFF_ANGLE = 0.5 * DEGREE
 LIFT_OFF_GAP = 0.5 * MILLIMETRE
 """A condyle is off the insert where both its gap and the coronal angle of the two gaps exceed
-what fluoroscopy errs by (the source, 4.3)."""
+what fluoroscopy errs by (Sharma 2008, 4.3)."""
 
 FARTHEST_GAP = 3e-3
 """m: a femoral component farther from the insert, or deeper in it, is misplaced."""

@@ -2,9 +2,9 @@
 
 Where the femur has sunk in deeper than it was moved, or has come to lie at a larger coronal
 angle than it was turned by, the load would have brought both condyles into contact anyway:
-the recorded rotation is restored and pressed again (the source, 4.3, figure 4-8).
+the recorded rotation is restored and pressed again (Sharma 2008, 4.3, figure 4-8).
 
-The source joins the two conditions by "and"; `restore_when="both"` does so.
+Sharma (2008) joins the two conditions by "and"; `restore_when="both"` does so.
 """
 
 from dataclasses import replace

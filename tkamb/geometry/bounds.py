@@ -3,19 +3,16 @@
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.geometry.frames import Array, rotate, transform
+from tkamb.geometry.frames import Array, Index, rotate, transform
 from tkamb.geometry.ragged import Ragged
 from tkamb.geometry.surface import Surface
-
-Index = NDArray[np.int64]
 
 CELL_EDGE = 1e-3
 """m."""
 MOST_CELLS = 400
 """Cells along an edge of the grid; a larger surface gets larger ones."""
-WIDEST = 4
+WIDE_IN_CELLS = 4
 """Cells along an edge; larger triangles are dealt with one by one."""
 LARGEST_SLOPE = 3.0
 """Rise over run of a bound's planes."""
@@ -135,15 +132,15 @@ class HeightBound:
     def _covered(self, low: Array, high: Array) -> Iterator[tuple[Index, tuple[Index, Index]]]:
         """Yield rectangles (m,) and one cell (m,), (m,) that each of them covers."""
         first, last = self._place(low), self._place(high)
-        wide = (last - first >= WIDEST).any(axis=1)
+        wide = (last - first >= WIDE_IN_CELLS).any(axis=1)
         for t in np.flatnonzero(wide):
             rows, columns = (np.arange(first[t, k], last[t, k] + 1) for k in (0, 1))
             cells = np.repeat(rows, len(columns)), np.tile(columns, len(rows))
             yield np.full(len(cells[0]), t), cells
         small = np.flatnonzero(~wide)
         first, last = first[small], last[small]
-        for i in range(WIDEST):
-            for j in range(WIDEST):
+        for i in range(WIDE_IN_CELLS):
+            for j in range(WIDE_IN_CELLS):
                 inside = (first[:, 0] + i <= last[:, 0]) & (first[:, 1] + j <= last[:, 1])
                 yield small[inside], (first[inside, 0] + i, first[inside, 1] + j)
 

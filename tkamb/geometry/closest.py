@@ -1,19 +1,18 @@
 """Closest points of the femoral condyles and the insert, and the gap between them."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import fcl
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tkamb.geometry.condyles import FACET_DEPTH, SAMPLE_SPACING, condyle_faces
-from tkamb.geometry.frames import Array, inverse, rotate, transform
+from tkamb.geometry.first_touch import FirstTouch
+from tkamb.geometry.frames import Array, Index, inverse, rotate, transform
 from tkamb.geometry.nearest import NearestPoints, sampled
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
-
-Indices = NDArray[np.int64]
 
 REGION_RADIUS = 1.6e-2
 """m; the close region ends this far from the closest point."""
@@ -82,6 +81,11 @@ class ClosestPointQuery:
         medial, lateral = condyle_faces(femoral, split)
         self._condyles = [_Condyle(femoral, faces) for faces in (medial, lateral) if len(faces)]
 
+    @cached_property
+    def first_touch(self) -> FirstTouch:
+        """How far either condyle travels along -y until it touches."""
+        return FirstTouch(self.femoral, self.insert, self.split)
+
     def at(self, pose_femoral_in_insert: Array) -> CondyleGaps:
         """Return the gaps at a pose (4, 4)."""
         pose = np.asarray(pose_femoral_in_insert, float)
@@ -110,7 +114,7 @@ class ClosestPointQuery:
         on_femoral, on_insert = (np.asarray(point) * MILLIMETRE for point in result.nearest_points)
         return float(distance) * MILLIMETRE, on_femoral, on_insert
 
-    def _touching(self, condyle: "_Condyle", pose: Array) -> Indices:
+    def _touching(self, condyle: "_Condyle", pose: Array) -> Index:
         """Return the triangles of the condyle that cut or touch the insert's surface."""
         request = fcl.CollisionRequest(num_max_contacts=_BATCH, enable_contact=True)
         result = fcl.CollisionResult()
@@ -120,7 +124,7 @@ class ClosestPointQuery:
         distance = self._nearest.at(transform(pose, condyle.points)).distance
         return condyle.around(condyle.vertices[[np.argmin(distance)]])
 
-    def _deepest_vertices(self, condyle: "_Condyle", pose: Array) -> Indices:
+    def _deepest_vertices(self, condyle: "_Condyle", pose: Array) -> Index:
         """Return the deepest few vertices inside the insert, deepest first; none if apart.
 
         The depth along y bounds the depth from above and orders the search.
@@ -147,7 +151,7 @@ class ClosestPointQuery:
         inside = (face >= 0) & (self.insert.face_normals[face, 1] > 0)
         return np.where(inside, distance, 0.0)
 
-    def _refined(self, faces: Indices, pose: Array) -> tuple[float, Array, Array]:
+    def _refined(self, faces: Index, pose: Array) -> tuple[float, Array, Array]:
         """Return gap and points of the deepest point of triangles, cutting the best finer."""
         corners = self.femoral.triangles[faces]
         triangles = transform(pose, corners.reshape(-1, 3)).reshape(-1, 3, 3)
@@ -171,7 +175,7 @@ class ClosestPointQuery:
 class _Condyle:
     """The triangles of one condyle: their tree, their vertices."""
 
-    def __init__(self, femoral: Surface, faces: Indices) -> None:
+    def __init__(self, femoral: Surface, faces: Index) -> None:
         self.faces = faces
         self.tree = _tree(femoral, faces)
         self.vertices = np.unique(femoral.faces[faces])
@@ -184,7 +188,7 @@ class _Condyle:
         place = fcl.Transform(pose[:3, :3], pose[:3, 3] / MILLIMETRE)
         return fcl.CollisionObject(self.tree, place)
 
-    def around(self, vertices: Indices) -> Indices:
+    def around(self, vertices: Index) -> Index:
         """Return the triangles that touch the vertices."""
         touched = np.zeros(self._corners.max() + 1, bool)
         touched[vertices] = True
@@ -207,7 +211,7 @@ class _CloseRegion:
         faces: (k,) the triangles that belong to the part.
     """
 
-    def __init__(self, surface: Surface, faces: NDArray[np.int64]) -> None:
+    def __init__(self, surface: Surface, faces: Index) -> None:
         part = Surface(surface.vertices, surface.faces[faces], surface.name)
         samples, owner, areas = sampled(part, SAMPLE_SPACING)
         first, self._areas = _thinned(samples, areas)
@@ -244,7 +248,7 @@ class _CloseRegion:
         return centre, mean / np.linalg.norm(mean)
 
 
-def _thinned(samples: Array, areas: Array) -> tuple[NDArray[np.int64], Array]:
+def _thinned(samples: Array, areas: Array) -> tuple[Index, Array]:
     """Keep one sample of each cube of the spacing: its index, and the area of them all."""
     cubes = np.floor(samples / SAMPLE_SPACING).astype(np.int64)
     order = np.argsort(-areas, kind="stable")
@@ -253,7 +257,7 @@ def _thinned(samples: Array, areas: Array) -> tuple[NDArray[np.int64], Array]:
     return order[first].astype(np.int64), np.asarray(total, np.float64)
 
 
-def _tree(surface: Surface, faces: Indices) -> fcl.BVHModel:
+def _tree(surface: Surface, faces: Index) -> fcl.BVHModel:
     """Return the triangles as a tree in millimetres.
 
     fcl compares with absolute tolerances: in metres it finds small triangles that are 30 µm

@@ -1,9 +1,8 @@
 """Where a femoral component parts into two condyles, and the lowest point of each."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.geometry.frames import Array, rotate, transform
+from tkamb.geometry.frames import Array, Index, rotate, transform
 from tkamb.geometry.nearest import sampled
 from tkamb.geometry.surface import Surface
 
@@ -50,9 +49,7 @@ def condyle_split(femoral: Surface) -> float | None:
     return float((middles[first] + middles[last]) / 2)
 
 
-def condyle_faces(
-    femoral: Surface, split: float | None
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def condyle_faces(femoral: Surface, split: float | None) -> tuple[Index, Index]:
     """Return the triangles (k,) of the medial and of the lateral condyle.
 
     A triangle belongs to the side that its centroid is on. Without a split all of them are
@@ -120,4 +117,4 @@ def _lowest(pose: Array, vertices: Array, samples: Array, areas: Array) -> Array
     )
     across = rotate(pose, np.vstack([samples[near], lowest]) - lowest)
     step = weights @ across / weights.sum()
-    return np.asarray(transform(pose, lowest) + step * np.array([1.0, 0.0, 1.0]))
+    return transform(pose, lowest) + step * np.array([1.0, 0.0, 1.0])

@@ -4,15 +4,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.subdivision import Coarsened, coarsened
 from tkamb.geometry.surface import Surface
 
-Indices = NDArray[np.int64]
-
-STEEPEST = 0.1
+SMALLEST_COSINE = 0.1
 """Smallest cosine between normal and direction that a shift is divided by: 84 deg."""
 
 
@@ -61,7 +58,7 @@ class CurvedSurface:
         """Corner normals, sagittas and plane's normal side by side (k, 15)."""
         return np.hstack([self.normals.reshape(-1, 9), self.sagittas, self.surface.face_normals])
 
-    def shift(self, faces: Indices, weights: Array, direction: Array) -> tuple[Array, Array]:
+    def shift(self, faces: Index, weights: Array, direction: Array) -> tuple[Array, Array]:
         """Return how far the patches are from points on their triangles along a direction.
 
         To first order in the patch's height.
@@ -85,7 +82,7 @@ class CurvedSurface:
         height = 4.0 * np.einsum("ij,ij->i", around, sagittas)
         along = np.einsum("ij,ij->i", normals, planes)
         cosine = normals @ direction
-        steep = np.copysign(np.maximum(np.abs(cosine), STEEPEST), cosine)
+        steep = np.copysign(np.maximum(np.abs(cosine), SMALLEST_COSINE), cosine)
         return height * along / steep, normals
 
 
@@ -100,4 +97,4 @@ def _sagittas(surface: Surface, normals: Array) -> Array:
     coming = np.einsum("kij,kij->ki", end, edge)
     product, total = leaving * coming, leaving + coming
     alike = product > 0.0
-    return np.asarray(np.where(alike, 0.5 * product / np.where(alike, total, 1.0), 0.0))
+    return np.where(alike, 0.5 * product / np.where(alike, total, 1.0), 0.0)

@@ -3,15 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tkamb.geometry.bounds import HeightBound, Patches
-from tkamb.geometry.frames import Array, inverse, rotate, transform
+from tkamb.geometry.frames import Array, Index, Mask, inverse, rotate, transform
 from tkamb.geometry.ragged import Ragged
 from tkamb.geometry.surface import Surface
-
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 UP = np.array([0.0, 1.0, 0.0])
 EDGE_BAND = 0.03
@@ -21,7 +18,7 @@ MOST_EDGES = 1500
 FIRST_PATCHES = 12
 FIRST_LOOK = 64
 """So many promising vertices of so many patches give the bound that spares the others a ray."""
-ROUNDING = 1e-12
+CLEARANCE_ROUNDING = 1e-12
 """m; what a bound may be wrong by."""
 
 
@@ -106,7 +103,7 @@ class FirstTouch:
         planes = self._height_bound.planes(low[:, ::2], high[:, ::2])
         over = np.flatnonzero(np.isfinite(planes[:, 2]))
         least = self._patches.least(pose, over, _normals_of(planes[over]))
-        return over, least - planes[over, 2] - ROUNDING
+        return over, least - planes[over, 2] - CLEARANCE_ROUNDING
 
     def _placed(self, pose: Array, vertices: Index) -> Array:
         return transform(pose, self._femoral.vertices[vertices])
@@ -124,7 +121,7 @@ class FirstTouch:
     def _at_least(self, pose: Array, vertices: Index) -> Array:
         """Return a lower bound (n,) of the clearance of femoral vertices; inf beside the insert."""
         points = self._placed(pose, vertices)
-        least = points[:, 1] - self._height_bound.over(points) - ROUNDING
+        least = points[:, 1] - self._height_bound.over(points) - CLEARANCE_ROUNDING
         return np.where(_within(points, self._insert.bounds), least, np.inf)
 
     def _near_tops(self, pose: Array, faces: Index, bound: float, side: int | None) -> Index:
@@ -134,7 +131,7 @@ class FirstTouch:
         planes = self._height_bound.planes(low, high)
         normals = _normals_of(planes)
         above = np.minimum.reduce([np.einsum("ij,ij->i", c, normals) for c in corners])
-        near = above - planes[:, 3] - ROUNDING <= bound
+        near = above - planes[:, 3] - CLEARANCE_ROUNDING <= bound
         tops = self._height_bound.vertices_in_rectangles(low[near], high[near])
         tops = tops[self._insert_tops[tops]]
         if side is not None and self._split is not None:

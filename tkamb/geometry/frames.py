@@ -21,6 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 KNEE_COORDINATES = ("ap", "si", "ml", "axial_rotation", "adduction", "flexion")
 """Order of the six knee coordinates: translations (m), then rotations (rad)."""

@@ -15,12 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.ragged import counted
 from tkamb.geometry.surface import Surface
-
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 ODD_SHARE = 0.01
 """Largest share of lines with an odd number of crossings that is mended, not refused."""

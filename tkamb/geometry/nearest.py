@@ -5,16 +5,15 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.normals import NO_CREASE, corner_normals, interpolated
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
 
-Indices = NDArray[np.int64]
 
 _MOST_SAMPLES = 150_000
 _CANDIDATES = 8
@@ -33,7 +32,7 @@ class Nearest:
 
     distance: Array
     points: Array
-    faces: Indices
+    faces: Index
     normals: Array
 
 
@@ -84,12 +83,12 @@ class NearestPoints:
     def _sample_normals(self) -> Array:
         return self.normals_at(self._samples, self._faces)
 
-    def normals_at(self, points: Array, faces: Indices) -> Array:
+    def normals_at(self, points: Array, faces: Index) -> Array:
         """Return the interpolated unit normals (n, 3) at points (n, 3) of given triangles."""
         return interpolated(self.surface, self._corner_normals, points, faces)
 
 
-def sampled(surface: "Surface", spacing: float) -> tuple[Array, Indices, Array]:
+def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
     """Return samples (n, 3) that cover every triangle, the triangle (n,) and area (n,) of each.
 
     A triangle is cut into n² like ones so that no edge is longer than the spacing; the
@@ -129,7 +128,7 @@ def nearest_on_triangles(triangles: Array, points: Array) -> Array:
     on_edges = start + part[:, :, None] * along
     nearest = ((on_edges - target) ** 2).sum(axis=2).argmin(axis=1)
     feet[outside] = on_edges[np.arange(len(start)), nearest]
-    return np.asarray(feet)
+    return feet
 
 
 def _plane_weights(triangles: Array, points: Array) -> Array:
@@ -145,7 +144,7 @@ def _plane_weights(triangles: Array, points: Array) -> Array:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    return np.asarray(np.einsum("ij,ij->i", a, b))
+    return np.einsum("ij,ij->i", a, b)
 
 
 def _centres(n: int) -> Array:

@@ -3,15 +3,13 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.topology import edge_use
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
 
-Index = NDArray[np.int64]
 
 SHARP_EDGE = float(np.deg2rad(40.0))
 """rad: neighbouring triangles that turn by more than this meet in a sharp edge."""
@@ -65,7 +63,7 @@ def interpolated(surface: "Surface", normals: Array, points: Array, faces: Index
     return _unit(np.einsum("ij,ijk->ik", weights, normals[faces]))
 
 
-def sharp_edges(surface: "Surface", sharp: float = SHARP_EDGE) -> NDArray[np.bool_]:
+def sharp_edges(surface: "Surface", sharp: float = SHARP_EDGE) -> Mask:
     """Return (k, 3): whether the edge opposite each corner is sharp, open or shared by many."""
     edge, count = edge_use(surface.faces)
     cosine = 0.5 * (_sums(edge, np.repeat(surface.face_normals, 3, axis=0)) ** 2).sum(axis=1) - 1

@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
 
-Index = NDArray[np.int64]
 
 EDGE_TOLERANCE = 1e-9
 """How far outside a triangle, in barycentric units, a crossing still belongs to it."""
@@ -181,11 +180,11 @@ class RayCaster:
         scaled = ((points - self._centre) / self._radius).astype(np.float32)
         return np.asarray(self._scene.run(scaled, directions.astype(np.float32)), np.int64)
 
-    def _meets_sphere(self, points: Array, directions: Array) -> NDArray[np.bool_]:
+    def _meets_sphere(self, points: Array, directions: Array) -> Mask:
         offset = self._centre - points
         along = np.einsum("ij,ij->i", offset, directions)
         off_axis = np.linalg.norm(offset - along[:, None] * directions, axis=1)
-        return np.asarray((off_axis <= 1.01 * self._radius) & (along >= -self._radius))
+        return (off_axis <= 1.01 * self._radius) & (along >= -self._radius)
 
     def _intersect(self, origins: Array, directions: Array, face: Index) -> tuple[Array, Array]:
         """Return the distance to each triangle's plane and the barycentrics (n, 3) there."""

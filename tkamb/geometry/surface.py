@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
-from tkamb.geometry.frames import Array, transform
+from tkamb.geometry.frames import Array, Index, transform
 from tkamb.geometry.nearest import NearestPoints
 from tkamb.geometry.normals import SHARP_EDGE, corner_angles, corner_normals, interpolated
 from tkamb.geometry.ragged import Ragged
@@ -32,7 +31,7 @@ class Surface:
     """
 
     vertices: Array
-    faces: NDArray[np.int64]
+    faces: Index
     name: str = "surface"
 
     @cached_property
@@ -73,7 +72,7 @@ class Surface:
         rows = np.stack([np.cross(second, normal), np.cross(normal, first)], axis=1)
         return np.divide(rows, square, out=np.full_like(rows, np.nan), where=square > 0)
 
-    def barycentric(self, points: Array, faces: NDArray[np.int64]) -> Array:
+    def barycentric(self, points: Array, faces: Index) -> Array:
         """Return the barycentric coordinates (n, 3) of points (n, 3), m, on triangles (n,).
 
         Those of a point beside its triangle are cut to 0 to 1; thirds on a degenerate one.
@@ -94,7 +93,7 @@ class Surface:
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     @cached_property
-    def corner_vertices(self) -> NDArray[np.int64]:
+    def corner_vertices(self) -> Index:
         """The faces (k, 3) with vertices at the same place taken for one."""
         _, merged = np.unique(self.vertices, axis=0, return_inverse=True)
         return merged.reshape(-1)[self.faces].astype(np.int64)
@@ -117,7 +116,7 @@ class Surface:
     def _smooth_corner_normals(self) -> Array:
         return corner_normals(self, SMOOTH_WITHIN, corner_angles(self))
 
-    def smooth_normals(self, points: Array, faces: NDArray[np.int64]) -> Array:
+    def smooth_normals(self, points: Array, faces: Index) -> Array:
         """Return unit normals (n, 3) at points (n, 3), m, on triangles `faces` (n,).
 
         Interpolated between angle-weighted normals at the corners, which leave out triangles

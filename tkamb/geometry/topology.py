@@ -3,14 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
-from tkamb.geometry.frames import Array
-
-Indices = NDArray[np.int64]
+from tkamb.geometry.frames import Array, Index
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,18 +22,18 @@ class BoundaryLoop:
         perimeter: length of the loop, units of the surface.
     """
 
-    vertices: Indices
+    vertices: Index
     centre: Array
     width: float
     perimeter: float
 
 
-def half_edges(faces: Indices) -> Indices:
+def half_edges(faces: Index) -> Index:
     """Return the directed edges (3k, 2) of the faces (k, 3), face by face."""
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
-def edge_use(faces: Indices) -> tuple[Indices, Indices]:
+def edge_use(faces: Index) -> tuple[Index, Index]:
     """Return for every half edge its undirected edge (3k,), and how many faces use each edge."""
     ends = np.sort(half_edges(faces), axis=1)
     key = ends[:, 0] * (int(faces.max(initial=0)) + 1) + ends[:, 1]
@@ -44,13 +41,13 @@ def edge_use(faces: Indices) -> tuple[Indices, Indices]:
     return edge.reshape(-1), count
 
 
-def open_edges(faces: Indices) -> Indices:
+def open_edges(faces: Index) -> Index:
     """Return the directed edges (m, 2) that only one face uses."""
     edge, count = edge_use(faces)
     return half_edges(faces)[count[edge] == 1]
 
 
-def boundary_loops(vertices: Array, faces: Indices) -> list[BoundaryLoop]:
+def boundary_loops(vertices: Array, faces: Index) -> list[BoundaryLoop]:
     """Return the loops of open edges, widest first.
 
     Two holes that touch in a vertex come out as two loops. Chains that do not close (where
@@ -60,11 +57,11 @@ def boundary_loops(vertices: Array, faces: Indices) -> list[BoundaryLoop]:
     return sorted(loops, key=lambda loop: -loop.width)
 
 
-def _traced(edges: Indices) -> list[Indices]:
+def _traced(edges: Index) -> list[Index]:
     following: dict[int, list[int]] = {}
     for start, end in edges.tolist():
         following.setdefault(start, []).append(end)
-    loops: list[Indices] = []
+    loops: list[Index] = []
     while following:
         path = [next(iter(following))]
         position = {path[0]: 0}
@@ -93,7 +90,7 @@ def _traced(edges: Indices) -> list[Indices]:
     return loops
 
 
-def _measured(vertices: Array, loop: Indices) -> BoundaryLoop:
+def _measured(vertices: Array, loop: Index) -> BoundaryLoop:
     points = vertices[loop]
     centre = points.mean(axis=0)
     perimeter = float(np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
@@ -113,7 +110,7 @@ def _width(points: Array) -> float:
     return float(np.ptp(hull @ across.T, axis=0).min())
 
 
-def connected_parts(faces: Indices) -> Indices:
+def connected_parts(faces: Index) -> Index:
     """Return for every face (k,) the number of the connected part that it belongs to."""
     n = int(faces.max(initial=0)) + 1
     edges = half_edges(faces)
@@ -122,10 +119,10 @@ def connected_parts(faces: Indices) -> Indices:
     return np.unique(label[faces[:, 0]], return_inverse=True)[1].reshape(-1)
 
 
-def signed_volumes(vertices: Array, faces: Indices) -> Array:
+def signed_volumes(vertices: Array, faces: Index) -> Array:
     """Return the volume (k,) that each face spans with the centre of the vertices, m³."""
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
-    return np.asarray(np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
+    return np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,14 +137,14 @@ class Body:
         closed: whether its skin has no open edge.
     """
 
-    faces: Indices
+    faces: Index
     extents: Array
     centre: Array
     area: float
     closed: bool
 
 
-def separate_bodies(vertices: Array, faces: Indices) -> list[Body]:
+def separate_bodies(vertices: Array, faces: Index) -> list[Body]:
     """Return the bodies of a surface, the one with the largest skin first.
 
     A closed part of negative volume (its normals point to its inside) whose bounding box lies
@@ -163,7 +160,7 @@ def separate_bodies(vertices: Array, faces: Indices) -> list[Body]:
     found = [_body(vertices, faces, part, loose) for part in parts]
     volume = np.bincount(label, signed_volumes(vertices, faces))
     outer = [k for k in range(len(found)) if volume[k] >= 0 or not found[k].closed]
-    held: dict[int, list[Indices]] = {k: [found[k].faces] for k in outer}
+    held: dict[int, list[Index]] = {k: [found[k].faces] for k in outer}
     for k in set(range(len(found))) - set(outer):
         around = [q for q in outer if found[q].closed and _within(found[k], found[q])]
         held.setdefault(min(around, key=lambda q: found[q].area, default=k), []).append(parts[k])
@@ -174,7 +171,7 @@ def separate_bodies(vertices: Array, faces: Indices) -> list[Body]:
     return sorted(bodies, key=lambda body: -body.area)
 
 
-def _body(vertices: Array, faces: Indices, part: Indices, loose: Indices) -> Body:
+def _body(vertices: Array, faces: Index, part: Index, loose: Index) -> Body:
     corners = vertices[faces[part]]
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -176,7 +176,7 @@ class MotionTable(SceneTable):
     motion: Literal["recorded", "roll-slip"] = Field(
         "recorded",
         description=(
-            "'roll-slip' (the source): rotations and ML as recorded, AP from rolling plus slip, "
+            "'roll-slip' (Sharma 2008): rotations and ML as recorded, AP from rolling plus slip, "
             "SI from first touch; needs the implant"
         ),
     )
@@ -334,7 +334,7 @@ class GroundReactionTable(SceneTable):
         "+x,+y,+z", description="axes of the file that point forward, up and right"
     )
     applied: Literal["cop", "ankle"] = Field(
-        "cop", description="'ankle' applies the force alone at the ankle centre (the source)"
+        "cop", description="'ankle' applies the force alone at the ankle centre (Sharma 2008)"
     )
     cutoff_Hz: Number | Literal["none"]
     unloaded_N: Number = Field(
@@ -391,7 +391,7 @@ class Attachment(SceneTable):
 class LigamentTable(SceneTable):
     """One bundle: tension only, on a straight line.
 
-    `law = "two-line"` (Shin 2007, the source) takes `stiffness_N_per_mm`;
+    `law = "two-line"` (Shin 2007) takes `stiffness_N_per_mm`;
     `law = "quadratic-toe"` (Blankevoort 1991) takes `stiffness_N_per_strain`.
     """
 

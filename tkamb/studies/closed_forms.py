@@ -34,7 +34,7 @@ from tkamb.contact.pair import Bearing, ContactPair
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Mask
 from tkamb.geometry.surface import Surface
 from tkamb.studies.bodies import balls, block, flat
 from tkamb.studies.elastic_layer import sphere_on_layer
@@ -47,8 +47,8 @@ SIDE_MM = 24.0
 """Of the block under the plate: divides by the cells of 2 and 3 mm."""
 KEPT_GRID_MM = 0.9
 """Cells small enough that the operator of the block is worth a file."""
-SOURCE_APPROACH = 0.6808
-"""Approach of the source's springs under the plate over that of the solid they stand for: nu is
+SHARMA_APPROACH = 0.6808
+"""Approach of Sharma's springs under the plate over that of the solid they stand for: nu is
 0.35 whatever the material, and they are too stiff at free sides. A number of its own, kept so
 that a change is seen."""
 TOLERANCES: dict[str, tuple[float, float]] = {
@@ -172,7 +172,7 @@ def solution(case: ClosedForm) -> tuple[float, float]:
         if case.model == "foundation":
             strain = 1.0 - np.exp(-strain)
         if case.model == "lattice-source":
-            strain *= SOURCE_APPROACH
+            strain *= SHARMA_APPROACH
         return thick * strain, stress
     if case.kind == "layer":
         layer = sphere_on_layer(radius, thick, load, young, case.nu)
@@ -258,9 +258,11 @@ def _column(case: ClosedForm) -> Callable[[float], float]:
     return pressure
 
 
-def _inner(result: ContactResult) -> Array:
+def _inner(result: ContactResult) -> Mask:
     """Return the points a fifth of the block's side away from its edges."""
-    return np.asarray((np.abs(result.points[:, [0, 2]]) < 0.3 * SIDE_MM * MILLIMETRE).all(axis=1))
+    across = np.abs(result.points[:, [0, 2]]).max(axis=1)
+    inner: Mask = across < 0.3 * SIDE_MM * MILLIMETRE
+    return inner
 
 
 def _plate(side: float) -> Surface:

@@ -22,6 +22,7 @@ from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import TkambError
 from tkamb.known_errors import setting_label
+from tkamb.memory import peak_rss
 from tkamb.studies.cases import StudyCase, study_case
 from tkamb.studies.quantities import Quantities, quantities, raster_map
 
@@ -121,8 +122,6 @@ def measure_apart(job: Job, longest: float = LONGEST_SECONDS) -> Measure:
 
 def measure(job: Job) -> Measure:
     """Measure in this process."""
-    from tkamb.press.press import peak_rss
-
     model = _model(job)
     (prepare, cold), (case, state, result) = _first(model, job)
     if result.status is not ContactStatus.OK:
