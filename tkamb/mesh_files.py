@@ -7,8 +7,8 @@ from typing import Any
 import trimesh
 
 from tkamb.atomic import replaced_file
-from tkamb.contact.lattice.grid import Lattice, build_grid
-from tkamb.contact.lattice.quality import LatticeQuality, measure_quality
+from tkamb.contact.lattice.meshing.grid import Lattice, build_grid
+from tkamb.contact.lattice.meshing.quality import LatticeQuality, measure_quality
 from tkamb.contact.registry import COARSEST_MM
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement

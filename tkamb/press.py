@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from tkamb.contact import materials
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import Bearing, ContactPair
-from tkamb.contact.pressing import check_load, first_touch_height
+from tkamb.contact.pressing import check_load
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import CondyleContact, ContactResult, ContactStatus
 from tkamb.defaults import CONTACT_MODEL
@@ -195,7 +195,7 @@ def press_meshes(
     _check_load(load)
     model = contact_model(contact, resolution_mm, **(options or {}))
     pair, femoral_pose = load_pair(femoral, insert, units, pose, bearing, material, axes, side)
-    if not math.isfinite(first_touch_height(pair, femoral_pose)):
+    if not math.isfinite(pair.first_touch_height(femoral_pose)):
         raise InputError(
             "neither condyle lies over the insert",
             femoral,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.grid import Lattice
+from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.materials import LinearElastic, Material, RambergOsgood
 from tkamb.contact.pair import Bearing
 from tkamb.errors import InputError

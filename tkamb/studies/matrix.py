@@ -51,8 +51,6 @@ SETTINGS = {
         (
             {"tolerance": 1e-2},
             {"tolerance": 1e-5},
-            {"nonlinear_within_mm": 4.0},
-            {"nonlinear_within_mm": 8.0},
         ),
     ),
     "lattice-linear": Settings(),
