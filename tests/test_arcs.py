@@ -9,7 +9,7 @@ from condyle_profiles import condyle_profile
 from inserts import DATA, raised, real_insert
 from shapes import torus_condyle, trough
 from surface_arcs import arc_lengths, draw_uv_lines
-from tkamb.contact.lattice.grid import build_grid
+from tkamb.contact.lattice.meshing.grid import build_grid
 from tkamb.errors import InputError
 from tkamb.geometry.surface import Surface
 from tkamb.inputs.meshes import load_surface

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lattice_bodies import dished_insert
-from tkamb.contact.lattice.grid import build_grid
+from tkamb.contact.lattice.meshing.grid import build_grid
 from tkamb.contact.materials import material, tabulated_material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model

@@ -4,8 +4,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from tkamb.contact.lattice.grid import Lattice, build_grid
-from tkamb.contact.lattice.quality import LatticeQuality, measure_quality
+from tkamb.contact.lattice.meshing.grid import Lattice, build_grid
+from tkamb.contact.lattice.meshing.quality import LatticeQuality, measure_quality
 from tkamb.contact.registry import COARSEST_MM
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement

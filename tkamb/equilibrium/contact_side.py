@@ -20,11 +20,10 @@ from tkamb.body.contact_points import CondylePoint
 from tkamb.body.knee import solve_knee, unsolved
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
-from tkamb.contact.pressing import first_touch_height, within_insert
+from tkamb.contact.pressing import within_insert
 from tkamb.contact.probe import condyle_wrenches
 from tkamb.contact.registry import contact_model
-from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.contact.summary import medial_points
+from tkamb.contact.result import ContactResult, ContactStatus, medial_points
 from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.frame_contact import FrameContact
@@ -214,7 +213,7 @@ class ContactSide:
 
     def on_the_insert(self, place: Array) -> Array:
         """Return coordinates (6,) whose superior-inferior one makes the condyles just touch."""
-        height = first_touch_height(self.state.pair, knee_pose(place))
+        height = self.state.pair.first_touch_height(knee_pose(place))
         return np.array([place[0], height - FIRST_DEPTH, *place[2:]])
 
     def _equilibrium_loads(

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.contact.area import area_above
 from tkamb.contact.result import ContactResult
-from tkamb.contact.summary import area_above
 from tkamb.geometry.adjustment import Adjustment
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class FrameContact:
         """Return the share of a condyle's contact area above a pressure (Pa), 1 at most.
 
         The pressure is taken as linear between the map's points, see
-        `tkamb.contact.summary.area_above`.
+        `tkamb.contact.area.area_above`.
         """
         if self.result is None or self.triangles is None:
             return NAN

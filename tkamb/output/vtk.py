@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.atomic import replaced_file
-from tkamb.contact.lattice.cells import scaled_jacobians
-from tkamb.contact.lattice.grid import Lattice
+from tkamb.contact.lattice.meshing.cells import scaled_jacobians
+from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.geometry.frames import Array
 
 HEXAHEDRON = 12

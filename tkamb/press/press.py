@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tkamb.contact import materials
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import Bearing, ContactPair
-from tkamb.contact.pressing import check_load, first_touch_height
+from tkamb.contact.pressing import check_load
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult
 from tkamb.defaults import CONTACT_MODEL
@@ -79,7 +79,7 @@ def press_meshes(
     _check_load(load)
     model = contact_model(contact, resolution_mm, **(options or {}))
     pair, placed = load_pair(femoral, insert, units, pose, bearing, material, axes, side)
-    if not math.isfinite(first_touch_height(pair, placed)):
+    if not math.isfinite(pair.first_touch_height(placed)):
         raise InputError(
             "neither condyle lies over the insert",
             femoral,

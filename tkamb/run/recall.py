@@ -1,7 +1,7 @@
 """A frame's contact as arrays, and back: what a resumed run starts its next frame from.
 
-It stands in for the frame before as a guess, as good as the frame itself but for what a
-contact model remembers privately: answers stay within the solver's tolerance.
+It stands in for the frame before as a guess, as good as the frame itself but for its warm
+start, which is not kept: answers stay within the solver's tolerance.
 """
 
 from collections.abc import Mapping
@@ -31,7 +31,6 @@ def contact_arrays(contact: FrameContact | None) -> dict[str, Array] | None:
         return None
     result, knee = contact.result, contact.equilibrium
     arrays = {name: np.asarray(getattr(result, name), float) for name in RESULT_ARRAYS}
-    arrays["approach"] = np.array(result.approach, float)
     if knee is not None:
         arrays["equilibrium_coordinates"] = knee.coordinates
         arrays["equilibrium_force"] = knee.balance.force
@@ -54,8 +53,7 @@ def recalled(
 
 def _result(state: PreparedContact, arrays: Mapping[str, Array]) -> ContactResult:
     fields: dict[str, Any] = {name: arrays[name] for name in RESULT_ARRAYS}
-    fields["approach"] = float(arrays["approach"])
-    return ContactResult(points=state.points, medial=None, lateral=None, **fields)
+    return ContactResult(pair=state.pair, points=state.points, medial=None, lateral=None, **fields)
 
 
 def _equilibrium(

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tkamb.contact.lattice.grid import Lattice
+from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.materials import LinearElastic, Material, RambergOsgood
 from tkamb.contact.pair import Bearing
 from tkamb.errors import ComputationError, InputError

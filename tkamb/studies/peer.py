@@ -18,17 +18,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from tkamb.contact.lattice.covered import covered_areas
-from tkamb.contact.lattice.femoral import FemoralFloor
-from tkamb.contact.lattice.grid import Lattice, build_grid
-from tkamb.contact.lattice.pressure_map import ContactMap, contact_map
-from tkamb.contact.pair import ContactPair
-from tkamb.contact.pressing import pose_at_approach
+from tkamb.contact.area import covered_areas
+from tkamb.contact.lattice.meshing.contact_map import ContactMap, contact_map
+from tkamb.contact.lattice.meshing.grid import Lattice, build_grid
+from tkamb.contact.lattice.problem import SurfaceFromBelow
+from tkamb.contact.pair import ContactPair, PreparedContact
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult
-from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
 from tkamb.errors import ComputationError
-from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.surface import Surface
 from tkamb.studies.calculix import LONGEST_SECONDS, Deck, PeerRun, run_calculix
@@ -145,7 +142,7 @@ class _Problem:
     lattice: Lattice
     nodes: Index
     map: ContactMap
-    floor: FemoralFloor
+    floor: SurfaceFromBelow
     pose: Array
     depth: float
     touchable: Mask
@@ -157,14 +154,14 @@ def _problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -> _Pr
     nodes, surface = contact_map(lattice, pair.insert)
     smooth = lattice.nodes.copy()
     smooth[nodes, 1] += surface.lift
-    floor = FemoralFloor(pair.femoral, pair.femoral.rays)
+    floor = SurfaceFromBelow(pair.femoral, pair.femoral.rays)
     guess = contact_model("foundation", grid_mm)
     depth = guess.press(guess.prepare(pair), load, pose).approach
     if not depth > 0:
         raise ComputationError("needs a load that presses the bodies together", "CalculiX")
-    places, _ = floor.over(surface.points, pose_at_approach(pair, pose, 0.0))
+    places, _ = floor.over(surface.points, pair.pose_at_approach(pose, 0.0))
     near = places[:, 1] - surface.points[:, 1] < TOUCHABLE_WITHIN * depth
-    placed = pose_at_approach(pair, pose, depth)
+    placed = pair.pose_at_approach(pose, depth)
     patch = _patch(pair.femoral.moved(placed), surface.points[near], grid_mm * MILLIMETRE)
     lattice = replace(lattice, nodes=smooth)
     return _Problem(pair, lattice, nodes, surface, floor, placed, depth, near, patch)
@@ -184,7 +181,7 @@ def _result(problem: _Problem, load: float, run: PeerRun) -> tuple[ContactResult
     if not {"NREF", "NINSERT", "contact"} <= run.blocks.keys():
         raise ComputationError("gave no contact stress", "CalculiX")
     approach = problem.depth - float(run.blocks["NREF"][-1, 2]) * MILLIMETRE
-    pose = pose_at_approach(problem.pair, problem.pose, approach)
+    pose = problem.pair.pose_at_approach(problem.pose, approach)
     bent = _bent(problem, run)
     force = _nodal_forces(problem, pose, run, bent)
     balance = -float(force[:, 1].sum()) / load
@@ -197,25 +194,11 @@ def _result(problem: _Problem, load: float, run: PeerRun) -> tuple[ContactResult
         surface.points, surface.triangles, surface.triangle_area,
         pressure, gap, problem.pair.material,
     )  # fmt: skip
-    medial, lateral = summarise_condyles(
-        medial_points(surface.points, pose, condyle_split(problem.pair.femoral)),
-        surface.points, pressure, covered, force, surface.thickness,
+    result = ContactResult.of(
+        PreparedContact(problem.pair, surface), pose, pressure, gap, force, covered=covered,
+        iterations=run.iterations, residual=abs(balance - 1),
     )  # fmt: skip
-    return ContactResult(
-        pose=pose,
-        points=surface.points,
-        normals=surface.normals,
-        pressure=pressure,
-        area=surface.area,
-        gap=gap,
-        nodal_force=force,
-        wrench_on_insert=wrench_of(surface.points, force),
-        medial=medial,
-        lateral=lateral,
-        approach=approach,
-        iterations=run.iterations,
-        residual=abs(balance - 1),
-    ), balance
+    return result, balance
 
 
 def _bent(problem: _Problem, run: PeerRun) -> ContactMap:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.contact.lattice.cells import FACES
-from tkamb.contact.lattice.grid import build_grid
+from tkamb.contact.lattice.meshing.cells import FACES
+from tkamb.contact.lattice.meshing.grid import build_grid
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
 from tkamb.output.metrics import body_weight, map_rows, medial_share
