@@ -28,7 +28,7 @@ from tkamb.atomic import claim_directory, write_text  # noqa: E402
 from tkamb.contact.materials import material  # noqa: E402
 from tkamb.contact.pair import ContactPair  # noqa: E402
 from tkamb.contact.registry import contact_model  # noqa: E402
-from tkamb.press.press import peak_rss  # noqa: E402
+from tkamb.memory import peak_rss  # noqa: E402
 from tkamb.studies.calculix import find_program  # noqa: E402
 from tkamb.studies.cases import StudyCase  # noqa: E402
 from tkamb.studies.kept_rows import KeptRows, row_key  # noqa: E402

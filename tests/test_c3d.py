@@ -9,8 +9,9 @@ from recordings import AMTI_CORNERS, standing_markers, write_c3d
 from tkamb.errors import InputError
 from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.ground_reaction import load_ground_reaction
-from tkamb.inputs.labels import matched_labels
+from tkamb.inputs.markers import matched_labels
 from tkamb.inputs.tables import read_table
+from tkamb.scene.si import in_si
 from tkamb.scene.tables import GroundReactionTable
 
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw" / "motion"
@@ -106,7 +107,7 @@ def test_one_foot_on_two_plates_is_their_summed_wrench_at_one_centre_of_pressure
         file=path, plates=(1, 2), laboratory_axes="+x,+z,-y", cutoff_Hz="none"
     )
     time = read_c3d(path).analog_time
-    ground = load_ground_reaction(table, time, "right")
+    ground = load_ground_reaction(in_si(table), time, "right")
     force, point, free = pushes()
     into = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     np.testing.assert_allclose(ground.force, force @ into.T, atol=1e-3)
@@ -121,7 +122,7 @@ def test_below_the_threshold_the_point_is_held_and_the_wrench_kept(tmp_path):
         file=path, plates=(1,), laboratory_axes="+x,+z,-y", cutoff_Hz="none", unloaded_N=195.0
     )
     recording = read_c3d(path)
-    ground = load_ground_reaction(table, recording.analog_time, "right")
+    ground = load_ground_reaction(in_si(table), recording.analog_time, "right")
     assert 0 < ground.loaded.sum() < len(ground.loaded)
     into = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     about = ground.moment + np.cross(ground.point, ground.force)
@@ -228,7 +229,7 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, mistake):
 def test_the_plates_must_be_named_and_there(tmp_path, plates, words):
     table = GroundReactionTable(file=two_plates(tmp_path), plates=plates, cutoff_Hz="none")
     with pytest.raises(InputError, match=words):
-        load_ground_reaction(table, np.zeros(1), "right")
+        load_ground_reaction(in_si(table), np.zeros(1), "right")
 
 
 def test_a_plate_that_pushes_down_is_refused(tmp_path):
@@ -238,7 +239,7 @@ def test_a_plate_that_pushes_down_is_refused(tmp_path):
         file=path, plates=(1,), laboratory_axes="+x,+z,-y", cutoff_Hz="none"
     )
     with pytest.raises(InputError, match="down"):
-        load_ground_reaction(table, np.array([0.05]), "right")
+        load_ground_reaction(in_si(table), np.array([0.05]), "right")
 
 
 @pytest.mark.skipif(not JW.is_dir(), reason="subject JW's recordings are not beside the project")

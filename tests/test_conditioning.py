@@ -8,9 +8,9 @@ import pytest
 
 from scenes import MODEL, write_scene
 from tkamb import simulate
-from tkamb.body.inverse_dynamics import LARGEST_CONDITION
 from tkamb.body.knee import solve_knee
 from tkamb.body.load import PointForces
+from tkamb.body.unknowns import LARGEST_CONDITION
 from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.geometry.frames import transform
 from tkamb.run.status import FAILED, frame_status

@@ -16,7 +16,7 @@ from tkamb.importing.links import find_links, quarter_turn
 from tkamb.importing.model_fit import ModelChain, fit_model
 from tkamb.importing.soft_tissue import soft_tissue
 from tkamb.importing.urdf import link_inertias, patient_urdf
-from tkamb.inputs.labels import matched_labels
+from tkamb.inputs.markers import matched_labels
 from tkamb.inputs.meshes import load_surface
 from tkamb.inputs.tables import read_table
 from tkamb.opensim.read import read_osim

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from knees import leg
 from tkamb.body.chain import ChainMotion
 from tkamb.body.contact_points import CondylePoint
-from tkamb.body.inverse_dynamics import Unknown
 from tkamb.body.knee import Extensor, KneeGeometry, solve_knee
 from tkamb.body.load import PointForces
+from tkamb.body.unknowns import Unknown
 from tkamb.geometry.frames import pose, transform
 
 FRICTION = 0.05

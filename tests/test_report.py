@@ -253,7 +253,7 @@ def test_maps_have_one_scale_to_the_largest_pressure(bend):
 def test_page_right_is_the_subjects_right(side, lateral_axis, medial_is):
     run = make_run("bend", frames=5)
     run.summary.update(side=side, lateral_axis=lateral_axis)
-    x, y = top_view(run).place(np.array(3.0), np.array(-23.0))
+    x, y = top_view(run).page_coordinates(np.array(3.0), np.array(-23.0))
     assert y == 3.0
     assert (x < 0) == (medial_is == "left")
 

@@ -16,7 +16,7 @@ from tkamb.atomic import claim_directory
 from tkamb.columns import COLUMNS, columns_as_markdown, is_ligament, ligament_of
 from tkamb.errors import InputError
 from tkamb.output.maps import ContactMaps, MapWriter, read_maps, write_maps
-from tkamb.results import Results, csv_text
+from tkamb.results import Results, csv_text, read_csv
 from tkamb.results_folder import read_results, write_results
 
 ROOT = Path(__file__).parents[1]
@@ -64,6 +64,12 @@ def test_what_is_not_modelled_is_an_empty_cell():
     assert row["flexion_deg"] == "60.0"
     assert row["status"] == "singular"
     assert len(first.split(",")) == len(COLUMNS) - 1
+
+
+def test_a_column_of_an_earlier_release_is_read_under_its_new_name(tmp_path):
+    path = tmp_path / "results.csv"
+    path.write_text("time_s,softest_N_per_mm,status\n0.0,120.5,ok\n")
+    assert read_csv(path)["smallest_stiffness_N_per_mm"] == [120.5]
 
 
 @pytest.mark.parametrize(

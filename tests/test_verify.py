@@ -162,7 +162,7 @@ def test_one_of_two_runs_at_once_is_refused(run, capfd):
     from tkamb import claim
 
     scene, out = run
-    descriptor = claim._lock(out)  # as another process would hold it
+    descriptor = claim._acquire_lock(out)  # as another process would hold it
     try:
         assert main(["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:1"]) == 2
     finally:

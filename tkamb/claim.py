@@ -64,7 +64,7 @@ def claimed_directory(path: str | Path, force: bool = False) -> Iterator[Path]:
             return
         _check_ours(path, force)
         fresh = not os.path.lexists(path / MARKER)
-        with _locked(path):
+        with _holding_lock(path):
             _held.add(key)
             try:
                 _mark(path)
@@ -93,7 +93,7 @@ def settle(folder: Path) -> None:
     deadline = clock.monotonic() + LONGEST_WAIT
     while replacement_pending(folder):
         try:
-            with _locked(folder):
+            with _holding_lock(folder):
                 finish_replacement(folder)
         except BusyFolderError:  # the one who holds it is about to finish it
             if clock.monotonic() > deadline:
@@ -106,16 +106,16 @@ class BusyFolderError(InputError):
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def _holding_lock(path: Path) -> Iterator[None]:
     """Hold the lock of a folder's marker, which is made if it is not there."""
-    descriptor = _lock(path)
+    descriptor = _acquire_lock(path)
     try:
         yield
     finally:
         os.close(descriptor)
 
 
-def _lock(path: Path) -> int:
+def _acquire_lock(path: Path) -> int:
     marker = path / MARKER
     while True:
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC

@@ -11,12 +11,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from tkamb.command_options import add_no_cache, without_cache
 from tkamb.datasets.command import add_data
 from tkamb.guard import guarded
 from tkamb.importing.command import add_import
-from tkamb.mesh_command import add_mesh
-from tkamb.press.command import add_press
+from tkamb.mesh_command import add_contact, add_mesh, add_no_cache, add_press, without_cache
 from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
 from tkamb.view.command import add_view
@@ -44,8 +42,8 @@ def _keep_to_one_thread() -> None:
     The lattice's solves wait for memory; further threads wait for each other, which on a
     busy machine takes several times as long.
     """
-    said = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    if "numpy" not in sys.modules and not any(name in os.environ for name in said):
+    limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    if "numpy" not in sys.modules and not any(name in os.environ for name in limits):
         os.environ["OMP_NUM_THREADS"] = "1"
 
 
@@ -64,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_run(commands)
     _add_folder_commands(commands)
     add_press(commands)
-    _add_contact(commands)
+    add_contact(commands)
     add_mesh(commands)
     _add_scene(commands)
     add_import(commands)
@@ -106,14 +104,6 @@ def _add_folder_commands(commands: Any) -> None:
     report = commands.add_parser("report", help="write report.html of a folder of results anew")
     report.add_argument("folder", type=Path, metavar="DIR")
     report.set_defaults(command=_report)
-
-
-def _add_contact(commands: Any) -> None:
-    contact = commands.add_parser("contact", help="contact models")
-    verbs = contact.add_subparsers(required=True, metavar="VERB")
-    verbs.add_parser("list", help="names, what each assumes and needs").set_defaults(
-        command=_contact_list
-    )
 
 
 def _add_scene(commands: Any) -> None:
@@ -225,14 +215,6 @@ def _report(options: argparse.Namespace) -> int:
     with claimed_directory(options.folder) as folder:
         write_report(results, folder / REPORT_NAME)
     print(f"report: {options.folder / REPORT_NAME}")
-    return 0
-
-
-def _contact_list(options: argparse.Namespace) -> int:
-    from tkamb.contact.registry import contact_descriptions
-
-    for name, line in contact_descriptions().items():
-        print(f"{name:18s} {line}")
     return 0
 
 

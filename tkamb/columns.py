@@ -180,6 +180,9 @@ COLUMNS: tuple[Column, ...] = (
     ),
 )
 
+RENAMED = {"softest_N_per_mm": "smallest_stiffness_N_per_mm"}
+"""Names in results of earlier releases, and today's."""
+
 KINDS: dict[str, Kind] = {column.name: column.kind for column in COLUMNS}
 _PREFIX, _SUFFIX = LIGAMENT.split("<name>")
 

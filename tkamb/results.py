@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.columns import KINDS, is_ligament, ordered_names
+from tkamb.columns import KINDS, RENAMED, is_ligament, ordered_names
 from tkamb.errors import InputError, names_near
 from tkamb.files import TABLE_LIMIT, read_text
 from tkamb.geometry.frames import Array
@@ -30,7 +30,7 @@ class Results:
             texts. Columns of the table `COLUMNS` that are not given are not modelled and
             hold NaN; the order becomes the table's.
         summary: provenance and notes, JSON-able; the keys that the report reads are listed
-            in `tkamb.output.provenance`.
+            in docs/results.md.
         maps: pressure maps per frame; None without contact.
         directory: where it was written to or read from.
 
@@ -44,7 +44,7 @@ class Results:
     directory: Path | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "columns", _completed(self.columns))
+        object.__setattr__(self, "columns", _complete_columns(self.columns))
 
     def __len__(self) -> int:
         return len(self.columns["status"])
@@ -95,7 +95,7 @@ class Results:
         return headline_html(self)
 
 
-def _completed(given: Mapping[str, Any]) -> dict[str, Any]:
+def _complete_columns(given: Mapping[str, Any]) -> dict[str, Any]:
     names = ordered_names(given)
     unknown = sorted(set(given) - set(names))
     if unknown:
@@ -117,7 +117,7 @@ def _completed(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_csv(path: str | Path) -> dict[str, Any]:
-    """Read the columns of a results.csv.
+    """Read the columns of a results.csv, of this release or an earlier one.
 
     Raises:
         InputError: no such file, an unknown column, a row of another length, not a number.
@@ -129,12 +129,12 @@ def read_csv(path: str | Path) -> dict[str, Any]:
         raise InputError(f"cannot be read as CSV ({error})", path) from None
     if not rows:
         raise InputError("is empty", path)
-    header, body = rows[0], rows[1:]
+    header, body = [RENAMED.get(name, name) for name in rows[0]], rows[1:]
     for number, row in enumerate(body, start=2):
         if len(row) != len(header):
             raise InputError(f"line {number} has {len(row)} cells, not {len(header)}", path)
     cells = list(zip(*body, strict=True)) or [() for _ in header]
-    return {name: _parsed(name, values, path) for name, values in zip(header, cells, strict=True)}
+    return {name: _parse(name, values, path) for name, values in zip(header, cells, strict=True)}
 
 
 def csv_text(columns: Mapping[str, Any]) -> str:
@@ -158,7 +158,7 @@ def _cell(name: str, value: Any) -> str:
     return repr(float(value))
 
 
-def _parsed(name: str, cells: tuple[str, ...], path: Path) -> Any:
+def _parse(name: str, cells: tuple[str, ...], path: Path) -> Any:
     if KINDS.get(name) == "text":
         return list(cells)
     if name not in KINDS and not is_ligament(name):

@@ -71,20 +71,20 @@ def differences(directory: Path, summary: Mapping[str, Any]) -> list[str]:
 
     Results of a release that kept no SHA-256 differ in nothing that could be known.
     """
-    said, recorded = [], summary.get("files")
+    messages, recorded = [], summary.get("files")
     if not isinstance(recorded, Mapping):
         return []
     if summary.get("summary_sha256") != _summary_hash(summary):
-        said.append(f"{SUMMARY_NAME} has changed since it was written")
+        messages.append(f"{SUMMARY_NAME} has changed since it was written")
     for name in (CSV_NAME, MAPS_NAME):
         there = (directory / name).exists()
         if there and name not in recorded:
-            said.append(f"{name} does not belong to these results")
+            messages.append(f"{name} does not belong to these results")
         elif not there and name in recorded:
-            said.append(f"{name} is missing")
+            messages.append(f"{name} is missing")
         elif there and sha256_of(directory / name) != recorded[name]:
-            said.append(f"{name} has changed since it was written")
-    return said
+            messages.append(f"{name} has changed since it was written")
+    return messages
 
 
 def write_results(results: Results, directory: str | Path, *, force: bool = False) -> None:
@@ -199,7 +199,7 @@ def verify_results(directory: str | Path) -> Verdict:
         raise InputError("was not written by tkamb run", directory / SUMMARY_NAME)
     found = differences(directory, summary)
     if not isinstance(summary.get("files"), Mapping):
-        found.append("carries no SHA-256: written by an earlier tkamb, nothing can be said")
+        found.append("carries no SHA-256: written by an earlier tkamb, nothing can be messages")
     try:
         read_results(directory, check=False)
     except InputError as error:

@@ -90,7 +90,7 @@ def contact_points(
     if abs(nearest) > FARTHEST_GAP:
         word = "apart" if nearest > 0 else "overlapping"
         problems = (f"condyles {word} by {abs(nearest) / MILLIMETRE:.1f} mm",)
-    return ContactPoints(condyles, _lifted(condyles), problems)
+    return ContactPoints(condyles, _find_lifted(condyles), problems)
 
 
 def nearest_gap(gaps: "CondyleGaps") -> float:
@@ -102,7 +102,7 @@ def _condyle(gap: "CondyleGap", sliding: Callable[[Array], Array]) -> CondylePoi
     return CondylePoint(gap.centre, gap.normal, sliding(gap.centre), gap.gap)
 
 
-def _lifted(condyles: dict[str, CondylePoint]) -> frozenset[str]:
+def _find_lifted(condyles: dict[str, CondylePoint]) -> frozenset[str]:
     if len(condyles) < 2:
         return frozenset()
     medial, lateral = condyles["medial"], condyles["lateral"]

@@ -7,13 +7,12 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from tkamb.body.chain import Chain, ChainState
-from tkamb.body.inverse_dynamics import Unknown
 from tkamb.body.knee import Extensor
 from tkamb.body.load import PointForces
 from tkamb.body.muscles import Line, Muscle, PatellarLigament, Wrap, muscle_line, off_femur
 from tkamb.body.patella import ExtensorMechanism, PatellaState, patella_at, solve_patella
 from tkamb.body.patellofemoral import PatellofemoralContact
-from tkamb.body.unknowns import muscle_load
+from tkamb.body.unknowns import Unknown, muscle_load
 from tkamb.body.wrapping import TautPath, is_inside
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, inverse, transform
@@ -80,8 +79,8 @@ class ExtensorFrames:
                 for pose, coordinates in zip(poses, recorded[:, 0], strict=True)
             ]
         else:
-            self.states = _solved(self._mechanism, poses)
-            self._joints = self._differentiated(time, rates)
+            self.states = _solve_all(self._mechanism, poses)
+            self._joints = self._differentiate(time, rates)
 
     def joints(self, k: int) -> Array:
         """Return patella coordinates, rates and accelerations (3, 3) of frame k; NaN if lost."""
@@ -189,7 +188,7 @@ class ExtensorFrames:
             None if self.ligament.wrap is None else self.ligament.wrap.outline,
         )
 
-    def _differentiated(self, time: Array, rates: Rates) -> Array:
+    def _differentiate(self, time: Array, rates: Rates) -> Array:
         """Return the solved coordinates with their rates (f, 3, 3); NaN where it is lost.
 
         Lost frames between found ones are bridged for the rates of their neighbours (shape-
@@ -213,7 +212,7 @@ class ExtensorFrames:
         return result
 
 
-def _solved(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]:
+def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]:
     """Solve frame after frame, each from the one before."""
     states: list[PatellaState] = []
     for pose in poses:

@@ -18,14 +18,17 @@ J of `knee_axes`: zero at equilibrium, and along +q_i where the femur wants to g
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tkamb.body import unknowns
 from tkamb.body.knee import KneeGeometry
-from tkamb.body.ligaments import BundleArrays, Ligament
 from tkamb.body.load import wrench_of
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_axes, knee_pose, transform
+
+if TYPE_CHECKING:
+    from tkamb.body.ligaments import BundleArrays, Ligament
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +62,7 @@ class JointEquilibrium:
     """
 
     external: Array
-    ligaments: BundleArrays
+    ligaments: "BundleArrays"
     line: PatellarLine | None
     keeping: Array
     released: tuple[int, ...]
@@ -71,19 +74,19 @@ class JointEquilibrium:
             coordinates: (..., 6) knee coordinates.
             contact: (6,) w_contact on the insert.
         """
-        axes, columns, wrench = self._loaded(coordinates, contact)
+        axes, columns, wrench = self._sum_loads(coordinates, contact)
         kept = _magnitudes(axes[..., self._prescribed, :], columns, wrench)
         left = wrench + np.einsum("...ij,...j->...i", columns, kept)
         return -np.einsum("...ij,...j->...i", axes[..., list(self.released), :], left)
 
     def kept(self, coordinates: Array, contact: Array) -> Array:
         """Return y (6 - n,): what keeps the prescribed coordinates, flexion last."""
-        axes, columns, wrench = self._loaded(coordinates, contact)
+        axes, columns, wrench = self._sum_loads(coordinates, contact)
         return _magnitudes(axes[..., self._prescribed, :], columns, wrench)
 
     def contact_gain(self, coordinates: Array) -> Array:
         """Return d r / d w_contact (n, 6) at coordinates (6,)."""
-        axes, columns, _ = self._loaded(coordinates, np.zeros(6))
+        axes, columns, _ = self._sum_loads(coordinates, np.zeros(6))
         rows = axes[self._prescribed]
         through = np.eye(6) - columns @ np.linalg.solve(rows @ columns, rows)
         return np.asarray(-axes[list(self.released)] @ through)
@@ -92,7 +95,7 @@ class JointEquilibrium:
     def _prescribed(self) -> list[int]:
         return [i for i in range(6) if i not in self.released]
 
-    def _loaded(self, coordinates: Array, contact: Array) -> tuple[Array, Array, Array]:
+    def _sum_loads(self, coordinates: Array, contact: Array) -> tuple[Array, Array, Array]:
         """Return axes (..., 6, 6), columns B (..., 6, 6 - n) and wrench (..., 6)."""
         poses = knee_pose(coordinates)
         wrench = self.external + contact + self.ligaments.wrench(poses)
@@ -110,7 +113,7 @@ def _magnitudes(rows: Array, columns: Array, wrench: Array) -> Array:
 
 def joint_equilibrium(
     geometry: KneeGeometry,
-    ligaments: Sequence[Ligament],
+    ligaments: "Sequence[Ligament]",
     coordinates: Array,
     released: tuple[int, ...],
     middle: Array,
@@ -179,12 +182,14 @@ def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
 
 
 def crossing_bundles(
-    geometry: KneeGeometry, ligaments: Sequence[Ligament], coordinates: Array
-) -> BundleArrays:
+    geometry: KneeGeometry, ligaments: "Sequence[Ligament]", coordinates: Array
+) -> "BundleArrays":
     """Return the bundles that cross the knee, their ends in the femur and insert frames.
 
     An end on the patella moves with the femur from where it stands.
     """
+    from tkamb.body.ligaments import BundleArrays
+
     state, chain = geometry.state, geometry.state.chain
     to_femur = inverse(knee_pose(coordinates))
     crossing, femur, shank = [], [], []

@@ -17,10 +17,9 @@ import numpy as np
 from tkamb.body import unknowns
 from tkamb.body.chain import ChainState
 from tkamb.body.contact_points import CondylePoint
-from tkamb.body.inverse_dynamics import Unknown, solve
 from tkamb.body.load import PointForces
 from tkamb.body.load_state import LoadState, contradictions, load_states, wrong_signs
-from tkamb.body.unknowns import muscle_load
+from tkamb.body.unknowns import Unknown, muscle_load, solve
 from tkamb.geometry.frames import Array
 from tkamb.units import MILLIMETRE
 
@@ -224,7 +223,7 @@ class _System:
         values = self.solution.values
         flexion, adduction = self.external_moments()
         return KneeLoads(
-            values | dict.fromkeys(self._unloaded(), 0.0),
+            values | dict.fromkeys(self._zero_loads(), 0.0),
             self.contact_force(values),
             flexion,
             adduction,
@@ -279,7 +278,7 @@ class _System:
         rows = self.geometry.state.chain.knee_columns()
         return -float(knee[rows[5]]), -float(knee[rows[4]])
 
-    def _unloaded(self) -> list[str]:
+    def _zero_loads(self) -> list[str]:
         """Return the loads of the extensor mechanism that are zero, where it is slack."""
         return [*map(muscle_load, self.slack), *PATELLAR] if self.slack else []
 

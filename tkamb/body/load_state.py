@@ -12,8 +12,7 @@ from collections.abc import Iterable, Mapping
 from itertools import product
 from typing import NamedTuple
 
-from tkamb.body.inverse_dynamics import Solution
-from tkamb.body.unknowns import MUSCLE
+from tkamb.body.unknowns import MUSCLE, Solution
 
 ROUNDING = 1e-6
 """N: a sign that is wrong by less is rounding."""

@@ -126,9 +126,9 @@ def slip_of_points(
     backwards = -np.sign(np.diff(points[:, 0]))
     lever = _mean(points[:, 2] - centre_z) / np.cos(_mean(slope))
     return CondyleSlip(
-        _cumulated(femoral_arcs(points, poses)),
-        _cumulated(backwards * travelled),
-        _cumulated(np.diff(axial_rotation) * lever),
+        _cumulate(femoral_arcs(points, poses)),
+        _cumulate(backwards * travelled),
+        _cumulate(np.diff(axial_rotation) * lever),
     )
 
 
@@ -225,7 +225,7 @@ def roll_slip_motion(
     contact = moved[0, 0] + arms[0, 0]
     moved[0, 1] -= touch.travel(knee_pose(moved[0]))
     for k in range(1, len(moved)):
-        contact = _rolled(profile, contact, poses[k, 2, 3] + arms[k, 2], backwards[k - 1])
+        contact = _roll(profile, contact, poses[k, 2, 3] + arms[k, 2], backwards[k - 1])
         contact -= axial[k - 1]
         moved[k, 0] = contact - arms[k, 0]
         moved[k, 1] -= touch.travel(knee_pose(moved[k])) if np.isfinite(contact) else np.nan
@@ -243,7 +243,7 @@ def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
     return points.mean(axis=0) - poses[:, :3, 3], np.asarray(arcs)
 
 
-def _rolled(profile: InsertProfile, x: float, z: float, backwards: float) -> float:
+def _roll(profile: InsertProfile, x: float, z: float, backwards: float) -> float:
     """Return x after an arc backwards along the insert's surface at z (midpoint rule)."""
     _, slope = profile.at(np.array([[x, 0.0, z]]))
     middle = x - 0.5 * backwards * np.cos(slope[0])
@@ -255,5 +255,5 @@ def _mean(values: Array) -> Array:
     return np.asarray(0.5 * (values[1:] + values[:-1]))
 
 
-def _cumulated(steps: Array) -> Array:
+def _cumulate(steps: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(steps)])

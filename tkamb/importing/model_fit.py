@@ -13,8 +13,8 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.importing.markers import recorded_labels
 from tkamb.inputs.inverse_kinematics import ChainFit, Index, NormalEquations, fit_chain, put, skew
-from tkamb.inputs.labels import matched_labels
-from tkamb.inputs.markers import marker_trajectories
+from tkamb.inputs.laboratory import laboratory_rotation
+from tkamb.inputs.markers import marker_trajectories, matched_labels
 from tkamb.inputs.tables import Table
 from tkamb.opensim.kinematics import Kinematics
 from tkamb.opensim.model import OpenSimModel
@@ -130,16 +130,17 @@ def fit_model(
     recorded: Table,
     weights: Mapping[str, float] | None = None,
     locked: Sequence[str] = (),
+    laboratory_axes: str = "+x,+y,+z",
 ) -> tuple[ModelChain, ChainFit[Array]]:
     """Return a model's chain fitted to a recording, all frames at once.
-
-    The recording's axes must be the model's ground (or the root joint must be free to turn).
 
     Args:
         model: the model.
         recorded: table of markers.
         weights: marker -> weight of its squared distance, where not 1.
         locked: coordinates kept at their default.
+        laboratory_axes: axes of the file that are the model's ground x, y and z (forward, up
+            and right), as "-x,+z,+y".
 
     Raises:
         InputError: fewer than three markers in common.
@@ -153,7 +154,8 @@ def fit_model(
         )
     chain = ModelChain(model, list(match), locked)
     scale = recorded.unit_scale(None, "length_unit")
-    measured = marker_trajectories(recorded, list(match.values()), scale)
+    turn = laboratory_rotation(laboratory_axes, recorded.path)
+    measured = marker_trajectories(recorded, list(match.values()), scale) @ turn.T
     values = np.array([(weights or {}).get(name, 1.0) for name in match])
     first = int(np.argmax(np.isfinite(measured).all(axis=2).sum(axis=1)))
     begin = fit_chain(chain, measured[first : first + 1], values, chain.default(1))

@@ -190,20 +190,21 @@ def _along_geodesic(state: Array, pieces: Array, axes: Array) -> Array:
     inverse_squares = 1.0 / axes**2
     curvature = inverse_squares.prod()
 
-    def rate(y: Array) -> Array:
-        gradient = y[:, :3] * inverse_squares
-        squared = (gradient**2).sum(axis=1)
-        pull = (y[:, 3:6] ** 2) @ inverse_squares / squared
-        result = np.empty_like(y)
-        result[:, :3] = y[:, 3:6]
-        result[:, 3:6] = -pull[:, None] * gradient
-        result[:, 6] = y[:, 7]
-        result[:, 7] = -curvature / squared**2 * y[:, 6]
-        return result
+    def rate(y: Array, result: Array) -> None:
+        gradient, velocity = y[:3] * inverse_squares[:, None], y[3:6]
+        squared = np.einsum("if,if->f", gradient, gradient)
+        result[:3] = velocity
+        result[3:6] = gradient * (inverse_squares @ (velocity * velocity) / -squared)
+        result[6] = y[7]
+        result[7] = y[6] * (-curvature / (squared * squared))
 
-    stages = np.empty((DOP853.n_stages, *state.shape))
-    for step in pieces.T[..., None]:
+    # Components first and stages in one row each: a step's sums are products of small matrices.
+    y = np.ascontiguousarray(state.T)
+    stages = np.empty((DOP853.n_stages, *y.shape))
+    rows = stages.reshape(DOP853.n_stages, -1)
+    for step in pieces.T:
         for k, weights in enumerate(DOP853.A):
-            stages[k] = rate(state + step * np.tensordot(weights[:k], stages[:k], 1))
-        state = state + step * np.tensordot(DOP853.B, stages, 1)
-    return state
+            moved = (weights[:k] @ rows[:k]).reshape(y.shape)
+            rate(y + step * moved, stages[k])
+        y = y + step * (DOP853.B @ rows).reshape(y.shape)
+    return y.T

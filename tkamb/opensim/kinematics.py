@@ -120,6 +120,20 @@ class Kinematics:
             values[..., self.coordinates[coupler.dependent]] = coupler.function(independent)
         return values
 
+    def coupling(self, q: ArrayLike) -> Array:
+        """Return ∂q/∂q (..., n, n): one coordinate's own change, and that of what follows it.
+
+        The column of a coordinate that follows another is zero: it is none of its own.
+        """
+        values = self.vector(q)
+        result = np.broadcast_to(np.eye(values.shape[-1]), (*values.shape, values.shape[-1])).copy()
+        for coupler in self.model.couplers:
+            dependent = self.coordinates[coupler.dependent]
+            independent = self.coordinates[coupler.independent]
+            slope = coupler.function.slope(values[..., independent])
+            result[..., dependent, :] = slope[..., None] * result[..., independent, :]
+        return result
+
     def poses(self, q: Mapping[str, float] | ArrayLike) -> Array:
         """Return the poses (..., b, 4, 4) of ground and all bodies in ground."""
         return self._chain(self.axis_values(self.vector(q)))[0]

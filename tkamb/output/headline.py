@@ -1,7 +1,9 @@
 """What a reader learns in the first half minute: a few cards and sentences, in plain words."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,6 +38,15 @@ class Card:
     def line(self) -> str:
         """Return the card as one line of text."""
         return f"{self.title}: {self.value} ({self.detail})"
+
+
+def run_title(summary: Mapping[str, Any]) -> str:
+    """Return the title that a run's summary gives, or else the name of its scene."""
+    if summary.get("title"):
+        return str(summary["title"])
+    scene = Path(str(summary.get("scene") or "tkamb run"))
+    name = scene.parent.name if scene.stem == "scene" and scene.parent.name else scene.stem
+    return name.upper() if len(name) <= 3 else name.replace("_", " ").capitalize()
 
 
 def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:

@@ -21,8 +21,8 @@ from tkamb.atomic import replaced_file
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 
-FILE_NAME = "contact.h5"
 UNITS = "SI: m, s, Pa, N; poses 4x4"
+COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 PER_FRAME = ("pressure_Pa", "gap_m", "nodal_force_N", "femoral_pose", "time_s")
 
 
@@ -30,7 +30,7 @@ class MapWriter:
     """Grows contact.h5 by one frame at a time; a kill leaves the frames before it readable.
 
     Args:
-        path: the file; an older one is replaced.
+        path: the file; an older one is replaced. None: the file is in memory alone.
         points: (n, 3) m, insert frame.
         triangles: (k, 3) indices into the points.
         attributes: frame, model, version, scene hash, ...: text or numbers.
@@ -41,15 +41,16 @@ class MapWriter:
 
     def __init__(
         self,
-        path: str | Path,
+        path: str | Path | None,
         points: ArrayLike,
         triangles: ArrayLike,
         attributes: Mapping[str, Any],
     ) -> None:
-        self.path = Path(path)
+        self.path = None if path is None else Path(path)
         points = np.asarray(points, float)
+        options: dict[str, Any] = {} if path else {"driver": "core", "backing_store": False}
         with self._written():
-            self._file = h5py.File(self.path, "w")
+            self._file = h5py.File(path or "memory", "w", **options)
             self._begin(points, np.asarray(triangles, np.int64), attributes)
 
     def _begin(
@@ -74,9 +75,7 @@ class MapWriter:
             float,
             maxshape=(None, *shape),
             chunks=(1, *shape),
-            compression="gzip",
-            compression_opts=1,
-            shuffle=True,
+            **(COMPRESSION if self.path else {}),
         )
 
     def append(
@@ -119,7 +118,10 @@ class MapWriter:
     @property
     def maps(self) -> "ContactMaps":
         """What was written so far."""
-        return ContactMaps(self.path)
+        if self.path is not None:
+            return ContactMaps(self.path)
+        arrays = {name: dataset[()] for name, dataset in self._file.items()}
+        return ContactMaps(arrays, dict(self._file.attrs))
 
     def close(self) -> None:
         """Close the file; nothing can be appended after it.
@@ -153,59 +155,6 @@ class MapWriter:
         except InputError:
             if error is None:  # else the block has said it already
                 raise
-
-
-class MapMemory:
-    """Collects maps frame by frame without a file; the methods are `MapWriter`'s."""
-
-    def __init__(self, points: Array, triangles: Array, attributes: Mapping[str, Any]) -> None:
-        self._fixed = {"points_m": points, "triangles": triangles}
-        self._attributes = attributes
-        self._frames: dict[str, list[Array]] = {name: [] for name in PER_FRAME}
-
-    def append(
-        self,
-        time: float,
-        pressure: ArrayLike,
-        gap: ArrayLike,
-        nodal_force: ArrayLike,
-        femoral_pose: ArrayLike,
-    ) -> None:
-        """Add one frame."""
-        values = (pressure, gap, nodal_force, femoral_pose, time)
-        for name, value in zip(PER_FRAME, values, strict=True):
-            self._frames[name].append(np.array(value, float))
-
-    def append_failed(self, time: float) -> None:
-        """Add a frame without a result: NaN everywhere but the time."""
-        n, nan = len(self._fixed["points_m"]), np.nan
-        self.append(time, *(np.full(shape, nan) for shape in ((n,), (n,), (n, 3), (4, 4))))
-
-    @property
-    def maps(self) -> "ContactMaps":
-        """What was collected."""
-        frames = {name: np.stack(values) for name, values in self._frames.items()}
-        return ContactMaps(self._fixed | frames, self._attributes)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Nothing is to be closed."""
-
-
-def map_sink(
-    directory: str | Path | None, points: Array, triangles: Array, attributes: Mapping[str, Any]
-) -> MapWriter | MapMemory:
-    """Return what collects a run's maps: contact.h5 in a folder, or memory for None."""
-    if directory is None:
-        return MapMemory(points, triangles, attributes)
-    return MapWriter(Path(directory) / FILE_NAME, points, triangles, attributes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +211,7 @@ class ContactMaps:
         """Units, frame, model, version, scene hash."""
         if not isinstance(self.source, Path):
             return {"units": UNITS, **(self.given_attributes or {})}
-        with _opened(self.source) as file:
+        with _open(self.source) as file:
             return dict(file.attrs)
 
     def __len__(self) -> int:
@@ -271,7 +220,7 @@ class ContactMaps:
     def _array(self, name: str, frames: int | None = None) -> Any:
         if not isinstance(self.source, Path):
             return np.asarray(self.source[name])
-        with _opened(self.source) as file:
+        with _open(self.source) as file:
             if name not in file:
                 raise InputError(f"has no '{name}'", self.source, "is it a contact.h5 of tkamb?")
             return file[name][:frames]
@@ -304,7 +253,7 @@ def write_maps(maps: ContactMaps, path: Path) -> None:
             writer.append(time, *frame, maps.femoral_pose[k])
 
 
-def _opened(path: Path) -> Any:
+def _open(path: Path) -> Any:
     try:
         return h5py.File(path, "r")
     except FileNotFoundError:

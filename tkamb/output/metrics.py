@@ -115,8 +115,8 @@ def residual_share(results: "Results") -> Array:
 
 def failed(results: "Results") -> NDArray[np.bool_]:
     """Return which frames (f,) say that they failed, or are not ok and have no contact force."""
-    said = np.array([status.startswith("failed") for status in results.status], bool)
-    return said | (~_clean(results) & np.isnan(results["force_total_N"]))
+    marked = np.array([status.startswith("failed") for status in results.status], bool)
+    return marked | (~_clean(results) & np.isnan(results["force_total_N"]))
 
 
 def flagged(results: "Results") -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ import numpy as np
 from tkamb.atomic import write_text
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import LABELS, HorizontalAxis, horizontal_axis
-from tkamb.output.headline import cards
+from tkamb.output.headline import cards, run_title
 from tkamb.output.metrics import body_weight, failed, flagged
 from tkamb.output.pages import asset, policy_sources, render
 from tkamb.output.panels import Panel, centre_panel, panels
@@ -55,7 +55,7 @@ def report_html(results: "Results") -> str:
         policy=POLICY.format(script=policy_sources(script), style=policy_sources(style)),
         style=style,
         script=script,
-        title=_title(results.summary),
+        title=run_title(results.summary),
         subtitle=_subtitle(results),
         cards=cards(results, axis),
         sentences=_sentences(results.summary),
@@ -78,18 +78,10 @@ def headline_html(results: "Results") -> str:
         PACKAGE,
         "notebook.html",
         style=asset(PACKAGE, "notebook.css"),
-        title=_title(results.summary),
+        title=run_title(results.summary),
         subtitle=_subtitle(results),
         cards=cards(results, horizontal_axis(results)),
     )
-
-
-def _title(summary: dict[str, Any]) -> str:
-    if summary.get("title"):
-        return str(summary["title"])
-    scene = Path(str(summary.get("scene", "tkamb run")))
-    name = scene.parent.name if scene.stem == "scene" and scene.parent.name else scene.stem
-    return name.upper() if len(name) <= 3 else name.replace("_", " ").capitalize()
 
 
 def _subtitle(results: "Results") -> str:
@@ -165,8 +157,8 @@ def _provenance(summary: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _text(value: Any) -> str:
     if isinstance(value, dict):
-        kept = {str(k).replace("_", " "): v for k, v in value.items() if v not in (None, {}, [])}
-        return ", ".join(f"{name} {_text(item)}" for name, item in kept.items())
+        filled = {str(k).replace("_", " "): v for k, v in value.items() if v not in (None, {}, [])}
+        return ", ".join(f"{name} {_text(item)}" for name, item in filled.items())
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):
@@ -179,7 +171,7 @@ def _cursor_data(results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
     drawn = (*panels(results), centre_panel(results))
     name = axis.label.split(" (")[0]
     return {
-        "x": _rounded(axis.values),
+        "x": _round(axis.values),
         "place": [f"{name} {axis.at(k)}" for k in range(len(results))],
         "status": results.status,
         "panels": {panel.name: _cursor_lines(panel) for panel in drawn if panel.lines},
@@ -195,11 +187,11 @@ def _cursor_lines(panel: Panel) -> list[dict[str, Any]]:
             "label": line.label,
             "colour": line.colour,
             "digits": digits,
-            "values": _rounded(line.values),
+            "values": _round(line.values),
         }
         for line in panel.lines
     ]
 
 
-def _rounded(values: Array) -> list[float | None]:
+def _round(values: Array) -> list[float | None]:
     return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values]

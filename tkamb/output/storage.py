@@ -67,8 +67,8 @@ def write_trc(path: Path, time: Array, markers: Mapping[str, Array], rate_Hz: fl
         "\t".join(["", "", *axes]),
         "",
     ]
-    places = np.concatenate(list(markers.values()), axis=1) * 1e3
-    for k, row in enumerate(places):
+    positions = np.concatenate(list(markers.values()), axis=1) * 1e3
+    for k, row in enumerate(positions):
         cells = ["" if np.isnan(value) else f"{value:.5f}" for value in row]
         lines.append("\t".join([str(k + 1), f"{time[k]:.6f}", *cells]))
     write_text(path, "\n".join(lines) + "\n")

@@ -84,10 +84,10 @@ def reasons(statuses: Sequence[str]) -> dict[str, list[int]]:
             if words and words != "ok":
                 words = f"failed: {words}" if failure and position == 0 else words
                 found.setdefault(NUMBER.sub("#", words), []).append((frame, words))
-    joined = {
+    rows = {
         _with_ranges([words for _, words in one]): [k for k, _ in one] for one in found.values()
     }
-    return dict(sorted(joined.items(), key=lambda item: not item[0].startswith("failed")))
+    return dict(sorted(rows.items(), key=lambda item: not item[0].startswith("failed")))
 
 
 def _with_ranges(variants: Sequence[str]) -> str:

@@ -12,7 +12,8 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, pose
 from tkamb.inputs.motion import KneeMotion, load_motion
 from tkamb.inputs.patient import load_urdf
-from tkamb.scene import Scene
+from tkamb.scene.scene import Scene
+from tkamb.scene.si import in_si
 from tkamb.scene.tables import FemoralImplantTable, PatellarImplantTable
 from tkamb.units import MILLIMETRE
 
@@ -88,11 +89,11 @@ def load_case(scene: Scene) -> Case:
         InputError: whatever is wrong with them, in one line.
     """
     with_patella = scene.patella is not None
-    chain = Chain(load_urdf(scene.patient, with_patella), with_patella)
+    chain = Chain(load_urdf(in_si(scene.patient), with_patella), with_patella)
     parts = _Parts(scene)
     released = scene.contact.released if scene.contact else ()
     motion = load_motion(
-        scene.motion,
+        in_si(scene.motion),
         scene.patient.side,
         parts.insert_mesh_in_insert,
         parts.femoral_mesh_in_femur,
@@ -116,14 +117,16 @@ def load_case(scene: Scene) -> Case:
     if scene.tibia:
         from tkamb.inputs.tibia import load_tibia
 
-        tibia = load_tibia(scene.tibia, motion.time, scene.patient.side, scene.motion.cutoff_Hz)
+        tibia = load_tibia(
+            in_si(scene.tibia), motion.time, scene.patient.side, scene.motion.cutoff_Hz
+        )
     elif motion.markers:
         cutoff = scene.motion.cutoff_Hz
         tibia = motion.markers.shank_motion(cutoff, motion.time, str(scene.motion.file))
     if scene.ground_reaction:
         from tkamb.inputs.ground_reaction import check_under_foot, load_ground_reaction
 
-        ground = load_ground_reaction(scene.ground_reaction, motion.time, scene.patient.side)
+        ground = load_ground_reaction(in_si(scene.ground_reaction), motion.time, scene.patient.side)
         if tibia and scene.ground_reaction.applied == "cop":
             check_under_foot(ground, tibia.pose[:, :3, 3], scene.ground_reaction.file)
     muscles: tuple[Muscle, ...] = ()

@@ -111,33 +111,33 @@ def load_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> Sce
         scene = Scene.model_validate(content)
     except ValidationError as error:
         raise _complaint(error, path, overrides or {}) from None
-    return _resolved(scene, path.parent)
+    return _resolve_paths(scene, path.parent)
 
 
 def _content(path: Path) -> dict[str, Any]:
     """Return what a scene file says, on top of what its base says."""
-    content = _parsed(path)
+    content = _parse(path)
     if "base" not in content:
         return content
     name = content["base"]
     if not isinstance(name, str) or name != Path(name).name:
         raise InputError("'base' is no file name", path, "name a scene file in the same folder")
-    base = _parsed(path.parent / name)
+    base = _parse(path.parent / name)
     if "base" in base:
         raise InputError(f"its base {name} has a base itself", path, "name that one")
-    return _merged(base, content)
+    return _merge(base, content)
 
 
-def _merged(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+def _merge(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
     """Return the base's keys with one's own in their place; tables are merged."""
     merged = base | own
     for key, value in own.items():
         if isinstance(value, dict) and isinstance(base.get(key), dict):
-            merged[key] = _merged(base[key], value)
+            merged[key] = _merge(base[key], value)
     return merged
 
 
-def _parsed(path: Path) -> dict[str, Any]:
+def _parse(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(read_text(path, what="scene file"))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
@@ -218,7 +218,7 @@ def _tables_with(complaint: ErrorDetails) -> str:
     return f"; '{key}' is a key of {', '.join(named)}" if named else ""
 
 
-def _resolved(model: Any, folder: Path) -> Any:
+def _resolve_paths(model: Any, folder: Path) -> Any:
     """Return the model with its paths made absolute against the scene's folder."""
     changed: dict[str, Any] = {}
     for name in type(model).model_fields:
@@ -226,7 +226,7 @@ def _resolved(model: Any, folder: Path) -> Any:
         if isinstance(value, Path):
             changed[name] = Path(os.path.abspath(folder / value))
         elif isinstance(value, SceneTable):
-            changed[name] = _resolved(value, folder)
+            changed[name] = _resolve_paths(value, folder)
         elif isinstance(value, tuple) and value and isinstance(value[0], SceneTable):
-            changed[name] = tuple(_resolved(one, folder) for one in value)
+            changed[name] = tuple(_resolve_paths(one, folder) for one in value)
     return model.model_copy(update=changed) if changed else model

@@ -51,6 +51,18 @@ Offset = Annotated[Vector, _within(-600, 600, "is it in millimetres?")]
 Turn = Annotated[Vector, _within(-360, 360, "is it in degrees?")]
 
 
+def _known_format(name: str) -> str:
+    from tkamb.inputs.tables import READERS
+
+    if name not in READERS:
+        raise ValueError(f"unknown table format '{name}', use {', '.join(READERS)}")
+    return name
+
+
+TableFormat = Annotated[str, AfterValidator(_known_format)]
+FORMAT = "csv, sto, mot, trc or c3d; default: the suffix"
+
+
 class SceneTable(BaseModel):
     """A table of the scene file: frozen, and unknown keys are errors."""
 
@@ -171,9 +183,7 @@ class MotionTable(SceneTable):
     slip_share: Number = Field(
         1.0, ge=0, le=10, description="roll-slip: share of the recorded slip; 0 is pure rolling"
     )
-    format: Literal["csv", "sto", "mot", "trc", "c3d"] | None = Field(
-        None, description="default: the suffix"
-    )
+    format: TableFormat | None = Field(None, description=FORMAT)
     interpretation: Literal["coordinates", "pose", "markers"] = "coordinates"
     markers: MarkersTable | None = Field(None, description="with interpretation = 'markers'")
     sequence: str | None = Field(
@@ -305,7 +315,7 @@ class GroundReactionTable(SceneTable):
     """The force that the ground exerts on the foot: one level plate, or plates of a `.c3d`."""
 
     file: Path
-    format: Literal["csv", "sto", "mot", "c3d"] | None = None
+    format: TableFormat | None = Field(None, description=FORMAT)
     plates: tuple[int, ...] = Field(
         (),
         description="of a .c3d: the plates that the foot stood on, in turn or at once, from 1; "

@@ -1,21 +1,21 @@
 """A run into a drawing: geometry of the scene, forces and numbers of results.csv, the maps."""
 
-from collections.abc import Callable, Iterable
-from pathlib import Path
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tkamb.contact.lattice.meshing.cells import FACES
 from tkamb.contact.lattice.meshing.grid import build_grid
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import SIDES, Array
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
+from tkamb.output.headline import run_title
 from tkamb.output.metrics import body_weight, map_rows, medial_share
 from tkamb.scene.case import Case
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 from tkamb.view.arrows import contact_markers, force_arrows
 from tkamb.view.drawing import Drawing, PressureMap, Reading
-from tkamb.view.run import CaseResults
+from tkamb.view.run import CaseResults, Progress
 from tkamb.view.solids import floor_and_foot, solids
 from tkamb.view.strands import (
     centre_markers,
@@ -27,8 +27,6 @@ from tkamb.view.strands import (
 
 if TYPE_CHECKING:
     from tkamb.results import Results
-
-Progress = Callable[[Iterable[int]], Iterable[int]]
 
 STAND_INS = "{} plain stand-ins between the joint centres; they carry no load."
 FOOT = "The foot is a stand-in too, drawn level with the floor whatever it did."
@@ -86,10 +84,7 @@ def _stand_ins(case: Case, foot: bool) -> tuple[str, ...]:
 
 
 def _title(run: CaseResults) -> str:
-    path = Path(str(run.results.summary.get("scene") or "scene"))
-    name = path.parent.name if path.stem == "scene" and path.parent.name else path.stem
-    name = name.upper() if len(name) <= 3 else name.replace("_", " ").capitalize()
-    contact = run.case.scene.contact
+    name, contact = run_title(run.results.summary), run.case.scene.contact
     if contact is None:
         return f"{name} (contact not modelled)"
     return f"{name}, contact: {contact.model} at {contact.resolution_mm:g} mm"
@@ -131,28 +126,38 @@ def lattice_lines(case: Case) -> Array:
 def readings(results: "Results", axis: HorizontalAxis) -> tuple[Reading, ...]:
     """Return the lines of numbers; what no frame has is left out."""
     weight = body_weight(results)
-    hip = np.sqrt(sum(results[f"hip_force_{a}_N"] ** 2 for a in ("ap", "si", "ml")))
-    ground = np.sqrt(sum(results[f"ground_reaction_{a}_N"] ** 2 for a in ("ap", "si", "ml")))
+
+    def number(name: str, values: Array, unit: str, digits: int = 0) -> Reading:
+        return _reading(name, lambda value: _text(value, digits) + unit, values)
+
+    def force(name: str, values: Array) -> Reading:
+        return _reading(name, lambda value: f"{value / weight:.2f} BW ({value:.0f} N)", values)
+
+    def both(name: str, column: str, unit: str, digits: int = 0, scale: float = 1.0) -> Reading:
+        def write(medial: float, lateral: float) -> str:
+            return f"M {_text(medial, digits)} · L {_text(lateral, digits)}{unit}"
+
+        return _reading(name, write, *(scale * results[f"{side}_{column}"] for side in SIDES))
+
     rows = [
-        _number("flexion", results["flexion_deg"], "°", 1),
-        _direction("adduction", results["adduction_deg"], "varus", "valgus"),
-        _direction("axial rotation", results["axial_rotation_deg"], "ext.", "int."),
-        _force("contact force", results["force_total_N"], weight),
-        _both_sides("· by deformation", results, "{}_force_N", " BW", 2, 1.0 / weight),
-        _both_sides("· by equilibrium", results, "{}_force_equilibrium_N", " BW", 2, 1.0 / weight),
-        _number("· medial share, deform.", 100 * medial_share(results, "deformation"), " %", 0),
-        _number("· medial share, equil.", 100 * medial_share(results, "equilibrium"), " %", 0),
-        _both_sides("peak pressure", results, "{}_peak_pressure_MPa", " MPa", 1),
-        _both_sides("contact area", results, "{}_area_mm2", " mm²", 0),
-        _force("quadriceps", results["quadriceps_N"], weight),
-        _force("patellar ligament", results["patellar_ligament_N"], weight),
-        _force("patellofemoral", results["patellofemoral_N"], weight),
-        _force("hip", hip, weight),
-        _force("ground reaction", ground, weight),
+        _reading("time", lambda value: f"{value:.2f} s", results["time_s"]),
+        number("flexion", results["flexion_deg"], "°", 1),
+        _reading("adduction", _direction("varus", "valgus"), results["adduction_deg"]),
+        _reading("axial rotation", _direction("ext.", "int."), results["axial_rotation_deg"]),
+        force("contact force", results["force_total_N"]),
+        both("· by deformation", "force_N", " BW", 2, 1.0 / weight),
+        both("· by equilibrium", "force_equilibrium_N", " BW", 2, 1.0 / weight),
+        number("· medial share, deform.", 100 * medial_share(results, "deformation"), " %"),
+        number("· medial share, equil.", 100 * medial_share(results, "equilibrium"), " %"),
+        both("peak pressure", "peak_pressure_MPa", " MPa", 1),
+        both("contact area", "area_mm2", " mm²"),
+        force("quadriceps", results["quadriceps_N"]),
+        force("patellar ligament", results["patellar_ligament_N"]),
+        force("patellofemoral", results["patellofemoral_N"]),
+        force("hip", _magnitude(results, "hip_force")),
+        force("ground reaction", _magnitude(results, "ground_reaction")),
     ]
-    time = tuple(f"{t:.2f} s" for t in results["time_s"])
-    shown = [row for row in rows if any(value != "–" for value in row.values)]
-    return (Reading("time", time), *shown)
+    return tuple(row for row in rows if any(value != "–" for value in row.values))
 
 
 def frame_labels(axis: HorizontalAxis) -> tuple[str, ...]:
@@ -161,47 +166,25 @@ def frame_labels(axis: HorizontalAxis) -> tuple[str, ...]:
     return tuple(words.format(axis.at(k)) for k in range(len(axis.values)))
 
 
-def _number(name: str, values: Array, unit: str, digits: int) -> Reading:
-    return Reading(name, tuple(_text(value, unit, digits) for value in values))
-
-
-def _force(name: str, values: Array, weight: float) -> Reading:
+def _reading(name: str, write: Callable[..., str], *columns: Array) -> Reading:
+    """Return one text per frame, "–" where no column has a number."""
     return Reading(
         name,
         tuple(
-            f"{value / weight:.2f} BW ({value:.0f} N)" if np.isfinite(value) else "–"
-            for value in values
+            write(*values) if np.isfinite(values).any() else "–"
+            for values in zip(*columns, strict=True)
         ),
     )
 
 
-def _direction(name: str, angles: Array, positive: str, negative: str) -> Reading:
-    """Return angles without a sign, with the word for their direction."""
-    words = (positive if angle >= 0 else negative for angle in np.round(angles, 1))
-    return Reading(
-        name,
-        tuple(
-            f"{abs(angle):.1f}° {word}" if np.isfinite(angle) else "–"
-            for angle, word in zip(angles, words, strict=True)
-        ),
-    )
+def _magnitude(results: "Results", stem: str) -> Array:
+    return np.sqrt(sum(results[f"{stem}_{axis}_N"] ** 2 for axis in ("ap", "si", "ml")))
 
 
-def _both_sides(
-    name: str, results: "Results", pattern: str, unit: str, digits: int, scale: float = 1.0
-) -> Reading:
-    """Return medial and lateral values in one line."""
-    medial, lateral = (scale * results[pattern.format(side)] for side in ("medial", "lateral"))
-    return Reading(
-        name,
-        tuple(
-            f"M {_text(m, '', digits)} · L {_text(x, '', digits)}{unit}"
-            if np.isfinite(m) or np.isfinite(x)
-            else "–"
-            for m, x in zip(medial, lateral, strict=True)
-        ),
-    )
+def _direction(positive: str, negative: str) -> Callable[[float], str]:
+    """Return what writes an angle (deg) without a sign, with the word for its direction."""
+    return lambda angle: f"{abs(angle):.1f}° {positive if round(angle, 1) >= 0 else negative}"
 
 
-def _text(value: float, unit: str, digits: int) -> str:
-    return f"{value:.{digits}f}{unit}".replace("-", "−") if np.isfinite(value) else "–"
+def _text(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}".replace("-", "−") if np.isfinite(value) else "–"

@@ -22,7 +22,16 @@ from numpy.typing import NDArray
 from tkamb.geometry.frames import Array
 from tkamb.units import MILLIMETRE
 from tkamb.view.colours import pressure_scale, strain_scale
-from tkamb.view.drawing import HIDDEN_AT_FIRST, LAYERS, Drawing, PressureMap, Solid
+from tkamb.view.drawing import (
+    HIDDEN_AT_FIRST,
+    LAYERS,
+    Arrow,
+    Drawing,
+    Marker,
+    PressureMap,
+    Solid,
+    Strand,
+)
 from tkamb.view.shading import Shaded, shade
 
 METRES_PER_BODY_WEIGHT = 0.03
@@ -60,7 +69,7 @@ class Block:
         self._size += len(padded)
         return span
 
-    def packed(self, header: dict[str, Any]) -> bytes:
+    def compress(self, header: dict[str, Any]) -> bytes:
         """Return header and arrays, compressed."""
         text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
@@ -74,7 +83,7 @@ def pack(drawings: Sequence[Drawing]) -> bytes:
     block = Block()
     peak = peak_pressure(drawings)
     limit = max(one.strain_limit for one in drawings)
-    return block.packed(
+    return block.compress(
         {
             "layers": list(LAYERS),
             "hidden": list(HIDDEN_AT_FIRST),
@@ -96,13 +105,13 @@ def peak_pressure(drawings: Sequence[Drawing]) -> float:
 def packed_map(found: PressureMap, peak: float, words: str) -> bytes:
     """Return one map alone, on the scale of a page that is open, with words about it."""
     block = Block()
-    return block.packed({"map": _map(block, found, peak), "words": words})
+    return block.compress({"map": _map(block, found, peak), "words": words})
 
 
 def packed_lattice(lines: Array) -> bytes:
     """Return the lines (s, 2, 3) m of a lattice alone."""
     block = Block()
-    return block.packed({"lattice": block.put(lines, "float32")})
+    return block.compress({"lattice": block.put(lines, "float32")})
 
 
 def _view(block: Block, number: int, drawing: Drawing, peak: float) -> dict[str, Any]:
@@ -133,40 +142,43 @@ def _view(block: Block, number: int, drawing: Drawing, peak: float) -> dict[str,
         "times": [float(time) for time in drawing.times],
         "commands": [block.put_bytes(umsgpack.packb(one.lower())) for one in commands],
         "moving": moving,
-        "strands": [
-            {
-                "path": _node_name(root, one.layer, one.name),
-                "frames": len(one.points),
-                "count": one.points.shape[1],
-                "points": block.put(one.points, "float32"),
-                "colours": block.put(one.colours, "uint8"),
-                "radius": one.radius,
-            }
-            for one in drawing.strands
-        ],
-        "arrows": [
-            {
-                "path": _node_name(root, "forces", one.name),
-                "name": one.name,
-                "meaning": one.meaning,
-                "colour": one.colour,
-                "ends_there": one.ends_there,
-                "points": block.put(one.points, "float32"),
-                "forces": block.put(one.forces, "float32"),
-            }
-            for one in drawing.arrows
-        ],
-        "markers": [
-            {
-                "path": _node_name(root, one.layer, one.name),
-                "colour": one.colour,
-                "radius": one.radius,
-                "points": block.put(one.points, "float32"),
-            }
-            for one in drawing.markers
-        ],
+        "strands": [_strand(block, root, one) for one in drawing.strands],
+        "arrows": [_arrow(block, root, one) for one in drawing.arrows],
+        "markers": [_marker(block, root, one) for one in drawing.markers],
         "map": _map(block, drawing.map, peak) if drawing.map else None,
         "lattice": block.put(drawing.lattice, "float32") if len(drawing.lattice) else None,
+    }
+
+
+def _strand(block: Block, root: str, strand: Strand) -> dict[str, Any]:
+    return {
+        "path": _node_name(root, strand.layer, strand.name),
+        "frames": len(strand.points),
+        "count": strand.points.shape[1],
+        "points": block.put(strand.points, "float32"),
+        "colours": block.put(strand.colours, "uint8"),
+        "radius": strand.radius,
+    }
+
+
+def _arrow(block: Block, root: str, arrow: Arrow) -> dict[str, Any]:
+    return {
+        "path": _node_name(root, "forces", arrow.name),
+        "name": arrow.name,
+        "meaning": arrow.meaning,
+        "colour": arrow.colour,
+        "ends_there": arrow.ends_there,
+        "points": block.put(arrow.points, "float32"),
+        "forces": block.put(arrow.forces, "float32"),
+    }
+
+
+def _marker(block: Block, root: str, marker: Marker) -> dict[str, Any]:
+    return {
+        "path": _node_name(root, marker.layer, marker.name),
+        "colour": marker.colour,
+        "radius": marker.radius,
+        "points": block.put(marker.points, "float32"),
     }
 
 

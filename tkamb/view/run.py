@@ -48,9 +48,9 @@ class CaseResults:
         side, found = ContactSide(self.case, self.mechanics), []
         touched: list[FrameContact] = []
         for k in progress(self.frames):
-            body, carried = side.frame(k, touched)
+            body, contact_of_frame = side.frame(k, touched)
             found.append(body)
-            touched.append(carried)
+            touched.append(contact_of_frame)
         return found
 
 
@@ -181,5 +181,5 @@ def _scene_of(results: Results) -> Scene:
             "put it back, or run it again",
         )
     contact = results.summary.get("contact") or {}
-    kept = {f"contact.{key}": value for key, value in contact.items() if value is not None}
-    return load_scene(path, kept)
+    overrides = {f"contact.{key}": value for key, value in contact.items() if value is not None}
+    return load_scene(path, overrides)

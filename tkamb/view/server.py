@@ -72,7 +72,7 @@ class ContactSwitch:
         if not 0 <= row < len(self.run.frames):
             raise TkambError(f"there is no frame {row}")
         with self._lock:
-            return self._computed(row, model)
+            return self._compute(row, model)
 
     def lattice(self) -> bytes:
         """Return the lines of the run's lattice, packed.
@@ -83,14 +83,14 @@ class ContactSwitch:
         with self._lock:
             return packed_lattice(lattice_lines(self.run.case))
 
-    def _computed(self, row: int, model: str) -> bytes:
+    def _compute(self, row: int, model: str) -> bytes:
         side = self._side(model)
-        _, carried = side.frame(self.run.frames[row])
+        _, contact = side.frame(self.run.frames[row])
         points, triangles = side.state.points, side.state.triangles
-        result = carried.result
+        result = contact.result
         if result is None:
             nothing = PressureMap(points, triangles, *np.zeros((2, 1, len(points))))
-            return packed_map(nothing, self.peak, f"{model}: {carried.problem}")
+            return packed_map(nothing, self.peak, f"{model}: {contact.problem}")
         found = PressureMap(points, triangles, result.pressure[None] / MEGAPASCAL, result.gap[None])
         parts = []
         for name in SIDE_COLOURS:
@@ -100,7 +100,7 @@ class ContactSwitch:
                     f"{name} {condyle.force:.0f} N on {condyle.area / MILLIMETRE**2:.0f} mm², "
                     f"peak {condyle.peak_pressure / MEGAPASCAL:.1f} MPa"
                 )
-        words = [f"{model}: {'; '.join(parts)}", f"{carried.seconds:.2f} s", *carried.flags]
+        words = [f"{model}: {'; '.join(parts)}", f"{contact.seconds:.2f} s", *contact.flags]
         if found.peak > self.peak:
             words.append(f"the map exceeds the colour scale ({self.peak:.1f} MPa)")
         return packed_map(found, self.peak, "; ".join(words))

@@ -4,7 +4,7 @@ import os
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from html import escape
 from pathlib import Path
@@ -17,13 +17,12 @@ from tkamb.view.draw import draw
 from tkamb.view.drawing import Drawing
 from tkamb.view.page import page_html, screenshot
 from tkamb.view.payload import pack, peak_pressure
-from tkamb.view.run import CaseResults, no_frame, run_of_results
+from tkamb.view.run import CaseResults, Progress, no_frame, run_of_results
 from tkamb.view.server import ContactSwitch, ViewServer
 
 if TYPE_CHECKING:
     from tkamb.results import Results
 
-Progress = Callable[[Iterable[int]], Iterable[int]]
 Line = Callable[[str], None]
 
 

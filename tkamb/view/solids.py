@@ -139,7 +139,7 @@ def _shaft(end: Array, profile: tuple[tuple[float, float], ...], name: str) -> S
     )
     mesh = trimesh.creation.revolve(outline, sections=28)
     turn = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], end / length)
-    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64), name).moved(turn)
+    return _surface(mesh, name).moved(turn)
 
 
 def _patella(case: Case) -> Surface:
@@ -152,10 +152,8 @@ def _patella(case: Case) -> Surface:
     half = 0.5 * float(np.linalg.norm(along))
     radii = np.array([PATELLA_DEPTH, half, PATELLA_WIDTH])
     turn = trimesh.geometry.align_vectors([0.0, 1.0, 0.0], along / (2.0 * half))[:3, :3]
-    surface = Surface(
-        np.asarray(ball.vertices) * radii, np.asarray(ball.faces, np.int64), "patella"
-    )
-    return surface.moved(pose(turn, 0.5 * (top + bottom)))
+    ball.apply_scale(radii)
+    return _surface(ball, "patella").moved(pose(turn, 0.5 * (top + bottom)))
 
 
 def floor_and_foot(
@@ -201,16 +199,14 @@ def _floor_pose(geometry: KneeGeometry, tibia_in_laboratory: Array, floor: float
 def _floor_surface() -> Surface:
     box = trimesh.creation.box(PLATE)
     box.apply_translation([PLATE_CENTRE, -0.5 * PLATE[1], 0.0])
-    return Surface(np.asarray(box.vertices), np.asarray(box.faces, np.int64), "floor")
+    return _surface(box, "floor")
 
 
 def _foot_surface(height: float) -> Surface:
     """Return a foot whose ankle is `height` (m) above the sole."""
     ankle = (0.0, height / MILLIMETRE, 0.0, ANKLE_RADIUS)
     parts = [_hull((*SOLE, INSTEP)), _hull((INSTEP, ankle))]
-    first = len(parts[0].vertices)
-    vertices = np.concatenate([part.vertices for part in parts])
-    return Surface(vertices, np.concatenate([parts[0].faces, parts[1].faces + first]), "foot")
+    return _surface(parts[0] + parts[1], "foot")
 
 
 def _hull(balls: Sequence[tuple[float, ...]]) -> trimesh.Trimesh:
@@ -218,3 +214,7 @@ def _hull(balls: Sequence[tuple[float, ...]]) -> trimesh.Trimesh:
     ball = trimesh.creation.icosphere(subdivisions=3)
     points = [ball.vertices * radius + centre for *centre, radius in balls]
     return trimesh.convex.convex_hull(np.concatenate(points) * MILLIMETRE)
+
+
+def _surface(mesh: trimesh.Trimesh, name: str) -> Surface:
+    return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64), name)

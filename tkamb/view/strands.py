@@ -64,14 +64,14 @@ def extensor_strands(mechanics: Mechanics, states: Sequence[ChainState]) -> tupl
 
 def _tendon(name: str, paths: list[TautPath | None]) -> Strand:
     """Return the strand of a taut path; its corners are doubled where the colour changes."""
-    lines = [_coloured(path) for path in paths]
+    lines = [_colour_path(path) for path in paths]
     most = max(len(points) for points, _ in lines)
     points = np.stack([np.pad(p, ((0, most - len(p)), (0, 0)), mode="edge") for p, _ in lines])
     colours = np.stack([np.pad(c, ((0, most - len(c)), (0, 0)), mode="edge") for _, c in lines])
     return Strand(name, "extensor lines", points, colours, TENDON_RADIUS)
 
 
-def _coloured(path: TautPath | None) -> tuple[Array, Colours]:
+def _colour_path(path: TautPath | None) -> tuple[Array, Colours]:
     """Return points and colours: free, on the bone, free."""
     free, wrapped = rgb(TENDON), rgb(WRAPPED)
     if path is None or not np.isfinite(path.points).all():
