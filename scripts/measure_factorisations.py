@@ -14,9 +14,9 @@ import time
 import numpy as np
 import scipy.sparse.linalg as linalg
 
-from tkamb.contact.lattice.cells import CORNERS
-from tkamb.contact.lattice.network import CalibratedNetwork
-from tkamb.contact.lattice.operator import fixed_unknowns, prepare_operator
+from tkamb.contact.lattice.linear.operator import fixed_unknowns, prepare_operator
+from tkamb.contact.lattice.meshing.cells import CORNERS
+from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
 from tkamb.contact.materials import material
 
 

@@ -24,17 +24,17 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 from lattice_cases import two_condyles  # noqa: E402
+from tkamb.atomic import claim_directory, write_text  # noqa: E402
 from tkamb.contact.materials import material  # noqa: E402
 from tkamb.contact.pair import ContactPair  # noqa: E402
 from tkamb.contact.registry import contact_model  # noqa: E402
-from tkamb.output.atomic import claim_directory, write_text  # noqa: E402
-from tkamb.press.press import peak_rss  # noqa: E402
-from tkamb.studies.calculix import press_by_calculix  # noqa: E402
-from tkamb.studies.calculix_run import find_program  # noqa: E402
+from tkamb.memory import peak_rss  # noqa: E402
+from tkamb.studies.calculix import find_program  # noqa: E402
 from tkamb.studies.cases import StudyCase  # noqa: E402
 from tkamb.studies.kept_rows import KeptRows, row_key  # noqa: E402
 from tkamb.studies.measures import ONE_THREAD  # noqa: E402
-from tkamb.studies.tradeoff_block import with_block  # noqa: E402
+from tkamb.studies.peer import press_by_calculix  # noqa: E402
+from tradeoff_blocks import with_block  # noqa: E402
 
 PEER = "CalculiX C3D8I"
 MODELS = ("lattice", "fe", PEER, "CalculiX C3D8")

@@ -117,7 +117,7 @@ class FreeBodies:
         # moments about an axis through the patella: about the laboratory's origin they are large
         here = self.leg.in_laboratory("patella", self.t)[:3, 3]
         rows = np.array([self._sagittal(w, femur, here) for w in (*columns, right)])
-        names = ("quadriceps", "patellofemoral", "patellofemoral_tangential")
+        names = ("muscle_quadriceps", "patellofemoral", "patellofemoral_tangential")
         return dict(zip(names, np.linalg.solve(rows[:3].T, rows[3]), strict=True))
 
     @staticmethod

@@ -3,7 +3,8 @@
 import numpy as np
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
-from tkamb.body.demand import KneeDemand, LigamentSet, unit_keeper
+from tkamb.body.joint_equilibrium import JointEquilibrium, unit_keeper
+from tkamb.body.ligaments import BundleArrays
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.equilibrium.released import SCALE, ReleasedForces, released_indices
@@ -36,7 +37,9 @@ def bundles(ends=(), stiffness=1e5):
     femur = np.array([femoral for femoral, _, _ in ends], float).reshape(-1, 3)
     shank = np.array([tibial for _, tibial, _ in ends], float).reshape(-1, 3)
     slack = np.array([length for _, _, length in ends], float)
-    return LigamentSet(femur, shank, np.ones(len(ends), bool), np.full(len(ends), stiffness), slack)
+    return BundleArrays(
+        femur, shank, np.ones(len(ends), bool), np.full(len(ends), stiffness), slack
+    )
 
 
 def demand(external, released=ALL, ligaments=None):
@@ -46,7 +49,7 @@ def demand(external, released=ALL, ligaments=None):
         unit_keeper(name, np.zeros(3)) for i, name in enumerate(KNEE_COORDINATES) if i not in rows
     ]
     chosen = bundles() if ligaments is None else ligaments
-    return KneeDemand(np.asarray(external, float), chosen, None, np.array(keeping).T, rows)
+    return JointEquilibrium(np.asarray(external, float), chosen, None, np.array(keeping).T, rows)
 
 
 def push(force, point=(0.0, 0.0, 0.0)):

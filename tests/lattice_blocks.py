@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tkamb.contact.lattice.cells import CORNERS, join_springs
+from tkamb.contact.lattice.meshing.cells import CORNERS, join_springs
 
 
 def block(counts, edges, stretch=0.0):

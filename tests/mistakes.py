@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from scenes import MODEL, as_toml
-from tkamb.case import load_case
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import TkambError
-from tkamb.mechanics.mechanics import Mechanics
 from tkamb.plausibility.plausibility import Plausibility
 from tkamb.run.status import frame_status
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 DM = MODEL.parent / "dm"
 DATA = MODEL.parents[2] / "shared" / "data" / "dm"
@@ -71,7 +71,7 @@ def keep_meshes(monkeypatch):
     for module, name in (
         ("tkamb.inputs.meshes", "load_surface"),
         ("tkamb.geometry.closest", "ClosestPointQuery"),
-        ("tkamb.mechanics.extensor", "PatellofemoralContact"),
+        ("tkamb.body.extensor", "PatellofemoralContact"),
     ):
         place = __import__(module, fromlist=[name])
         monkeypatch.setattr(place, name, kept(getattr(place, name), store))
@@ -123,7 +123,7 @@ class Bench:
             status = frame_status(case, k, body, None, plausibility.flags(k, body))
             flags = [] if status == "ok" else status.split("; ")
             words |= {f"{k}: {NUMBER.sub('#', word)}" for word in flags}
-            values = {**body.loads.values, **body.tensions}
+            values = {**body.loads.values, **body.geometry.tensions}
             forces += [*body.loads.contact_force, *(values[name] for name in sorted(values))]
         return Outcome("", frozenset(words), np.array(forces))
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tkamb.geometry.frames import Array, knee_pose
-from tkamb.output.maps_file import ContactMaps
+from tkamb.output.maps import ContactMaps
 from tkamb.results import Results
 
 MASS_KG = 75.0

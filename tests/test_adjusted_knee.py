@@ -5,9 +5,9 @@ import pytest
 
 from scenes import write_scene
 from tkamb import load_scene, simulate
-from tkamb.case import load_case
 from tkamb.equilibrium.contact_side import ContactSide
-from tkamb.mechanics.mechanics import Mechanics
+from tkamb.equilibrium.mechanics import Mechanics
+from tkamb.scene.case import load_case
 
 FRAMES = slice(3, 26, 10)
 
@@ -37,7 +37,7 @@ def split(results):
 
 
 def test_the_adjustment_leaves_the_shipped_total_alone(tmp_path):
-    """The source: the total changes by less than 0.001 BW. Here: 1e-5, nothing is to be mended."""
+    """Sharma (2008): the total changes by less than 0.001 BW. Here 1e-5: nothing to be mended."""
     adjusted, recorded = with_and_without(wrong_scene(tmp_path, 0.0, 0.0))
     change = adjusted["force_total_BW"] - recorded["force_total_BW"]
     assert np.abs(change).max() < 0.001

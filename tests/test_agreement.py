@@ -9,17 +9,16 @@ import pytest
 from joints import HALF, flat_joint
 from scenes import write_scene
 from tkamb import simulate
-from tkamb.case import load_case
 from tkamb.contact.registry import contact_model
-from tkamb.equilibrium.contact_side import ContactSide
-from tkamb.equilibrium.split_sensitivity import split_sensitivity
+from tkamb.equilibrium.contact_side import ContactSide, split_sensitivity
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_pose
-from tkamb.mechanics.mechanics import Mechanics
 from tkamb.output.axis import horizontal_axis
 from tkamb.output.headline import cards
 from tkamb.run.agreement import contradictions
 from tkamb.scene import load_scene
-from tkamb.studies.recordings import change_recording
+from tkamb.scene.case import load_case
+from tkamb.studies.cases import change_recording
 
 DM = Path(__file__).parents[1] / "models" / "dm" / "scene.toml"
 DATA = Path(__file__).parents[2] / "shared" / "data" / "dm"

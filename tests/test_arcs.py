@@ -5,13 +5,12 @@ import pytest
 import trimesh
 from scipy.integrate import quad
 
+from condyle_profiles import condyle_profile
 from inserts import DATA, raised, real_insert
 from shapes import torus_condyle, trough
-from tkamb.contact.lattice.grid import build_grid
+from surface_arcs import arc_lengths, draw_uv_lines
+from tkamb.contact.lattice.meshing.grid import build_grid
 from tkamb.errors import InputError
-from tkamb.geometry.arcs import arc_lengths, draw_uv_lines
-from tkamb.geometry.profiles import condyle_profile
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 from tkamb.inputs.meshes import load_surface
 
@@ -103,7 +102,7 @@ def test_normals_on_the_dishes_of_real_inserts(name):
     lines = draw_uv_lines(points, lattice.index[nodes, 0], lattice.index[nodes, 2])
     dish = (np.abs(np.abs(points[:, 2]) - 0.022) < 0.008) & (np.abs(points[:, 0]) < 0.012)
     assert dish.sum() > 500
-    _, face = RayCaster(insert).first(points[dish] * [1, 0, 1] + [0, 0.05, 0], (0, -1, 0))
+    _, face = insert.rays.first(points[dish] * [1, 0, 1] + [0, 0.05, 0], (0, -1, 0))
     cosine = np.einsum("ij,ij->i", lines.normals[dish], insert.face_normals[face])
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     assert np.percentile(angle, 95) < 2.0

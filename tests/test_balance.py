@@ -25,8 +25,7 @@ from tkamb.contact.probe import Probe
 from tkamb.contact.registry import contact_model
 from tkamb.equilibrium.balance import BalanceStatus, Trial, find_balance
 from tkamb.equilibrium.released import SCALE, ReleasedForces
-from tkamb.geometry.frames import knee_pose, knee_twist
-from tkamb.geometry.knee_axes import knee_axes
+from tkamb.geometry.frames import knee_axes, knee_pose, knee_twist
 
 LOAD = 1000.0
 TOUCH = HEIGHT + BALL - 0.05e-3
@@ -65,7 +64,7 @@ def test_springs_come_to_rest_where_their_matrix_says():
         )
         assert end.status is BalanceStatus.OK
         assert np.allclose(end.coordinates, np.linalg.solve(stiffness, load), atol=2e-6)
-        assert end.softest == pytest.approx(np.linalg.eigvalsh(stiffness)[0], rel=1e-3)
+        assert end.smallest_stiffness == pytest.approx(np.linalg.eigvalsh(stiffness)[0], rel=1e-3)
 
 
 def test_energy_falls_in_every_step_through_a_stiffening_contact():

@@ -5,12 +5,12 @@ import pytest
 
 from scenes import fast_scene, write_scene
 from tkamb import load_scene, simulate
-from tkamb.case import load_case
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import knee_pose
-from tkamb.mechanics.mechanics import Mechanics
 from tkamb.output.tables import strain_table
+from tkamb.scene.case import load_case
 
 FEW = {"motion.frames": 26}
 FRAMES = slice(10, 91, 40)
@@ -56,8 +56,10 @@ def test_strains_and_first_wrapping_are_in_the_summary(bend):
     wrapped = bend["flexion_deg"][bend["quadriceps_wrap_deg"] > 0]
     assert bend.summary["first_wrapping_flexion_deg"] == wrapped.min()
     table = strain_table(bend.summary)
-    assert "PCL_anterolateral" in table
-    assert f"{100 * found['strain']['MCL_deep'][0]:.1f}" in table
+    shown = {name: cells for name, *cells in table.rows}
+    assert "PCL_anterolateral" in shown
+    drawn = f"{100 * found['strain']['MCL_deep'][0]:.1f}".replace("-", "−")
+    assert shown["MCL_deep"][0] == drawn
 
 
 def test_roll_slip_with_the_recorded_slip_is_the_recorded_motion():
@@ -124,6 +126,6 @@ def test_a_wider_band_wraps_sooner_and_further():
         mechanics = Mechanics(
             load_case(load_scene(fast_scene(), FEW | {"quadriceps.band_mm": band}))
         )
-        wraps.append([mechanics.placed(k).wrap for k in (12, 19, 25)])
+        wraps.append([mechanics.geometry(k).extensor.wrap for k in (12, 19, 25)])
     assert wraps[0][0] == 0.0
     assert (np.array(wraps[1]) > np.array(wraps[0])).all()

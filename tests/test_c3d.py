@@ -9,9 +9,10 @@ from recordings import AMTI_CORNERS, standing_markers, write_c3d
 from tkamb.errors import InputError
 from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.ground_reaction import load_ground_reaction
-from tkamb.inputs.labels import matched_labels
+from tkamb.inputs.markers import matched_labels
 from tkamb.inputs.tables import read_table
-from tkamb.scene_tables import GroundReactionTable
+from tkamb.scene.si import in_si
+from tkamb.scene.tables import GroundReactionTable
 
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw" / "motion"
 COUNT, RATIO = 20, 10
@@ -106,7 +107,7 @@ def test_one_foot_on_two_plates_is_their_summed_wrench_at_one_centre_of_pressure
         file=path, plates=(1, 2), laboratory_axes="+x,+z,-y", cutoff_Hz="none"
     )
     time = read_c3d(path).analog_time
-    ground = load_ground_reaction(table, time, "right")
+    ground = load_ground_reaction(in_si(table), time, "right")
     force, point, free = pushes()
     into = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     np.testing.assert_allclose(ground.force, force @ into.T, atol=1e-3)
@@ -115,13 +116,40 @@ def test_one_foot_on_two_plates_is_their_summed_wrench_at_one_centre_of_pressure
     assert ground.loaded.all()
 
 
+def test_on_a_step_the_point_moves_along_the_line_of_action(tmp_path):
+    """What the foot bears is the same wrench, given at the level that it stands on."""
+    path = two_plates(tmp_path)
+    both = {}
+    for surface in (0.0, 400.0):
+        table = GroundReactionTable(
+            file=path,
+            plates=(1, 2),
+            laboratory_axes="+x,+z,-y",
+            cutoff_Hz="none",
+            surface_mm=surface,
+        )
+        both[surface] = load_ground_reaction(table, np.array([0.05, 0.1]), "right")
+    flat, step = both.values()
+    np.testing.assert_allclose(step.force, flat.force)
+    np.testing.assert_allclose(step.point[:, 1] - flat.point[:, 1], 0.4)
+    shift = step.point - flat.point
+    np.testing.assert_allclose(np.cross(shift, flat.force)[:, [0, 2]], 0.0, atol=1e-9)
+    for found in both.values():
+        about = found.moment + np.cross(found.point, found.force)
+        np.testing.assert_allclose(about, flat.moment + np.cross(flat.point, flat.force), atol=1e-9)
+        np.testing.assert_allclose(found.moment[:, [0, 2]], 0.0, atol=1e-9)
+    table = GroundReactionTable(file=tmp_path / "x.mot", cutoff_Hz="none", surface_mm=1.0)
+    with pytest.raises(InputError, match="surface_mm"):
+        load_ground_reaction(table, np.array([0.05]), "right")
+
+
 def test_below_the_threshold_the_point_is_held_and_the_wrench_kept(tmp_path):
     path = two_plates(tmp_path)
     table = GroundReactionTable(
         file=path, plates=(1,), laboratory_axes="+x,+z,-y", cutoff_Hz="none", unloaded_N=195.0
     )
     recording = read_c3d(path)
-    ground = load_ground_reaction(table, recording.analog_time, "right")
+    ground = load_ground_reaction(in_si(table), recording.analog_time, "right")
     assert 0 < ground.loaded.sum() < len(ground.loaded)
     into = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     about = ground.moment + np.cross(ground.point, ground.force)
@@ -228,7 +256,7 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, mistake):
 def test_the_plates_must_be_named_and_there(tmp_path, plates, words):
     table = GroundReactionTable(file=two_plates(tmp_path), plates=plates, cutoff_Hz="none")
     with pytest.raises(InputError, match=words):
-        load_ground_reaction(table, np.zeros(1), "right")
+        load_ground_reaction(in_si(table), np.zeros(1), "right")
 
 
 def test_a_plate_that_pushes_down_is_refused(tmp_path):
@@ -238,7 +266,7 @@ def test_a_plate_that_pushes_down_is_refused(tmp_path):
         file=path, plates=(1,), laboratory_axes="+x,+z,-y", cutoff_Hz="none"
     )
     with pytest.raises(InputError, match="down"):
-        load_ground_reaction(table, np.array([0.05]), "right")
+        load_ground_reaction(in_si(table), np.array([0.05]), "right")
 
 
 @pytest.mark.skipif(not JW.is_dir(), reason="subject JW's recordings are not beside the project")

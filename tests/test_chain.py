@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from knees import leg, random_motion
 from tkamb.body import unknowns
-from tkamb.body.inverse_dynamics import Unknown, solve
 from tkamb.body.load import PointForces, total_wrench
+from tkamb.body.unknowns import Unknown, solve
 from tkamb.geometry.frames import inverse, rotate, transform
 
 

@@ -8,11 +8,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from shapes import bicondylar, plate, sphere, trough, two_dishes
-from tkamb.geometry.closest import ClosestPointQuery, closest_points
-from tkamb.geometry.condyles import condyle_faces, condyle_split
+from tkamb.geometry.closest import ClosestPointQuery
+from tkamb.geometry.condyles import LowestPoints, condyle_faces, condyle_split
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
-from tkamb.geometry.lowest import LowestPoints, lowest_points
 from tkamb.geometry.nearest import NearestPoints, nearest_on_triangles, sampled
 from tkamb.geometry.surface import Surface
 from tkamb.inputs.meshes import axes_rotation, load_surface
@@ -184,21 +183,16 @@ def test_each_condyle_has_its_own_gap():
     assert varus.lateral.gap - varus.medial.gap == pytest.approx(expected, rel=0.03)
 
 
-def test_the_function_is_the_query():
-    ball, insert = sphere(RADIUS, 3), plate()
-    one = closest_points(ball, insert, lifted(0.031), None)
-    other = ClosestPointQuery(ball, insert, None).at(lifted(0.031))
-    assert one.medial.gap == other.medial.gap
-
-
 def test_moving_both_bodies_in_the_plane_changes_nothing():
     ball, insert = sphere(RADIUS, 4), plate()
     for height in (0.0301, 0.0295):
-        here = closest_points(ball, insert, lifted(height), None).medial
+        here = ClosestPointQuery(ball, insert, None).at(lifted(height)).medial
         shift = np.array([0.002, 0.0, -0.003])
         moved = ball.moved(lifted(0.01, 0.02, -0.01, Rotation.from_rotvec([0.1, 0.2, 0.3])))
         back = inverse(lifted(0.01, 0.02, -0.01, Rotation.from_rotvec([0.1, 0.2, 0.3])))
-        there = closest_points(moved, insert, lifted(height, *shift[[0, 2]]) @ back, None).medial
+        there = (
+            ClosestPointQuery(moved, insert, None).at(lifted(height, *shift[[0, 2]]) @ back).medial
+        )
         assert there.gap == pytest.approx(here.gap, abs=1e-12)
         assert np.allclose(there.centre, here.centre + shift, atol=2e-4)
 
@@ -221,7 +215,7 @@ def test_lowest_point_of_a_rolling_ball_stays_under_its_centre():
 
 def test_lowest_points_of_two_condyles():
     femoral = bicondylar()
-    medial, lateral = lowest_points(femoral, knee_pose([0, 0.03, 0, 0, 0, 0.5]), 0.0)
+    medial, lateral = LowestPoints(femoral, 0.0).at(knee_pose([0, 0.03, 0, 0, 0, 0.5]))
     assert medial == pytest.approx([0, 0.008, -0.022], abs=2e-4)
     assert lateral == pytest.approx([0, 0.008, 0.022], abs=2e-4)
 

@@ -8,14 +8,14 @@ import pytest
 
 from scenes import MODEL, write_scene
 from tkamb import simulate
-from tkamb.body.inverse_dynamics import LARGEST_CONDITION
 from tkamb.body.knee import solve_knee
 from tkamb.body.load import PointForces
-from tkamb.case import load_case
+from tkamb.body.unknowns import LARGEST_CONDITION
+from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.geometry.frames import transform
-from tkamb.mechanics.mechanics import FrameLoads, Mechanics
 from tkamb.run.status import FAILED, frame_status
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 MIDDLE = 60
 
@@ -98,12 +98,12 @@ def test_a_scene_that_comes_near_the_singularity_says_so(tmp_path):
 def test_quadriceps_through_the_patellofemoral_contact_holds_no_number():
     """Then it cannot pull on the patellar ligament, whatever its tension."""
     geometry = shipped_frame().geometry
-    quadriceps = geometry.extensor.quadriceps
+    quadriceps = geometry.muscles[0].loads
     (on_patella,) = (load for load in quadriceps if load.link == "patella")
     shift = geometry.extensor.contact_point - on_patella.points[0]
     moved = tuple(PointForces(one.link, one.points + shift, one.forces) for one in quadriceps)
-    extensor = replace(geometry.extensor, quadriceps=moved)
-    loads = solve_knee(replace(geometry, extensor=extensor), 0.05)
+    muscles = (replace(geometry.muscles[0], loads=moved),)
+    loads = solve_knee(replace(geometry, muscles=muscles), 0.05)
     assert loads.problems == ("singular equations",)
     assert loads.values == {}
 

@@ -1,7 +1,7 @@
 """Contact models by name, and the conformance of every one of them."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -45,6 +45,17 @@ def test_a_model_of_another_package_is_found_and_conforms(plugin):
     assert type(model).__module__ == "tkamb_winkler.model"
     assert model.modulus == 1e11
     check_contact_model(model)
+
+
+def test_a_winkler_bed_is_one_file_of_thirty_lines_and_one_row():
+    """What a new model costs: its physics in one file, and a row of the entry points."""
+    folder = PLUGIN / "tkamb_winkler"
+    source = (folder / "model.py").read_text(encoding="utf-8")
+    assert len(source.splitlines()) <= 30
+    others = [path.read_text(encoding="utf-8") for path in folder.glob("*.py")]
+    assert sum(len(text.splitlines()) for text in others) == len(source.splitlines()) + 1
+    page = (PLUGIN.parents[1] / "docs" / "contact_model.md").read_text(encoding="utf-8")
+    assert source in page
 
 
 def test_without_the_package_its_name_is_unknown():
@@ -124,9 +135,30 @@ class Suggestible(ElasticFoundation):
         return result
 
 
+@dataclass(frozen=True)
+class Flat(ElasticFoundation):
+    """Says that the bodies only touch, whatever their pose."""
+
+    def evaluate(self, state, pose, guess=None):
+        result = super().evaluate(state, pose, guess)
+        object.__setattr__(result, "approach", 0.0)
+        return result
+
+
+@dataclass(frozen=True)
+class Unmoved(ElasticFoundation):
+    """Says the same of a press alone, and leaves the femoral component where it touches."""
+
+    def press(self, state, load, pose, guess=None):
+        result = super().press(state, load, pose, guess)
+        return replace(result, pose=state.pair.pose_at_approach(pose, 0.0))
+
+
 @pytest.mark.parametrize(
     ("model", "broken"),
     [
+        (Flat, "the approach is the travel since touch"),
+        (Unmoved, "pressing moves the femoral component"),
         (Sucking, "no wrench when apart"),
         (Forgetful, "integral of pressure"),
         (Suggestible, "a guess changes no answer"),

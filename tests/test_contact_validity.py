@@ -6,11 +6,11 @@ import pytest
 from lattice_bodies import above, box_insert, condyles, dished_insert
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
+from tkamb.contact.pressing import thickness_near
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
-from tkamb.contact.validity import thickness_near
 from tkamb.geometry.surface import Surface
-from tkamb.press.press_report import PressReport
+from tkamb.press import PressReport
 
 MODELS = ["foundation", "foundation-linear", "hertz", "lattice", "lattice-linear", "fe"]
 FEW = ["foundation-linear", "hertz", "lattice", "lattice-linear"]

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from scenes import fast_scene
-from tkamb.case import load_case
 from tkamb.equilibrium.contact_side import LOAD_CHANGE, POINT_CHANGE, ContactSide
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
-from tkamb.mechanics.mechanics import Mechanics
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 from tkamb.simulation import simulate
 
 SCENE = fast_scene()

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from tkamb.body.ligaments import build_ligaments, quadratic_toe_force
-from tkamb.case import Case, load_case
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
@@ -20,6 +19,8 @@ from tkamb.inputs.motion import load_motion
 from tkamb.inputs.tables import read_table
 from tkamb.inputs.tibia import load_tibia
 from tkamb.scene import load_scene
+from tkamb.scene.case import Case, load_case
+from tkamb.scene.si import in_si
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data" / "dm"
@@ -88,7 +89,7 @@ def test_the_mirrored_reading_closes_the_gaps_as_well_and_half_of_it_does_not():
     spread = {}
     for turned in ((), roles[:1], roles[1:2], roles):
         table = mirrored.motion.model_copy(update={"signs_turned": turned})
-        motion = load_motion(table, "right", placed @ turn, turn)
+        motion = load_motion(in_si(table), "right", placed @ turn, turn)
         found = [query.at(place) for place in knee_pose(motion.raw_coordinates[62:101:3])]
         spread[turned] = 1e3 * np.std([gap.medial.gap - gap.lateral.gap for gap in found])
     assert spread[roles] == pytest.approx(spread[()], abs=0.05)
@@ -164,8 +165,8 @@ def test_stride_is_the_most_representative_one():
     forces, leans = [], []
     for start, end in pairwise(strikes):
         at = np.linspace(start, end, 51)
-        forces.append(load_ground_reaction(scene.ground_reaction, at, "right").force)
-        up = load_tibia(scene.tibia, at, "right", 6.0).pose[:, :3, 1]
+        forces.append(load_ground_reaction(in_si(scene.ground_reaction), at, "right").force)
+        up = load_tibia(in_si(scene.tibia), at, "right", 6.0).pose[:, :3, 1]
         leans.append(np.arctan2(up[:, [0, 2]], up[:, [1]]))
     score = sum(
         distance / distance.mean()
@@ -212,7 +213,7 @@ def test_ligaments_are_near_their_slack_length_in_stance():
     }
     bundles: dict[str, list] = {}
     total = np.zeros(len(femur))
-    for strand in build_ligaments(case().scene.ligament, poses, motion.coordinates[:, 5]):
+    for strand in build_ligaments(case().ligaments, poses, motion.coordinates[:, 5]):
         length = strand.length(poses)
         bundles.setdefault(re.sub(r"\d+$", "", strand.name), []).append(strand.strain(length))
         total += strand.force(length)

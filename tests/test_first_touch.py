@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
-from tkamb.geometry.ceiling import Ceiling
+from tkamb.geometry.bounds import HeightBound, Patches
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import knee_pose, pose, transform
-from tkamb.geometry.patches import Patches
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -18,9 +16,9 @@ def vertex_clearance(femoral, insert, at):
     """Return the smallest clearance at any vertex of either body, every one of them tried."""
     moved = Surface(transform(at, femoral.vertices), femoral.faces)
     above = moved.vertices + UP * (0.1 - moved.vertices[:, 1:2])
-    down = 0.1 - RayCaster(insert).first(above, -UP)[0]
+    down = 0.1 - insert.rays.first(above, -UP)[0]
     below = insert.vertices - UP * (0.1 + insert.vertices[:, 1:2])
-    up = RayCaster(moved).first(below, UP)[0] - 0.1
+    up = moved.rays.first(below, UP)[0] - 0.1
     return min((moved.vertices[:, 1] - down).min(), (up - insert.vertices[:, 1]).min())
 
 
@@ -87,7 +85,7 @@ def test_travel_moves_with_the_pose_and_not_with_the_femoral_frame():
 def test_the_ceiling_is_above_the_surface_everywhere():
     _, insert = bodies()
     lift = np.random.default_rng(0).uniform(0, 1e-3, len(insert.vertices))
-    ceiling = Ceiling(insert, lift)
+    ceiling = HeightBound(insert, lift)
     points = insert.triangles.mean(axis=1)
     above = ceiling.over(points) - points[:, 1]
     assert (above >= -1e-15).all()

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tkamb.case import load_case
 from tkamb.equilibrium.contact_side import ContactSide
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
+from tkamb.geometry.condyles import LowestPoints
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import knee_pose
-from tkamb.geometry.lowest import LowestPoints
 from tkamb.inputs.tables import read_table
-from tkamb.mechanics.mechanics import Mechanics
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 BEND = Path(__file__).parents[1] / "models" / "deep_knee_bend"
 ALL = ["ap", "ml", "axial_rotation", "adduction"]
@@ -45,7 +45,7 @@ def test_flexion_alone_finds_the_state_of_the_whole_recording(tmp_path):
     for k in (30, 75):
         contacts = [side.frame(k)[1] for side in sides]
         assert not any(contact.problem for contact in contacts)
-        places = [contact.settled.coordinates for contact in contacts]
+        places = [contact.equilibrium.coordinates for contact in contacts]
         apart = np.abs(places[0] - places[1])
         assert apart[:3].max() < 2e-4, k
         assert np.degrees(apart[3:]).max() < 0.3, k

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
-from tkamb.contact.bed import sample_bed
 from tkamb.contact.foundation import (
     ElasticFoundation,
     LinearFoundation,
@@ -15,8 +14,8 @@ from tkamb.contact.foundation import (
 )
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
-from tkamb.contact.pressing import first_touch_height, pose_at_approach
 from tkamb.contact.result import ContactStatus
+from tkamb.contact.samples import sample_surface
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, knee_pose, pose
 from tkamb.geometry.surface import Surface
@@ -90,7 +89,7 @@ def test_a_flat_punch_gives_uniform_pressure_on_the_whole_top():
 def test_the_bed_lies_on_the_mesh_with_true_areas_normals_and_thickness():
     radius = 25e-3
     insert = dished_insert(lambda x, z: 32e-3 - np.sqrt(radius**2 - x**2 - z**2))
-    bed = sample_bed(insert, 1e-3)
+    bed = sample_surface(insert, 1e-3)
     outward = np.array([0, 32e-3, 0]) - bed.points
     distance = np.linalg.norm(outward, axis=1)
     assert np.allclose(distance, radius, atol=8e-6)
@@ -107,7 +106,7 @@ def test_the_bed_lies_on_the_mesh_with_true_areas_normals_and_thickness():
 
 def test_the_bed_shows_a_post():
     insert = dished_insert(lambda x, z: np.where(np.hypot(x, z) < 4e-3, 20e-3, 8e-3))
-    bed = sample_bed(insert, 1e-3)
+    bed = sample_surface(insert, 1e-3)
     on_post = np.hypot(bed.points[:, 0], bed.points[:, 2]) < 3.4e-3
     assert np.allclose(bed.points[on_post, 1], 20e-3)
     assert np.allclose(bed.thickness[on_post], 20e-3)
@@ -117,7 +116,7 @@ def test_an_open_insert_is_refused():
     closed = flat_insert(8e-3)
     up = closed.face_normals[:, 1] > 0.5
     with pytest.raises(InputError, match="closed"):
-        sample_bed(Surface(closed.vertices, closed.faces[up], "lid"), 1e-3)
+        sample_surface(Surface(closed.vertices, closed.faces[up], "lid"), 1e-3)
 
 
 def test_pressure_laws():
@@ -223,13 +222,13 @@ def test_first_touch_of_crossed_cylinders_is_found_on_their_edges():
     ridge = dished_insert(lambda x, z: 10e-3 - 0.5 * np.abs(x), spacing=15e-3)
     roof = dished_insert(lambda x, z: 10e-3 - 0.5 * np.abs(z), spacing=15e-3)
     flipped = Surface(roof.vertices * [1, -1, 1], roof.faces[:, ::-1].copy(), "roof")
-    assert first_touch_height(ContactPair(flipped, ridge, LINEAR), np.eye(4)) == pytest.approx(
+    assert ContactPair(flipped, ridge, LINEAR).first_touch_height(np.eye(4)) == pytest.approx(
         20e-3, abs=1e-12
     )
     shifted = pose(np.eye(3), [3.1e-3, 0, 2.3e-3])
     pair = ContactPair(flipped, ridge, LINEAR)
-    assert first_touch_height(pair, shifted) == pytest.approx(20e-3, abs=1e-12)
-    assert pose_at_approach(pair, shifted, 1e-3)[1, 3] == pytest.approx(19e-3, abs=1e-12)
+    assert pair.first_touch_height(shifted) == pytest.approx(20e-3, abs=1e-12)
+    assert pair.pose_at_approach(shifted, 1e-3)[1, 3] == pytest.approx(19e-3, abs=1e-12)
 
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -238,7 +237,7 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 @pytest.mark.skipif(not DATA.is_dir(), reason="the data folder shared/data is not here")
 def test_a_real_implant_is_loaded_on_both_dishes():
     """JW's components aligned, 1500 N: even split, centres in the dishes."""
-    from tkamb.press.press import press_meshes
+    from tkamb.press import press_meshes
 
     folder = DATA / "jw" / "geometry"
     report = press_meshes(

@@ -21,12 +21,12 @@ import pytest
 
 from free_body import FreeBodies, Lent
 from raw_leg import Leg
-from tkamb.case import load_case
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import pose
 from tkamb.inputs.meshes import axes_rotation, load_surface
-from tkamb.mechanics.mechanics import Mechanics
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 MODELS = Path(__file__).parents[1] / "models"
 DATA = Path(__file__).parents[2] / "shared" / "data" / "dm"
@@ -97,7 +97,7 @@ def lent(frame):
     geometry, loads = frame.geometry, frame.loads
     quadriceps, ligament = (
         [(load.link, *pair) for load in line for pair in zip(load.points, load.forces, strict=True)]
-        for line in (geometry.extensor.quadriceps, geometry.extensor.patellar_ligament)
+        for line in (geometry.muscles[0].loads, geometry.extensor.patellar_ligament)
     )
     return Lent(
         {side: (condyle.point, condyle.normal) for side, condyle in geometry.condyles.items()},
@@ -112,10 +112,11 @@ def lent(frame):
 def test_lines_that_wrap_nothing_run_between_the_scenes_points(shipped):
     leg, mechanics, time = shipped
     for k in SHIPPED_FRAMES:
-        extensor, wrap = mechanics.frame(k).geometry.extensor, mechanics.frame(k).wrap
+        geometry = mechanics.frame(k).geometry
+        extensor = geometry.extensor
         lines = {"patellar_ligament": extensor.patellar_ligament}
-        if wrap == 0.0:
-            lines["quadriceps"] = extensor.quadriceps
+        if extensor.wrap == 0.0:
+            lines["quadriceps"] = geometry.muscles[0].loads
         back = np.linalg.inv(leg.insert_in_laboratory(time[k]))
         for name, loads in lines.items():
             for (end, place), load in zip(leg.ends(name, time[k]), loads, strict=True):
@@ -133,5 +134,5 @@ def test_the_free_bodies_notice_a_load_that_is_wrong_by_one_per_cent(shipped):
         more = FreeBodies(leg, time[k], lent(mechanics.frame(k))).loads()
     finally:
         leg.ground = ground
-    assert abs(more["quadriceps"] - own["quadriceps"]) > 10 * FORCE
+    assert abs(more["muscle_quadriceps"] - own["muscle_quadriceps"]) > 10 * FORCE
     assert np.abs(more["hip_moment"] - own["hip_moment"]).max() > 5 * MOMENT

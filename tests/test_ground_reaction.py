@@ -6,7 +6,8 @@ import pytest
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR
 from tkamb.inputs.ground_reaction import load_ground_reaction
-from tkamb.scene_tables import GroundReactionTable
+from tkamb.scene.si import in_si
+from tkamb.scene.tables import GroundReactionTable
 
 STAMPS = np.arange(2401) / 1200
 AT = np.linspace(0.2, 1.8, 33)
@@ -30,7 +31,9 @@ def write(path, force, point, moment, stamps=STAMPS):
 
 
 def plate(file, **changes):
-    return GroundReactionTable(**({"file": file, "length_unit": "m", "cutoff_Hz": 50.0} | changes))
+    return in_si(
+        GroundReactionTable(**({"file": file, "length_unit": "m", "cutoff_Hz": 50.0} | changes))
+    )
 
 
 def about_origin(reaction):

@@ -11,16 +11,17 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from scenes import MODEL, write_scene
-from tkamb.body import knee, patellofemoral, unknowns
+from tkamb.body import contact_points, knee, patellofemoral
 from tkamb.body.chain import Chain
-from tkamb.case import Case, load_case
-from tkamb.geometry import close_region, condyles
+from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
+from tkamb.geometry import closest, condyles
 from tkamb.geometry.frames import pose
 from tkamb.geometry.nearest import NearestPoints
 from tkamb.geometry.surface import Surface
 from tkamb.inputs.patient import load_urdf
-from tkamb.mechanics.mechanics import FrameLoads, Mechanics
-from tkamb.scene import Scene, load_scene
+from tkamb.scene import Scene, lines, load_scene
+from tkamb.scene.case import Case, load_case
+from tkamb.scene.si import in_si
 
 FEW = 26
 FRAMES = (0, 9, 15, 23)
@@ -48,8 +49,8 @@ def numbers(frame: FrameLoads) -> np.ndarray:
             loads.external_flexion,
             loads.external_adduction,
             loads.sensitivity,
-            *frame.tensions.values(),
-            frame.wrap,
+            *frame.geometry.tensions.values(),
+            frame.geometry.extensor.wrap,
         ]
     )
 
@@ -171,7 +172,7 @@ def scaled_scene(scene: Scene) -> Scene:
 
 def scaled_chain(case: Case) -> Chain:
     """Return the chain with placements, inertias and gravity in the new units."""
-    chain = Chain(load_urdf(case.scene.patient, True), True)
+    chain = Chain(load_urdf(in_si(case.scene.patient), True), True)
     model = chain.model
     for joint in range(model.njoints):
         place, inertia = model.jointPlacements[joint], model.inertias[joint]
@@ -200,9 +201,10 @@ def scaled_case(case: Case) -> Case:
     units = np.array([LENGTH] * 3 + [1.0] * 3)
     flat = np.array([LENGTH, LENGTH, 1.0])
     motion, tibia, ground = case.motion, case.tibia, case.ground
+    scene, chain = scaled_scene(case.scene), scaled_chain(case)
     return Case(
-        scaled_scene(case.scene),
-        scaled_chain(case),
+        scene,
+        chain,
         replace(
             motion,
             time=motion.time * TIME,
@@ -229,17 +231,21 @@ def scaled_case(case: Case) -> Case:
         surface(case.femoral),
         surface(case.insert),
         surface(case.patella),
+        lines.ligaments(scene),
+        lines.muscles(scene, chain),
+        lines.patellar_ligament(scene),
     )
 
 
 def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
     """Lengths, masses and times scaled, gravity and the model's own lengths along."""
-    monkeypatch.setattr(unknowns, "STANDSTILL", unknowns.STANDSTILL * LENGTH / TIME)
+    shipped_loads()  # before anything is scaled: they are kept
+    monkeypatch.setattr(contact_points, "STANDSTILL", contact_points.STANDSTILL * LENGTH / TIME)
     own_lengths = {
         knee: ("RESIDUAL_SHIFT",),
         patellofemoral: ("PATCH_DEPTH", "SAMPLE_SPACING", "REACH"),
-        close_region: ("RESOLUTION", "REACH", "_SPACING", "_DOUBT"),
-        condyles: ("NOTCH_DEPTH", "_STRIP", "_DEEPEST"),
+        closest: ("FACET_DEPTH", "REGION_RADIUS", "SAMPLE_SPACING", "ESTIMATE_ERROR"),
+        condyles: ("NOTCH_DEPTH", "STRIP_WIDTH", "_DEEPEST"),
     }
     for module, names in own_lengths.items():
         for name in names:
@@ -262,9 +268,13 @@ def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
             before.loads.external_flexion * FORCE * LENGTH, rel=1e-9, abs=1e-9
         )
         assert after.loads.sensitivity == pytest.approx(before.loads.sensitivity * FORCE, rel=1e-6)
-        assert after.wrap == pytest.approx(before.wrap, abs=1e-9)
-        for name, tension in before.tensions.items():
-            assert after.tensions[name] == pytest.approx(tension * FORCE, rel=1e-9, abs=1e-9)
+        assert after.geometry.extensor.wrap == pytest.approx(
+            before.geometry.extensor.wrap, abs=1e-9
+        )
+        for name, tension in before.geometry.tensions.items():
+            assert after.geometry.tensions[name] == pytest.approx(
+                tension * FORCE, rel=1e-9, abs=1e-9
+            )
 
 
 def resampled_scene(folder, rate, cutoff, start=1.0, stop=2.0):

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from lattice_blocks import block
-from tkamb.contact.lattice import cache
-from tkamb.contact.lattice.bbar import BbarHexahedra
-from tkamb.contact.lattice.network import CalibratedNetwork
-from tkamb.contact.lattice.operator import fixed_unknowns, prepare_operator
-from tkamb.contact.lattice.operator_check import operator_error
-from tkamb.contact.lattice.response import SINGLE
+from tkamb.contact.lattice.linear import cache
+from tkamb.contact.lattice.linear.operator import fixed_unknowns, operator_error, prepare_operator
+from tkamb.contact.lattice.linear.response import SINGLE
+from tkamb.contact.lattice.solids.bbar import BbarHexahedra
+from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
 from tkamb.contact.materials import material
 
 EDGES = np.full(3, 1e-3)

@@ -8,7 +8,7 @@ import trimesh
 
 from lattice_bodies import above, box_insert, pair, plate, sphere_cap
 from layer_contact import sphere_on_layer
-from tkamb.contact.lattice.covered import covered_areas
+from tkamb.contact.area import covered_areas
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.geometry.surface import Surface

@@ -7,9 +7,9 @@ import pytest
 import scipy.sparse.linalg as linalg
 
 from lattice_blocks import block
-from tkamb.contact.lattice.network import CalibratedNetwork
-from tkamb.contact.lattice.operator import fixed_unknowns, prepare_operator
-from tkamb.contact.lattice.response import unknowns_of
+from tkamb.contact.lattice.linear.operator import fixed_unknowns, prepare_operator
+from tkamb.contact.lattice.linear.response import unknowns_of
+from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
 from tkamb.contact.materials import material
 
 MM = 1e-3
@@ -73,23 +73,23 @@ def test_response_of_some_nodes_is_part_of_the_whole(bearing):
     assert part.project(y) == pytest.approx(operator.half.project(y)[some])
 
 
-def test_few_nodes_need_few_members():
-    """Forces on, and displacements of, some nodes: the members above them are enough."""
+def test_few_nodes_need_few_fronts():
+    """Forces on, and displacements of, some nodes: the fronts above them are enough."""
     solid, held, operator, top = prepared("fixed")
     some = top[:4]
-    members = operator.members_of(some)
-    assert len(members) < len(operator.factor.fronts)
+    fronts = operator.fronts_of(some)
+    assert len(fronts) < len(operator.factor.fronts)
     force = np.zeros_like(solid.nodes)
     force[some] = np.random.default_rng(4).normal(size=(4, 3))
-    y = operator.start(force, members)
+    y = operator.start(force, fronts)
     assert y == pytest.approx(operator.start(force), rel=1e-12, abs=1e-12 * np.abs(y).max())
     u = operator.solve(force)
-    operator.factor.backward(y, members)
+    operator.factor.backward(y, fronts)
     assert operator.nodal(y)[some] == pytest.approx(u[some])
-    rest = np.setdiff1d(np.arange(len(operator.factor.fronts)), members)
+    rest = np.setdiff1d(np.arange(len(operator.factor.fronts)), fronts)
     operator.factor.backward(y, rest)
     assert operator.nodal(y) == pytest.approx(u)
-    assert len(operator.members_of(np.flatnonzero(held.reshape(-1, 3).all(axis=1)))) == 0
+    assert len(operator.fronts_of(np.flatnonzero(held.reshape(-1, 3).all(axis=1)))) == 0
 
 
 def test_single_precision_keeps_displacements_to_a_few_parts_in_a_million():

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from scenes import MODEL
-from tkamb.case import load_case
+from tkamb.contact.area import area_above
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
-from tkamb.contact.summary import area_above, medial_points
+from tkamb.contact.result import medial_points
 from tkamb.geometry.frames import knee_pose
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 FRAMES, FAR = (12, 36, 84), 60
 LOADS = {11: 700.0, 12: 750.0, 35: 1400.0, 36: 1450.0, 60: 2000.0, 83: 2150.0, 84: 2200.0}
@@ -35,9 +36,15 @@ def prepared(name):
     return model, model.prepare(shipped()[0])
 
 
+def too_deep(state, result, factor):
+    """Return a guess without a warm start, whose approach is too large by a factor."""
+    pose = state.pair.pose_at_approach(result.pose, factor * result.approach)
+    return replace(result, pose=pose, warm_start=None)
+
+
 def columns(state, result):
     """Return what a results table says of a contact."""
-    medial = medial_points(result.points, result.pose, state.split)
+    medial = medial_points(result.points, result.pose, state.pair.split)
     found = {"approach": result.approach, "lowest gap": result.gap[result.pressure == 0].min()}
     for side, own in (("medial", medial), ("lateral", ~medial)):
         condyle = getattr(result, side)
@@ -66,7 +73,8 @@ def test_answers_do_not_depend_on_the_guess(name, frame):
     wanted = columns(state, cold)
     before = model.press(state, LOADS[frame - 1], poses[frame - 1])
     far = model.press(state, LOADS[FAR], poses[FAR])
-    for guess in (before, far, replace(before), replace(far, approach=3.0 * far.approach)):
+    assert before.warm_start is not None
+    for guess in (before, far, replace(before, warm_start=None), too_deep(state, far, 3.0)):
         found = columns(state, model.press(state, LOADS[frame], poses[frame], guess))
         for key, value in found.items():
             near = {"abs": 5e-6} if "centre" in key else {"rel": 5e-3, "abs": 2e-7}
@@ -77,7 +85,7 @@ def test_the_gap_beside_the_contact_is_that_of_the_deformed_insert():
     """Seen with few candidates and with all of them: the same nodes, the same gap."""
     (model, state), (_, poses) = prepared("lattice-linear"), shipped()
     few = model.press(state, 2000.0, poses[84])
-    many = model.press(state, 2000.0, poses[84], replace(few, approach=20.0 * few.approach))
+    many = model.press(state, 2000.0, poses[84], too_deep(state, few, 20.0))
     assert few.gap == pytest.approx(many.gap, rel=5e-3, abs=2e-7)
     assert (few.gap >= 0).all()
 

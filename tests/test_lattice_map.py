@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from tkamb.contact.lattice.grid import build_grid
-from tkamb.contact.lattice.pressure_map import contact_map
+from tkamb.contact.lattice.meshing.contact_map import contact_map
+from tkamb.contact.lattice.meshing.grid import build_grid
 from tkamb.studies.bodies import block, dishes, flat
 
 RADIUS, THICK = 34e-3, 8e-3

@@ -5,10 +5,10 @@ import pytest
 import scipy.sparse.linalg as linalg
 
 from lattice_blocks import block
-from tkamb.contact.lattice.bbar import BbarHexahedra
-from tkamb.contact.lattice.curve import ShearCurve
-from tkamb.contact.lattice.network import CalibratedNetwork
-from tkamb.contact.lattice.source import SourceNetwork
+from tkamb.contact.lattice.solids.bbar import BbarHexahedra
+from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
+from tkamb.contact.lattice.solids.curve import ShearCurve
+from tkamb.contact.lattice.source.springs import SourceNetwork
 from tkamb.contact.materials import material, tabulated_material
 
 MM = 1e-3
@@ -112,4 +112,4 @@ def test_linear_material_loses_nothing():
     nodes, _, cells, _ = block((2, 2, 2), edges)
     for solid in SOLIDS:
         made = solid(nodes, cells, edges, material("polyethylene-linear"))
-        assert not made.correction(np.ones_like(nodes)).any()
+        assert not made.residual_force(np.ones_like(nodes)).any()

@@ -9,10 +9,10 @@ import pytest
 from lattice_blocks import block
 from lattice_bodies import box_insert, pair, sphere_cap
 from tkamb import memory
-from tkamb.contact.lattice import memory_need, operator
-from tkamb.contact.lattice.network import CalibratedNetwork
-from tkamb.contact.lattice.operator import fixed_unknowns, prepare_operator
-from tkamb.contact.lattice.response import SINGLE
+from tkamb.contact.lattice.linear import memory_need, operator
+from tkamb.contact.lattice.linear.operator import fixed_unknowns, prepare_operator
+from tkamb.contact.lattice.linear.response import SINGLE
+from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError

@@ -5,16 +5,16 @@ import pytest
 import scipy.sparse.linalg as linalg
 
 from lattice_blocks import block, uniform_strain
-from tkamb.contact.lattice.bbar import BbarHexahedra
-from tkamb.contact.lattice.calibrated import (
+from tkamb.contact.lattice.solids.bbar import BbarHexahedra
+from tkamb.contact.lattice.solids.calibrated import (
+    CalibratedNetwork,
     body_diagonal_stiffness,
     box_corners,
     deviatoric_matrices,
     spring_families,
     spring_matrix,
 )
-from tkamb.contact.lattice.network import CalibratedNetwork
-from tkamb.contact.lattice.source import SourceNetwork, source_factor
+from tkamb.contact.lattice.source.springs import SourceNetwork, source_factor
 from tkamb.contact.materials import Material
 
 MM = 1e-3

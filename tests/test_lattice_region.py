@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from lattice_bodies import condyles, dished_insert, pair
-from tkamb.contact.lattice.candidates import choose_start
-from tkamb.contact.lattice.problem import undeformed
-from tkamb.contact.lattice.region import Region, members_that_count
-from tkamb.contact.lattice.solver import Tolerance, solve
+from tkamb.contact.lattice.initial_guess import WarmStart, initial_guess
+from tkamb.contact.lattice.linear.compliance import ComplianceCache
+from tkamb.contact.lattice.model import warm_start_of
+from tkamb.contact.lattice.problem import Region, undeformed
+from tkamb.contact.lattice.solver import Tolerance, elements_that_count, solve
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult
@@ -29,16 +30,21 @@ def solved(state, x, tolerance, before=None):
     """Return the solution at a place, from rest or from an earlier solution."""
     pose = POSE.copy()
     pose[0, 3] += x
-    gaps, foot = undeformed(state.problem, pose)
+    gaps, planes = undeformed(state.problem, pose)
     lowest = gaps.min()
     pose[1, 3] -= lowest
-    rest = gaps - lowest, foot.raised(-lowest)
-    start = choose_start(state.pool, *rest, 0.4e-3, False, None, None)
+    rest = gaps - lowest, planes.raised(-lowest)
+    start = initial_guess(state.compliance, *rest, 0.4e-3, False, None, None)
     if before is not None:
         moved = np.zeros_like(state.points)
         moved[before.candidates] = before.displacement
         own = moved[start.candidates]
-        start = replace(start, lost=before.lost, moved=own, region=before.region)
+        start = replace(
+            start,
+            nonlinear_residual=before.nonlinear_residual,
+            moved=own,
+            region=before.region,
+        )
     return solve(state.problem, pose, LOAD, start, Tolerance(tolerance))
 
 
@@ -46,7 +52,7 @@ def imbalance(state, solution):
     """Return what is out of balance anywhere in the solid, relative to the contact forces."""
     problem = state.problem
     outside = -problem.solid.internal_force(solution.field)
-    pushed = solution.forces.force[:, None] * solution.footing.normals
+    pushed = solution.forces.force[:, None] * solution.planes.normals
     outside[problem.contact_nodes[solution.candidates]] += pushed
     return np.linalg.norm(outside.ravel()[~problem.held]) / np.linalg.norm(pushed)
 
@@ -63,39 +69,55 @@ def test_the_whole_solid_is_in_balance_from_rest_and_from_a_neighbour(state, tol
     assert warm.forces.approach == pytest.approx(again.forces.approach, rel=5 * tolerance)
 
 
-def test_few_members_count_and_the_rest_of_the_forces_is_zero(state):
+def test_few_elements_count_and_the_rest_of_the_forces_is_zero(state):
     found = solved(state, 0.0, 1e-3)
     region, whole = found.region, Region.everywhere(state.problem)
     assert whole.whole and not region.whole
-    assert len(region.members) < 0.7 * len(whole.members)
+    assert len(region.elements) < 0.7 * len(whole.elements)
     assert len(region.fronts) <= len(whole.fronts)
-    outside = np.setdiff1d(np.arange(len(found.lost)), region.nodes)
-    assert not found.lost[outside].any()
-    lost = np.linalg.norm(state.problem.solid.lost(found.field), axis=1)
-    others = np.setdiff1d(whole.members, region.members)
-    assert lost[others].max() <= lost[region.members].min()
+    outside = np.setdiff1d(np.arange(len(found.nonlinear_residual)), region.nodes)
+    assert not found.nonlinear_residual[outside].any()
+    lost = np.linalg.norm(state.problem.solid.nonlinear_residual(found.field), axis=1)
+    others = np.setdiff1d(whole.elements, region.elements)
+    assert lost[others].max() <= lost[region.elements].min()
 
 
-def test_members_are_left_out_up_to_the_bound():
+def test_elements_are_left_out_up_to_the_bound():
     size = np.array([3.0, 0.1, 5.0, 0.2, 0.0])
-    assert members_that_count(size, 0.2).tolist() == [0, 2, 3]
-    assert members_that_count(size, 0.23).tolist() == [0, 2]
-    assert members_that_count(size, 0.0).tolist() == [0, 1, 2, 3]
-    assert members_that_count(size, 10.0).tolist() == []
+    assert elements_that_count(size, 0.2).tolist() == [0, 2, 3]
+    assert elements_that_count(size, 0.23).tolist() == [0, 2]
+    assert elements_that_count(size, 0.0).tolist() == [0, 1, 2, 3]
+    assert elements_that_count(size, 10.0).tolist() == []
 
 
-def test_an_approach_may_be_found_when_it_is_read():
-    asked = []
+def test_the_approach_is_that_of_the_pose(state):
+    """Nothing is handed over: it follows from pair and pose, also after a change of pose."""
+    resting = state.pair.pose_at_approach(POSE, 0.0)
+    result = ContactResult.of(state, resting, *np.zeros((2, len(state.points))))
+    assert result.approach == 0.0
+    deeper = replace(result, pose=state.pair.pose_at_approach(POSE, 2e-4))
+    assert deeper.approach == pytest.approx(2e-4, abs=1e-15)
+    assert np.isnan(ContactResult.failed(state, POSE, "why").approach)
 
-    def approach():
-        asked.append(True)
-        return 2e-4
 
-    nothing = np.zeros(1)
-    result = ContactResult(*[nothing] * 8, None, None, approach)
-    assert not asked
-    assert result.approach == result.approach == 2e-4
-    assert len(asked) == 1
-    assert replace(result, approach=1e-4).approach == 1e-4
-    with pytest.raises(TypeError, match="approach"):
-        ContactResult(*[nothing] * 8, None, None)
+def test_compliance_at_hand_changes_no_answer(state):
+    """Pressed with what other poses have left, and with nothing."""
+    model = contact_model("lattice", 2.0)
+    for x in (4e-3, -3e-3):
+        moved = POSE.copy()
+        moved[0, 3] += x
+        model.press(state, LOAD, moved)
+    bare = replace(state, compliance=ComplianceCache(state.problem.operator.half))
+    used, fresh = model.press(state, LOAD, POSE), model.press(bare, LOAD, POSE)
+    assert used.approach == pytest.approx(fresh.approach, rel=1e-9)
+    assert used.pressure == pytest.approx(fresh.pressure, rel=1e-6, abs=1.0)
+
+
+def test_a_warm_start_of_another_insert_is_not_used(state):
+    """A guess of another state saves nothing and harms nothing."""
+    model = contact_model("lattice", 2.0)
+    other = replace(state, problem=replace(state.problem))
+    stranger = model.press(other, LOAD, POSE)
+    assert isinstance(stranger.warm_start, WarmStart)
+    assert warm_start_of(state, stranger) is None
+    assert warm_start_of(other, stranger) is stranger.warm_start

@@ -9,6 +9,7 @@ import trimesh
 from tkamb.body.generic_ligaments import condylar_axis, generic_ligaments
 from tkamb.body.ligaments import (
     TOE_STRAIN,
+    Ligament,
     build_ligaments,
     ligament_loads,
     quadratic_toe_force,
@@ -16,12 +17,13 @@ from tkamb.body.ligaments import (
     two_line_force,
 )
 from tkamb.body.load import total_wrench
-from tkamb.case import load_case
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, knee_pose
 from tkamb.geometry.surface import Surface
 from tkamb.scene import load_scene
-from tkamb.scene_tables import LigamentTable
+from tkamb.scene.case import load_case
+from tkamb.scene.lines import ligament
+from tkamb.scene.tables import LigamentTable
 
 SLACK = 0.05
 FLEXION = np.deg2rad(np.arange(0.0, 101.0, 5.0))
@@ -31,7 +33,7 @@ POSES = {
 }
 
 
-def table(**changes: object) -> LigamentTable:
+def bundle_of(**changes: object) -> Ligament:
     content = {
         "name": "MCL_anterior",
         "proximal": {"link": "femur", "point_mm": (5.0, 10.0, -40.0)},
@@ -40,7 +42,7 @@ def table(**changes: object) -> LigamentTable:
         "stiffness_N_per_mm": 90.0,
         "reference_strain": 0.04,
     }
-    return LigamentTable.model_validate({**content, **changes})
+    return ligament(LigamentTable.model_validate({**content, **changes}))
 
 
 @pytest.mark.parametrize(
@@ -65,15 +67,15 @@ def test_quadratic_toe_has_no_kink() -> None:
 
 
 def test_reference_strain_holds_at_the_reference_frame() -> None:
-    (bundle,) = build_ligaments([table(reference_flexion_deg=31.0)], POSES, FLEXION)
+    (bundle,) = build_ligaments([bundle_of(reference_flexion_deg=31.0)], POSES, FLEXION)
     strain = bundle.strain(bundle.length(POSES))
     assert strain[6] == pytest.approx(0.04)
     assert np.ptp(strain) > 0.01
 
 
 def test_forces_are_equal_and_opposite() -> None:
-    (bundle,) = build_ligaments([table()], POSES, FLEXION)
-    tension, loads = bundle.loads({"femur": POSES["femur"][0], "tibia": np.eye(4)})
+    (bundle,) = build_ligaments([bundle_of()], POSES, FLEXION)
+    (tension,), loads = ligament_loads([bundle], {"femur": POSES["femur"][0], "tibia": np.eye(4)})
     assert tension == pytest.approx(0.5 * 9e4 * 0.04 * bundle.slack_length)
     assert np.abs(total_wrench(loads, np.array([0.3, 0.1, 0.2]))).max() < 1e-12 * tension
     assert loads[0].forces[0, 1] < 0.0  # the femur is pulled down
@@ -81,12 +83,18 @@ def test_forces_are_equal_and_opposite() -> None:
 
 def test_gathered_loads_are_those_of_the_bundles() -> None:
     toe = {"law": "quadratic-toe", "stiffness_N_per_mm": None, "stiffness_N_per_strain": 2750.0}
-    tables = [table(), table(name="LCL", **toe), table(name="slack", reference_strain=-0.1)]
-    bundles = build_ligaments(tables, POSES, FLEXION)
+    given = [
+        bundle_of(),
+        bundle_of(name="LCL", **toe),
+        bundle_of(name="slack", reference_strain=-0.1),
+    ]
+    bundles = build_ligaments(given, POSES, FLEXION)
     here = {"femur": POSES["femur"][0], "tibia": np.eye(4)}
     tension, loads = ligament_loads(bundles, here)
-    alone = [bundle.loads(here) for bundle in bundles]
-    assert tension == pytest.approx([t for t, _ in alone])
+    alone = [ligament_loads([bundle], here) for bundle in bundles]
+    assert tension == pytest.approx(
+        [float(bundle.force(bundle.length(here))) for bundle in bundles]
+    )
     assert tension[2] == 0.0
     assert len(loads) == 2
     for load in loads:
@@ -97,13 +105,13 @@ def test_gathered_loads_are_those_of_the_bundles() -> None:
 
 def test_slack_length_is_taken_as_given() -> None:
     (bundle,) = build_ligaments(
-        [table(reference_strain=None, slack_length_mm=80.0)], POSES, FLEXION
+        [bundle_of(reference_strain=None, slack_length_mm=80.0)], POSES, FLEXION
     )
     assert bundle.slack_length == pytest.approx(0.08)
 
 
 def test_strain_table_shows_what_was_not_reached() -> None:
-    bundles = build_ligaments([table()], POSES, FLEXION[:14])
+    bundles = build_ligaments([bundle_of()], POSES, FLEXION[:14])
     strains = strain_table(
         bundles, {"femur": POSES["femur"][:14], "tibia": np.eye(4)}, FLEXION[:14]
     )
@@ -114,7 +122,9 @@ def test_strain_table_shows_what_was_not_reached() -> None:
 
 def test_unknown_link_is_one_clear_line() -> None:
     with pytest.raises(InputError, match="fibula") as error:
-        build_ligaments([table(distal={"link": "fibula", "point_mm": (0, 0, 0)})], POSES, FLEXION)
+        build_ligaments(
+            [bundle_of(distal={"link": "fibula", "point_mm": (0, 0, 0)})], POSES, FLEXION
+        )
     assert "MCL_anterior" in str(error.value)
 
 
@@ -138,18 +148,17 @@ def test_generic_set_scales_with_the_implant() -> None:
     """Twice the implant, twice the distances; the same strains; and it says what it is."""
     small = generic_ligaments(cylinder(0.02, 0.07), slab(0.075), np.eye(4), ("MCL", "LCL"))
     large = generic_ligaments(cylinder(0.04, 0.14), slab(0.15), np.eye(4), ("MCL", "LCL"))
-    assert [table.name for table in small] == [
+    assert [bundle.name for bundle in small] == [
         "generic_MCL_anterior",
         "generic_MCL_oblique",
         "generic_MCL_deep",
         "generic_LCL",
     ]
-    axis = 1e3 * condylar_axis(cylinder(0.02, 0.07))
+    axis = condylar_axis(cylinder(0.02, 0.07))
     for one, two in zip(small, large, strict=True):
-        assert two.proximal.point_mm - axis == pytest.approx(
-            2 * (one.proximal.point_mm - axis), abs=0.01
-        )
-        assert np.array(two.distal.point_mm) == pytest.approx(2 * np.array(one.distal.point_mm))
+        reach = one.proximal.position - axis
+        assert two.proximal.position - axis == pytest.approx(2 * reach, abs=1e-5)
+        assert two.distal.position == pytest.approx(2 * one.distal.position)
     with pytest.raises(InputError, match="ITB"):
         generic_ligaments(cylinder(0.02, 0.07), slab(0.075), np.eye(4), ("ITB",))
 
@@ -162,10 +171,10 @@ def test_generic_set_is_plausible_on_the_shipped_knee() -> None:
     assert case.femoral is not None
     assert case.insert is not None
     frame = case.chain.insert_in_tibia
-    tables = generic_ligaments(case.femoral, case.insert, frame)
+    generic = generic_ligaments(case.femoral, case.insert, frame)
     poses = {"femur": knee_pose(case.motion.coordinates), "tibia": inverse(frame)}
     flexion = case.motion.coordinates[:, 5]
-    strains = strain_table(build_ligaments(tables, poses, flexion), poses, flexion)
+    strains = strain_table(build_ligaments(generic, poses, flexion), poses, flexion)
     for name, values in strains.items():
         assert np.isfinite(values).all()
         if "CL_" not in name or "MCL" in name:

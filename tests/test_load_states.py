@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 from knees import leg
 from tkamb.body.chain import ChainMotion
+from tkamb.body.contact_points import CondylePoint
 from tkamb.body.knee import Extensor, KneeGeometry, solve_knee
 from tkamb.body.load import PointForces
-from tkamb.body.unknowns import CondylePoint
+from tkamb.body.unknowns import Unknown
 from tkamb.geometry.frames import pose, transform
 
 FRICTION = 0.05
@@ -20,7 +21,13 @@ FLEXION = np.radians(30.0)
 UP = np.array([0.0, 1.0, 0.0])
 HALF = 0.024
 """m: half the distance of the condyles' contact points."""
-CARRIED = ("medial_normal", "lateral_normal", "quadriceps", "patellar_ligament", "patellofemoral")
+CARRIED = (
+    "medial_normal",
+    "lateral_normal",
+    "muscle_quadriceps",
+    "patellar_ligament",
+    "patellofemoral",
+)
 
 
 @pytest.fixture(scope="module")
@@ -37,17 +44,19 @@ def knee():
         "tuberosity": np.array([0.04, -0.04, 0.0]),
         "contact": transform(state.pose("patella"), np.array([-0.006, 0.0, 0.0])),
     }
+    pull = line("femur", at["origin"], "patella", at["insertion"])
     extensor = Extensor(
-        line("femur", at["origin"], "patella", at["insertion"]),
         line("patella", at["proximal"], "tibia", at["tuberosity"]),
         at["contact"],
         state.pose("patella")[:3, 0],
+        ("quadriceps",),
     )
     condyles = {
         side: CondylePoint(np.array([0.0, 0.0, z]), UP, np.array([0.02, 0.0, 0.0]), 0.0)
         for side, z in (("medial", -HALF), ("lateral", HALF))
     }
-    return KneeGeometry(state, None, (), condyles, frozenset(), extensor)
+    muscle = Unknown("muscle_quadriceps", pull)
+    return KneeGeometry(state, None, (), condyles, frozenset(), extensor, (muscle,))
 
 
 def line(link, start, other, end):

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from shapes import joined, plate, sphere, two_dishes
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.geometry.boundary import boundary_loops
 from tkamb.geometry.repair import repair
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.topology import boundary_loops
 from tkamb.inputs.mesh_check import check_mesh
 from tkamb.inputs.meshes import BONE_SIZE, axes_rotation, load_surface, mirrored
 
@@ -80,7 +80,6 @@ def test_axes_turn_the_mesh(tmp_path):
     straight = load_surface(save(tmp_path / "straight.ply", insert), "mm", name="insert")
     assert np.array_equal(there.vertices, straight.vertices)
     assert np.array_equal(there.faces, straight.faces)
-    assert there.content_hash == straight.content_hash
 
 
 def test_mirrored_twice_is_the_same_and_stays_outward():

@@ -44,7 +44,7 @@ def test_patient_and_motion_alone_touch_nothing_else(tmp_path):
         assert not module.startswith(("tkamb.contact", "tkamb.output.maps"))
         assert module not in (
             "tkamb.body.ligaments",
-            "tkamb.mechanics.extensor",
+            "tkamb.body.extensor",
             "tkamb.inputs.meshes",
         )
     assert seen["others"] == []

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, knee_pose, mirrored_pose, pose
 from tkamb.inputs.motion import load_motion
-from tkamb.scene_tables import MotionTable
+from tkamb.scene.si import in_si
+from tkamb.scene.tables import MotionTable
 
 TIME = np.linspace(0, 3, 101)
 EYE = np.eye(4)
@@ -63,7 +64,7 @@ def pose_columns(poses, sequence, time=TIME):
 
 def coordinates_table(file, **changes):
     keys = {"file": file, "angle_unit": "deg", "length_unit": "mm", "cutoff_Hz": "none"}
-    return MotionTable(**(keys | changes))
+    return in_si(MotionTable(**(keys | changes)))
 
 
 def pose_table(file, sequence="XYZ", **changes):

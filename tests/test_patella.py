@@ -16,11 +16,11 @@ from tkamb.body.patella import (
     solve_patella,
 )
 from tkamb.body.patellofemoral import PatellofemoralContact
-from tkamb.case import load_case
+from tkamb.equilibrium.mechanics import extensor_frames
 from tkamb.geometry.frames import Array, inverse, knee_pose, transform
 from tkamb.geometry.surface import Surface
-from tkamb.mechanics.extensor import ExtensorFrames
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 TROCHLEA, DOME = 0.025, 0.02
 CENTRE = np.array([0.004, 0.0, 0.0])
@@ -161,9 +161,9 @@ def test_quadriceps_is_shortest_there(mechanism: ExtensorMechanism) -> None:
     turn = np.deg2rad(4.0)
     lengths = []
     for step in (-turn, 0.0, turn):
-        balance = frame.settled(state.coordinates, float(state.coordinates[2] + step))
+        balance = frame.at_rotation(state.coordinates, float(state.coordinates[2] + step))
         assert balance is not None
-        lengths.append(balance.quadriceps.length)
+        lengths.append(balance.muscle.length)
     assert lengths[1] < min(lengths[0], lengths[2])
     slope = (lengths[2] - lengths[0]) / (2 * turn)
     curvature = (lengths[2] - 2 * lengths[1] + lengths[0]) / turn**2
@@ -243,7 +243,7 @@ def shipped() -> tuple[Array, list[PatellaState]]:
     """Flexion (deg) and patella of every frame of the shipped deep knee bend."""
     path = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
     case = load_case(load_scene(path, {"patella.motion": "solved"}))
-    frames = ExtensorFrames(case, knee_pose(case.motion.coordinates))
+    frames = extensor_frames(case, knee_pose(case.motion.coordinates))
     return np.rad2deg(case.motion.coordinates[:, 5]), frames.states
 
 

@@ -9,11 +9,11 @@ import pytest
 from scenes import MODEL, write_scene
 from test_patella import INSERTION, knee_at, mechanism  # noqa: F401
 from tkamb import simulate
+from tkamb.body import extensor
 from tkamb.body.patella import ExtensorMechanism, PatellaStatus, solve_patella
-from tkamb.case import load_case
-from tkamb.mechanics import extensor
-from tkamb.mechanics.mechanics import Mechanics
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 FEW = {"motion.frames": 11, "patella.motion": "solved", "contact.resolution_mm": 3.0}
 
@@ -85,7 +85,7 @@ def test_a_guess_inside_the_outline_of_the_femur_does_not_lose_the_patella(mecha
     [
         ({"ligament_length": 0.005}, (PatellaStatus.NO_CONTACT, PatellaStatus.LIGAMENT)),
         ({"ligament_length": 0.4}, (PatellaStatus.NO_CONTACT,)),
-        ({"quadriceps_origin": np.array([0.028, -0.22, 0.0])}, (PatellaStatus.MOMENT,)),
+        ({"muscle_origin": np.array([0.028, -0.22, 0.0])}, (PatellaStatus.MOMENT,)),
     ],
 )
 def test_the_condition_that_fails_is_named(mechanism, change, conditions):  # noqa: F811
@@ -114,5 +114,5 @@ def test_a_frame_that_loses_the_patella_fails_and_the_run_goes_on(plain, monkeyp
     assert np.isnan(results["force_total_N"][5])
     others = [k for k in range(11) if k != 5]
     assert not any(status[k].startswith("failed") for k in others)
-    quadriceps = [plain.frame(k).loads.values["quadriceps"] for k in others]
+    quadriceps = [plain.frame(k).loads.values["muscle_quadriceps"] for k in others]
     assert np.allclose(results["quadriceps_N"][others], quadriceps, atol=0.5)

@@ -12,7 +12,8 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, mirrored_pose
 from tkamb.inputs.patient import load_urdf
 from tkamb.inputs.segments import segment_inertia
-from tkamb.scene_tables import PatientTable
+from tkamb.scene.si import in_si
+from tkamb.scene.tables import PatientTable
 
 LOOP = '<joint name="loop" type="fixed"><parent link="femur"/><child link="tibia"/></joint>'
 
@@ -20,7 +21,7 @@ LOOP = '<joint name="loop" type="fixed"><parent link="femur"/><child link="tibia
 def table(tmp_path, text, side="right", **more):
     path = tmp_path / "leg.urdf"
     path.write_text(text)
-    return PatientTable(urdf=path, side=side, mass_kg=75.0, **more)
+    return in_si(PatientTable(urdf=path, side=side, mass_kg=75.0, **more))
 
 
 def left(text):
@@ -127,6 +128,6 @@ def test_missing_sex_is_asked_for(tmp_path):
 
 
 def test_missing_file_is_named(tmp_path):
-    nowhere = PatientTable(urdf=tmp_path / "none.urdf", side="right", mass_kg=75.0)
+    nowhere = in_si(PatientTable(urdf=tmp_path / "none.urdf", side="right", mass_kg=75.0))
     with pytest.raises(InputError, match=r"none\.urdf: no such URDF"):
         load_urdf(nowhere, True)

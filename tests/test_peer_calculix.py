@@ -9,21 +9,20 @@ import numpy as np
 import pytest
 
 from lattice_bodies import dished_insert
-from tkamb.contact.lattice.grid import build_grid
+from tkamb.contact.lattice.meshing.grid import build_grid
 from tkamb.contact.materials import material, tabulated_material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.surface import Surface
-from tkamb.studies import calculix
+from tkamb.studies import peer
 from tkamb.studies.bodies import balls, block, dishes
-from tkamb.studies.calculix import measure_by_calculix, peer_rows, press_by_calculix
-from tkamb.studies.calculix_deck import Deck
-from tkamb.studies.calculix_run import PeerRun, run_calculix
+from tkamb.studies.calculix import Deck, PeerRun, run_calculix
 from tkamb.studies.cases import study_case
+from tkamb.studies.peer import measure_by_calculix, press_by_calculix
 from tkamb.studies.references import read_references
-from tkamb.studies.tradeoff_block import with_block
+from tkamb.studies.tradeoff import run_peer
 
 ROOT = Path(__file__).parents[1]
 WITH_CALCULIX = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
@@ -48,12 +47,12 @@ def test_an_undeformed_insert_has_the_gaps_of_its_smooth_surface():
     """Facets of 2 mm in a dish: the lift is in the nodes already, the gap must not count it."""
     insert = block(lambda x, z: 8e-3 + (x**2 + z**2) / 120e-3, (16e-3, 16e-3), 2e-3)
     bodies = ContactPair(balls(22e-3, 0.0), insert, material(LINEAR))
-    problem = calculix._problem(bodies, 500.0, knee_pose(np.zeros(6)), 1.0)
+    problem = peer._problem(bodies, 500.0, knee_pose(np.zeros(6)), 1.0)
     still = np.zeros((len(problem.lattice.nodes), 4))
     still[:, 0] = np.arange(1, len(still) + 1)
-    bent = calculix._bent(problem, PeerRun({"NINSERT": still}, 0.0, 0.0, 0))
+    bent = peer._bent(problem, PeerRun({"NINSERT": still}, 0.0, 0.0, 0))
     pose = knee_pose([0, 40e-3, 0, 0, 0, 0])
-    gap = calculix._gaps(problem, pose, bent)
+    gap = peer._gaps(problem, pose, bent)
     x, y, z = problem.map.points.T
     smooth = y + problem.map.lift
     near = np.hypot(x, z) < 5e-3
@@ -96,7 +95,7 @@ def test_what_calculix_has_not_is_refused():
 def test_without_the_program_one_clear_line(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(InputError, match=r"CalculiX.*not installed.*apt-get"):
-        peer_rows([study_case("two condyles")], read_references())
+        list(run_peer([study_case("two condyles")], read_references()))
 
 
 def test_a_run_that_takes_too_long_or_fails_is_a_row_with_the_reason(tmp_path, monkeypatch):
@@ -160,6 +159,6 @@ def test_the_page_is_what_the_script_makes_of_its_json(monkeypatch):
     made = runpy.run_path(str(ROOT / "scripts" / "peer_calculix.py"))
     rows = json.loads((ROOT / "docs" / "peer_calculix.json").read_text(encoding="utf-8"))
     text = (ROOT / "docs" / "peer_calculix.md").read_text(encoding="utf-8")
-    assert with_block(text, made["block"](rows), "peer") == text, (
+    assert made["with_block"](text, made["block"](rows), "peer") == text, (
         "run scripts/peer_calculix.py --page"
     )

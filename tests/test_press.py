@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
+from tkamb import press
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.surface import Surface
-from tkamb.press import press
-from tkamb.press.press import read_pose
+from tkamb.press import read_pose
 
 FOUNDATION = ["--contact", "foundation"]
 press_meshes = partial(press.press_meshes, contact="foundation")

@@ -1,5 +1,7 @@
 """Rays: exact distances, no leaks, every crossing once."""
 
+import pickle
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,7 +10,6 @@ from hypothesis import strategies as st
 from inserts import dished, raised
 from shapes import sphere
 from tkamb.geometry.height_field import inside_intervals
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
 DOWN = (0.0, -1.0, 0.0)
@@ -40,7 +41,7 @@ def test_where_in_its_triangle_a_ray_crosses():
     ends = surface.vertices[surface.mesh.edges_unique].mean(axis=1)
     aims = np.concatenate([upper, middles[middles[:, 1] > 5e-3], ends[ends[:, 1] > 5e-3]])
     origins = np.concatenate([aims * [1, 0, 1] + [0, 0.05, 0], [[0.03, 0.05, 0.0]]])
-    distance, face, weights = RayCaster(surface).first_in_face(origins, DOWN)
+    distance, face, weights = surface.rays.first_in_face(origins, DOWN)
     assert face[-1] == -1 and np.isnan(weights[-1]).all()
     assert (face[:-1] >= 0).all() and (weights[:-1] > -1e-9).all()
     np.testing.assert_allclose(weights[:-1].sum(axis=1), 1.0, atol=1e-12)
@@ -55,7 +56,7 @@ def test_first_agrees_with_all_triangles_in_double_precision(far):
     rng = np.random.default_rng(1)
     direction = np.array([0.3, -1.0, 0.2]) / np.linalg.norm([0.3, -1.0, 0.2])
     origins = rng.uniform(-0.02, 0.02, (200, 3)) + np.array([far, 0.05, far])
-    distance, face = RayCaster(surface).first(origins, direction)
+    distance, face = surface.rays.first(origins, direction)
     expected = brute(surface, origins, direction)
     assert ((face >= 0) == np.isfinite(expected)).mean() > 0.99
     both = (face >= 0) & np.isfinite(expected)
@@ -69,7 +70,7 @@ def test_hits_lie_in_the_plane_of_their_triangle():
     origins = np.column_stack(
         [rng.uniform(-0.02, 0.02, 2000), np.full(2000, 0.5), rng.uniform(-0.03, 0.03, 2000)]
     )
-    distance, face = RayCaster(surface).first(origins, DOWN)
+    distance, face = surface.rays.first(origins, DOWN)
     assert (face >= 0).all()
     hit = origins + distance[:, None] * DOWN
     off = np.einsum("ij,ij->i", hit - surface.triangles[face, 0], surface.face_normals[face])
@@ -81,7 +82,7 @@ def test_no_leaks_on_a_grid_aligned_with_vertices_and_edges():
     x, z = np.linspace(-0.02, 0.02, 161), np.linspace(-0.03, 0.03, 241)
     xx, zz = (v.ravel() for v in np.meshgrid(x, z, indexing="ij"))
     origins = np.column_stack([xx, np.full(len(xx), 0.1), zz])
-    distance, face = RayCaster(surface).first(origins, DOWN)
+    distance, face = surface.rays.first(origins, DOWN)
     assert (face >= 0).all()
     on_vertex = (np.arange(161)[:, None] % 2 == 0) & (np.arange(241) % 2 == 0)
     np.testing.assert_allclose(0.1 - distance[on_vertex.ravel()], top(xx, zz)[on_vertex.ravel()])
@@ -94,7 +95,7 @@ def test_all_reports_every_crossing_once_and_sorted():
     origins = np.column_stack([xx, np.full(len(xx), 0.1), zz])
     vertical = surface.vertices[np.abs(surface.vertices[:, 1]) > 1e-6][:500] * [0.999, 0, 0.999]
     origins = np.concatenate([origins, vertical + np.array([0, 0.1, 0])])
-    ray, distance, face = RayCaster(surface).all(origins, DOWN)
+    ray, distance, face = surface.rays.all(origins, DOWN)
     np.testing.assert_array_equal(np.bincount(ray), np.full(len(origins), 2))
     np.testing.assert_array_equal(ray, np.sort(ray))
     assert (np.diff(distance.reshape(-1, 2), axis=1) > 0.005).all()
@@ -108,14 +109,14 @@ def test_directions_per_ray_through_the_centre_of_a_sphere():
     rng = np.random.default_rng(3)
     directions = rng.normal(size=(500, 3))
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    ray, distance, _ = RayCaster(ball).all(-0.05 * unit, directions)
+    ray, distance, _ = ball.rays.all(-0.05 * unit, directions)
     np.testing.assert_array_equal(ray, np.repeat(np.arange(500), 2))
     assert np.abs(distance.reshape(-1, 2) - [0.03, 0.07]).max() < 2e-5
 
 
 def test_origin_inside_and_on_the_surface():
     ball = sphere(0.02, 4)
-    caster = RayCaster(ball)
+    caster = ball.rays
     inside, _ = caster.first([[0.0, 0.0, 0.0]], DOWN)
     assert inside[0] == pytest.approx(0.02, abs=1e-9)
     on, _ = caster.first([[0.0, -0.02, 0.0]], DOWN)
@@ -158,7 +159,18 @@ def test_intervals_agree_with_embree_on_random_grids(seed):
     origins = np.empty((400, 3))
     origins[:, axis] = low[axis] - 0.01
     origins[:, (axis + 1) % 3], origins[:, (axis + 2) % 3] = a, b
-    ray, distance, _ = RayCaster(surface).all(origins, np.eye(3)[axis])
+    ray, distance, _ = surface.rays.all(origins, np.eye(3)[axis])
     np.testing.assert_array_equal(ray[::2], found.first * 20 + found.second)
     np.testing.assert_allclose(low[axis] - 0.01 + distance[::2], found.lower, atol=1e-12)
     np.testing.assert_allclose(low[axis] - 0.01 + distance[1::2], found.upper, atol=1e-12)
+
+
+def test_a_surface_builds_its_rays_and_normals_once_and_keeps_them_to_itself():
+    """What is derived stays with the surface; only the triangles go to another process."""
+    ball = sphere(0.02, 3, (0.0, 0.0, 0.0))
+    assert ball.rays is ball.rays and ball.nearest is ball.nearest
+    assert ball.corner_normals is ball.corner_normals
+    sent = pickle.loads(pickle.dumps(ball))
+    assert set(vars(sent)) == {"vertices", "faces", "name"}
+    origins, up = np.array([[0.0, -1.0, 0.0]]), (0.0, 1.0, 0.0)
+    assert sent.rays.first(origins, up)[0] == ball.rays.first(origins, up)[0]

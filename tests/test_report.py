@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from headless import Page
 from synthetic_run import MASS_KG, make_run
 from tkamb.errors import InputError
 from tkamb.output import metrics
@@ -17,9 +18,8 @@ from tkamb.output.metrics import map_rows
 from tkamb.output.panels import panels
 from tkamb.output.pressure_maps import draw_maps, mapped_frames, top_view
 from tkamb.output.report import report_html, write_report
-from tkamb.output.tables import flags_table, motion_table, reasons
+from tkamb.output.tables import flag_rows, motion_table, reasons
 from tkamb.results import Results
-from tkamb.view.browser import HeadlessBrowser, find_browser
 
 VOID = {"meta", "br", "input", "img", "link", "hr"}
 
@@ -92,10 +92,7 @@ def test_references_inside_the_page_have_a_target(page):
 
 def curve(page, panel, line):
     """Pixels (n, 2) of a curve and the box of its axes."""
-    picture = re.search(rf'id="figure-{panel}">.*?</svg>', page, re.DOTALL)
-    if picture is None:
-        picture = re.search(rf"id='figure-{panel}'>.*?</svg>", page, re.DOTALL)
-    text = picture.group()
+    text = re.search(rf'id="figure-{panel}">.*?</svg>', page, re.DOTALL).group()
     box = [float(v) for v in re.search(r'data-box="([^"]+)"', text).group(1).split()]
     span = [float(v) for v in re.search(r'data-range="([^"]+)"', text).group(1).split()]
     path = re.search(rf'id="{panel}-line-{re.escape(line)}">\s*<path d="([^"]+)"', text).group(1)
@@ -190,7 +187,7 @@ def test_the_known_error_stands_beside_pressure_and_area_in_colour_where_it_is_l
         assert all(word in card.detail for word in words)
         (areas,) = [panel for panel in panels(results) if panel.name == "areas"]
         assert areas.warning is coloured
-        assert ("class='warning'" in report_html(results)) is coloured
+        assert ('class="warning"' in report_html(results)) is coloured
 
 
 def test_moments_in_percent_of_weight_and_height(bend, gait):
@@ -210,18 +207,16 @@ def test_lifted_condyle_leaves_the_whole_share_to_the_other():
 
 
 def test_table_holds_every_ten_degrees(bend):
-    rows = re.findall(r"<tr><td>(.*?)</td></tr>", motion_table(bend, horizontal_axis(bend)))
-    flexion = [float(row.split("</td><td>")[0]) for row in rows]
-    assert np.allclose(flexion, np.arange(0, 121, 10), atol=0.6)
-    last = rows[-1].split("</td><td>")
-    assert last[1] == f"{bend['force_total_BW'][-1]:.2f}"
+    table = motion_table(bend, horizontal_axis(bend))
+    assert table.headings[:2] == [("flexion", "deg"), ("total force", "BW")]
+    assert np.allclose([float(row[0]) for row in table.rows], np.arange(0, 121, 10), atol=0.6)
+    assert table.rows[-1][1] == f"{bend['force_total_BW'][-1]:.2f}"
 
 
 def test_flagged_frames_are_told_in_plain_words(gait):
-    text = flags_table(gait, horizontal_axis(gait))
-    assert "<td>singular</td><td>1</td><td>20</td><td>20 %</td>" in text
-    row = "<td>raw filtered differ</td><td>6</td><td>50–55</td><td>50 % to 55 %</td>"
-    assert row in text
+    rows = flag_rows(gait, horizontal_axis(gait))
+    assert ("singular", "1", "20", "20 %") in rows
+    assert ("raw filtered differ", "6", "50–55", "50 % to 55 %") in rows
 
 
 def test_reasons_that_differ_in_a_number_are_one_row():
@@ -258,7 +253,7 @@ def test_maps_have_one_scale_to_the_largest_pressure(bend):
 def test_page_right_is_the_subjects_right(side, lateral_axis, medial_is):
     run = make_run("bend", frames=5)
     run.summary.update(side=side, lateral_axis=lateral_axis)
-    x, y = top_view(run).place(np.array(3.0), np.array(-23.0))
+    x, y = top_view(run).page_coordinates(np.array(3.0), np.array(-23.0))
     assert y == 3.0
     assert (x < 0) == (medial_is == "left")
 
@@ -328,7 +323,7 @@ def test_report_is_the_same_each_time(bend, page):
 
 
 def test_cursor_data_are_the_columns(bend, page):
-    data = json.loads(re.search(r"id='data'>(.*?)</script>", page, re.DOTALL).group(1))
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL).group(1))
     assert np.allclose(data["x"], bend["flexion_deg"], rtol=1e-4)
     total = data["panels"]["forces"][0]
     assert total["label"] == "total"
@@ -356,29 +351,13 @@ def test_notebooks_show_headline_and_plots(bend):
         bend.plot(axis="angle")
 
 
-@pytest.fixture(scope="module")
-def browser():
-    if find_browser() is None:
-        pytest.skip("no chromium here (Debian: apt install chromium)")
-    with HeadlessBrowser() as browser:
-        yield browser
-
-
-def opened(browser, path, ready):
-    """Open a file and wait until an expression holds."""
-    browser.problems.clear()
-    browser.command("Page.navigate", {"url": path.as_uri()})
-    until = f"new Promise((done) => {{ const t = setInterval(() => {{ if ({ready}) {{"
-    browser.evaluate(until + "clearInterval(t); done(true); } }, 20); })")
-
-
 LIVE = "document.body && document.body.classList.contains('live')"
 
 
-def test_slider_moves_the_cursor_and_the_numbers(bend, page, tmp_path, browser):
+def test_slider_moves_the_cursor_and_the_numbers(bend, page, tmp_path, chromium):
     path = tmp_path / "report.html"
     path.write_text(page, encoding="utf-8")
-    opened(browser, path, LIVE)
+    browser = Page(chromium).open(path.as_uri(), LIVE)
     browser.evaluate(
         "(() => { const slider = document.getElementById('frame'); slider.value = 50;"
         "slider.dispatchEvent(new Event('input')); })()"
@@ -398,7 +377,7 @@ def test_slider_moves_the_cursor_and_the_numbers(bend, page, tmp_path, browser):
     assert browser.evaluate(joined) == "round"
 
 
-def test_a_script_that_is_not_the_report_s_own_does_not_run(page, tmp_path, browser):
+def test_a_script_that_is_not_the_report_s_own_does_not_run(page, tmp_path, chromium):
     path = tmp_path / "report.html"
     foreign = (
         "<script>document.title = 'foreign'</script>"
@@ -407,7 +386,7 @@ def test_a_script_that_is_not_the_report_s_own_does_not_run(page, tmp_path, brow
     )
     (tmp_path / "other.js").write_text("document.title = 'foreign'")
     path.write_text(page.replace("</body>", foreign), encoding="utf-8")
-    opened(browser, path, LIVE)
+    browser = Page(chromium).open(path.as_uri(), LIVE)
     assert browser.evaluate("document.title") != "foreign"
     refused = [told for told in browser.problems if "Content Security Policy" in told]
     assert len(refused) >= 3

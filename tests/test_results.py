@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 from synthetic_run import make_run
+from tkamb.atomic import claim_directory
+from tkamb.columns import COLUMNS, columns_as_markdown, is_ligament, ligament_of
 from tkamb.errors import InputError
-from tkamb.output.maps_file import ContactMaps, MapWriter, read_maps, write_maps
-from tkamb.results import Results, claim_directory, read_results, write_results
-from tkamb.run.columns import COLUMNS, columns_as_markdown, is_ligament, ligament_of
+from tkamb.output.maps import ContactMaps, MapWriter, read_maps, write_maps
+from tkamb.results import Results, csv_text, read_csv
+from tkamb.results_folder import read_results, write_results
 
 ROOT = Path(__file__).parents[1]
 
@@ -52,17 +54,22 @@ def test_columns_stand_in_the_order_of_the_table():
     assert names.index(ligaments[0]) == names.index("external_adduction_moment_Nm") + 1
 
 
-def test_what_is_not_modelled_is_an_empty_cell(tmp_path):
+def test_what_is_not_modelled_is_an_empty_cell():
     run = Results({"time_s": [0.0, 0.5], "flexion_deg": [0.0, 60.0], "status": ["ok", "singular"]})
     assert "force_total_N" in run.not_modelled
     assert "flexion_deg" not in run.not_modelled
-    run.write_csv(tmp_path / "results.csv")
-    header, first, second = (tmp_path / "results.csv").read_text().splitlines()
+    header, first, second = csv_text(run.columns).splitlines()
     row = dict(zip(header.split(","), second.split(","), strict=True))
     assert row["force_total_N"] == ""
     assert row["flexion_deg"] == "60.0"
     assert row["status"] == "singular"
     assert len(first.split(",")) == len(COLUMNS) - 1
+
+
+def test_a_column_of_an_earlier_release_is_read_under_its_new_name(tmp_path):
+    path = tmp_path / "results.csv"
+    path.write_text("time_s,softest_N_per_mm,status\n0.0,120.5,ok\n")
+    assert read_csv(path)["smallest_stiffness_N_per_mm"] == [120.5]
 
 
 @pytest.mark.parametrize(
@@ -102,7 +109,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(InputError, match="No space left"):
-        make_run(frames=9, maps=False).write_csv(tmp_path / "results.csv")
+        write_results(make_run(frames=9, maps=False), tmp_path)
     assert (tmp_path / "results.csv").read_text() == before
     assert [path.name for path in tmp_path.glob(".*")] == [".tkamb"]
 
@@ -151,7 +158,7 @@ def test_failed_frame_is_nan_in_the_maps(tmp_path):
 
 WRITER = """
 import sys, numpy as np
-from tkamb.output.maps_file import MapWriter
+from tkamb.output.maps import MapWriter
 n = 500
 rng = np.random.default_rng(1)
 noise = rng.normal(size=n)

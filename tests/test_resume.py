@@ -14,10 +14,11 @@ import pytest
 from scenes import fast_scene, write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.output.maps_file import read_maps
-from tkamb.output.shards import Shard, Shards
-from tkamb.results import Results, read_results
+from tkamb.output.maps import read_maps
+from tkamb.results import Results
+from tkamb.results_folder import read_results
 from tkamb.run.recorder import interrupt_later
+from tkamb.run.shards import Shard, Shards
 from tkamb.simulation import simulate
 
 ROOT = Path(__file__).parents[1]

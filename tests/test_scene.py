@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from scenes import MODEL, write_scene
-from tkamb.case import load_case
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.geometry.frames import KNEE_COORDINATES
-from tkamb.scene import load_scene
+from tkamb.geometry.frames import KNEE_COORDINATES, MIRROR
+from tkamb.scene import lines, load_scene
+from tkamb.scene.case import load_case
 
 ROOT = Path(__file__).parents[1]
 
@@ -111,3 +111,18 @@ def test_signs_turned_is_the_recording_with_its_columns_negated(tmp_path):
     np.testing.assert_allclose(turned.raw_coordinates, whole * signs, atol=1e-12)
     with pytest.raises(InputError, match="unknown role 'rotation_1'"):
         load_case(load_scene(path, {"motion.signs_turned": ["rotation_1"]}))
+
+
+def test_the_case_leaves_the_scene_as_its_file_has_it(tmp_path):
+    """A left knee's points and generic bundles are the case's: the scene's hash is its own."""
+    generic = {"ligaments": ["MCL"]}
+    path = write_scene(tmp_path, ("ligament",), generic_ligaments=generic)
+    scene = load_scene(path, {"motion.frames": 3})
+    case = load_case(scene)
+    assert case.scene is scene
+    assert [bundle.name[:11] for bundle in case.ligaments] == ["generic_MCL"] * 3
+    left = scene.model_copy(update={"patient": scene.patient.model_copy(update={"side": "left"})})
+    one, other = (lines.patellar_ligament(each).distal.position for each in (scene, left))
+    assert other.tolist() == (MIRROR @ one).tolist()
+    assert one[2] == pytest.approx(0.003)
+    assert left.patellar_ligament == scene.patellar_ligament

@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tkamb.body.demand import external_wrench
+from tkamb.body.joint_equilibrium import external_wrench
 from tkamb.body.load import total_wrench
-from tkamb.case import load_case
 from tkamb.contact.probe import condyle_wrenches
 from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.contact_side import ContactSide
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.equilibrium.released import SCALE
 from tkamb.geometry.frames import knee_pose
-from tkamb.mechanics.mechanics import Mechanics
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 ROOT = Path(__file__).parents[1]
 BEND = ROOT / "models" / "deep_knee_bend" / "scene.toml"
@@ -39,7 +39,7 @@ def bend():
 
 
 @pytest.fixture(scope="module")
-def settled(bend):
+def resting(bend):
     """Body and contact of a few frames, each from the one before."""
     contacts, found = [], {}
     for k in (40, 41, 42, 60, 80):
@@ -48,13 +48,13 @@ def settled(bend):
     return found
 
 
-def test_the_shank_is_in_equilibrium(bend, settled):
+def test_the_shank_is_in_equilibrium(bend, resting):
     """Ground, weight and inertia, ligaments, patellar ligament and contact add up to nothing."""
-    for k, (body, contact) in settled.items():
-        placed = contact.settled.placed
-        total = external_wrench(placed.geometry, contact.settled.coordinates)
-        shank = [load for load in placed.geometry.ligaments if load.link.startswith("tibia")]
-        pull = [p for p in placed.geometry.extensor.patellar_ligament if p.link == "tibia"]
+    for k, (body, contact) in resting.items():
+        geometry = contact.equilibrium.geometry
+        total = external_wrench(geometry, contact.equilibrium.coordinates)
+        shank = [load for load in geometry.ligaments if load.link.startswith("tibia")]
+        pull = [p for p in geometry.extensor.patellar_ligament if p.link == "tibia"]
         total = total + total_wrench(shank, np.zeros(3))
         total = total + body.loads.values["patellar_ligament"] * total_wrench(pull, np.zeros(3))
         for name, condyle in body.geometry.condyles.items():
@@ -64,20 +64,20 @@ def test_the_shank_is_in_equilibrium(bend, settled):
         assert np.abs(total[3:]).max() < 0.02, k
 
 
-def test_equilibrium_and_deformation_are_one_state(settled):
-    for body, contact in settled.values():
+def test_equilibrium_and_deformation_are_one_state(resting):
+    for body, contact in resting.values():
         for name in ("ap", "ml"):
             assert abs(body.loads.values[f"residual_{name}"]) < 0.1
         assert abs(body.loads.values["residual_axial"]) < 0.03
         for side, condyle in condyle_wrenches(contact.result, 0.0).items():
             assert body.loads.values[f"{side}_normal"] == pytest.approx(condyle.force, abs=0.1)
-        assert np.allclose(contact.result.pose, knee_pose(contact.settled.coordinates))
+        assert np.allclose(contact.result.pose, knee_pose(contact.equilibrium.coordinates))
 
 
 def test_flexion_stays_as_recorded_and_what_is_kept_too(bend):
     partly = side_of(BEND, released=["ml", "adduction"])
     _, contact = partly.frame(60)
-    kept = np.abs(contact.settled.coordinates - partly.case.motion.coordinates[60])
+    kept = np.abs(contact.equilibrium.coordinates - partly.case.motion.coordinates[60])
     assert contact.result is not None
     assert (kept[[0, 3, 5]] == 0).all()
     assert (kept[[2, 4]] > 0).all()
@@ -91,27 +91,46 @@ def test_flexion_stays_as_recorded_and_what_is_kept_too(bend):
         [0, 3e-3, -5e-3, np.radians(5), np.radians(-5)],
     ],
 )
-def test_starts_5_mm_and_5_deg_away_reach_the_same_rest(bend, settled, away):
-    home = settled[60][1].settled.coordinates
+def test_starts_5_mm_and_5_deg_away_reach_the_same_rest(bend, resting, away):
+    home = resting[60][1].equilibrium.coordinates
     start = bend.on_the_insert(home + np.append(away, 0.0))
-    again = bend.released.settle(60, start)
+    again = bend.released.find(60, start)
     assert again.problem == ""
     assert np.abs((again.coordinates - home) * SCALE).max() < 2e-5
 
 
-def test_a_start_over_the_rim_says_that_it_did_not_arrive(bend, settled):
-    home = settled[60][1].settled.coordinates
+def test_a_frame_that_needs_flexors_rests_with_the_quadriceps_slack(bend):
+    """A ground reaction 0.2 m ahead: a line that may push drives the knee off the insert first."""
+    ground = replace(bend.case.ground, point=bend.case.ground.point + np.array([0.2, 0, 0]))
+    case = replace(bend.case, ground=ground)
+    side = ContactSide(case, Mechanics(case))
+    for k in (5, 40):
+        body, contact = side.frame(k)
+        knee = contact.equilibrium
+        assert knee.problem == "" and body.loads.values["quadriceps"] == 0.0
+        assert knee.balance.status is BalanceStatus.OK and knee.patella.status.found
+        assert body.loads.values["residual_flexion"] < -10.0
+        away = np.array([2e-3, 0, 1e-3, 0, np.radians(1), 0])
+        start = side.on_the_insert(knee.coordinates + away)
+        again = side.released.find(k, start)
+        assert np.abs((again.coordinates - knee.coordinates) * SCALE).max() < 2e-5
+
+
+def test_a_start_over_the_rim_says_that_it_did_not_arrive(bend, resting):
+    home = resting[60][1].equilibrium.coordinates
     start = bend.on_the_insert(home + np.array([-5e-3, 0, 5e-3, np.radians(-5), 0, 0]))
-    assert bend.released.settle(60, start).problem == ("released: out of the contact model's range")
+    assert bend.released.find(60, start).problem == ("released: out of the contact model's range")
 
 
-def test_friction_drags_the_knee_back(bend, settled):
+def test_friction_drags_the_knee_back(bend, resting):
     """Without friction the same frame rests elsewhere, and every step of the search does work."""
     smooth = side_of(BEND, friction=0.0)
     _, contact = smooth.frame(60)
-    away = np.abs((contact.settled.coordinates - settled[60][1].settled.coordinates) * SCALE)
+    away = np.abs(
+        (contact.equilibrium.coordinates - resting[60][1].equilibrium.coordinates) * SCALE
+    )
     assert 1e-5 < away.max() < 5e-3
-    assert contact.settled.balance.status is BalanceStatus.OK
+    assert contact.equilibrium.balance.status is BalanceStatus.OK
 
 
 def test_without_anything_that_holds_it_a_frame_fails_with_the_reason(bend):
@@ -120,7 +139,7 @@ def test_without_anything_that_holds_it_a_frame_fails_with_the_reason(bend):
     side = ContactSide(case, Mechanics(case))
     start = case.motion.coordinates[60].copy()
     start[0] += 60e-3
-    ended = side.released.settle(60, start)
+    ended = side.released.find(60, start)
     assert ended.problem.startswith("released")
 
 
@@ -141,7 +160,7 @@ def test_a_recorded_position_that_climbs_the_eminence_slides_back_into_the_dishe
     assert contact.result.medial.force > 250
     assert contact.result.lateral.force > 250
     assert contact.result.pressure.max() < 0.7 * peak
-    moved = contact.settled.coordinates - freed.case.motion.coordinates[10]
+    moved = contact.equilibrium.coordinates - freed.case.motion.coordinates[10]
     assert abs(moved[2]) < 2e-3
 
 

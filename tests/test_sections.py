@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from tkamb.geometry.corner_normals import corner_normals, sharp_edges
+from tkamb.geometry.normals import sharp_edges
 from tkamb.geometry.surface import Surface
 
 
@@ -14,7 +14,7 @@ def surface(mesh: trimesh.Trimesh) -> Surface:
 
 def test_rim_of_a_cylinder_does_not_tilt_the_wall() -> None:
     part = surface(trimesh.creation.cylinder(0.02, 0.05, sections=180))
-    normals = corner_normals(part)
+    normals = part.corner_normals
     wall = np.abs(part.face_normals[:, 2]) < 0.5
     corners = part.triangles[wall]
     radial = corners * [1.0, 1.0, 0.0]
@@ -29,7 +29,7 @@ def test_far_nearer_to_a_sphere_than_the_facets() -> None:
     errors = []
     for level in (3, 4, 5):
         part = surface(trimesh.creation.icosphere(level, 1.0))
-        off = np.linalg.norm(corner_normals(part) - part.triangles, axis=2)
+        off = np.linalg.norm(part.corner_normals - part.triangles, axis=2)
         facets = np.linalg.norm(part.face_normals[:, None] - part.triangles, axis=2)
         assert off.mean() < 0.1 * facets.mean()
         errors.append(off.mean())

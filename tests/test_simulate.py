@@ -5,8 +5,8 @@ import pytest
 
 from scenes import fast_scene, write_scene
 from tkamb import load_scene, simulate
+from tkamb.columns import COLUMNS
 from tkamb.errors import InputError
-from tkamb.run.columns import COLUMNS
 
 EVERY_TENTH = slice(0, 101, 10)
 
@@ -29,7 +29,7 @@ def test_every_frame_has_numbers(bend):
 def test_forces_go_the_way_of_the_source(bend):
     """Rising with flexion, PL/Q from 1 down, PF/Q up to about 1; the README's numbers.
 
-    The source's PL/Q ends at 0.45, its PF/Q begins at 0.2: the README says that ours do not.
+    Sharma's (2008) PL/Q ends at 0.45, its PF/Q begins at 0.2: the README says that ours do not.
     """
     force, quadriceps = bend["force_total_BW"], bend["quadriceps_N"]
     assert (np.diff(force[:-1]) > 0).all()

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from condyle_profiles import condyle_profile
+from surface_arcs import arc_lengths
 from tkamb.body.slip import (
     CondyleSlip,
     InsertProfile,
@@ -14,13 +16,11 @@ from tkamb.body.slip import (
     roll_slip_motion,
     sliding_velocity,
 )
-from tkamb.case import load_case
-from tkamb.geometry.arcs import arc_lengths
+from tkamb.geometry.condyles import LowestPoints
 from tkamb.geometry.frames import Array, inverse, knee_pose, knee_twist, transform
-from tkamb.geometry.lowest import LowestPoints
-from tkamb.geometry.profiles import condyle_profile
 from tkamb.geometry.surface import Surface
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 RADIUS, TROUGH, DEPTH = 0.02, 0.05, 0.012
 FRAMES = 61

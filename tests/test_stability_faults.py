@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tkamb.contact.lattice import cache, model, report, solver
+from tkamb.contact.lattice import model, report, solver
 from tkamb.contact.lattice.active_set import _forces_of, solve_contact
+from tkamb.contact.lattice.linear import cache
 from tkamb.contact.materials import RambergOsgood
-from tkamb.studies.audit import complaints
+from tkamb.studies.audit import PEER_BOUNDS, complaints, peer_distances
 from tkamb.studies.closed_forms import KEPT_GRID_MM, ClosedForm, closed_forms, press_closed_form
 from tkamb.studies.extremes import Extreme
-from tkamb.studies.peer_answers import FARTHEST, peer_distances
 from tkamb.studies.stability import judge_safely, stored_verdicts
 
 PLATES = [
@@ -81,12 +81,12 @@ def test_a_key_without_young_s_modulus_fails(monkeypatch):
 
 @pytest.mark.parametrize("case", PLATES, ids=lambda case: case.model)
 def test_the_weakest_node_dropped_fails(case, monkeypatch):
-    def dropping(compliance, gap, lean, load, active, approach=0.0):
-        found = solve_contact(compliance, gap, lean, load, active, approach)
+    def dropping(compliance, gap, normal_y, load, active, approach=0.0):
+        found = solve_contact(compliance, gap, normal_y, load, active, approach)
         kept = found.active.copy()
         kept[np.argmin(np.where(kept, found.force, np.inf))] = False
-        force, depth = _forces_of(compliance, gap, lean, load, kept, approach)
-        opening = np.where(kept, 0.0, gap + compliance @ force + depth * lean)
+        force, depth = _forces_of(compliance, gap, normal_y, load, kept, approach)
+        opening = np.where(kept, 0.0, gap + compliance @ force + depth * normal_y)
         return replace(found, force=force, gap=opening, approach=depth, active=kept)
 
     monkeypatch.setattr(solver, "solve_contact", dropping)
@@ -100,14 +100,15 @@ def test_calculix_s_answers_hold_the_lattice_and_notice_a_changed_case():
     contact = model_of(PEERED)
     found = contact.press(contact.prepare(PEERED.pair), PEERED.load_N, PEERED.pose)
     apart = peer_distances(PEERED, found)
-    assert set(apart) == set(FARTHEST) and all(apart[key] < FARTHEST[key] for key in apart)
-    stiffer = replace(found, approach=found.approach / 1.05)
-    assert peer_distances(PEERED, stiffer)["approach"] > FARTHEST["approach"]
+    assert set(apart) == set(PEER_BOUNDS) and all(apart[key] < PEER_BOUNDS[key] for key in apart)
+    lifted = PEERED.pair.pose_at_approach(found.pose, found.approach / 1.05)
+    stiffer = replace(found, pose=lifted)
+    assert peer_distances(PEERED, stiffer)["approach"] > PEER_BOUNDS["approach"]
     assert peer_distances(replace(PEERED, load_N=77.0), found) == {}
 
 
 def test_a_stored_answer_to_another_case_is_no_reference(monkeypatch):
-    monkeypatch.setattr("tkamb.studies.peer_answers.body_hash", lambda extreme: "another")
+    monkeypatch.setattr("tkamb.studies.audit.body_hash", lambda extreme: "another")
     verdict = judge_safely(PEERED)
     assert verdict.kind == "unverified" and "make_stability_answers" in verdict.reason
 

@@ -7,17 +7,16 @@ import trimesh
 from contact_bodies import dished_insert
 from lattice_bodies import above, box_insert, condyles
 from scenes import MODEL
-from tkamb.case import load_case
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
 from tkamb.geometry.curved import CurvedSurface
 from tkamb.geometry.frames import knee_pose
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.subdivision import coarsened
 from tkamb.geometry.surface import Surface
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 UP = np.array([0.0, 1.0, 0.0])
 LINEAR = material("polyethylene-linear")
@@ -92,7 +91,7 @@ def test_the_curved_patches_stay():
     assert wanted[0].max() > 1e-5
     for times in (1, 2):
         finer = halved(surface, times, seed=3)
-        near = RayCaster(finer).first(points + UP, -UP)[1]
+        near = finer.rays.first(points + UP, -UP)[1]
         patches = CurvedSurface.of(finer)
         found = patches.shift(near, finer.barycentric(points, near), UP)
         assert np.abs(found[0] - wanted[0]).max() < 1e-8

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from scenes import MODEL, write_scene
 from tkamb.errors import InputError
-from tkamb.inputs.tables import read_table
+from tkamb.inputs.tables import READERS, Table, read_table
+from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 TRC = (
     "PathFileType\t4\t(X/Y/Z)\tshank.trc\n"
@@ -126,3 +129,24 @@ def test_units_must_be_stated_and_agree(tmp_path):
     csv = read_table(written(tmp_path, "a.csv", "time\n0\n"))
     with pytest.raises(InputError, match="no unit of length"):
         csv.unit_scale(None, "length_unit")
+
+
+def test_a_format_is_one_reader_and_one_row(tmp_path, monkeypatch):
+    """A toy format of `name: numbers` lines carries a whole scene's motion, by its suffix."""
+
+    def read_toy(path):
+        lines = [line.split(":") for line in path.read_text(encoding="utf-8").splitlines()]
+        return Table(path, {name: np.array(cells.split(), float) for name, cells in lines})
+
+    monkeypatch.setitem(READERS, "toy", read_toy)
+    scene = write_scene(tmp_path, motion__file="motion.toy")
+    recorded = read_table(tmp_path / "motion.csv")
+    lines = [f"{name}: {' '.join(map(repr, v.tolist()))}" for name, v in recorded.columns.items()]
+    written(tmp_path, "motion.toy", "\n".join(lines))
+    shipped = load_case(load_scene(MODEL / "scene.toml")).motion
+    toy = load_case(load_scene(scene)).motion
+    np.testing.assert_array_equal(toy.coordinates, shipped.coordinates)
+    named = load_case(load_scene(scene, {"motion.format": "toy"})).motion
+    np.testing.assert_array_equal(named.velocity, shipped.velocity)
+    with pytest.raises(InputError, match=r"unknown table format 'toys', use csv, .*toy"):
+        load_scene(scene, {"motion.format": "toys"})

@@ -1,6 +1,8 @@
 """The trade-off: references, errors, front, rows, table and picture."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,27 +10,29 @@ import numpy as np
 import pytest
 
 from scenes import write_scene
-from tkamb.case import load_case
 from tkamb.cli import main
 from tkamb.contact.registry import BUILT_IN, contact_model
 from tkamb.errors import InputError
+from tkamb.memory import peak_rss
 from tkamb.scene import load_scene
-from tkamb.studies import matrix, tradeoff
+from tkamb.scene.case import load_case
+from tkamb.studies import tradeoff
 from tkamb.studies.body_trade import CHANGES, body_table, run_body_trade
-from tkamb.studies.cases import case_names, study_case
+from tkamb.studies.cases import case_names, copied_scene, study_case, thin_out
 from tkamb.studies.elastic_layer import sphere_on_layer
-from tkamb.studies.front import NOISE, moved, on_front
 from tkamb.studies.kept_rows import KeptRows
 from tkamb.studies.measures import Job, measure, measure_apart
-from tkamb.studies.quantities import common_limit, errors, map_error, quantities, raster_map
-from tkamb.studies.recordings import copied_scene, thin_out
+from tkamb.studies.quantities import errors, map_error, quantities, raster_map
 from tkamb.studies.references import (
+    common_limit,
     compute_reference,
     limits,
     read_references,
     reference_of,
     write_references,
 )
+from tkamb.studies.row import TIMING_NOISE, on_front
+from tradeoff_blocks import moved
 
 ROOT = Path(__file__).parents[1]
 KEYS = {
@@ -151,7 +155,7 @@ def test_the_front_is_blind_to_noise_in_time():
     assert front[points.index(best)]
     for point, mark in zip(points, front, strict=True):
         if mark:
-            assert not any(t * NOISE < point[0] and e <= point[1] for t, e in points)
+            assert not any(t * TIMING_NOISE < point[0] and e <= point[1] for t, e in points)
     again = on_front(
         [(t * f, e) for (t, e), f in zip(points, rng.uniform(1, 1.05, 40), strict=True)]
     )
@@ -177,13 +181,21 @@ def test_a_measure_in_a_process_of_its_own():
     assert found.values == pytest.approx(here.values)
 
 
+def test_peak_memory_is_the_process_s_own():
+    """A parent that holds 400 MB starts a process that takes a tenth of it."""
+    held = np.ones(50_000_000)
+    asked = "from tkamb.memory import peak_rss; print(peak_rss())"
+    told = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
+    assert float(told.stdout) < 0.5 * held.nbytes / 1e6 < peak_rss()
+
+
 def test_what_cannot_be_measured_is_a_row_too():
     assert measure_apart(Job("sphere", "foundation", -1.0)).status.startswith("failed: ")
     assert measure_apart(Job("sphere", "lattice", 0.7), longest=1.0).status == "stopped after 1 s"
 
 
 def test_the_default_matrix_leaves_out_only_repeats():
-    wanted, everything = matrix.jobs(), matrix.jobs(full=True)
+    wanted, everything = tradeoff.jobs(), tradeoff.jobs(full=True)
     assert {job.contact for job in wanted} >= set(BUILT_IN)
     assert {job.case for job in wanted} == set(case_names())
     labels = {job.label for job in wanted}
@@ -192,12 +204,12 @@ def test_the_default_matrix_leaves_out_only_repeats():
     assert len(set(keys)) == len(keys)
     every = {(job.case, job.label, job.resolution_mm) for job in everything}
     assert set(keys) < every and {k[1:] for k in keys} == {k[1:] for k in every}
-    seconds = matrix.expected_seconds(wanted, tradeoff.cases_of(wanted))
+    seconds = tradeoff.expected_seconds(wanted, tradeoff.cases_of(wanted))
     assert len(seconds) == len(wanted) and sum(seconds) < 900
 
 
 def test_the_quick_study_is_stopped_and_goes_on(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(matrix, "QUICK_MODELS", ("foundation", "lattice", "fe"))
+    monkeypatch.setattr(tradeoff, "QUICK_MODELS", ("foundation", "lattice", "fe"))
     asked = []
 
     def stopped_at_the_third(job):

@@ -9,8 +9,8 @@ import pytest
 from scenes import write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.output.shards import Shard, Shards
-from tkamb.results import read_results
+from tkamb.results_folder import read_results
+from tkamb.run.shards import Shard, Shards
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_inputs_that_changed_are_named(finished, tmp_path, capfd):
 
 
 def test_other_code_is_a_note(run, capfd, monkeypatch):
-    monkeypatch.setattr("tkamb.verify.code_identity", lambda: "other")
+    monkeypatch.setattr("tkamb.results_folder.code_identity", lambda: "other")
     status, said = verified(run[1], capfd)
     assert status == 0 and "computed by other code" in said
 
@@ -159,10 +159,10 @@ def test_a_frames_folder_that_is_a_link_is_not_followed(tmp_path):
 
 
 def test_one_of_two_runs_at_once_is_refused(run, capfd):
-    from tkamb.output import claim
+    from tkamb import claim
 
     scene, out = run
-    descriptor = claim._lock(out)  # as another process would hold it
+    descriptor = claim._acquire_lock(out)  # as another process would hold it
     try:
         assert main(["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:1"]) == 2
     finally:

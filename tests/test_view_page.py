@@ -4,16 +4,13 @@ import numpy as np
 import pytest
 
 import tkamb
-from tkamb.output.maps_file import read_maps
-from tkamb.results import read_results
-from tkamb.view.browser import HeadlessBrowser, find_browser
+from headless import Page
+from tkamb.output.maps import read_maps
+from tkamb.results_folder import read_results
 from tkamb.view.run import open_run
 from tkamb.view.show import Show, serve_in_background
 from viewed import SCENE, force, levels, matrix, move_slider, shipped_run, short_results
 
-pytestmark = pytest.mark.skipif(
-    find_browser() is None, reason="no chromium here (Debian: apt install chromium)"
-)
 FRAMES = (0, 2, 5)
 
 
@@ -28,21 +25,19 @@ def show(folder):
 
 
 @pytest.fixture(scope="module")
-def browser(show, tmp_path_factory):
-    page = tmp_path_factory.mktemp("page") / "knee.html"
-    show.write_html(page)
-    with HeadlessBrowser() as browser:
-        browser.open(page.as_uri())
-        yield browser
+def browser(show, chromium, tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "knee.html"
+    show.write_html(path)
+    return Page(chromium).open(path.as_uri())
 
 
 @pytest.fixture(scope="module")
-def live(show):
+def live(show, chromium):
     server = show.server()
     serve_in_background(server)
-    with HeadlessBrowser() as browser:
-        browser.open(server.url)
-        yield server, browser
+    page = Page(chromium).open(server.url)
+    yield server, page
+    page.close()
     server.close()
 
 
@@ -227,25 +222,24 @@ def test_another_contact_model_on_the_frame(live):
     assert browser.problems == []
 
 
-def test_two_contact_models_side_by_side_on_one_scale(folder, tmp_path):
+def test_two_contact_models_side_by_side_on_one_scale(folder, chromium, tmp_path):
     other = tmp_path / "hertz"
     other.mkdir()
     short_results(other, SCENE, every=50, contact="hertz")
     page = tmp_path / "both.html"
     Show([open_run(folder), open_run(other)]).write_html(page)
     peaks = [read_maps(one / "contact.h5").pressure_Pa.max() for one in (folder, other)]
-    with HeadlessBrowser() as browser:
-        browser.open(page.as_uri())
-        move_slider(browser, 5)
-        assert browser.evaluate("tkamb.data.peak_MPa") == pytest.approx(max(peaks) / 1e6)
-        for view, one in enumerate((folder, other)):
-            given = read_maps(one / "contact.h5").pressure_Pa[-1]
-            drawn = levels(browser, view) * max(peaks)
-            np.testing.assert_allclose(drawn[given > 0], given[given > 0], atol=1e-4 * max(peaks))
-        assert browser.problems == []
+    browser = Page(chromium).open(page.as_uri())
+    move_slider(browser, 5)
+    assert browser.evaluate("tkamb.data.peak_MPa") == pytest.approx(max(peaks) / 1e6)
+    for view, one in enumerate((folder, other)):
+        given = read_maps(one / "contact.h5").pressure_Pa[-1]
+        drawn = levels(browser, view) * max(peaks)
+        np.testing.assert_allclose(drawn[given > 0], given[given > 0], atol=1e-4 * max(peaks))
+    assert browser.problems == []
 
 
-def test_a_picture_is_made(show, tmp_path):
+def test_a_picture_is_made(show, chromium, tmp_path):
     show.write_png(tmp_path / "knee.png", (640, 480))
     assert (tmp_path / "knee.png").read_bytes().startswith(b"\x89PNG")
 

@@ -1,4 +1,4 @@
-"""The solids of the viewer: thinned surfaces, the foot on its floor, bones, load paths."""
+"""The solids of the viewer: decimated surfaces, the foot on its floor, bones, load paths."""
 
 from pathlib import Path
 
@@ -7,20 +7,17 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from tkamb.case import load_case
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.frames import inverse, transform
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
-from tkamb.mechanics.mechanics import Mechanics
 from tkamb.output.metrics import JUMP
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 from tkamb.view.draw import draw
-from tkamb.view.foot import standing
 from tkamb.view.run import open_run
-from tkamb.view.shading import MOST_TRIANGLES, shaded
-from tkamb.view.solids import solids
+from tkamb.view.shading import MOST_TRIANGLES, decimate, shade
+from tkamb.view.solids import floor_and_foot, solids
 from tkamb.view.strands import path_strands
-from tkamb.view.thinning import thinned
 from viewed import MODELS, shipped_run
 
 DM = MODELS / "dm" / "scene.toml"
@@ -52,17 +49,17 @@ def distances(points, whole, spacing=1e-4):
 
 
 @pytest.mark.parametrize(("most", "largest"), [(6000, 1e-4), (2000, 5e-4), (500, 2e-3)])
-def test_a_thinned_surface_is_within_its_stated_error(most, largest):
+def test_a_decimated_surface_is_within_its_stated_error(most, largest):
     whole = ball()
-    fewer, error = thinned(whole, most)
+    fewer, error = decimate(whole, most)
     assert 0 < len(fewer.faces) <= most and 0 < error < largest
     for one, other in ((fewer, whole), (whole, fewer)):
         assert distances(one.vertices, other).max() < error + 2e-4
 
 
-def test_a_thinned_surface_faces_outwards_and_encloses_as_much():
+def test_a_decimated_surface_faces_outwards_and_encloses_as_much():
     whole = ball()
-    fewer, error = thinned(whole, 1500)
+    fewer, error = decimate(whole, 1500)
     outwards = np.einsum("ij,ij->i", fewer.face_normals, fewer.triangles.mean(axis=1))
     assert (outwards > 0).all()
     volume = [trimesh.Trimesh(one.vertices, one.faces).volume for one in (fewer, whole)]
@@ -73,7 +70,7 @@ def test_flat_faces_and_sharp_edges_survive_thinning():
     box = trimesh.creation.box((0.02, 0.03, 0.04))
     for _ in range(5):
         box = box.subdivide()
-    fewer, error = thinned(surface(box), 3000)
+    fewer, error = decimate(surface(box), 3000)
     assert len(fewer.faces) <= 3000 and error < 1e-4
     off_the_box = np.abs(np.abs(fewer.vertices) - (0.01, 0.015, 0.02)).min(axis=1)
     assert off_the_box.max() < 1e-8
@@ -82,13 +79,13 @@ def test_flat_faces_and_sharp_edges_survive_thinning():
 
 def test_a_small_surface_is_left_alone():
     whole = ball(20)
-    fewer, error = thinned(whole, len(whole.faces))
+    fewer, error = decimate(whole, len(whole.faces))
     assert fewer is whole and error == 0.0
 
 
 def test_the_shipped_implant_is_drawn_within_a_third_of_a_millimetre(drawing):
     for solid in drawing.solids:
-        drawn = shaded(solid.surface)
+        drawn = shade(solid.surface)
         assert len(drawn.faces) <= MOST_TRIANGLES
         assert drawn.error < 0.35e-3
 
@@ -109,7 +106,7 @@ def test_the_foot_stands_on_the_floor_and_holds_the_ankle(run, drawing):
     foot = next(one for one in drawing.solids if one.name == "foot")
     floor = next(one for one in drawing.solids if one.name == "floor")
     for row, k in enumerate(run.frames):
-        ankle = run.mechanics.placed(k).geometry.state.point("tibia", np.zeros(3))
+        ankle = run.mechanics.geometry(k).state.point("tibia", np.zeros(3))
         sole = transform(inverse(floor.poses[row]) @ foot.poses[row], foot.surface.vertices)
         assert abs(sole[:, 1].min()) < 1e-3
         local = transform(inverse(foot.poses[row]), ankle)
@@ -121,11 +118,11 @@ def test_no_floor_where_the_reaction_is_put_at_the_ankle():
     scene = load_scene(
         MODELS / "deep_knee_bend" / "scene.toml", {"ground_reaction.applied": "ankle"}
     )
-    assert standing(load_case(scene), (), ()) == ((), ())
+    assert floor_and_foot(load_case(scene), (), ()) == ((), ())
 
 
 def test_centres_of_pressure_lie_on_the_insert(run, drawing):
-    rays = RayCaster(run.case.insert)
+    rays = run.case.insert.rays
     found = [one for one in drawing.markers if "centre of pressure" in one.name][-2:]
     for marker in found:
         assert np.isfinite(marker.points).all()
@@ -151,7 +148,7 @@ def test_the_bone_that_the_scene_names_is_drawn():
     if not data.is_dir():
         pytest.skip("subject DM's data are not beside the project")
     mechanics = Mechanics(load_case(load_scene(DM, {"motion.frames": 26})))
-    states = [mechanics.placed(k).geometry.state for k in range(2)]
+    states = [mechanics.geometry(k).state for k in range(2)]
     made = solids(mechanics.case, mechanics.poses[:2], states, None, [-1] * 2)
     femur = next(one for one in made if one.name == "femur")
     given = trimesh.load(data / "geometry" / "bone_femur.stl")

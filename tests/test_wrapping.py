@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from tkamb.body.lines import StringLine
-from tkamb.body.load import total_wrench
-from tkamb.body.wrapping import loads_per_unit_tension, taut_path
+from tkamb.body.load import LinkPoint, total_wrench
+from tkamb.body.muscles import Line, Wrap
+from tkamb.body.wrapping import taut_path
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
 from tkamb.geometry.sections import convex_outline, sagittal_outline, sagittal_section
@@ -35,16 +35,19 @@ def circle_length(start: np.ndarray, end: np.ndarray, radius: float) -> float:
     return float(np.hypot(plane, end[2] - start[2]))
 
 
-def quadriceps() -> StringLine:
+def between(link: str, start: list[float], other: str, end: list[float]) -> tuple[LinkPoint, ...]:
+    return LinkPoint(link, np.array(start)), LinkPoint(other, np.array(end))
+
+
+def quadriceps() -> Line:
     """A femur with an elliptic outline; the patella is carried by the insert frame here."""
-    return StringLine(
+    return Line(
         "quadriceps",
-        "femur",
-        np.array([0.012, 0.2, 0.006]),
-        "tibia",
-        np.array([0.05, 0.02, -0.004]),
-        ellipse(0.034, 0.03),
-        "femur",
+        (
+            LinkPoint("femur", np.array([0.012, 0.2, 0.006])),
+            LinkPoint("tibia", np.array([0.05, 0.02, -0.004])),
+        ),
+        Wrap("femur", ellipse(0.034, 0.03)),
     )
 
 
@@ -87,10 +90,32 @@ def test_unit_tension_balances_exactly() -> None:
 
 
 def test_reaction_presses_the_bone_without_friction() -> None:
-    path = taut_path(np.array([0.0, 0.2, 0.02]), np.array([0.0, -0.06, -0.01]), CIRCLE)
-    reaction = loads_per_unit_tension(path, "a", "b", "bone")[2]
+    points = between("a", [0.0, 0.2, 0.02], "b", [0.0, -0.06, -0.01])
+    line = Line("string", points, Wrap("bone", CIRCLE))
+    reaction = line.loads(line.path(dict.fromkeys(("a", "b", "bone"), np.eye(4))))[2]
+    assert reaction.link == "bone"
     assert np.abs(reaction.forces[:, 2]).max() < 1e-12
     assert (np.sum(reaction.forces * reaction.points, axis=1) < 0.0).all()
+
+
+def test_a_via_point_takes_the_turn_of_the_string_to_its_own_link() -> None:
+    """Three stretches by hand, the wrapped one in the middle; in sum no force and no moment."""
+    via = LinkPoint("shank", np.array([0.02, -0.09, 0.01]))
+    start, end = between("hip", [-0.03, 0.3, 0.0], "shank", [0.0, -0.3, 0.02])
+    origin = LinkPoint("femur", np.array([0.0, 0.2, 0.02]))
+    line = Line("string", (start, origin, via, end), Wrap("femur", CIRCLE, stretch=1))
+    path = line.path(dict.fromkeys(("hip", "femur", "shank"), np.eye(4)))
+    around = taut_path(origin.position, via.position, CIRCLE)
+    assert around.wrapped
+    straight = np.linalg.norm(origin.position - start.position)
+    straight += np.linalg.norm(end.position - via.position)
+    assert path.length == pytest.approx(around.length + straight)
+    assert path.wrap_angle == around.wrap_angle
+    loads = line.loads(path)
+    assert [load.link for load in loads] == ["hip", "shank", "femur", "shank"]
+    along = (end.position - via.position) / np.linalg.norm(end.position - via.position)
+    assert loads[3].forces[0] == pytest.approx(along - around.end_direction)
+    assert np.abs(total_wrench(loads, np.array([0.1, -0.2, 0.3]))).max() < 1e-14
 
 
 @pytest.mark.parametrize("coordinate", range(6))
@@ -177,7 +202,7 @@ def test_outline_stops_below_the_start() -> None:
         sagittal_outline([surface], [1.0])
 
 
-def shipped_lines() -> tuple[StringLine, StringLine]:
+def shipped_lines() -> tuple[Line, Line]:
     """Quadriceps and patellar ligament about the shipped implant; the ligament's distal end
     lies under the insert, where no real one does, so that it wraps the insert's lip."""
     folder = Path(__file__).parents[1] / "models" / "deep_knee_bend"
@@ -188,24 +213,22 @@ def shipped_lines() -> tuple[StringLine, StringLine]:
     )
     planes = np.linspace(-0.005, 0.005, 5)
     top = float(femoral.bounds[1, 1])
-    quadriceps = StringLine(
+    quadriceps = Line(
         "quadriceps",
-        "femur",
-        np.array([float(femoral.bounds[1, 0]) - 0.012, top + 0.15, 0.004]),
-        "patella",
-        np.array([0.01, 0.02, 0.0]),
-        sagittal_outline([femoral], planes, 0.003),
-        "femur",
+        (
+            LinkPoint("femur", np.array([float(femoral.bounds[1, 0]) - 0.012, top + 0.15, 0.004])),
+            LinkPoint("patella", np.array([0.01, 0.02, 0.0])),
+        ),
+        Wrap("femur", sagittal_outline([femoral], planes, 0.003)),
     )
     lip = float(insert.bounds[1, 0])
-    ligament = StringLine(
+    ligament = Line(
         "patellar_ligament",
-        "patella",
-        np.array([0.008, -0.02, 0.0]),
-        "tibia",
-        np.array([lip - 0.02, -0.02, 0.005]),
-        sagittal_outline([insert], planes, 0.002),
-        "tibia",
+        (
+            LinkPoint("patella", np.array([0.008, -0.02, 0.0])),
+            LinkPoint("tibia", np.array([lip - 0.02, -0.02, 0.005])),
+        ),
+        Wrap("tibia", sagittal_outline([insert], planes, 0.002)),
     )
     return quadriceps, ligament
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes import fast_scene
-from tkamb.results import write_results
+from tkamb.results_folder import write_results
 from tkamb.simulation import simulate
 
 MODELS = Path(__file__).parents[1] / "models"

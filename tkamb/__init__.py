@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tkamb.contact.registry import contact_model
-    from tkamb.results import Results, read_results
+    from tkamb.results import Results
+    from tkamb.results_folder import read_results
     from tkamb.scene import Scene, load_scene
     from tkamb.simulation import simulate
     from tkamb.view.show import show
@@ -25,7 +26,7 @@ _HOMES = {
     "Scene": "tkamb.scene",
     "contact_model": "tkamb.contact.registry",
     "load_scene": "tkamb.scene",
-    "read_results": "tkamb.results",
+    "read_results": "tkamb.results_folder",
     "show": "tkamb.view.show",
     "simulate": "tkamb.simulation",
 }

@@ -11,12 +11,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from tkamb.command_options import add_no_cache, without_cache
 from tkamb.datasets.command import add_data
+from tkamb.export_command import add_export
 from tkamb.guard import guarded
 from tkamb.importing.command import add_import
-from tkamb.mesh_command import add_mesh
-from tkamb.press.command import add_press
+from tkamb.mesh_command import add_contact, add_mesh, add_no_cache, add_press, without_cache
 from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
 from tkamb.view.command import add_view
@@ -45,8 +44,8 @@ def _keep_to_one_thread() -> None:
     The lattice's solves wait for memory; further threads wait for each other, which on a
     busy machine takes several times as long.
     """
-    said = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    if "numpy" not in sys.modules and not any(name in os.environ for name in said):
+    limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    if "numpy" not in sys.modules and not any(name in os.environ for name in limits):
         os.environ["OMP_NUM_THREADS"] = "1"
 
 
@@ -65,11 +64,12 @@ def _parser() -> argparse.ArgumentParser:
     _add_run(commands)
     _add_folder_commands(commands)
     add_press(commands)
-    _add_contact(commands)
+    add_contact(commands)
     add_mesh(commands)
     _add_scene(commands)
     add_import(commands)
     add_data(commands)
+    add_export(commands)
     add_view(commands)
     add_tradeoff(commands)
     add_stability(commands)
@@ -110,14 +110,6 @@ def _add_folder_commands(commands: Any) -> None:
     report.set_defaults(command=_report)
 
 
-def _add_contact(commands: Any) -> None:
-    contact = commands.add_parser("contact", help="contact models")
-    verbs = contact.add_subparsers(required=True, metavar="VERB")
-    verbs.add_parser("list", help="names, what each assumes and needs").set_defaults(
-        command=_contact_list
-    )
-
-
 def _add_scene(commands: Any) -> None:
     scene = commands.add_parser("scene", help="the scene file")
     scene.add_argument("--schema", action="store_true", required=True, help="print its JSON schema")
@@ -152,10 +144,10 @@ def _run(options: argparse.Namespace) -> int:
     from tkamb.run.profiling import Profile, profile_lines
 
     profile = Profile() if options.profile else None
+    from tkamb.claim import claimed_directory
     from tkamb.output.axis import horizontal_axis
-    from tkamb.output.claim import claimed_directory
     from tkamb.output.headline import cards
-    from tkamb.results import write_results
+    from tkamb.results_folder import write_results
     from tkamb.run.status import FAILED
     from tkamb.simulation import simulate
 
@@ -211,7 +203,7 @@ def _default_directory(scene: Path) -> Path:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from tkamb.verify import verify_results
+    from tkamb.results_folder import verify_results
 
     verdict = verify_results(options.folder)
     print("\n".join(f"{options.folder}: {line}" for line in verdict.lines()))
@@ -219,22 +211,14 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from tkamb.output.claim import claimed_directory
+    from tkamb.claim import claimed_directory
     from tkamb.output.report import write_report
-    from tkamb.results import REPORT_NAME, read_results
+    from tkamb.results_folder import REPORT_NAME, read_results
 
     results = read_results(options.folder)  # before a folder is made or marked
     with claimed_directory(options.folder) as folder:
         write_report(results, folder / REPORT_NAME)
     print(f"report: {options.folder / REPORT_NAME}")
-    return 0
-
-
-def _contact_list(options: argparse.Namespace) -> int:
-    from tkamb.contact.registry import contact_descriptions
-
-    for name, line in contact_descriptions().items():
-        print(f"{name:18s} {line}")
     return 0
 
 

@@ -1,9 +1,64 @@
-"""`tkamb mesh`: its arguments, and what it prints."""
+"""Commands on meshes, without a scene (`press`, `mesh`, `contact`): arguments in, status out."""
 
 import argparse
 import json
 from pathlib import Path
 from typing import Any
+
+from tkamb.defaults import CONTACT_MODEL
+from tkamb.errors import InputError
+
+
+def add_press(commands: Any) -> None:
+    """Add `press` to the command line."""
+    press = commands.add_parser("press", help="contact alone: press two meshes together")
+    press.add_argument("femoral", type=Path)
+    press.add_argument("insert", type=Path)
+    press.add_argument("--load", type=float, required=True, metavar="N")
+    press.add_argument("--units", choices=("mm", "m"), default="mm", help="of both meshes")
+    pose = press.add_mutually_exclusive_group()
+    pose.add_argument(
+        "--pose",
+        type=float,
+        nargs=6,
+        metavar=("X", "Y", "Z", "RX", "RY", "RZ"),
+        help="femoral mesh in the insert mesh's axes: mesh units, degrees (intrinsic x-y-z)",
+    )
+    pose.add_argument("--pose-file", type=Path, metavar="F", help="the same six numbers in a file")
+    press.add_argument(
+        "--contact", default=CONTACT_MODEL, metavar="NAME", help="default: %(default)s"
+    )
+    add_no_cache(press)
+    press.add_argument("--resolution", type=float, default=1.0, metavar="MM")
+    press.add_argument("--bearing", choices=("fixed", "mobile"), default="fixed")
+    press.add_argument("--material", default="polyethylene", metavar="NAME")
+    _add_side(press)
+    press.add_argument("--adjust", action=argparse.BooleanOptionalAction, default=False)
+    press.add_argument("--json", action="store_true")
+    press.set_defaults(command=_press)
+
+
+def _press(options: argparse.Namespace) -> int:
+    from tkamb.press import press_meshes, read_pose
+
+    pose = read_pose(options.pose_file) if options.pose_file else options.pose
+    report = press_meshes(
+        options.femoral,
+        options.insert,
+        options.load,
+        units=options.units,
+        pose=None if pose is None else tuple(pose),
+        contact=options.contact,
+        resolution_mm=options.resolution,
+        bearing=options.bearing,
+        material=options.material,
+        axes=options.axes,
+        side=options.side,
+        adjust=options.adjust,
+        options=without_cache(options.contact) if options.no_cache else None,
+    )
+    print(json.dumps(report.as_dict(), indent=2) if options.json else "\n".join(report.lines()))
+    return 0 if report.carried else 1
 
 
 def add_mesh(commands: Any) -> None:
@@ -23,13 +78,7 @@ def add_mesh(commands: Any) -> None:
     lattice.add_argument("insert", type=Path, metavar="INSERT")
     lattice.add_argument("--resolution", type=float, default=1.0, metavar="MM", help="cell size")
     lattice.add_argument("--units", choices=("mm", "m"), default="mm", help="of the mesh")
-    lattice.add_argument(
-        "--axes",
-        default="+x,+y,+z",
-        metavar="ANT,SUP,RIGHT",
-        help="mesh axes that point anterior, superior, right; write --axes=-x,+y,-z",
-    )
-    lattice.add_argument("--side", choices=("right", "left"), default="right")
+    _add_side(lattice)
     lattice.add_argument("--out", type=Path, metavar="F.vtu", help="for ParaView or meshio")
     lattice.add_argument("--json", action="store_true")
     lattice.set_defaults(command=_mesh_lattice)
@@ -47,7 +96,7 @@ def _mesh_check(options: argparse.Namespace) -> int:
 
 
 def _mesh_part(options: argparse.Namespace) -> int:
-    from tkamb.mesh_part import write_body
+    from tkamb.mesh_files import write_body
 
     line = write_body(options.file, options.number, options.out)
     print(f"{options.out}: {line}")
@@ -55,7 +104,7 @@ def _mesh_part(options: argparse.Namespace) -> int:
 
 
 def _mesh_lattice(options: argparse.Namespace) -> int:
-    from tkamb.lattice_file import lattice_of_file
+    from tkamb.mesh_files import lattice_of_file
 
     report = lattice_of_file(
         options.insert,
@@ -67,3 +116,53 @@ def _mesh_lattice(options: argparse.Namespace) -> int:
     )
     print(json.dumps(report.as_dict(), indent=2) if options.json else "\n".join(report.lines()))
     return 0
+
+
+def add_contact(commands: Any) -> None:
+    """Add the command `contact` and its verb."""
+    contact = commands.add_parser("contact", help="contact models")
+    verbs = contact.add_subparsers(required=True, metavar="VERB")
+    verbs.add_parser("list", help="names, what each assumes and needs").set_defaults(
+        command=_contact_list
+    )
+
+
+def _contact_list(options: argparse.Namespace) -> int:
+    from tkamb.contact.registry import contact_descriptions
+
+    for name, line in contact_descriptions().items():
+        print(f"{name:18s} {line}")
+    return 0
+
+
+def _add_side(command: argparse.ArgumentParser) -> None:
+    """Add --axes and --side: how a mesh lies in the knee."""
+    command.add_argument(
+        "--axes",
+        default="+x,+y,+z",
+        metavar="ANT,SUP,RIGHT",
+        help="mesh axes that point anterior, superior, right; write --axes=-x,+y,-z",
+    )
+    command.add_argument("--side", choices=("right", "left"), default="right")
+
+
+def add_no_cache(command: argparse.ArgumentParser) -> None:
+    """Add --no-cache to a command."""
+    command.add_argument(
+        "--no-cache", action="store_true", help="neither read nor keep prepared operators on disk"
+    )
+
+
+def without_cache(contact: str | None) -> dict[str, Any]:
+    """Return the options of a contact model that then keeps nothing on disk.
+
+    Raises:
+        InputError: there is no such model, or it keeps nothing anyway.
+    """
+    from tkamb.contact.registry import contact_options
+
+    if contact is None:
+        raise InputError("no contact is modelled", "--no-cache", "leave it out")
+    if "cache" not in contact_options(contact):
+        raise InputError(f"'{contact}' keeps nothing on disk", "--no-cache", "leave it out")
+    return {"cache": False}

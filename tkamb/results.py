@@ -1,7 +1,7 @@
 """What a run found: one row per frame, the contact maps, and where it all came from."""
 
-import hashlib
-import json
+import csv
+import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,31 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tkamb.columns import KINDS, RENAMED, is_ligament, ordered_names
 from tkamb.errors import InputError, names_near
-from tkamb.files import MEGABYTE, read_json, sha256_of
+from tkamb.files import TABLE_LIMIT, read_text
 from tkamb.geometry.frames import Array
-from tkamb.output.atomic import (
-    Replacement,
-    claim_directory,
-    replaced_together,
-    write_synced,
-    write_text,
-)
-from tkamb.output.claim import claimed_directory, settle
-from tkamb.output.results_csv import csv_text, read_csv
-from tkamb.run.columns import COLUMNS, KINDS, ordered_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tkamb.output.maps_file import ContactMaps
-
-__all__ = ["COLUMNS", "Results", "claim_directory", "read_results", "write_results"]
-
-CSV_NAME, SUMMARY_NAME, REPORT_NAME = "results.csv", "summary.json", "report.html"
-MAPS_NAME = "contact.h5"
-SUMMARY_LIMIT = 256 * MEGABYTE
-"""Bytes of a summary: a line for every failed frame."""
+    from tkamb.output.maps import ContactMaps
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +30,7 @@ class Results:
             texts. Columns of the table `COLUMNS` that are not given are not modelled and
             hold NaN; the order becomes the table's.
         summary: provenance and notes, JSON-able; the keys that the report reads are listed
-            in `tkamb.output.provenance`.
+            in docs/results.md.
         maps: pressure maps per frame; None without contact.
         directory: where it was written to or read from.
 
@@ -60,7 +44,7 @@ class Results:
     directory: Path | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "columns", _completed(self.columns))
+        object.__setattr__(self, "columns", _complete_columns(self.columns))
 
     def __len__(self) -> int:
         return len(self.columns["status"])
@@ -110,126 +94,8 @@ class Results:
 
         return headline_html(self)
 
-    def write_csv(self, path: str | Path) -> None:
-        """Write results.csv, whole or not at all; NaN is an empty cell.
 
-        Raises:
-            InputError: the folder cannot be written.
-        """
-        write_text(Path(path), csv_text(self.columns))
-
-
-def read_results(directory: str | Path, *, check: bool = True) -> Results:
-    """Read what `write_results` wrote; numbers come back bit for bit.
-
-    What a kill left to be put in place is put there first.
-
-    Args:
-        directory: the folder.
-        check: hold the files against the SHA-256 in summary.json.
-
-    Raises:
-        InputError: a file is missing, is not what it should be, or not what was written.
-    """
-    directory = Path(directory)
-    settle(directory)
-    columns = read_csv(directory / CSV_NAME)
-    summary = read_summary(directory)
-    maps = None
-    if (directory / MAPS_NAME).exists():
-        from tkamb.output.maps_file import read_maps
-
-        maps = read_maps(directory / MAPS_NAME)
-    if check and (found := differences(directory, summary)):
-        raise InputError(found[0], directory, "`tkamb verify` tells all; run it again")
-    return Results(columns, summary, maps, directory)
-
-
-def read_summary(directory: Path) -> dict[str, Any]:
-    """Return a folder's summary.json.
-
-    Raises:
-        InputError: no such file, or not a JSON object.
-    """
-    path = directory / SUMMARY_NAME
-    found = read_json(path, SUMMARY_LIMIT, what="summary of a run")
-    if not isinstance(found, dict):
-        raise InputError("is no JSON object", path, "is it a folder that `tkamb run` wrote?")
-    return found
-
-
-def differences(directory: Path, summary: Mapping[str, Any]) -> list[str]:
-    """Return in words what of a folder's files is not what was written with the summary.
-
-    Results of a release that kept no SHA-256 differ in nothing that could be known.
-    """
-    said, recorded = [], summary.get("files")
-    if not isinstance(recorded, Mapping):
-        return []
-    if summary.get("summary_sha256") != _summary_hash(summary):
-        said.append(f"{SUMMARY_NAME} has changed since it was written")
-    for name in (CSV_NAME, MAPS_NAME):
-        there = (directory / name).exists()
-        if there and name not in recorded:
-            said.append(f"{name} does not belong to these results")
-        elif not there and name in recorded:
-            said.append(f"{name} is missing")
-        elif there and sha256_of(directory / name) != recorded[name]:
-            said.append(f"{name} has changed since it was written")
-    return said
-
-
-def write_results(results: Results, directory: str | Path, *, force: bool = False) -> None:
-    """Write results.csv, summary.json, contact.h5 and report.html: all of them or none.
-
-    Without maps, a contact.h5 of an earlier run in that folder is removed, since it would pass
-    for this run's. The shards of a run under way (`tkamb.output.shards`) have served and go.
-
-    Args:
-        results: what to write.
-        directory: the folder; made if it is not there.
-        force: write even into a folder that holds things that are not tkamb's.
-
-    Raises:
-        InputError: the folder cannot be claimed (`tkamb.output.claim`) or written.
-    """
-    from tkamb.output.report import report_html
-    from tkamb.output.shards import remove_shards
-
-    with claimed_directory(directory, force) as folder:
-        with replaced_together(folder) as files:
-            _put_maps(results.maps, files)
-            put_numbers(results, files)
-            write_synced(files.path(REPORT_NAME), report_html(results))
-        remove_shards(folder)
-
-
-def put_numbers(results: Results, files: Replacement) -> None:
-    """Write results.csv and summary.json with what becomes results.csv's and contact.h5's SHA-256.
-
-    Args:
-        results: what to write.
-        files: among which a new contact.h5 is already; else the one in place is kept.
-    """
-    write_synced(files.path(CSV_NAME), csv_text(results.columns))
-    recorded = {CSV_NAME: sha256_of(files.path(CSV_NAME))}
-    if results.maps is None:
-        files.remove(MAPS_NAME)
-    else:
-        recorded[MAPS_NAME] = sha256_of(files.current(MAPS_NAME))
-    summary = _plain(results.summary) | {"files": recorded}
-    summary["summary_sha256"] = _summary_hash(summary)
-    text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
-    write_synced(files.path(SUMMARY_NAME), text + "\n")
-
-
-def _summary_hash(summary: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of all of a summary but this."""
-    content = {key: value for key, value in summary.items() if key != "summary_sha256"}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def _completed(given: Mapping[str, Any]) -> dict[str, Any]:
+def _complete_columns(given: Mapping[str, Any]) -> dict[str, Any]:
     names = ordered_names(given)
     unknown = sorted(set(given) - set(names))
     if unknown:
@@ -250,28 +116,54 @@ def _completed(given: Mapping[str, Any]) -> dict[str, Any]:
     return columns
 
 
-def _plain(value: Any) -> Any:
-    """Return the value with numpy, paths and NaN turned into what JSON has."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return str(value) if isinstance(value, Path) else value
+def read_csv(path: str | Path) -> dict[str, Any]:
+    """Read the columns of a results.csv, of this release or an earlier one.
+
+    Raises:
+        InputError: no such file, an unknown column, a row of another length, not a number.
+    """
+    path = Path(path)
+    try:
+        rows = list(csv.reader(io.StringIO(read_text(path, TABLE_LIMIT))))
+    except csv.Error as error:
+        raise InputError(f"cannot be read as CSV ({error})", path) from None
+    if not rows:
+        raise InputError("is empty", path)
+    header, body = [RENAMED.get(name, name) for name in rows[0]], rows[1:]
+    for number, row in enumerate(body, start=2):
+        if len(row) != len(header):
+            raise InputError(f"line {number} has {len(row)} cells, not {len(header)}", path)
+    cells = list(zip(*body, strict=True)) or [() for _ in header]
+    return {name: _parse(name, values, path) for name, values in zip(header, cells, strict=True)}
 
 
-def _put_maps(maps: "ContactMaps | None", files: Replacement) -> None:
-    """Write maps that are not in their place already."""
-    if maps is None:
-        return
-    if (
-        isinstance(maps.source, Path)
-        and maps.source.absolute() == files.current(MAPS_NAME).absolute()
-    ):
-        return
-    from tkamb.output.maps_file import write_maps
+def csv_text(columns: Mapping[str, Any]) -> str:
+    """Return the text of a results.csv: numbers bit for bit, NaN as an empty cell."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(columns)
+    cells = [[_cell(name, value) for value in values] for name, values in columns.items()]
+    writer.writerows(zip(*cells, strict=True))
+    return buffer.getvalue()
 
-    write_maps(maps, files.path(MAPS_NAME))
+
+def _cell(name: str, value: Any) -> str:
+    kind = KINDS.get(name, "number")
+    if kind == "text":
+        return str(value)
+    if math.isnan(value):
+        return ""
+    if kind == "integer" and float(value).is_integer():
+        return str(int(value))
+    return repr(float(value))
+
+
+def _parse(name: str, cells: tuple[str, ...], path: Path) -> Any:
+    if KINDS.get(name) == "text":
+        return list(cells)
+    if name not in KINDS and not is_ligament(name):
+        raise InputError(f"unknown column '{name}'", path, names_near(name, KINDS))
+    try:
+        return np.array([float(cell) if cell else math.nan for cell in cells])
+    except ValueError as error:
+        raise InputError(f"column '{name}': {error}", path) from None

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tkamb.case import Case, load_case
+from tkamb.claim import claimed_directory
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
-from tkamb.mechanics.mechanics import Mechanics
-from tkamb.output.claim import claimed_directory
 from tkamb.plausibility.plausibility import Plausibility
 from tkamb.results import Results
 from tkamb.run.recorder import FolderRecorder, Recorder, finished_results
@@ -18,6 +17,7 @@ from tkamb.run.status import frame_status
 from tkamb.run.summary import input_hashes, run_identity, scene_hash, summary_of
 from tkamb.run.tabulate import frame_row, join_rows
 from tkamb.scene import Scene, load_scene
+from tkamb.scene.case import Case, load_case
 
 if TYPE_CHECKING:
     from tkamb.equilibrium.contact_side import ContactSide
@@ -58,7 +58,7 @@ def simulate(
 
     Raises:
         InputError: the scene or a file that it names cannot be used, the run to resume is
-            another one, or the folder cannot be claimed (`tkamb.output.claim`).
+            another one, or the folder cannot be claimed (`tkamb.claim`).
         KeyboardInterrupt: with a folder, what was finished is written there first.
     """
     if isinstance(scene, str | Path):

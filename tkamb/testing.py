@@ -13,7 +13,6 @@ import trimesh
 from tkamb.contact.materials import material
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import ContactPair
-from tkamb.contact.pressing import first_touch_height, pose_at_approach
 from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array, inverse, knee_pose
@@ -124,7 +123,7 @@ def _check_declaration(model: ContactModel) -> None:
 
 def _check_apart(model: ContactModel, state: Any, case: ConformanceCase) -> None:
     what = "there is no wrench when apart"
-    result = model.evaluate(state, pose_at_approach(case.pair, case.pose, -1e-3))
+    result = model.evaluate(state, case.pair.pose_at_approach(case.pose, -1e-3))
     _require(result.status is ContactStatus.OK, what, f"status {result.status.value}")
     _require((result.wrench_on_insert == 0).all() and (result.pressure == 0).all(), what)
     _require(result.medial is None and result.lateral is None, what, "a condyle carries")
@@ -144,11 +143,15 @@ def _check_load(
         _close(pressed.pose.ravel()[kept], np.asarray(case.pose).ravel()[kept], 1e-12, 1.0),
         "pressing keeps rotation, x and z",
     )
-    travelled = first_touch_height(case.pair, case.pose) - pressed.pose[1, 3]
-    _require(
-        _close(pressed.approach, travelled, 1e-9, 1.0), "the approach is the travel since touch"
-    )
     again = model.evaluate(state, pressed.pose)
+    travelled = case.pair.first_touch_height(case.pose) - pressed.pose[1, 3]
+    _require(travelled > 0, "pressing moves the femoral component into the insert")
+    for found in (pressed, again):
+        _require(
+            _close(found.approach, travelled, 1e-9, 1.0),
+            "the approach is the travel since touch",
+            f"{found.approach} m for {travelled} m",
+        )
     _require(
         _close(again.wrench_on_insert[:3], pressed.wrench_on_insert[:3], case.tolerance, case.load),
         "evaluating the pressed pose gives the pressed force",
@@ -223,7 +226,7 @@ def _check_stiffness(
     forces = np.array(
         [
             -model.evaluate(
-                state, pose_at_approach(case.pair, case.pose, depth + step)
+                state, case.pair.pose_at_approach(case.pose, depth + step)
             ).wrench_on_insert[1]
             for step in steps
         ]

@@ -13,10 +13,15 @@ import pinocchio as pin
 
 from tkamb.body.load import PointForces, wrenches
 from tkamb.errors import InputError, names_near
-from tkamb.geometry.frames import Array, inverse, rotate, transform
-
-KNEE = ("knee_ap", "knee_si", "knee_ml", "knee_axial_rotation", "knee_adduction", "knee_flexion")
-PATELLA = ("patella_ap", "patella_si", "patella_rotation")
+from tkamb.geometry.frames import (
+    KNEE_JOINT_NAMES,
+    PATELLA_JOINT_NAMES,
+    Array,
+    inverse,
+    rotate,
+    transform,
+)
+from tkamb.units import STANDARD_GRAVITY
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,19 +50,19 @@ class Chain:
         gravity: m/s², downwards in the laboratory.
     """
 
-    def __init__(self, urdf: str, with_patella: bool, gravity: float = 9.80665) -> None:
+    def __init__(self, urdf: str, with_patella: bool, gravity: float = STANDARD_GRAVITY) -> None:
         try:
             full = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
         except (ValueError, RuntimeError) as error:
             raise InputError(f"Pinocchio cannot build the chain ({error})", "URDF") from None
-        self.joints = KNEE + (PATELLA if with_patella else ())
+        self.joints = KNEE_JOINT_NAMES + (PATELLA_JOINT_NAMES if with_patella else ())
         keep = {"universe", "root_joint", *self.joints}
         lock = [full.getJointId(name) for name in full.names if name not in keep]
         model = pin.buildReducedModel(full, lock, pin.neutral(full)) if lock else full
         model.gravity = pin.Motion(np.array([0.0, -gravity, 0.0]), np.zeros(3))
         self.model = model
         self._columns = [model.joints[model.getJointId(name)].idx_v for name in self.joints]
-        base = model.getJointId("knee_ap")
+        base = model.getJointId(KNEE_JOINT_NAMES[0])
         self._insert_in_root = model.jointPlacements[base].homogeneous
         self._tibia_in_root = model.frames[self.frame_id("tibia")].placement.homogeneous
 
@@ -76,7 +81,7 @@ class Chain:
     @property
     def patella_joint_in_femur(self) -> Array:
         """pose_joint_in_femur (4, 4): where the patella's sagittal plane lies on the femur."""
-        return self.model.jointPlacements[self.model.getJointId("patella_ap")].homogeneous
+        return self.model.jointPlacements[self.model.getJointId(PATELLA_JOINT_NAMES[0])].homogeneous
 
     def link_in(self, link: str, base: str) -> Array:
         """Return pose_link_in_base (4, 4) of two links that are fixed to each other."""

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tkamb.body.ligaments import Ligament
+from tkamb.body.load import LinkPoint
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, transform
 from tkamb.geometry.surface import Surface
-from tkamb.scene_tables import Attachment, LigamentTable
 from tkamb.units import MILLIMETRE
 
 PREFIX = "generic_"
@@ -51,8 +52,8 @@ def generic_ligaments(
     insert: Surface,
     pose_insert_in_tibia: Array,
     wanted: Sequence[str] = ("MCL", "LCL", "PCL"),
-) -> tuple[LigamentTable, ...]:
-    """Return scene tables of a generic set, scaled to an implant.
+) -> tuple[Ligament, ...]:
+    """Return the bundles of a generic set, scaled to an implant.
 
     Args:
         femoral: femoral component in the femur link's frame (right knee).
@@ -61,7 +62,7 @@ def generic_ligaments(
         wanted: ligaments that the patient has, of MCL, LCL, PCL, ACL.
 
     Returns:
-        Tables on the links "femur" and "tibia"; the reference pose is extension.
+        Bundles between the links "femur" and "tibia"; the reference pose is extension.
 
     Raises:
         InputError: no such ligament.
@@ -75,13 +76,22 @@ def generic_ligaments(
     axis = condylar_axis(femoral)
     femoral_unit = 0.5 * float(np.ptp(femoral.bounds[:, 2]))
     insert_unit = 0.5 * float(np.ptp(insert.bounds[:, 2]))
-    tables = []
+    found = []
     for name, bundle in BUNDLES.items():
         if name.split("_")[0] in wanted:
             proximal = axis + femoral_unit * np.array(bundle.proximal)
             distal = transform(pose_insert_in_tibia, insert_unit * np.array(bundle.distal))
-            tables.append(_table(PREFIX + name, bundle, proximal, distal))
-    return tuple(tables)
+            found.append(
+                Ligament(
+                    PREFIX + name,
+                    LinkPoint("femur", proximal),
+                    LinkPoint("tibia", distal),
+                    "two-line",
+                    bundle.stiffness_N_per_mm / MILLIMETRE,
+                    reference_strain=bundle.reference_strain,
+                )
+            )
+    return tuple(found)
 
 
 def condylar_axis(femoral: Surface) -> Array:
@@ -100,21 +110,3 @@ def condylar_axis(femoral: Surface) -> Array:
     columns = np.column_stack([down, np.ones(len(flexion))])
     (x, y, _), *_ = np.linalg.lstsq(columns, support, rcond=None)
     return np.array([x, y, float(femoral.bounds[:, 2].mean())])
-
-
-def _table(name: str, bundle: _Bundle, proximal: Array, distal: Array) -> LigamentTable:
-    def end(link: str, point: Array) -> Attachment:
-        x, y, z = (point / MILLIMETRE).tolist()
-        return Attachment(link=link, point_mm=(x, y, z))
-
-    return LigamentTable(
-        name=name,
-        proximal=end("femur", proximal),
-        distal=end("tibia", distal),
-        law="two-line",
-        stiffness_N_per_mm=bundle.stiffness_N_per_mm,
-        stiffness_N_per_strain=None,
-        slack_length_mm=None,
-        reference_strain=bundle.reference_strain,
-        reference_flexion_deg=0.0,
-    )

@@ -14,17 +14,16 @@ J Biomech Eng 113:263 (1991), doi:10.1115/1.2894883.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tkamb.body.load import PointForces
+from tkamb.body.load import LinkPoint, PointForces, wrench_of
 from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array, transform
-from tkamb.scene_tables import Attachment, LigamentTable
-from tkamb.units import DEGREE, MILLIMETRE
+from tkamb.units import DEGREE
 
 TOE_STRAIN = 0.03
 """eps1: the toe region ends at twice this strain, the same for every ligament."""
@@ -59,23 +58,23 @@ class Ligament:
 
     Args:
         name: as in the scene.
-        proximal_link: link of the proximal end.
-        proximal_point: (3,) m, in that link's frame.
-        distal_link: link of the distal end.
-        distal_point: (3,) m, in that link's frame.
+        proximal: its proximal end.
+        distal: its distal end.
         law: which of the two laws.
         stiffness: N/m for "two-line", N per unit strain for "quadratic-toe".
-        slack_length: m.
+        slack_length: m; NaN where a reference strain is given instead.
+        reference_strain: strain at the reference pose.
+        reference_flexion: rad, of the reference pose.
     """
 
     name: str
-    proximal_link: str
-    proximal_point: Array
-    distal_link: str
-    distal_point: Array
+    proximal: LinkPoint
+    distal: LinkPoint
     law: Law
     stiffness: float
-    slack_length: float
+    slack_length: float = float("nan")
+    reference_strain: float = float("nan")
+    reference_flexion: float = 0.0
 
     def ends(self, poses: Mapping[str, Array]) -> tuple[Array, Array]:
         """Return proximal and distal end (..., 3) in the insert frame.
@@ -83,8 +82,8 @@ class Ligament:
         Args:
             poses: link -> pose_link_in_insert, (4, 4) or (f, 4, 4).
         """
-        proximal = transform(poses[self.proximal_link], self.proximal_point)
-        return proximal, transform(poses[self.distal_link], self.distal_point)
+        proximal = transform(poses[self.proximal.link], self.proximal.position)
+        return proximal, transform(poses[self.distal.link], self.distal.position)
 
     def length(self, poses: Mapping[str, Array]) -> Array:
         """Return the distance (...,) between the ends, m."""
@@ -100,19 +99,59 @@ class Ligament:
         law = two_line_force if self.law == "two-line" else quadratic_toe_force
         return law(length, self.slack_length, self.stiffness)
 
-    def loads(self, poses: Mapping[str, Array]) -> tuple[float, tuple[PointForces, PointForces]]:
-        """Return the tension (N) and what it does to the two links, at one frame.
 
-        The two forces are equal and opposite and lie on the line through both ends.
-        """
-        proximal, distal = self.ends(poses)
-        length = float(np.linalg.norm(distal - proximal))
-        tension = float(self.force(length))
-        pull = (tension / length * (distal - proximal))[None]
-        return tension, (
-            PointForces(self.proximal_link, proximal[None], pull),
-            PointForces(self.distal_link, distal[None], -pull),
+@dataclass(frozen=True, eq=False)
+class BundleArrays:
+    """Several bundles at once, their ends in two frames of one's choice.
+
+    Args:
+        proximal: (m, 3) m, one end of each.
+        distal: (m, 3) m, the other end.
+        two_line: (m,) which law.
+        stiffness: (m,) N/m or N per unit strain, as the law takes it.
+        slack_length: (m,) m.
+    """
+
+    proximal: Array
+    distal: Array
+    two_line: NDArray[np.bool_]
+    stiffness: Array
+    slack_length: Array
+
+    @classmethod
+    def of(cls, bundles: Sequence[Ligament], proximal: Array, distal: Array) -> "BundleArrays":
+        """Return bundles with their ends (m, 3)."""
+        return cls(
+            proximal.reshape(-1, 3),
+            distal.reshape(-1, 3),
+            np.array([bundle.law == "two-line" for bundle in bundles], bool),
+            np.array([bundle.stiffness for bundle in bundles], float),
+            np.array([bundle.slack_length for bundle in bundles], float),
         )
+
+    def pulls(self, proximal: Array, distal: Array) -> tuple[Array, Array]:
+        """Return tensions (..., m) N and the pulls (..., m, 3) N on the distal ends.
+
+        Args:
+            proximal: (..., m, 3) m, and
+            distal: (..., m, 3) m, the ends in one frame.
+        """
+        along = proximal - distal
+        length = np.linalg.norm(along, axis=-1)
+        law = (length, self.slack_length, self.stiffness)
+        tension = np.where(self.two_line, two_line_force(*law), quadratic_toe_force(*law))
+        return tension, (tension / length)[..., None] * along
+
+    def wrench(self, poses: Array) -> Array:
+        """Return the wrench (..., 6) about the origin of the distal ends' frame, on its body.
+
+        Args:
+            poses: (..., 4, 4) of the proximal ends' frame in the distal ends'.
+        """
+        proximal = np.einsum("...ij,mj->...mi", poses[..., :3, :3], self.proximal)
+        proximal = proximal + poses[..., None, :3, 3]
+        _, pull = self.pulls(proximal, self.distal)
+        return wrench_of(self.distal, pull).sum(axis=-2)
 
 
 def ligament_loads(
@@ -120,45 +159,38 @@ def ligament_loads(
 ) -> tuple[Array, tuple[PointForces, ...]]:
     """Return all tensions (n,) N and what they do to the links, at one frame.
 
-    The same as `Ligament.loads` of every bundle, gathered into one load per link.
+    The forces on a bundle's ends are equal and opposite, and lie on the line through both;
+    they are gathered into one load per link.
 
     Args:
         ligaments: the bundles.
         poses: link -> pose_link_in_insert (4, 4).
     """
-    proximal_links = np.array([bundle.proximal_link for bundle in ligaments])
-    distal_links = np.array([bundle.distal_link for bundle in ligaments])
-    proximal = _placed(proximal_links, [b.proximal_point for b in ligaments], poses)
-    distal = _placed(distal_links, [b.distal_point for b in ligaments], poses)
-    along = distal - proximal
-    length = np.linalg.norm(along, axis=1)
-    slack = np.array([bundle.slack_length for bundle in ligaments])
-    stiffness = np.array([bundle.stiffness for bundle in ligaments])
-    two_line = np.array([bundle.law == "two-line" for bundle in ligaments], bool)
-    tension = np.where(
-        two_line,
-        two_line_force(length, slack, stiffness),
-        quadratic_toe_force(length, slack, stiffness),
-    )
-    pull = (tension / length)[:, None] * along
+    points = [*(bundle.proximal for bundle in ligaments), *(bundle.distal for bundle in ligaments)]
+    links = np.array([point.link for point in points]).reshape(2, -1)
+    here = np.array([poses[point.link] for point in points], float)
+    places = np.array([point.position for point in points], float)
+    ends = np.einsum("nij,nj->ni", here[:, :3, :3], places) + here[:, :3, 3]
+    ends = ends.reshape(2, -1, 3)
+    tension, pull = BundleArrays.of(ligaments, *ends).pulls(*ends)
     loads = []
-    for link in dict.fromkeys([*proximal_links.tolist(), *distal_links.tolist()]):
-        up, down = proximal_links == link, distal_links == link
-        points = np.concatenate([proximal[up], distal[down]])
-        loads.append(PointForces(link, points, np.concatenate([pull[up], -pull[down]])))
+    for link in dict.fromkeys(links.ravel().tolist()):
+        own = links == link
+        forces = np.concatenate([-pull[own[0]], pull[own[1]]])
+        loads.append(PointForces(link, ends[own], forces))
     return tension, tuple(loads)
 
 
 def build_ligaments(
-    tables: Sequence[LigamentTable], poses: Mapping[str, Array], flexion: Array
+    ligaments: Sequence[Ligament], poses: Mapping[str, Array], flexion: Array
 ) -> tuple[Ligament, ...]:
-    """Return the scene's bundles, slack lengths found where a reference strain is given.
+    """Return bundles whose slack lengths are found where a reference strain is given.
 
     A reference strain eps_r holds at the frame nearest to the reference flexion, where the
     bundle has length L_r: L0 = L_r/(1 + eps_r).
 
     Args:
-        tables: the scene's [[ligament]] tables.
+        ligaments: the bundles.
         poses: link -> pose_link_in_insert (f, 4, 4).
         flexion: (f,) rad, of the same frames.
 
@@ -166,54 +198,34 @@ def build_ligaments(
         InputError: unknown link, an end that lies on the other one, or no recorded frame near
             the reference flexion.
     """
-    return tuple(_build(table, poses, np.asarray(flexion, float)) for table in tables)
+    flexion = np.asarray(flexion, float)
+    return tuple(_with_slack_length(bundle, poses, flexion) for bundle in ligaments)
 
 
-def _build(table: LigamentTable, poses: Mapping[str, Array], flexion: Array) -> Ligament:
-    stiffness = table.stiffness_N_per_strain
-    if table.stiffness_N_per_mm is not None:
-        stiffness = table.stiffness_N_per_mm / MILLIMETRE
-    if stiffness is None:
-        raise InputError("has no stiffness", f"ligament {table.name}")
-    for end in (table.proximal, table.distal):
+def _with_slack_length(bundle: Ligament, poses: Mapping[str, Array], flexion: Array) -> Ligament:
+    where = f"ligament {bundle.name}"
+    for end in (bundle.proximal, bundle.distal):
         if end.link not in poses:
-            where = f"ligament {table.name}"
             raise InputError(f"no link '{end.link}'", where, names_near(end.link, poses))
-    bundle = Ligament(
-        table.name,
-        table.proximal.link,
-        _metres(table.proximal),
-        table.distal.link,
-        _metres(table.distal),
-        table.law,
-        stiffness,
-        1.0,
-    )
-    reference = nearest_frame(flexion, table.reference_flexion_deg)
+    reference = nearest_frame(flexion, bundle.reference_flexion)
     length = float(bundle.length(_frame(poses, reference)))
     if length == 0.0:
-        raise InputError("both ends are the same point", f"ligament {table.name}")
-    if table.slack_length_mm is not None:
-        slack = table.slack_length_mm * MILLIMETRE
-    else:
-        _check_reference(table, float(flexion[reference]))
-        slack = length / (1.0 + float(table.reference_strain or 0.0))
-    return Ligament(**{**vars(bundle), "slack_length": slack})
-
-
-def _check_reference(table: LigamentTable, flexion: float) -> None:
-    if abs(flexion - table.reference_flexion_deg * DEGREE) > FARTHEST_REFERENCE:
+        raise InputError("both ends are the same point", where)
+    if not np.isnan(bundle.slack_length):
+        return bundle
+    if abs(flexion[reference] - bundle.reference_flexion) > FARTHEST_REFERENCE:
         raise InputError(
-            f"its reference pose is at {table.reference_flexion_deg:g} deg of flexion, but the "
-            f"nearest recorded frame is at {flexion / DEGREE:.0f} deg",
-            f"ligament {table.name}",
+            f"its reference pose is at {bundle.reference_flexion / DEGREE:g} deg of flexion, but "
+            f"the nearest recorded frame is at {flexion[reference] / DEGREE:.0f} deg",
+            where,
             "give slack_length_mm, or a reference strain at a flexion that was recorded",
         )
+    return replace(bundle, slack_length=length / (1.0 + bundle.reference_strain))
 
 
-def nearest_frame(flexion: Array, flexion_deg: float) -> int:
-    """Return the index of the frame whose flexion (rad) is nearest to `flexion_deg`."""
-    return int(np.nanargmin(np.abs(flexion - flexion_deg * DEGREE)))
+def nearest_frame(flexion: Array, wanted: float) -> int:
+    """Return the index of the frame whose flexion (f,) is nearest to the wanted one, rad."""
+    return int(np.nanargmin(np.abs(flexion - wanted)))
 
 
 def strain_table(
@@ -235,7 +247,7 @@ def strain_table(
     Returns:
         name -> strain at each flexion.
     """
-    frames = [nearest_frame(flexion, angle) for angle in at_deg]
+    frames = [nearest_frame(flexion, angle * DEGREE) for angle in at_deg]
     reached = [
         abs(flexion[k] - angle * DEGREE) <= within_deg * DEGREE
         for k, angle in zip(frames, at_deg, strict=True)
@@ -245,19 +257,6 @@ def strain_table(
         strain = [float(bundle.strain(bundle.length(_frame(poses, k)))) for k in frames]
         table[bundle.name] = tuple(s if r else np.nan for s, r in zip(strain, reached, strict=True))
     return table
-
-
-def _placed(links: NDArray[np.str_], points: list[Array], poses: Mapping[str, Array]) -> Array:
-    """Return points (n, 3), each given in its own link, in the insert frame."""
-    placed = np.array(points, float).reshape(-1, 3)
-    for link in np.unique(links):
-        rows = links == link
-        placed[rows] = transform(poses[str(link)], placed[rows])
-    return placed
-
-
-def _metres(end: Attachment) -> Array:
-    return np.asarray(end.point_mm, float) * MILLIMETRE
 
 
 def _frame(poses: Mapping[str, Array], k: int) -> dict[str, Array]:

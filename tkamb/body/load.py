@@ -1,4 +1,4 @@
-"""Point forces, and their wrenches about the insert's origin."""
+"""Points on links, point forces, and their wrenches about the insert's origin."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -6,6 +6,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tkamb.geometry.frames import Array
+
+
+@dataclass(frozen=True, eq=False)
+class LinkPoint:
+    """A point fixed to a link.
+
+    Args:
+        link: name in the URDF.
+        position: (3,) m, in the link's frame.
+    """
+
+    link: str
+    position: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +36,12 @@ class PointForces:
     points: Array
     forces: Array
     moment: Array = field(default_factory=lambda: np.zeros(3))
+
+
+def wrench_of(points: Array, forces: Array) -> Array:
+    """Return force and moment (..., 6) about the origin of forces (..., 3) at points (..., 3)."""
+    points = np.broadcast_to(points, forces.shape)
+    return np.concatenate([forces, np.cross(points, forces)], axis=-1)
 
 
 def wrenches(loads: Sequence[PointForces]) -> Array:

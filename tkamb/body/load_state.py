@@ -1,25 +1,27 @@
-"""Which loads of the knee act at one frame: a condyle may be lifted, the quadriceps slack.
+"""Which loads of the knee act at one frame: a condyle may be lifted, the extensor muscle slack.
 
-Lines pull and contacts push: N_medial, N_lateral, Q, PL and PF along its normal are >= 0. A
-load that is left out is replaced by a residual moment, and only where it is asked for what it
-cannot do: a condyle that would have to pull, were it there; a quadriceps that would have to
-push. Otherwise a frame would be balanced without a load that it needs. So there are at most
-six sets: no condyle, the medial or the lateral one lifted, the extensor mechanism taut or
-slack, less those that the recorded gap excludes.
+Lines pull and contacts push: N_medial, N_lateral, the muscle's tension, PL and PF along its normal
+are >= 0. A load that is left out is replaced by a residual moment, and only where it is asked for
+what it cannot do: a condyle that would have to pull, were it there; a muscle that would have to
+push. Otherwise a frame would be balanced without a load that it needs. So there are at most six
+sets: no condyle, the medial or the lateral one lifted, the extensor mechanism taut or slack, less
+those that the recorded gap excludes.
 """
 
 from collections.abc import Iterable, Mapping
 from itertools import product
 from typing import NamedTuple
 
-from tkamb.body.inverse_dynamics import Solution
+from tkamb.body.unknowns import MUSCLE, Solution
 
 ROUNDING = 1e-6
 """N: a sign that is wrong by less is rounding."""
 
 PATELLA_MOMENT = 0.25
 """N·m: the patella's own weight and inertia (up to 5 N on an arm of 45 mm), which stand between
-a quadriceps that pulls and one that is slack."""
+an extensor that pulls and one that is slack."""
+
+PATELLAR_LOADS = ("patellar_ligament", "patellofemoral")
 
 
 class LoadState(NamedTuple):
@@ -27,20 +29,23 @@ class LoadState(NamedTuple):
 
     Args:
         lifted: sides of the condyles that carry nothing.
-        slack: the extensor mechanism carries nothing.
+        slack: muscles of the extensor mechanism, where it carries nothing; else empty.
     """
 
     lifted: frozenset[str]
-    slack: bool
+    slack: frozenset[str]
 
     @property
     def label(self) -> str:
         """What is left out, in words."""
         left_out = [f"{side} lifted" for side in sorted(self.lifted)]
-        return " and ".join(left_out + ["quadriceps slack"] * self.slack) or "all loaded"
+        left_out += [f"{muscle} slack" for muscle in sorted(self.slack)]
+        return " and ".join(left_out) or "all loaded"
 
 
-def load_states(sides: Iterable[str], off: frozenset[str], extensor: bool) -> list[LoadState]:
+def load_states(
+    sides: Iterable[str], off: frozenset[str], extensors: Iterable[str]
+) -> list[LoadState]:
     """Return the sets to try, fewest left out first, a slack muscle before a lifted condyle.
 
     The order is the preference where several hold: contact is seen in the recorded gap, the
@@ -49,12 +54,19 @@ def load_states(sides: Iterable[str], off: frozenset[str], extensor: bool) -> li
     Args:
         sides: of the condyles that are modelled.
         off: sides that the recorded gap keeps off the insert.
-        extensor: whether the extensor mechanism is modelled.
+        extensors: names of the extensor muscles; none: the mechanism is not modelled.
     """
-    touching = [side for side in sides if side not in off]
-    lifted = [off, *(off | {side} for side in touching if len(touching) == 2)]
-    states = [LoadState(*state) for state in product(lifted, (False, True)[: 1 + extensor])]
-    return sorted(states, key=lambda state: (len(state.lifted) + state.slack, len(state.lifted)))
+    near = [side for side in sides if side not in off]
+    lifted = [off, *(off | {side} for side in near if len(near) == 2)]
+    slack = dict.fromkeys([frozenset[str](), frozenset(extensors)])
+    states = [LoadState(*state) for state in product(lifted, slack)]
+    return sorted(
+        states, key=lambda state: (len(state.lifted) + bool(state.slack), len(state.lifted))
+    )
+
+
+def _muscles(values: Mapping[str, float]) -> list[str]:
+    return [name for name in values if name.startswith(MUSCLE)]
 
 
 def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
@@ -62,10 +74,10 @@ def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
     if not solution.regular:
         return ["singular equations"]
     values = solution.values
-    carried = ("medial_normal", "lateral_normal", "quadriceps", "patellar_ligament")
+    one_sided = ("medial_normal", "lateral_normal", *_muscles(values), *PATELLAR_LOADS)
     wrong = [
-        f"{name.replace('_', ' ')} {values[name]:.3g} N"
-        for name in (*carried, "patellofemoral")
+        f"{name.removeprefix(MUSCLE).replace('_', ' ')} {values[name]:.3g} N"
+        for name in one_sided
         if values.get(name, 0.0) < -ROUNDING
     ]
     if state.slack:
@@ -88,10 +100,11 @@ def contradictions(
     """
     wrong = wrong_signs(state, solutions[state])
     if state.slack:
-        taut = solutions[LoadState(state.lifted, False)]
-        pulls = [taut.values[name] for name in ("quadriceps", "patellar_ligament")]
-        if not min(pulls) < -ROUNDING:
-            wrong.append(f"quadriceps would pull with {pulls[0]:.3g} N")
+        taut = solutions[LoadState(state.lifted, frozenset())].values
+        pulls = {name: taut[name] for name in (*_muscles(taut), "patellar_ligament")}
+        if not min(pulls.values()) < -ROUNDING:
+            name, pull = next(iter(pulls.items()))
+            wrong.append(f"{name.removeprefix(MUSCLE)} would pull with {pull:.3g} N")
     for side in sorted(state.lifted - off):
         there = solutions[LoadState(state.lifted - {side}, state.slack)]
         force = there.values[f"{side}_normal"]

@@ -5,21 +5,21 @@ and three equations of a massless patella without friction:
 
     gap to the femoral component = 0
     length of the patellar ligament = its given length
-    quadriceps, ligament and contact force meet in one point (moment balance in the plane)
+    muscle, ligament and contact force meet in one point (moment balance in the plane)
 
-By virtual work the third says that the quadriceps' length is stationary among all places
+By virtual work the third says that the muscle's length is stationary among all places
 that satisfy the first two; a stable patella sits at a minimum of it. So the search turns
 the patella in the direction of the unbalanced moment until that changes sign.
 """
 
 from dataclasses import dataclass
+from enum import Enum
 from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import brentq
 
-from tkamb.body.patella_state import ExtensorMechanism, PatellaState, PatellaStatus
-from tkamb.body.patellofemoral import PatellarContact
+from tkamb.body.patellofemoral import PatellarContact, PatellofemoralContact
 from tkamb.body.wrapping import TautPath, path_in_link
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, inverse, rotate, transform
@@ -39,6 +39,82 @@ NEAR = 5e-3
 """m: a place found farther from where the button first touched lies behind the femur."""
 
 
+class PatellaStatus(Enum):
+    """How the search ended: found, or which condition of the place was not met."""
+
+    OK = "ok"
+    SEVERAL = "several_solutions"
+    EDGE = "contact_on_edge_of_femoral_mesh"
+    NO_CONTACT = "no contact: the button meets the femoral component at no rotation"
+    LINE = "a line's end lies inside what it wraps, or runs along the contact normal"
+    GAP = "the gap to the femoral component does not close"
+    LIGAMENT = "the patellar ligament's length is not met"
+    MOMENT = "moments balance at no rotation that was tried"
+    PULL = "the contact would have to pull, or the patellar ligament to push"
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a place; else the value says which condition failed."""
+        return self in (PatellaStatus.OK, PatellaStatus.SEVERAL, PatellaStatus.EDGE)
+
+
+@dataclass(frozen=True, eq=False)
+class PatellaState:
+    """The patella at one frame.
+
+    Args:
+        coordinates: (3,) patella_ap, patella_si (m), patella_rotation (rad); NaN if not found.
+        contact_point: (3,) m, on the line of action, insert frame.
+        contact_normal: (3,) unit, out of the femur into the patella, in the femur's sagittal
+            plane, insert frame.
+        contact_on_patella: (3,) m, the same point in the patella's frame.
+        gap: m, positive when apart.
+        ligament_ratio: patellar ligament tension per tension of the muscle, massless patella.
+        patellofemoral_ratio: patellofemoral force per tension of the muscle, massless patella.
+        shift: m along z, the mediolateral shift that is left out of the motion; first order.
+        tilt: rad about y, likewise.
+        status: how the search ended.
+    """
+
+    coordinates: Array
+    contact_point: Array
+    contact_normal: Array
+    contact_on_patella: Array
+    gap: float
+    ligament_ratio: float
+    patellofemoral_ratio: float
+    shift: float
+    tilt: float
+    status: PatellaStatus
+
+
+@dataclass(frozen=True, eq=False)
+class ExtensorMechanism:
+    """What stays the same over all frames.
+
+    Args:
+        contact: button against femoral component, in the patellar joint's frame.
+        pose_joint_in_femur: (4, 4), the patellar joint's frame on the femur link.
+        muscle_origin: (3,) m, femur link; of the stretch that leaves the femur.
+        muscle_insertion: (3,) m, patella link.
+        ligament_proximal: (3,) m, patella link.
+        ligament_distal: (3,) m, insert frame.
+        ligament_length: m.
+        femoral_outline: (n, 2) m, in the femur link's x-y plane; None: no wrapping.
+        insert_outline: (n, 2) m, in the insert's x-y plane; None: no wrapping.
+    """
+
+    contact: PatellofemoralContact
+    pose_joint_in_femur: Array
+    muscle_origin: Array
+    muscle_insertion: Array
+    ligament_proximal: Array
+    ligament_distal: Array
+    ligament_length: float
+    femoral_outline: Array | None = None
+    insert_outline: Array | None = None
+
+
 class _Lost(ComputationError):
     """A search that ended without a place: which condition was not met."""
 
@@ -49,11 +125,11 @@ class _Lost(ComputationError):
 
 @dataclass(frozen=True, eq=False)
 class _Balance:
-    """Forces on the patella per unit quadriceps tension, in the joint's frame."""
+    """Forces on the patella per unit tension of the muscle, in the joint's frame."""
 
     coordinates: Array
     contact: PatellarContact
-    quadriceps: TautPath
+    muscle: TautPath
     ligament: TautPath
     ligament_force: float
     normal_force: float
@@ -113,7 +189,7 @@ class _Frame:
         self.in_insert = np.asarray(pose_femur_in_insert, float) @ mechanism.pose_joint_in_femur
         self.insert = inverse(self.in_insert)
         self.femur = inverse(mechanism.pose_joint_in_femur)
-        self.origin = transform(self.femur, mechanism.quadriceps_origin)
+        self.origin = transform(self.femur, mechanism.muscle_origin)
         self.tuberosity = transform(self.insert, mechanism.ligament_distal)
 
     def balance(self, coordinates: Array) -> _Balance:
@@ -121,33 +197,33 @@ class _Frame:
         m = self.mechanism
         here = m.contact.pose(coordinates)
         contact = m.contact.at(coordinates)
-        quadriceps = path_in_link(
-            self.origin, transform(here, m.quadriceps_insertion), m.femoral_outline, self.femur
+        muscle = path_in_link(
+            self.origin, transform(here, m.muscle_insertion), m.femoral_outline, self.femur
         )
         ligament = path_in_link(
             transform(here, m.ligament_proximal), self.tuberosity, m.insert_outline, self.insert
         )
-        pull, hold = -quadriceps.end_direction[:2], ligament.start_direction[:2]
+        pull, hold = -muscle.end_direction[:2], ligament.start_direction[:2]
         sides = np.column_stack([hold, contact.normal[:2]])
         if abs(np.linalg.det(sides)) < 1e-6:
             raise ComputationError("the patellar ligament runs along the contact normal")
         ligament_force, normal_force = np.linalg.solve(sides, -pull)
         moment = (
-            _cross(quadriceps.points[-1], pull)
+            _cross(muscle.points[-1], pull)
             + ligament_force * _cross(ligament.points[0], hold)
             + normal_force * _cross(contact.point, contact.normal)
         )
         return _Balance(
             coordinates,
             contact,
-            quadriceps,
+            muscle,
             ligament,
             float(ligament_force),
             float(normal_force),
             float(moment),
         )
 
-    def settled(self, start: Array, rotation: float) -> _Balance:
+    def at_rotation(self, start: Array, rotation: float) -> _Balance:
         """Return the balance where gap and ligament length hold at a rotation (Newton).
 
         Raises:
@@ -174,11 +250,11 @@ class _Frame:
         Raises:
             ComputationError: there is none within `WIDEST_TURN`.
         """
-        here = self.settled(guess, float(guess[2]))
+        here = self.at_rotation(guess, float(guess[2]))
         step = FIRST_STEP
         while abs(here.coordinates[2] - guess[2]) < WIDEST_TURN:
             turn = here.coordinates[2] + np.sign(here.moment) * step
-            there = self.settled(here.coordinates, float(turn))
+            there = self.at_rotation(here.coordinates, float(turn))
             if there.moment * here.moment <= 0.0:
                 return self.between(here, there)
             here, step = there, 1.6 * step
@@ -190,7 +266,7 @@ class _Frame:
 
         def moment(rotation: float) -> float:
             nonlocal last
-            last = self.settled(last.coordinates, rotation)
+            last = self.at_rotation(last.coordinates, rotation)
             return last.moment
 
         ends = (here.coordinates[2], there.coordinates[2])
@@ -198,7 +274,7 @@ class _Frame:
         return last
 
     def scan(self) -> tuple[_Balance, bool]:
-        """Return the stable balance with the shortest quadriceps, and whether there are more.
+        """Return the stable balance with the shortest muscle, and whether there are more.
 
         Raises:
             _Lost: there is none; with the condition that the nearest miss did not meet.
@@ -223,7 +299,7 @@ class _Frame:
         if not found:
             misses += [PatellaStatus.MOMENT] * any(places)
             raise _Lost(max(misses, key=_CONDITIONS.index))
-        return min(found, key=lambda b: b.quadriceps.length), len(found) > 1
+        return min(found, key=lambda b: b.muscle.length), len(found) > 1
 
     def first_touch(self, rotation: float) -> _Balance:
         """Return the balance at a rotation, the patella swung in on its ligament from in front.
@@ -248,7 +324,7 @@ class _Frame:
         for _ in range(6):
             middle = 0.5 * (free + deep)
             free, deep = (free, middle) if m.contact.touches(place(middle)) else (middle, deep)
-        found = self.settled(place(free), rotation)
+        found = self.at_rotation(place(free), rotation)
         if np.linalg.norm((found.coordinates - place(free))[:2]) > NEAR:
             raise _Lost(PatellaStatus.GAP)
         return found

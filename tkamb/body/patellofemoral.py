@@ -31,10 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
-from tkamb.geometry.corner_normals import corner_normals, sharp_edges
 from tkamb.geometry.frames import Array, pose, transform
-from tkamb.geometry.nearest import NearestPoints
-from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.normals import sharp_edges
 from tkamb.geometry.surface import Surface
 
 PATCH_DEPTH = 5e-5
@@ -108,8 +106,8 @@ class PatellofemoralContact:
         tilt_yield: float = TILT_YIELD,
     ) -> None:
         self.ml, self._yield = ml, np.array([lateral_yield, tilt_yield])
-        self._nearest = NearestPoints(femoral)
-        self._corner_normals, self._sharp = corner_normals(femoral), sharp_edges(femoral)
+        self._nearest = femoral.nearest
+        self._corner_normals, self._sharp = femoral.corner_normals, sharp_edges(femoral)
         self._samples = _joint_side(patellar)
         self._left: NDArray[np.bool_] = np.asarray(self._samples[:, 2] < 0.0)
         count = len(self._samples)
@@ -195,7 +193,7 @@ def _joint_side(patellar: Surface) -> Array:
     axes = [np.arange(low[k] + 0.5 * SAMPLE_SPACING, high[k], SAMPLE_SPACING) for k in (1, 2)]
     y, z = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
     start = np.column_stack([np.full(len(y), low[0] - SAMPLE_SPACING), y, z])
-    distance, _ = RayCaster(patellar).first(start, np.array([1.0, 0.0, 0.0]))
+    distance, _ = patellar.rays.first(start, np.array([1.0, 0.0, 0.0]))
     hit = np.isfinite(distance)
     samples = start[hit] + distance[hit, None] * np.array([1.0, 0.0, 0.0])
     if not ((samples[:, 2] < 0.0).any() and (samples[:, 2] >= 0.0).any()):

@@ -21,11 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tkamb.geometry.condyles import LowestPoints
 from tkamb.geometry.first_touch import FirstTouch
-from tkamb.geometry.frames import Array, inverse, knee_pose, rotate, transform
-from tkamb.geometry.lowest import LowestPoints
-from tkamb.geometry.rays import RayCaster
-from tkamb.geometry.smooth_normals import smooth_normals
+from tkamb.geometry.frames import Array, inverse, knee_pose, knee_twist, rotate, transform
 from tkamb.geometry.surface import Surface
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -64,7 +62,7 @@ class InsertProfile:
     """
 
     def __init__(self, insert: Surface) -> None:
-        self._insert, self._rays = insert, RayCaster(insert)
+        self._insert = insert
         self._above = float(insert.bounds[1, 1]) + 1e-3
 
     def at(self, points: Array) -> tuple[Array, Array]:
@@ -75,13 +73,13 @@ class InsertProfile:
         """
         start = np.array(points, float)
         start[:, 1] = self._above
-        distance, face = self._rays.first(start, -UP)
+        distance, face = self._insert.rays.first(start, -UP)
         hit = face >= 0
         height, slope = np.full(len(start), np.nan), np.full(len(start), np.nan)
         height[hit] = self._above - distance[hit]
         feet = start[hit]
         feet[:, 1] = height[hit]
-        normal = smooth_normals(self._insert, feet, face[hit])
+        normal = self._insert.smooth_normals(feet, face[hit])
         slope[hit] = np.arctan2(-normal[:, 0], normal[:, 1])
         return height, slope
 
@@ -128,9 +126,9 @@ def slip_of_points(
     backwards = -np.sign(np.diff(points[:, 0]))
     lever = _mean(points[:, 2] - centre_z) / np.cos(_mean(slope))
     return CondyleSlip(
-        _cumulated(femoral_arcs(points, poses)),
-        _cumulated(backwards * travelled),
-        _cumulated(np.diff(axial_rotation) * lever),
+        _cumulate(femoral_arcs(points, poses)),
+        _cumulate(backwards * travelled),
+        _cumulate(np.diff(axial_rotation) * lever),
     )
 
 
@@ -177,6 +175,23 @@ def sliding_velocity(velocity: Array, spin: Array, arm: Array, lever: Array) -> 
     return np.asarray((velocity + np.cross(spin, arm))[:, 0] - spin[:, 1] * lever)
 
 
+def forward_sliding(coordinates: Array, rates: Array, centre: Array, contact: Array) -> float:
+    """Return the forward sliding (m/s) at a contact point by rigid-body kinematics.
+
+    Args:
+        coordinates: (6,) knee coordinates, m and rad.
+        rates: (6,) their rates.
+        centre: (3,) m, geometric centre of the component, femoral frame.
+        contact: (3,) m, insert frame.
+    """
+    velocity, spin = knee_twist(coordinates, rates)
+    arm, lever = (
+        contact - coordinates[:3],
+        contact[2] - transform(knee_pose(coordinates), centre)[2],
+    )
+    return float(sliding_velocity(velocity[None], spin[None], arm[None], np.array([lever]))[0])
+
+
 def roll_slip_motion(
     femoral: Surface,
     insert: Surface,
@@ -184,7 +199,7 @@ def roll_slip_motion(
     coordinates: Array,
     slip: Array,
 ) -> Array:
-    """Return the source's motion: rotations given, AP from rolling plus slip, SI from contact.
+    """Return the motion of Sharma (2008): rotations given, AP rolls and slips, SI from contact.
 
     The mean of the condyles' contact points moves backwards by the femoral arc less the
     slip, along the insert; the femur comes down to first touch in every frame. The first
@@ -210,7 +225,7 @@ def roll_slip_motion(
     contact = moved[0, 0] + arms[0, 0]
     moved[0, 1] -= touch.travel(knee_pose(moved[0]))
     for k in range(1, len(moved)):
-        contact = _rolled(profile, contact, poses[k, 2, 3] + arms[k, 2], backwards[k - 1])
+        contact = _roll(profile, contact, poses[k, 2, 3] + arms[k, 2], backwards[k - 1])
         contact -= axial[k - 1]
         moved[k, 0] = contact - arms[k, 0]
         moved[k, 1] -= touch.travel(knee_pose(moved[k])) if np.isfinite(contact) else np.nan
@@ -228,7 +243,7 @@ def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
     return points.mean(axis=0) - poses[:, :3, 3], np.asarray(arcs)
 
 
-def _rolled(profile: InsertProfile, x: float, z: float, backwards: float) -> float:
+def _roll(profile: InsertProfile, x: float, z: float, backwards: float) -> float:
     """Return x after an arc backwards along the insert's surface at z (midpoint rule)."""
     _, slope = profile.at(np.array([[x, 0.0, z]]))
     middle = x - 0.5 * backwards * np.cos(slope[0])
@@ -240,5 +255,5 @@ def _mean(values: Array) -> Array:
     return np.asarray(0.5 * (values[1:] + values[:-1]))
 
 
-def _cumulated(steps: Array) -> Array:
+def _cumulate(steps: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(steps)])

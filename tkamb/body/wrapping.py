@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tkamb.body.load import PointForces
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, transform
 
@@ -101,25 +100,6 @@ def taut_path(start: Array, end: Array, outline: Array) -> TautPath:
 def is_inside(point: Array, outline: Array) -> bool:
     """Say whether a point (3,) lies within an outline (n, 2) of its own frame."""
     return bool((_height(point[:2], outline) >= 0.0).all())
-
-
-def loads_per_unit_tension(
-    path: TautPath, start_link: str, end_link: str, wrapped_link: str | None
-) -> tuple[PointForces, ...]:
-    """Return the forces of a unit tension on the links, in the path's frame.
-
-    They sum to zero force and zero moment: both ends are pulled along the path, and each
-    corner presses the wrapped link by the change of direction there.
-    """
-    directions = path.directions
-    loads = [
-        PointForces(start_link, path.points[:1], directions[:1]),
-        PointForces(end_link, path.points[-1:], -directions[-1:]),
-    ]
-    if path.wrapped and wrapped_link is not None:
-        turns = np.diff(directions, axis=0)
-        loads.append(PointForces(wrapped_link, path.points[1:-1], turns))
-    return tuple(loads)
 
 
 def path_in_link(

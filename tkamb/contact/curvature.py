@@ -134,7 +134,7 @@ def _value(quadric: Array, place: Array) -> float:
 
 
 def _slope(quadric: Array, place: Array) -> Array:
-    return np.asarray(quadric[1:3] + _hessian(quadric) @ place)
+    return quadric[1:3] + _hessian(quadric) @ place
 
 
 def _nearest_place(difference: Array, radius: float) -> Array | None:

@@ -5,34 +5,24 @@ from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.contact.bed import STEEPEST, Bed, sample_bed
 from tkamb.contact.curvature import OsculatingContact, osculate
 from tkamb.contact.ellipse import ContactEllipse, contact_ellipse
-from tkamb.contact.foundation import gaps_along_normals
 from tkamb.contact.model import ContactModel
-from tkamb.contact.pair import ContactPair, PreparedContact
-from tkamb.contact.pressing import approach_at, failed_result
-from tkamb.contact.result import CondyleContact, ContactResult, ContactStatus
-from tkamb.contact.summary import summarise_condyles, thickness_under, wrench_of
-from tkamb.contact.validity import peak_flags
-from tkamb.geometry.condyles import condyle_split
-from tkamb.geometry.first_touch import FirstTouch
-from tkamb.geometry.frames import Array
-from tkamb.geometry.rays import RayCaster
+from tkamb.contact.result import CondyleContact, ContactResult, peak_flags, thickness_under
+from tkamb.contact.samples import STEEPEST, SampledContact, SurfaceSamples, gaps_along_normals
+from tkamb.geometry.frames import SIDES, Array, Index
 
 SHORT_AXIS_SUB_CELLS = 10
 """Sub-cells on the ellipse's short semi-axis, over which the pressure is averaged."""
 FEWEST_SUB_CELLS, MOST_SUB_CELLS = 6, 50
 """Bounds of the sub-cells per edge of a grid cell."""
-LEAST_ON_BED = 0.95
+LEAST_HELD = 0.95
 """Share of the semi-ellipsoid that must lie on the insert."""
 FLATTEST = 1e-6
 """Smallest ratio of the two relative curvatures that still makes an ellipse."""
 
 
-SIDES = ("medial", "lateral")
 CONFORMING = "conforms to the insert: no ellipse (relative curvature is not positive)"
 
 
@@ -47,35 +37,6 @@ class CondyleGeometry:
 
     height: float
     contact: OsculatingContact | None
-
-
-@dataclass(frozen=True, eq=False)
-class HertzState(PreparedContact):
-    """Ray casters, first touch and the bed that shows the pressure.
-
-    Args:
-        pair: the two bodies.
-        bed: the sampled articular surface.
-        insert_rays: insert frame.
-        femoral_rays: femoral frame.
-        touch: first touch per condyle.
-    """
-
-    pair: ContactPair
-    bed: Bed
-    insert_rays: RayCaster
-    femoral_rays: RayCaster
-    touch: FirstTouch
-
-    @property
-    def points(self) -> Array:  # type: ignore[override]
-        """Map points (n, 3) m, insert frame."""
-        return self.bed.points
-
-    @property
-    def triangles(self) -> NDArray[np.int64]:  # type: ignore[override]
-        """Map triangles (k, 3)."""
-        return self.bed.triangles
 
 
 @dataclass(frozen=True)
@@ -115,25 +76,15 @@ class Hertz(ContactModel):
     resolution: float = 1e-3
     patch_radius: float = 4e-3
 
-    def prepare(self, pair: ContactPair) -> HertzState:
-        """Sample the articular surface and build ray casters."""
-        return HertzState(
-            pair,
-            sample_bed(pair.insert, self.resolution),
-            RayCaster(pair.insert),
-            RayCaster(pair.femoral),
-            FirstTouch(pair.femoral, pair.insert, condyle_split(pair.femoral)),
-        )
-
     def evaluate(
-        self, state: HertzState, pose: Array, guess: ContactResult | None = None
+        self, state: SampledContact, pose: Array, guess: ContactResult | None = None
     ) -> ContactResult:
         """Return the contact at a pose; see `ContactModel`."""
         if not np.isfinite(pose).all():
-            return failed_result(state, pose, "the pose is not finite")
-        bed, material = state.bed, state.pair.material
+            return ContactResult.failed(state, pose, "the pose is not finite")
+        samples, material = state.surface, state.pair.material
         plane_modulus = material.young_modulus / (1 - material.poisson_ratio**2)
-        pressure = np.zeros((2, len(bed.points)))
+        pressure = np.zeros((2, len(samples.points)))
         patches: list[CondyleContact | None] = [None, None]
         flags: list[str] = []
         for side, geometry in enumerate(condyle_geometry(state, pose, self.patch_radius)):
@@ -141,26 +92,26 @@ class Hertz(ContactModel):
                 continue
             if geometry.contact is None:
                 if pose[1, 3] < geometry.height:
-                    return failed_result(state, pose, f"{SIDES[side]} condyle {CONFORMING}")
+                    return ContactResult.failed(state, pose, f"{SIDES[side]} condyle {CONFORMING}")
                 continue
             depth = indentation(geometry, pose)
             if depth <= 0:
                 continue
             flat, steep = geometry.contact.relative / 2
             patch = contact_ellipse(flat, steep, depth, plane_modulus)
-            pressure[side], share = map_pressure(bed, geometry.contact, patch)
-            if share < LEAST_ON_BED:
-                return failed_result(
+            pressure[side], share = map_pressure(samples, geometry.contact, patch)
+            if share < LEAST_HELD:
+                return ContactResult.failed(
                     state, pose, f"{SIDES[side]} contact ellipse leaves the insert"
                 )
-            carried = patches[side] = _described(bed, geometry.contact, patch)
+            carried = patches[side] = _described(samples, geometry.contact, patch)
             if patch.long_axis > carried.thickness:
                 flags.append(f"{SIDES[side]} contact ellipse is wider than the insert is thick")
         return _collected(state, pose, pressure, patches, tuple(flags))
 
 
 def condyle_geometry(
-    state: HertzState, pose: Array, patch_radius: float
+    state: SampledContact, pose: Array, patch_radius: float
 ) -> tuple[CondyleGeometry | None, CondyleGeometry | None]:
     """Return how each condyle meets the insert; the pose's y does not matter.
 
@@ -180,48 +131,52 @@ def indentation(geometry: CondyleGeometry, pose: Array) -> float:
 
 
 def map_pressure(
-    bed: Bed, contact: OsculatingContact, patch: ContactEllipse
+    samples: SurfaceSamples, contact: OsculatingContact, patch: ContactEllipse
 ) -> tuple[Array, float]:
-    """Return the semi-ellipsoid on the bed (n,), Pa, and the share of it that the bed holds.
+    """Return the semi-ellipsoid on the samples (n,), Pa, and the share of it that they hold.
 
-    Averaged over sub-cells of each grid cell, then scaled so that the vertical force on the
-    bed is the patch's force times n_y. A patch much narrower than a cell goes to the nearest
-    point.
+    Averaged over sub-cells of each grid cell, then scaled so that the vertical force is the
+    patch's force times n_y. A patch much narrower than a cell goes to the nearest point.
     """
-    pressure = np.zeros(len(bed.points))
-    offset = bed.points - contact.point
+    pressure = np.zeros(len(samples.points))
+    offset = samples.points - contact.point
     wanted = patch.force * contact.normal[1]
-    if patch.short_axis < bed.resolution / MOST_SUB_CELLS * SHORT_AXIS_SUB_CELLS:
+    if patch.short_axis < samples.resolution / MOST_SUB_CELLS * SHORT_AXIS_SUB_CELLS:
         nearest = int(np.einsum("ij,ij->i", offset, offset).argmin())
-        pressure[nearest] = wanted / (bed.area[nearest] * bed.normals[nearest, 1])
+        pressure[nearest] = wanted / (samples.area[nearest] * samples.normals[nearest, 1])
         return pressure, 1.0
     beyond = np.abs(offset @ contact.axes.T) - [patch.long_axis, patch.short_axis]
-    low = np.abs(offset @ contact.normal) < patch.long_axis + bed.resolution
-    near = np.flatnonzero((beyond.max(axis=1) < 2 * bed.resolution) & low)
-    pressure[near] = patch.peak_pressure * _cell_means(bed, near, contact, patch)
-    held = float((pressure * bed.area) @ bed.normals[:, 1])
+    low = np.abs(offset @ contact.normal) < patch.long_axis + samples.resolution
+    near = np.flatnonzero((beyond.max(axis=1) < 2 * samples.resolution) & low)
+    pressure[near] = patch.peak_pressure * _cell_means(samples, near, contact, patch)
+    held = float((pressure * samples.area) @ samples.normals[:, 1])
     return (pressure * (wanted / held), held / wanted) if held > 0 else (pressure, 0.0)
 
 
 def _cell_means(
-    bed: Bed, near: NDArray[np.int64], contact: OsculatingContact, patch: ContactEllipse
+    samples: SurfaceSamples,
+    near: Index,
+    contact: OsculatingContact,
+    patch: ContactEllipse,
 ) -> Array:
     """Return the mean of sqrt(1 - (u/a)² - (v/b)²) over the grid cells of points (m,)."""
-    wanted = int(np.ceil(SHORT_AXIS_SUB_CELLS * bed.resolution / patch.short_axis))
+    wanted = int(np.ceil(SHORT_AXIS_SUB_CELLS * samples.resolution / patch.short_axis))
     count = min(max(wanted, FEWEST_SUB_CELLS), MOST_SUB_CELLS)
-    ticks = ((np.arange(count) + 0.5) / count - 0.5) * bed.resolution
+    ticks = ((np.arange(count) + 0.5) / count - 0.5) * samples.resolution
     dx, dz = (grid.ravel() for grid in np.meshgrid(ticks, ticks))
-    normals = bed.normals[near]
+    normals = samples.normals[near]
     slope = -normals[:, [0, 2]] / np.maximum(normals[:, 1:2], STEEPEST)
     rise = slope[:, :1] * dx + slope[:, 1:] * dz
     offset = np.stack(np.broadcast_arrays(dx, rise, dz), axis=-1)
-    places = (bed.points[near] - contact.point)[:, None] + offset
-    u, v = np.moveaxis(places @ contact.axes.T, -1, 0)
+    positions = (samples.points[near] - contact.point)[:, None] + offset
+    u, v = np.moveaxis(positions @ contact.axes.T, -1, 0)
     inside = 1 - (u / patch.long_axis) ** 2 - (v / patch.short_axis) ** 2
-    return np.asarray(np.sqrt(np.maximum(inside, 0.0)).mean(axis=1))
+    return np.sqrt(np.maximum(inside, 0.0)).mean(axis=1)
 
 
-def _described(bed: Bed, contact: OsculatingContact, patch: ContactEllipse) -> CondyleContact:
+def _described(
+    samples: SurfaceSamples, contact: OsculatingContact, patch: ContactEllipse
+) -> CondyleContact:
     area = np.pi * patch.long_axis * patch.short_axis
     return CondyleContact(
         force=patch.force,
@@ -229,59 +184,48 @@ def _described(bed: Bed, contact: OsculatingContact, patch: ContactEllipse) -> C
         mean_pressure=patch.force / area,
         peak_pressure=patch.peak_pressure,
         centre_of_pressure=contact.point,
-        thickness=thickness_under(contact.point, bed.points, bed.thickness),
+        thickness=thickness_under(contact.point, samples.points, samples.thickness),
     )
 
 
 def _collected(
-    state: HertzState,
+    state: SampledContact,
     pose: Array,
     pressure: Array,
     patches: list[CondyleContact | None],
     flags: tuple[str, ...],
 ) -> ContactResult:
-    bed = state.bed
     both = pressure.sum(axis=0)
-    nodal_force = -(both * bed.area)[:, None] * bed.normals
-    medial = pressure[0] > 0
-    summed = summarise_condyles(medial, bed.points, both, bed.area, nodal_force, bed.thickness)
-    sides = [
-        None
+    gap = gaps_along_normals(state.surface, state.pair.femoral, pose)
+    result = ContactResult.of(state, pose, both, gap, medial=pressure[0] > 0)
+    sides = {
+        side: None
         if patch is None or found is None
         else replace(patch, force=found.force, mean_pressure=found.force / patch.area)
-        for patch, found in zip(patches, summed, strict=True)
-    ]
-    return ContactResult(
-        pose=np.array(pose, float),
-        points=bed.points,
-        normals=bed.normals,
-        pressure=both,
-        area=bed.area,
-        gap=gaps_along_normals(bed, state.femoral_rays, pose),
-        nodal_force=nodal_force,
-        wrench_on_insert=wrench_of(bed.points, nodal_force),
-        medial=sides[0],
-        lateral=sides[1],
-        approach=approach_at(state.pair, pose),
-        status=ContactStatus.OK,
-        flags=(*flags, *peak_flags(*sides)),
+        for side, patch, found in zip(SIDES, patches, (result.medial, result.lateral), strict=True)
+    }
+    return replace(
+        result,
+        medial=sides["medial"],
+        lateral=sides["lateral"],
+        flags=(*flags, *peak_flags(sides)),
     )
 
 
 @lru_cache(maxsize=8)
 def _geometry(
-    state: HertzState, level: bytes, patch_radius: float
+    state: SampledContact, level: bytes, patch_radius: float
 ) -> tuple[CondyleGeometry | None, CondyleGeometry | None]:
     pose = np.frombuffer(level).reshape(4, 4)
     found: list[CondyleGeometry | None] = []
-    for touch in state.touch.at(pose):
+    for touch in state.pair.first_touch.at(pose):
         if touch is None:
             found.append(None)
             continue
         touching = pose.copy()
         touching[1, 3] = -touch.travel
         contact = osculate(
-            state.insert_rays, state.femoral_rays, touching, touch.point, patch_radius
+            state.pair.insert.rays, state.pair.femoral.rays, touching, touch.point, patch_radius
         )
         usable = contact is not None and contact.relative[0] > FLATTEST * contact.relative[1]
         found.append(CondyleGeometry(-touch.travel, contact if usable else None))

@@ -80,7 +80,7 @@ class RambergOsgood:
         """Return d sigma / d eps = E / (1 + alpha n u^(n-1)), Pa."""
         ratio = self._ratio(strain, young_modulus)
         softening = self.alpha * self.exponent * ratio ** (self.exponent - 1)
-        return np.asarray(young_modulus / (1 + softening))
+        return young_modulus / (1 + softening)
 
     def _ratio(self, strain: Array, young_modulus: float) -> Array:
         """Return u = |sigma| / sigma0."""
@@ -158,12 +158,12 @@ class TabulatedLaw:
         """Return stress, Pa."""
         inside = np.clip(strain, -self.strain[-1], self.strain[-1])
         beyond = (strain - inside) * self._slope(self.strain[-1])
-        return np.asarray((self._curve(inside) + beyond) * (young_modulus / self.young_modulus))
+        return (self._curve(inside) + beyond) * (young_modulus / self.young_modulus)
 
     def tangent(self, strain: Array, young_modulus: float) -> Array:
         """Return d stress / d strain, Pa."""
         inside = np.clip(strain, -self.strain[-1], self.strain[-1])
-        return np.asarray(self._slope(inside) * (young_modulus / self.young_modulus))
+        return self._slope(inside) * (young_modulus / self.young_modulus)
 
 
 @dataclass(frozen=True)
@@ -241,8 +241,8 @@ _POLYETHYLENE = {
     "reference_stress": 8.4194 * MEGAPASCAL,
     "exponent": 4.5485,
 }
-"""The source's fit (section 5.2) to the true stress-strain data of Halloran et al., J Biomech
-38:323 (2005), doi:10.1016/j.jbiomech.2004.02.046."""
+"""The fit of Sharma (2008), section 5.2, to the true stress-strain data of Halloran et al., J
+Biomech 38:323 (2005), doi:10.1016/j.jbiomech.2004.02.046."""
 
 MATERIALS = {
     "polyethylene": "Ramberg-Osgood fit to true stress-strain of UHMWPE, E 561.5 MPa, nu 0.45",

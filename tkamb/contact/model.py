@@ -1,4 +1,4 @@
-"""The contract that every contact model answers.
+"""The contract that every contact model answers (see docs/contact_model.md).
 
 *Given this pose of the femoral component in the insert, what pressure and what wrench?*
 What depends on geometry alone is paid once, in `prepare`. All vectors are in the insert
@@ -8,10 +8,13 @@ frame (x anterior, y superior, z to the subject's right), SI units.
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
+import numpy as np
+
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import press_by_search
 from tkamb.contact.probe import Probe
 from tkamb.contact.result import ContactResult
+from tkamb.contact.samples import SampledContact, sample_surface
 from tkamb.geometry.frames import Array
 
 
@@ -27,9 +30,16 @@ class ContactModel(ABC):
     assumes: ClassVar[str]
     needs: ClassVar[str]
 
-    @abstractmethod
+    resolution: float
+
     def prepare(self, pair: ContactPair) -> Any:
-        """Do the work that depends on geometry and material alone."""
+        """Do the work that depends on geometry and material alone.
+
+        Here: sample the insert's surface, ready the first touch. A model that prepares more
+        returns a `tkamb.contact.pair.PreparedContact` of its own.
+        """
+        pair.touch_at(np.eye(4))
+        return SampledContact(pair, sample_surface(pair.insert, self.resolution))
 
     @abstractmethod
     def evaluate(

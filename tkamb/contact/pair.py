@@ -1,17 +1,16 @@
 """The two bodies of a contact, and what a model prepares of them."""
 
-from abc import ABC
+import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.materials import Material
-from tkamb.geometry.first_touch import FirstTouch
-from tkamb.geometry.frames import Array
-from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.condyles import condyle_split
+from tkamb.geometry.first_touch import FirstTouch, Touch
+from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.surface import Surface
 
 Bearing = Literal["fixed", "mobile"]
@@ -34,27 +33,93 @@ class ContactPair:
     bearing: Bearing = "fixed"
 
     @cached_property
-    def femoral_rays(self) -> RayCaster:
-        """Rays against the femoral component, in its own frame."""
-        return RayCaster(self.femoral)
-
-    @cached_property
-    def insert_rays(self) -> RayCaster:
-        """Rays against the insert."""
-        return RayCaster(self.insert)
+    def split(self) -> float | None:
+        """z (m, femoral frame) between the condyles; None: one condyle, called medial."""
+        return condyle_split(self.femoral)
 
     @cached_property
     def first_touch(self) -> FirstTouch:
-        """How far the femoral component travels until either condyle touches."""
-        return FirstTouch(self.femoral, self.insert, rays=(self.femoral_rays, self.insert_rays))
+        """How far the femoral component travels until each condyle touches."""
+        return FirstTouch(self.femoral, self.insert, self.split)
+
+    def touch_at(self, pose: Array) -> Touch | None:
+        """Return the first touch of either condyle, whatever the pose's y; travel from y = 0.
+
+        None if the femoral component does not lie over the insert or the pose is not finite.
+        The last few answers are kept.
+        """
+        level = np.array(pose, float)
+        if not np.isfinite(level).all():
+            return None
+        level[1, 3] = 0.0
+        return _first_touch(self, level.tobytes())
+
+    def first_touch_height(self, pose: Array) -> float:
+        """Return the y (m) of the femoral origin at which the bodies first touch.
+
+        It depends on the rotation, x and z of pose_femoral_in_insert, not on its y; NaN where
+        `touch_at` finds nothing.
+        """
+        touch = self.touch_at(pose)
+        return math.nan if touch is None else -touch.travel
+
+    def approach(self, pose: Array) -> float:
+        """Return the travel along -y since first touch (m) at a pose; 0 when apart."""
+        depth = self.first_touch_height(pose) - float(pose[1, 3])
+        return depth if depth > 0 else 0.0
+
+    def pose_at_approach(self, pose: Array, approach: float) -> Array:
+        """Return the pose moved along y to an approach (m)."""
+        moved = np.array(pose, float)
+        moved[1, 3] = self.first_touch_height(pose) - approach
+        return moved
 
 
-class PreparedContact(ABC):
-    """What `prepare` returns: read-only, holds the map's points and their triangles."""
+@lru_cache(maxsize=8)
+def _first_touch(pair: ContactPair, level: bytes) -> Touch | None:
+    return pair.first_touch.either(np.frombuffer(level).reshape(4, 4))
+
+
+@dataclass(frozen=True, eq=False)
+class ContactSurface:
+    """The insert's articular surface as points: what every pressure map stands on.
+
+    Args:
+        points: (n, 3) m, insert frame, on the undeformed insert.
+        normals: (n, 3) outward unit normals.
+        area: (n,) m², tributary area of each point on the true surface, not projected.
+        thickness: (n,) m, insert below each point along y.
+        triangles: (k, 3) of neighbouring points, facing up.
+    """
+
+    points: Array
+    normals: Array
+    area: Array
+    thickness: Array
+    triangles: Index
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedContact:
+    """What `prepare` returns: read-only; a model may add what it needs.
+
+    Args:
+        pair: the two bodies.
+        surface: the points of every map of this state.
+    """
 
     pair: ContactPair
-    points: Array
-    triangles: NDArray[np.int64]
+    surface: ContactSurface
+
+    @property
+    def points(self) -> Array:
+        """Map points (n, 3) m, insert frame."""
+        return self.surface.points
+
+    @property
+    def triangles(self) -> Index:
+        """Map triangles (k, 3)."""
+        return self.surface.triangles
 
     @property
     def node_count(self) -> int:

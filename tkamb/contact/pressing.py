@@ -1,22 +1,21 @@
-"""The generic way to press: find the approach along -y that carries a load."""
+"""The generic way to press: find the approach along -y that carries a load.
+
+And where the answer stops being one: bodies pressed through each other.
+"""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.contact.validity import HALF, compression
 from tkamb.errors import InputError
 from tkamb.geometry.first_touch import Touch
 from tkamb.geometry.frames import Array
-
-if TYPE_CHECKING:
-    from tkamb.contact.model import ContactModel
+from tkamb.units import MILLIMETRE
 
 LOAD_TOLERANCE = 1e-6
 """Largest relative difference between reaction and load that counts as reached."""
@@ -30,7 +29,27 @@ FINEST_TRAVEL = 1e-16
 """m; a bracket this narrow cannot be narrowed."""
 MOST_EVALUATIONS = 80
 
+HALF = 0.5
+"""Approach over thickness beyond which a result is flagged; at 1 it is none."""
+AROUND = 0.5 * MILLIMETRE
+"""Within this of its rim the insert is as thick as anywhere so near: it has no thickness there."""
+SKIN = 1e-7
+"""m; rays into the insert start so far below its surface, and nothing counts as thinner."""
+
+THROUGH = "is there a spike or a thin place in a mesh?"
+COLUMNS = np.array([(x, 0.0, z) for x in (0, -1, 1) for z in (0, -1, 1)]) * AROUND
+DOWN = np.array([0.0, -1.0, 0.0])
+
 Reaction = Callable[[float], float]
+
+
+class Evaluates(Protocol):
+    """What the search needs of a contact model."""
+
+    def evaluate(
+        self, state: Any, pose: Array, guess: ContactResult | None = None
+    ) -> ContactResult:
+        """Return the contact at a pose."""
 
 
 @dataclass(frozen=True)
@@ -50,30 +69,6 @@ class LoadSearch:
     deepest: float
 
 
-def first_touch_height(pair: ContactPair, pose: Array) -> float:
-    """Return the y (m) of the femoral origin at which the bodies first touch.
-
-    It depends on the rotation, x and z of pose_femoral_in_insert, not on its y; NaN if the
-    femoral component does not lie over the insert or the pose is not finite. The last few
-    answers are kept.
-    """
-    touch = _touch_at(pair, pose)
-    return math.nan if touch is None else -touch.travel
-
-
-def approach_at(pair: ContactPair, pose: Array) -> float:
-    """Return the travel along -y since first touch (m) at a pose; 0 when apart."""
-    depth = first_touch_height(pair, pose) - float(pose[1, 3])
-    return depth if depth > 0 else 0.0
-
-
-def pose_at_approach(pair: ContactPair, pose: Array, approach: float) -> Array:
-    """Return the pose moved along y to an approach (m)."""
-    moved = np.array(pose, float)
-    moved[1, 3] = first_touch_height(pair, pose) - approach
-    return moved
-
-
 def check_load(load: float) -> None:
     """Raise an InputError for a load (N) that no contact can carry."""
     if not (math.isfinite(load) and load >= 0):
@@ -81,7 +76,7 @@ def check_load(load: float) -> None:
 
 
 def press_by_search(
-    model: "ContactModel",
+    model: Evaluates,
     state: Any,
     load: float,
     pose: Array,
@@ -112,8 +107,10 @@ def press_by_search(
     """
     check_load(load)
     pose = np.array(pose, float)
-    if not math.isfinite(first_touch_height(state.pair, pose)):
-        return failed_result(state, pose, "the femoral component does not lie over the insert")
+    if not math.isfinite(state.pair.first_touch_height(pose)):
+        return ContactResult.failed(
+            state, pose, "the femoral component does not lie over the insert"
+        )
     if load == 0:
         return unloaded_result(model, state, pose)
     seen = _Evaluations(model, state, pose, guess)
@@ -121,8 +118,10 @@ def press_by_search(
     found = search_load(reaction or seen.reaction, load, start)
     if not math.isfinite(found.approach):
         why = seen.at(found.deepest).flags
-        lost = f"a load of {load:g} N cannot be reached"
-        return failed_result(state, pose, lost, *why, found=found)
+        missed = f"a load of {load:g} N cannot be reached"
+        return ContactResult.failed(
+            state, pose, missed, *why, iterations=found.evaluations, residual=found.residual
+        )
     return within_insert(state, _carried(seen.at(found.approach), found, load))
 
 
@@ -132,7 +131,6 @@ def _carried(result: ContactResult, found: LoadSearch, load: float) -> ContactRe
     missed = not residual <= COARSE_TOLERANCE
     return replace(
         result,
-        approach=found.approach,
         iterations=found.evaluations,
         residual=residual,
         status=ContactStatus.NOT_CONVERGED if missed else result.status,
@@ -144,7 +142,7 @@ class _Evaluations:
     """Evaluates a model at approaches and keeps the last result."""
 
     def __init__(
-        self, model: "ContactModel", state: Any, pose: Array, guess: ContactResult | None
+        self, model: Evaluates, state: Any, pose: Array, guess: ContactResult | None
     ) -> None:
         self._model, self._state, self._pose, self._guess = model, state, pose, guess
         self._approach = math.nan
@@ -153,7 +151,7 @@ class _Evaluations:
     def at(self, approach: float) -> ContactResult:
         """Return the result at an approach (m)."""
         if self._last is None or approach != self._approach:
-            placed = pose_at_approach(self._state.pair, self._pose, approach)
+            placed = self._state.pair.pose_at_approach(self._pose, approach)
             self._last = self._model.evaluate(self._state, placed, self._guess)
             self._approach = approach
         return self._last
@@ -222,91 +220,77 @@ def _between(low: float, low_value: float, high: float, high_value: float) -> fl
     return trial if low < trial < high else middle
 
 
-def unloaded_result(model: "ContactModel", state: Any, pose: Array) -> ContactResult:
+def unloaded_result(model: Evaluates, state: Any, pose: Array) -> ContactResult:
     """Return first touch: no pressure, no force."""
-    touching = pose_at_approach(state.pair, pose, 0.0)
-    result = model.evaluate(state, touching)
-    nothing = np.zeros(len(result.points))
-    return replace(
-        result,
-        pressure=nothing,
-        nodal_force=np.zeros((len(nothing), 3)),
-        wrench_on_insert=np.zeros(6),
-        medial=None,
-        lateral=None,
-        approach=0.0,
-        status=ContactStatus.OK,
-        iterations=0,
-        residual=0.0,
-        flags=(),
-    )
-
-
-def failed_result(
-    state: Any, pose: Array, *reasons: str, found: LoadSearch | None = None
-) -> ContactResult:
-    """Return a result that holds nothing but the reason: OUT_OF_RANGE and NaN.
-
-    Args:
-        state: has the map's points.
-        pose: (4, 4) at which it failed.
-        reasons: plain words, become the flags.
-        found: the search that failed, if there was one.
-    """
-    points = np.asarray(state.points)
-    unknown = np.full(len(points), np.nan)
-    return ContactResult(
-        pose=np.array(pose, float),
-        points=points,
-        normals=np.full_like(points, np.nan),
-        pressure=unknown,
-        area=unknown,
-        gap=unknown,
-        nodal_force=np.full_like(points, np.nan),
-        wrench_on_insert=np.full(6, np.nan),
-        medial=None,
-        lateral=None,
-        approach=math.nan,
-        status=ContactStatus.OUT_OF_RANGE,
-        iterations=0 if found is None else found.evaluations,
-        residual=math.nan if found is None else found.residual,
-        flags=tuple(dict.fromkeys(reasons)),
-    )
+    touching = state.pair.pose_at_approach(pose, 0.0)
+    gap = model.evaluate(state, touching).gap
+    return ContactResult.of(state, touching, np.zeros(len(gap)), gap)
 
 
 def within_insert(state: Any, result: ContactResult, *more: str) -> ContactResult:
     """Return the result if the bodies are not pressed through each other.
 
     OUT_OF_RANGE where the approach is as large as the insert is thick; a flag from half of
-    that on. See `tkamb.contact.validity.compression`.
+    that on. See `compression`.
 
     Args:
         state: prepared contact.
         result: a contact.
         more: flags to add.
     """
-    touch = _touch_at(state.pair, result.pose)
+    touch = state.pair.touch_at(result.pose)
     if touch is not None and result.approach > 0:
         ratio, words = compression(state.pair, touch, result)
         if ratio >= 1.0:
-            return failed_result(state, result.pose, f"{words}: {_THROUGH}", *result.flags)
+            return ContactResult.failed(state, result.pose, f"{words}: {THROUGH}", *result.flags)
         if ratio >= HALF:
-            more = (*more, f"{words}: {_THROUGH}")
+            more = (*more, f"{words}: {THROUGH}")
     return replace(result, flags=(*result.flags, *more)) if more else result
 
 
-_THROUGH = "is there a spike or a thin place in a mesh?"
+def compression(pair: ContactPair, touch: Touch, result: ContactResult) -> tuple[float, str]:
+    """Return the largest ratio of approach to insert thickness, and in words where it is.
+
+    The undeformed bodies overlap by the whole approach where they first touch. It is compared
+    with the insert's thickness there and under each condyle's centre of pressure: a spike of
+    the femoral component is met at the one, a spike of the insert at the other.
+
+    Args:
+        pair: the two bodies.
+        touch: where they first touch at the result's rotation, x and z.
+        result: a contact with an approach.
+    """
+    condyles = {"medial": result.medial, "lateral": result.lateral}
+    positions = {"where the meshes first touch": touch.point} | {
+        f"under the {side} condyle": condyle.centre_of_pressure
+        for side, condyle in condyles.items()
+        if condyle is not None
+    }
+    thickness = thickness_near(pair, np.array(list(positions.values())))
+    worst = int(thickness.argmin())
+    where, (x, _, z) = list(positions.items())[worst]
+    return result.approach / float(thickness[worst]), (
+        f"an approach of {result.approach / MILLIMETRE:.3g} mm {where} (x = {x / MILLIMETRE:.1f}, "
+        f"z = {z / MILLIMETRE:.1f} mm), where the insert is {thickness[worst] / MILLIMETRE:.3g} mm "
+        "thick"
+    )
 
 
-def _touch_at(pair: ContactPair, pose: Array) -> Touch | None:
-    """Return the first touch of either condyle, whatever the pose's y; travel from y = 0."""
-    level = np.array(pose, float)
-    if not np.isfinite(level).all():
-        return None
-    level[1, 3] = 0.0
-    return _first_touch(pair, level.tobytes())
+def thickness_near(pair: ContactPair, positions: Array) -> Array:
+    """Return the insert's thickness (n,), m, along y at positions (n, 3), from its top down.
 
-
-@lru_cache(maxsize=8)
-def _first_touch(pair: ContactPair, level: bytes) -> Touch | None:
-    return pair.first_touch.either(np.frombuffer(level).reshape(4, 4))
+    To where it ends first. Near a rim it is the largest within `AROUND`; the height above the
+    bottom where no column meets the insert.
+    """
+    low, high = pair.insert.bounds[:, 1]
+    columns = (positions[:, None] + COLUMNS).reshape(-1, 3)
+    columns[:, 1] = high + AROUND
+    enter, _ = pair.insert.rays.first(columns, DOWN)
+    met = np.isfinite(enter)
+    columns[met, 1] -= enter[met] + SKIN
+    leave, _ = pair.insert.rays.first(columns, DOWN)
+    met &= np.isfinite(leave)
+    thick = np.where(met, leave + SKIN, 0.0).reshape(len(positions), -1)
+    whole = met.reshape(thick.shape).all(axis=1)
+    found = np.where(whole, thick[:, 0], thick.max(axis=1))
+    return np.maximum(np.where(found > 0, found, positions[:, 1] - low), SKIN)

@@ -6,17 +6,13 @@ of `evaluate`. A model that knows its tangent brings a faster probe with stiffne
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.contact.summary import medial_points, wrench_of
-from tkamb.geometry.condyles import condyle_split
+from tkamb.contact.pressing import Evaluates
+from tkamb.contact.result import ContactResult, ContactStatus, medial_points, wrench_of
 from tkamb.geometry.frames import Array
-
-if TYPE_CHECKING:
-    from tkamb.contact.model import ContactModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +49,7 @@ class CondyleWrench:
         """
         force = self.wrench[:3]
         left = self.wrench[3:] - np.cross(self.centre, force)
-        return np.asarray(self.centre + np.cross(force, left) / (force @ force))
+        return self.centre + np.cross(force, left) / (force @ force)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +69,7 @@ class ProbedContact:
     @property
     def wrench(self) -> Array:
         """(6,) on the insert."""
-        return np.asarray(sum((c.wrench for c in self.condyles.values()), np.zeros(6)))
+        return sum((c.wrench for c in self.condyles.values()), np.zeros(6))
 
 
 class Probe:
@@ -85,11 +81,8 @@ class Probe:
         guess: an earlier result.
     """
 
-    def __init__(
-        self, model: "ContactModel", state: Any, guess: ContactResult | None = None
-    ) -> None:
+    def __init__(self, model: Evaluates, state: Any, guess: ContactResult | None = None) -> None:
         self._model, self._state, self._guess = model, state, guess
-        self._split = condyle_split(state.pair.femoral)
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4)."""
@@ -97,7 +90,7 @@ class Probe:
         if result.status is not ContactStatus.OK:
             return ProbedContact({}, known=False)
         self._guess = result
-        return ProbedContact(condyle_wrenches(result, self._split))
+        return ProbedContact(condyle_wrenches(result, self._state.pair.split))
 
 
 def condyle_wrenches(result: ContactResult, split: float | None) -> dict[str, CondyleWrench]:

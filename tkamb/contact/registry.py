@@ -26,10 +26,10 @@ BUILT_IN = {
     "hertz": "tkamb.contact.hertz:Hertz",
     "foundation": "tkamb.contact.foundation:ElasticFoundation",
     "foundation-linear": "tkamb.contact.foundation:LinearFoundation",
-    "lattice": "tkamb.contact.lattice.calibrated_model:CalibratedLattice",
-    "lattice-linear": "tkamb.contact.lattice.calibrated_model:LinearLattice",
-    "lattice-source": "tkamb.contact.lattice.source_model:SourceLattice",
-    "fe": "tkamb.contact.fe:FiniteElements",
+    "lattice": "tkamb.contact.lattice.model:CalibratedLattice",
+    "lattice-linear": "tkamb.contact.lattice.model:LinearLattice",
+    "lattice-source": "tkamb.contact.lattice.source.model:SourceLattice",
+    "fe": "tkamb.contact.lattice.model:FiniteElements",
 }
 
 

@@ -1,11 +1,20 @@
 """What a contact model finds at one pose: pressure map, wrench, and what each condyle carries."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from typing import Any
 
-from tkamb.geometry.frames import Array
+import numpy as np
+
+from tkamb.contact.pair import ContactPair, PreparedContact
+from tkamb.geometry.frames import Array, Mask, inverse, transform
+from tkamb.units import MEGAPASCAL
+
+HIGHEST_KNOWN = 100.0 * MEGAPASCAL
+"""Peak pressure beyond which polyethylene's curves are extrapolated (they end at 40 to 60 MPa)."""
 
 
 class ContactStatus(Enum):
@@ -37,32 +46,15 @@ class CondyleContact:
     thickness: float
 
 
-class _WhenRead:
-    """A field that may be given as a function, which is called when the field is first read."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = f"_{name}"
-
-    def __get__(self, instance: Any, owner: type) -> float:
-        if instance is None:
-            raise AttributeError("no default")
-        value = instance.__dict__[self._name]
-        if callable(value):
-            value = instance.__dict__[self._name] = float(value())
-        return float(value)
-
-    def __set__(self, instance: Any, value: float | Callable[[], float]) -> None:
-        instance.__dict__[self._name] = value
-
-
 @dataclass(frozen=True, eq=False)
 class ContactResult:
-    """Pressure map and wrench at one pose.
+    """Pressure map and wrench at one pose; made by `ContactResult.of`.
 
     The map has the same n points in every result of one state. Arrays are in the insert
     frame, SI.
 
     Args:
+        pair: the two bodies.
         pose: (4, 4) pose_femoral_in_insert at which it holds (after pressing in).
         points: (n, 3) map points on the undeformed insert.
         normals: (n, 3) outward unit normals of the insert there.
@@ -73,14 +65,15 @@ class ContactResult:
         wrench_on_insert: (6,) force (N) and moment about the insert origin (N·m).
         medial: what the medial condyle (or the only one) carries; None when nothing.
         lateral: what the lateral condyle carries; None when nothing, or no such condyle.
-        approach: m, travel along -y since first touch; 0 when apart. A model that does not
-            need it may give a function of no argument, called when it is first read.
         status: how the evaluation ended.
         iterations: of the model's own solver.
         residual: relative residual of that solver.
         flags: plain words for what a reader must know (strain below -0.4, ...).
+        warm_start: where the solver of the same state may begin when this result is handed
+            back as a guess; None for a model that needs none.
     """
 
+    pair: ContactPair
     pose: Array
     points: Array
     normals: Array
@@ -91,8 +84,171 @@ class ContactResult:
     wrench_on_insert: Array
     medial: CondyleContact | None
     lateral: CondyleContact | None
-    approach: float = _WhenRead()  # type: ignore[assignment]
     status: ContactStatus = ContactStatus.OK
     iterations: int = 0
     residual: float = 0.0
     flags: tuple[str, ...] = ()
+    warm_start: Any = None
+
+    @cached_property
+    def approach(self) -> float:
+        """m, travel along -y since first touch; 0 when apart, NaN when out of range.
+
+        Worked out when it is first asked for, from the pose and the undeformed bodies.
+        """
+        if self.status is ContactStatus.OUT_OF_RANGE:
+            return math.nan
+        return self.pair.approach(self.pose)
+
+    @classmethod
+    def of(
+        cls,
+        state: PreparedContact,
+        pose: Array,
+        pressure: Array,
+        gap: Array,
+        nodal_force: Array | None = None,
+        area: Array | None = None,
+        covered: Array | None = None,
+        medial: Mask | None = None,
+        **ending: Any,
+    ) -> "ContactResult":
+        """Return the result of a pressure map: sides, wrench, areas and sums follow from it.
+
+        The force on point i is -p_i A_i n_i, the wrench the sum over the points, moments about
+        the insert's origin. A pressure that is not finite makes it OUT_OF_RANGE.
+
+        Args:
+            state: what `prepare` returned.
+            pose: (4, 4) pose_femoral_in_insert.
+            pressure: (n,) Pa, >= 0.
+            gap: (n,) m, positive when apart.
+            nodal_force: (n, 3) N on the insert, for a model that knows it better.
+            area: (n,) m², that the forces stand on; by default the points' tributary area.
+            covered: (n,) m², in contact around each point, for the condyles' areas; by
+                default `area`.
+            medial: (n,) points under the medial condyle; by default `medial_points`.
+            ending: status, iterations, residual, flags, warm_start.
+        """
+        surface, pose = state.surface, np.array(pose, float)
+        if not np.isfinite(pressure).all():
+            return cls.failed(state, pose, "the femoral component lies too deep in the insert")
+        area = surface.area if area is None else area
+        if nodal_force is None:
+            nodal_force = -(pressure * area)[:, None] * surface.normals
+        if medial is None:
+            medial = medial_points(surface.points, pose, state.pair.split)
+        sums = (surface.points, pressure, area if covered is None else covered, nodal_force)
+        loaded = pressure > 0
+        sides = {
+            "medial": _summed(loaded & medial, *sums, surface.thickness),
+            "lateral": _summed(loaded & ~medial, *sums, surface.thickness),
+        }
+        ending["flags"] = (*ending.get("flags", ()), *peak_flags(sides))
+        return cls(
+            pair=state.pair,
+            pose=pose,
+            points=surface.points,
+            normals=surface.normals,
+            pressure=pressure,
+            area=area,
+            gap=gap,
+            nodal_force=nodal_force,
+            wrench_on_insert=wrench_of(surface.points, nodal_force),
+            medial=sides["medial"],
+            lateral=sides["lateral"],
+            **ending,
+        )
+
+    @classmethod
+    def failed(
+        cls,
+        state: PreparedContact,
+        pose: Array,
+        *reasons: str,
+        iterations: int = 0,
+        residual: float = math.nan,
+    ) -> "ContactResult":
+        """Return a result that holds nothing but the reasons: OUT_OF_RANGE and NaN."""
+        points = state.surface.points
+        unknown, vectors = np.full(len(points), np.nan), np.full_like(points, np.nan)
+        return cls(
+            pair=state.pair,
+            pose=np.array(pose, float),
+            points=points,
+            normals=vectors,
+            pressure=unknown,
+            area=unknown,
+            gap=unknown,
+            nodal_force=vectors,
+            wrench_on_insert=np.full(6, np.nan),
+            medial=None,
+            lateral=None,
+            status=ContactStatus.OUT_OF_RANGE,
+            iterations=iterations,
+            residual=residual,
+            flags=tuple(dict.fromkeys(reasons)),
+        )
+
+
+def medial_points(points: Array, pose: Array, split: float | None) -> Mask:
+    """Say which map points (n, 3) lie under the medial condyle.
+
+    A point belongs to the condyle on whose side of the femoral component it lies: femoral
+    z < split is medial (right knee; left ones are mirrored at input).
+
+    Args:
+        points: (n, 3) m, insert frame.
+        pose: (4, 4) pose_femoral_in_insert.
+        split: z between the condyles in the femoral frame, m; None: one condyle, all medial.
+    """
+    if split is None:
+        return np.ones(len(points), bool)
+    return transform(inverse(pose), points)[:, 2] < split
+
+
+def wrench_of(points: Array, nodal_force: Array) -> Array:
+    """Return force (N) and moment about the insert origin (N·m), (6,), of nodal forces."""
+    carrying = nodal_force.any(axis=1)
+    force = nodal_force[carrying]
+    return np.concatenate([force.sum(axis=0), np.cross(points[carrying], force).sum(axis=0)])
+
+
+def _summed(
+    chosen: Mask, points: Array, pressure: Array, area: Array, nodal_force: Array, thickness: Array
+) -> CondyleContact | None:
+    """Return what the chosen points (n,) carry; None when there are none.
+
+    The area is at least the force over the peak pressure: where contact is smaller than the
+    cells the mean pressure is not above the peak.
+    """
+    if not chosen.any():
+        return None
+    force = float(np.linalg.norm(nodal_force[chosen].sum(axis=0)))
+    weight = np.linalg.norm(nodal_force[chosen], axis=1)
+    centre = weight @ points[chosen] / weight.sum()
+    peak = float(pressure[chosen].max())
+    covered = max(float(area[chosen].sum()), force / peak)
+    under = thickness_under(centre, points, thickness)
+    return CondyleContact(force, covered, force / covered, peak, centre, under)
+
+
+def thickness_under(position: Array, points: Array, thickness: Array) -> float:
+    """Return the insert's thickness (m) under a position (3,), between the nearest map points.
+
+    Inverse-distance weights of the four points nearest in x and z.
+    """
+    away = np.hypot(*(points[:, [0, 2]] - position[[0, 2]]).T)
+    near = np.argpartition(away, 3)[:4] if len(points) > 4 else np.arange(len(points))
+    weight = 1.0 / np.maximum(away[near], 1e-9)
+    return float(weight @ thickness[near] / weight.sum())
+
+
+def peak_flags(sides: dict[str, CondyleContact | None]) -> Iterator[str]:
+    """Yield a flag for each condyle whose peak pressure is beyond what any law was fitted to."""
+    for side, condyle in sides.items():
+        if condyle is not None and condyle.peak_pressure > HIGHEST_KNOWN:
+            yield (
+                f"{side} peak above {HIGHEST_KNOWN / MEGAPASCAL:.0f} MPa: polyethylene's law is "
+                "not known there; is this the lip or an edge?"
+            )

@@ -9,10 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tkamb.atomic import claim_directory, replaced_file
 from tkamb.datasets.dataset import DataFile, Dataset
 from tkamb.errors import InputError
 from tkamb.files import sha256_of
-from tkamb.output.atomic import claim_directory, replaced_file
 
 TIMEOUT_S = 30
 """s without an answer after which a server counts as gone."""

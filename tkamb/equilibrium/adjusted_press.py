@@ -2,9 +2,9 @@
 
 Where the femur has sunk in deeper than it was moved, or has come to lie at a larger coronal
 angle than it was turned by, the load would have brought both condyles into contact anyway:
-the recorded rotation is restored and pressed again (the source, 4.3, figure 4-8).
+the recorded rotation is restored and pressed again (Sharma 2008, 4.3, figure 4-8).
 
-The source joins the two conditions by "and"; `restore_when="both"` does so.
+Sharma (2008) joins the two conditions by "and"; `restore_when="both"` does so.
 """
 
 from dataclasses import replace
@@ -40,10 +40,10 @@ def press_adjusted(
         ComputationError: the femoral component does not lie over the insert.
     """
     result = model.press(state, load, adjustment.pose, guess)
-    settled = adjustment.coronal_angle == 0.0 or adjustment.restored
-    if result.status is not ContactStatus.OK or settled:
+    final = adjustment.coronal_angle == 0.0 or adjustment.restored
+    if result.status is not ContactStatus.OK or final:
         return result, replace(adjustment, penetration=float(result.approach))
-    checked = _checked(query, adjustment, result)
+    checked = _check(query, adjustment, result)
     exceeded = (
         checked.penetration > abs(checked.translation),
         abs(checked.final_angle) > abs(checked.coronal_angle),
@@ -56,7 +56,7 @@ def press_adjusted(
     return result, replace(checked, pose=restored, translation=-travel, restored=True)
 
 
-def _checked(query: ClosestPointQuery, adjustment: Adjustment, result: ContactResult) -> Adjustment:
+def _check(query: ClosestPointQuery, adjustment: Adjustment, result: ContactResult) -> Adjustment:
     medial, lateral = touches(query, result.pose)
     angle = (medial - lateral) / adjustment.intercondylar_distance
     return replace(adjustment, penetration=-min(medial, lateral), final_angle=angle)

@@ -28,7 +28,7 @@ FORCE_TOLERANCE = 0.05
 """N (moments over the lever arm): what may be left of a converged coordinate's force."""
 STEP_TOLERANCE = 2e-6
 """m: the Newton step that is left of a converged coordinate."""
-SOFTEST = 100.0
+SMALLEST_STIFFNESS = 100.0
 """N/m: a state that gives way by more than 10 mm per newton is indeterminate."""
 FIRST_RADIUS, WIDEST_RADIUS, NARROWEST_RADIUS = 0.5e-3, 3e-3, 1e-9
 """m: the trust region at the start, and its limits."""
@@ -74,7 +74,7 @@ class Balance:
         status: how it ended.
         steps: Newton steps, taken or taken back.
         trials: how often the forces were computed.
-        softest: N/m, smallest real part of the stiffness' eigenvalues.
+        smallest_stiffness: N/m, smallest real part of the stiffness' eigenvalues.
         work: N·m done by the forces along each step taken, all positive.
     """
 
@@ -84,7 +84,7 @@ class Balance:
     status: BalanceStatus
     steps: int
     trials: int
-    softest: float
+    smallest_stiffness: float
     work: tuple[float, ...]
 
 
@@ -171,8 +171,8 @@ class _Search:
 
         Follower loads and friction make it unsymmetric; their work is no measure then.
         """
-        symmetric, softest = smallest_eigenvalues(self.stiffness)
-        if symmetric > 0 or softest <= 0:
+        symmetric, smallest_stiffness = smallest_eigenvalues(self.stiffness)
+        if symmetric > 0 or smallest_stiffness <= 0:
             return False
         newton = np.linalg.solve(self.stiffness, self.force)
         full = np.allclose(step, newton, rtol=1e-9, atol=0)
@@ -205,19 +205,23 @@ class _Search:
         if np.abs(self.force).max() > FORCE_TOLERANCE:
             return False
         left, values, right = np.linalg.svd(self.stiffness)
-        held = values > SOFTEST
+        held = values > SMALLEST_STIFFNESS
         step = right[held].T @ ((left.T @ self.force)[held] / values[held])
         return bool((np.abs(step) < STEP_TOLERANCE).all())
 
     def _kind(self) -> BalanceStatus:
-        if not (self._own or self._fresh) and self._softest() <= SOFTEST:
+        if not (self._own or self._fresh) and self._smallest_stiffness() <= SMALLEST_STIFFNESS:
             self._refresh()
-        softest = self._softest()
-        if softest < -SOFTEST:
+        smallest_stiffness = self._smallest_stiffness()
+        if smallest_stiffness < -SMALLEST_STIFFNESS:
             return BalanceStatus.UNSTABLE
-        return BalanceStatus.OK if softest > SOFTEST else BalanceStatus.INDETERMINATE
+        return (
+            BalanceStatus.OK
+            if smallest_stiffness > SMALLEST_STIFFNESS
+            else BalanceStatus.INDETERMINATE
+        )
 
-    def _softest(self) -> float:
+    def _smallest_stiffness(self) -> float:
         return smallest_eigenvalues(self.stiffness)[1] if self.known else np.nan
 
     def _end(self, status: BalanceStatus) -> Balance:
@@ -228,7 +232,7 @@ class _Search:
             status,
             self._steps,
             self._trials,
-            self._softest(),
+            self._smallest_stiffness(),
             tuple(self._work),
         )
 
@@ -241,9 +245,9 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
         force: (n,) N.
         radius: m.
     """
-    symmetric, softest = smallest_eigenvalues(stiffness)
+    symmetric, smallest_stiffness = smallest_eigenvalues(stiffness)
     identity = np.eye(len(force))
-    if softest > 0:
+    if smallest_stiffness > 0:
         step = np.linalg.solve(stiffness, force)
         if np.linalg.norm(step) <= radius:
             return np.asarray(step)

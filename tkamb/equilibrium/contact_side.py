@@ -16,26 +16,30 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tkamb.body.contact_points import CondylePoint
 from tkamb.body.knee import solve_knee, unsolved
-from tkamb.body.unknowns import CondylePoint
-from tkamb.case import Case
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
-from tkamb.contact.pressing import first_touch_height, within_insert
+from tkamb.contact.pressing import within_insert
 from tkamb.contact.probe import condyle_wrenches
 from tkamb.contact.registry import contact_model
-from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.contact.summary import medial_points
+from tkamb.contact.result import ContactResult, ContactStatus, medial_points
 from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.frame_contact import FrameContact
-from tkamb.equilibrium.split_sensitivity import split_sensitivity
+from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import Array, knee_pose
-from tkamb.mechanics.mechanics import FrameLoads, Mechanics
+from tkamb.scene.case import Case
 
 if TYPE_CHECKING:
-    from tkamb.equilibrium.released import ReleasedKnee, SettledKnee
+    from tkamb.equilibrium.released import KneeEquilibrium, ReleasedKnee
+
+from typing import Any
+
+from tkamb.contact.model import ContactModel
+from tkamb.geometry.frames import KNEE_COORDINATES, knee_coordinates
+from tkamb.units import DEGREE
 
 NAN = float("nan")
 
@@ -48,6 +52,11 @@ ASTRAY = (BalanceStatus.OUT_OF_RANGE, BalanceStatus.NOT_CONVERGED)
 """Ends of a search that another start may mend."""
 FIRST_DEPTH = 5e-5
 """m: how deep the search for released coordinates begins."""
+ADDUCTION_STEP = 0.02 * DEGREE
+"""Small against the 0.2 to 0.5 deg that unload a condyle, and it moves some 60 N, thirty times
+what the lattice's tolerance leaves open; steps of 0.005 to 0.1 deg agree within 5 to 15 %."""
+
+ADDUCTION = KNEE_COORDINATES.index("adduction")
 
 
 class ContactSide:
@@ -85,9 +94,9 @@ class ContactSide:
                 and the last that were found are where released coordinates begin.
         """
         if self.released is None:
-            body, contact = self._pressed(k, before)
+            body, contact = self._press_recorded(k, before)
         else:
-            body, contact = self._settled(self.released, k, before)
+            body, contact = self._release(self.released, k, before)
         if contact.result is None or body.loads.problems or self.case.split is None:
             return body, contact
         if "adduction" in self.table.released:
@@ -97,7 +106,9 @@ class ContactSide:
         seconds = contact.seconds + clock.perf_counter() - start
         return body, replace(contact, sensitivity=sensitivity, seconds=seconds)
 
-    def _pressed(self, k: int, before: Sequence[FrameContact]) -> tuple[FrameLoads, FrameContact]:
+    def _press_recorded(
+        self, k: int, before: Sequence[FrameContact]
+    ) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact at the recorded rotation."""
         guess = before[-1].result if before else None
         body = self.mechanics.frame(k)
@@ -107,7 +118,7 @@ class ContactSide:
             contact = self.carry(body, self.mechanics.poses[k], contact.result)
         if self.table.coupling == "none":
             return body, contact
-        return self._coupled(k, body, contact)
+        return self._couple(k, body, contact)
 
     def carry(self, body: FrameLoads, pose: Array, guess: ContactResult | None) -> FrameContact:
         """Press in what the body asks for, at the measured (or adjusted) rotation.
@@ -133,7 +144,7 @@ class ContactSide:
         seconds = clock.perf_counter() - start
         return self._contact(result, adjustment, seconds)
 
-    def _coupled(
+    def _couple(
         self, k: int, body: FrameLoads, contact: FrameContact
     ) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact once the resultants of the one are the points of the other."""
@@ -165,37 +176,37 @@ class ContactSide:
             contact, result=None, problem=problem
         )
 
-    def _settled(
+    def _release(
         self, released: "ReleasedKnee", k: int, before: Sequence[FrameContact]
     ) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact with the released coordinates at rest."""
         start = clock.perf_counter()
-        good = [contact for contact in before if contact.settled and contact.result][-2:]
-        earlier, guess = (good[-1].settled, good[-1].result) if good else (None, None)
+        good = [contact for contact in before if contact.equilibrium and contact.result][-2:]
+        earlier, guess = (good[-1].equilibrium, good[-1].result) if good else (None, None)
         points = {} if len(released.released) == 5 else self._nearest_points(k)
-        settled = None
-        for place in self._starts(k, [c.settled.coordinates for c in good if c.settled]):
+        knee = None
+        for place in self._starts(k, [c.equilibrium.coordinates for c in good if c.equilibrium]):
             if np.isfinite(place).all():
-                settled = released.settle(k, place, points, earlier)
-                if settled.balance.status not in ASTRAY:
+                knee = released.find(k, place, points, earlier)
+                if knee.balance.status not in ASTRAY:
                     break
-        if settled is None:
+        if knee is None:
             contact = self._nothing("the femoral component does not lie over the insert")
             body = self.mechanics.frame(k)
             return replace(body, loads=unsolved([contact.problem])), contact
-        result, contact = None, self._nothing(settled.problem)
-        if not settled.problem:
-            result = self.model.evaluate(self.state, knee_pose(settled.coordinates), guess)
+        result, contact = None, self._nothing(knee.problem)
+        if not knee.problem:
+            result = self.model.evaluate(self.state, knee_pose(knee.coordinates), guess)
             result = within_insert(self.state, result)
             contact = self._contact(result, None, 0.0)
         contact = replace(
             contact,
             seconds=clock.perf_counter() - start,
-            iterations=settled.passes,
-            load_change=settled.change,
-            settled=settled,
+            iterations=knee.passes,
+            load_change=knee.change,
+            equilibrium=knee,
         )
-        return self._settled_loads(k, settled, contact, points), contact
+        return self._equilibrium_loads(k, knee, contact, points), contact
 
     def _starts(self, k: int, found: list[Array]) -> Iterator[Array]:
         """Yield where a search may begin: as the last frames went on, as the last, as recorded.
@@ -212,27 +223,28 @@ class ContactSide:
 
     def on_the_insert(self, place: Array) -> Array:
         """Return coordinates (6,) whose superior-inferior one makes the condyles just touch."""
-        height = first_touch_height(self.state.pair, knee_pose(place))
+        height = self.state.pair.first_touch_height(knee_pose(place))
         return np.array([place[0], height - FIRST_DEPTH, *place[2:]])
 
-    def _settled_loads(
-        self, k: int, settled: "SettledKnee", contact: FrameContact, points: dict[str, Array]
+    def _equilibrium_loads(
+        self, k: int, knee: "KneeEquilibrium", contact: FrameContact, points: dict[str, Array]
     ) -> FrameLoads:
-        start, placed = clock.perf_counter(), settled.placed
-        geometry = placed.geometry
+        start, geometry = clock.perf_counter(), knee.geometry
         if contact.result is None:
             loads = unsolved([contact.problem])
         else:
             up, still = np.array([0.0, 1.0, 0.0]), np.zeros(3)
-            apart = {side: CondylePoint(point, up, still, NAN) for side, point in points.items()}
-            carrying = self._resultants(k, settled.coordinates, contact.result)
+            separated = {
+                side: CondylePoint(point, up, still, NAN) for side, point in points.items()
+            }
+            touching = self._resultants(k, knee.coordinates, contact.result)
             sides = {"medial"} if self.case.split is None else {"medial", "lateral"}
             geometry = replace(
-                geometry, condyles=apart | carrying, lifted=frozenset(sides - set(carrying))
+                geometry, condyles=separated | touching, lifted=frozenset(sides - set(touching))
             )
             loads = solve_knee(geometry, self.mechanics.friction)
         seconds = clock.perf_counter() - start
-        return FrameLoads(geometry, loads, placed.tensions, placed.wrap, None, 0.0, seconds)
+        return FrameLoads(geometry, loads, None, 0.0, seconds)
 
     def _resultants(self, k: int, place: Array, result: ContactResult) -> dict[str, CondylePoint]:
         """Return the contact's resultants as the contact points of the equations."""
@@ -274,3 +286,27 @@ def _points(body: FrameLoads) -> dict[str, Array]:
 def _travel(before: dict[str, Array], after: dict[str, Array]) -> float:
     """Return the farthest (m) that a contact point has moved."""
     return max(float(np.linalg.norm(after[side] - before[side])) for side in after)
+
+
+def split_sensitivity(model: ContactModel, state: Any, result: ContactResult) -> float:
+    """Return the change of the medial force with the adduction at a constant load, N/rad.
+
+    Zero where one condyle carries everything: it then holds only until the other touches. NaN
+    where the turned press does not succeed.
+
+    Args:
+        model: the contact model.
+        state: what its `prepare` returned.
+        result: a contact; the load is what it carries along -y.
+    """
+    load = -float(result.wrench_on_insert[1])
+    place = knee_coordinates(result.pose)
+    place[ADDUCTION] += ADDUCTION_STEP
+    turned = model.press(state, load, knee_pose(place), result)
+    if turned.status is not ContactStatus.OK:
+        return float("nan")
+    return (_medial(turned) - _medial(result)) / ADDUCTION_STEP
+
+
+def _medial(result: ContactResult) -> float:
+    return result.medial.force if result.medial else 0.0

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.contact.area import area_above
 from tkamb.contact.result import ContactResult
-from tkamb.contact.summary import area_above
 from tkamb.geometry.adjustment import Adjustment
 
 if TYPE_CHECKING:
-    from tkamb.equilibrium.released import SettledKnee
+    from tkamb.equilibrium.released import KneeEquilibrium
 
 NAN = float("nan")
 
@@ -30,7 +30,7 @@ class FrameContact:
         iterations: of body and contact, until they agreed; 0 if not coupled.
         load_change: N, by the last of them.
         point_change: m, likewise, of the centres of pressure.
-        settled: the search for the released coordinates, if there are any.
+        equilibrium: the search for the released coordinates, if there are any.
         sensitivity: N/rad, of the medial force to adduction (`split_sensitivity`); NaN where
             adduction is released, or there is one condyle.
         triangles: (k, 3) of the map.
@@ -45,7 +45,7 @@ class FrameContact:
     iterations: int = 0
     load_change: float = NAN
     point_change: float = NAN
-    settled: "SettledKnee | None" = None
+    equilibrium: "KneeEquilibrium | None" = None
     sensitivity: float = NAN
     triangles: NDArray[np.int64] | None = None
 
@@ -53,7 +53,7 @@ class FrameContact:
         """Return the share of a condyle's contact area above a pressure (Pa), 1 at most.
 
         The pressure is taken as linear between the map's points, see
-        `tkamb.contact.summary.area_above`.
+        `tkamb.contact.area.area_above`.
         """
         if self.result is None or self.triangles is None:
             return NAN

@@ -22,12 +22,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.body.demand import KneeDemand, knee_demand
-from tkamb.body.unknowns import CondylePoint
+from tkamb.body.contact_points import CondylePoint
+from tkamb.body.joint_equilibrium import JointEquilibrium, joint_equilibrium
+from tkamb.body.knee import KneeGeometry
+from tkamb.body.load import wrench_of
 from tkamb.equilibrium.balance import Balance, BalanceStatus, Trial, find_balance
-from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
-from tkamb.geometry.knee_axes import knee_axes
-from tkamb.mechanics.mechanics import Mechanics, PlacedKnee
+from tkamb.equilibrium.mechanics import Mechanics
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_axes, knee_pose
 
 if TYPE_CHECKING:
     from tkamb.body.patella import PatellaState
@@ -36,9 +37,9 @@ if TYPE_CHECKING:
 LEVER = 0.025
 """m: half the usual distance of the condyles; makes rotations comparable to translations."""
 SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
-SETTLED = 2e-6
+KNEE_CHANGE = 2e-6
 """m: the knee moves less than this when the patella is found anew."""
-SETTLED_FORCE = 0.1
+FORCE_CHANGE = 0.1
 """N: neither does the contact force."""
 MOST_PASSES = 8
 TINY = 1e-7
@@ -48,17 +49,17 @@ TINY = 1e-7
 Sliding = Callable[[Array, Array], Array]
 
 
-def _at_rest(place: Array, point: Array) -> Array:
+def _no_sliding(place: Array, point: Array) -> Array:
     return np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False)
-class SettledKnee:
+class KneeEquilibrium:
     """One frame with its released coordinates at rest.
 
     Args:
         coordinates: (6,) m and rad.
-        placed: the leg there.
+        geometry: the leg there, without its contact.
         patella: where it is; None if not modelled.
         contact: the contact there.
         balance: the last search.
@@ -69,7 +70,7 @@ class SettledKnee:
     """
 
     coordinates: Array
-    placed: PlacedKnee
+    geometry: KneeGeometry
     patella: "PatellaState | None"
     contact: "ProbedContact"
     balance: Balance
@@ -98,13 +99,13 @@ class ReleasedKnee:
         self.released = released_indices(names)
         self._rows = list(self.released)
 
-    def settle(
+    def find(
         self,
         k: int,
         start: Array,
         points: dict[str, Array] | None = None,
-        before: SettledKnee | None = None,
-    ) -> SettledKnee:
+        before: KneeEquilibrium | None = None,
+    ) -> KneeEquilibrium:
         """Return frame k at rest.
 
         Args:
@@ -126,26 +127,28 @@ class ReleasedKnee:
             middle = _middle(knee.contact, points, place)
             shift = np.abs(middle - last).max() if self._keeps else 0.0
             if pushes:
-                slack = True
-            elif knee.problem or (max(moved, shift) < SETTLED and change < SETTLED_FORCE):
+                # a line that pushes drives the knee away: slack, it begins where this began
+                slack, knee = True, before
+                place, middle, force = np.array(start, float), np.array(start[:3]), force * np.nan
+            elif knee.problem or (max(moved, shift) < KNEE_CHANGE and change < FORCE_CHANGE):
                 return knee
         assert knee is not None
         return replace(knee, problem="knee and patella do not settle together")
 
     def _pass(
-        self, k: int, place: Array, middle: Array, slack: bool, before: SettledKnee | None
-    ) -> tuple[SettledKnee, bool]:
+        self, k: int, place: Array, middle: Array, slack: bool, before: KneeEquilibrium | None
+    ) -> tuple[KneeEquilibrium, bool]:
         """Return the knee at rest with the patella as at `place`, and whether it would push."""
         patella = self._patella(k, place, before.patella if before else None)
-        placed = self._mechanics.placed(k, place, patella)
-        forces = self._forces(k, placed, middle, slack)
+        geometry = self._mechanics.geometry(k, place, patella)
+        forces = self._forces(k, geometry, middle, slack)
         balance = forces.balance(before.balance.stiffness if before else None)
-        contact, problem = forces.contact(balance), "; ".join(placed.problems)
+        contact, problem = forces.contact(balance), "; ".join(geometry.problems)
         if balance.status is not BalanceStatus.OK:
             problem = problem or f"released: {balance.status.value}"
-        knee = SettledKnee(
+        knee = KneeEquilibrium(
             forces.at(balance),
-            placed,
+            geometry,
             patella,
             contact,
             balance,
@@ -167,25 +170,27 @@ class ReleasedKnee:
             return None
         return extensor.patella(k, knee_pose(place), guess.coordinates if guess else None)
 
-    def _forces(self, k: int, placed: PlacedKnee, middle: Array, slack: bool) -> "ReleasedForces":
+    def _forces(
+        self, k: int, geometry: KneeGeometry, middle: Array, slack: bool
+    ) -> "ReleasedForces":
         mechanics = self._mechanics
-        demand = knee_demand(
-            placed.geometry,
+        joint = joint_equilibrium(
+            geometry,
             mechanics.ligaments,
-            placed.coordinates,
+            geometry.coordinates,
             self.released,
             middle,
             slack,
         )
         sliding = partial(mechanics.sliding, k)
-        return ReleasedForces(demand, self._probe, placed.coordinates, mechanics.friction, sliding)
+        return ReleasedForces(joint, self._probe, geometry.coordinates, mechanics.friction, sliding)
 
 
 class ReleasedForces:
     """What drives the released coordinates at trial places, the patella held on the femur.
 
     Args:
-        demand: of the body.
+        joint: of the body.
         probe: of the contact model.
         place: (6,) knee coordinates; those not released stay.
         friction: Coulomb coefficient.
@@ -197,15 +202,15 @@ class ReleasedForces:
 
     def __init__(
         self,
-        demand: KneeDemand,
+        joint: JointEquilibrium,
         probe: "Probe",
         place: Array,
         friction: float = 0.0,
-        sliding: Sliding = _at_rest,
+        sliding: Sliding = _no_sliding,
     ) -> None:
-        self._demand, self._probe, self._place = demand, probe, np.array(place, float)
+        self._joint, self._probe, self._place = joint, probe, np.array(place, float)
         self._friction, self._sliding = friction, sliding
-        self._rows = list(demand.released)
+        self._rows = list(joint.released)
         self._scale = SCALE[self._rows]
         self.seen: dict[bytes, ProbedContact] = {}
 
@@ -223,15 +228,15 @@ class ReleasedForces:
         contact = self.seen[x.tobytes()] = self._probe.at(knee_pose(place))
         if not contact.known:
             return Trial(np.full(len(x), np.nan))
-        wrench, stiffness = self._rubbing(place, contact)
+        wrench, stiffness = self._with_friction(place, contact)
         if stiffness is None:
-            return Trial(self._demand.imbalance(place, wrench) / self._scale)
+            return Trial(self._joint.imbalance(place, wrench) / self._scale)
         steps = np.zeros((len(x) + 1, 6))
         steps[np.arange(len(x)), self._rows] = TINY / self._scale
-        forces = self._demand.imbalance(place + steps, wrench) / self._scale
+        forces = self._joint.imbalance(place + steps, wrench) / self._scale
         change = (forces[:-1] - forces[-1]).T / TINY
         twists = knee_axes(place)[self._rows] / self._scale[:, None]
-        gain = self._demand.contact_gain(place) / self._scale[:, None]
+        gain = self._joint.contact_gain(place) / self._scale[:, None]
         return Trial(forces[-1], -(change + gain @ stiffness @ twists.T))
 
     def at(self, balance: Balance) -> Array:
@@ -240,25 +245,25 @@ class ReleasedForces:
 
     def pushes(self, balance: Balance) -> bool:
         """Return whether the patellar ligament, where it is taut, would have to push."""
-        if self._demand.line is None:
+        if self._joint.line is None:
             return False
         place = self.at(balance)
-        wrench, _ = self._rubbing(place, self.contact(balance))
-        return bool(self._demand.kept(place, wrench)[-1] < 0)
+        wrench, _ = self._with_friction(place, self.contact(balance))
+        return bool(self._joint.kept(place, wrench)[-1] < 0)
 
     def _with(self, x: Array) -> Array:
         place = self._place.copy()
         place[self._rows] = x / self._scale
         return place
 
-    def _rubbing(self, place: Array, contact: "ProbedContact") -> tuple[Array, Array | None]:
+    def _with_friction(self, place: Array, contact: "ProbedContact") -> tuple[Array, Array | None]:
         """Return wrench (6,) on the insert with friction, and its stiffness (6, 6) if known."""
         wrench, stiffness = np.zeros(6), np.zeros((6, 6))
         for condyle in contact.condyles.values():
             sliding = self._sliding(place, condyle.point)
             touch = CondylePoint(condyle.point, condyle.normal, sliding, 0.0)
             drag = touch.normal - touch.direction(self._friction)
-            rubbing = np.concatenate([drag, np.cross(touch.point, drag)])
+            rubbing = wrench_of(touch.point, drag)
             wrench += condyle.wrench + condyle.force * rubbing
             if condyle.stiffness is not None:
                 pressed = -touch.normal @ condyle.stiffness[:3]

@@ -9,7 +9,7 @@ Fluoroscopy errs by about 0.5 mm and 0.5 deg, which is more than the deformation
    the turn that this takes would exceed 0.5 deg.
 3. It is always moved along y to first touch.
 
-The source does not say about which point it turns. Registration places the component's centre
+Sharma (2008) does not say about which point it turns. Registration places the component's centre
 better than any other point, so the centre stays where it was recorded. About the contact
 points, 25 mm below, 0.4 deg shift the component sideways by 0.2 mm, and in dishes little
 wider than the condyles the contact by 1.3 mm: enough to change the total force by 0.02 BW.
@@ -20,27 +20,25 @@ rotation.
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.closest import ClosestPointQuery, CondyleGaps
-from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import Array, pose, transform
 from tkamb.units import DEGREE, MILLIMETRE
 
 LARGEST_ANGLE = 0.5 * DEGREE
 """rad: coronal angles from here on are taken as lift-off and left alone."""
 
-FARTHEST = 3.0 * MILLIMETRE
+LARGEST_RECORDED_GAP = 3.0 * MILLIMETRE
 """m: with both condyles farther than this from the insert the pose is no recorded contact."""
 
-LEVEL = 5e-6
+LEVEL_DIFFERENCE = 5e-6
 """m: condyles whose gaps differ by less are level as far as a mesh can say; no turn."""
 
-EQUAL = 1e-7
+TOUCH_DIFFERENCE = 1e-7
 """m: difference of the condyles' clearances at which they touch together."""
 
 MOST_TURNS = 20
@@ -90,7 +88,10 @@ def adjust(query: ClosestPointQuery, recorded: Array) -> Adjustment:
     _check_near(gaps)
     angle, distance = _coronal_angle(gaps)
     turn = 0.0
-    if gaps.lateral is not None and LEVEL < abs(angle) * distance < LARGEST_ANGLE * distance:
+    if (
+        gaps.lateral is not None
+        and LEVEL_DIFFERENCE < abs(angle) * distance < LARGEST_ANGLE * distance
+    ):
         turn = _levelling_turn(query, recorded, distance)
         turn = turn if abs(turn) < LARGEST_ANGLE else 0.0
     turned = _turned(query, recorded, turn) if turn else recorded
@@ -101,7 +102,7 @@ def adjust(query: ClosestPointQuery, recorded: Array) -> Adjustment:
 def _check_near(gaps: CondyleGaps) -> None:
     found = [gap.gap for gap in (gaps.medial, gaps.lateral) if gap is not None]
     nearest = min(found, key=abs)
-    if abs(nearest) > FARTHEST:
+    if abs(nearest) > LARGEST_RECORDED_GAP:
         word = "above" if nearest > 0.0 else "inside"
         raise InputError(
             f"neither condyle is near the insert (nearest {abs(nearest) * 1e3:.1f} mm {word})",
@@ -129,7 +130,7 @@ def _levelling_turn(query: ClosestPointQuery, recorded: Array, distance: float) 
     last, error = 0.0, difference(0.0)
     turn = error / distance
     for _ in range(MOST_TURNS):
-        if abs(error) < EQUAL or turn == last:
+        if abs(error) < TOUCH_DIFFERENCE or turn == last:
             return last
         now = difference(turn)
         slope = (now - error) / (turn - last)
@@ -140,7 +141,7 @@ def _levelling_turn(query: ClosestPointQuery, recorded: Array, distance: float) 
 
 def touches(query: ClosestPointQuery, at: Array) -> tuple[float, float]:
     """Return travel (m) along -y to touch, medial and lateral; negative once inside."""
-    medial, lateral = _first_touch(query).at(at)
+    medial, lateral = query.first_touch.at(at)
     if medial is None or lateral is None:
         raise ComputationError("a condyle does not lie over the insert", "femoral adjustment")
     return medial.travel, lateral.travel
@@ -152,7 +153,7 @@ def travel_to_touch(query: ClosestPointQuery, at: Array) -> float:
     Raises:
         ComputationError: the femur does not lie over the insert.
     """
-    travel = _first_touch(query).travel(at)
+    travel = query.first_touch.travel(at)
     if not math.isfinite(travel):
         raise ComputationError("the femur does not lie over the insert", "femoral adjustment")
     return travel
@@ -170,8 +171,3 @@ def raised(at: Array, along_y: float) -> Array:
     moved = np.array(at)
     moved[1, 3] += along_y
     return moved
-
-
-@lru_cache(maxsize=4)
-def _first_touch(query: ClosestPointQuery) -> FirstTouch:
-    return FirstTouch(query.femoral, query.insert, query.split)

@@ -1,21 +1,25 @@
 """Closest points of the femoral condyles and the insert, and the gap between them."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import fcl
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from tkamb.geometry.close_region import CloseRegion
-from tkamb.geometry.condyles import condyle_faces
-from tkamb.geometry.frames import Array, transform
-from tkamb.geometry.nearest import NearestPoints
-from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.condyles import FACET_DEPTH, SAMPLE_SPACING, condyle_faces
+from tkamb.geometry.first_touch import FirstTouch
+from tkamb.geometry.frames import Array, Index, inverse, rotate, transform
+from tkamb.geometry.nearest import NearestPoints, sampled
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
-Indices = NDArray[np.int64]
-
+REGION_RADIUS = 1.6e-2
+"""m; the close region ends this far from the closest point."""
+FACING_COSINE = 0.7
+"""Cosine of the angle between the surfaces, above which they face each other."""
+ESTIMATE_ERROR = 1e-4
+"""m; how far the quick estimate of a gap may be out on coarse meshes."""
 _ROUNDS = 3
 _KEPT = 8
 _BATCH = 64
@@ -60,9 +64,9 @@ class ClosestPointQuery:
     of an edge (about 1 µm of depth on implants). Both are the smallest signed distance to
     the insert over the condyle, so the gap is continuous through touch.
 
-    The normal is the mean of the insert's interpolated vertex normals over the close region
-    (`tkamb.geometry.close_region`), not the normal of a facet nor the line between the
-    points: it is defined at touch and turns smoothly as the contact moves.
+    The normal is the mean of the insert's interpolated vertex normals over the region in which
+    the surfaces are as close as their meshes can tell, not the normal of a facet nor the line
+    between the points: it is defined at touch and turns smoothly as the contact moves.
 
     Args:
         femoral: femoral component, femoral frame.
@@ -72,11 +76,15 @@ class ClosestPointQuery:
 
     def __init__(self, femoral: Surface, insert: Surface, split: float | None) -> None:
         self.femoral, self.insert, self.split = femoral, insert, split
-        self._nearest = NearestPoints(insert)
-        self._rays = RayCaster(insert)
+        self._nearest = insert.nearest
         self._insert_tree = _tree(insert, np.arange(len(insert.faces)))
         medial, lateral = condyle_faces(femoral, split)
         self._condyles = [_Condyle(femoral, faces) for faces in (medial, lateral) if len(faces)]
+
+    @cached_property
+    def first_touch(self) -> FirstTouch:
+        """How far either condyle travels along -y until it touches."""
+        return FirstTouch(self.femoral, self.insert, self.split)
 
     def at(self, pose_femoral_in_insert: Array) -> CondyleGaps:
         """Return the gaps at a pose (4, 4)."""
@@ -106,7 +114,7 @@ class ClosestPointQuery:
         on_femoral, on_insert = (np.asarray(point) * MILLIMETRE for point in result.nearest_points)
         return float(distance) * MILLIMETRE, on_femoral, on_insert
 
-    def _touching(self, condyle: "_Condyle", pose: Array) -> Indices:
+    def _touching(self, condyle: "_Condyle", pose: Array) -> Index:
         """Return the triangles of the condyle that cut or touch the insert's surface."""
         request = fcl.CollisionRequest(num_max_contacts=_BATCH, enable_contact=True)
         result = fcl.CollisionResult()
@@ -116,7 +124,7 @@ class ClosestPointQuery:
         distance = self._nearest.at(transform(pose, condyle.points)).distance
         return condyle.around(condyle.vertices[[np.argmin(distance)]])
 
-    def _deepest_vertices(self, condyle: "_Condyle", pose: Array) -> Indices:
+    def _deepest_vertices(self, condyle: "_Condyle", pose: Array) -> Index:
         """Return the deepest few vertices inside the insert, deepest first; none if apart.
 
         The depth along y bounds the depth from above and orders the search.
@@ -139,11 +147,11 @@ class ClosestPointQuery:
 
     def _depth_along_y(self, points: Array) -> Array:
         """Return the distance (n,) up to the insert's surface, 0 for points outside it."""
-        distance, face = self._rays.first(points, np.array([0.0, 1.0, 0.0]))
+        distance, face = self.insert.rays.first(points, np.array([0.0, 1.0, 0.0]))
         inside = (face >= 0) & (self.insert.face_normals[face, 1] > 0)
         return np.where(inside, distance, 0.0)
 
-    def _refined(self, faces: Indices, pose: Array) -> tuple[float, Array, Array]:
+    def _refined(self, faces: Index, pose: Array) -> tuple[float, Array, Array]:
         """Return gap and points of the deepest point of triangles, cutting the best finer."""
         corners = self.femoral.triangles[faces]
         triangles = transform(pose, corners.reshape(-1, 3)).reshape(-1, 3, 3)
@@ -167,12 +175,12 @@ class ClosestPointQuery:
 class _Condyle:
     """The triangles of one condyle: their tree, their vertices."""
 
-    def __init__(self, femoral: Surface, faces: Indices) -> None:
+    def __init__(self, femoral: Surface, faces: Index) -> None:
         self.faces = faces
         self.tree = _tree(femoral, faces)
         self.vertices = np.unique(femoral.faces[faces])
         self.points = femoral.vertices[self.vertices]
-        self.region = CloseRegion(femoral, faces)
+        self.region = _CloseRegion(femoral, faces)
         self._corners = femoral.faces[faces]
 
     def placed(self, pose: Array) -> fcl.CollisionObject:
@@ -180,21 +188,76 @@ class _Condyle:
         place = fcl.Transform(pose[:3, :3], pose[:3, 3] / MILLIMETRE)
         return fcl.CollisionObject(self.tree, place)
 
-    def around(self, vertices: Indices) -> Indices:
+    def around(self, vertices: Index) -> Index:
         """Return the triangles that touch the vertices."""
         touched = np.zeros(self._corners.max() + 1, bool)
         touched[vertices] = True
         return self.faces[touched[self._corners].any(axis=1)]
 
 
-def closest_points(
-    femoral: Surface, insert: Surface, pose_femoral_in_insert: Array, split: float | None
-) -> CondyleGaps:
-    """Return the gaps at one pose; `ClosestPointQuery` is the way to many."""
-    return ClosestPointQuery(femoral, insert, split).at(pose_femoral_in_insert)
+class _CloseRegion:
+    """Part of one body's surface, prepared to find its close region with another body.
+
+    On conforming surfaces the closest point of two meshes wanders by millimetres from pose
+    to pose, for differences in gap of a few micrometres. The centre of the region,
+
+        c = sum w_i p_i / sum w_i,   w_i = A_i exp(-(g_i - g) / FACET_DEPTH)
+
+    over samples i of area A_i and signed gap g_i (g the smallest gap, p_i the foot on the
+    other body), moves smoothly and coincides with the closest point where that is sharp.
+
+    Args:
+        surface: the body, own frame.
+        faces: (k,) the triangles that belong to the part.
+    """
+
+    def __init__(self, surface: Surface, faces: Index) -> None:
+        part = Surface(surface.vertices, surface.faces[faces], surface.name)
+        samples, owner, areas = sampled(part, SAMPLE_SPACING)
+        first, self._areas = _thinned(samples, areas)
+        self._samples, self._normals = samples[first], part.face_normals[owner[first]]
+        self._tree = cKDTree(self._samples)
+
+    def centre(
+        self, other: NearestPoints, pose: Array, gap: float, closest: Array
+    ) -> tuple[Array, Array]:
+        """Return the centre (3,) on the other body and its mean unit normal (3,) there.
+
+        Args:
+            other: nearest points of the other body, whose frame all points are in.
+            pose: (4, 4) of this body in the other's frame.
+            gap: m, the smallest signed gap.
+            closest: (3,) m, this body's point with that gap.
+        """
+        own = transform(inverse(pose), closest)
+        near = np.array(self._tree.query_ball_point(own, REGION_RADIUS), dtype=int)
+        here = self._normals[self._tree.query(own)[1]]
+        near = near[self._normals[near] @ here > 0.5]
+        points = transform(pose, self._samples[near])
+        within = np.abs(other.heights(points) - gap) < ESTIMATE_ERROR + 5 * FACET_DEPTH
+        near, points = near[within], points[within]
+        found = other.at(np.concatenate([points, closest[None]]))
+        facing = -np.einsum("ij,ij->i", rotate(pose, self._normals[near]), found.normals[:-1])
+        above = np.einsum("ij,ij->i", points - found.points[:-1], found.normals[:-1])
+        excess = np.where(above < 0, -1, 1) * found.distance[:-1] - gap
+        excess = np.where(excess < -FACET_DEPTH, np.inf, np.maximum(excess, 0.0))
+        weights = self._areas[near] * (facing > FACING_COSINE) * np.exp(-excess / FACET_DEPTH)
+        weights = np.append(weights, self._areas.mean())
+        mean = weights @ found.normals
+        centre = other.at((weights @ found.points / weights.sum())[None]).points[0]
+        return centre, mean / np.linalg.norm(mean)
 
 
-def _tree(surface: Surface, faces: Indices) -> fcl.BVHModel:
+def _thinned(samples: Array, areas: Array) -> tuple[Index, Array]:
+    """Keep one sample of each cube of the spacing: its index, and the area of them all."""
+    cubes = np.floor(samples / SAMPLE_SPACING).astype(np.int64)
+    order = np.argsort(-areas, kind="stable")
+    _, first, cube = np.unique(cubes[order], axis=0, return_index=True, return_inverse=True)
+    total = np.bincount(cube.reshape(-1), areas[order])
+    return order[first].astype(np.int64), np.asarray(total, np.float64)
+
+
+def _tree(surface: Surface, faces: Index) -> fcl.BVHModel:
     """Return the triangles as a tree in millimetres.
 
     fcl compares with absolute tolerances: in metres it finds small triangles that are 30 µm

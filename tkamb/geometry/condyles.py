@@ -1,16 +1,20 @@
-"""Where a femoral component parts into a medial and a lateral condyle."""
+"""Where a femoral component parts into two condyles, and the lowest point of each."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, rotate, transform
 from tkamb.geometry.nearest import sampled
 from tkamb.geometry.surface import Surface
 
 NOTCH_DEPTH = 2e-3
 """m; a shallower valley between two lobes does not make two condyles."""
+FACET_DEPTH = 3e-5
+"""m; depth that facets of 1–2 mm cut off a condyle: heights that differ by less are the same."""
+STRIP_WIDTH = 1e-3
+"""m; of the strips along z in which the notch is looked for."""
+SAMPLE_SPACING = 1e-3
+"""m; between the samples of a condyle's surface."""
 _FLEXIONS = np.radians(np.arange(0.0, 121.0, 15.0))
-_STRIP = 1e-3
 _DEEPEST = 15e-3
 
 
@@ -45,9 +49,7 @@ def condyle_split(femoral: Surface) -> float | None:
     return float((middles[first] + middles[last]) / 2)
 
 
-def condyle_faces(
-    femoral: Surface, split: float | None
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def condyle_faces(femoral: Surface, split: float | None) -> tuple[Index, Index]:
     """Return the triangles (k,) of the medial and of the lateral condyle.
 
     A triangle belongs to the side that its centroid is on. Without a split all of them are
@@ -61,9 +63,9 @@ def condyle_faces(
 
 def _mean_outline(femoral: Surface) -> tuple[Array, Array]:
     """Return height (n,) of the outline above its lowest point and z (n,) of the strips, m."""
-    samples = np.concatenate([sampled(femoral, _STRIP / 2)[0], femoral.vertices])
+    samples = np.concatenate([sampled(femoral, STRIP_WIDTH / 2)[0], femoral.vertices])
     low, high = femoral.bounds[:, 2]
-    count = max(int(np.ceil((high - low) / _STRIP)), 3)
+    count = max(int(np.ceil((high - low) / STRIP_WIDTH)), 3)
     strip = np.clip(((samples[:, 2] - low) / (high - low) * count).astype(int), 0, count - 1)
     total = np.zeros(count)
     for flexion in _FLEXIONS:
@@ -73,3 +75,46 @@ def _mean_outline(femoral: Surface) -> tuple[Array, Array]:
         total += np.minimum(outline - outline.min(), _DEEPEST)
     middles = low + (np.arange(count) + 0.5) * (high - low) / count
     return total / len(_FLEXIONS), middles
+
+
+class LowestPoints:
+    """Lowest point of each condyle along the insert's y, prepared for many poses.
+
+    y is that of the lowest vertex. x and z are the mean of the condyle's surface, weighted
+    with exp(-height / FACET_DEPTH) of the height above that vertex, so that the point rolls with
+    the condyle and does not jump from vertex to vertex of the mesh.
+
+    Args:
+        femoral: femoral component, femoral frame.
+        split: z between the condyles in the femoral frame, None for one condyle.
+    """
+
+    def __init__(self, femoral: Surface, split: float | None) -> None:
+        self._condyles = []
+        for faces in condyle_faces(femoral, split):
+            if len(faces):
+                part = Surface(femoral.vertices, femoral.faces[faces], femoral.name)
+                samples, _, areas = sampled(part, SAMPLE_SPACING)
+                self._condyles.append((femoral.vertices[np.unique(part.faces)], samples, areas))
+
+    def at(self, pose_femoral_in_insert: Array) -> tuple[Array, Array | None]:
+        """Return the points (3,) m, insert frame, of the medial and the lateral condyle.
+
+        The lateral one is None where there is no split.
+        """
+        pose = np.asarray(pose_femoral_in_insert, float)
+        points = [_lowest(pose, *condyle) for condyle in self._condyles]
+        return points[0], points[1] if len(points) > 1 else None
+
+
+def _lowest(pose: Array, vertices: Array, samples: Array, areas: Array) -> Array:
+    heights = vertices @ pose[1, :3]
+    lowest = vertices[np.argmin(heights)]
+    above = samples @ pose[1, :3] - heights.min()
+    near = above < 10 * FACET_DEPTH
+    weights = np.append(areas[near], areas.mean()) * np.exp(
+        -np.append(above[near], 0) / FACET_DEPTH
+    )
+    across = rotate(pose, np.vstack([samples[near], lowest]) - lowest)
+    step = weights @ across / weights.sum()
+    return transform(pose, lowest) + step * np.array([1.0, 0.0, 1.0])

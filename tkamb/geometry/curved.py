@@ -4,16 +4,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.geometry.corner_normals import corner_normals
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.subdivision import Coarsened, coarsened
 from tkamb.geometry.surface import Surface
 
-Indices = NDArray[np.int64]
-
-STEEPEST = 0.1
+SMALLEST_COSINE = 0.1
 """Smallest cosine between normal and direction that a shift is divided by: 84 deg."""
 
 
@@ -34,7 +30,7 @@ class CurvedSurface:
 
     Args:
         surface: its triangles share their vertices.
-        normals: (k, 3, 3) unit normals at the corners, see `corner_normals`.
+        normals: (k, 3, 3) unit normals at the corners, see `Surface.corner_normals`.
         sagittas: (k, 3) m, of the edge opposite each corner, along the triangle's normal.
         finer: the triangles that points are given on, and where they lie on the surface's;
             None: they are the surface's own.
@@ -54,7 +50,7 @@ class CurvedSurface:
         """Return the patches of a surface from its own corner normals."""
         finer = coarsened(surface)
         surface = surface if finer is None else finer.surface
-        normals = corner_normals(surface)
+        normals = surface.corner_normals
         return cls(surface, normals, _sagittas(surface, normals), finer)
 
     @cached_property
@@ -62,7 +58,7 @@ class CurvedSurface:
         """Corner normals, sagittas and plane's normal side by side (k, 15)."""
         return np.hstack([self.normals.reshape(-1, 9), self.sagittas, self.surface.face_normals])
 
-    def shift(self, faces: Indices, weights: Array, direction: Array) -> tuple[Array, Array]:
+    def shift(self, faces: Index, weights: Array, direction: Array) -> tuple[Array, Array]:
         """Return how far the patches are from points on their triangles along a direction.
 
         To first order in the patch's height.
@@ -86,7 +82,7 @@ class CurvedSurface:
         height = 4.0 * np.einsum("ij,ij->i", around, sagittas)
         along = np.einsum("ij,ij->i", normals, planes)
         cosine = normals @ direction
-        steep = np.copysign(np.maximum(np.abs(cosine), STEEPEST), cosine)
+        steep = np.copysign(np.maximum(np.abs(cosine), SMALLEST_COSINE), cosine)
         return height * along / steep, normals
 
 
@@ -101,4 +97,4 @@ def _sagittas(surface: Surface, normals: Array) -> Array:
     coming = np.einsum("kij,kij->ki", end, edge)
     product, total = leaving * coming, leaving + coming
     alike = product > 0.0
-    return np.asarray(np.where(alike, 0.5 * product / np.where(alike, total, 1.0), 0.0))
+    return np.where(alike, 0.5 * product / np.where(alike, total, 1.0), 0.0)

@@ -3,16 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from tkamb.geometry.ceiling import Ceiling, rows_of
-from tkamb.geometry.frames import Array, inverse, rotate, transform
-from tkamb.geometry.patches import Patches
-from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.bounds import HeightBound, Patches
+from tkamb.geometry.frames import Array, Index, Mask, inverse, rotate, transform
+from tkamb.geometry.ragged import Ragged
 from tkamb.geometry.surface import Surface
-
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 UP = np.array([0.0, 1.0, 0.0])
 EDGE_BAND = 0.03
@@ -22,7 +18,7 @@ MOST_EDGES = 1500
 FIRST_PATCHES = 12
 FIRST_LOOK = 64
 """So many promising vertices of so many patches give the bound that spares the others a ray."""
-ROUNDING = 1e-12
+CLEARANCE_ROUNDING = 1e-12
 """m; what a bound may be wrong by."""
 
 
@@ -53,22 +49,14 @@ class FirstTouch:
         femoral: in the femoral frame.
         insert: in the insert frame.
         split: z between the condyles in the femoral frame, m; None: one condyle (medial).
-        rays: ray casters of femoral component and insert, made if not given.
     """
 
-    def __init__(
-        self,
-        femoral: Surface,
-        insert: Surface,
-        split: float | None = None,
-        rays: tuple[RayCaster, RayCaster] | None = None,
-    ) -> None:
+    def __init__(self, femoral: Surface, insert: Surface, split: float | None = None) -> None:
         self._femoral, self._insert, self._split = femoral, insert, split
-        self._femoral_rays, self._insert_rays = rays or (RayCaster(femoral), RayCaster(insert))
         self._insert_tops = _with_face_towards(insert, UP)
         self._femoral_edges = _Edges(femoral, np.ones(len(femoral.vertices), bool))
         self._insert_edges = _Edges(insert, self._insert_tops)
-        self._ceiling = Ceiling(insert, self._insert_edges.reach)
+        self._height_bound = HeightBound(insert, self._insert_edges.reach)
         self._patches = Patches(femoral, self._femoral_edges.reach)
 
     def at(self, pose: ArrayLike) -> tuple[Touch | None, Touch | None]:
@@ -112,10 +100,10 @@ class FirstTouch:
     def _near_patches(self, pose: Array) -> tuple[Index, Array]:
         """Return the femoral patches over the insert and lower bounds of their clearance."""
         low, high = self._patches.extent(pose)
-        planes = self._ceiling.planes(low[:, ::2], high[:, ::2])
+        planes = self._height_bound.planes(low[:, ::2], high[:, ::2])
         over = np.flatnonzero(np.isfinite(planes[:, 2]))
         least = self._patches.least(pose, over, _normals_of(planes[over]))
-        return over, least - planes[over, 2] - ROUNDING
+        return over, least - planes[over, 2] - CLEARANCE_ROUNDING
 
     def _placed(self, pose: Array, vertices: Index) -> Array:
         return transform(pose, self._femoral.vertices[vertices])
@@ -133,36 +121,36 @@ class FirstTouch:
     def _at_least(self, pose: Array, vertices: Index) -> Array:
         """Return a lower bound (n,) of the clearance of femoral vertices; inf beside the insert."""
         points = self._placed(pose, vertices)
-        least = points[:, 1] - self._ceiling.over(points) - ROUNDING
+        least = points[:, 1] - self._height_bound.over(points) - CLEARANCE_ROUNDING
         return np.where(_within(points, self._insert.bounds), least, np.inf)
 
     def _near_tops(self, pose: Array, faces: Index, bound: float, side: int | None) -> Index:
         """Return the insert's vertices over which one of the triangles may be low enough."""
         corners = [transform(pose, self._femoral.triangles[faces, corner]) for corner in range(3)]
         low, high = np.minimum.reduce(corners)[:, ::2], np.maximum.reduce(corners)[:, ::2]
-        planes = self._ceiling.planes(low, high)
+        planes = self._height_bound.planes(low, high)
         normals = _normals_of(planes)
         above = np.minimum.reduce([np.einsum("ij,ij->i", c, normals) for c in corners])
-        near = above - planes[:, 3] - ROUNDING <= bound
-        tops = self._ceiling.vertices_in_rectangles(low[near], high[near])
+        near = above - planes[:, 3] - CLEARANCE_ROUNDING <= bound
+        tops = self._height_bound.vertices_in_rectangles(low[near], high[near])
         tops = tops[self._insert_tops[tops]]
         if side is not None and self._split is not None:
             z = transform(inverse(pose), self._insert.vertices[tops])[:, 2]
             tops = tops[(z >= self._split) == bool(side)]
-        return np.asarray(tops)
+        return tops
 
     def _over_insert(self, points: Array) -> Array:
         start = points.copy()
         start[:, 1] = self._insert.bounds[1, 1] + 1e-3
-        distance, _ = self._insert_rays.first(start, -UP)
-        return np.asarray(points[:, 1] - start[:, 1] + distance)
+        distance, _ = self._insert.rays.first(start, -UP)
+        return points[:, 1] - start[:, 1] + distance
 
     def _under_femoral(self, pose: Array, points: Array) -> Array:
         start, back = points.copy(), inverse(pose)
         radius = float(np.abs(self._femoral.bounds).max())
         start[:, 1] = pose[1, 3] - 2 * radius - 1e-3
-        distance, _ = self._femoral_rays.first(transform(back, start), rotate(back, UP))
-        return np.asarray(start[:, 1] + distance - points[:, 1])
+        distance, _ = self._femoral.rays.first(transform(back, start), rotate(back, UP))
+        return start[:, 1] + distance - points[:, 1]
 
     def _lowest(
         self, pose: Array, bottoms: tuple[Index, Array], tops: tuple[Index, Array]
@@ -198,8 +186,7 @@ class _Edges:
         self._band = EDGE_BAND * np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
         self._band += np.median(self._band) if len(self._band) else 0.0
         corner = self._ends.ravel()
-        self._of_vertex = np.argsort(corner, kind="stable") // 2
-        self._first = np.searchsorted(np.sort(corner), np.arange(len(surface.vertices) + 1))
+        self._at_vertex = Ragged.by_key(corner, len(surface.vertices))
         self.reach = np.zeros(len(surface.vertices))
         np.maximum.at(self.reach, corner, np.repeat(self._band, 2))
 
@@ -213,13 +200,12 @@ class _Edges:
         """
         above = clearance - smallest
         close = np.flatnonzero(above <= self.reach[vertices])
-        first = self._first
-        edges = rows_of(first, self._of_vertex, vertices[close])
-        count = first[vertices[close] + 1] - first[vertices[close]]
-        beyond = np.repeat(above[close], count) - self._band[edges]
+        vertex, corner = self._at_vertex.of(vertices[close])
+        edges = corner // 2
+        beyond = above[close][vertex] - self._band[edges]
         order = np.argsort(beyond, kind="stable")
         edges = edges[order[beyond[order] <= 0]]
-        return np.asarray(self._ends[np.unique(edges[: 2 * MOST_EDGES])])
+        return self._ends[np.unique(edges[: 2 * MOST_EDGES])]
 
 
 def _with_face_towards(surface: Surface, direction: Array) -> Mask:
@@ -238,7 +224,7 @@ def _normals_of(planes: Array) -> Array:
 def _within(points: Array, bounds: Array) -> Mask:
     """Say which points (n, 3) lie within bounds (2, 3) in x and z."""
     x, z, (low, high) = points[:, 0], points[:, 2], bounds
-    return np.asarray((x >= low[0]) & (x <= high[0]) & (z >= low[2]) & (z <= high[2]))
+    return (x >= low[0]) & (x <= high[0]) & (z >= low[2]) & (z <= high[2])
 
 
 def _crossing(upper: Array, lower: Array) -> Touch | None:

@@ -5,24 +5,23 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array, pose
+from tkamb.geometry.frames import Array, Index, Mask, pose
 from tkamb.geometry.surface import Surface
 
 FLATNESS = 5e-5
 """m; corners of one flat may lie this far from its plane (noise of the mesh)."""
 TILT_LIMIT = math.radians(30.0)
 """A bottom tilted by less than this from -y is turned level."""
-COMPARABLE = 0.5
+COMPARABLE_SHARE = 0.5
 """Flats whose area is at least this share of the largest compete with it."""
-CLEAR = 0.9
+CLEAR_SHARE = 0.9
 """Between two flats that face down, the larger wins below this ratio of areas."""
-UNEVEN = 1e-6
+UNEVEN_NOISE = 1e-6
 """m; a bottom that is rougher than this gets a notice: noise, or no flat at all."""
-_LEVEL = 1e-6
+_LEVEL_TILT = 1e-6
 """rad; a smaller tilt is rounding and stays as it is."""
 _CONE = math.radians(15.0)
 
@@ -45,8 +44,8 @@ class FlatBottom:
     normal: Array
     centre: Array
     area: float
-    faces: NDArray[np.int64]
-    vertices: NDArray[np.int64]
+    faces: Index
+    vertices: Index
     noise: float
 
 
@@ -58,21 +57,18 @@ def find_flats(surface: Surface) -> list[FlatBottom]:
     refitted with tolerances that follow the mesh's own noise. Its triangles are set aside
     and the search repeats while a flat of comparable area is found.
     """
-    corners = surface.triangles
-    normals = surface.face_normals
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = 0.5 * np.linalg.norm(cross, axis=1)
+    normals, area = surface.face_normals, surface.areas
     free = area > 0
     flats: list[FlatBottom] = []
     for _ in range(12):
         flat = _largest_flat(surface, normals, area, free) if free.any() else None
-        if flat is None or (flats and flat.area < COMPARABLE * max(f.area for f in flats)):
+        if flat is None or (flats and flat.area < COMPARABLE_SHARE * max(f.area for f in flats)):
             break
         flats.append(flat)
         free = free.copy()
         free[flat.faces] = False
     largest = max((flat.area for flat in flats), default=0.0)
-    flats = [flat for flat in flats if flat.area >= COMPARABLE * largest]
+    flats = [flat for flat in flats if flat.area >= COMPARABLE_SHARE * largest]
     return sorted(flats, key=lambda flat: -flat.area)
 
 
@@ -97,20 +93,20 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
     down = [flat for flat in flats if -flat.normal[1] >= math.cos(TILT_LIMIT)]
     if not down:
         raise _faces_elsewhere(surface.name, flats[0], rotation)
-    if len(down) > 1 and down[1].area >= CLEAR * down[0].area:
+    if len(down) > 1 and down[1].area >= CLEAR_SHARE * down[0].area:
         raise InputError(
             f"{surface.name} has two flats that could be its bottom: "
             f"{_described(down[0], rotation)}, and {_described(down[1], rotation)}",
             None,
             "remove one, or give the part without its underside",
         )
-    if down[0].noise > UNEVEN:
+    if down[0].noise > UNEVEN_NOISE:
         _log.warning(
             "%s: the flat bottom is uneven by %.0f µm (root mean square)",
             surface.name,
             1e6 * down[0].noise,
         )
-    if down[0].area < CLEAR * flats[0].area:
+    if down[0].area < CLEAR_SHARE * flats[0].area:
         _log.warning(
             "%s: the flat that faces inferior (%s) is taken as the bottom, though another is "
             "larger (%s)",
@@ -180,15 +176,13 @@ def _levelling(normal: Array) -> Array:
     """Return the smallest rotation (3, 3) that turns the normal to -y."""
     axis = np.cross(normal, [0.0, -1.0, 0.0])
     sine = float(np.linalg.norm(axis))
-    if sine < _LEVEL:
+    if sine < _LEVEL_TILT:
         return np.eye(3)
     angle = math.atan2(sine, -normal[1])
-    return np.asarray(Rotation.from_rotvec(axis / sine * angle).as_matrix())
+    return Rotation.from_rotvec(axis / sine * angle).as_matrix()
 
 
-def _largest_flat(
-    surface: Surface, normals: Array, area: Array, free: NDArray[np.bool_]
-) -> FlatBottom | None:
+def _largest_flat(surface: Surface, normals: Array, area: Array, free: Mask) -> FlatBottom | None:
     best: FlatBottom | None = None
     for seed in _peaks(normals[free], area[free]):
         flat = _grown(surface, normals, area, free, seed)
@@ -215,7 +209,7 @@ def _peaks(normals: Array, area: Array) -> list[Array]:
 
 
 def _grown(
-    surface: Surface, normals: Array, area: Array, free: NDArray[np.bool_], seed: Array
+    surface: Surface, normals: Array, area: Array, free: Mask, seed: Array
 ) -> FlatBottom | None:
     near = np.flatnonzero(free & (normals @ seed > math.cos(_CONE)))
     corners, weight = surface.triangles[near], area[near]

@@ -21,9 +21,20 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 KNEE_COORDINATES = ("ap", "si", "ml", "axial_rotation", "adduction", "flexion")
 """Order of the six knee coordinates: translations (m), then rotations (rad)."""
+
+KNEE_JOINT_NAMES = tuple(f"knee_{name}" for name in KNEE_COORDINATES)
+"""Their joints in the URDF, in the same order."""
+
+PATELLA_COORDINATES = PATELLA_JOINT_NAMES = ("patella_ap", "patella_si", "patella_rotation")
+"""The patella's in the femur's sagittal plane, and their joints: m, m, rad."""
+
+SIDES = ("medial", "lateral")
+"""The condyles."""
 
 
 def pose(rotation: ArrayLike, translation: ArrayLike) -> Array:
@@ -104,14 +115,31 @@ def knee_twist(coordinates: ArrayLike, rates: ArrayLike) -> tuple[Array, Array]:
         Velocity (..., 3) m/s of the femoral origin and angular velocity (..., 3) rad/s, both
         in the insert frame.
     """
-    c, rate = np.asarray(coordinates, float), np.asarray(rates, float)
-    zero, one = np.zeros_like(c[..., 0]), np.ones_like(c[..., 0])
-    superior = np.stack([zero, one, zero], axis=-1)
-    floating = np.stack([np.cos(c[..., 3]), zero, np.sin(c[..., 3])], axis=-1)
-    medial_lateral = knee_pose(c)[..., :3, 2]
-    spin = (
-        -rate[..., 3, None] * superior
-        - rate[..., 4, None] * floating
-        + rate[..., 5, None] * medial_lateral
-    )
-    return rate[..., :3], spin
+    rate = np.asarray(rates, float)
+    return rate[..., :3], np.einsum("...i,...ij->...j", rate, knee_axes(coordinates)[..., 3:])
+
+
+def knee_axes(coordinates: ArrayLike) -> Array:
+    """Return the femur's twist per unit rate of each knee coordinate.
+
+    A wrench w (force, moment about the insert's origin) on the femur does the generalised
+    forces `knee_axes(q) @ w` in the six coordinates.
+
+    Args:
+        coordinates: (..., 6) knee coordinates, m and rad.
+
+    Returns:
+        (..., 6, 6): row i is the velocity of the femoral point at the insert's origin and the
+        angular velocity, insert frame, for a unit rate of coordinate i.
+    """
+    c = np.asarray(coordinates, float)
+    axes = np.zeros((*c.shape[:-1], 6, 6))
+    axes[..., [0, 1, 2], [0, 1, 2]] = 1.0
+    turn, tilt = c[..., 3], c[..., 4]
+    axes[..., 3, 4] = -1.0
+    axes[..., 4, 3], axes[..., 4, 5] = -np.cos(turn), -np.sin(turn)
+    axes[..., 5, 3] = -np.sin(turn) * np.cos(tilt)
+    axes[..., 5, 4] = np.sin(tilt)
+    axes[..., 5, 5] = np.cos(turn) * np.cos(tilt)
+    axes[..., 3:, :3] = np.cross(c[..., None, :3], axes[..., 3:, 3:])
+    return axes

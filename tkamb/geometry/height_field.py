@@ -15,11 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
+from tkamb.geometry.ragged import counted
 from tkamb.geometry.surface import Surface
-
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 ODD_SHARE = 0.01
 """Largest share of lines with an odd number of crossings that is mended, not refused."""
@@ -114,8 +112,7 @@ def _crossings(
         np.searchsorted(second, high[:, 1], "right"),
     )
     count = (a1 - a0) * (b1 - b0)
-    face = np.repeat(np.arange(len(count)), count)
-    rank = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    face, rank = counted(count)
     width = (b1 - b0)[face]
     a, b = a0[face] + rank // np.maximum(width, 1), b0[face] + rank % np.maximum(width, 1)
     points = np.column_stack([first[a], second[b]])

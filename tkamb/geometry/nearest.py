@@ -2,15 +2,18 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from tkamb.geometry.frames import Array
-from tkamb.geometry.surface import Surface
+from tkamb.geometry.frames import Array, Index
+from tkamb.geometry.normals import NO_CREASE, corner_normals, interpolated
 
-Indices = NDArray[np.int64]
+if TYPE_CHECKING:
+    from tkamb.geometry.surface import Surface
+
 
 _MOST_SAMPLES = 150_000
 _CANDIDATES = 8
@@ -29,7 +32,7 @@ class Nearest:
 
     distance: Array
     points: Array
-    faces: Indices
+    faces: Index
     normals: Array
 
 
@@ -42,15 +45,16 @@ class NearestPoints:
     default spacing on implants).
     """
 
-    def __init__(self, surface: Surface, spacing: float = 7e-4) -> None:
+    def __init__(self, surface: "Surface", spacing: float = 7e-4) -> None:
         self.surface = surface
         self._samples, self._faces, _ = sampled(surface, spacing)
         self._tree = cKDTree(self._samples)
 
     @cached_property
-    def vertex_normals(self) -> Array:
-        """Unit normals (n, 3) of the vertices, weighted by the areas of their triangles."""
-        return vertex_normals(self.surface)
+    def _corner_normals(self) -> Array:
+        """Unit normals (k, 3, 3) of the vertices, weighted by the areas of their triangles."""
+        area = self.surface.areas[:, None] * np.ones(3)
+        return corner_normals(self.surface, NO_CREASE, area)
 
     def at(self, points: ArrayLike) -> Nearest:
         """Return the nearest points to `points` (n, 3), m, in the surface's frame."""
@@ -79,16 +83,12 @@ class NearestPoints:
     def _sample_normals(self) -> Array:
         return self.normals_at(self._samples, self._faces)
 
-    def normals_at(self, points: Array, faces: Indices) -> Array:
+    def normals_at(self, points: Array, faces: Index) -> Array:
         """Return the interpolated unit normals (n, 3) at points (n, 3) of given triangles."""
-        weights = self.surface.barycentric(points, faces)
-        corners = self.vertex_normals[self.surface.faces[faces]]
-        normal = np.einsum("ij,ijk->ik", weights, corners)
-        length = np.linalg.norm(normal, axis=1, keepdims=True)
-        return np.asarray(np.divide(normal, length, out=np.zeros_like(normal), where=length > 0))
+        return interpolated(self.surface, self._corner_normals, points, faces)
 
 
-def sampled(surface: Surface, spacing: float) -> tuple[Array, Indices, Array]:
+def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
     """Return samples (n, 3) that cover every triangle, the triangle (n,) and area (n,) of each.
 
     A triangle is cut into n² like ones so that no edge is longer than the spacing; the
@@ -101,8 +101,7 @@ def sampled(surface: Surface, spacing: float) -> tuple[Array, Indices, Array]:
     while (cuts**2).sum() > max(_MOST_SAMPLES, len(triangles)) and cuts.max() > 1:
         spacing *= 1.2
         cuts = np.maximum(np.ceil(longest / spacing).astype(int), 1)
-    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    area = 0.5 * np.linalg.norm(cross, axis=1) / cuts**2
+    area = surface.areas / cuts**2
     samples, faces = [], []
     for n in np.unique(cuts):
         members = np.flatnonzero(cuts == n)
@@ -110,16 +109,6 @@ def sampled(surface: Surface, spacing: float) -> tuple[Array, Indices, Array]:
         faces.append(np.repeat(members, n * n))
     owner = np.concatenate(faces)
     return np.concatenate([s.reshape(-1, 3) for s in samples]), owner, area[owner]
-
-
-def vertex_normals(surface: Surface) -> Array:
-    """Return the unit normals (n, 3) of the vertices, weighted by area; outward."""
-    corners = surface.triangles
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    index = surface.faces.reshape(-1)
-    total = _summed(index, np.repeat(cross, 3, axis=0), len(surface.vertices))
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0))
 
 
 def nearest_on_triangles(triangles: Array, points: Array) -> Array:
@@ -139,7 +128,7 @@ def nearest_on_triangles(triangles: Array, points: Array) -> Array:
     on_edges = start + part[:, :, None] * along
     nearest = ((on_edges - target) ** 2).sum(axis=2).argmin(axis=1)
     feet[outside] = on_edges[np.arange(len(start)), nearest]
-    return np.asarray(feet)
+    return feet
 
 
 def _plane_weights(triangles: Array, points: Array) -> Array:
@@ -154,12 +143,8 @@ def _plane_weights(triangles: Array, points: Array) -> Array:
     return np.stack([1 - second - third, second, third], axis=1)
 
 
-def _summed(index: Indices, rows: Array, count: int) -> Array:
-    return np.stack([np.bincount(index, column, count) for column in rows.T], axis=1)
-
-
 def _dot(a: Array, b: Array) -> Array:
-    return np.asarray(np.einsum("ij,ij->i", a, b))
+    return np.einsum("ij,ij->i", a, b)
 
 
 def _centres(n: int) -> Array:

@@ -7,23 +7,22 @@ sideways. Contact along y, as modelled here, cannot see that.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, label
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Mask
 from tkamb.geometry.height_field import inside_intervals
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
 SPACING = 1e-3
 """m between the lines along y."""
-RISE = 8e-3
+POST_RISE = 8e-3
 """m: what stands higher than this above the dishes may be a post."""
-DROP = 3e-3
+SIDE_DROP = 3e-3
 """m: a side of a post falls by this within two lines (56 deg) ..."""
 STEEP_SHARE = 0.75
 """... on at least this share of its outline."""
-MIDDLE = 0.25
+MIDDLE_SHARE = 0.25
 """The centre of a post lies within this share of the width from the middle."""
 
 
@@ -64,24 +63,24 @@ def find_post(insert: Surface) -> Post | None:
     top = np.full((len(x), len(z)), -np.inf)
     np.maximum.at(top, (found.second, found.first), found.upper)
     dish = float(np.percentile(top[np.isfinite(top)], 2.0))
-    patches, count = label(top > dish + RISE)
+    patches, count = label(top > dish + POST_RISE)
     for number in range(1, count + 1):
         patch = patches == number
         i, k = np.nonzero(patch)
-        centred = abs(z[k].mean() - (low[2] + high[2]) / 2) < MIDDLE * (high[2] - low[2]) / 2
+        centred = abs(z[k].mean() - (low[2] + high[2]) / 2) < MIDDLE_SHARE * (high[2] - low[2]) / 2
         if centred and patch.sum() >= 9 and _steep_share(top, patch) >= STEEP_SHARE:
             height = float(top[patch].max() - dish)
             return Post(float(x[i].mean()), float(z[k].mean()), height, len(i) * SPACING**2)
     return None
 
 
-def _steep_share(top: Array, patch: NDArray[np.bool_]) -> float:
+def _steep_share(top: Array, patch: Mask) -> float:
     """Return the share of the columns around a patch that lie far below its edge."""
     near = binary_dilation(patch)
     around = binary_dilation(near, iterations=1) & ~near
     edge = float(np.median(top[patch & ~_eroded(patch)]))
-    return float(np.mean(top[around] < edge - DROP)) if around.any() else 0.0
+    return float(np.mean(top[around] < edge - SIDE_DROP)) if around.any() else 0.0
 
 
-def _eroded(patch: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _eroded(patch: Mask) -> Mask:
     return ~binary_dilation(~patch)

@@ -8,17 +8,18 @@ double precision. Rays that embree misses are offered once more from four points
 so that a ray along a rim, or through an edge, still finds what it touches.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from tkamb.geometry.frames import Array
-from tkamb.geometry.surface import Surface
+from tkamb.geometry.frames import Array, Index, Mask
 
-Index = NDArray[np.int64]
+if TYPE_CHECKING:
+    from tkamb.geometry.surface import Surface
+
 
 EDGE_TOLERANCE = 1e-9
 """How far outside a triangle, in barycentric units, a crossing still belongs to it."""
@@ -41,7 +42,7 @@ class RayCaster:
         surface: (n, 3) vertices in metres, any frame; rays are given in the same frame.
     """
 
-    def __init__(self, surface: Surface) -> None:
+    def __init__(self, surface: "Surface") -> None:
         self.surface = surface
         lower, upper = surface.bounds
         self._centre = 0.5 * (lower + upper)
@@ -50,7 +51,6 @@ class RayCaster:
         rows = surface.barycentric_rows.reshape(-1, 6)
         self._planes = np.hstack([surface.triangles[:, 0], surface.face_normals, rows])
         self._narrowest = _least_altitudes(surface)
-        self._ring = _VertexRing(surface)
         self._scene: Any = EmbreeScene(robust=True)
         scaled = ((surface.vertices - self._centre) / self._radius).astype(np.float32)
         TriangleMesh(self._scene, scaled, surface.faces.astype(np.int32))
@@ -180,11 +180,11 @@ class RayCaster:
         scaled = ((points - self._centre) / self._radius).astype(np.float32)
         return np.asarray(self._scene.run(scaled, directions.astype(np.float32)), np.int64)
 
-    def _meets_sphere(self, points: Array, directions: Array) -> NDArray[np.bool_]:
+    def _meets_sphere(self, points: Array, directions: Array) -> Mask:
         offset = self._centre - points
         along = np.einsum("ij,ij->i", offset, directions)
         off_axis = np.linalg.norm(offset - along[:, None] * directions, axis=1)
-        return np.asarray((off_axis <= 1.01 * self._radius) & (along >= -self._radius))
+        return (off_axis <= 1.01 * self._radius) & (along >= -self._radius)
 
     def _intersect(self, origins: Array, directions: Array, face: Index) -> tuple[Array, Array]:
         """Return the distance to each triangle's plane and the barycentrics (n, 3) there."""
@@ -205,12 +205,20 @@ class RayCaster:
         self, origins: Array, directions: Array, start: Array, face: Index
     ) -> tuple[Index, Array, Index]:
         """Return crossings (ray, distance, face) with triangles at the vertices of `face`."""
-        ray, candidate = self._ring.around(face)
+        ray, candidate = self._sharing_a_vertex(face)
         t, weights = self._intersect(origins[ray], directions[ray], candidate)
         keep = (weights.min(axis=1) >= -EDGE_TOLERANCE) & (
             t >= start[ray] - SAME_CROSSING * self._radius
         )
         return ray[keep], t[keep], candidate[keep]
+
+    def _sharing_a_vertex(self, face: Index) -> tuple[Index, Index]:
+        """Return (place in `face`, triangle) of all at the vertices of each `face` but -1."""
+        known, count = np.flatnonzero(face >= 0), len(self.surface.faces)
+        vertices = self.surface.corner_vertices[face[known]].ravel()
+        place, corner = self.surface.corners_at_vertices.of(vertices)
+        key = np.unique(known[place // 3] * count + corner // 3)  # each pair once
+        return key // count, key % count
 
     def _look_behind(
         self, origins: Array, directions: Array, distance: Array, face: Index, left: Index
@@ -248,29 +256,7 @@ class RayCaster:
         return ray[order], t[order], face[order]
 
 
-class _VertexRing:
-    """For each triangle, the triangles that share a vertex with it (itself included)."""
-
-    def __init__(self, surface: Surface) -> None:
-        _, merged = np.unique(surface.vertices, axis=0, return_inverse=True)
-        self._faces = merged.reshape(-1)[surface.faces]
-        corner = self._faces.ravel()
-        self._order = np.argsort(corner, kind="stable") // 3
-        self._start = np.searchsorted(np.sort(corner), np.arange(corner.max() + 2))
-
-    def around(self, face: Index) -> tuple[Index, Index]:
-        """Return (position in `face`, triangle) for every proposal but -1, no repeats."""
-        known = np.flatnonzero(face >= 0)
-        vertex = self._faces[face[known]].ravel()
-        count = self._start[vertex + 1] - self._start[vertex]
-        owner = np.repeat(np.repeat(known, 3), count)
-        first = np.repeat(self._start[vertex] - np.cumsum(count) + count, count)
-        triangle = self._order[first + np.arange(count.sum())]
-        key = np.unique(owner * len(self._faces) + triangle)
-        return key // len(self._faces), key % len(self._faces)
-
-
-def _least_altitudes(surface: Surface) -> Array:
+def _least_altitudes(surface: "Surface") -> Array:
     """Return the least altitude (k,) of every triangle, m."""
     edges = np.roll(surface.triangles, 1, axis=1) - surface.triangles
     doubled = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)

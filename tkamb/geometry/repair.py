@@ -3,15 +3,20 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from tkamb.geometry.boundary import BoundaryLoop, boundary_loops, edge_use, half_edges, open_edges
-from tkamb.geometry.frames import Array
-
-Indices = NDArray[np.int64]
+from tkamb.geometry.frames import Array, Index
+from tkamb.geometry.topology import (
+    BoundaryLoop,
+    boundary_loops,
+    connected_parts,
+    edge_use,
+    half_edges,
+    open_edges,
+    signed_volumes,
+)
 
 WELD_DISTANCE = 5e-5
 """m; open edges whose ends are closer than this are one edge."""
@@ -35,14 +40,14 @@ class Repair:
     """
 
     vertices: Array
-    faces: Indices
+    faces: Index
     notices: tuple[str, ...]
     holes: tuple[BoundaryLoop, ...]
-    forks: Indices
+    forks: Index
     one_sided: bool
 
 
-def repair(vertices: Array, faces: Indices) -> Repair:
+def repair(vertices: Array, faces: Index) -> Repair:
     """Mend duplicate and degenerate faces, winding, cracks, small holes, loose vertices.
 
     The corners of the triangles may be unmerged, as in an STL file; merging equal corners
@@ -88,7 +93,7 @@ def _notice(count: int, noun: str, what: str) -> str:
     return f"{count} {noun if count == 1 else several} {what}" if count else ""
 
 
-def _merged(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
+def _merged(vertices: Array, faces: Index) -> tuple[Array, Index]:
     rows = np.ascontiguousarray(vertices + 0.0).view("V24").reshape(-1)
     _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
     order = np.argsort(first)
@@ -97,13 +102,13 @@ def _merged(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
     return vertices[first[order]] + 0.0, rank[inverse.reshape(-1)][faces]
 
 
-def _without_collapsed(faces: Indices) -> tuple[Indices, int]:
+def _without_collapsed(faces: Index) -> tuple[Index, int]:
     a, b, c = faces.T
     good = (a != b) & (b != c) & (c != a)
     return faces[good], int((~good).sum())
 
 
-def _without_duplicates(faces: Indices) -> tuple[Indices, int]:
+def _without_duplicates(faces: Index) -> tuple[Index, int]:
     """Keep one of equal faces; of two back to back (a fold without thickness) keep none."""
     corners = np.sort(faces, axis=1)
     _, first, group, count = np.unique(
@@ -126,7 +131,7 @@ def _without_duplicates(faces: Indices) -> tuple[Indices, int]:
     return faces[keep], int((count - 1).sum())
 
 
-def _wound(vertices: Array, faces: Indices) -> tuple[Indices, int, bool]:
+def _wound(vertices: Array, faces: Index) -> tuple[Index, int, bool]:
     """Turn the minority (by area) of each connected part so that neighbours agree.
 
     Every face is two nodes, as it is and turned; neighbours are linked in the states that
@@ -155,7 +160,7 @@ def _wound(vertices: Array, faces: Indices) -> tuple[Indices, int, bool]:
     return result, 0 if one_sided else int(flip.sum()), one_sided
 
 
-def _welded(vertices: Array, faces: Indices) -> tuple[Indices, int]:
+def _welded(vertices: Array, faces: Index) -> tuple[Index, int]:
     """Join ends of open edges that lie within WELD_DISTANCE of one another."""
     loose = np.unique(open_edges(faces))
     if len(loose) == 0:
@@ -171,7 +176,7 @@ def _welded(vertices: Array, faces: Indices) -> tuple[Indices, int]:
     return target[faces], int((target != np.arange(len(vertices))).sum())
 
 
-def _filled(vertices: Array, faces: Indices) -> tuple[Array, Indices, int, float]:
+def _filled(vertices: Array, faces: Index) -> tuple[Array, Index, int, float]:
     """Close small holes: three edges by their triangle, more by a fan about their centre."""
     new_vertices, new_faces = [vertices], [faces]
     widest, total, filled = 0.0, len(vertices), 0
@@ -190,7 +195,7 @@ def _filled(vertices: Array, faces: Indices) -> tuple[Array, Indices, int, float
     return np.concatenate(new_vertices), np.concatenate(new_faces), filled, widest
 
 
-def _outward(vertices: Array, faces: Indices) -> tuple[Indices, int]:
+def _outward(vertices: Array, faces: Index) -> tuple[Index, int]:
     """Turn closed bodies that are inside out; a void within another body stays one."""
     part = connected_parts(faces)
     open_parts = set(np.unique(part[np.isin(faces, open_edges(faces)).any(axis=1)]))
@@ -214,27 +219,12 @@ def _box(corners: Array) -> tuple[Array, Array]:
     return corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
 
 
-def connected_parts(faces: Indices) -> Indices:
-    """Return for every face (k,) the number of the connected part that it belongs to."""
-    n = int(faces.max(initial=0)) + 1
-    edges = half_edges(faces)
-    graph = coo_matrix((np.ones(len(edges), bool), edges.T), shape=(n, n))
-    label = connected_components(graph, directed=False)[1]
-    return np.unique(label[faces[:, 0]], return_inverse=True)[1].reshape(-1)
-
-
-def signed_volumes(vertices: Array, faces: Indices) -> Array:
-    """Return the volume (k,) that each face spans with the centre of the vertices, m³."""
-    a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
-    return np.asarray(np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
-
-
-def _referenced(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
+def _referenced(vertices: Array, faces: Index) -> tuple[Array, Index]:
     used, index = np.unique(faces, return_inverse=True)
     return vertices[used], index.reshape(faces.shape).astype(np.int64)
 
 
-def _forks(faces: Indices) -> Indices:
+def _forks(faces: Index) -> Index:
     edge, count = edge_use(faces)
     odd = (count > 2) & (count % 2 == 1)
     return np.unique(half_edges(faces)[odd[edge]])

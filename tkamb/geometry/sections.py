@@ -49,7 +49,7 @@ def convex_outline(points: Array, offset: float = 0.0, step_deg: float = 2.0) ->
             hull = grown[ConvexHull(grown).vertices]
     except (QhullError, ValueError, IndexError):
         raise InputError("the section spans no area", "sagittal outline") from None
-    return np.asarray(hull)
+    return hull
 
 
 def sagittal_outline(

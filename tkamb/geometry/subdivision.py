@@ -8,17 +8,15 @@ coarser ones alone.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tkamb.geometry.boundary import edge_use
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
+from tkamb.geometry.ragged import Ragged
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.topology import edge_use
 
-Indices = NDArray[np.int64]
-
-ROUNDING = 1e-6
+HALVING_TOLERANCE = 1e-6
 """Of the surface's size: how far a halved edge's middle may be from its line, as files round."""
 MOST_LEVELS = 8
 MOST_PARTS = 100
@@ -36,7 +34,7 @@ class Coarsened:
     """
 
     surface: Surface
-    parent: Indices
+    parent: Index
     corners: Array
 
 
@@ -91,23 +89,18 @@ class _Search:
     neighbours. From one of them the next are found across the neighbours' tips.
     """
 
-    def __init__(self, surface: Surface, across: Indices) -> None:
+    def __init__(self, surface: Surface, across: Index) -> None:
         self._faces, self._points, self._across = surface.faces, surface.vertices, across
-        self._near = ROUNDING * float(np.linalg.norm(np.ptp(surface.bounds, axis=0)))
-        order = np.argsort(surface.faces.ravel(), kind="stable")
-        self._around = order // 3
-        self._corner = order % 3
-        self._first = np.searchsorted(
-            surface.faces.ravel()[order], np.arange(len(surface.vertices) + 1)
-        )
+        self._near = HALVING_TOLERANCE * float(np.linalg.norm(np.ptp(surface.bounds, axis=0)))
+        self._corners = Ragged.by_key(surface.faces.ravel(), len(surface.vertices))
 
-    def tips(self, middle: Indices) -> Indices:
+    def tips(self, middle: Index) -> Index:
         """Return the vertices (m, 3) of the neighbours across from each corner's edge."""
         others, own = self._faces[self._across[middle]], self._faces[middle]
         shared = (others[:, :, :, None] == own[:, None, None]).any(axis=3)
         return np.take_along_axis(others, np.argmin(shared, axis=2)[..., None], axis=2)[..., 0]
 
-    def middles_of(self, part: Indices) -> Indices:
+    def middles_of(self, part: Index) -> Index:
         """Return the middle triangles of a part (faces that hang together); none: not cut."""
         first = part[0]
         starts = [[first], *([face] for face in self._across[first])]
@@ -118,7 +111,7 @@ class _Search:
                     return found
         return np.zeros(0, np.int64)
 
-    def _spread(self, start: Indices) -> Indices | None:
+    def _spread(self, start: Index) -> Index | None:
         """Return all middle triangles that follow from one; None where they contradict."""
         kind = np.zeros(len(self._faces), np.int8)  # 1: middle, 2: at a tip
         even = np.zeros(len(self._points), bool)
@@ -139,7 +132,7 @@ class _Search:
         every = np.concatenate(found)
         return None if even[self._faces[every]].any() else every
 
-    def _are_middles(self, faces: Indices) -> bool:
+    def _are_middles(self, faces: Index) -> bool:
         """Say whether the corners of faces halve the edges between their neighbours' tips."""
         if (faces < 0).any() or (self._across[faces] < 0).any():
             return False
@@ -147,15 +140,12 @@ class _Search:
         halves = 0.5 * np.stack([b + c, c + a, a + b], axis=1)
         return bool(np.abs(halves - self._points[self._faces[faces]]).max() <= self._near)
 
-    def _beyond(self, tips: Indices) -> Indices:
+    def _beyond(self, tips: Index) -> Index:
         """Return the faces across from each tip of all the faces around it."""
-        count = self._first[tips + 1] - self._first[tips]
-        begins = np.repeat(self._first[tips] - np.cumsum(count) + count, count)
-        place = begins + np.arange(count.sum())
-        return np.unique(self._across[self._around[place], self._corner[place]])
+        return np.unique(self._across.ravel()[self._corners.of(tips)[1]])
 
 
-def _across(faces: Indices) -> Indices:
+def _across(faces: Index) -> Index:
     """Return the face (k, 3) across the edge opposite each corner; -1: none, or several."""
     edge, count = edge_use(faces)
     order = np.argsort(edge, kind="stable")
@@ -166,10 +156,10 @@ def _across(faces: Indices) -> Indices:
     here = pair[edge].reshape(-1, 3, 2)
     own = np.arange(len(faces))[:, None]
     other = np.where(here[..., 0] == own, here[..., 1], here[..., 0])
-    return np.asarray(np.roll(other, -1, axis=1))
+    return np.roll(other, -1, axis=1)
 
 
-def _parts(across: Indices) -> tuple[int, Indices]:
+def _parts(across: Index) -> tuple[int, Index]:
     """Return how many parts hang together across edges, and whose each face is (k,)."""
     face, corner = np.nonzero(across >= 0)
     ones = np.ones(len(face), np.int8)

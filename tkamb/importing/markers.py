@@ -9,8 +9,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, transform
 from tkamb.importing.anatomy import Leg, find_leg
 from tkamb.importing.links import Links
-from tkamb.inputs.labels import matched_labels
-from tkamb.inputs.markers import fit_seen, marker_trajectories
+from tkamb.inputs.markers import fit_seen, marker_trajectories, matched_labels
 from tkamb.inputs.tables import Table, read_table
 from tkamb.units import DEGREE
 

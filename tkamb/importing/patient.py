@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tkamb.case import Case, load_case
+from tkamb.atomic import claim_directory, write_text
 from tkamb.errors import InputError
 from tkamb.importing.anatomy import Leg, find_leg
 from tkamb.importing.links import Links, find_links
@@ -22,8 +22,8 @@ from tkamb.importing.urdf import patient_urdf
 from tkamb.inputs.meshes import load_surface
 from tkamb.inputs.tables import read_table
 from tkamb.opensim.read import read_osim
-from tkamb.output.atomic import claim_directory, write_text
 from tkamb.scene import load_scene
+from tkamb.scene.case import Case, load_case
 from tkamb.units import DEGREE, MILLIMETRE
 
 SAME_MASS = 0.01

@@ -10,12 +10,13 @@ import numpy as np
 from tkamb.geometry.frames import MIRROR, Array, inverse, mirrored_pose, transform
 from tkamb.importing.markers import ModelSegment, facing, segments_of
 from tkamb.importing.scene_text import SceneText
-from tkamb.inputs.labels import matched_labels, plain_label
 from tkamb.inputs.leg_chain import LegChain
 from tkamb.inputs.marker_motion import both_fits, leg_segments, neutral_coordinates
+from tkamb.inputs.markers import matched_labels, plain_label
 from tkamb.inputs.tables import read_table
 from tkamb.scene import Scene
-from tkamb.scene_tables import MarkersTable
+from tkamb.scene.si import in_si
+from tkamb.scene.tables import MarkersTable
 
 
 def with_static_markers(
@@ -80,10 +81,10 @@ def calibrated_markers(
         )
         for own in table.segment
     ]
-    table = table.model_copy(update={"segment": tuple(there)})
-    segments, measured = leg_segments(table, recorded, None, side)
-    chain = LegChain(segments, pose_insert_in_tibia, table.knee == "free")
-    neutral = neutral_coordinates(table, side)
+    markers = in_si(table.model_copy(update={"segment": tuple(there)}))
+    segments, measured = leg_segments(markers, recorded, None, side)
+    chain = LegChain(segments, pose_insert_in_tibia, markers.knee == "free")
+    neutral = neutral_coordinates(markers, side)
     _, whole = both_fits(chain, segments, measured, neutral, recorded)
     mirror = MIRROR if side == "left" else np.eye(3)
     found = {}

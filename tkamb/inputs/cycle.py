@@ -7,7 +7,6 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.scene_tables import MotionTable
 
 
 @dataclass(frozen=True)
@@ -27,17 +26,29 @@ class Cycle:
     closed: bool
 
     @staticmethod
-    def of(percent: Array, knee: Array, table: MotionTable, path: Path) -> "Cycle":
+    def of(
+        percent: Array,
+        knee: Array,
+        interval: tuple[float, float],
+        offset_percent: float,
+        path: Path,
+    ) -> "Cycle":
         """Return the scene's cycle.
 
         It is closed if 100 % was recorded too and no coordinate differs there from 0 % by
         more than its largest step between neighbouring samples.
 
+        Args:
+            percent: (n,) the recorded per cents.
+            knee: (n, 6) knee coordinates there.
+            interval: s, on which the cycle lies.
+            offset_percent: per cent of the cycle at the interval's start.
+            path: of the file, for messages.
+
         Raises:
             InputError: not per cent, not an interval, or an offset into an open cycle.
         """
-        assert table.cycle_s is not None
-        start, end = table.cycle_s
+        start, end = interval
         if not start < end:
             raise InputError("[motion] cycle_s does not rise", path)
         if percent[0] < -1e-9 or percent[-1] > 100 + 1e-9 or percent[-1] - percent[0] < 2:
@@ -49,13 +60,13 @@ class Cycle:
         whole = percent[-1] - percent[0] > 100 - 1e-9
         steps = np.abs(np.diff(knee, axis=0)).max(axis=0)
         closed = bool(whole and np.all(np.abs(knee[-1] - knee[0]) <= steps))
-        if table.cycle_offset_percent and not closed:
+        if offset_percent and not closed:
             raise InputError(
                 "is not a closed cycle, so it has no frame before or after its ends",
                 path,
                 "set cycle_offset_percent to 0",
             )
-        return Cycle(start, end - start, table.cycle_offset_percent, closed)
+        return Cycle(start, end - start, offset_percent, closed)
 
     def seconds(self, percent: Array) -> Array:
         """Return the times of per cents, not wrapped into the interval."""

@@ -13,7 +13,6 @@ force and moment stay exactly as measured and filtered, only their point is conv
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -22,9 +21,9 @@ from tkamb.geometry.frames import MIRROR, Array
 from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import check_roles, laboratory_rotation
+from tkamb.inputs.recordings import ForceRecording, Side
 from tkamb.inputs.samples import OddSample, check_range, check_spacing, odd_samples
 from tkamb.inputs.tables import Table, read_table
-from tkamb.scene_tables import GroundReactionTable
 from tkamb.units import MILLIMETRE
 
 LEVEL_TOLERANCE = 0.01
@@ -61,13 +60,11 @@ class GroundReaction:
     odd: tuple[OddSample, ...] = ()
 
 
-def load_ground_reaction(
-    table: GroundReactionTable, time: Array, side: Literal["right", "left"]
-) -> GroundReaction:
+def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> GroundReaction:
     """Return the ground reaction at the frames of the knee's motion.
 
     Args:
-        table: the scene's [ground_reaction].
+        source: what to read, and how.
         time: (f,) s of the frames, on the file's clock.
         side: of the knee; a left foot is mirrored.
 
@@ -76,18 +73,24 @@ def load_ground_reaction(
             mainly upwards, or a centre of pressure is missing or not level while the plate is
             loaded.
     """
-    from_plates = (table.format or table.file.suffix.lower().lstrip(".")) == "c3d"
+    from_plates = (source.format or source.file.suffix.lower().lstrip(".")) == "c3d"
     if from_plates:
-        stamps, force, point, moment = _of_plates(table)
+        stamps, force, point, moment = _read_plates(source)
     else:
-        recorded = read_table(table.file, table.format)
-        stamps = recorded.time(table.columns.get("time", "time"))
-        force, point, moment = _recorded(table, recorded)
-    path = table.file
+        if source.surface:
+            raise InputError(
+                "is for plates of a .c3d: a table states its points itself",
+                "[ground_reaction] surface_mm",
+                "leave it out",
+            )
+        recorded = read_table(source.file, source.format)
+        stamps = recorded.time(source.columns.get("time", "time"))
+        force, point, moment = _read_columns(source, recorded)
+    path = source.file
     check_spacing(path, stamps)
-    _check_upward(force, table)
-    loaded = force[:, 1] >= table.unloaded_N
-    point = _held(stamps, point, loaded, path)
+    _check_upward(force, source)
+    loaded = force[:, 1] >= source.unloaded
+    point = _hold_point(stamps, point, loaded, path)
     near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
     # of plates the wrench was recorded: their point is a quotient, which small forces shake
     points = None if from_plates else point[near]
@@ -102,10 +105,8 @@ def load_ground_reaction(
     if side == "left":
         force, point, moment = force @ MIRROR, point @ MIRROR, -moment @ MIRROR
     wrench = np.concatenate([force, np.cross(point, force) + moment], axis=1)
-    filtered, _, _ = differentiate_coordinates(
-        stamps, wrench, table.cutoff_Hz, time, name=str(path)
-    )
-    reaction = _at_centre_of_pressure(filtered, level, table.unloaded_N, time, stamps, point)
+    filtered, _, _ = differentiate_coordinates(stamps, wrench, source.cutoff, time, name=str(path))
+    reaction = _at_centre_of_pressure(filtered, level, source.unloaded, time, stamps, point)
     return replace(reaction, odd=odd)
 
 
@@ -150,22 +151,22 @@ def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
         )
 
 
-def _recorded(table: GroundReactionTable, recorded: Table) -> tuple[Array, Array, Array]:
+def _read_columns(source: ForceRecording, recorded: Table) -> tuple[Array, Array, Array]:
     """Return force (N), point (m) and free moment (N·m), each (n, 3), in the laboratory."""
     roles = [f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)]
-    check_roles(table.columns, ("time", *roles), recorded.path, "ground_reaction")
-    rotation = laboratory_rotation(table.laboratory_axes, recorded.path)
+    check_roles(source.columns, ("time", *roles), recorded.path, "ground_reaction")
+    rotation = laboratory_rotation(source.laboratory_axes, recorded.path)
     columns = []
     for role in roles:
-        column = table.columns.get(role, role)
+        column = source.columns.get(role, role)
         if role.startswith("point"):
             columns.append(recorded.column(column))  # undefined while unloaded
-        elif role.startswith("force") or role in table.columns or column in recorded.columns:
+        elif role.startswith("force") or role in source.columns or column in recorded.columns:
             columns.append(recorded.complete_column(column))
         else:
             columns.append(np.zeros_like(columns[0]))
     values = np.stack(columns, axis=1).reshape(-1, 3, 3) @ rotation.T
-    scale = recorded.unit_scale(table.length_unit, "length_unit")
+    scale = recorded.unit_scale(source.length_unit, "length_unit")
     force, point, moment = values[:, 0], values[:, 1] * scale, values[:, 2]
     for kind, found, largest, unit in (
         ("force", force, LARGEST_FORCE, "N"),
@@ -178,34 +179,36 @@ def _recorded(table: GroundReactionTable, recorded: Table) -> tuple[Array, Array
     return force, point, moment
 
 
-def _of_plates(table: GroundReactionTable) -> tuple[Array, Array, Array, Array]:
+def _read_plates(source: ForceRecording) -> tuple[Array, Array, Array, Array]:
     """Return times (k,) s, force, point and free moment, each (k, 3), of a recording's plates.
 
     The wrenches are summed about the laboratory's origin and kept: the point lies on the level
-    of the plates' surface, carried over in time while the vertical force is below `unloaded_N`.
+    of the plates' surface or that of a step on them, `surface_mm` above it, and is carried over
+    in time while the vertical force is below `unloaded_N`.
     """
-    recording = read_c3d(table.file)
-    check_roles(table.columns, (), table.file, "ground_reaction")
+    recording = read_c3d(source.file)
+    check_roles(source.columns, (), source.file, "ground_reaction")
     there = {plate.number: plate for plate in recording.plates}
-    missing = [number for number in table.plates if number not in there]
-    if missing or not table.plates:
+    missing = [number for number in source.plates if number not in there]
+    if missing or not source.plates:
         asked = f"has no force plate {missing[0]}" if missing else "holds several force plates"
         raise InputError(
             asked if there else "holds no force plate",
-            table.file,
+            source.file,
             f"give [ground_reaction] plates, of {', '.join(map(str, there)) or 'none'}",
         )
-    rotation = laboratory_rotation(table.laboratory_axes, table.file)
-    plates = [there[number] for number in dict.fromkeys(table.plates)]
+    rotation = laboratory_rotation(source.laboratory_axes, source.file)
+    plates = [there[number] for number in dict.fromkeys(source.plates)]
     wrench = np.sum([plate.wrench for plate in plates], axis=0)
     force, about_origin = wrench[:, :3] @ rotation.T, wrench[:, 3:] @ rotation.T
     levels = [float((rotation @ plate.centre)[1]) for plate in plates]
     if np.ptp(levels) > LEVEL_TOLERANCE:
-        raise InputError("the plates lie at different levels", table.file, "give them one by one")
+        raise InputError("the plates lie at different levels", source.file, "give them one by one")
     point = np.full_like(force, np.nan)
-    loaded = force[:, 1] >= table.unloaded_N
-    point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], levels[0])
-    point = _held(recording.analog_time, point, loaded, table.file)
+    loaded = force[:, 1] >= source.unloaded
+    level = levels[0] + source.surface
+    point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], level)
+    point = _hold_point(recording.analog_time, point, loaded, source.file)
     return recording.analog_time, force, point, about_origin - np.cross(point, force)
 
 
@@ -217,21 +220,21 @@ def _centre_of_pressure(force: Array, about_origin: Array, level: float) -> Arra
     return np.stack([x, np.full_like(x, level), z], axis=1)
 
 
-def _check_upward(force: Array, table: GroundReactionTable) -> None:
+def _check_upward(force: Array, source: ForceRecording) -> None:
     """Raise where the largest force on the foot points down or sideways."""
     up, down = float(force[:, 1].max()), float(-force[:, 1].min())
     aside = float(np.hypot(force[:, 0], force[:, 2]).max())
-    if max(down, aside) > max(up, table.unloaded_N):
+    if max(down, aside) > max(up, source.unloaded):
         word, size = ("down", down) if down > aside else ("sideways", aside)
         raise InputError(
             f"the ground pushes the foot up with {max(up, 0.0):.4g} N at most, but {word} with "
             f"{size:.4g} N",
-            table.file,
+            source.file,
             "check [ground_reaction] columns and laboratory_axes; it is the force on the foot",
         )
 
 
-def _held(stamps: Array, point: Array, loaded: np.ndarray, path: Path) -> Array:
+def _hold_point(stamps: Array, point: Array, loaded: np.ndarray, path: Path) -> Array:
     """Return the points with those of the unloaded plate carried over in time."""
     missing = loaded & ~np.isfinite(point).all(axis=1)
     if missing.any():

@@ -92,8 +92,8 @@ class LegChain:
             fitted: segment -> (f, 4, 4), NaN where it could not be fitted.
             neutral: (6,) knee coordinates that a hinge keeps.
         """
-        shank = _filled(fitted["shank"])
-        thigh = _filled(fitted["thigh"])
+        shank = _fill_gaps(fitted["shank"])
+        thigh = _fill_gaps(fitted["thigh"])
         knee = np.tile(neutral, (len(shank), 1))
         turn = np.swapaxes((shank @ self.insert)[:, :3, :3], 1, 2) @ thigh[:, :3, :3]
         angles = Rotation.from_matrix(turn).as_euler("YXZ")
@@ -104,7 +104,7 @@ class LegChain:
         for ball in self.balls:
             parent = {"shank": shank, "thigh": thigh}.get(ball.joined_to)
             assert parent is not None
-            own = _filled(fitted[ball.name])[:, :3, :3]
+            own = _fill_gaps(fitted[ball.name])[:, :3, :3]
             state.turns[ball.name] = np.swapaxes(parent[:, :3, :3], 1, 2) @ own
         return state
 
@@ -157,10 +157,10 @@ class LegChain:
 
     def moved(self, state: LegState, step: Array) -> LegState:
         """Return the state after a step (f, n)."""
-        shank = _carried(state.shank, step[:, :6])
+        shank = _carry(state.shank, step[:, :6])
         knee = state.knee.copy()
         if self.free:
-            thigh = _carried(state.thigh, step[:, 6:12])
+            thigh = _carry(state.thigh, step[:, 6:12])
         else:
             knee[:, FLEXION] += step[:, 6]
             thigh = shank @ self.insert @ knee_pose(knee)
@@ -189,12 +189,12 @@ class LegChain:
         )
 
 
-def _carried(poses: Array, step: Array) -> Array:
+def _carry(poses: Array, step: Array) -> Array:
     turn = Rotation.from_rotvec(step[:, 3:]).as_matrix()
     return pose(turn @ poses[:, :3, :3], poses[:, :3, 3] + step[:, :3])
 
 
-def _filled(poses: Array) -> Array:
+def _fill_gaps(poses: Array) -> Array:
     """Return the poses with those that are missing taken from the frame before (or after)."""
     known = np.flatnonzero(np.isfinite(poses[:, 0, 3]))
     if not len(known):

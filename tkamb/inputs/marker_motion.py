@@ -28,10 +28,10 @@ from tkamb.inputs.inverse_kinematics import ChainFit, fit_chain
 from tkamb.inputs.laboratory import laboratory_rotation
 from tkamb.inputs.leg_chain import FLEXION, LegChain, LegState, Segment
 from tkamb.inputs.markers import WRONG_MARKERS, fit_seen, marker_trajectories
+from tkamb.inputs.recordings import MarkerSet, MotionRecording, Side
 from tkamb.inputs.tables import Table, read_table
 from tkamb.inputs.tibia import BodyMotion
-from tkamb.scene_tables import MarkersTable, MotionTable
-from tkamb.units import DEGREE, MILLIMETRE
+from tkamb.units import MILLIMETRE
 
 Method = Literal["segments", "chain"]
 KNEE_SEGMENTS = ("shank", "thigh")
@@ -76,12 +76,12 @@ class MarkerKinematics:
 
 
 def load_marker_motion(
-    table: MotionTable, side: Literal["right", "left"], pose_insert_in_tibia: Array
+    source: MotionRecording, side: Side, pose_insert_in_tibia: Array
 ) -> MarkerKinematics:
     """Return knee and shank of a recording's markers.
 
     Args:
-        table: the scene's [motion] with its markers.
+        source: what to read, with its markers.
         side: of the knee; a left leg is mirrored, laboratory and all.
         pose_insert_in_tibia: (4, 4), of the (mirrored) patient.
 
@@ -89,12 +89,12 @@ def load_marker_motion(
         InputError: file, labels or markers cannot be used, markers that fit nowhere, or a gap
             in the interval.
     """
-    assert table.markers is not None
-    recorded = read_table(table.file, table.format)
+    assert source.markers is not None
+    recorded = read_table(source.file, source.format)
     time = recorded.time()
-    segments, measured = leg_segments(table.markers, recorded, table.length_unit, side)
-    neutral = neutral_coordinates(table.markers, side)
-    chain = LegChain(segments, pose_insert_in_tibia, table.markers.knee == "free")
+    segments, measured = leg_segments(source.markers, recorded, source.length_unit, side)
+    neutral = neutral_coordinates(source.markers, side)
+    chain = LegChain(segments, pose_insert_in_tibia, source.markers.knee == "free")
     fits, whole = both_fits(chain, segments, measured, neutral, recorded)
     if not whole.solved.all():
         raise InputError(
@@ -111,7 +111,7 @@ def load_marker_motion(
         ),
     }
     rms: dict[Method, Array] = {"segments": _joint_rms(fits, measured), "chain": whole.rms}
-    return _compared(table, recorded, time, readings, rms, chain, measured, neutral)
+    return _compare_readings(source, recorded, time, readings, rms, chain, measured, neutral)
 
 
 def both_fits(
@@ -131,7 +131,7 @@ def both_fits(
 
 
 def leg_segments(
-    table: MarkersTable, recorded: Table, length_unit: str | None, side: str
+    markers: MarkerSet, recorded: Table, length_unit: str | None, side: str
 ) -> tuple[list[Segment], dict[str, Array]]:
     """Return the segments, and segment -> its markers (n, m, 3) m, laboratory, gaps NaN.
 
@@ -139,22 +139,19 @@ def leg_segments(
         InputError: a marker that the recording does not hold.
     """
     scale = recorded.unit_scale(length_unit, "length_unit")
-    rotation = laboratory_rotation(table.laboratory_axes, recorded.path)
+    rotation = laboratory_rotation(markers.laboratory_axes, recorded.path)
     mirror = MIRROR if side == "left" else np.eye(3)
     segments, measured = [], {}
-    for own in table.segment:
-        labels = tuple(own.markers_mm)
+    for own in markers.segment:
+        labels = tuple(own.markers)
         seen = marker_trajectories(recorded, list(labels), scale) @ rotation.T
         measured[own.name] = seen @ mirror
-        ends = [
-            None if end is None else mirror @ np.array(end) * MILLIMETRE
-            for end in (own.joint_mm, own.centre_mm)
-        ]
+        ends = [None if end is None else mirror @ end for end in (own.joint, own.centre)]
         segments.append(
             Segment(
                 own.name,
                 labels,
-                np.array(list(own.markers_mm.values())) * MILLIMETRE @ mirror,
+                np.array(list(own.markers.values())) @ mirror,
                 np.array([own.weights.get(label, 1.0) for label in labels]),
                 own.joined_to or "",
                 *ends,
@@ -163,10 +160,10 @@ def leg_segments(
     return segments, measured
 
 
-def neutral_coordinates(table: MarkersTable, side: str) -> Array:
+def neutral_coordinates(markers: MarkerSet, side: str) -> Array:
     """Return the knee coordinates (6,), m and rad, that a hinge keeps; flexion is zero."""
-    ap, si, ml = np.array(table.neutral_mm) * MILLIMETRE
-    axial, adduction = np.array(table.neutral_deg) * DEGREE
+    ap, si, ml = markers.neutral_translation
+    axial, adduction = markers.neutral_rotation
     return np.array([ap, si, -ml if side == "left" else ml, axial, adduction, 0.0])
 
 
@@ -187,8 +184,8 @@ def _check_fits(rms: dict[str, Array], recorded: Table) -> None:
             )
 
 
-def _compared(
-    table: MotionTable,
+def _compare_readings(
+    source: MotionRecording,
     recorded: Table,
     time: Array,
     readings: dict[Method, tuple[Array, Array]],
@@ -198,11 +195,11 @@ def _compared(
     neutral: Array,
 ) -> MarkerKinematics:
     """Return both readings, (shank, thigh) in the laboratory, where the one in use is whole."""
-    assert table.markers is not None
-    used = table.markers.method
+    assert source.markers is not None
+    used = source.markers.method
     knees = {name: _knee(low @ chain.insert, high) for name, (low, high) in readings.items()}
     gone = np.concatenate([np.isnan(measured[name]).any(axis=2) for name in KNEE_SEGMENTS], axis=1)
-    run = _run(time, np.isnan(knees[used][:, 0]), table.interval_s, recorded)
+    run = _run(time, np.isnan(knees[used][:, 0]), source.interval, recorded)
     return MarkerKinematics(
         time[run],
         used,

@@ -1,17 +1,45 @@
-"""Rigid fit of skin markers: where a body stands, from the markers on it."""
+"""Skin markers: found by their labels, and the rigid fit that says where their body stands.
+
+The same marker is `R.Thigh.Superior`, `RThighSuperior`, `JW:RThighSuperior`.
+"""
+
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, pose, transform
-from tkamb.inputs.labels import matched_labels
+from tkamb.inputs.recordings import ShankRecording
 from tkamb.inputs.tables import Table
-from tkamb.scene_tables import TibiaTable
 from tkamb.units import MILLIMETRE
 
 WRONG_MARKERS = 0.05
 """m; a median residual above this is a wrong marker, unit or set, not soft tissue."""
+
+
+def plain_label(label: str) -> str:
+    """Return a label without the subject's prefix, dots, underscores, blanks and case."""
+    name = label.rpartition(":")[2]
+    return "".join(c for c in name if c not in "._- ").lower()
+
+
+def matched_labels(names: Iterable[str], labels: Iterable[str]) -> dict[str, str]:
+    """Return name -> the recording's label, for the names that it holds.
+
+    An exact label comes first, then one that is the same when both are plain. A plain label
+    that stands twice in the recording (two subjects) matches nothing.
+    """
+    labels = list(labels)
+    plain: dict[str, list[str]] = {}
+    for label in labels:
+        plain.setdefault(plain_label(label), []).append(label)
+    found = {}
+    for name in names:
+        candidates = [name] if name in labels else plain.get(plain_label(name), [])
+        if len(candidates) == 1:
+            found[name] = candidates[0]
+    return found
 
 
 def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) -> Array:
@@ -31,7 +59,7 @@ def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) 
     return np.moveaxis(np.array(columns), 2, 0) * metres_per_unit
 
 
-def shank_points(table: TibiaTable, recorded: Table) -> tuple[Array, Array]:
+def shank_points(source: ShankRecording, recorded: Table) -> tuple[Array, Array]:
     """Return the shank's markers and joint centres, measured and in the tibia link.
 
     A joint centre is carried by a rigid fit of the neighbouring segment's markers.
@@ -42,17 +70,17 @@ def shank_points(table: TibiaTable, recorded: Table) -> tuple[Array, Array]:
     Raises:
         InputError: no unit, unknown markers, or a neighbour's markers that do not fit.
     """
-    scale = recorded.unit_scale(table.length_unit, "length_unit")
-    points = [marker_trajectories(recorded, [name], scale) for name in table.markers_mm]
-    reference = list(table.markers_mm.values())
-    for joint in table.joint_centre:
-        measured = marker_trajectories(recorded, list(joint.markers_mm), scale)
-        own = np.array(list(joint.markers_mm.values())) * MILLIMETRE
+    scale = recorded.unit_scale(source.length_unit, "length_unit")
+    points = [marker_trajectories(recorded, [name], scale) for name in source.markers]
+    reference = list(source.markers.values())
+    for joint in source.joint_centre:
+        measured = marker_trajectories(recorded, list(joint.markers), scale)
+        own = np.array(list(joint.markers.values()))
         poses, residual = fit_rigid(measured, own, joint.name)
         check_fit(residual, f"the markers of joint centre '{joint.name}'", recorded)
-        points.append(transform(poses, np.array(joint.centre_mm) * MILLIMETRE)[:, None])
-        reference.append(joint.tibia_mm)
-    return np.concatenate(points, axis=1), np.array(reference) * MILLIMETRE
+        points.append(transform(poses, joint.centre)[:, None])
+        reference.append(joint.tibia)
+    return np.concatenate(points, axis=1), np.array(reference)
 
 
 def check_fit(residual: Array, what: str, recorded: Table) -> None:
@@ -95,7 +123,7 @@ def fit_rigid(points: Array, reference: Array, name: str = "the tibia") -> tuple
     complete = np.isfinite(points.reshape(len(points), -1)).all(axis=1)
     result, residual = np.full((len(points), 4, 4), np.nan), np.full(len(points), np.nan)
     if complete.any():
-        result[complete], residual[complete] = _fitted(points[complete], reference)
+        result[complete], residual[complete] = _fit(points[complete], reference)
     return result, residual
 
 
@@ -156,7 +184,7 @@ def _nearest_rotation(h: Array) -> Array:
     return np.asarray((v * signs[:, None, :]) @ ut)
 
 
-def _fitted(points: Array, reference: Array) -> tuple[Array, Array]:
+def _fit(points: Array, reference: Array) -> tuple[Array, Array]:
     means, centre = points.mean(axis=1), reference.mean(axis=0)
     h = np.einsum("mi,nmj->nij", reference - centre, points - means[:, None])
     rotation = _nearest_rotation(h)

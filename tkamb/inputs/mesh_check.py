@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from tkamb.geometry.bodies import separate_bodies
-from tkamb.geometry.boundary import BoundaryLoop, boundary_loops
 from tkamb.geometry.flat_bottom import facing, find_flats
 from tkamb.geometry.frames import Array
 from tkamb.geometry.repair import Repair, connected_parts, repair
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.topology import BoundaryLoop, boundary_loops, separate_bodies
 from tkamb.inputs.meshes import BONE_SIZE, SHEET_WIDTH, Indices, plausible_units, read_triangles
 from tkamb.units import LENGTH
 
@@ -104,7 +103,7 @@ class MeshHealth:
         return [
             f"{self.file}",
             f"  {self.triangles} triangles, {self.vertices} vertices, "
-            f"{_counted(self.components, 'component')}",
+            f"{_count_noun(self.components, 'component')}",
             *self._parts(),
             f"  {self._closedness()}",
             *(f"  would be mended when loaded: {phrase}" for phrase in self.repairs),
@@ -130,7 +129,7 @@ class MeshHealth:
         if self.watertight:
             return "watertight"
         after = "closed after repair" if self.closed_after_repair else "not closed after repair"
-        return f"not watertight ({_counted(len(self.holes), 'hole')}); {after}"
+        return f"not watertight ({_count_noun(len(self.holes), 'hole')}); {after}"
 
     def _defects(self) -> list[str]:
         lines = []
@@ -179,7 +178,7 @@ def check_mesh(path: str | Path) -> MeshHealth:
         InputError: no such file, not a mesh, no triangles, or NaN.
     """
     vertices, faces = read_triangles(path)
-    extents, units, scale = _measured(vertices, faces)
+    extents, units, scale = _measure(vertices, faces)
     mended = repair(vertices * scale, faces)
     merged, corners, watertight = _as_it_is(vertices, faces)
     return MeshHealth(
@@ -208,11 +207,11 @@ def mended_mesh(path: str | Path) -> tuple[Repair, float]:
         InputError: as `check_mesh`.
     """
     vertices, faces = read_triangles(path)
-    scale = _measured(vertices, faces)[2]
+    scale = _measure(vertices, faces)[2]
     return repair(vertices * scale, faces), scale
 
 
-def _measured(vertices: Array, faces: Indices) -> tuple[Array, list[str], float]:
+def _measure(vertices: Array, faces: Indices) -> tuple[Array, list[str], float]:
     """Return the extents, the units that make it a part of a knee, and a unit in m."""
     extents = np.ptp(vertices[faces.reshape(-1)], axis=0)
     longest = float(extents.max())
@@ -254,5 +253,5 @@ def _flats(mended: Repair, name: str) -> tuple[FlatSide, ...]:
     return tuple(side for side in sides if side.area_share > _LEAST_SHARE and side.tilt_deg < 30)
 
 
-def _counted(count: int, noun: str) -> str:
+def _count_noun(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"

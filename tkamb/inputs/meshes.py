@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.files import MESH_LIMIT, check_file
-from tkamb.geometry.bodies import Body, separate_bodies
-from tkamb.geometry.boundary import BoundaryLoop
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.geometry.repair import Repair, repair
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.topology import Body, BoundaryLoop, separate_bodies
 from tkamb.inputs.vtp import read_vtp
 from tkamb.units import LENGTH, MILLIMETRE
 

@@ -8,7 +8,7 @@ the clinical angles and the patella's sagittal coordinates keep theirs.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from tkamb.errors import InputError
 from tkamb.geometry.frames import (
     KNEE_COORDINATES,
+    PATELLA_COORDINATES,
     Array,
     inverse,
     knee_coordinates,
@@ -25,15 +26,14 @@ from tkamb.geometry.frames import (
 from tkamb.inputs.cycle import Cycle
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import angle_scale, check_roles, poses_of_columns
+from tkamb.inputs.recordings import MotionRecording, Side
 from tkamb.inputs.samples import OddSample, check_range, check_spacing, check_steps, odd_samples
 from tkamb.inputs.tables import Table, read_table
-from tkamb.scene_tables import MotionTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.inputs.marker_motion import MarkerKinematics
 
-PATELLA_COORDINATES = ("patella_ap", "patella_si", "patella_rotation")
 LIMITS_DEG = {"axial_rotation": (-90, 90), "adduction": (-45, 45), "flexion": (-45, 180)}
 """Beyond these, columns, axes or units are mistaken; adduction also stays off its gimbal."""
 FARTHEST_MM = (-200, 200)
@@ -88,8 +88,8 @@ class KneeMotion:
 
 
 def load_motion(
-    table: MotionTable,
-    side: Literal["right", "left"],
+    source: MotionRecording,
+    side: Side,
     pose_insert_mesh_in_insert: Array,
     pose_femoral_mesh_in_femur: Array,
     released: Sequence[str] = (),
@@ -101,7 +101,7 @@ def load_motion(
     insert mesh, T_femur_in_insert = T_insert_mesh_in_insert P T_femur_in_femoral_mesh.
 
     Args:
-        table: the scene's [motion].
+        source: what to read, and how.
         side: the knee's side; a left one is mirrored.
         pose_insert_mesh_in_insert: (4, 4) m; the file's axes into the insert frame, whose
             z points to the subject's right on both sides (not mirrored).
@@ -112,43 +112,43 @@ def load_motion(
     Raises:
         InputError: file, columns, times, filter or cycle cannot be used.
     """
-    if table.markers is not None:
+    if source.markers is not None:
         assert pose_insert_in_tibia is not None
-        return _from_markers(table, side, pose_insert_in_tibia, released)
-    recorded = read_table(table.file, table.format)
-    _check_roles(table, recorded)
-    recorded = _with_signs_turned(recorded, table)
+        return _from_markers(source, side, pose_insert_in_tibia, released)
+    recorded = read_table(source.file, source.format)
+    _check_roles(source, recorded)
+    recorded = _turn_signs(recorded, source)
     unrecorded: tuple[str, ...] = ()
-    time = recorded.time(table.columns.get("time", "time"))
-    if table.interpretation == "pose":
-        assert table.sequence is not None
+    time = recorded.time(source.columns.get("time", "time"))
+    if source.interpretation == "pose":
+        assert source.sequence is not None
         mesh = poses_of_columns(
-            recorded, table.columns, table.sequence, table.angle_unit, table.length_unit
+            recorded, source.columns, source.sequence, source.angle_unit, source.length_unit
         )
         poses = pose_insert_mesh_in_insert @ mesh @ inverse(pose_femoral_mesh_in_femur)
         knee = knee_coordinates(mirrored_pose(poses) if side == "left" else poses)
     else:
-        unrecorded = _unrecorded(recorded, table, released)
-        knee = _recorded_coordinates(recorded, table, KNEE_COORDINATES, unrecorded)
+        unrecorded = _find_unrecorded(recorded, source, released)
+        knee = _read_coordinates(recorded, source, KNEE_COORDINATES, unrecorded)
         if side == "left":
             knee[:, KNEE_COORDINATES.index("ml")] *= -1.0
     _check_knee(knee, recorded.path)
-    named = [c for c in PATELLA_COORDINATES if c in table.columns or c in recorded.columns]
-    patella = _recorded_coordinates(recorded, table, PATELLA_COORDINATES) if named else None
+    named = [c for c in PATELLA_COORDINATES if c in source.columns or c in recorded.columns]
+    patella = _read_coordinates(recorded, source, PATELLA_COORDINATES) if named else None
     if patella is not None:
         _check_patella(patella, recorded.path)
-    motion = _differentiated(time, knee, patella, table, recorded.path)
+    motion = _differentiate(time, knee, patella, source, recorded.path)
     return replace(motion, unrecorded=unrecorded)
 
 
 def _from_markers(
-    table: MotionTable, side: Literal["right", "left"], insert: Array, released: Sequence[str]
+    source: MotionRecording, side: Side, insert: Array, released: Sequence[str]
 ) -> KneeMotion:
     """Return the motion that skin markers give: the coordinates that are taken from them."""
     from tkamb.inputs.marker_motion import load_marker_motion
 
-    assert table.markers is not None
-    taken = table.markers.coordinates
+    assert source.markers is not None
+    taken = source.markers.coordinates
     unrecorded = tuple(name for name in KNEE_COORDINATES if name not in taken)
     if needed := [name for name in unrecorded if name not in released]:
         raise InputError(
@@ -156,21 +156,23 @@ def _from_markers(
             "[motion.markers]",
             "add it to coordinates, or let the knee find it: [contact] released",
         )
-    found = load_marker_motion(table, side, insert)
+    found = load_marker_motion(source, side, insert)
     knee = found.coordinates.copy()
     for name in unrecorded:
         knee[:, KNEE_COORDINATES.index(name)] = 0.0
-    _check_knee(knee, table.file)
-    motion = _differentiated(found.time, knee, None, table, table.file)
+    _check_knee(knee, source.file)
+    motion = _differentiate(found.time, knee, None, source, source.file)
     return replace(motion, unrecorded=unrecorded, markers=found)
 
 
-def _unrecorded(recorded: Table, table: MotionTable, released: Sequence[str]) -> tuple[str, ...]:
+def _find_unrecorded(
+    recorded: Table, source: MotionRecording, released: Sequence[str]
+) -> tuple[str, ...]:
     """Return the coordinates without a column, all of which must be released."""
     missing = [
         role
         for role in KNEE_COORDINATES
-        if role not in table.columns and role not in recorded.columns
+        if role not in source.columns and role not in recorded.columns
     ]
     needed = [role for role in missing if role not in released]
     if needed:
@@ -183,30 +185,33 @@ def _unrecorded(recorded: Table, table: MotionTable, released: Sequence[str]) ->
     return tuple(missing)
 
 
-def _recorded_coordinates(
-    recorded: Table, table: MotionTable, roles: tuple[str, ...], unrecorded: tuple[str, ...] = ()
+def _read_coordinates(
+    recorded: Table,
+    source: MotionRecording,
+    roles: tuple[str, ...],
+    unrecorded: tuple[str, ...] = (),
 ) -> Array:
-    length = recorded.unit_scale(table.length_unit, "length_unit")
-    angle = angle_scale(recorded, table.angle_unit)
+    length = recorded.unit_scale(source.length_unit, "length_unit")
+    angle = angle_scale(recorded, source.angle_unit)
     units = {
         role: length if role.rsplit("_")[-1] in ("ap", "si", "ml") else angle for role in roles
     }
     values = np.zeros((recorded.rows, len(roles)))
     for i, role in enumerate(roles):
         if role not in unrecorded:
-            name = table.columns.get(role, role)
+            name = source.columns.get(role, role)
             values[:, i] = recorded.complete_column(name) * units[role]
     return values
 
 
-def _check_roles(table: MotionTable, recorded: Table) -> None:
-    if table.interpretation == "pose":
+def _check_roles(source: MotionRecording, recorded: Table) -> None:
+    if source.interpretation == "pose":
         kinds = ("rotation", "translation")
         own = tuple(f"{kind}_{k}" for kind in kinds for k in (1, 2, 3))
     else:
         own = KNEE_COORDINATES
-    check_roles(table.columns, ("time", *own, *PATELLA_COORDINATES), recorded.path, "motion")
-    for role in table.signs_turned:
+    check_roles(source.columns, ("time", *own, *PATELLA_COORDINATES), recorded.path, "motion")
+    for role in source.signs_turned:
         if role not in own:
             raise InputError(
                 f"unknown role '{role}' in [motion] signs_turned",
@@ -215,9 +220,9 @@ def _check_roles(table: MotionTable, recorded: Table) -> None:
             )
 
 
-def _with_signs_turned(recorded: Table, table: MotionTable) -> Table:
+def _turn_signs(recorded: Table, source: MotionRecording) -> Table:
     """Return the recording with the columns of the roles in `signs_turned` negated."""
-    names = {table.columns.get(role, role) for role in table.signs_turned}
+    names = {source.columns.get(role, role) for role in source.signs_turned}
     turned = {name: -recorded.column(name) for name in names}
     return replace(recorded, columns=recorded.columns | turned)
 
@@ -246,7 +251,7 @@ def _check_patella(patella: Array, path: Path) -> None:
         check_range(path, f"knee: {name}", values, limits, unit, question)
 
 
-def _checked_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, ...]:
+def _find_odd_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, ...]:
     """Return the odd samples of the coordinates (n, 6 or 9), none of which steps too fast."""
     odd: list[OddSample] = []
     for i, name in enumerate((*KNEE_COORDINATES, *PATELLA_COORDINATES)[: values.shape[1]]):
@@ -258,20 +263,22 @@ def _checked_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, .
     return tuple(odd)
 
 
-def _differentiated(
-    time: Array, knee: Array, patella: Array | None, table: MotionTable, path: Path
+def _differentiate(
+    time: Array, knee: Array, patella: Array | None, source: MotionRecording, path: Path
 ) -> KneeMotion:
     """Return the filtered motion at the scene's frames."""
     values = knee if patella is None else np.concatenate([knee, patella], axis=1)
-    cycle = Cycle.of(time, knee, table, path) if table.cycle_s else None
+    cycle = None
+    if source.cycle:
+        cycle = Cycle.of(time, knee, source.cycle, source.cycle_offset_percent, path)
     sampled = cycle.seconds(time) if cycle else time
     check_spacing(path, sampled)
-    odd = _checked_steps(sampled, values, path)
-    at = _frames(sampled, table, cycle)
+    odd = _find_odd_steps(sampled, values, path)
+    at = _frames(sampled, source, cycle)
     inside = cycle.wrapped(at, sampled) if cycle else at
     closed = cycle is not None and cycle.closed
     name = str(path)
-    x, v, a = differentiate_coordinates(sampled, values, table.cutoff_Hz, inside, closed, name)
+    x, v, a = differentiate_coordinates(sampled, values, source.cutoff, inside, closed, name)
     raw, _, _ = differentiate_coordinates(sampled, knee, "none", inside, name=name)
     filtered_pose, raw_pose = knee_pose(x[:, :6]), knee_pose(raw)
     turn = inverse(raw_pose)[:, :3, :3] @ filtered_pose[:, :3, :3]
@@ -293,15 +300,15 @@ def _differentiated(
     )
 
 
-def _frames(sampled: Array, table: MotionTable, cycle: Cycle | None) -> Array:
+def _frames(sampled: Array, source: MotionRecording, cycle: Cycle | None) -> Array:
     if cycle:
-        return cycle.frames(sampled, table.frames)
-    start, end = table.interval_s or (sampled[0], sampled[-1])
+        return cycle.frames(sampled, source.frames)
+    start, end = source.interval or (sampled[0], sampled[-1])
     inside = sampled[(sampled >= start - 1e-9) & (sampled <= end + 1e-9)]
     if len(inside) < 2 or start < sampled[0] - 1e-9 or end > sampled[-1] + 1e-9:
         raise InputError(
             f"covers {sampled[0]:g} to {sampled[-1]:g} s, but interval_s is {start:g} to {end:g}",
-            table.file,
+            source.file,
             "choose [motion] interval_s inside the recording",
         )
-    return np.linspace(start, end, table.frames) if table.frames else inside
+    return np.linspace(start, end, source.frames) if source.frames else inside

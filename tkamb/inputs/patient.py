@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from tkamb.errors import InputError
 from tkamb.files import read_xml
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, pose
+from tkamb.inputs.recordings import Patient
 from tkamb.inputs.segments import RigidInertia, Sex, combined, segment_inertia
 from tkamb.inputs.urdf_check import (
     check_chain,
@@ -26,7 +27,6 @@ from tkamb.inputs.urdf_check import (
     check_tree,
     numbers_of,
 )
-from tkamb.scene_tables import PatientTable
 
 PATELLA_MASS = 0.1
 """kg, at the patella link's origin unless the URDF says otherwise."""
@@ -48,32 +48,32 @@ ASIDE = 0.5
 """Of that distance: how far the other end may lie beside the link's y axis, which is upwards."""
 
 
-def load_urdf(table: PatientTable, with_patella: bool) -> str:
+def load_urdf(patient: Patient, with_patella: bool) -> str:
     """Return the URDF text of a right knee (a left one mirrored), complete and checked.
 
     Args:
-        table: the scene's [patient].
+        patient: who it is.
         with_patella: whether the patella and its joints are needed.
 
     Raises:
         InputError: missing file, link or joint, wrong axis, singular inertia.
     """
-    path = table.urdf
-    robot = _parsed(path)
+    path = patient.urdf
+    robot = _parse(path)
     check_elements(robot, path)
     check_links(robot, path, with_patella)
     check_tree(robot, path)
-    if table.side == "left":
+    if patient.side == "left":
         _mirror(robot)
-    check_chain(robot, path, table.side, with_patella)
+    check_chain(robot, path, patient.side, with_patella)
     _check_places(robot, path)
-    _complete_inertias(robot, table, with_patella)
+    _complete_inertias(robot, patient, with_patella)
     for link in robot.findall("link"):
         check_inertia(link, path, link.get("name") in {"tibia", "femur", "patella"})
     return ElementTree.tostring(robot, encoding="unicode")
 
 
-def _parsed(path: Path) -> ElementTree.Element:
+def _parse(path: Path) -> ElementTree.Element:
     robot = read_xml(path, what="URDF")
     if robot.tag != "robot":
         raise InputError(f"is not a URDF: its root is <{robot.tag}>, not <robot>", path)
@@ -143,32 +143,32 @@ def _check_places(robot: ElementTree.Element, path: Path) -> None:
         )
 
 
-def _complete_inertias(robot: ElementTree.Element, table: PatientTable, with_patella: bool) -> None:
+def _complete_inertias(robot: ElementTree.Element, patient: Patient, with_patella: bool) -> None:
     links = {link.get("name"): link for link in robot.findall("link")}
     missing = [n for n in ("tibia", "femur") if links[n].find("inertial") is None]
-    if missing and table.sex is None:
+    if missing and patient.sex is None:
         raise InputError(
             f"link '{missing[0]}' has no <inertial>",
-            table.urdf,
+            patient.urdf,
             "add one, or give [patient] sex for the de Leva table",
         )
     for name in missing:
-        assert table.sex is not None
-        _write_inertia(links[name], _segment(robot, name, table.sex, table))
+        assert patient.sex is not None
+        _write_inertia(links[name], _segment(robot, name, patient.sex, patient))
     if with_patella and links["patella"].find("inertial") is None:
         tensor = PATELLA_MASS * PATELLA_RADIUS_OF_GYRATION**2 * np.eye(3)
         _write_inertia(links["patella"], RigidInertia(PATELLA_MASS, np.zeros(3), tensor))
 
 
-def _segment(robot: ElementTree.Element, name: str, sex: Sex, table: PatientTable) -> RigidInertia:
+def _segment(robot: ElementTree.Element, name: str, sex: Sex, patient: Patient) -> RigidInertia:
     joints = {joint.get("name"): joint for joint in robot.findall("joint")}
     if name == "femur":
-        hip = _fixed_pose(robot, "hip", "femur", table.urdf)[:3, 3]
-        return segment_inertia("thigh", sex, table.mass_kg, hip, np.zeros(3))
+        hip = _fixed_pose(robot, "hip", "femur", patient.urdf)[:3, 3]
+        return segment_inertia("thigh", sex, patient.mass, hip, np.zeros(3))
     ankle = np.zeros(3)
     knee = _origin(joints["knee_ap"])[:3, 3]
-    shank = segment_inertia("shank", sex, table.mass_kg, knee, ankle)
-    foot = segment_inertia("foot", sex, table.mass_kg, ankle, ankle + np.array([0, -1.0, 0]))
+    shank = segment_inertia("shank", sex, patient.mass, knee, ankle)
+    foot = segment_inertia("foot", sex, patient.mass, ankle, ankle + np.array([0, -1.0, 0]))
     return combined(shank, foot)
 
 

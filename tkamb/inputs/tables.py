@@ -3,6 +3,7 @@
 import math
 import re
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,6 @@ from tkamb.files import TABLE_LIMIT, read_text
 from tkamb.geometry.frames import Array
 from tkamb.units import LENGTH
 
-FORMATS = ("csv", "sto", "mot", "trc", "c3d")
 TRC_ROUNDING_S = 1e-3
 """Cameras write `.trc` times rounded to the millisecond; the header's rate is exact."""
 
@@ -120,7 +120,7 @@ def read_table(path: Path, format: str | None = None) -> Table:
 
     Args:
         path: the file.
-        format: "csv", "sto", "mot", "trc" or "c3d"; by default the suffix.
+        format: a name of `READERS`; by default the suffix.
 
     Raises:
         InputError: missing or unreadable file, unknown format, a malformed header or row, an
@@ -128,18 +128,19 @@ def read_table(path: Path, format: str | None = None) -> Table:
     """
     path = Path(path)
     kind = format or path.suffix.lower().lstrip(".")
-    if kind not in FORMATS:
-        raise InputError(f"unknown table format '{kind}'", path, f"use {', '.join(FORMATS)}")
-    if kind == "c3d":
-        return _read_c3d(path)
-    lines = read_text(path, TABLE_LIMIT, "utf-8-sig").splitlines()
-    if kind == "csv":
-        return _read_csv(path, lines)
-    return _read_trc(path, lines) if kind == "trc" else _read_storage(path, lines)
+    if kind not in READERS:
+        raise InputError(f"unknown table format '{kind}'", path, f"use {', '.join(READERS)}")
+    return READERS[kind](path)
 
 
-def _read_csv(path: Path, lines: list[str]) -> Table:
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text file that is no larger than a table may be."""
+    return read_text(path, TABLE_LIMIT, "utf-8-sig").splitlines()
+
+
+def read_csv(path: Path) -> Table:
     """Comma-separated: one header row; empty lines and lines that begin with # are skipped."""
+    lines = read_lines(path)
     rows = [
         (number, line.split(","))
         for number, line in enumerate(lines, 1)
@@ -155,8 +156,9 @@ def _read_csv(path: Path, lines: list[str]) -> Table:
     return Table(path, _columns(path, names, rows[1:]))
 
 
-def _read_storage(path: Path, lines: list[str]) -> Table:
+def read_storage(path: Path) -> Table:
     """OpenSim storage: `key=value` lines to `endheader`, column names, rows."""
+    lines = read_lines(path)
     ends = [k for k, line in enumerate(lines) if line.strip().lower() == "endheader"]
     if not ends:
         raise InputError("has no 'endheader' line", path, "is it an OpenSim storage file?")
@@ -175,8 +177,9 @@ def _read_storage(path: Path, lines: list[str]) -> Table:
     return Table(path, _columns(path, rows[0][1], rows[1:]), in_degrees=degrees)
 
 
-def _read_trc(path: Path, lines: list[str]) -> Table:
+def read_trc(path: Path) -> Table:
     """Markers. A marker at exactly (0, 0, 0), an empty cell and NaN are gaps."""
+    lines = read_lines(path)
     if len(lines) < 6 or not lines[0].startswith("PathFileType"):
         raise InputError("is not a .trc file: too short or no 'PathFileType' line", path)
     header = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=False))
@@ -199,7 +202,7 @@ def _read_trc(path: Path, lines: list[str]) -> Table:
     return Table(path, table, length_unit=header.get("Units", "").strip() or None)
 
 
-def _read_c3d(path: Path) -> Table:
+def read_c3d_markers(path: Path) -> Table:
     """Markers of a C3D file on the recording's own clock, m."""
     from tkamb.inputs.c3d import read_c3d
 
@@ -263,3 +266,13 @@ def _why_uneven(cells: int, names: int) -> str:
     if cells > names:
         return "are there decimal commas? write points"
     return "is a cell missing, or a comma?"
+
+
+READERS: dict[str, Callable[[Path], Table]] = {
+    "csv": read_csv,
+    "sto": read_storage,
+    "mot": read_storage,
+    "trc": read_trc,
+    "c3d": read_c3d_markers,
+}
+"""Suffix, which is the format's name in a scene -> its reader. A new format is a row here."""

@@ -5,7 +5,6 @@ ankle centre. A left shank is mirrored here, so that the mechanics see a right o
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,9 +18,9 @@ from tkamb.inputs.laboratory import (
     poses_of_columns,
 )
 from tkamb.inputs.markers import check_fit, complete_run, fit_rigid, shank_points
+from tkamb.inputs.recordings import ShankRecording, Side
 from tkamb.inputs.samples import OddSample, check_range, check_spacing, check_steps, odd_samples
 from tkamb.inputs.tables import Table, read_table
-from tkamb.scene_tables import TibiaTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 MOST_LEAN_DEG = 150.0
@@ -61,34 +60,32 @@ class BodyMotion:
     odd: tuple[OddSample, ...] = ()
 
 
-def load_tibia(
-    table: TibiaTable, time: Array, side: Literal["right", "left"], cutoff_Hz: Cutoff
-) -> BodyMotion:
+def load_tibia(source: ShankRecording, time: Array, side: Side, cutoff_Hz: Cutoff) -> BodyMotion:
     """Return the tibia's motion at the frames of the knee's motion.
 
     The whole record is filtered and then evaluated, so that a record longer than the
     interval has no end effect in it.
 
     Args:
-        table: the scene's [tibia].
+        source: what to read, and how.
         time: (f,) s of the frames, on the file's clock.
         side: of the knee.
-        cutoff_Hz: the motion's cut-off, which holds unless the table has its own.
+        cutoff_Hz: the motion's cut-off, which holds unless the source has its own.
 
     Raises:
         InputError: file, columns or markers cannot be used, or do not cover `time`.
     """
-    cutoff: Cutoff = cutoff_Hz if table.cutoff_Hz is None else table.cutoff_Hz
-    recorded = read_table(table.file)
-    if table.kind == "sagittal":
-        return _sagittal(table, recorded, time, side, cutoff)
-    stamps = recorded.time(table.columns.get("time", "time"))
-    rotation = pose(laboratory_rotation(table.laboratory_axes, recorded.path), np.zeros(3))
+    cutoff: Cutoff = cutoff_Hz if source.cutoff is None else source.cutoff
+    recorded = read_table(source.file)
+    if source.kind == "sagittal":
+        return _sagittal(source, recorded, time, side, cutoff)
+    stamps = recorded.time(source.columns.get("time", "time"))
+    rotation = pose(laboratory_rotation(source.laboratory_axes, recorded.path), np.zeros(3))
     residual = None
-    if table.kind == "markers":
-        stamps, poses, residual = _fitted(table, recorded, stamps, time)
+    if source.kind == "markers":
+        stamps, poses, residual = _fit_markers(source, recorded, stamps, time)
     else:
-        poses = _recorded_poses(table, recorded)
+        poses = _read_poses(source, recorded)
     poses = rotation @ poses
     if side == "left":
         poses = mirrored_pose(poses)
@@ -118,13 +115,13 @@ def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tup
 
 
 def _sagittal(
-    table: TibiaTable, recorded: Table, time: Array, side: str, cutoff: Cutoff
+    source: ShankRecording, recorded: Table, time: Array, side: str, cutoff: Cutoff
 ) -> BodyMotion:
     """Return the lean about the laboratory's z over a fixed ankle."""
-    check_roles(table.columns, ("time", "angle"), recorded.path, "tibia")
-    stamps = recorded.time(table.columns.get("time", "time"))
-    lean = recorded.complete_column(table.columns.get("angle", "angle"))
-    lean = lean * angle_scale(recorded, table.angle_unit)
+    check_roles(source.columns, ("time", "angle"), recorded.path, "tibia")
+    stamps = recorded.time(source.columns.get("time", "time"))
+    lean = recorded.complete_column(source.columns.get("angle", "angle"))
+    lean = lean * angle_scale(recorded, source.angle_unit)
     limits = (-MOST_LEAN_DEG, MOST_LEAN_DEG)
     question = "check [tibia] columns and angle_unit: it is the lean from the vertical"
     check_range(recorded.path, "shank: angle", lean / DEGREE, limits, "deg", question)
@@ -135,7 +132,7 @@ def _sagittal(
     angle, rate, rate_of_rate = differentiate_coordinates(
         stamps, -lean, cutoff, time, name=str(recorded.path)
     )
-    ankle = np.array(table.ankle_mm) * MILLIMETRE
+    ankle = source.ankle
     if side == "left":
         ankle = MIRROR @ ankle
     velocity, acceleration = np.zeros((len(time), 6)), np.zeros((len(time), 6))
@@ -144,24 +141,23 @@ def _sagittal(
     return BodyMotion(time, pose(rotation, ankle), velocity, acceleration, odd=odd)
 
 
-def _recorded_poses(table: TibiaTable, recorded: Table) -> Array:
-    assert table.sequence is not None
-    assert table.length_unit is not None
+def _read_poses(source: ShankRecording, recorded: Table) -> Array:
+    assert source.sequence is not None
     kinds = ("rotation", "translation")
     roles = tuple(f"{kind}_{k}" for kind in kinds for k in (1, 2, 3))
-    check_roles(table.columns, ("time", *roles), recorded.path, "tibia")
+    check_roles(source.columns, ("time", *roles), recorded.path, "tibia")
     return poses_of_columns(
-        recorded, table.columns, table.sequence, table.angle_unit, table.length_unit
+        recorded, source.columns, source.sequence, source.angle_unit, source.length_unit
     )
 
 
-def _fitted(
-    table: TibiaTable, recorded: Table, stamps: Array, time: Array
+def _fit_markers(
+    source: ShankRecording, recorded: Table, stamps: Array, time: Array
 ) -> tuple[Array, Array, Array]:
     """Return times, poses and residuals of the marker fit, around the frames."""
-    check_roles(table.columns, ("time",), recorded.path, "tibia")
-    points, reference = shank_points(table, recorded)
-    names = [*table.markers_mm, *(joint.name for joint in table.joint_centre)]
+    check_roles(source.columns, ("time",), recorded.path, "tibia")
+    points, reference = shank_points(source, recorded)
+    names = [*source.markers, *(joint.name for joint in source.joint_centre)]
     run = complete_run(points, names, stamps, time[0], time[-1], recorded)
     poses, residual = fit_rigid(points[run], reference)
     check_fit(residual, "shank markers", recorded)

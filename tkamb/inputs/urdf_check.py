@@ -12,25 +12,33 @@ from typing import Literal
 import numpy as np
 
 from tkamb.errors import InputError, names_near
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import KNEE_JOINT_NAMES, PATELLA_JOINT_NAMES, Array
 
 Axis = tuple[int, int, int]
 
-KNEE_JOINTS: dict[str, tuple[str, Axis]] = {
-    "knee_ap": ("prismatic", (1, 0, 0)),
-    "knee_si": ("prismatic", (0, 1, 0)),
-    "knee_ml": ("prismatic", (0, 0, 1)),
-    "knee_axial_rotation": ("revolute", (0, -1, 0)),
-    "knee_adduction": ("revolute", (-1, 0, 0)),
-    "knee_flexion": ("revolute", (0, 0, 1)),
-}
+KNEE_JOINTS: dict[str, tuple[str, Axis]] = dict(
+    zip(
+        KNEE_JOINT_NAMES,
+        (
+            ("prismatic", (1, 0, 0)),
+            ("prismatic", (0, 1, 0)),
+            ("prismatic", (0, 0, 1)),
+            ("revolute", (0, -1, 0)),
+            ("revolute", (-1, 0, 0)),
+            ("revolute", (0, 0, 1)),
+        ),
+        strict=True,
+    )
+)
 """Knee joints of a right knee, tibia to femur; a left one has (0 1 0) and (1 0 0) instead."""
 
-PATELLA_JOINTS: dict[str, tuple[str, Axis]] = {
-    "patella_ap": ("prismatic", (1, 0, 0)),
-    "patella_si": ("prismatic", (0, 1, 0)),
-    "patella_rotation": ("revolute", (0, 0, 1)),
-}
+PATELLA_JOINTS: dict[str, tuple[str, Axis]] = dict(
+    zip(
+        PATELLA_JOINT_NAMES,
+        (("prismatic", (1, 0, 0)), ("prismatic", (0, 1, 0)), ("revolute", (0, 0, 1))),
+        strict=True,
+    )
+)
 
 CHAINS = (("tibia", KNEE_JOINTS, "femur"), ("femur", PATELLA_JOINTS, "patella"))
 """Where each chain of joints begins and ends."""

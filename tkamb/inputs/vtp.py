@@ -120,9 +120,9 @@ class _PolyData:
         else:
             raise ValueError(f"format '{form}'")
         raw = form == "appended" and self._raw
-        return np.frombuffer(self._decoded(source, raw), dtype)
+        return np.frombuffer(self._decode(source, raw), dtype)
 
-    def _decoded(self, source: bytes, raw: bool) -> bytes:
+    def _decode(self, source: bytes, raw: bool) -> bytes:
         """Return the bytes of an array after its header."""
         size = self._header.itemsize
         if not self._compressed:

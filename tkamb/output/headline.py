@@ -1,9 +1,9 @@
 """What a reader learns in the first half minute: a few cards and sentences, in plain words."""
 
-import re
+from collections.abc import Mapping
 from dataclasses import dataclass
-from html import escape
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,20 +39,14 @@ class Card:
         """Return the card as one line of text."""
         return f"{self.title}: {self.value} ({self.detail})"
 
-    def html(self) -> str:
-        """Return the card as HTML."""
-        kind = "card warning" if self.warning else "card"
-        return (
-            f'<div class="{kind}"><h3>{escape(self.title)}</h3>'
-            f'<p class="value">{escape(self.value)}</p><p>{_unbroken(self.detail)}</p></div>'
-        )
 
-
-def _unbroken(text: str) -> str:
-    """Return HTML in which numbers keep their units and ranges their ends on one line."""
-    text = re.sub(r"(\d) (%|BW|N|MPa|mm)\b", "\\1\u00a0\\2", escape(text))
-    text = re.sub(r"(\d) %", "\\1\u00a0%", text)
-    return re.sub(r"([\d.]+–[\d.]+)", r'<span class="whole">\1</span>', text)
+def run_title(summary: Mapping[str, Any]) -> str:
+    """Return the title that a run's summary gives, or else the name of its scene."""
+    if summary.get("title"):
+        return str(summary["title"])
+    scene = Path(str(summary.get("scene") or "tkamb run"))
+    name = scene.parent.name if scene.stem == "scene" and scene.parent.name else scene.stem
+    return name.upper() if len(name) <= 3 else name.replace("_", " ").capitalize()
 
 
 def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
@@ -78,10 +72,11 @@ def _where(results: "Results", axis: HorizontalAxis, frame: int) -> str:
 
 
 def _questions(results: "Results") -> Card | None:
-    asked = results.summary.get("questions") or []
-    if not asked:
+    questions = results.summary.get("questions") or []
+    if not questions:
         return None
-    return Card("Questions to answer", str(len(asked)), " ".join(map(str, asked)), True)
+    detail = " ".join(map(str, questions))
+    return Card("Questions to answer", str(len(questions)), detail, True)
 
 
 def _peak_force(results: "Results", axis: HorizontalAxis) -> Card | None:
@@ -145,10 +140,10 @@ def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
             )
         else:
             detail += f"; never above yield ({stress:g}\u00a0MPa)"
-    said = results.summary.get("known_error")
-    if said is not None:
-        detail += f"; {_model(results)} {known_error_words(said, PRESSURE_AND_AREA)}"
-    large = said is not None and is_large(said, PRESSURE_AND_AREA)
+    error = results.summary.get("known_error")
+    if error is not None:
+        detail += f"; {_model(results)} {known_error_words(error, PRESSURE_AND_AREA)}"
+    large = error is not None and is_large(error, PRESSURE_AND_AREA)
     return Card("Peak contact pressure", f"{found.value:.1f} MPa", detail, large)
 
 

@@ -7,14 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import SIDES, Array
 from tkamb.run.agreement import UNLOADED
 from tkamb.units import MILLIMETRE, STANDARD_GRAVITY
 
 if TYPE_CHECKING:
     from tkamb.results import Results
 
-SIDES = ("medial", "lateral")
 JUMP = 8.0 * MILLIMETRE
 MANY_STEPS = 5.0
 """A centre of pressure that moves by more than JUMP, and by many median steps, from one frame to
@@ -116,8 +115,8 @@ def residual_share(results: "Results") -> Array:
 
 def failed(results: "Results") -> NDArray[np.bool_]:
     """Return which frames (f,) say that they failed, or are not ok and have no contact force."""
-    said = np.array([status.startswith("failed") for status in results.status], bool)
-    return said | (~_clean(results) & np.isnan(results["force_total_N"]))
+    marked = np.array([status.startswith("failed") for status in results.status], bool)
+    return marked | (~_clean(results) & np.isnan(results["force_total_N"]))
 
 
 def flagged(results: "Results") -> NDArray[np.bool_]:

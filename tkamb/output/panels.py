@@ -1,11 +1,13 @@
 """What the report draws: the plots of a run, their lines and what they mean."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tkamb.columns import is_ligament, ligament_of
+from tkamb.geometry.frames import Array
 from tkamb.known_errors import is_large, known_error_words
 from tkamb.output import style
 from tkamb.output.metrics import (
@@ -15,12 +17,60 @@ from tkamb.output.metrics import (
     split_undetermined,
     tension_ratio,
 )
-from tkamb.output.panel import Line, Panel, without_empty_lines
 from tkamb.output.style import BLACK, BLUE, GREEN, GREY, PURPLE, SIDE_COLOURS, VERMILLION
-from tkamb.run.columns import is_ligament, ligament_of
 
 if TYPE_CHECKING:
     from tkamb.results import Results
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """One curve.
+
+    Args:
+        name: unique in its panel; a column's name, or what was made from columns.
+        label: as the legend shows it.
+        values: (f,) in the panel's unit.
+        colour: of the line.
+        dashed: drawn dashed.
+    """
+
+    name: str
+    label: str
+    values: Array
+    colour: str
+    dashed: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One plot.
+
+    Args:
+        name: id of the plot in the page.
+        title: what it shows.
+        unit: of the vertical axis.
+        lines: its curves.
+        note: a sentence under the plot.
+        level: (value, label) of a horizontal reference line.
+        second: (factor, unit) of a second vertical axis on the right.
+        logarithmic: vertical axis.
+        from_zero: the vertical axis holds zero.
+        limits: of the vertical axis, where they are known beforehand.
+        warning: the note is something to look at.
+    """
+
+    name: str
+    title: str
+    unit: str
+    lines: tuple[Line, ...]
+    note: str = ""
+    level: tuple[float, str] | None = None
+    second: tuple[float, str] | None = None
+    logarithmic: bool = False
+    from_zero: bool = True
+    limits: tuple[float, float] | None = None
+    warning: bool = False
 
 
 def panels(results: "Results") -> tuple[Panel, ...]:
@@ -30,8 +80,14 @@ def panels(results: "Results") -> tuple[Panel, ...]:
         _external, _ground, _ligaments, _residuals, _residual_moment, _hip_force, _hip_moment,
         _motion, _slip, _adjustment, _adjustment_effect, _condition,
     )  # fmt: skip
-    made = (without_empty_lines(make(results)) for make in makers)
+    made = (_without_empty_lines(make(results)) for make in makers)
     return tuple(panel for panel in made if panel.lines)
+
+
+def _without_empty_lines(panel: Panel) -> Panel:
+    """Return the panel with only the lines that hold a number."""
+    lines = tuple(line for line in panel.lines if np.isfinite(line.values).any())
+    return replace(panel, lines=lines)
 
 
 def lateral_axis_name(results: "Results") -> str:
@@ -147,12 +203,12 @@ def _areas(results: "Results") -> Panel:
 
 def _with_known_error(results: "Results", panel: Panel, names: tuple[str, ...]) -> Panel:
     """Return the panel with what its contact model is known to be off by."""
-    said = results.summary.get("known_error")
-    if said is None:
+    error = results.summary.get("known_error")
+    if error is None:
         return panel
-    words = known_error_words(said, names)
+    words = known_error_words(error, names)
     note = f"{words[0].upper()}{words[1:]}."
-    return replace(panel, note=note, warning=is_large(said, names))
+    return replace(panel, note=note, warning=is_large(error, names))
 
 
 def centre_panel(results: "Results") -> Panel:
@@ -160,7 +216,7 @@ def centre_panel(results: "Results") -> Panel:
     lines = _both_sides(results, "cop_ap_mm")
     title = "Anterior position of the centres of pressure"
     note = "Insert x; zero is the middle of its bottom."
-    return without_empty_lines(Panel("centres", title, "mm", lines, note))
+    return _without_empty_lines(Panel("centres", title, "mm", lines, note))
 
 
 def _pressures(results: "Results") -> Panel:

@@ -16,8 +16,7 @@ from matplotlib.ticker import (
 from tkamb.errors import InputError
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
 from tkamb.output.metrics import failed, flagged
-from tkamb.output.panel import Panel
-from tkamb.output.panels import centre_panel, panels
+from tkamb.output.panels import Panel, centre_panel, panels
 from tkamb.output.style import BLACK, GREY, ORANGE, legend_above, new_figure, settings
 
 if TYPE_CHECKING:
@@ -37,7 +36,7 @@ def draw_panel(panel: Panel, results: "Results", axis: HorizontalAxis) -> Figure
         figure = new_figure(WIDTH, HEIGHT)
         axes = figure.add_subplot()
         _draw_lines(axes, panel, axis)
-        _dress(axes, panel, axis)
+        _label_axes(axes, panel, axis)
         mark_frames(axes, results, axis)
         legend_above(axes, _legend_columns(panel))
     return figure
@@ -69,7 +68,7 @@ def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = Non
         for k, panel in enumerate(chosen):
             axes = figure.add_subplot(rows, min(2, len(chosen)), k + 1)
             _draw_lines(axes, panel, horizontal)
-            _dress(axes, panel, horizontal)
+            _label_axes(axes, panel, horizontal)
             mark_frames(axes, results, horizontal)
             axes.set_title(panel.title, loc="left", pad=28, fontweight="bold")
             legend_above(axes, _legend_columns(panel))
@@ -111,7 +110,7 @@ def _legend_columns(panel: Panel) -> int:
     return 2 if sum(len(line.label) + 6 for line in panel.lines) > 72 else 4
 
 
-def _dress(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:
+def _label_axes(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:
     axes.set_xlabel(axis.label)
     axes.set_ylabel(panel.unit if panel.unit != "–" else "")
     low, high = float(np.min(axis.values)), float(np.max(axis.values))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis
-from tkamb.output.maps_file import ContactMaps
+from tkamb.output.maps import ContactMaps
 from tkamb.output.metrics import map_rows, stretches
 from tkamb.output.panels import lateral_axis_name
 from tkamb.output.style import BLACK, GREY, PRESSURE_MAP, SIDE_COLOURS, new_figure, settings
@@ -51,7 +51,7 @@ class TopView:
         self.triangles = maps.triangles[np.argsort(height)]
         self.shade = _shade(points, self.triangles)
 
-    def place(self, ap: Array, ml: Array) -> tuple[Array, Array]:
+    def page_coordinates(self, ap: Array, ml: Array) -> tuple[Array, Array]:
         """Return page coordinates (mm) of insert x and z (mm)."""
         return self.sign * ml, ap
 
@@ -139,7 +139,7 @@ def draw_paths(
         axes = figure.add_subplot()
         view.draw_insert(axes)
         for side, colour in SIDE_COLOURS.items():
-            x, y = view.place(results[f"{side}_cop_ap_mm"], results[f"{side}_cop_ml_mm"])
+            x, y = view.page_coordinates(results[f"{side}_cop_ap_mm"], results[f"{side}_cop_ml_mm"])
             parts = stretches(np.column_stack([x, y]) * MILLIMETRE)
             apart = np.full(len(x), np.nan)
             for number, part in enumerate(parts):
@@ -182,7 +182,9 @@ def _draw_pressure(axes: Axes, view: TopView, pressure: Array, scale: Normalize)
 
 def _draw_centres(axes: Axes, view: TopView, results: "Results", frame: int) -> None:
     for side in SIDE_COLOURS:
-        x, y = view.place(results[f"{side}_cop_ap_mm"][frame], results[f"{side}_cop_ml_mm"][frame])
+        x, y = view.page_coordinates(
+            results[f"{side}_cop_ap_mm"][frame], results[f"{side}_cop_ml_mm"][frame]
+        )
         axes.plot(x, y, "+", color="white", markersize=7, markeredgewidth=2.4)
         axes.plot(x, y, "+", color=BLACK, markersize=6, markeredgewidth=1.1)
 

@@ -1,32 +1,39 @@
-"""The report: one page that stands by itself, for a biomechanist to read in a minute."""
+"""The report: one page that stands by itself, for a biomechanist to read in a minute.
 
-from html import escape
+Its frame slider moves one cursor in every plot; the numbers of the frames stand in the page as
+JSON, rounded to five digits. Without scripts, and on paper, the page reads as before.
+"""
+
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tkamb.output.atomic import write_text
-from tkamb.output.axis import HorizontalAxis, horizontal_axis
-from tkamb.output.cursor import SCRIPT, cursor_bar
-from tkamb.output.headline import cards
+import numpy as np
+
+from tkamb.atomic import write_text
+from tkamb.geometry.frames import Array
+from tkamb.output.axis import LABELS, HorizontalAxis, horizontal_axis
+from tkamb.output.headline import cards, run_title
 from tkamb.output.metrics import body_weight, failed, flagged
-from tkamb.output.panel import Panel
-from tkamb.output.panels import centre_panel, panels
+from tkamb.output.pages import asset, policy_sources, render
+from tkamb.output.panels import Panel, centre_panel, panels
 from tkamb.output.plots import draw_panel
-from tkamb.output.policy import sources
 from tkamb.output.pressure_maps import draw_maps, draw_paths, mapped_frames, top_view
-from tkamb.output.provenance import provenance_rows, sentences
-from tkamb.output.report_style import CSS, NOTEBOOK_CSS
 from tkamb.output.style import svg_text
-from tkamb.output.tables import flags_table, motion_table, strain_table
+from tkamb.output.tables import flag_rows, motion_table, strain_table
 
 if TYPE_CHECKING:
     from tkamb.results import Results
 
+PACKAGE = "tkamb.output"
 POLICY = (
-    f"default-src 'none'; script-src {sources(SCRIPT)}; style-src-elem {sources(CSS)}; "
+    "default-src 'none'; script-src {script}; style-src-elem {style}; "
     "style-src-attr 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
 )
 """The page runs its own script and loads nothing; the plots set their colours in attributes."""
+PROVENANCE = (
+    "scene", "scene_sha256", "started", "command", "versions", "seconds", "contact", "frame",
+)  # fmt: skip
+"""Keys of the summary that are shown as they are."""
 
 
 def write_report(results: "Results", path: str | Path) -> None:
@@ -41,37 +48,40 @@ def write_report(results: "Results", path: str | Path) -> None:
 def report_html(results: "Results") -> str:
     """Return the report as HTML: vector plots, pictures and style are inside the page."""
     axis = horizontal_axis(results)
-    title = escape(_title(results.summary))
-    return (
-        "<!DOCTYPE html>\n"
-        f'<html lang="en"><head><meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
-        f"<title>{title}</title>\n"
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<style>{CSS}</style></head>\n<body>\n"
-        f"<header><h1>{title}</h1><p>{_subtitle(results)}</p></header>\n"
-        f"{_summary_section(results, axis)}{_maps_section(results, axis)}"
-        f"{_plots_section(results, axis)}{_tables_section(results, axis)}"
-        f"{_provenance_section(results)}{cursor_bar(results, axis)}</body></html>\n"
+    style, script = asset(PACKAGE, "report.css"), asset(PACKAGE, "report.js")
+    return render(
+        PACKAGE,
+        "report.html",
+        policy=POLICY.format(script=policy_sources(script), style=policy_sources(style)),
+        style=style,
+        script=script,
+        title=run_title(results.summary),
+        subtitle=_subtitle(results),
+        cards=cards(results, axis),
+        sentences=_sentences(results.summary),
+        maps=_maps(results, axis),
+        legend=_legend(results),
+        plots=[_plot(panel, results, axis) for panel in panels(results)],
+        motion=motion_table(results, axis),
+        strain=strain_table(results.summary),
+        flags=flag_rows(results, axis),
+        axis_name=LABELS[axis.kind].split(" (")[0],
+        provenance=_provenance(results.summary),
+        last_frame=len(results) - 1,
+        cursor=_cursor_data(results, axis),
     )
 
 
 def headline_html(results: "Results") -> str:
     """Return the headline numbers alone, with their style, for notebooks."""
-    boxes = "".join(card.html() for card in cards(results, horizontal_axis(results)))
-    title = escape(_title(results.summary))
-    return (
-        f"<div class='tkamb'><style>{NOTEBOOK_CSS}</style><h2>{title}</h2>"
-        f"<p>{_subtitle(results)}</p><div class='cards'>{boxes}</div></div>"
+    return render(
+        PACKAGE,
+        "notebook.html",
+        style=asset(PACKAGE, "notebook.css"),
+        title=run_title(results.summary),
+        subtitle=_subtitle(results),
+        cards=cards(results, horizontal_axis(results)),
     )
-
-
-def _title(summary: dict[str, Any]) -> str:
-    if summary.get("title"):
-        return str(summary["title"])
-    scene = Path(str(summary.get("scene", "tkamb run")))
-    name = scene.parent.name if scene.stem == "scene" and scene.parent.name else scene.stem
-    return name.upper() if len(name) <= 3 else name.replace("_", " ").capitalize()
 
 
 def _subtitle(results: "Results") -> str:
@@ -83,7 +93,7 @@ def _subtitle(results: "Results") -> str:
         f"{summary['body_mass_kg']:g} kg; one body weight (BW) is {weight:.0f} N",
         _contact_words(contact),
     ]
-    return " · ".join(escape(part) for part in parts if part)
+    return " · ".join(part for part in parts if part)
 
 
 def _contact_words(contact: dict[str, Any]) -> str:
@@ -97,74 +107,91 @@ def _contact_words(contact: dict[str, Any]) -> str:
     return words
 
 
-def _summary_section(results: "Results", axis: HorizontalAxis) -> str:
-    boxes = "".join(card.html() for card in cards(results, axis))
-    notes = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences(results.summary))
-    listed = f"<h2>What to know</h2><ul class='notes'>{notes}</ul>" if notes else ""
-    return f"<section><div class='cards'>{boxes}</div>{listed}</section>\n"
-
-
-def _maps_section(results: "Results", axis: HorizontalAxis) -> str:
-    view = top_view(results)
-    frames = mapped_frames(results, axis)
+def _maps(results: "Results", axis: HorizontalAxis) -> dict[str, Any] | None:
+    """Return the pictures of pressure on the insert; None without maps."""
+    view, frames = top_view(results), mapped_frames(results, axis)
     if view is None or not frames:
-        return ""
-    maps = svg_text(draw_maps(results, view, axis, frames), "maps")
-    paths = svg_text(draw_paths(results, view, axis, frames), "paths")
-    centres = _plot(centre_panel(results), results, axis)
-    side = results.summary.get("side", "right")
-    return (
-        "<section><h2>Pressure on the insert</h2>"
-        f"<figure class='wide'>{maps}<figcaption>Insert of the {escape(str(side))} knee from "
-        "above, anterior up. Crosses: centres of pressure. One colour scale for the whole run."
-        "</figcaption></figure>"
-        "<div class='grid'>"
-        f"<figure id='figure-paths'><h3>Paths of the centres of pressure</h3>{paths}"
-        "<figcaption>Blue: medial, red: lateral; broken where a centre jumps. Dots: the frames "
-        "above.</figcaption></figure>"
-        f"{centres}</div></section>\n"
-    )
+        return None
+    return {
+        "pictures": svg_text(draw_maps(results, view, axis, frames), "maps"),
+        "paths": svg_text(draw_paths(results, view, axis, frames), "paths"),
+        "centres": _plot(centre_panel(results), results, axis),
+        "side": view.side,
+    }
 
 
-def _plots_section(results: "Results", axis: HorizontalAxis) -> str:
-    drawn = "".join(_plot(panel, results, axis) for panel in panels(results))
-    return (
-        f"<section><h2>Over the motion</h2>{_marks(results)}"
-        f"<div class='grid'>{drawn}</div></section>\n"
-    )
+def _plot(panel: Panel, results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
+    return {"panel": panel, "svg": svg_text(draw_panel(panel, results, axis), panel.name)}
 
 
-def _plot(panel: Panel, results: "Results", axis: HorizontalAxis) -> str:
-    picture = svg_text(draw_panel(panel, results, axis), panel.name)
-    kind = " class='warning'" if panel.warning else ""
-    note = f"<figcaption{kind}>{escape(panel.note)}</figcaption>" if panel.note else ""
-    return (
-        f"<figure class='plot' id='figure-{panel.name}'><h3>{escape(panel.title)}"
-        f" <small>({escape(panel.unit)})</small></h3>{picture}"
-        f"<p class='readout'></p>{note}</figure>"
-    )
-
-
-def _marks(results: "Results") -> str:
-    words = ["Lines run in time order."]
+def _legend(results: "Results") -> list[str]:
+    """Return what the marks in the plots mean."""
+    sentences = ["Lines run in time order."]
     if flagged(results).any():
-        words.append("Orange ticks at the bottom: frames to be read with care.")
+        sentences.append("Orange ticks at the bottom: frames to be read with care.")
     if failed(results).any():
-        words.append("Crosses at the bottom: frames that failed; the lines are broken there.")
-    return f"<p class='legend'>{' '.join(words)}</p>"
+        sentences.append("Crosses at the bottom: frames that failed; the lines are broken there.")
+    return sentences
 
 
-def _tables_section(results: "Results", axis: HorizontalAxis) -> str:
-    return (
-        "<section><h2>Numbers</h2>"
-        f"{motion_table(results, axis)}"
-        "<p class='legend'>Recorded frames nearest to each place; nothing is interpolated. "
-        "All columns of all frames are in results.csv.</p>"
-        f"{strain_table(results.summary)}"
-        f"<h2>Frames to be read with care</h2>{flags_table(results, axis)}</section>\n"
-    )
+def _sentences(summary: dict[str, Any]) -> list[str]:
+    """Return what a reader must know, one sentence each, without repeats."""
+    found: list[str] = []
+    for key in ("residuals", "notes", "assumptions"):
+        value = summary.get(key) or []
+        found.extend([value] if isinstance(value, str) else [str(item) for item in value])
+    missing = summary.get("not_modelled")
+    if missing:
+        found.append("Not modelled: " + ", ".join(map(str, missing)) + ".")
+    return list(dict.fromkeys(found))
 
 
-def _provenance_section(results: "Results") -> str:
-    rows = provenance_rows(results.summary)
-    return f"<section><h2>Where it comes from</h2><table class='keys'>{rows}</table></section>\n"
+def _provenance(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return where the run came from: name and text."""
+    return [
+        (key.replace("_", " ").replace("sha256", "SHA-256"), _text(summary[key]))
+        for key in PROVENANCE
+        if summary.get(key) not in (None, "", {}, [])
+    ]
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, dict):
+        filled = {str(k).replace("_", " "): v for k, v in value.items() if v not in (None, {}, [])}
+        return ", ".join(f"{name} {_text(item)}" for name, item in filled.items())
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return ", ".join(_text(item) for item in value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _cursor_data(results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
+    """Return what the slider shows of each frame: position, status, the lines of every plot."""
+    drawn = (*panels(results), centre_panel(results))
+    name = axis.label.split(" (")[0]
+    return {
+        "x": _round(axis.values),
+        "place": [f"{name} {axis.at(k)}" for k in range(len(results))],
+        "status": results.status,
+        "panels": {panel.name: _cursor_lines(panel) for panel in drawn if panel.lines},
+    }
+
+
+def _cursor_lines(panel: Panel) -> list[dict[str, Any]]:
+    """Return a panel's lines with as many decimals as show a thousandth of its largest value."""
+    largest = max(float(np.nanmax(np.abs(line.values))) for line in panel.lines)
+    digits = int(np.clip(2 - np.floor(np.log10(largest)), 0, 4)) if largest > 0 else 0
+    return [
+        {
+            "label": line.label,
+            "colour": line.colour,
+            "digits": digits,
+            "values": _round(line.values),
+        }
+        for line in panel.lines
+    ]
+
+
+def _round(values: Array) -> list[float | None]:
+    return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values]

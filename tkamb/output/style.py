@@ -90,8 +90,13 @@ def svg_text(figure: "Figure", name: str, dpi: int = 200) -> str:
 def _box(figure: "Figure") -> str:
     axes = figure.axes[0]
     width, height = 72 * figure.get_size_inches()
-    place = axes.get_position()
-    edges = (place.x0 * width, place.x1 * width, (1 - place.y1) * height, (1 - place.y0) * height)
+    position = axes.get_position()
+    edges = (
+        position.x0 * width,
+        position.x1 * width,
+        (1 - position.y1) * height,
+        (1 - position.y0) * height,
+    )
     box = " ".join(f"{edge:.2f}" for edge in edges)
     low, high = axes.get_xlim()
     return f'data-box="{box}" data-range="{low:.9g} {high:.9g}"'

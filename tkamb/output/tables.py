@@ -2,14 +2,14 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from html import escape
+from dataclasses import dataclass
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tkamb.geometry.frames import Array
-from tkamb.output.axis import LABELS, HorizontalAxis
+from tkamb.output.axis import HorizontalAxis
 from tkamb.output.metrics import (
     body_weight,
     medial_share,
@@ -26,59 +26,49 @@ Entry = tuple[str, str, Array, int]
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 
-def motion_table(results: "Results", axis: HorizontalAxis) -> str:
-    """Return the HTML table of the frames nearest to 0, 10, ..., or at even times."""
+@dataclass(frozen=True)
+class Table:
+    """A table of texts.
+
+    Args:
+        headings: of the columns; where they have units, (name, unit).
+        rows: as long as the headings, but for a strain table's first cell, the bundle.
+    """
+
+    headings: Sequence[Any]
+    rows: Sequence[Sequence[str]]
+
+
+def motion_table(results: "Results", axis: HorizontalAxis) -> Table:
+    """Return the frames nearest to 0, 10, ..., or at even times."""
     entries = [entry for entry in _entries(results, axis) if np.isfinite(entry[2]).any()]
-    head = "".join(
-        f"<th>{escape(name)}<br><small>{escape(unit)}</small></th>" for name, unit, *_ in entries
+    stops = axis.stops(13 if axis.kind == "flexion" else 11)
+    return Table(
+        [(name, unit) for name, unit, *_ in entries],
+        [[_number(values[k], digits) for *_, values, digits in entries] for k in stops],
     )
-    body = "".join(
-        "<tr>" + "".join(f"<td>{_number(v[k], digits)}</td>" for *_, v, digits in entries) + "</tr>"
-        for k in axis.stops(13 if axis.kind == "flexion" else 11)
-    )
-    return f"<table class='numbers'><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def strain_table(summary: Mapping[str, Any]) -> str:
-    """Return the HTML table of the ligaments' strains, so that a wrong insertion is seen."""
+def strain_table(summary: Mapping[str, Any]) -> Table | None:
+    """Return the ligaments' strains in per cent, so that a wrong insertion is seen."""
     found = summary.get("ligament_strain")
     if not found:
-        return ""
-    head = "".join(f"<th>{angle:g}°</th>" for angle in found["flexion_deg"])
-    rows = "".join(
-        f"<tr><td>{escape(name)}</td>"
-        + "".join(f"<td>{_number(_percent(value), 1)}</td>" for value in strain)
-        + "</tr>"
-        for name, strain in found["strain"].items()
-    )
-    return (
-        "<details><summary>Ligament strain at three flexions, %</summary>"
-        "<p class='legend'>Negative: slack. A bundle above about 10 % is attached at the wrong "
-        "place or has the wrong slack length. –: no recorded frame within 10°.</p>"
-        f"<table><thead><tr><th>bundle</th>{head}</tr></thead>"
-        f"<tbody>{rows}</tbody></table></details>"
+        return None
+    return Table(
+        [f"{angle:g}°" for angle in found["flexion_deg"]],
+        [
+            [name, *("–" if one is None else _number(100.0 * one, 1) for one in strain)]
+            for name, strain in found["strain"].items()
+        ],
     )
 
 
-def _percent(strain: float | None) -> float:
-    return float("nan") if strain is None else 100.0 * strain
-
-
-def flags_table(results: "Results", axis: HorizontalAxis) -> str:
-    """Return the HTML table of what is not ok: one row per reason, and in which frames."""
-    rows = "".join(
-        f"<tr><td>{escape(reason)}</td><td>{len(frames)}</td><td>{_stretches(frames)}</td>"
-        f"<td>{_places(frames, axis)}</td></tr>"
+def flag_rows(results: "Results", axis: HorizontalAxis) -> list[tuple[str, str, str, str]]:
+    """Return what is not ok: why, in how many frames, in which, and where they lie."""
+    return [
+        (reason, str(len(frames)), _stretches(frames), _positions(frames, axis))
         for reason, frames in reasons(results.status).items()
-    )
-    if not rows:
-        return "<p>Every frame is ok.</p>"
-    name = LABELS[axis.kind].split(" (")[0]
-    return (
-        "<p class='legend'>Frames are counted from 0. A frame that failed holds no numbers for "
-        "what failed.</p><table><thead><tr><th>why</th><th>how many</th><th>frames</th>"
-        f"<th>{name}</th></tr></thead><tbody>{rows}</tbody></table>"
-    )
+    ]
 
 
 def reasons(statuses: Sequence[str]) -> dict[str, list[int]]:
@@ -94,11 +84,13 @@ def reasons(statuses: Sequence[str]) -> dict[str, list[int]]:
             if words and words != "ok":
                 words = f"failed: {words}" if failure and position == 0 else words
                 found.setdefault(NUMBER.sub("#", words), []).append((frame, words))
-    merged = {_merged([words for _, words in one]): [k for k, _ in one] for one in found.values()}
-    return dict(sorted(merged.items(), key=lambda item: not item[0].startswith("failed")))
+    rows = {
+        _with_ranges([words for _, words in one]): [k for k, _ in one] for one in found.values()
+    }
+    return dict(sorted(rows.items(), key=lambda item: not item[0].startswith("failed")))
 
 
-def _merged(variants: Sequence[str]) -> str:
+def _with_ranges(variants: Sequence[str]) -> str:
     """Return one text for texts that differ in their numbers: with the numbers' ranges."""
     columns = zip(*(NUMBER.findall(words) for words in variants), strict=True)
     ranges = []
@@ -123,7 +115,7 @@ def _stretches(frames: Sequence[int]) -> str:
     return ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in _runs(frames))
 
 
-def _places(frames: Sequence[int], axis: HorizontalAxis) -> str:
+def _positions(frames: Sequence[int], axis: HorizontalAxis) -> str:
     return ", ".join(
         axis.at(a) if a == b else f"{axis.at(a)} to {axis.at(b)}" for a, b in _runs(frames)
     )

@@ -12,10 +12,10 @@ from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.cells import scaled_jacobians
-from tkamb.contact.lattice.grid import Lattice
+from tkamb.atomic import replaced_file
+from tkamb.contact.lattice.meshing.cells import scaled_jacobians
+from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.geometry.frames import Array
-from tkamb.output.atomic import replaced_file
 
 HEXAHEDRON = 12
 """VTK's number for a cell of eight nodes."""

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tkamb.case import Case
 from tkamb.geometry.frames import knee_pose, transform
 from tkamb.plausibility.question import Question
+from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
 
 PEAK_LOAD = (0.4, 4.0)

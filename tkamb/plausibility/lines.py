@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.case import Case
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.plausibility.question import Question, some
-from tkamb.scene_tables import Attachment
+from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.body.ligaments import Ligament
+    from tkamb.body.load import LinkPoint
 
 STRAIN = 0.15
 """Ligaments of the knee tear at 12 to 20 % (Kennedy et al. 1976, Butler et al. 1986)."""
@@ -29,8 +29,8 @@ TENDON = (0.025, 0.085)
 """m, of the patellar ligament's length."""
 PATELLA_AWAY = (0.015, 0.08)
 """m, of the patella's origin from the flexion axis."""
-QUADRICEPS = (0.08, 0.55)
-"""m, of the quadriceps' origin above the flexion axis: within the thigh."""
+ORIGIN = (0.08, 0.55)
+"""m, of an extensor's origin above the flexion axis: within the thigh."""
 TUBEROSITY = (0.01, 0.11)
 """m, of the patellar ligament's distal end from the insert's centre; it lies below and ahead."""
 ON_PATELLA = 0.06
@@ -42,27 +42,28 @@ a few per cent."""
 
 def attachment_questions(case: Case) -> Iterator[Question]:
     """Points in metres called millimetres, and bundles that end far from the knee."""
-    scene = case.scene
     ends = [
-        (f"{t.name} {side}", getattr(t, side))
-        for t in scene.ligament
+        (f"{bundle.name} {side}", getattr(bundle, side))
+        for bundle in case.ligaments
         for side in ("proximal", "distal")
     ]
-    far = [name for name, end in ends if not _belongs(*_placed(case, end))]
+    far = [name for name, end in ends if not _belongs(*_on_carrier(case, end))]
     if far:
         yield Question(
             f"{some(far)} ends more than {FARTHEST_ATTACHMENT / MILLIMETRE:.0f} mm from the knee, "
             "or beyond the joint: is its point_mm, sign or link another one?",
             "attachment far from its place",
         )
-    if scene.quadriceps and scene.patellar_ligament:
+    for muscle in case.muscles:
+        ends += [(f"[{muscle.name}] origin", muscle.points[0])]
+        ends += [(f"[{muscle.name}] via point", point) for point in muscle.points[1:-1]]
+        ends += [(f"[{muscle.name}] insertion", muscle.points[-1])]
+    if case.patellar_ligament:
         ends += [
-            ("[quadriceps] origin", scene.quadriceps.origin),
-            ("[quadriceps] insertion", scene.quadriceps.insertion),
-            ("[patellar_ligament] proximal", scene.patellar_ligament.proximal),
-            ("[patellar_ligament] distal", scene.patellar_ligament.distal),
+            ("[patellar_ligament] proximal", case.patellar_ligament.proximal),
+            ("[patellar_ligament] distal", case.patellar_ligament.distal),
         ]
-    tiny = [name for name, end in ends if 0.0 < np.abs(end.point_mm).max() < 1.0]
+    tiny = [name for name, end in ends if 0.0 < np.abs(end.position).max() < MILLIMETRE]
     if tiny:
         yield Question(
             f"{some(tiny)} lies within 1 mm of its link's origin: is point_mm in metres?",
@@ -70,32 +71,32 @@ def attachment_questions(case: Case) -> Iterator[Question]:
         )
 
 
-def _placed(case: Case, end: Attachment) -> tuple[str, Array]:
+def _on_carrier(case: Case, end: "LinkPoint") -> tuple[str, Array]:
     """Return the link that carries an attachment, and where on it that is (3,) m.
 
     On the tibia in the insert frame, on femur or patella in that link's own.
     """
     chain = case.chain
     carrier = chain.carrier(end.link)
-    place = transform(chain.link_in(end.link, carrier), np.array(end.point_mm) * MILLIMETRE)
+    place = transform(chain.link_in(end.link, carrier), end.position)
     if carrier == "tibia":
         place = transform(inverse(chain.insert_in_tibia), place)
     return carrier, place
 
 
 def _belongs(carrier: str, place: Array) -> bool:
-    """Say whether a ligament may end at a place (3,) m, as `_placed` gives it."""
+    """Say whether a ligament may end at a place (3,) m, as `_on_carrier` gives it."""
     beyond = {"tibia": place[1], "femur": -place[1]}.get(carrier, 0.0)
     return float(np.linalg.norm(place)) <= FARTHEST_ATTACHMENT and beyond <= BEYOND
 
 
 def stiffness_questions(case: Case) -> Iterator[Question]:
     """Bundles stiffer or softer than any ligament."""
-    for key, (low, high), unit in (
-        ("stiffness_N_per_mm", STIFFNESS_PER_MM, "N/mm"),
-        ("stiffness_N_per_strain", STIFFNESS_PER_STRAIN, "N per unit strain"),
+    for law, (low, high), scale, unit in (
+        ("two-line", STIFFNESS_PER_MM, MILLIMETRE, "N/mm"),
+        ("quadratic-toe", STIFFNESS_PER_STRAIN, 1.0, "N per unit strain"),
     ):
-        values = {t.name: k for t in case.scene.ligament if (k := getattr(t, key)) is not None}
+        values = {b.name: b.stiffness * scale for b in case.ligaments if b.law == law}
         if odd := [name for name, k in values.items() if not low <= k <= high]:
             yield Question(
                 f"{some(odd)}: {values[odd[0]]:g} {unit} is no ligament's stiffness ({low:g} to "
@@ -147,28 +148,27 @@ def strain_questions(
 
 
 def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Question]:
-    """Ends of quadriceps and patellar ligament, and the length between recorded ends.
+    """Ends of the muscles on the patella and its ligament, and the length between recorded ends.
 
     Args:
         case: the case.
         poses: link -> pose_link_in_insert (f, 4, 4).
     """
-    quadriceps, ligament = case.scene.quadriceps, case.scene.patellar_ligament
-    if quadriceps is None or ligament is None:
+    ligament = case.patellar_ligament
+    if ligament is None:
         return
-    off = []
-    _, origin = _placed(case, quadriceps.origin)
-    if not QUADRICEPS[0] <= origin[1] <= QUADRICEPS[1] or np.hypot(origin[0], origin[2]) > 0.12:
-        off.append("[quadriceps] origin")
-    _, distal = _placed(case, ligament.distal)
+    off, on_patella = [], [("[patellar_ligament] proximal", ligament.proximal, -1.0)]
+    for muscle in case.muscles:
+        _, origin = _on_carrier(case, muscle.points[0])
+        if not ORIGIN[0] <= origin[1] <= ORIGIN[1] or np.hypot(origin[0], origin[2]) > 0.12:
+            off.append(f"[{muscle.name}] origin")
+        on_patella.insert(-1, (f"[{muscle.name}] insertion", muscle.points[-1], 1.0))
+    _, distal = _on_carrier(case, ligament.distal)
     away = float(np.linalg.norm(distal))
     if not TUBEROSITY[0] <= away <= TUBEROSITY[1] or distal[0] < 0 or distal[1] > 0.01:
         off.append("[patellar_ligament] distal")
-    for name, end, sign in (
-        ("[quadriceps] insertion", quadriceps.insertion, 1.0),
-        ("[patellar_ligament] proximal", ligament.proximal, -1.0),
-    ):
-        _, place = _placed(case, end)
+    for name, end, sign in on_patella:
+        _, place = _on_carrier(case, end)
         if np.linalg.norm(place) > ON_PATELLA or sign * place[1] < 0.0:
             off.append(name)
     if off:
@@ -176,15 +176,12 @@ def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Quest
             f"{some(off)} lies where no such line ends: is its point_mm, sign or link another one?",
             "extensor line ends off its bone",
         )
-    ends = [
-        transform(poses[end.link], np.array(end.point_mm) * MILLIMETRE)
-        for end in (ligament.proximal, ligament.distal)
-    ]
+    ends = [transform(poses[e.link], e.position) for e in (ligament.proximal, ligament.distal)]
     lengths = np.linalg.norm(ends[0] - ends[1], axis=1)
-    yield from _tendon(lengths[np.isfinite(lengths)], ligament.length_mm)
+    yield from _tendon(lengths[np.isfinite(lengths)], ligament.length)
 
 
-def _tendon(lengths: Array, declared_mm: float | None) -> Iterator[Question]:
+def _tendon(lengths: Array, declared: float) -> Iterator[Question]:
     """The patellar ligament's lengths (f,) m between its ends, and the declared one."""
     if not len(lengths):
         return
@@ -196,9 +193,9 @@ def _tendon(lengths: Array, declared_mm: float | None) -> Iterator[Question]:
             "is one of its ends, or the patella's motion, wrong in sign or unit?",
             "patellar ligament of odd length",
         )
-    elif declared_mm is not None and abs(declared_mm * MILLIMETRE / mean - 1) > TENDON_CHANGE:
+    elif abs(declared / mean - 1) > TENDON_CHANGE:  # not where none is declared: NaN
         yield Question(
             f"the patellar ligament is {mean / MILLIMETRE:.0f} mm between its ends, but length_mm "
-            f"is {declared_mm:g}: which is right?",
+            f"is {declared / MILLIMETRE:g}: which is right?",
             "patellar ligament of odd length",
         )

@@ -4,10 +4,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from tkamb.case import Case
 from tkamb.geometry.frames import KNEE_COORDINATES
 from tkamb.inputs.samples import OddSample
 from tkamb.plausibility.question import Question
+from tkamb.scene.case import Case
 from tkamb.units import DEGREE
 
 FLEXION_RADIANS = 3.3

@@ -10,7 +10,7 @@ from tkamb.plausibility.question import Question, some
 from tkamb.plausibility.segments import segment_questions
 
 if TYPE_CHECKING:
-    from tkamb.mechanics.mechanics import FrameLoads, Mechanics
+    from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 
 FORCE_BW = 8.0
 """BW: instrumented knees measured 5 to 6 at most, in stumbling (Bergmann et al. 2014)."""
@@ -37,7 +37,7 @@ class Plausibility:
             *foot_questions(case),
             *direction_questions(case),
         ]
-        if case.scene.ligament or case.scene.quadriceps:
+        if case.ligaments or case.muscles:
             found += _line_questions(mechanics)
         self.questions: tuple[Question, ...] = tuple(found)
 
@@ -49,7 +49,7 @@ class Plausibility:
         if self._mechanics.ligaments:
             from tkamb.plausibility.lines import STRAIN, torn_bundles
 
-            if torn := torn_bundles(self._mechanics.ligaments, body.tensions):
+            if torn := torn_bundles(self._mechanics.ligaments, body.geometry.tensions):
                 words.append(f"ligament strain above {100 * STRAIN:.0f} %: {some(torn)}")
         force = float(np.linalg.norm(body.loads.contact_force)) / self._mechanics.case.body_weight
         if force > FORCE_BW:

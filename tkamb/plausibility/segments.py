@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tkamb.case import Case
 from tkamb.geometry.frames import Array
 from tkamb.inputs.segments import DE_LEVA
 from tkamb.plausibility.question import Question
+from tkamb.scene.case import Case
 from tkamb.units import DEGREE, MILLIMETRE
 
 SEGMENT_MASS = 1.6

@@ -13,9 +13,9 @@ import numpy as np
 from tkamb.units import DEGREE
 
 if TYPE_CHECKING:
-    from tkamb.case import Case
     from tkamb.equilibrium.frame_contact import FrameContact
-    from tkamb.mechanics.mechanics import FrameLoads
+    from tkamb.equilibrium.mechanics import FrameLoads
+    from tkamb.scene.case import Case
 
 SHARES_APART = 0.25
 """Two estimates of the medial share that differ by more contradict each other."""

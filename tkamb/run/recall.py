@@ -1,7 +1,7 @@
 """A frame's contact as arrays, and back: what a resumed run starts its next frame from.
 
-It stands in for the frame before as a guess, as good as the frame itself but for what a
-contact model remembers privately: answers stay within the solver's tolerance.
+It stands in for the frame before as a guess, as good as the frame itself but for its warm
+start, which is not kept: answers stay within the solver's tolerance.
 """
 
 from collections.abc import Mapping
@@ -16,11 +16,11 @@ from tkamb.contact.result import ContactResult
 from tkamb.equilibrium.balance import Balance, BalanceStatus
 from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.equilibrium.frame_contact import FrameContact
-from tkamb.equilibrium.released import SettledKnee
+from tkamb.equilibrium.released import KneeEquilibrium
 from tkamb.geometry.frames import Array
 
 if TYPE_CHECKING:
-    from tkamb.mechanics.mechanics import Mechanics
+    from tkamb.equilibrium.mechanics import Mechanics
 
 RESULT_ARRAYS = ("pose", "normals", "pressure", "area", "gap", "nodal_force", "wrench_on_insert")
 
@@ -29,15 +29,14 @@ def contact_arrays(contact: FrameContact | None) -> dict[str, Array] | None:
     """Return what is worth keeping of a frame's contact by name; None without a result."""
     if contact is None or contact.result is None:
         return None
-    result, settled = contact.result, contact.settled
+    result, knee = contact.result, contact.equilibrium
     arrays = {name: np.asarray(getattr(result, name), float) for name in RESULT_ARRAYS}
-    arrays["approach"] = np.array(result.approach, float)
-    if settled is not None:
-        arrays["settled_coordinates"] = settled.coordinates
-        arrays["settled_force"] = settled.balance.force
-        arrays["settled_stiffness"] = settled.balance.stiffness
-        if settled.patella is not None:
-            arrays["settled_patella"] = settled.patella.coordinates
+    if knee is not None:
+        arrays["equilibrium_coordinates"] = knee.coordinates
+        arrays["equilibrium_force"] = knee.balance.force
+        arrays["equilibrium_stiffness"] = knee.balance.stiffness
+        if knee.patella is not None:
+            arrays["equilibrium_patella"] = knee.patella.coordinates
     return arrays
 
 
@@ -48,35 +47,36 @@ def recalled(
     none = np.zeros(len(side.state.points), bool)
     if arrays is None:
         return FrameContact(None, none, None, 0.0, "not recalled", ())
-    settled = _settled(mechanics, frame, arrays) if "settled_coordinates" in arrays else None
-    return FrameContact(_result(side.state, arrays), none, None, 0.0, "", (), settled=settled)
+    knee = _equilibrium(mechanics, frame, arrays) if "equilibrium_coordinates" in arrays else None
+    return FrameContact(_result(side.state, arrays), none, None, 0.0, "", (), equilibrium=knee)
 
 
 def _result(state: PreparedContact, arrays: Mapping[str, Array]) -> ContactResult:
     fields: dict[str, Any] = {name: arrays[name] for name in RESULT_ARRAYS}
-    fields["approach"] = float(arrays["approach"])
-    return ContactResult(points=state.points, medial=None, lateral=None, **fields)
+    return ContactResult(pair=state.pair, points=state.points, medial=None, lateral=None, **fields)
 
 
-def _settled(mechanics: "Mechanics", frame: int, arrays: Mapping[str, Array]) -> SettledKnee:
+def _equilibrium(
+    mechanics: "Mechanics", frame: int, arrays: Mapping[str, Array]
+) -> KneeEquilibrium:
     patella = None
-    if mechanics.extensor is not None and "settled_patella" in arrays:
+    if mechanics.extensor is not None and "equilibrium_patella" in arrays:
         state = mechanics.extensor.states[frame]
-        patella = replace(state, coordinates=arrays["settled_patella"])
-    place, nan = arrays["settled_coordinates"], float("nan")
-    return SettledKnee(
+        patella = replace(state, coordinates=arrays["equilibrium_patella"])
+    place, nan = arrays["equilibrium_coordinates"], float("nan")
+    return KneeEquilibrium(
         coordinates=place,
-        placed=mechanics.placed(frame, place, patella),
+        geometry=mechanics.geometry(frame, place, patella),
         patella=patella,
         contact=ProbedContact({}),
         balance=Balance(
             coordinates=place,
-            force=arrays["settled_force"],
-            stiffness=arrays["settled_stiffness"],
+            force=arrays["equilibrium_force"],
+            stiffness=arrays["equilibrium_stiffness"],
             status=BalanceStatus.OK,
             steps=0,
             trials=0,
-            softest=nan,
+            smallest_stiffness=nan,
             work=(),
         ),
         passes=0,

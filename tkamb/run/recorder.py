@@ -1,6 +1,6 @@
 """What takes the frames of a run as they are finished: memory, or a folder that survives a kill.
 
-In a folder every finished frame is a file of its own (`tkamb.output.shards`) before the next
+In a folder every finished frame is a file of its own (`tkamb.run.shards`) before the next
 begins. contact.h5 grows beside them; about once a second a copy takes its place together with
 results.csv, which calls the other frames not computed, and summary.json.
 """
@@ -14,12 +14,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tkamb.atomic import replaced_together
 from tkamb.geometry.frames import Array
-from tkamb.output.shards import Row, Shard, Shards, check_same_run
+from tkamb.results_folder import MAPS_NAME, REPORT_NAME, SUMMARY_NAME, put_numbers, read_results
+from tkamb.run.shards import Row, Shard, Shards, check_same_run
 
 if TYPE_CHECKING:
-    from tkamb.output.maps_file import ContactMaps, MapWriter
-    from tkamb.output.maps_memory import MapKeeper
+    from tkamb.output.maps import ContactMaps, MapWriter
     from tkamb.results import Results
 
 MAPS = ("pressure", "gap", "nodal_force", "pose")
@@ -38,15 +39,15 @@ class Recorder:
 
     def __init__(self) -> None:
         self.rows: dict[int, Row] = {}
-        self._sink: MapKeeper | MapWriter | None = None
+        self._writer: MapWriter | None = None
         self._stack = ExitStack()
 
     def begin_maps(self, points: Array, triangles: Array, labels: Mapping[str, Any]) -> None:
         """Make ready for pressure maps on these points; not called without contact."""
-        from tkamb.output.maps_memory import map_sink
+        from tkamb.output.maps import MapWriter
 
-        self._sink = map_sink(self._map_folder(), points, triangles, labels)
-        self._stack.enter_context(self._sink)
+        self._writer = MapWriter(self._maps_path, points, triangles, labels)
+        self._stack.enter_context(self._writer)
 
     def record(self, frame: int, row: Row, contact: dict[str, Array] | None) -> None:
         """Keep a finished frame.
@@ -58,12 +59,12 @@ class Recorder:
                 modelled.
         """
         self.rows[frame] = row
-        if self._sink is None:
+        if self._writer is None:
             return
         if contact is None:
-            self._sink.append_failed(float(row["time_s"]))
+            self._writer.append_failed(float(row["time_s"]))
         else:
-            self._sink.append(float(row["time_s"]), *(contact[name] for name in MAPS))
+            self._writer.append(float(row["time_s"]), *(contact[name] for name in MAPS))
 
     def take_earlier(self, frames: range) -> dict[int, dict[str, Array] | None]:
         """Take over what an earlier run finished; return frame -> the contact's arrays."""
@@ -85,14 +86,14 @@ class Recorder:
     @property
     def maps(self) -> "ContactMaps | None":
         """The pressure maps of the finished frames."""
-        return None if self._sink is None else self._sink.maps
+        return None if self._writer is None else self._writer.maps
 
     def close(self) -> None:
         """Nothing can be recorded after it."""
         self._stack.close()
 
-    def _map_folder(self) -> Path | None:
-        return None
+    _maps_path: Path | None = None
+    """Where contact.h5 grows; None: in memory."""
 
 
 class FolderRecorder(Recorder):
@@ -101,7 +102,7 @@ class FolderRecorder(Recorder):
     Nothing in the folder changes before the first frame is finished.
 
     Args:
-        directory: a folder that this process has claimed (`tkamb.output.claim`).
+        directory: a folder that this process has claimed (`tkamb.claim`).
         identity: what makes two runs the same.
         resume: go on with the frames that an earlier run left there.
 
@@ -113,6 +114,7 @@ class FolderRecorder(Recorder):
         super().__init__()
         self._directory = directory
         self._shards = Shards(directory, identity, resume)
+        self._maps_path = self._shards.folder / MAPS_NAME
         self._pause, self._shown = 0.0, -SHORTEST_PAUSE
         self._map_arguments: tuple[Any, ...] | None = None
 
@@ -139,7 +141,7 @@ class FolderRecorder(Recorder):
 
     def _record(self, frame: int, row: Row, contact: dict[str, Array] | None) -> None:
         self._shards.begin()
-        if self._map_arguments is not None and self._sink is None:
+        if self._map_arguments is not None and self._writer is None:
             super().begin_maps(*self._map_arguments)
         super().record(frame, row, contact)
 
@@ -152,9 +154,9 @@ class FolderRecorder(Recorder):
     @property
     def maps(self) -> "ContactMaps | None":
         """See `Recorder`; as they stand in the output folder."""
-        from tkamb.output.maps_file import FILE_NAME, ContactMaps
+        from tkamb.output.maps import ContactMaps
 
-        return None if self._sink is None else ContactMaps(self._directory / FILE_NAME)
+        return None if self._writer is None else ContactMaps(self._directory / MAPS_NAME)
 
     def finish(self) -> None:
         """See `Recorder`; what is published afterwards is whole."""
@@ -163,21 +165,15 @@ class FolderRecorder(Recorder):
 
     def publish(self, results: "Results") -> None:
         """Put results.csv, summary.json and contact.h5 in their places together; a report goes."""
-        from tkamb.output.atomic import replaced_together
-        from tkamb.output.maps_file import FILE_NAME
-        from tkamb.results import REPORT_NAME, put_numbers
 
         start = clock.perf_counter()
         with interrupt_later(), replaced_together(self._directory) as files:
-            if self._sink is not None:
-                shutil.copyfile(self._shards.folder / FILE_NAME, files.path(FILE_NAME))
+            if self._writer is not None:
+                shutil.copyfile(self._shards.folder / MAPS_NAME, files.path(MAPS_NAME))
             put_numbers(results, files)
             files.remove(REPORT_NAME)
         self._shown = clock.perf_counter()
         self._pause = max(SHORTEST_PAUSE, (self._shown - start) / DEAREST_SHARE)
-
-    def _map_folder(self) -> Path | None:
-        return self._shards.folder
 
 
 @contextmanager
@@ -202,8 +198,6 @@ def finished_results(directory: Path, identity: Mapping[str, Any]) -> "Results |
     Raises:
         InputError: they are another run's, or no longer what was written.
     """
-    from tkamb.results import SUMMARY_NAME, read_results
-
     if not (directory / SUMMARY_NAME).exists():
         return None
     results = read_results(directory)

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.case import Case
-from tkamb.mechanics.mechanics import FrameLoads
+from tkamb.equilibrium.mechanics import FrameLoads
 from tkamb.run.agreement import contradictions
+from tkamb.scene.case import Case
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
@@ -50,8 +50,8 @@ def frame_status(
     if contact and contact.problem and not failures:
         failures.append(contact.problem)
     words = [*_motion_flags(case, k), *_flank_flags(body), *_adjustment_flags(case, body)]
-    settled = contact is not None and contact.settled is not None
-    words += [_lift_off(body, side, settled) for side in sorted(body.loads.lifted)]
+    released = contact is not None and contact.equilibrium is not None
+    words += [_lift_off(body, side, released) for side in sorted(body.loads.lifted)]
     if body.loads.slack:
         words.append("flexors needed, which are not modelled: quadriceps slack")
     if body.loads.ambiguous:
@@ -64,8 +64,8 @@ def frame_status(
     return "; ".join(words) or "ok"
 
 
-def _lift_off(body: FrameLoads, side: str, settled: bool) -> str:
-    if settled:
+def _lift_off(body: FrameLoads, side: str, released: bool) -> str:
+    if released:
         return f"{side} condyle lifts off"
     if side in body.geometry.lifted:
         where = "where the other one touches" if body.adjustment else "as recorded"

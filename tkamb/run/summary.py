@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from tkamb.case import Case
 from tkamb.code_identity import code_identity
+from tkamb.equilibrium.mechanics import STRAIN_FLEXIONS
 from tkamb.files import sha256_of
 from tkamb.known_errors import as_json, known_error
-from tkamb.mechanics.mechanics import STRAIN_FLEXIONS
 from tkamb.run.status import FAILED
-from tkamb.scene_tables import ContactTable
+from tkamb.scene.case import Case
+from tkamb.scene.tables import ContactTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 RESIDUALS = (
@@ -36,7 +36,7 @@ def summary_of(
     path: Path | None,
     strains: Mapping[str, Sequence[float]],
 ) -> dict[str, Any]:
-    """Return the JSON-able summary of a run; `tkamb.output.provenance` lists its keys.
+    """Return the JSON-able summary of a run; docs/results.md lists its keys.
 
     Args:
         case: the case.
@@ -45,34 +45,11 @@ def summary_of(
         path: of the scene file, if it came from one.
         strains: ligament bundle -> strain at each of `STRAIN_FLEXIONS`.
     """
-    scene, statuses, times = case.scene, columns["status"], columns["time_s"]
-    left = scene.patient.side == "left"
-    summary: dict[str, Any] = {
-        "scene": None if path is None else str(path.absolute()),
-        "scene_sha256": scene_hash(case),
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": " ".join(["tkamb", *sys.argv[1:]]),
-        "versions": _versions(),
-        "seconds": seconds,
-        "side": scene.patient.side,
-        "frame": "insert frame: x anterior, y superior, z "
-        + ("lateral (a left knee, computed as its mirror image)" if left else "right (lateral)"),
-        "body_mass_kg": scene.patient.mass_kg,
-        "height_mm": scene.patient.height_mm,
-        "yield_stress_MPa": scene.output.yield_stress_MPa,
-        "axis": scene.output.axis,
-        "frames": len(statuses),
-        "failed_frames": [
-            {"frame": k, "time_s": float(times[k]), "status": status}
-            for k, status in enumerate(statuses)
-            if status.startswith(FAILED)
-        ],
-        "flagged_frames": sum(s != "ok" and not s.startswith(FAILED) for s in statuses),
-        "peak_force_total_BW": _peak(columns["force_total_BW"]),
-        "not_modelled": not_modelled(case),
-        "assumptions": assumptions(case),
-        "notes": list(scene.output.notes),
-    }
+    scene = case.scene
+    summary = _origin(case, path) | {"seconds": seconds} | _subject(case) | _counts(columns)
+    summary["not_modelled"] = not_modelled(case)
+    summary["assumptions"] = assumptions(case)
+    summary["notes"] = list(scene.output.notes)
     if strains:
         summary["ligament_strain"] = {"flexion_deg": STRAIN_FLEXIONS, "strain": strains}
     if scene.patella:
@@ -90,6 +67,47 @@ def summary_of(
         start = time[0] - percent[0] * slope
         summary["cycle_percent_s"] = [start, start + 100.0 * slope]
     return summary
+
+
+def _origin(case: Case, path: Path | None) -> dict[str, Any]:
+    """Return which scene was run, when, how and by what."""
+    return {
+        "scene": None if path is None else str(path.absolute()),
+        "scene_sha256": scene_hash(case),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": " ".join(["tkamb", *sys.argv[1:]]),
+        "versions": _versions(),
+    }
+
+
+def _subject(case: Case) -> dict[str, Any]:
+    """Return whose knee it is, in which frame, and how it is shown."""
+    patient, output = case.scene.patient, case.scene.output
+    left = "lateral (a left knee, computed as its mirror image)"
+    lateral = left if patient.side == "left" else "right (lateral)"
+    return {
+        "side": patient.side,
+        "frame": f"insert frame: x anterior, y superior, z {lateral}",
+        "body_mass_kg": patient.mass_kg,
+        "height_mm": patient.height_mm,
+        "yield_stress_MPa": output.yield_stress_MPa,
+        "axis": output.axis,
+    }
+
+
+def _counts(columns: dict[str, Any]) -> dict[str, Any]:
+    """Return how many frames there are, which failed, and the largest force."""
+    statuses, times = columns["status"], columns["time_s"]
+    return {
+        "frames": len(statuses),
+        "failed_frames": [
+            {"frame": k, "time_s": float(times[k]), "status": status}
+            for k, status in enumerate(statuses)
+            if status.startswith(FAILED)
+        ],
+        "flagged_frames": sum(s != "ok" and not s.startswith(FAILED) for s in statuses),
+        "peak_force_total_BW": _peak(columns["force_total_BW"]),
+    }
 
 
 @lru_cache(maxsize=1)
@@ -156,41 +174,45 @@ def not_modelled(case: Case) -> list[str]:
 def assumptions(case: Case) -> list[str]:
     """Return what the numbers rest on, in plain words."""
     scene = case.scene
-    said = [
+    sentences = [
         "Segments are rigid; the hip carries the force and moment of all that crosses it.",
     ]
     if scene.motion.cutoff_Hz == "none":
-        said.append("The motion is differentiated as given, unfiltered.")
+        sentences.append("The motion is differentiated as given, unfiltered.")
     else:
-        said.append(f"The motion is low-passed at {scene.motion.cutoff_Hz:g} Hz.")
+        sentences.append(f"The motion is low-passed at {scene.motion.cutoff_Hz:g} Hz.")
     if case.motion.unrecorded:
-        said.append(
+        sentences.append(
             f"Nobody recorded {', '.join(case.motion.unrecorded)}: they are found, and the rates "
             "that enter inertia and the direction of sliding are those of a first guess."
         )
     if scene.motion.motion == "roll-slip":
-        said.append(
+        sentences.append(
             "Roll-slip motion: AP from rolling plus "
             f"{scene.motion.slip_share:g} x the recorded slip, SI from first touch."
         )
     if scene.generic_ligaments:
-        said.append(
+        sentences.append(
             f"{', '.join(scene.generic_ligaments.ligaments)}: a generic set scaled to the "
             "implant, not this patient's; look at the strains."
         )
     if case.motion.markers:
-        said.append(_marker_reading(case))
+        sentences.append(_marker_reading(case))
     elif not scene.tibia:
-        said.append("No [tibia]: the shank stands upright and still.")
+        sentences.append("No [tibia]: the shank stands upright and still.")
     if scene.ground_reaction and scene.ground_reaction.applied == "ankle":
-        said.append("The ground reaction acts at the ankle centre, without moment (the source).")
+        sentences.append(
+            "The ground reaction acts at the ankle centre, without moment (Sharma 2008)."
+        )
     if not scene.patella:
-        said.append("No muscles: the knee's flexion moment is carried by nothing (a residual).")
+        sentences.append(
+            "No muscles: the knee's flexion moment is carried by nothing (a residual)."
+        )
     if scene.contact:
-        said.append(_agreement(scene.contact))
+        sentences.append(_agreement(scene.contact))
     if scene.patient.side == "left":
-        said.append("A left knee is computed as its mirror image: z is lateral.")
-    return said
+        sentences.append("A left knee is computed as its mirror image: z is lateral.")
+    return sentences
 
 
 def _marker_reading(case: Case) -> str:
@@ -215,10 +237,10 @@ def _agreement(table: ContactTable) -> str:
     if table.released:
         names = ", ".join(sorted({*table.released, "si"}))
         return f"{names} are not the recorded ones: body and contact are at rest in them."
-    said = "The contact model presses in the superior-inferior force at the measured rotation; "
+    sentence = "The contact model presses in the superior-inferior force at the measured rotation; "
     if table.coupling == "points":
-        return said + "the deformed contact's resultants act in the body's equations."
-    return said + "it does not feed back into the body."
+        return sentence + "the deformed contact's resultants act in the body's equations."
+    return sentence + "it does not feed back into the body."
 
 
 def _first_wrapping(columns: dict[str, Any]) -> float | None:

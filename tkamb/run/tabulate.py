@@ -5,16 +5,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.body.dome_sensitivity import dome_sensitivity
-from tkamb.case import Case
-from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates
-from tkamb.mechanics.mechanics import FrameLoads
+from tkamb.body.knee import dome_sensitivity
+from tkamb.columns import ligament_column
+from tkamb.equilibrium.mechanics import FrameLoads
+from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, knee_coordinates
 from tkamb.run.agreement import normal_force, share_by_equilibrium, split_determined
-from tkamb.run.columns import ligament_column
 from tkamb.run.status import FAILED
+from tkamb.scene.case import Case
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 if TYPE_CHECKING:
+    from tkamb.body.contact_points import CondylePoint
     from tkamb.body.slip import CondyleSlip
     from tkamb.equilibrium.frame_contact import FrameContact
     from tkamb.inputs.marker_motion import MarkerKinematics
@@ -44,9 +45,7 @@ def frame_row(
     """
     row = _motion_row(case, k) | _body_row(case, body)
     for side, slip in slips.items():
-        from tkamb.mechanics.sliding import sliding_row
-
-        row |= sliding_row(case, k, side, slip, body.geometry.condyles.get(side))
+        row |= _slip_row(case, k, side, slip, body.geometry.condyles.get(side))
     if contact is not None:
         row |= _contact_row(contact, case.scene.output.yield_stress_MPa * MEGAPASCAL)
         row |= _pose_row(contact)
@@ -96,10 +95,10 @@ def _marker_row(markers: "MarkerKinematics", time: Array) -> dict[str, Any]:
 
 
 def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
-    loads, values = frame.loads, frame.loads.values
+    loads, values, extensor = frame.loads, frame.loads.values, frame.geometry.extensor
     on_insert = -loads.contact_force
     total = float(np.linalg.norm(on_insert))
-    normal = {side: normal_force(frame, side) for side in ("medial", "lateral")}
+    normal = {side: normal_force(frame, side) for side in SIDES}
     row = {
         "force_si_N": -on_insert[1],
         "force_ap_N": on_insert[0],
@@ -109,7 +108,8 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
         "medial_force_equilibrium_N": normal["medial"],
         "lateral_force_equilibrium_N": normal["lateral"],
         "medial_share_equilibrium": share_by_equilibrium(frame),
-        "quadriceps_wrap_deg": frame.wrap / DEGREE,
+        "quadriceps_wrap_deg": (extensor.wrap if extensor else NAN) / DEGREE,
+        "quadriceps_N": extensor.tension(values) if extensor else NAN,
         "external_flexion_moment_Nm": loads.external_flexion,
         "external_adduction_moment_Nm": loads.external_adduction,
         "residual_sensitivity_N": loads.sensitivity,
@@ -118,7 +118,7 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
     if frame.effect is not None:
         row["adjust_force_change_BW"] = frame.effect.force / case.body_weight
         row["adjust_share_change"] = frame.effect.share
-    for name in ("quadriceps", "patellar_ligament", "patellofemoral", "patellofemoral_tangential"):
+    for name in ("patellar_ligament", "patellofemoral", "patellofemoral_tangential"):
         row[f"{name}_N"] = values.get(name, NAN)
     for axis in ("ap", "si", "ml"):
         row[f"hip_force_{axis}_N"] = values.get(f"hip_force_{axis}", NAN)
@@ -129,14 +129,44 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
     row["residual_coronal_Nm"] = values.get("residual_coronal", NAN)
     row["residual_flexion_Nm"] = values.get("residual_flexion", NAN)
     friction = case.scene.contact.friction if case.scene.contact else 0.0
-    dome = {} if loads.problems else dome_sensitivity(frame.geometry, friction)
-    row |= {f"{name}_per_dome_mm_N": slope * MILLIMETRE for name, slope in dome.items()}
+    dome = None if loads.problems else dome_sensitivity(frame.geometry, friction)
+    for name, slope in zip(("quadriceps", "patellofemoral"), dome or (), strict=False):
+        row[f"{name}_per_dome_mm_N"] = slope * MILLIMETRE
     if frame.geometry.ground:
         ground = frame.geometry.ground.forces[0]
         row |= {
             f"ground_reaction_{a}_N": g for a, g in zip(("ap", "si", "ml"), ground, strict=True)
         }
-    return row | {ligament_column(name): tension for name, tension in frame.tensions.items()}
+    return row | {
+        ligament_column(name): tension for name, tension in frame.geometry.tensions.items()
+    }
+
+
+def _slip_row(
+    case: Case, k: int, side: str, slip: "CondyleSlip", contact: "CondylePoint | None"
+) -> dict[str, float]:
+    """Return how one condyle moves on the insert at one frame.
+
+    - slip and its rate, from arcs of successive lowest points (`tkamb.body.slip`);
+    - the same rate without arcs: the rigid-body velocity of the femur's contact point relative
+      to the insert, forwards, less its axial part;
+    - that velocity along the contact normal. Surfaces that stay in touch have none: what is
+      left is by how much the recorded motion violates the contact constraint.
+    """
+    values = {
+        "slip_mm": slip.slip[k],
+        "slip_velocity_mm_per_s": slip.slip_velocity(case.motion.time)[k],
+    }
+    if contact is not None:
+        from tkamb.body.slip import forward_sliding
+
+        assert case.femoral is not None
+        centre, motion = case.femoral.bounds.mean(axis=0), case.motion
+        values["sliding_velocity_mm_per_s"] = forward_sliding(
+            motion.coordinates[k], motion.velocity[k], centre, contact.point
+        )
+        values["normal_velocity_mm_per_s"] = contact.sliding @ contact.normal
+    return {f"{side}_{name}": float(value) / MILLIMETRE for name, value in values.items()}
 
 
 def _contact_row(frame: "FrameContact", yield_stress: float) -> dict[str, float]:
@@ -150,7 +180,7 @@ def _contact_row(frame: "FrameContact", yield_stress: float) -> dict[str, float]
         row["adjust_translation_mm"] = frame.adjustment.translation / MILLIMETRE
         row["adjust_coronal_deg"] = frame.adjustment.coronal_angle / DEGREE
         row["adjust_restored"] = float(frame.adjustment.restored)
-    for side in ("medial", "lateral"):
+    for side in SIDES:
         row |= _condyle_row(side, frame, yield_stress)
     return row
 
@@ -163,15 +193,16 @@ def _pose_row(frame: "FrameContact") -> dict[str, float]:
     if frame.iterations:
         row["coupling_iterations"] = frame.iterations
         row["coupling_change_N"] = frame.load_change
-    if frame.settled is None:
+    if frame.equilibrium is None:
         return row | {"coupling_change_mm": frame.point_change / MILLIMETRE}
     angles = ("adduction", "axial_rotation")
     return (
         row
         | {f"{angle}_deg": named[angle] / DEGREE for angle in angles}
         | {
-            "contact_trials": frame.settled.trials,
-            "softest_N_per_mm": frame.settled.balance.softest * MILLIMETRE,
+            "contact_trials": frame.equilibrium.trials,
+            "smallest_stiffness_N_per_mm": frame.equilibrium.balance.smallest_stiffness
+            * MILLIMETRE,
         }
     )
 

@@ -4,19 +4,36 @@
 - The pressures, over the areas that they stand on, carry it too.
 - Nothing pulls, and nothing that is solved for passes through the femoral component.
 - What the condyles are said to carry is what the map under them carries.
+
+Beside that stand CalculiX's answers to some extremes, stored; `scripts/make_stability_answers`
+makes them. CalculiX (C3D8I) solves the same hexahedra, so that cells as coarse as those of the
+quick study do. Where contact is a few cells wide the two differ by what their elements differ; the
+bounds are the largest of those distances as measured, rounded up.
 """
 
+import json
 import math
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 
 from tkamb.contact.result import ContactResult
+from tkamb.errors import InputError
+from tkamb.studies.cases import content_hash
+from tkamb.studies.extremes import Extreme
+from tkamb.studies.quantities import Quantities, errors, quantities
 
 CARRIED = 0.005
 """Relative: forces, pressures and condyles against the load."""
 PASSED = 5e-3
 """Of the approach: how far a node may be inside the femoral component, a few times the solver's
 tolerance."""
+PEER_ANSWERS = Path(__file__).with_name("peer_answers.json")
+PEER_BOUNDS = {"approach": 0.035, "force": 0.01, "mean_pressure": 0.09, "peak_pressure": 0.09}
+"""Largest relative distance from CalculiX."""
+PEER_MODELS = ("lattice", "lattice-linear", "fe")
 
 
 def complaints(result: ContactResult, load: float, solved: bool, source_rule: bool) -> list[str]:
@@ -60,3 +77,35 @@ def _off(what: str, found: float, wanted: float) -> str:
     if math.isclose(found, wanted, rel_tol=CARRIED):
         return ""
     return f"{what} {found / wanted:.4f} of what they must"
+
+
+def body_hash(extreme: Extreme) -> str:
+    """Return the SHA-256 of an extreme's bodies, material, pose, load and grid."""
+    words = (extreme.pair.material, extreme.pair.bearing, extreme.load_N, extreme.resolution_mm)
+    return content_hash(extreme.pair, [extreme.pose], words)
+
+
+@cache
+def stored_answers(path: Path = PEER_ANSWERS) -> Mapping[str, tuple[str, Quantities]]:
+    """Return case -> (hash, quantities in SI)."""
+    content = json.loads(path.read_text(encoding="utf-8"))
+    return {name: (row["hash"], row["quantities"]) for name, row in content.items()}
+
+
+def peer_distances(extreme: Extreme, result: ContactResult) -> dict[str, float]:
+    """Return the relative distances from CalculiX; nothing where it was not asked.
+
+    Raises:
+        InputError: the case has changed since it was asked.
+    """
+    if extreme.model not in PEER_MODELS or extreme.label not in stored_answers():
+        return {}
+    known, answer = stored_answers()[extreme.label]
+    if known != body_hash(extreme):
+        raise InputError(
+            "CalculiX's answer is to an earlier version of the case",
+            f"case '{extreme.label}'",
+            "run scripts/make_stability_answers",
+        )
+    found = errors(quantities(result), answer)
+    return {name: found[name] for name in PEER_BOUNDS}

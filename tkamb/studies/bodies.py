@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.surface import Surface
 
 Height = Callable[[Array, Array], Array]
@@ -83,13 +83,11 @@ def dishes(thickness: float, radius: float, apart: float, rim: float = 2e-3) -> 
     return height
 
 
-def _corners(*numbers: NDArray[Any]) -> NDArray[np.int64]:
+def _corners(*numbers: NDArray[Any]) -> Index:
     return np.stack([n.ravel() for n in numbers], axis=1).astype(np.int64)
 
 
-def _ball(
-    radius: float, waist: float, finest_deg: float, sectors: int
-) -> tuple[Array, NDArray[np.int64]]:
+def _ball(radius: float, waist: float, finest_deg: float, sectors: int) -> tuple[Array, Index]:
     polar = np.radians(
         np.concatenate([np.arange(finest_deg, 24, finest_deg), np.linspace(24, 180, 50)[:-1]])
     )

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.case import load_case
 from tkamb.errors import InputError, TkambError
 from tkamb.geometry.frames import Array
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 from tkamb.simulation import simulate
+from tkamb.studies.cases import copied_scene, thin_out
 from tkamb.studies.kept_rows import KeptRows, row_key
-from tkamb.studies.recordings import copied_scene, thin_out
 
 if TYPE_CHECKING:
     from tkamb.results import Results

@@ -1,280 +1,253 @@
-"""CalculiX beside the built-in models: the same hexahedra, pose and load, another program.
+"""CalculiX: one contact problem as it reads it, its run as a process, the numbers that it prints.
 
-It starts without any answer of the lattice's: the femoral component begins where an elastic
-foundation would carry the load. Each position begins anew, so that its cold and warm times are the
-same. Its contact nodes lie on the smooth surface that the insert's mesh stands for, as those of the
-lattice do; the femoral component is faceted. Its pressures act on the deformed faces; here they
-become nodal forces, and those, over the undeformed tributary areas, pressures as the built-in
-models define them.
-
-Strain: linear cases have small strain on both sides. CalculiX's Ramberg-Osgood law wants finite
-strain (true stress over the Eulerian strain of the deformed shape), the built-in models keep
-small strain: a nonlinear comparison is one of the two measures as well.
+The deck: hexahedra, a rigid patch, penalty contact, a load. The femoral patch is a rigid layer of
+wedges that may move along y only. It begins at a guessed depth in the insert and is let go under
+the whole load: CalculiX closes the overlap and finds the balance in one increment, or in as many as
+it needs. Contact is node to surface, so that a node carries its pressure times its share of the
+deformed faces around it. The run: one thread, a limit of time, its own peak memory.
 """
 
+import math
+import os
+import shutil
+import subprocess
+import tempfile
 import time as clock
-from collections.abc import Collection, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from tkamb.contact.lattice.covered import covered_areas
-from tkamb.contact.lattice.femoral import FemoralFloor
-from tkamb.contact.lattice.grid import Lattice, build_grid
-from tkamb.contact.lattice.pressure_map import ContactMap, Indices, contact_map
-from tkamb.contact.pair import ContactPair
-from tkamb.contact.pressing import pose_at_approach
-from tkamb.contact.registry import contact_model
-from tkamb.contact.result import ContactResult
-from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
-from tkamb.errors import ComputationError
-from tkamb.geometry.condyles import condyle_split
-from tkamb.geometry.frames import Array
-from tkamb.geometry.rays import RayCaster
+from tkamb.contact.lattice.meshing.grid import Lattice
+from tkamb.contact.materials import LinearElastic, Material, RambergOsgood
+from tkamb.contact.pair import Bearing
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.surface import Surface
-from tkamb.studies.calculix_deck import Deck
-from tkamb.studies.calculix_run import LONGEST_SECONDS, PeerRun, find_program, run_calculix
-from tkamb.studies.cases import StudyCase
-from tkamb.studies.measures import Job, Measure
-from tkamb.studies.quantities import quantities, raster_map
-from tkamb.studies.references import Reference
-from tkamb.studies.row import Row, compared
+from tkamb.memory import peak_rss
+from tkamb.studies.measures import ONE_THREAD
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
-Mask = NDArray[np.bool_]
-
-GRIDS_MM: dict[str, tuple[float, ...]] = {"sphere": (2.0,), "two condyles": (2.0, 1.0)}
-"""Cell sizes of the cases that CalculiX is given; two condyles at 1 mm take it minutes."""
-ELEMENT = "C3D8I"
-REACH = 2.0
-"""Nodes whose gap at first touch is within this many times the guessed depth can be touched."""
-LEAST_LEAN = -0.3
-"""Largest y of a femoral normal that takes part."""
-UNEVEN = 0.01
-"""Largest difference of the summed contact forces from the load, over the load."""
+PENALTY = 1e5
+"""N/mm³: contact gives way by 0.3 µm at 30 MPa."""
+PATCH_THICKNESS = np.array([0.0, 1e-3, 0.0])
+"""m: of the layer of wedges that stands for the rigid femoral component."""
+PROGRAM = "ccx"
+LONGEST_SECONDS = 600.0
+"""A run that takes longer is stopped and says so."""
+OUTPUT_FILE = "output"
+POLL_SECONDS = 0.05
+"""Between two looks at the process's memory."""
 
 
 @dataclass(frozen=True, eq=False)
-class PeerAnswer:
-    """What CalculiX found.
+class Deck:
+    """What CalculiX is asked.
 
     Args:
-        result: on the contact nodes of the lattice's grid, by the contract's definitions.
-        run: its times, memory and iterations.
-        prepare_seconds: for the grid, the guess and the input.
-        nodes: of the insert.
-        balance: vertical contact forces over the load.
+        lattice: nodes and hexahedra of the insert.
+        patch: the part of the femoral component that can touch, insert frame, where it begins.
+        material: of the insert.
+        bearing: how the bottom is held.
+        load: N, along -y.
+        element: "C3D8" (fully integrated, locks as nu nears 0.5), "C3D8I" (incompatible modes).
     """
 
-    result: ContactResult
-    run: PeerRun
-    prepare_seconds: float
-    nodes: int
-    balance: float
+    lattice: Lattice
+    patch: Surface
+    material: Material
+    bearing: Bearing
+    load: float
+    element: str
+
+    @property
+    def text(self) -> str:
+        """The input in mm, N and MPa.
+
+        Raises:
+            InputError: the material's law or the bearing is not one of CalculiX's here.
+        """
+        return "\n".join([*self._mesh(), *self._sets(), *self._solids(), *self._step(), ""])
+
+    @property
+    def _centre(self) -> int:
+        """Number of the node that moves the rigid patch."""
+        return len(self.lattice.nodes) + 2 * len(self.patch.vertices) + 1
+
+    def _mesh(self) -> list[str]:
+        lattice, patch, n = self.lattice, self.patch, len(self.lattice.nodes)
+        places = np.concatenate([lattice.nodes, patch.vertices, patch.vertices + PATCH_THICKNESS])
+        wedges = patch.faces[:, [0, 2, 1]] + n
+        wedges = np.concatenate([wedges, wedges + len(patch.vertices)], axis=1)
+        lines = ["*NODE, NSET=NALL"]
+        for number, (x, y, z) in enumerate(places / MILLIMETRE, 1):
+            lines.append(f"{number},{x:.9e},{y:.9e},{z:.9e}")
+        lines += [f"{self._centre},0.,30.,0.", f"{self._centre + 1},0.,30.,0."]
+        lines += [f"*ELEMENT, TYPE={self.element}, ELSET=INSERT", *_numbered(1, lattice.cells)]
+        lines.append("*ELEMENT, TYPE=C3D6, ELSET=FEMUR")
+        return lines + _numbered(len(lattice.cells) + 1, wedges)
+
+    def _sets(self) -> list[str]:
+        n, m = len(self.lattice.nodes), len(self.patch.vertices)
+        first = len(self.lattice.cells) + 1
+        lines = _set("NBOTTOM", self.lattice.bottom_nodes)
+        lines += _set("NREF", np.array([self._centre - 1])) + _set("NINSERT", np.arange(n))
+        lines += _set("NSLAVE", np.unique(self.lattice.contact_triangles))
+        lines += _set("NFEMUR", np.arange(n, n + 2 * m))
+        lines += ["*SURFACE, NAME=SLAVE, TYPE=NODE", "NSLAVE", "*SURFACE, NAME=MASTER"]
+        return lines + [f"{first + e},S1" for e in range(len(self.patch.faces))]
+
+    def _solids(self) -> list[str]:
+        return [
+            *("*MATERIAL, NAME=INSERT", *_law(self.material)),
+            *("*MATERIAL, NAME=STEEL", "*ELASTIC", "2.1E5,0.3"),
+            "*SOLID SECTION, ELSET=INSERT, MATERIAL=INSERT",
+            "*SOLID SECTION, ELSET=FEMUR, MATERIAL=STEEL",
+            f"*RIGID BODY, NSET=NFEMUR, REF NODE={self._centre}, ROT NODE={self._centre + 1}",
+            *("*SURFACE INTERACTION, NAME=SI", "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR"),
+            f"{PENALTY},0.001",
+            "*CONTACT PAIR, INTERACTION=SI, TYPE=NODE TO SURFACE",
+            "SLAVE,MASTER",
+        ]
+
+    def _step(self) -> list[str]:
+        if self.bearing != "fixed":
+            raise InputError("holds its inserts by the whole bottom", "CalculiX's deck")
+        centre, finite = self._centre, "" if self.material.is_linear else ", NLGEOM"
+        return [
+            *("*BOUNDARY", "NBOTTOM,1,3", f"{centre},1,1", f"{centre},3,3", f"{centre + 1},1,3"),
+            *("*STEP, INC=300" + finite, "*STATIC", "1.,1.,1e-7,1."),
+            *("*CLOAD", f"{centre},2,{-self.load}"),
+            *("*NODE PRINT, NSET=NREF, FREQUENCY=1000", "U"),
+            *("*NODE PRINT, NSET=NINSERT, FREQUENCY=1000", "U"),
+            *("*CONTACT PRINT, FREQUENCY=1000", "CSTR", "*END STEP"),
+        ]
 
 
-def peer_rows(
-    cases: Iterable[StudyCase],
-    references: dict[str, Reference],
-    sizes_mm: Collection[float] = (2.0,),
-) -> list[Row]:
-    """Return a row for each case and size of `GRIDS_MM`; its status says why one failed.
+def _law(material: Material) -> list[str]:
+    modulus, ratio, law = material.young_modulus / MEGAPASCAL, material.poisson_ratio, material.law
+    if isinstance(law, RambergOsgood):
+        stress = law.reference_stress / MEGAPASCAL
+        return ["*DEFORMATION PLASTICITY", f"{modulus},{ratio},{stress},{law.exponent},{law.alpha}"]
+    if isinstance(law, LinearElastic):
+        return ["*ELASTIC", f"{modulus},{ratio}"]
+    raise InputError("has no law that CalculiX knows", f"material '{material.name}'")
+
+
+def _numbered(first: int, members: Index) -> list[str]:
+    return [f"{i},{','.join(str(v + 1) for v in row)}" for i, row in enumerate(members, first)]
+
+
+def _set(name: str, nodes: Index) -> list[str]:
+    return [f"*NSET, NSET={name}", *(str(v + 1) for v in nodes)]
+
+
+@dataclass(frozen=True, eq=False)
+class PeerRun:
+    """What one run of CalculiX gave and took.
 
     Args:
-        cases: that may be pressed.
-        references: case name -> converged answer.
-        sizes_mm: cell sizes that are wanted.
+        blocks: the last block of numbers of each kind in its .dat file, by the first word.
+        seconds: of the process.
+        peak_rss_MB: of the process (1e6 bytes).
+        iterations: equilibrium iterations, one factorisation each.
+    """
+
+    blocks: dict[str, Array]
+    seconds: float
+    peak_rss_MB: float
+    iterations: int
+
+
+def find_program() -> str:
+    """Return where CalculiX is.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    found = shutil.which(PROGRAM)
+    if found is None:
+        raise InputError("is not installed", "CalculiX", "apt-get install calculix-ccx")
+    return found
+
+
+def run_calculix(text: str, longest: float = LONGEST_SECONDS) -> PeerRun:
+    """Run a deck.
+
+    Args:
+        text: the input.
+        longest: s, after which it is stopped.
 
     Raises:
         InputError: CalculiX is not installed.
+        ComputationError: it stopped with an error, or was stopped.
     """
-    find_program()
-    rows = []
-    for case in cases:
-        for size in GRIDS_MM.get(case.name, ()):
-            if size in sizes_mm:
-                job = Job(case.name, f"calculix {ELEMENT}", size)
-                rows.append(compared(job, measure_by_calculix(case, size), references[case.name]))
-    return rows
+    program = find_program()
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        (place / "peer.inp").write_text(text, encoding="utf-8")
+        start = clock.perf_counter()
+        memory = _wait([program, "-i", "peer"], place, longest)
+        seconds = clock.perf_counter() - start
+        if not (place / "peer.dat").exists():
+            raise ComputationError(
+                f"gave no output: {_last_words(place / OUTPUT_FILE)}", "CalculiX"
+            )
+        blocks = _blocks((place / "peer.dat").read_text(encoding="utf-8").splitlines())
+        iterations = _iterations((place / "peer.cvg").read_text(encoding="utf-8"))
+        return PeerRun(blocks, seconds, memory, iterations)
 
 
-def measure_by_calculix(
-    case: StudyCase, grid_mm: float, longest: float = LONGEST_SECONDS
-) -> Measure:
-    """Return CalculiX's measure of a case; its status says why there is none.
-
-    Args:
-        case: what to press.
-        grid_mm: edge of the hexahedra.
-        longest: s, after which it is stopped.
-    """
-    try:
-        answer = press_by_calculix(case.pair, case.load, case.pose, grid_mm, longest=longest)
-    except ComputationError as error:
-        return Measure(str(error))
-    seconds = answer.run.seconds
-    return Measure(
-        "ok",
-        answer.prepare_seconds,
-        seconds,
-        seconds,
-        answer.run.peak_rss_MB,
-        answer.run.iterations,
-        answer.nodes,
-        quantities(answer.result),
-        {f"{i} {j}": p for (i, j), p in raster_map(answer.result).items()},
-    )
+def _wait(command: list[str], place: Path, longest: float) -> float:
+    """Run a command to its end with one thread; return its peak memory, MB."""
+    memory, start = math.nan, clock.perf_counter()
+    with (
+        open(place / OUTPUT_FILE, "wb") as output,
+        subprocess.Popen(
+            command, cwd=place, stdout=output, stderr=subprocess.STDOUT, env=os.environ | ONE_THREAD
+        ) as process,
+    ):
+        try:
+            while process.poll() is None:
+                memory = float(np.fmax(memory, peak_rss(process.pid)))  # NaN once it has ended
+                if clock.perf_counter() - start > longest:
+                    raise ComputationError(f"stopped after {longest:g} s", "CalculiX")
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(POLL_SECONDS)
+        finally:
+            process.kill()
+    if process.returncode:
+        raise ComputationError(f"stopped: {_last_words(place / OUTPUT_FILE)}", "CalculiX")
+    return memory
 
 
-def press_by_calculix(
-    pair: ContactPair,
-    load: float,
-    pose: Array,
-    grid_mm: float,
-    element: str = ELEMENT,
-    longest: float = LONGEST_SECONDS,
-) -> PeerAnswer:
-    """Press a femoral component on an insert by CalculiX.
-
-    Args:
-        pair: the two bodies.
-        load: N, along -y.
-        pose: (4, 4) pose_femoral_in_insert; its y does not matter.
-        grid_mm: edge of the hexahedra.
-        element: "C3D8I" or "C3D8".
-        longest: s, after which CalculiX is stopped.
-
-    Raises:
-        InputError: CalculiX is not installed, or has no such material or bearing.
-        ComputationError: it failed, or what it found does not carry the load.
-    """
-    start = clock.perf_counter()
-    problem = _problem(pair, load, pose, grid_mm)
-    deck = Deck(problem.lattice, problem.patch, pair.material, pair.bearing, load, element)
-    text = deck.text
-    prepared = clock.perf_counter() - start
-    run = run_calculix(text, longest)
-    result, balance = _result(problem, load, run)
-    return PeerAnswer(result, run, prepared, len(problem.lattice.nodes), balance)
+def _last_words(path: Path) -> str:
+    """Return the line that says what went wrong, or the last one."""
+    lines = [line.strip(" *") for line in path.read_text(errors="replace").splitlines()]
+    lines = [line for line in lines if line]
+    wrong = [line for line in lines if line.lower().startswith("error")]
+    return (wrong or lines or ["it said nothing"])[-1]
 
 
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """The grid, and the femoral component where CalculiX begins.
-
-    Args:
-        pair: the two bodies.
-        lattice: grid of the insert, its contact nodes on the smooth surface.
-        nodes: (c,) contact nodes.
-        map: contact surface.
-        floor: femoral component from below.
-        pose: (4, 4) at the guessed depth.
-        depth: m, guessed.
-        touchable: (c,) contact nodes over which `patch` lies.
-        patch: femoral triangles, insert frame.
-    """
-
-    pair: ContactPair
-    lattice: Lattice
-    nodes: Indices
-    map: ContactMap
-    floor: FemoralFloor
-    pose: Array
-    depth: float
-    touchable: Mask
-    patch: Surface
+def _iterations(text: str) -> int:
+    """Count the lines of a .cvg file that belong to an iteration: step, increment, ..."""
+    return sum(line.split()[:1] != [] and line.split()[0].isdigit() for line in text.splitlines())
 
 
-def _problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -> _Problem:
-    lattice = build_grid(pair.insert, grid_mm * MILLIMETRE)
-    nodes, surface = contact_map(lattice, pair.insert)
-    smooth = lattice.nodes.copy()
-    smooth[nodes, 1] += surface.lift
-    floor = FemoralFloor(pair.femoral, RayCaster(pair.femoral))
-    guess = contact_model("foundation", grid_mm)
-    depth = guess.press(guess.prepare(pair), load, pose).approach
-    if not depth > 0:
-        raise ComputationError("needs a load that presses the bodies together", "CalculiX")
-    places, _ = floor.over(surface.points, pose_at_approach(pair, pose, 0.0))
-    near = places[:, 1] - surface.points[:, 1] < REACH * depth
-    placed = pose_at_approach(pair, pose, depth)
-    patch = _patch(pair.femoral.moved(placed), surface.points[near], grid_mm * MILLIMETRE)
-    lattice = replace(lattice, nodes=smooth)
-    return _Problem(pair, lattice, nodes, surface, floor, placed, depth, near, patch)
-
-
-def _patch(femoral: Surface, points: Array, spacing: float) -> Surface:
-    """Return the downward triangles that lie within a cell of points, seen from above."""
-    down = np.flatnonzero(femoral.face_normals[:, 1] < LEAST_LEAN)
-    middle = femoral.triangles[down].mean(axis=1)[:, ::2]
-    away, _ = cKDTree(points[:, ::2]).query(middle, distance_upper_bound=spacing)
-    used, faces = np.unique(femoral.faces[down[np.isfinite(away)]], return_inverse=True)
-    return Surface(femoral.vertices[used], faces.reshape(-1, 3).astype(np.int64), "patch")
-
-
-def _result(problem: _Problem, load: float, run: PeerRun) -> tuple[ContactResult, float]:
-    """Return what CalculiX found by the contract's definitions, and its forces over the load."""
-    if not {"NREF", "NINSERT", "contact"} <= run.blocks.keys():
-        raise ComputationError("gave no contact stress", "CalculiX")
-    approach = problem.depth - float(run.blocks["NREF"][-1, 2]) * MILLIMETRE
-    pose = pose_at_approach(problem.pair, problem.pose, approach)
-    bent = _bent(problem, run)
-    force = _nodal_forces(problem, pose, run, bent)
-    balance = -float(force[:, 1].sum()) / load
-    if not abs(balance - 1) <= UNEVEN:
-        raise ComputationError(f"gave pressures that sum to {balance:.4f} of the load", "CalculiX")
-    surface = problem.map
-    pressure = np.linalg.norm(force, axis=1) / surface.area
-    gap = _gaps(problem, pose, bent)
-    covered = covered_areas(
-        surface.points, surface.triangles, surface.triangle_area,
-        pressure, gap, problem.pair.material,
-    )  # fmt: skip
-    medial, lateral = summarise_condyles(
-        medial_points(surface.points, pose, condyle_split(problem.pair.femoral)),
-        surface.points, pressure, covered, force, surface.thickness,
-    )  # fmt: skip
-    return ContactResult(
-        pose=pose,
-        points=surface.points,
-        normals=surface.normals,
-        pressure=pressure,
-        area=surface.area,
-        gap=gap,
-        nodal_force=force,
-        wrench_on_insert=wrench_of(surface.points, force),
-        medial=medial,
-        lateral=lateral,
-        approach=approach,
-        iterations=run.iterations,
-        residual=abs(balance - 1),
-    ), balance
-
-
-def _bent(problem: _Problem, run: PeerRun) -> ContactMap:
-    """Return the deformed contact surface."""
-    moved = run.blocks["NINSERT"]
-    moved = moved[np.argsort(moved[:, 0]), 1:] * MILLIMETRE
-    deformed = replace(problem.lattice, nodes=problem.lattice.nodes + moved)
-    return contact_map(deformed, problem.pair.insert)[1]
-
-
-def _gaps(problem: _Problem, pose: Array, bent: ContactMap) -> Array:
-    """Return the vertical gaps (c,) above the deformed nodes, m, inf where nothing is above."""
-    above, _ = problem.floor.over(bent.points, pose)
-    return np.nan_to_num(above[:, 1] - bent.points[:, 1], nan=np.inf)
-
-
-def _nodal_forces(problem: _Problem, pose: Array, run: PeerRun, bent: ContactMap) -> Array:
-    """Return the forces (c, 3) on the contact nodes, N: pressure times deformed area."""
-    stress = run.blocks["contact"]
-    pressure = np.zeros(len(bent.points))
-    place = np.searchsorted(problem.nodes, stress[:, 0].astype(np.int64) - 1)
-    pressure[place] = np.maximum(stress[:, 1], 0.0) * MEGAPASCAL
-    loaded = pressure > 0
-    if not problem.touchable[loaded].all():
-        raise ComputationError("touches beyond the femoral patch it was given", "CalculiX")
-    _, normals = problem.floor.over(bent.points, pose)
-    return np.where(loaded[:, None], (pressure * bent.area)[:, None] * normals, 0.0)
+def _blocks(lines: Iterable[str]) -> dict[str, Array]:
+    """Return the blocks of numbers; a title's first word, and its set, name one."""
+    blocks: dict[str, list[list[float]]] = {}
+    rows: list[list[float]] = []
+    for line in lines:
+        words = line.split()
+        try:
+            numbers = [float(word) for word in words]
+        except ValueError:
+            named = words[words.index("set") + 1] if "set" in words else words[0]
+            rows = blocks[named] = []
+            continue
+        if numbers:
+            rows.append(numbers)
+    return {name: np.array(rows) for name, rows in blocks.items() if rows}

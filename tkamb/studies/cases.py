@@ -1,9 +1,13 @@
-"""What the trade-off is measured on: two bodies, a pose and a load."""
+"""What the studies are made on: two bodies, a pose and a load; the shipped knee bend, changed."""
 
+import csv
 import hashlib
 import json
+import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +20,8 @@ from tkamb.units import DEGREE, MILLIMETRE
 
 SHIPPED_SCENE = Path(__file__).parents[2] / "models" / "deep_knee_bend" / "scene.toml"
 KNEE_CASES = Path(__file__).with_name("knee_cases.json")
+RECORDINGS = ("motion.csv", "tibia.csv", "ground_reaction.csv")
+"""Of the shipped knee bend."""
 FLEXIONS_DEG = (15.0, 60.0, 105.0)
 """Of the shipped knee, and of a user's scene where it gets there."""
 
@@ -34,7 +40,7 @@ class StudyCase:
 
     Args:
         name: of the case.
-        says: one line.
+        label: one line.
         pair: the two bodies.
         pose: (4, 4) pose_femoral_in_insert; its y does not matter.
         load: N, along -y.
@@ -42,7 +48,7 @@ class StudyCase:
     """
 
     name: str
-    says: str
+    label: str
     pair: ContactPair
     pose: Array
     load: float
@@ -51,15 +57,8 @@ class StudyCase:
     @property
     def hash(self) -> str:
         """SHA-256 of bodies, material, pose and load."""
-        digest = hashlib.sha256()
         pair = self.pair
-        for array in (
-            *(pair.femoral.vertices, pair.femoral.faces, pair.insert.vertices, pair.insert.faces),
-            *(self.pose, np.array(self.load)),
-        ):
-            digest.update(np.ascontiguousarray(np.round(array, 12)).tobytes())
-        digest.update(repr((pair.material, pair.bearing)).encode())
-        return digest.hexdigest()
+        return content_hash(pair, [self.pose, np.array(self.load)], (pair.material, pair.bearing))
 
     def nearby(self, steps: float) -> Array:
         """Return the pose some frames later: each 0.06 mm back, 0.2 deg flexed, 0.06 deg turned."""
@@ -69,6 +68,16 @@ class StudyCase:
         pose[:3, :3] = moved[:3, :3] @ self.pose[:3, :3]
         pose[0, 3] += moved[0, 3]
         return pose
+
+
+def content_hash(pair: ContactPair, arrays: Sequence[Array], words: tuple[Any, ...]) -> str:
+    """Return the SHA-256 of two bodies, further arrays, and words as they are printed."""
+    digest = hashlib.sha256()
+    meshes = [a for body in (pair.femoral, pair.insert) for a in (body.vertices, body.faces)]
+    for array in (*meshes, *arrays):
+        digest.update(np.ascontiguousarray(np.round(array, 12)).tobytes())
+    digest.update(repr(words).encode())
+    return digest.hexdigest()
 
 
 def case_names(scene: Path | None = None) -> tuple[str, ...]:
@@ -108,33 +117,20 @@ def _sphere(name: str) -> StudyCase:
 
 
 def _two_condyles(name: str) -> StudyCase:
-    says = "two condyles of 22 mm in dishes of 34 mm, nonlinear"
-    return StudyCase(name, says, _bicondylar(34e-3), np.eye(4), 2000.0)
+    """Return two condyles of 22 mm, 22 mm apart, on a nonlinear insert of 8 mm."""
+    label, dish_radius, varus_deg = BICONDYLAR[name]
+    insert = block(dishes(8e-3, dish_radius, 11e-3), (30e-3, 46e-3))
+    pair = ContactPair(balls(22e-3, 11e-3), insert, material("polyethylene"))
+    return StudyCase(name, label, pair, knee_pose([0, 0, 0, 0, varus_deg * DEGREE, 0]), 2000.0)
 
 
-def _conforming(name: str) -> StudyCase:
-    says = "two condyles of 22 mm in dishes of 24 mm, nonlinear"
-    return StudyCase(name, says, _bicondylar(24e-3), np.eye(4), 2000.0)
-
-
-def _varus(name: str) -> StudyCase:
-    pose = knee_pose([0, 0, 0, 0, 0.3 * DEGREE, 0])
-    says = "two condyles, 0.3 deg of varus, nonlinear"
-    return StudyCase(name, says, _bicondylar(34e-3), pose, 2000.0)
-
-
-def _bicondylar(radius: float) -> ContactPair:
-    apart = 11e-3
-    insert = block(dishes(8e-3, radius, apart), (30e-3, 46e-3))
-    return ContactPair(balls(22e-3, apart), insert, material("polyethylene"))
-
-
-_ANALYTIC = {
-    "sphere": _sphere,
-    "two condyles": _two_condyles,
-    "conforming": _conforming,
-    "varus": _varus,
+BICONDYLAR = {
+    "two condyles": ("two condyles of 22 mm in dishes of 34 mm, nonlinear", 34e-3, 0.0),
+    "conforming": ("two condyles of 22 mm in dishes of 24 mm, nonlinear", 24e-3, 0.0),
+    "varus": ("two condyles, 0.3 deg of varus, nonlinear", 34e-3, 0.3),
 }
+"""Name -> label, radius of the dishes (m), varus (deg)."""
+_ANALYTIC = {"sphere": _sphere, **dict.fromkeys(BICONDYLAR, _two_condyles)}
 
 
 def _shipped(name: str) -> StudyCase:
@@ -152,13 +148,13 @@ def _shipped(name: str) -> StudyCase:
     insert = load_surface(folder / "insert.stl", "mm", name="insert", closed=True)
     insert = insert.moved(insert_placement(insert))
     pair = ContactPair(femoral, insert, material(stored["material"]), stored["bearing"])
-    return StudyCase(name, stored["says"], pair, np.array(stored["pose"]), stored["load_N"])
+    return StudyCase(name, stored["label"], pair, np.array(stored["pose"]), stored["load_N"])
 
 
 def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
-    from tkamb.case import load_case
-    from tkamb.mechanics.mechanics import Mechanics
+    from tkamb.equilibrium.mechanics import Mechanics
     from tkamb.scene import load_scene
+    from tkamb.scene.case import load_case
 
     case = load_case(load_scene(path))
     table, insert = case.scene.contact, case.scene.implant.insert
@@ -170,5 +166,42 @@ def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
     if not load > 0:
         raise InputError(f"frame {k} has no compressive contact force", path)
     pair = ContactPair(case.femoral, case.insert, material(table.material), insert.bearing)
-    says = f"{path.parent.name} at {case.motion.coordinates[k, 5] / DEGREE:.0f} deg, {load:.0f} N"
-    return StudyCase(name, says, pair, mechanics.poses[k], load)
+    label = f"{path.parent.name} at {case.motion.coordinates[k, 5] / DEGREE:.0f} deg, {load:.0f} N"
+    return StudyCase(name, label, pair, mechanics.poses[k], load)
+
+
+def copied_scene(folder: Path) -> Path:
+    """Copy the shipped knee bend into a folder and return its scene file there."""
+    shutil.copytree(SHIPPED_SCENE.parent, folder, dirs_exist_ok=True)
+    return folder / SHIPPED_SCENE.name
+
+
+def change_recording(path: Path, change: Callable[[list[str], Array], Array]) -> None:
+    """Write a recorded table anew.
+
+    Args:
+        path: a .csv file.
+        change: takes the columns' names and the rows (n, columns), returns the new rows.
+    """
+    with open(path, encoding="utf-8", newline="") as file:
+        lines = list(csv.reader(file))
+    rows = change(lines[0], np.array(lines[1:], float))
+    with open(path, "w", encoding="utf-8", newline="") as file:
+        csv.writer(file).writerows([lines[0], *([repr(float(v)) for v in row] for row in rows)])
+
+
+def thin_out(folder: Path, step: int) -> None:
+    """Leave only every `step`-th row of the recordings in a folder."""
+    for name in RECORDINGS:
+        change_recording(folder / name, lambda head, rows: rows[::step])
+
+
+def stretch_time(folder: Path, scale: float) -> None:
+    """Make the recordings in a folder take `scale` times as long."""
+
+    def stretched(head: list[str], rows: Array) -> Array:
+        rows[:, head.index("time_s")] *= scale
+        return rows
+
+    for name in RECORDINGS:
+        change_recording(folder / name, stretched)

@@ -19,10 +19,8 @@ References: Johnson, Contact Mechanics (1985), sections 3.4, 4.2, 4.3 and 5.8,
 doi:10.1017/CBO9781139171731; Ramberg & Osgood, NACA TN 902 (1943).
 """
 
-import os
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -36,10 +34,11 @@ from tkamb.contact.pair import Bearing, ContactPair
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Mask
 from tkamb.geometry.surface import Surface
 from tkamb.studies.bodies import balls, block, flat
 from tkamb.studies.elastic_layer import sphere_on_layer
+from tkamb.studies.measures import environment
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 CURVE = {"alpha": 0.0389, "reference_stress": 8.4194 * MEGAPASCAL, "exponent": 4.5485}
@@ -48,8 +47,8 @@ SIDE_MM = 24.0
 """Of the block under the plate: divides by the cells of 2 and 3 mm."""
 KEPT_GRID_MM = 0.9
 """Cells small enough that the operator of the block is worth a file."""
-SOURCE_APPROACH = 0.6808
-"""Approach of the source's springs under the plate over that of the solid they stand for: nu is
+SHARMA_APPROACH = 0.6808
+"""Approach of Sharma's springs under the plate over that of the solid they stand for: nu is
 0.35 whatever the material, and they are too stiff at free sides. A number of its own, kept so
 that a change is seen."""
 TOLERANCES: dict[str, tuple[float, float]] = {
@@ -91,7 +90,7 @@ class ClosedForm:
     resolution_mm: float = 3.0
 
     @property
-    def says(self) -> str:
+    def label(self) -> str:
         """The case in words: "plate: load_N=1"."""
         base = vars(ClosedForm(self.kind, self.model))
         changed = [f"{k}={v}" for k, v in vars(self).items() if v != base[k]]
@@ -133,12 +132,15 @@ def press_closed_form(case: ClosedForm) -> tuple[ContactResult, ContactPair]:
     model = contact_model(case.model, case.resolution_mm, **options)
     if case.kind != "kept":
         return model.press(model.prepare(pair), case.load_N, np.eye(4)), pair
-    with _operators_kept_apart() as folder:
+    with (
+        tempfile.TemporaryDirectory(prefix="tkamb-stability-") as folder,
+        environment({"TKAMB_CACHE_DIR": folder}),
+    ):
         model.prepare(replace(case, modulus_MPa=0.5 * case.modulus_MPa).pair)
         state = model.prepare(pair)
-        files = len(list(folder.glob("*.operator")))
+        files = len(list(Path(folder).glob("*.operator")))
         if files != 2:
-            raise ComputationError(f"{files} operators are kept of two materials", case.says)
+            raise ComputationError(f"{files} operators are kept of two materials", case.label)
         return model.press(state, case.load_N, np.eye(4)), pair
 
 
@@ -170,7 +172,7 @@ def solution(case: ClosedForm) -> tuple[float, float]:
         if case.model == "foundation":
             strain = 1.0 - np.exp(-strain)
         if case.model == "lattice-source":
-            strain *= SOURCE_APPROACH
+            strain *= SHARMA_APPROACH
         return thick * strain, stress
     if case.kind == "layer":
         layer = sphere_on_layer(radius, thick, load, young, case.nu)
@@ -256,9 +258,11 @@ def _column(case: ClosedForm) -> Callable[[float], float]:
     return pressure
 
 
-def _inner(result: ContactResult) -> Array:
+def _inner(result: ContactResult) -> Mask:
     """Return the points a fifth of the block's side away from its edges."""
-    return np.asarray((np.abs(result.points[:, [0, 2]]) < 0.3 * SIDE_MM * MILLIMETRE).all(axis=1))
+    across = np.abs(result.points[:, [0, 2]]).max(axis=1)
+    inner: Mask = across < 0.3 * SIDE_MM * MILLIMETRE
+    return inner
 
 
 def _plate(side: float) -> Surface:
@@ -269,18 +273,3 @@ def _plate(side: float) -> Surface:
 
 def _has_cache(name: str) -> bool:
     return "cache" in getattr(contact_class(name), "__dataclass_fields__", {})
-
-
-@contextmanager
-def _operators_kept_apart() -> Iterator[Path]:
-    """Keep prepared operators in a folder that is gone afterwards."""
-    before = os.environ.get("TKAMB_CACHE_DIR")
-    with tempfile.TemporaryDirectory(prefix="tkamb-stability-") as folder:
-        os.environ["TKAMB_CACHE_DIR"] = folder
-        try:
-            yield Path(folder)
-        finally:
-            if before is None:
-                del os.environ["TKAMB_CACHE_DIR"]
-            else:
-                os.environ["TKAMB_CACHE_DIR"] = before

@@ -28,10 +28,10 @@ def add_tradeoff(commands: Any) -> None:
 
 
 def _tradeoff(options: argparse.Namespace) -> int:
-    from tkamb.output.claim import claimed_directory
+    from tkamb.claim import claimed_directory
 
     if options.peer:
-        from tkamb.studies.calculix_run import find_program
+        from tkamb.studies.calculix import find_program
 
         find_program()
     with claimed_directory(options.out) as directory:
@@ -39,20 +39,25 @@ def _tradeoff(options: argparse.Namespace) -> int:
 
 
 def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
-    from tkamb.output.atomic import write_text
+    from tkamb.atomic import write_text
     from tkamb.studies import tradeoff as study
-    from tkamb.studies.advice import DEFAULT, comparison, recommendations
     from tkamb.studies.body_trade import CHANGES, BodyRow, body_json, body_table, run_body_trade
     from tkamb.studies.kept_rows import KeptRows
-    from tkamb.studies.matrix import expected_seconds, jobs
-    from tkamb.studies.tradeoff_report import picture, table
+    from tkamb.studies.row import as_json, with_fronts
+    from tkamb.studies.tradeoff_report import (
+        DEFAULT,
+        comparison,
+        picture,
+        recommendations,
+        table,
+    )
 
-    wanted = jobs(options.quick, options.scene, options.full)
+    wanted = study.jobs(options.quick, options.scene, options.full)
     cases = study.cases_of(wanted)
     kept = KeptRows(directory, options.resume)
     references = study.references_for(cases, options.recompute, _announce, kept)
     rows, whole = gather(
-        study.run_tradeoff(wanted, references, kept), expected_seconds(wanted, cases)
+        study.run_tradeoff(wanted, references, kept), study.expected_seconds(wanted, cases)
     )
     found = len(rows)
     if whole and options.peer:
@@ -64,13 +69,13 @@ def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
     if whole and not options.quick:
         planned = len(CHANGES)
         body, whole = gather(run_body_trade(kept), [1.0] * planned)
-    rows = study.with_fronts(rows)
+    rows = with_fronts(rows)
     lines = [*unfinished(found + len(body), len(wanted) + planned), *table(rows, references)]
     lines += ["", *comparison(rows), "", *recommendations(rows)]
     if body:
         lines += ["", *body_table(body)]
         write_text(directory / "body.json", body_json(body))
-    text = study.as_json(rows)
+    text = as_json(rows)
     _write(directory, "tradeoff", text, lines, picture(rows) if rows else None)
     print(text if options.json else "\n".join([*lines, f"picture: {directory / 'tradeoff.png'}"]))
     if not whole:
@@ -90,7 +95,7 @@ def add_stability(commands: Any) -> None:
 
 
 def _stability(options: argparse.Namespace) -> int:
-    from tkamb.output.claim import claimed_directory
+    from tkamb.claim import claimed_directory
 
     with claimed_directory(options.out) as directory:
         return _study_stability(options, directory)
@@ -99,7 +104,7 @@ def _stability(options: argparse.Namespace) -> int:
 def _study_stability(options: argparse.Namespace, directory: Path) -> int:
     from tkamb.studies import stability as study
     from tkamb.studies.kept_rows import KeptRows
-    from tkamb.studies.stability_report import picture, table
+    from tkamb.studies.stability import picture, table
 
     cases = study.stability_cases(options.quick)
     kept = KeptRows(directory, options.resume)
@@ -151,7 +156,7 @@ def _goes_on(directory: Path) -> str:
 
 def _write(directory: Path, name: str, text: str, lines: list[str], figure: Any) -> None:
     """Write a study's JSON, table and picture, each whole or not at all."""
-    from tkamb.output.atomic import replaced_file, write_text
+    from tkamb.atomic import replaced_file, write_text
 
     write_text(directory / f"{name}.json", text + "\n")
     write_text(directory / f"{name}.txt", "\n".join(lines) + "\n")

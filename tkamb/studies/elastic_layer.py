@@ -92,4 +92,4 @@ def _disks(at: Array, radii: Array, thickness: float, young: float, nu: float) -
     transform = radii[:, None] * j1(k[None] * radii[:, None]) / k
     step = layer * weights * WIDEST / 2 / thickness
     rest = j0(k[None] * at[:, None]) @ (step * transform).T
-    return np.asarray(2 * (1 - nu**2) / young * (half_space + rest))
+    return 2 * (1 - nu**2) / young * (half_space + rest)

@@ -11,10 +11,10 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from tkamb.atomic import write_text
 from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
 from tkamb.files import TABLE_LIMIT, read_bytes
-from tkamb.output.atomic import write_text
 
 FILE_NAME = "rows.jsonl"
 

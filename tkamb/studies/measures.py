@@ -10,7 +10,8 @@ import os
 import subprocess
 import sys
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import median
@@ -21,6 +22,7 @@ from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import TkambError
 from tkamb.known_errors import setting_label
+from tkamb.memory import peak_rss
 from tkamb.studies.cases import StudyCase, study_case
 from tkamb.studies.quantities import Quantities, quantities, raster_map
 
@@ -32,6 +34,18 @@ WARM_PRESSES = 7
 ENOUGH_SECONDS = 3.0
 """No more repeats once this much was measured; warm presses: `REPEATS` in any case."""
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+@contextmanager
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set variables of the environment for a while; processes started meanwhile keep them."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 @dataclass(frozen=True)
@@ -108,8 +122,6 @@ def measure_apart(job: Job, longest: float = LONGEST_SECONDS) -> Measure:
 
 def measure(job: Job) -> Measure:
     """Measure in this process."""
-    from tkamb.press.press import peak_rss
-
     model = _model(job)
     (prepare, cold), (case, state, result) = _first(model, job)
     if result.status is not ContactStatus.OK:

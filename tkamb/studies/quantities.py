@@ -6,10 +6,9 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
 from tkamb.contact.result import ContactResult
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import SIDES
 from tkamb.units import MILLIMETRE
 
-SIDES = ("medial", "lateral")
 PARTS = ("force", "mean_pressure", "peak_pressure", "area")
 RASTER = MILLIMETRE
 """m: spacing of the raster on which pressure maps are compared."""
@@ -89,28 +88,3 @@ def map_error(found: Raster, reference: Raster) -> float:
     given = np.array([found.get(place, 0.0) for place in places])
     true = np.array([reference.get(place, 0.0) for place in places])
     return float(np.linalg.norm(given - true) / np.linalg.norm(true))
-
-
-def common_limit(h: Array, values: Array, family: Array) -> tuple[float, float]:
-    """Return the limit h -> 0 that several families of grids share, and its uncertainty.
-
-    Least squares of q0 + c_f h² over all families f (Richardson with the order of
-    trilinear cells). The uncertainty is the largest of half the spread of the families' own
-    limits and of the residuals.
-
-    Args:
-        h: (n,) m, cell sizes.
-        values: (n,).
-        family: (n,) number of the family of each.
-    """
-    kinds = np.unique(family)
-    slopes = np.where(family[:, None] == kinds, h[:, None] ** 2, 0.0)
-    matrix = np.column_stack([np.ones(len(h)), slopes])
-    solution = np.linalg.lstsq(matrix, values, rcond=None)[0]
-    left = np.abs(matrix @ solution - values).max()
-    own = []
-    for kind in kinds:
-        some = family == kind
-        line = np.column_stack([np.ones(some.sum()), h[some] ** 2])
-        own.append(np.linalg.lstsq(line, values[some], rcond=None)[0][0])
-    return float(solution[0]), float(max(left, 0.5 * (max(own) - min(own))))

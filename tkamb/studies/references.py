@@ -14,16 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
+from tkamb.atomic import write_text
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
 from tkamb.errors import ComputationError, InputError
-from tkamb.output.atomic import write_text
+from tkamb.geometry.frames import Array
 from tkamb.studies.cases import Sphere, StudyCase
 from tkamb.studies.elastic_layer import sphere_on_layer
 from tkamb.studies.quantities import (
     Quantities,
     Raster,
-    common_limit,
     quantities,
     raster_map,
     raster_of,
@@ -116,6 +116,31 @@ def limits(solved: dict[str, Quantities]) -> tuple[Quantities, Quantities]:
             spread = float(np.ptp(finest) / 2)
             values[name], uncertainty[name] = middle, max(spread, abs(limit - middle) / 2)
     return values, uncertainty
+
+
+def common_limit(h: Array, values: Array, family: Array) -> tuple[float, float]:
+    """Return the limit h -> 0 that several families of grids share, and its uncertainty.
+
+    Least squares of q0 + c_f h² over all families f (Richardson with the order of
+    trilinear cells). The uncertainty is the largest of half the spread of the families' own
+    limits and of the residuals.
+
+    Args:
+        h: (n,) m, cell sizes.
+        values: (n,).
+        family: (n,) number of the family of each.
+    """
+    kinds = np.unique(family)
+    slopes = np.where(family[:, None] == kinds, h[:, None] ** 2, 0.0)
+    matrix = np.column_stack([np.ones(len(h)), slopes])
+    solution = np.linalg.lstsq(matrix, values, rcond=None)[0]
+    left = np.abs(matrix @ solution - values).max()
+    own = []
+    for kind in kinds:
+        some = family == kind
+        line = np.column_stack([np.ones(some.sum()), h[some] ** 2])
+        own.append(np.linalg.lstsq(line, values[some], rcond=None)[0][0])
+    return float(solution[0]), float(max(left, 0.5 * (max(own) - min(own))))
 
 
 def _by_layer(case: StudyCase, sphere: Sphere) -> tuple[Quantities, Quantities]:

@@ -1,9 +1,13 @@
-"""One row of the trade-off: a contact model on a case, with its times and errors."""
+"""Rows of the trade-off: a contact model on a case, its times and errors; their Pareto front."""
 
+import json
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+from tkamb.errors import InputError
 from tkamb.studies.measures import Job, Measure
 from tkamb.studies.quantities import errors, map_error, raster_of
 from tkamb.studies.references import Reference
@@ -12,6 +16,8 @@ FRONT_ERRORS = ("approach", "force", "peak_pressure")
 """The largest of these errors is the one of the front."""
 KEYS = ("approach", "force", "mean_pressure", "peak_pressure", "area", "map")
 TIMES = ("prepare_seconds", "cold_seconds", "warm_seconds", "peak_rss_MB")
+TIMING_NOISE = 1.2
+"""Two medians of time within this factor count as equal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,3 +94,47 @@ def floor_of(reference: Reference) -> float:
     shifted = {k: v + reference.uncertainty[k] for k, v in reference.values.items()}
     apart = errors(shifted, reference.values)
     return max(apart[key] for key in FRONT_ERRORS)
+
+
+def with_fronts(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows with those marked that are on their case's Pareto front."""
+    marked: list[Row] = []
+    for case in dict.fromkeys(row.job.case for row in rows):
+        some = [row for row in rows if row.job.case == case]
+        front = on_front([(row.measure.warm_seconds, row.worst) for row in some if row.errors])
+        marks = iter(front)
+        marked += [replace(row, on_front=bool(row.errors) and next(marks)) for row in some]
+    return marked
+
+
+def on_front(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Say which (seconds, error) are beaten by no other.
+
+    One beats another if it is no less accurate and clearly faster, or more accurate and not
+    clearly slower; clearly means by more than the noise.
+    """
+    return [not any(beats(other, point) for other in points) for point in points]
+
+
+def beats(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    """Say whether one (seconds, error) beats another; see `on_front`."""
+    faster = one[0] * TIMING_NOISE < other[0]
+    not_slower = one[0] <= other[0] * TIMING_NOISE
+    return (one[1] <= other[1] and faster) or (one[1] < other[1] and not_slower)
+
+
+def as_json(rows: Sequence[Row]) -> str:
+    """Return the rows as the JSON text of `tkamb tradeoff --json`."""
+    return json.dumps([row.as_dict() for row in rows], indent=1, allow_nan=False)
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Return the rows of a tradeoff.json.
+
+    Raises:
+        InputError: there is none, or it is something else.
+    """
+    try:
+        return [row_of(content) for content in json.loads(path.read_text(encoding="utf-8"))]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"is no table of a trade-off ({error})", path) from None

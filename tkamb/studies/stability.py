@@ -1,24 +1,27 @@
 """Stability at the extremes: every case judged in a process that may crash or hang."""
 
 import json
-import os
-import queue
-import subprocess
-import sys
-import threading
+import multiprocessing
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
+from multiprocessing.connection import Connection
+from multiprocessing.forkserver import ensure_running
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from tkamb.errors import ComputationError, TkambError
+from tkamb.output.style import BLUE, GREY, ORANGE, VERMILLION, new_figure, settings
 from tkamb.studies.closed_forms import ClosedForm, closed_forms
 from tkamb.studies.extremes import Extreme, Shape, beside_calculix, extremes
 from tkamb.studies.kept_rows import KeptRows, row_key
-from tkamb.studies.measures import ONE_THREAD
+from tkamb.studies.measures import ONE_THREAD, environment
 from tkamb.studies.scene_extremes import SceneExtreme, judge_scene, scene_extremes
-from tkamb.studies.verdict import KINDS, Verdict, judge, judge_closed_form
+from tkamb.studies.verdict import KINDS, WRONG, Verdict, judge, judge_closed_form
 
 Case = Extreme | ClosedForm | SceneExtreme
 
@@ -30,7 +33,7 @@ LONGEST_SECONDS = 120.0
 LONGEST_REFERENCE_SECONDS = 900.0
 """A case whose reference takes longer is unverified."""
 PRESSED = "pressed"
-"""What a process says once the model has answered."""
+"""What a process sends once the model has answered."""
 WORKERS = 2
 QUICK_SHARE = 13
 QUICK_GRID_MM = 3.0
@@ -38,6 +41,7 @@ QUICK_SHAPES: tuple[Shape, ...] = ("swapped", "lip", "spike")
 QUICK_PEERED = 4
 """The quick study takes one extreme in so many, no finer than this; unusual shapes; the first
 cases beside CalculiX; the first closed forms; no runs."""
+COLOURS = {"converged": BLUE, "flagged": ORANGE}
 
 
 def stability_cases(quick: bool) -> list[Case]:
@@ -73,126 +77,94 @@ def run_stability(
         kept: rows of an earlier study that are taken as they are; new ones are added.
         workers: cases at a time.
     """
-    asked, stored = _Asked(longest, kept), stored_verdicts()
+    judges, stored = _Judges(longest, kept), stored_verdicts()
     pool = ThreadPoolExecutor(workers)
     try:
-        for verdict in pool.map(asked.verdict, cases):
+        for verdict in pool.map(judges.verdict, cases):
             yield replace(verdict, expected=stored.get(verdict.key))
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
-        asked.stop()
+        judges.stop()
         pool.shutdown()
 
 
-class _Asked:
-    """Cases put to the processes that judge, one process for each thread."""
+class _Judges:
+    """Cases put to processes that may crash or hang, a new one for each case.
+
+    They are forked from a server that has imported all it takes (and computes nothing itself),
+    so that a new one costs milliseconds. Each computes with one thread.
+    """
 
     def __init__(self, longest: float, kept: KeptRows | None) -> None:
         self._longest, self._kept = longest, kept
-        self._local = threading.local()
-        self._workers: list[_Worker] = []
+        self._running: set[BaseProcess] = set()
+        self._stopped = False
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload([__name__])
+        with environment(ONE_THREAD):
+            ensure_running()
 
     def verdict(self, case: Case) -> Verdict:
         """Return the verdict on a case, kept or new."""
         if self._kept is None:
-            return self._worker().ask(case)
+            return self._judged_apart(case)
         key = row_key(type(case).__name__, asdict(case), self._longest)
         row = self._kept.get(key)
         if row is not None:
             return Verdict(**row)
-        found = self._worker().ask(case)
-        self._kept.put(key, found.as_dict())
+        found = self._judged_apart(case)
+        self._kept.put(key, asdict(found))
         return found
 
     def stop(self) -> None:
-        """End the processes."""
-        for worker in self._workers:
-            worker.stop()
-
-    def _worker(self) -> "_Worker":
-        if not hasattr(self._local, "worker"):
-            self._local.worker = _Worker(self._longest)
-            self._workers.append(self._local.worker)
-        found: _Worker = self._local.worker
-        return found
-
-
-class _Worker:
-    """A process that judges one case after the other, and is replaced when it does not answer."""
-
-    def __init__(self, longest: float) -> None:
-        self._longest = longest
-        self._process: subprocess.Popen[str] | None = None
-        self._lines: queue.Queue[str] = queue.Queue()
-        self._stopped = False
-
-    def ask(self, case: Case) -> Verdict:
-        """Return the verdict on a case.
-
-        Raises:
-            ComputationError: the study was stopped meanwhile.
-        """
-        process = self._process or self._started()
-        assert process.stdin is not None
-        process.stdin.write(json.dumps([type(case).__name__, asdict(case)]) + "\n")
-        process.stdin.flush()
-        kind, limit = "hang", self._longest
-        try:
-            line = self._lines.get(timeout=limit)
-            if line.strip() == PRESSED:
-                kind, limit = "unverified", LONGEST_REFERENCE_SECONDS
-                line = self._lines.get(timeout=limit)
-        except queue.Empty:
-            self._end()
-            what = "no answer" if kind == "hang" else "no reference"
-            return _ended(case, kind, f"{what} in {limit:g} s")
-        if self._stopped:
-            raise ComputationError("was stopped", case.says)
-        if not line:
-            status = process.wait()
-            self._end()
-            return _ended(case, "exception", f"the process ended with status {status}")
-        return Verdict(**json.loads(line))
-
-    def stop(self) -> None:
-        """End the process for good; a case that is being judged gets no verdict."""
+        """End the processes; the cases that they judge get no verdict."""
         self._stopped = True
-        if self._process is not None:
-            self._process.kill()
+        for process in list(self._running):
+            process.kill()
 
-    def _end(self) -> None:
-        """End the process; the next case gets a new one."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.communicate()
-        self._process = None
+    def _judged_apart(self, case: Case) -> Verdict:
+        receiver, sender = self._context.Pipe(duplex=False)
+        process = self._context.Process(target=_send_verdict, args=(case, sender), daemon=True)
+        process.start()
+        sender.close()  # so that the process's end is seen at the other end
+        self._running.add(process)
+        try:
+            return self._received(case, receiver)
+        except EOFError:
+            process.join()
+            if self._stopped:
+                raise ComputationError("was stopped", case.label) from None
+            reason = f"the process ended with status {process.exitcode}"
+            return _ended(case, "exception", reason)
+        finally:
+            process.kill()
+            process.join()
+            self._running.discard(process)
 
-    def _started(self) -> "subprocess.Popen[str]":
-        command = [sys.executable, "-m", "tkamb.studies.stability"]
-        pipe = subprocess.PIPE
-        process = subprocess.Popen(
-            command,
-            stdin=pipe,
-            stdout=pipe,
-            text=True,
-            start_new_session=True,
-            env=os.environ | ONE_THREAD,
-        )
-        lines: queue.Queue[str] = queue.Queue()
-        self._process, self._lines = process, lines
+    def _received(self, case: Case, receiver: Connection) -> Verdict:
+        """Return what a process sends within the limits of time; see `_send_verdict`."""
+        if self._stopped:
+            raise EOFError
+        if not receiver.poll(self._longest):
+            return _ended(case, "hang", f"no answer in {self._longest:g} s")
+        found = receiver.recv()
+        if found == PRESSED:
+            if not receiver.poll(LONGEST_REFERENCE_SECONDS):
+                reason = f"no reference in {LONGEST_REFERENCE_SECONDS:g} s"
+                return _ended(case, "unverified", reason)
+            found = receiver.recv()
+        verdict: Verdict = found
+        return verdict
 
-        def read() -> None:
-            assert process.stdout is not None
-            for line in iter(process.stdout.readline, ""):
-                lines.put(line)
-            lines.put("")
 
-        threading.Thread(target=read, daemon=True).start()
-        return process
+def _send_verdict(case: Case, sender: Connection) -> None:
+    """Judge a case: send `PRESSED` once the model has answered, then the verdict."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the study's to answer
+    sender.send(judge_safely(case, lambda: sender.send(PRESSED)))
 
 
 def _ended(case: Case, kind: str, reason: str) -> Verdict:
-    return Verdict(case.says, getattr(case, "model", "run"), kind, reason)
+    return Verdict(case.label, getattr(case, "model", "run"), kind, reason)
 
 
 def judge_safely(case: Case, pressed: Callable[[], None] = lambda: None) -> Verdict:
@@ -222,17 +194,71 @@ def summary(verdicts: Sequence[Verdict]) -> dict[str, Any]:
         "hangs": counts["hang"],
         "worse": sum(verdict.worse for verdict in verdicts),
         "failed": sum(verdict.failed for verdict in verdicts),
-        "rows": [verdict.as_dict() for verdict in verdicts],
+        "rows": [asdict(verdict) for verdict in verdicts],
     }
 
 
-def _answers() -> Iterator[Verdict]:
-    kinds = {kind.__name__: kind for kind in (Extreme, ClosedForm, SceneExtreme)}
-    for line in sys.stdin:
-        kind, fields = json.loads(line)
-        yield judge_safely(kinds[kind](**fields), lambda: print(PRESSED, flush=True))
+def table(verdicts: Sequence[Verdict]) -> list[str]:
+    """Return the counts by contact model, then the cases that failed, then the flagged ones."""
+    lines = [f"{'contact':18s} {'cases':>5s} " + " ".join(f"{kind:>15s}" for kind in KINDS)]
+    for model in [*dict.fromkeys(v.contact for v in verdicts), "all"]:
+        some = [v for v in verdicts if model in (v.contact, "all")]
+        counts = [sum(v.kind == kind for v in some) for kind in KINDS]
+        lines.append(f"{model:18s} {len(some):5d} " + " ".join(f"{n:15d}" for n in counts))
+    flagged = [v for v in verdicts if v.kind == "flagged" and not v.failed]
+    better = [v for v in verdicts if v.kind == "converged" and v.expected not in (None, v.kind)]
+    unknown = [v for v in verdicts if v.expected is None]
+    groups = {"failed": [v for v in verdicts if v.failed], "flagged": flagged}
+    groups |= {"better than stored": better, "no stored verdict": unknown}
+    for title, some in groups.items():
+        lines += ["", f"{title}: {len(some)}", *(_line(v) for v in some)]
+    return lines
 
 
-if __name__ == "__main__":
-    for verdict in _answers():
-        print(json.dumps(verdict.as_dict()), flush=True)
+def _line(verdict: Verdict) -> str:
+    was = f" (was {verdict.expected})" if verdict.expected not in (None, verdict.kind) else ""
+    return f"  {verdict.contact}, {verdict.case}: {verdict.kind}{was}: {verdict.reason}"
+
+
+def picture(verdicts: Sequence[Verdict]) -> Figure:
+    """Return one dot per case: what was driven out against the distance from the reference."""
+    groups = list(dict.fromkeys(_group(v) for v in verdicts))
+    with settings():
+        figure = new_figure(8.0, 1.6 + 0.2 * len(groups))
+        axis = figure.subplots()
+        for kind in KINDS:
+            some = [v for v in verdicts if v.kind == kind]
+            if not some:
+                continue
+            axis.plot(
+                [_distance(v) for v in some],
+                [groups.index(_group(v)) for v in some],
+                "o" if kind in COLOURS else "X",
+                color=COLOURS.get(kind, VERMILLION),
+                ms=4 if kind in COLOURS else 7,
+                alpha=0.75,
+                label=f"{kind.replace('_', ' ')} ({len(some)})",
+            )
+        axis.axvline(WRONG, color=GREY, lw=1, ls="--")
+        top = len(groups) - 0.3
+        axis.text(WRONG, top, "wrong beyond 2 % ", color=GREY, fontsize=7.5, ha="right")
+        axis.text(1.0, top, "no answer", color=GREY, fontsize=7.5, ha="center")
+        axis.set(xscale="log", xlim=(1e-9, 3.0), xlabel="largest distance from the reference")
+        axis.set_yticks(range(len(groups)), groups, fontsize=7.5)
+        axis.set_ylim(-0.7, len(groups) + 0.4)
+        figure.legend(loc="outside upper left", ncols=4)
+    return figure
+
+
+def _distance(verdict: Verdict) -> float:
+    return 1.0 if verdict.error is None else max(verdict.error, 2e-9)
+
+
+def _group(verdict: Verdict) -> str:
+    """Return the quantities that were driven out, or the run's kind."""
+    if verdict.contact == "run":
+        return " ".join(verdict.case.split()[:2])
+    if verdict.contact != "lattice":
+        return f"{verdict.contact}, any"
+    names = [part.split("=")[0].rsplit("_", 1)[0] for part in verdict.case.split(", ")]
+    return " and ".join(names)

@@ -1,16 +1,23 @@
-"""Speed against accuracy: every contact model on every case, against converged references."""
+"""Speed against accuracy: every contact model on every case, against converged references.
 
-import json
+The default matrix leaves out what repeats something else: fine grids and the solver's variants are
+measured on one case of each pair of bodies, not at every pose; `full` measures everything on every
+case.
+"""
+
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
-from tkamb.errors import InputError
-from tkamb.studies.calculix import peer_rows
-from tkamb.studies.cases import StudyCase, study_case
-from tkamb.studies.front import on_front
+import numpy as np
+
+from tkamb.contact.registry import contact_names
+from tkamb.studies.calculix import find_program
+from tkamb.studies.cases import StudyCase, case_names, study_case
 from tkamb.studies.kept_rows import KeptRows, row_key
 from tkamb.studies.measures import Job, Measure, measure_apart
+from tkamb.studies.peer import ELEMENT, measure_by_calculix
 from tkamb.studies.references import (
     STORED,
     Reference,
@@ -19,7 +26,92 @@ from tkamb.studies.references import (
     reference_of,
     write_references,
 )
-from tkamb.studies.row import Row, compared, row_of
+from tkamb.studies.row import Row, compared
+
+QUICK_CASES = ("sphere", "two condyles")
+QUICK_MODELS = ("hertz", "foundation", "lattice", "lattice-linear", "fe")
+ONE_OF_EACH = ("sphere", "two condyles", "conforming", "knee 60 deg", "scene 60 deg")
+"""Cases on which the fine grids are measured; the others repeat their bodies at another pose."""
+TRIED_ON = ("two condyles", "conforming", "knee 60 deg")
+"""Cases on which the variants are measured."""
+PEER_GRIDS_MM: dict[str, tuple[float, ...]] = {"sphere": (2.0,), "two condyles": (2.0, 1.0)}
+"""Cell sizes of the cases that CalculiX is given; two condyles at 1 mm take it minutes."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is measured of a contact model.
+
+    Args:
+        everywhere_mm: cell sizes on every case.
+        fine_mm: further ones on one case of each pair of bodies.
+        variants: options beside the default ones, at `variant_mm`.
+        variant_mm: cell size of the variants.
+    """
+
+    everywhere_mm: tuple[float, ...] = (2.0,)
+    fine_mm: tuple[float, ...] = (1.0,)
+    variants: tuple[dict[str, Any], ...] = field(default=())
+    variant_mm: float = 2.0
+
+
+SETTINGS = {
+    "hertz": Settings((1.0,), ()),
+    "foundation": Settings((2.0, 1.0), ()),
+    "foundation-linear": Settings((2.0, 1.0), ()),
+    "lattice": Settings(
+        (3.0, 2.0),
+        (1.5, 1.0),
+        ({"tolerance": 1e-2}, {"tolerance": 1e-5}),
+    ),
+    "lattice-linear": Settings(),
+    "lattice-source": Settings((2.0,), ()),
+    "fe": Settings((2.0,), (1.5, 1.0), ({"newton": True},)),
+}
+"""Of the built-in models; another package's model is measured at `Settings()`."""
+
+
+def jobs(quick: bool = False, scene: Path | None = None, full: bool = False) -> list[Job]:
+    """Return what is measured, case by case.
+
+    Args:
+        quick: two cases, 2 mm, the default options.
+        scene: a user's scene, whose cases come last.
+        full: every setting on every case.
+    """
+    given = None if scene is None else str(scene)
+    if quick:
+        return [Job(case, model, 2.0) for case in QUICK_CASES for model in QUICK_MODELS]
+    return [
+        Job(case, model, grid, options, given)
+        for case in case_names(scene)
+        for model in contact_names()
+        for grid, options in _of(SETTINGS.get(model, Settings()), case, full)
+    ]
+
+
+def _of(settings: Settings, case: str, full: bool) -> list[tuple[float, dict[str, Any]]]:
+    grids = settings.everywhere_mm
+    if full or case in ONE_OF_EACH:
+        grids += settings.fine_mm
+    found: list[tuple[float, dict[str, Any]]] = [(grid, {}) for grid in grids]
+    if full or case in TRIED_ON:
+        found += [(settings.variant_mm, options) for options in settings.variants]
+    return found
+
+
+def expected_seconds(wanted: Sequence[Job], cases: Sequence[StudyCase]) -> list[float]:
+    """Return roughly how long each job takes, for the time left: by the number of cells."""
+    box = {c.name: float(np.prod(np.ptp(c.pair.insert.vertices, axis=0))) for c in cases}
+    return [
+        2.0 + _per_node(job) * box[job.case] / (job.resolution_mm * 1e-3) ** 3 for job in wanted
+    ]
+
+
+def _per_node(job: Job) -> float:
+    if not job.contact.startswith(("lattice", "fe")):
+        return 0.0
+    return 2e-3 if "newton" in job.options else 6e-4
 
 
 def run_tradeoff(
@@ -42,17 +134,6 @@ def run_tradeoff(
         yield compared(job, measured, reference)
 
 
-def with_fronts(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows with those marked that are on their case's Pareto front."""
-    marked: list[Row] = []
-    for case in dict.fromkeys(row.job.case for row in rows):
-        some = [row for row in rows if row.job.case == case]
-        front = on_front([(row.measure.warm_seconds, row.worst) for row in some if row.errors])
-        marks = iter(front)
-        marked += [replace(row, on_front=bool(row.errors) and next(marks)) for row in some]
-    return marked
-
-
 def run_peer(
     cases: Iterable[StudyCase],
     references: dict[str, Reference],
@@ -70,17 +151,18 @@ def run_peer(
     Raises:
         InputError: CalculiX is not installed.
     """
+    find_program()
     for case in cases:
         reference = references[case.name]
-        key = row_key("calculix", case.hash, reference.values, sorted(sizes_mm))
-        found = kept.get(key) if kept else None
-        if found is None:
-            rows = peer_rows([case], references, sizes_mm)
-            found = {"rows": [[asdict(row.job), asdict(row.measure)] for row in rows]}
-            if kept:
-                kept.put(key, found)
-        for job, measured in found["rows"]:
-            yield compared(Job(**job), Measure(**measured), reference)
+        for size in sizes_mm:
+            if size not in PEER_GRIDS_MM.get(case.name, ()):
+                continue
+            key = row_key("calculix", case.hash, reference.values, size)
+            found = kept.get(key) if kept else None
+            measured = Measure(**found) if found else measure_by_calculix(case, size)
+            if kept and not found:
+                kept.put(key, asdict(measured))
+            yield compared(Job(case.name, f"calculix {ELEMENT}", size), measured, reference)
 
 
 def references_for(
@@ -103,7 +185,7 @@ def references_for(
         if case.name.startswith("scene"):
             found[case.name] = _own_reference(case, announce, kept)
         elif recompute:
-            announce(f"reference of case '{case.name}': {case.says}")
+            announce(f"reference of case '{case.name}': {case.label}")
             stored[case.name] = found[case.name] = compute_reference(case)
             write_references(stored, STORED)
         else:
@@ -118,7 +200,7 @@ def _own_reference(
     row = kept.get(key) if kept else None
     if row is not None:
         return Reference(**row | {"grids_mm": tuple(row["grids_mm"])})
-    announce(f"reference of case '{case.name}': {case.says}")
+    announce(f"reference of case '{case.name}': {case.label}")
     found = compute_reference(case)
     if kept:
         kept.put(key, asdict(found))
@@ -129,20 +211,3 @@ def cases_of(wanted: Sequence[Job]) -> list[StudyCase]:
     """Return the cases of some jobs."""
     names = {job.case: job.scene for job in wanted}
     return [study_case(name, Path(scene) if scene else None) for name, scene in names.items()]
-
-
-def as_json(rows: Sequence[Row]) -> str:
-    """Return the rows as the JSON text of `tkamb tradeoff --json`."""
-    return json.dumps([row.as_dict() for row in rows], indent=1, allow_nan=False)
-
-
-def read_rows(path: Path) -> list[Row]:
-    """Return the rows of a tradeoff.json.
-
-    Raises:
-        InputError: there is none, or it is something else.
-    """
-    try:
-        return [row_of(content) for content in json.loads(path.read_text(encoding="utf-8"))]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"is no table of a trade-off ({error})", path) from None

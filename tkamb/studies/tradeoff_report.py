@@ -1,19 +1,38 @@
-"""The trade-off for a reader: table and picture."""
+"""The trade-off for a reader: table, picture, the fastest model for an error, comparisons."""
 
 from collections.abc import Sequence
+from statistics import median
 
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tkamb.output.style import CYCLE, GREY, new_figure, settings
-from tkamb.studies.front import NOISE
+from tkamb.studies.quantities import SIDES
 from tkamb.studies.references import Reference
-from tkamb.studies.row import FRONT_ERRORS, KEYS, Row
+from tkamb.studies.row import FRONT_ERRORS, KEYS, TIMING_NOISE, Row
 
 MARKERS = "osD^vPX*<>"
 UNLABELLED_MM = 2.0
 """The cell size at which most points lie."""
+LIMITS = {
+    "approach": (0.05,),
+    "force": (0.03,),
+    "mean_pressure": (0.05, 0.10),
+    "peak_pressure": (0.02, 0.05, 0.10),
+    "area": (0.05, 0.10),
+    "map": (0.10,),
+}
+"""Errors for which the fastest model is named."""
+NAMES = dict(zip(KEYS, (key.replace("_", " ") for key in KEYS), strict=True)) | {
+    "force": "condyle force",
+    "map": "the pressure map (L2)",
+}
+COMPARED_ON, COMPARED_AT_MM = "two condyles", 2.0
+"""Case and cell size on which the default lattice is compared with finite elements."""
+DEFAULT = "lattice"
+
+Setting = tuple[str, float]
 
 
 def table(rows: Sequence[Row], references: dict[str, Reference]) -> list[str]:
@@ -31,7 +50,7 @@ def table(rows: Sequence[Row], references: dict[str, Reference]) -> list[str]:
         lines.append("")
     names = ", ".join(name.replace("_", " ") for name in FRONT_ERRORS)
     lines.append("* on the Pareto front of warm time against the largest of the errors in")
-    tie = f"medians of time within {100 * (NOISE - 1):.0f} % count as equal"
+    tie = f"medians of time within {100 * (TIMING_NOISE - 1):.0f} % count as equal"
     return [*lines, f"  {names}; {tie}. One thread."]
 
 
@@ -124,3 +143,132 @@ def _panel(axis: Axes, rows: Sequence[Row], labels: Sequence[str]) -> None:
 
 def _legend(axis: Axes) -> list[tuple[Artist, str]]:
     return list(zip(*axis.get_legend_handles_labels(), strict=True))
+
+
+def setting_of(row: Row) -> Setting:
+    """Return the model with its options, and its cell size (mm)."""
+    return row.job.label, row.job.resolution_mm
+
+
+def bodies_of(case: str) -> str:
+    """Return the name of a case's bodies: poses of one knee share them, varus is a pose too."""
+    if case.endswith(" deg"):
+        return case.split()[0]
+    return {"varus": "two condyles"}.get(case, case)
+
+
+def recommendations(rows: Sequence[Row]) -> list[str]:
+    """Return a sentence for each limit: the fastest model that keeps it wherever it was tried.
+
+    Only settings that were tried on all bodies are compared, by their median warm time over
+    one case of each.
+    """
+    settings = _settings_on_all_bodies(rows)
+    return [
+        f"for at most {100 * limit:g} % in {NAMES[key]}, {_fastest(settings, key, limit)}"
+        for key, limits in LIMITS.items()
+        for limit in limits
+    ]
+
+
+def _settings_on_all_bodies(rows: Sequence[Row]) -> dict[Setting, list[Row]]:
+    bodies = {bodies_of(row.job.case) for row in rows}
+    found: dict[Setting, list[Row]] = {}
+    for row in rows:
+        found.setdefault(setting_of(row), []).append(row)
+    return {
+        setting: some
+        for setting, some in found.items()
+        if {bodies_of(row.job.case) for row in some} == bodies
+    }
+
+
+def _fastest(settings: dict[Setting, list[Row]], key: str, limit: float) -> str:
+    worst = {
+        setting: max(row.errors.get(key, float("inf")) for row in some)
+        for setting, some in settings.items()
+    }
+    times = {setting: median(warm_by_bodies(some)) for setting, some in settings.items()}
+    kept = [setting for setting, error in worst.items() if error <= limit]
+    if kept:
+        best = min(kept, key=lambda setting: times[setting])
+        return f"the fastest is {_named(best)} ({milliseconds(times[best])} ms warm)"
+    if not worst:
+        return "nothing can be said: no setting was tried on all bodies"
+    nearest = min(worst, key=lambda setting: worst[setting])
+    return f"no setting: the nearest is {_named(nearest)} with {100 * worst[nearest]:.2g} %"
+
+
+def warm_by_bodies(rows: Sequence[Row]) -> list[float]:
+    """Return one warm time (s) for each pair of bodies, the median of its poses."""
+    bodies = dict.fromkeys(bodies_of(row.job.case) for row in rows)
+    return [
+        median(row.measure.warm_seconds for row in rows if bodies_of(row.job.case) == body)
+        for body in bodies
+    ]
+
+
+def milliseconds(seconds: float) -> str:
+    """Return a time in ms with three digits."""
+    value = 1e3 * seconds
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def _named(setting: Setting) -> str:
+    return f"{setting[0]} at {setting[1]:g} mm"
+
+
+def comparison(rows: Sequence[Row]) -> list[str]:
+    """Return how the default lattice compares with finite elements, measured in this run."""
+    some = [row for row in rows if row.job.case == COMPARED_ON and row.errors]
+    own = {row.job.resolution_mm: row for row in some if row.job.label == DEFAULT}
+    if COMPARED_AT_MM not in own:
+        return []
+    where = "is" if own[COMPARED_AT_MM].on_front else "is not"
+    time = milliseconds(own[COMPARED_AT_MM].measure.warm_seconds)
+    front = ", ".join(f"{size:g}" for size, row in own.items() if row.on_front)
+    first = (
+        f"{COMPARED_ON}, 2000 N, nonlinear, {COMPARED_AT_MM:g} mm: {DEFAULT} takes {time} ms a "
+        f"position (warm) and {where} on the front; its cell sizes on the front: {front or 'none'}"
+        " mm"
+    )
+    others = [
+        row
+        for row in some
+        if row.job.label.startswith("calculix")
+        or (row.job.label.startswith("fe") and row.job.resolution_mm == COMPARED_AT_MM)
+    ]
+    return [
+        first,
+        *(_against(r, own[size]) for r in others if (size := r.job.resolution_mm) in own),
+    ]
+
+
+def _against(row: Row, own: Row) -> str:
+    label, times = row.job.label, row.measure.warm_seconds / own.measure.warm_seconds
+    line = (
+        f"{label} at {row.job.resolution_mm:g} mm: {milliseconds(row.measure.warm_seconds)} ms, "
+        f"{times:.3g} times as long as {DEFAULT}"
+    )
+    if label == "fe":
+        line += "; it shares the lattice's stored response and solver"
+    if label.startswith("calculix"):
+        line += f"; {_apart(own, row)}; CalculiX has finite strain, the lattice small strain"
+    return line
+
+
+def _apart(own: Row, peer: Row) -> str:
+    """Return how far the lattice is from the peer, in per cent of the peer."""
+    a, b = own.measure.values, peer.measure.values
+    if not a or not b:
+        return "values not kept"
+    load = sum(b[f"{side}_force"] for side in SIDES)
+    peak = max(b[f"{side}_peak_pressure"] for side in SIDES)
+    shares = {
+        "approach": abs(a["approach"] / b["approach"] - 1),
+        "peak pressure": max(abs(a[f"{s}_peak_pressure"] - b[f"{s}_peak_pressure"]) for s in SIDES)
+        / peak,
+        "condyle force": max(abs(a[f"{s}_force"] - b[f"{s}_force"]) for s in SIDES) / load,
+    }
+    said = ", ".join(f"{100 * share:.2g} % in {name}" for name, share in shares.items())
+    return f"the lattice is off it by {said}"

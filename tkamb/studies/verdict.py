@@ -1,7 +1,7 @@
 """One case judged: converged, flagged, or failed.
 
-An extreme is judged by what every answer must obey (`audit`), by CalculiX where its answer is
-stored (`peer_answers`), and by full Newton on the same grid, which finds what is the solver's
+An extreme is judged by what every answer must obey and by CalculiX where its answer is stored
+(`audit`), and by full Newton on the same grid, which finds what is the solver's
 alone. A closed form is judged by its formula (`closed_forms`). What a case was judged before is
 stored as well: converged once, it may not become flagged.
 
@@ -16,7 +16,7 @@ stored as well: converged once, it may not become flagged.
 import math
 import time as clock
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from tkamb.contact.model import ContactModel
@@ -24,10 +24,9 @@ from tkamb.contact.pressing import press_by_search
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import ComputationError, TkambError
-from tkamb.studies.audit import complaints
+from tkamb.studies.audit import PEER_BOUNDS, complaints, peer_distances
 from tkamb.studies.closed_forms import TOLERANCES, ClosedForm, apart, press_closed_form
 from tkamb.studies.extremes import Extreme
-from tkamb.studies.peer_answers import FARTHEST, peer_distances
 from tkamb.studies.quantities import errors, quantities
 
 WRONG = 0.02
@@ -80,10 +79,6 @@ class Verdict:
         """Whether the study fails by it."""
         return self.worse or self.kind not in PASSED_KINDS
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the row as JSON."""
-        return asdict(self)
-
 
 def judge(extreme: Extreme, pressed: Callable[[], None] = lambda: None) -> Verdict:
     """Press an extreme and compare with its reference.
@@ -99,7 +94,7 @@ def judge(extreme: Extreme, pressed: Callable[[], None] = lambda: None) -> Verdi
         result = model.press(state, extreme.load_N, extreme.pose)
     except TkambError as error:
         seconds = clock.perf_counter() - start
-        return Verdict(extreme.says, extreme.model, "flagged", str(error), seconds=seconds)
+        return Verdict(extreme.label, extreme.model, "flagged", str(error), seconds=seconds)
     seconds = clock.perf_counter() - start
     pressed()
     if result.status is not ContactStatus.OK:
@@ -157,7 +152,7 @@ def _beside_peer(extreme: Extreme, result: ContactResult) -> list[str]:
     return [
         f"{name.replace('_', ' ')} {100 * value:.3g} % from CalculiX"
         for name, value in peer_distances(extreme, result).items()
-        if not value <= FARTHEST[name]
+        if not value <= PEER_BOUNDS[name]
     ]
 
 
@@ -183,7 +178,7 @@ def _verdict(
     result: ContactResult,
 ) -> Verdict:
     known = distance if distance is not None and math.isfinite(distance) else None
-    return Verdict(case.says, case.model, kind, reason, known, seconds, int(result.iterations))
+    return Verdict(case.label, case.model, kind, reason, known, seconds, int(result.iterations))
 
 
 def _model(extreme: Extreme, **options: Any) -> ContactModel:

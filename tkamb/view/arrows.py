@@ -120,8 +120,8 @@ def _distal_end(geometry: KneeGeometry, name: str) -> tuple[Array, Array]:
     """Return where a tendon ends and the pull (3,) of one newton there."""
     if geometry.extensor is None:
         return NOTHING, NOTHING
-    extensor = geometry.extensor
-    loads = extensor.quadriceps if name == "quadriceps" else extensor.patellar_ligament
+    (muscle,) = geometry.muscles
+    loads = muscle.loads if name == "quadriceps" else geometry.extensor.patellar_ligament
     end: PointForces = loads[1]
     return end.points[0], end.forces[0]
 

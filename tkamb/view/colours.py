@@ -41,12 +41,12 @@ def rgb(colour: str) -> Colours:
 
 def pressure_scale() -> Colours:
     """Return the 256 colours (256, 3) from no pressure to the largest of all frames."""
-    return _sampled(PRESSURE_MAP, np.linspace(0.0, 1.0, 256))
+    return _sample(PRESSURE_MAP, np.linspace(0.0, 1.0, 256))
 
 
 def strain_scale() -> Colours:
     """Return the 256 colours (256, 3) from no strain to the limit."""
-    return _sampled("YlOrRd", np.linspace(0.15, 1.0, 256))
+    return _sample("YlOrRd", np.linspace(0.15, 1.0, 256))
 
 
 def strain_colours(strain: ArrayLike, limit: float) -> Colours:
@@ -56,5 +56,5 @@ def strain_colours(strain: ArrayLike, limit: float) -> Colours:
     return np.where((strain > 0)[..., None], strain_scale()[level], rgb(SLACK)).astype(np.uint8)
 
 
-def _sampled(name: str, at: NDArray[np.float64]) -> Colours:
+def _sample(name: str, at: NDArray[np.float64]) -> Colours:
     return np.round(colormaps[name](at)[:, :3] * 255.0).astype(np.uint8)

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tkamb.errors import InputError
-from tkamb.view.browser import require_browser
-from tkamb.view.cameras import CAMERAS
+from tkamb.view import CAMERAS
 
 HIGHEST_PORT = 65535
 
@@ -102,4 +101,6 @@ def _check(options: argparse.Namespace) -> None:
         if path is not None and not os.access(path.absolute().parent, os.W_OK):
             raise InputError("cannot be written (no such folder, or not yours)", path)
     if options.png:
-        require_browser()
+        from tkamb.view.page import find_browser
+
+        find_browser()

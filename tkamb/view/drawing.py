@@ -156,7 +156,7 @@ class Drawing:
         side: "right" or "left".
         body_weight: N.
         contact: name of the contact model; empty without contact.
-        places: where in the motion each frame is, "60° of flexion".
+        labels: where in the motion each frame is, "60° of flexion".
         times: (f,) s.
         statuses: per frame, "ok" or plain words.
         readings: the numbers of every frame.
@@ -174,7 +174,7 @@ class Drawing:
     side: str
     body_weight: float
     contact: str
-    places: tuple[str, ...]
+    labels: tuple[str, ...]
     times: Array
     statuses: tuple[str, ...]
     readings: tuple[Reading, ...]
@@ -188,4 +188,4 @@ class Drawing:
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
-        return len(self.places)
+        return len(self.labels)

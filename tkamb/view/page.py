@@ -1,18 +1,20 @@
-"""The page around the scene: one HTML that needs nothing from elsewhere."""
+"""The page around the scene, one HTML that needs nothing from elsewhere, and a picture of it."""
 
 import base64
-import json
+import os
+import shutil
+import subprocess
+import tempfile
 from collections.abc import Sequence
-from html import escape
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import meshcat
 
-from tkamb.output.atomic import write_text
-from tkamb.output.policy import sources
+from tkamb.errors import ComputationError
+from tkamb.output.pages import asset, policy_sources, render
 
+PACKAGE = "tkamb.view"
 SCRIPTS = ("scene.js", "moving.js", "controls.js", "start.js")
 POLICY = (
     "default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; "
@@ -20,6 +22,18 @@ POLICY = (
 )
 """The browser itself refuses any request to another place and any script but the page's own, by
 their hashes; meshcat's viewer adds styles as it runs."""
+
+BROWSERS = (
+    "chromium",
+    "chromium-browser",
+    "google-chrome",
+    "google-chrome-stable",
+    "chrome",
+    "microsoft-edge",
+)
+SOFTWARE_GRAPHICS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+LONGEST_PICTURE = 120.0
+"""s."""
 
 
 def page_html(
@@ -39,47 +53,22 @@ def page_html(
         view: camera that is chosen first.
         live: contact models that the server can compute; None without a server.
     """
-    asked: dict[str, Any] = {"frame": frame, "view": view, "live": live}
-    data = ""
-    if packed is not None:
-        text = base64.b64encode(packed).decode()
-        data = f'<script type="application/octet-stream" id="data">{text}</script>'
-    scripts = [_escaped(text) for text in (_meshcat(), *map(_own, SCRIPTS))]
+    # What stands between script tags must not hold the text that closes them.
+    scripts = [
+        "\n" + text.replace("</script", "<\\/script")
+        for text in (_meshcat(), *(asset(PACKAGE, name) for name in SCRIPTS))
+    ]
     connect = "'none'" if live is None else "'self'"
-    return _filled(
-        _own("page.html"),
-        title=escape(title),
-        policy=POLICY.format(scripts=sources(*scripts), connect=connect),
-        style=_own("style.css"),
-        asked=json.dumps(asked).replace("<", "\\u003c"),
-        data=data,
-        scripts="\n".join(f"<script>{text}</script>" for text in scripts),
+    return render(
+        PACKAGE,
+        "page.html",
+        title=title,
+        policy=POLICY.format(scripts=policy_sources(*scripts), connect=connect),
+        style=asset(PACKAGE, "style.css"),
+        request={"frame": frame, "view": view, "live": live},
+        data=None if packed is None else base64.b64encode(packed).decode(),
+        scripts=scripts,
     )
-
-
-def write_page(path: Path, html: str) -> None:
-    """Write the page, whole or not at all.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
-    write_text(path, html)
-
-
-def _filled(template: str, **parts: str) -> str:
-    """Put the parts in, each once, so that a part's own braces stay as they are."""
-    for name in parts:
-        before, _, after = template.partition("{" + name + "}")
-        if name == "title":
-            after = after.replace("{title}", parts[name])
-        template = before + "\0" + name + "\0" + after
-    for name, text in parts.items():
-        template = template.replace("\0" + name + "\0", text)
-    return template
-
-
-def _own(name: str) -> str:
-    return files("tkamb.view").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def _meshcat() -> str:
@@ -88,6 +77,55 @@ def _meshcat() -> str:
     return (root / "viewer" / "dist" / "main.min.js").read_text(encoding="utf-8")
 
 
-def _escaped(text: str) -> str:
-    """Return a script as it may stand between its tags."""
-    return "\n" + text.replace("</script", "<\\/script")
+def find_browser() -> str:
+    """Return the path of a Chromium-like browser.
+
+    Raises:
+        ComputationError: there is none.
+    """
+    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if found is None:
+        raise ComputationError(
+            "no browser found", mend="install chromium (Debian: apt install chromium)"
+        )
+    return found
+
+
+def screenshot(html: str, size: tuple[int, int]) -> bytes:
+    """Return a PNG of a page of `page_html` that stands by itself, without its controls.
+
+    Args:
+        html: the page.
+        size: width and height in pixels.
+
+    Raises:
+        ComputationError: no browser, or the page does not become ready.
+    """
+    browser = find_browser()
+    with tempfile.TemporaryDirectory(prefix="tkamb-view-", ignore_cleanup_errors=True) as folder:
+        page, picture = Path(folder) / "page.html", Path(folder) / "picture.png"
+        page.write_text(html, encoding="utf-8")
+        command: list[Any] = [
+            browser,
+            "--headless=new",
+            f"--user-data-dir={folder}/profile",
+            f"--window-size={size[0]},{size[1]}",
+            "--hide-scrollbars",
+            "--no-first-run",
+            "--disable-background-networking",
+            "--disable-dev-shm-usage",
+            *SOFTWARE_GRAPHICS,
+            *(["--no-sandbox"] if os.geteuid() == 0 else []),
+            # The page unpacks its data after it is loaded: so much of its own time it is given.
+            "--virtual-time-budget=20000",
+            f"--screenshot={picture}",
+            "--dump-dom",
+            f"{page.as_uri()}#figure=1",
+        ]
+        try:
+            done = subprocess.run(command, capture_output=True, timeout=LONGEST_PICTURE)
+        except subprocess.TimeoutExpired:
+            raise ComputationError(f"no picture of the page in {LONGEST_PICTURE:g} s") from None
+        if b'data-ready="yes"' not in done.stdout or not picture.exists():
+            raise ComputationError("the page could not be drawn", str(browser))
+        return picture.read_bytes()

@@ -17,16 +17,28 @@ import umsgpack  # type: ignore[import-untyped]
 from meshcat.commands import SetObject, SetTransform
 from meshcat.geometry import MeshLambertMaterial, TriangularMeshGeometry, pack_numpy_array
 from meshcat.path import Path as NodePath
+from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array
 from tkamb.units import MILLIMETRE
 from tkamb.view.colours import pressure_scale, strain_scale
-from tkamb.view.drawing import HIDDEN_AT_FIRST, LAYERS, Drawing, PressureMap, Solid
-from tkamb.view.levels import levels
-from tkamb.view.shading import Shaded, shaded
+from tkamb.view.drawing import (
+    HIDDEN_AT_FIRST,
+    LAYERS,
+    Arrow,
+    Drawing,
+    Marker,
+    PressureMap,
+    Solid,
+    Strand,
+)
+from tkamb.view.shading import Shaded, shade
 
 METRES_PER_BODY_WEIGHT = 0.03
 """Length of an arrow of one body weight."""
+
+LEVELS = 32767
+"""Steps from no pressure to the largest."""
 
 FRONT = 0
 """three.js: triangles are seen from outside only, which spares half of them."""
@@ -51,13 +63,13 @@ class Block:
         return self._add(text, "uint8", len(text))
 
     def _add(self, part: bytes, kind: str, count: int) -> dict[str, Any]:
-        place = {"at": self._size, "of": kind, "n": count}
+        span = {"at": self._size, "of": kind, "n": count}
         padded = part + bytes(-len(part) % 4)
         self._parts.append(padded)
         self._size += len(padded)
-        return place
+        return span
 
-    def packed(self, header: dict[str, Any]) -> bytes:
+    def compress(self, header: dict[str, Any]) -> bytes:
         """Return header and arrays, compressed."""
         text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
@@ -71,7 +83,7 @@ def pack(drawings: Sequence[Drawing]) -> bytes:
     block = Block()
     peak = peak_pressure(drawings)
     limit = max(one.strain_limit for one in drawings)
-    return block.packed(
+    return block.compress(
         {
             "layers": list(LAYERS),
             "hidden": list(HIDDEN_AT_FIRST),
@@ -93,27 +105,27 @@ def peak_pressure(drawings: Sequence[Drawing]) -> float:
 def packed_map(found: PressureMap, peak: float, words: str) -> bytes:
     """Return one map alone, on the scale of a page that is open, with words about it."""
     block = Block()
-    return block.packed({"map": _map(block, found, peak), "words": words})
+    return block.compress({"map": _map(block, found, peak), "words": words})
 
 
 def packed_lattice(lines: Array) -> bytes:
     """Return the lines (s, 2, 3) m of a lattice alone."""
     block = Block()
-    return block.packed({"lattice": block.put(lines, "float32")})
+    return block.compress({"lattice": block.put(lines, "float32")})
 
 
 def _view(block: Block, number: int, drawing: Drawing, peak: float) -> dict[str, Any]:
     root = f"/tkamb/{number}"
-    commands, moving, notes = [_placed(root, drawing.side)], [], list(drawing.notes)
+    commands, moving, notes = [_insert_transform(root, drawing.side)], [], list(drawing.notes)
     for solid in drawing.solids:
-        shape = shaded(solid.surface)
+        shape = shade(solid.surface)
         if shape.error:
             notes.append(
                 f"{solid.name.capitalize()}: drawn with {len(shape.faces)} of "
                 f"{len(solid.surface.faces)} triangles, at most {shape.error / MILLIMETRE:.2f} mm "
                 "from the true surface."
             )
-        path = _place(root, solid.layer, solid.name)
+        path = _node_name(root, solid.layer, solid.name)
         commands += _commands(path, solid, shape)
         if len(solid.poses) > 1:
             poses = block.put(np.swapaxes(solid.poses, 1, 2), "float32")
@@ -123,47 +135,50 @@ def _view(block: Block, number: int, drawing: Drawing, peak: float) -> dict[str,
         "side": drawing.side,
         "body_weight": drawing.body_weight,
         "contact": drawing.contact,
-        "places": drawing.places,
+        "labels": drawing.labels,
         "statuses": drawing.statuses,
         "readings": [{"name": row.name, "values": row.values} for row in drawing.readings],
         "notes": notes,
         "times": [float(time) for time in drawing.times],
         "commands": [block.put_bytes(umsgpack.packb(one.lower())) for one in commands],
         "moving": moving,
-        "strands": [
-            {
-                "path": _place(root, one.layer, one.name),
-                "frames": len(one.points),
-                "count": one.points.shape[1],
-                "points": block.put(one.points, "float32"),
-                "colours": block.put(one.colours, "uint8"),
-                "radius": one.radius,
-            }
-            for one in drawing.strands
-        ],
-        "arrows": [
-            {
-                "path": _place(root, "forces", one.name),
-                "name": one.name,
-                "meaning": one.meaning,
-                "colour": one.colour,
-                "ends_there": one.ends_there,
-                "points": block.put(one.points, "float32"),
-                "forces": block.put(one.forces, "float32"),
-            }
-            for one in drawing.arrows
-        ],
-        "markers": [
-            {
-                "path": _place(root, one.layer, one.name),
-                "colour": one.colour,
-                "radius": one.radius,
-                "points": block.put(one.points, "float32"),
-            }
-            for one in drawing.markers
-        ],
+        "strands": [_strand(block, root, one) for one in drawing.strands],
+        "arrows": [_arrow(block, root, one) for one in drawing.arrows],
+        "markers": [_marker(block, root, one) for one in drawing.markers],
         "map": _map(block, drawing.map, peak) if drawing.map else None,
         "lattice": block.put(drawing.lattice, "float32") if len(drawing.lattice) else None,
+    }
+
+
+def _strand(block: Block, root: str, strand: Strand) -> dict[str, Any]:
+    return {
+        "path": _node_name(root, strand.layer, strand.name),
+        "frames": len(strand.points),
+        "count": strand.points.shape[1],
+        "points": block.put(strand.points, "float32"),
+        "colours": block.put(strand.colours, "uint8"),
+        "radius": strand.radius,
+    }
+
+
+def _arrow(block: Block, root: str, arrow: Arrow) -> dict[str, Any]:
+    return {
+        "path": _node_name(root, "forces", arrow.name),
+        "name": arrow.name,
+        "meaning": arrow.meaning,
+        "colour": arrow.colour,
+        "ends_there": arrow.ends_there,
+        "points": block.put(arrow.points, "float32"),
+        "forces": block.put(arrow.forces, "float32"),
+    }
+
+
+def _marker(block: Block, root: str, marker: Marker) -> dict[str, Any]:
+    return {
+        "path": _node_name(root, marker.layer, marker.name),
+        "colour": marker.colour,
+        "radius": marker.radius,
+        "points": block.put(marker.points, "float32"),
     }
 
 
@@ -172,11 +187,47 @@ def _map(block: Block, found: PressureMap, peak: float) -> dict[str, Any]:
         "count": len(found.points),
         "points": block.put(found.points, "float32"),
         "triangles": block.put(found.triangles, "uint32"),
-        "levels": block.put(levels(found, peak), "int16"),
+        "levels": block.put(pressure_levels(found, peak), "int16"),
     }
 
 
-def _placed(root: str, side: str) -> SetTransform:
+def pressure_levels(found: PressureMap, peak: float) -> NDArray[np.int16]:
+    """Return pressure as levels (f, n): 1 to LEVELS where loaded, negative where not.
+
+    A loaded point holds its share of the page's largest pressure. Between a loaded and an
+    unloaded point the contact ends where the level, drawn linearly, is zero: an unloaded point at
+    the rim holds minus its gap, scaled so that on average the rim lies halfway. This is for the
+    eye; at the points themselves the levels are the data's.
+
+    Args:
+        found: the map.
+        peak: MPa, top of the scale; a higher pressure has the top level.
+    """
+    share = np.clip(np.nan_to_num(found.pressure) / (peak or 1.0), 0.0, 1.0)
+    return np.stack(
+        [
+            _frame_levels(one, gap, found.triangles)
+            for one, gap in zip(share, found.gap, strict=True)
+        ]
+    )
+
+
+def _frame_levels(share: Array, gap: Array, triangles: NDArray[np.int64]) -> NDArray[np.int16]:
+    loaded = share > 0
+    level = np.where(loaded, np.maximum(np.round(share * LEVELS), 1.0), -float(LEVELS))
+    corners = loaded[triangles]
+    rim = np.zeros(len(share), bool)
+    rim[triangles[corners.any(axis=1) & ~corners.all(axis=1)]] = True
+    outside, inside = rim & ~loaded, rim & loaded
+    if outside.any():
+        apart = np.maximum(np.nan_to_num(gap[outside]), 0.0)
+        mean = float(apart.mean())
+        relative = apart / mean if mean > 0 else np.ones(len(apart))
+        level[outside] = -np.clip(relative * level[inside].mean(), 1.0, LEVELS)
+    return level.astype(np.int16)
+
+
+def _insert_transform(root: str, side: str) -> SetTransform:
     """Return the insert frame (y up) in meshcat's (z up), a left knee mirrored back."""
     turn = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
     if side == "left":
@@ -194,7 +245,7 @@ def _commands(path: str, solid: Solid, shape: Shaded) -> list[Any]:
     return made
 
 
-def _place(root: str, layer: str, name: str) -> str:
+def _node_name(root: str, layer: str, name: str) -> str:
     """Return a path in the scene tree; a name's own slash would divide it."""
     return f"{root}/{layer}/{name.replace('/', '-')}"
 

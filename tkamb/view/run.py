@@ -4,12 +4,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tkamb.case import Case, load_case
+from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.errors import InputError
-from tkamb.mechanics.mechanics import FrameLoads, Mechanics
-from tkamb.results import SUMMARY_NAME, Results, read_results
+from tkamb.results import Results
+from tkamb.results_folder import SUMMARY_NAME, read_results
 from tkamb.run.summary import files_hash, scene_hash
 from tkamb.scene import Scene, load_scene
+from tkamb.scene.case import Case, load_case
 from tkamb.simulation import simulate
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
@@ -17,7 +18,7 @@ RUN_AGAIN = "run it again: tkamb run"
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class CaseResults:
     """A case and the results that belong to it.
 
     Args:
@@ -47,9 +48,9 @@ class Run:
         side, found = ContactSide(self.case, self.mechanics), []
         touched: list[FrameContact] = []
         for k in progress(self.frames):
-            body, carried = side.frame(k, touched)
+            body, contact_of_frame = side.frame(k, touched)
             found.append(body)
-            touched.append(carried)
+            touched.append(contact_of_frame)
         return found
 
 
@@ -59,7 +60,7 @@ def open_run(
     contact: str | None = None,
     progress: Progress = lambda frames: frames,
     announce: Callable[[str], None] = lambda line: None,
-) -> Run:
+) -> CaseResults:
     """Return the run behind a results folder or a scene file.
 
     A scene whose results stand in its output folder is not run again.
@@ -88,9 +89,9 @@ def open_run(
         same = same and _same_files(case, results)
         if same and len(results) and not results.summary.get("unfinished_frames"):
             announce(f"results of this scene found in {folder}")
-            return joined(case, results)
+            return match_frames(case, results)
     announce("running the scene (keep its results with `tkamb run`)")
-    return joined(case, simulate(scene, scene_path=path, progress=progress))
+    return match_frames(case, simulate(scene, scene_path=path, progress=progress))
 
 
 def check_frame(paths: Sequence[Path], frame: int) -> None:
@@ -120,7 +121,7 @@ def no_frame(frame: int, most: int) -> InputError:
     return InputError(f"there is no frame {frame}", "--frame", f"0 to {most - 1}")
 
 
-def joined(case: Case, results: Results) -> Run:
+def match_frames(case: Case, results: Results) -> CaseResults:
     """Return the run of a case and its results.
 
     Raises:
@@ -133,10 +134,10 @@ def joined(case: Case, results: Results) -> Run:
         raise InputError(
             f"no frame at {error.args[0]} s in the scene's motion", "results", RUN_AGAIN
         ) from None
-    return Run(case, Mechanics(case), results, frames)
+    return CaseResults(case, Mechanics(case), results, frames)
 
 
-def run_of(results: Results) -> Run:
+def run_of_results(results: Results) -> CaseResults:
     """Return the run of results, whose summary names the scene.
 
     Raises:
@@ -150,7 +151,7 @@ def run_of(results: Results) -> Run:
     if not _same_files(case, results):
         what = "a mesh or table that it names has changed since these results were computed"
         raise InputError(what, scene, f"{RUN_AGAIN} {scene}")
-    return joined(case, results)
+    return match_frames(case, results)
 
 
 def _same_files(case: Case, results: Results) -> bool:
@@ -160,11 +161,11 @@ def _same_files(case: Case, results: Results) -> bool:
     return found is None or found == files_hash(case)
 
 
-def _from_folder(folder: Path) -> Run:
+def _from_folder(folder: Path) -> CaseResults:
     results = read_results(folder)
     if not len(results):
         raise InputError("holds no frame", folder, RUN_AGAIN)
-    return run_of(results)
+    return run_of_results(results)
 
 
 def _scene_of(results: Results) -> Scene:
@@ -180,5 +181,5 @@ def _scene_of(results: Results) -> Scene:
             "put it back, or run it again",
         )
     contact = results.summary.get("contact") or {}
-    kept = {f"contact.{key}": value for key, value in contact.items() if value is not None}
-    return load_scene(path, kept)
+    overrides = {f"contact.{key}": value for key, value in contact.items() if value is not None}
+    return load_scene(path, overrides)

@@ -1,17 +1,29 @@
-"""The live window's server: this machine only, and nothing but the page and its data.
+"""The live window: its server, and another contact model on one frame while one looks at it.
 
-Other users of the machine reach the port too: every address starts with a random token, which
-only the user's terminal shows.
+The server is for this machine only, and gives nothing but the page and its data. Other
+users of the machine reach the port too: every address starts with a random token, which only the
+user's terminal shows.
 """
 
 import json
 import secrets
+from dataclasses import replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Lock
 from typing import Any
 
+import numpy as np
+
+from tkamb.contact.registry import contact_names
+from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.errors import InputError, TkambError
-from tkamb.view.live import ContactSwitch
+from tkamb.output.style import SIDE_COLOURS
+from tkamb.units import MEGAPASCAL, MILLIMETRE
+from tkamb.view.draw import lattice_lines
+from tkamb.view.drawing import PressureMap
+from tkamb.view.payload import packed_lattice, packed_map
+from tkamb.view.run import CaseResults
 
 HOST = "127.0.0.1"
 LARGEST_QUESTION = 10_000
@@ -28,6 +40,81 @@ HEADERS = {
 }
 """Of every answer. The page's own policy says what it may load (`tkamb.view.page.POLICY`); who may
 frame it can only be said here."""
+
+
+class ContactSwitch:
+    """Computes a frame of a run with any contact model; each model is prepared once.
+
+    Args:
+        run: with [contact].
+        peak: MPa, top of the colour scale of the page.
+    """
+
+    def __init__(self, run: CaseResults, peak: float) -> None:
+        self.run, self.peak = run, peak
+        self._sides: dict[str, ContactSide] = {}
+        self._lock = Lock()
+
+    def models(self) -> tuple[str, ...]:
+        """Return the names that can be asked for; none without [contact]."""
+        return contact_names() if self.run.case.scene.contact else ()
+
+    def answer(self, row: int, model: str) -> bytes:
+        """Return map and plain words of one frame, packed.
+
+        Args:
+            row: row of the results.
+            model: name of the contact model.
+
+        Raises:
+            TkambError: no such model or frame, or the model cannot be prepared.
+        """
+        if not 0 <= row < len(self.run.frames):
+            raise TkambError(f"there is no frame {row}")
+        with self._lock:
+            return self._compute(row, model)
+
+    def lattice(self) -> bytes:
+        """Return the lines of the run's lattice, packed.
+
+        Raises:
+            TkambError: the insert cannot be meshed.
+        """
+        with self._lock:
+            return packed_lattice(lattice_lines(self.run.case))
+
+    def _compute(self, row: int, model: str) -> bytes:
+        side = self._side(model)
+        _, contact = side.frame(self.run.frames[row])
+        points, triangles = side.state.points, side.state.triangles
+        result = contact.result
+        if result is None:
+            nothing = PressureMap(points, triangles, *np.zeros((2, 1, len(points))))
+            return packed_map(nothing, self.peak, f"{model}: {contact.problem}")
+        found = PressureMap(points, triangles, result.pressure[None] / MEGAPASCAL, result.gap[None])
+        parts = []
+        for name in SIDE_COLOURS:
+            condyle = getattr(result, name)
+            if condyle is not None:
+                parts.append(
+                    f"{name} {condyle.force:.0f} N on {condyle.area / MILLIMETRE**2:.0f} mm², "
+                    f"peak {condyle.peak_pressure / MEGAPASCAL:.1f} MPa"
+                )
+        words = [f"{model}: {'; '.join(parts)}", f"{contact.seconds:.2f} s", *contact.flags]
+        if found.peak > self.peak:
+            words.append(f"the map exceeds the colour scale ({self.peak:.1f} MPa)")
+        return packed_map(found, self.peak, "; ".join(words))
+
+    def _side(self, model: str) -> ContactSide:
+        if model not in self._sides:
+            case = self.run.case
+            assert case.scene.contact is not None
+            own = model == case.scene.contact.model
+            changes = {"model": model} if own else {"model": model, "options": {}}
+            contact = case.scene.contact.model_copy(update=changes)
+            scene = case.scene.model_copy(update={"contact": contact})
+            self._sides[model] = ContactSide(replace(case, scene=scene), self.run.mechanics)
+        return self._sides[model]
 
 
 class ViewServer:
@@ -91,36 +178,36 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = LONGEST_SILENCE
 
     def do_GET(self) -> None:
-        if not self._own():
+        if not self._is_allowed():
             self._refuse()
-        elif self._asked_for in self.content:
-            self._send(HTTPStatus.OK, *self.content[self._asked_for])
+        elif self._path_below_token in self.content:
+            self._send(HTTPStatus.OK, *self.content[self._path_below_token])
         else:
-            self._say(HTTPStatus.NOT_FOUND, "no such page")
+            self._send_line(HTTPStatus.NOT_FOUND, "no such page")
 
     def do_POST(self) -> None:
-        if not self._own():
+        if not self._is_allowed():
             self._refuse()
             return
         try:
-            answer = self._answer(self._asked())
+            answer = self._answer(self._question())
         except TimeoutError:
-            self._say(HTTPStatus.REQUEST_TIMEOUT, "the question did not arrive")
+            self._send_line(HTTPStatus.REQUEST_TIMEOUT, "the question did not arrive")
         except (TkambError, ValueError, KeyError, RecursionError) as error:
-            self._say(HTTPStatus.BAD_REQUEST, str(error) or type(error).__name__)
+            self._send_line(HTTPStatus.BAD_REQUEST, str(error) or type(error).__name__)
         except Exception as error:  # the last handler: the window says it, the server goes on
             words = f"{type(error).__name__}: {error}"
-            self._say(HTTPStatus.INTERNAL_SERVER_ERROR, words)
+            self._send_line(HTTPStatus.INTERNAL_SERVER_ERROR, words)
         else:
             self._send(HTTPStatus.OK, "application/octet-stream", answer)
 
-    def _answer(self, asked: dict[str, Any]) -> bytes:
-        if self.switch is not None and self._asked_for == "contact":
-            frame, model = asked["frame"], asked["model"]
+    def _answer(self, question: dict[str, Any]) -> bytes:
+        if self.switch is not None and self._path_below_token == "contact":
+            frame, model = question["frame"], question["model"]
             if type(frame) is not int or not isinstance(model, str):
                 raise TkambError("frame is an integer, model a name")
             return self.switch.answer(frame, model)
-        if self.switch is not None and self._asked_for == "lattice":
+        if self.switch is not None and self._path_below_token == "lattice":
             return self.switch.lattice()
         raise TkambError("no such question")
 
@@ -128,20 +215,20 @@ class _Handler(BaseHTTPRequestHandler):
         """Stay quiet."""
 
     @property
-    def _asked_for(self) -> str:
+    def _path_below_token(self) -> str:
         """The path below the token."""
         return self.path.removeprefix(self.root)
 
-    def _asked(self) -> dict[str, Any]:
+    def _question(self) -> dict[str, Any]:
         length = int(self.headers.get("Content-Length") or 0)
         if not 0 < length <= LARGEST_QUESTION:
             raise TkambError("a question of no or too many bytes")
-        asked = json.loads(self.rfile.read(length))
-        if not isinstance(asked, dict):
+        question = json.loads(self.rfile.read(length))
+        if not isinstance(question, dict):
             raise TkambError("a question is an object")
-        return asked
+        return question
 
-    def _own(self) -> bool:
+    def _is_allowed(self) -> bool:
         origin = self.headers.get("Origin")
         given = self.path[: len(self.root)].encode(errors="replace")
         return (
@@ -151,9 +238,11 @@ class _Handler(BaseHTTPRequestHandler):
         )
 
     def _refuse(self) -> None:
-        self._say(HTTPStatus.FORBIDDEN, "another host or site, or not the address tkamb printed")
+        self._send_line(
+            HTTPStatus.FORBIDDEN, "another host or site, or not the address tkamb printed"
+        )
 
-    def _say(self, status: HTTPStatus, words: str) -> None:
+    def _send_line(self, status: HTTPStatus, words: str) -> None:
         """Send one line of text."""
         self._send(status, "text/plain; charset=utf-8", " ".join(words.split()).encode())
 

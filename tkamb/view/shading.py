@@ -4,15 +4,17 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from fast_simplification import simplify
 from numpy.typing import NDArray
 
-from tkamb.geometry.corner_normals import corner_normals
 from tkamb.geometry.surface import Surface
-from tkamb.view.thinning import thinned
+from tkamb.units import MILLIMETRE
 
 MOST_TRIANGLES = 6_000
-"""Per surface; a finer one is thinned before it is drawn. With two of that size and the smaller
+"""Per surface; a finer one is decimated before it is drawn. With two of that size and the smaller
 parts a frame takes less than 100 ms where no graphics card helps."""
+AGGRESSIVENESS = range(5, 11)
+"""How soon far vertices may be merged: tried until few enough triangles are left."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +25,7 @@ class Shaded:
         vertices: (n, 3) float32, m.
         normals: (n, 3) float32, unit.
         faces: (k, 3) uint32.
-        error: m, how far the drawn surface lies at most from the true one; 0 if not thinned.
+        error: m, how far the drawn surface lies at most from the true one; 0 if not decimated.
     """
 
     vertices: NDArray[np.float32]
@@ -33,10 +35,10 @@ class Shaded:
 
 
 @lru_cache(maxsize=16)
-def shaded(surface: Surface, most_triangles: int = MOST_TRIANGLES) -> Shaded:
+def shade(surface: Surface, most_triangles: int = MOST_TRIANGLES) -> Shaded:
     """Return a surface for drawing; vertices on sharp edges are doubled."""
-    surface, error = thinned(surface, most_triangles)
-    normals = corner_normals(surface)
+    surface, error = decimate(surface, most_triangles)
+    normals = surface.corner_normals
     flat = np.repeat(surface.face_normals[:, None], 3, axis=1)
     normals = np.where(np.linalg.norm(normals, axis=-1, keepdims=True) > 0, normals, flat)
     key = np.round(normals.reshape(-1, 3) * 127.0).astype(np.int64)
@@ -47,4 +49,31 @@ def shaded(surface: Surface, most_triangles: int = MOST_TRIANGLES) -> Shaded:
         normals.reshape(-1, 3)[first].astype(np.float32),
         inverse.reshape(-1, 3).astype(np.uint32),
         error,
+    )
+
+
+def decimate(surface: Surface, most_triangles: int) -> tuple[Surface, float]:
+    """Return a surface of at most so many triangles, and how far (m) the two lie apart at most.
+
+    Edges collapse in the order of their quadric error (Garland & Heckbert, Proc SIGGRAPH 97,
+    209). The distance is measured from the vertices and triangle centres of each to a point of
+    the other that is nearly the nearest one: it may be too large by a tenth of a millimetre.
+    """
+    if len(surface.faces) <= most_triangles:
+        return surface, 0.0
+    points, faces = surface.vertices / MILLIMETRE, surface.faces.astype(np.int32)
+    for aggressiveness in AGGRESSIVENESS:
+        fewer, kept = simplify(points, faces, target_count=most_triangles, agg=aggressiveness)
+        if len(kept) <= most_triangles:
+            break
+    found = Surface(fewer.astype(float) * MILLIMETRE, kept.astype(np.int64), surface.name)
+    return found, _distance(found, surface)
+
+
+def _distance(one: Surface, other: Surface) -> float:
+    """Return the largest distance (m) of vertices and triangle centres to the other surface."""
+    return max(
+        float(to.nearest.at(points).distance.max())
+        for of, to in ((one, other), (other, one))
+        for points in (of.vertices, of.triangles.mean(axis=1))
     )

@@ -2,31 +2,27 @@
 
 import os
 import sys
-import tempfile
 import threading
 import webbrowser
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tkamb.atomic import replaced_file, write_text
 from tkamb.errors import InputError
-from tkamb.output.atomic import replaced_file
-from tkamb.view.browser import take_picture
-from tkamb.view.cameras import CAMERAS
+from tkamb.view import CAMERAS
 from tkamb.view.draw import draw
 from tkamb.view.drawing import Drawing
-from tkamb.view.live import ContactSwitch
-from tkamb.view.page import page_html, write_page
+from tkamb.view.page import page_html, screenshot
 from tkamb.view.payload import pack, peak_pressure
-from tkamb.view.run import Run, no_frame, run_of
-from tkamb.view.server import ViewServer
+from tkamb.view.run import CaseResults, Progress, no_frame, run_of_results
+from tkamb.view.server import ContactSwitch, ViewServer
 
 if TYPE_CHECKING:
     from tkamb.results import Results
 
-Progress = Callable[[Iterable[int]], Iterable[int]]
 Line = Callable[[str], None]
 
 
@@ -47,7 +43,7 @@ class Show:
 
     def __init__(
         self,
-        runs: Sequence[Run],
+        runs: Sequence[CaseResults],
         *,
         frame: int = 0,
         camera: str = "oblique",
@@ -55,7 +51,7 @@ class Show:
         progress: Progress = lambda frames: frames,
     ) -> None:
         self.runs = tuple(runs)
-        self.frame, self.camera = self._checked(frame, camera)
+        self.frame, self.camera = self._check(frame, camera)
         self.drawings: tuple[Drawing, ...] = tuple(draw(run, progress, lattice) for run in runs)
         self.packed = pack(self.drawings)
         self.title = " | ".join(drawing.title for drawing in self.drawings)
@@ -67,7 +63,7 @@ class Show:
             InputError: no such frame or camera.
         """
         other = copy(self)
-        other.frame, other.camera = self._checked(frame, camera)
+        other.frame, other.camera = self._check(frame, camera)
         return other
 
     def html(self) -> str:
@@ -80,7 +76,7 @@ class Show:
         Raises:
             InputError: the folder cannot be written.
         """
-        write_page(Path(path), self.html())
+        write_text(Path(path), self.html())
 
     def write_png(self, path: str | Path, size: tuple[int, int] = (1400, 900)) -> None:
         """Write a picture of the frame, with colour bars and legend but without controls.
@@ -89,10 +85,7 @@ class Show:
             ComputationError: no browser.
             InputError: the folder cannot be written.
         """
-        with tempfile.TemporaryDirectory(prefix="tkamb-view-") as folder:
-            page = Path(folder) / "page.html"
-            write_page(page, self.html())
-            picture = take_picture(page, size, "figure=1")
+        picture = screenshot(self.html(), size)
         with replaced_file(Path(path)) as temporary:
             temporary.write_bytes(picture)
 
@@ -103,7 +96,7 @@ class Show:
             "</iframe>"
         )
 
-    def _checked(self, frame: int, camera: str) -> tuple[int, str]:
+    def _check(self, frame: int, camera: str) -> tuple[int, str]:
         most = max(len(run.frames) for run in self.runs)
         if not -most <= frame < most:
             raise no_frame(frame, most)
@@ -162,4 +155,4 @@ def show(results: "Results", frame: int = 0) -> Show:
     Raises:
         InputError: the scene is not there, or no longer what was run.
     """
-    return Show([run_of(results)], frame=frame)
+    return Show([run_of_results(results)], frame=frame)

@@ -1,8 +1,9 @@
-"""The rigid parts of a drawing: implant, patella, and bones as plain solids.
+"""The rigid parts of a drawing: implant, patella, bones as plain solids, floor and foot.
 
-A scene holds no bone meshes but one that the quadriceps may wrap, which is drawn; the other
+A scene holds no bone meshes but one that a muscle may wrap, which is drawn; the other
 bones are stand-ins of about the right size between the joint centres: they orient the eye and
-carry no load.
+carry no load. Nobody measured the foot: it hangs at the ankle, level with the floor and pointing
+where the shank does, so that the arrow of the ground reaction does not hang in the air.
 """
 
 from collections.abc import Sequence
@@ -11,14 +12,15 @@ import numpy as np
 import trimesh
 
 from tkamb.body.chain import ChainState
-from tkamb.case import Case
+from tkamb.body.knee import KneeGeometry
 from tkamb.geometry.frames import Array, inverse, pose, transform
 from tkamb.geometry.surface import Surface
-from tkamb.mechanics.extensor import quadriceps_bone
-from tkamb.output.maps_file import ContactMaps
+from tkamb.output.maps import ContactMaps
+from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
-from tkamb.view.colours import BONE, BUTTON, INSERT, METAL, RECORDED
-from tkamb.view.drawing import Solid
+from tkamb.view.arrows import centre_of_pressure
+from tkamb.view.colours import BLACK, BONE, BUTTON, FLOOR, INSERT, METAL, RECORDED
+from tkamb.view.drawing import Marker, Solid
 
 FEMUR_PROFILE = (
     (0.015, 19.0),
@@ -33,6 +35,23 @@ TIBIA_PROFILE = ((0.0, 26.0), (0.05, 24.0), (0.16, 15.0), (0.50, 11.0), (0.85, 1
 """Share of the length from the knee, and radius in mm."""
 
 PATELLA_DEPTH, PATELLA_WIDTH = 8.0 * MILLIMETRE, 21.0 * MILLIMETRE
+
+INSTEP = (15.0, 42.0, 0.0, 22.0)
+SOLE = (
+    (-48.0, 26.0, 0.0, 26.0),
+    (75.0, 26.0, 0.0, 22.0),
+    (125.0, 18.0, -24.0, 18.0),
+    (115.0, 16.0, 26.0, 16.0),
+    (172.0, 11.0, -20.0, 11.0),
+    (160.0, 10.0, 22.0, 10.0),
+)
+"""Balls in whose hull the foot lies: anterior of the ankle, above the sole, right; radius; mm."""
+
+ANKLE_RADIUS = 20.0
+"""mm."""
+PLATE = np.array([340.0, 5.0, 200.0]) * MILLIMETRE
+PLATE_CENTRE = 60.0 * MILLIMETRE
+"""m, anterior of the ankle."""
 
 
 def solids(
@@ -60,9 +79,9 @@ def solids(
     if case.insert is not None:
         found.append(Solid("insert", "insert", case.insert, INSERT, 1.0, still))
     if case.femoral is not None:
-        pressed = _pressed(solved, maps, rows)
+        poses = _contact_poses(solved, maps, rows)
         found.append(
-            Solid("femoral component", "femoral component", case.femoral, METAL, 0.5, pressed)
+            Solid("femoral component", "femoral component", case.femoral, METAL, 0.5, poses)
         )
         found.append(
             Solid(
@@ -83,7 +102,7 @@ def solids(
     return tuple(found)
 
 
-def _pressed(recorded: Array, maps: ContactMaps | None, rows: Sequence[int]) -> Array:
+def _contact_poses(recorded: Array, maps: ContactMaps | None, rows: Sequence[int]) -> Array:
     poses = recorded.copy()
     if maps is not None:
         stored = maps.femoral_pose
@@ -94,8 +113,8 @@ def _pressed(recorded: Array, maps: ContactMaps | None, rows: Sequence[int]) -> 
 
 
 def _femur(case: Case, states: Sequence[ChainState], poses: Array) -> Solid:
-    """Return the bone that the quadriceps may wrap, else a stand-in up to the hip."""
-    bone = quadriceps_bone(case)
+    """Return the bone that a muscle wraps, else a stand-in up to the hip."""
+    bone = case.bone
     if bone is not None:
         return Solid("femur", "bones", bone, BONE, 1.0, poses)
     hip = (inverse(poses[0]) @ np.append(states[0].point("hip", np.zeros(3)), 1.0))[:3]
@@ -120,23 +139,82 @@ def _shaft(end: Array, profile: tuple[tuple[float, float], ...], name: str) -> S
     )
     mesh = trimesh.creation.revolve(outline, sections=28)
     turn = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], end / length)
-    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64), name).moved(turn)
+    return _surface(mesh, name).moved(turn)
 
 
 def _patella(case: Case) -> Surface:
     """Return an ellipsoid from the tendon's insertion to the ligament's origin."""
-    scene = case.scene
-    assert scene.quadriceps is not None and scene.patellar_ligament is not None
-    top, bottom = (
-        transform(case.chain.link_in(end.link, "patella"), np.array(end.point_mm) * MILLIMETRE)
-        for end in (scene.quadriceps.insertion, scene.patellar_ligament.proximal)
-    )
+    assert case.patellar_ligament is not None
+    ends = (case.muscles[0].points[-1], case.patellar_ligament.proximal)
+    top, bottom = (transform(case.chain.link_in(end.link, "patella"), end.position) for end in ends)
     ball = trimesh.creation.icosphere(subdivisions=3)
     along = top - bottom
     half = 0.5 * float(np.linalg.norm(along))
     radii = np.array([PATELLA_DEPTH, half, PATELLA_WIDTH])
     turn = trimesh.geometry.align_vectors([0.0, 1.0, 0.0], along / (2.0 * half))[:3, :3]
-    surface = Surface(
-        np.asarray(ball.vertices) * radii, np.asarray(ball.faces, np.int64), "patella"
+    ball.apply_scale(radii)
+    return _surface(ball, "patella").moved(pose(turn, 0.5 * (top + bottom)))
+
+
+def floor_and_foot(
+    case: Case, geometries: Sequence[KneeGeometry], frames: Sequence[int]
+) -> tuple[tuple[Solid, ...], tuple[Marker, ...]]:
+    """Return floor and foot, and the centre of pressure; nothing without a force plate.
+
+    Args:
+        case: the case.
+        geometries: of the frames.
+        frames: of the motion.
+    """
+    table = case.scene.ground_reaction
+    if case.ground is None or case.tibia is None or table is None or table.applied == "ankle":
+        return (), ()
+    floor = float(np.median(case.ground.point[:, 1]))
+    tibias = case.tibia.pose[list(frames)]
+    grounds = np.stack(
+        [_floor_pose(one, tibia, floor) for one, tibia in zip(geometries, tibias, strict=True)]
     )
-    return surface.moved(pose(turn, 0.5 * (top + bottom)))
+    lowest = float((tibias[:, 1, 3] - floor).min())
+    feet = grounds.copy()
+    feet[:, :3, 3] += (tibias[:, 1, 3] - floor - lowest)[:, None] * grounds[:, :3, 1]
+    plate = Solid("floor", "floor", _floor_surface(), FLOOR, 0.6, grounds)
+    foot = Solid("foot", "bones", _foot_surface(lowest), BONE, 1.0, feet)
+    points = np.stack([centre_of_pressure(one) for one in geometries])
+    marker = Marker("centre of pressure", "floor", BLACK, points, 5.0 * MILLIMETRE)
+    return (plate, foot), (marker,)
+
+
+def _floor_pose(geometry: KneeGeometry, tibia_in_laboratory: Array, floor: float) -> Array:
+    """Return the pose (4, 4) in the insert frame of the floor under the ankle, y up."""
+    laboratory = geometry.state.pose("tibia") @ inverse(tibia_in_laboratory)
+    up = laboratory[:3, 1]
+    ahead = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    ahead /= np.linalg.norm(ahead)
+    below = tibia_in_laboratory[:3, 3].copy()
+    below[1] = floor
+    axes = np.column_stack([ahead, up, np.cross(ahead, up)])
+    return pose(axes, transform(laboratory, below))
+
+
+def _floor_surface() -> Surface:
+    box = trimesh.creation.box(PLATE)
+    box.apply_translation([PLATE_CENTRE, -0.5 * PLATE[1], 0.0])
+    return _surface(box, "floor")
+
+
+def _foot_surface(height: float) -> Surface:
+    """Return a foot whose ankle is `height` (m) above the sole."""
+    ankle = (0.0, height / MILLIMETRE, 0.0, ANKLE_RADIUS)
+    parts = [_hull((*SOLE, INSTEP)), _hull((INSTEP, ankle))]
+    return _surface(parts[0] + parts[1], "foot")
+
+
+def _hull(balls: Sequence[tuple[float, ...]]) -> trimesh.Trimesh:
+    """Return the hull of balls: centre and radius in mm."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    points = [ball.vertices * radius + centre for *centre, radius in balls]
+    return trimesh.convex.convex_hull(np.concatenate(points) * MILLIMETRE)
+
+
+def _surface(mesh: trimesh.Trimesh, name: str) -> Surface:
+    return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64), name)

@@ -7,11 +7,10 @@ import numpy as np
 
 from tkamb.body.chain import ChainState
 from tkamb.body.wrapping import TautPath
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
-from tkamb.mechanics.mechanics import Mechanics
 from tkamb.output.metrics import stretches
 from tkamb.output.style import SIDE_COLOURS
 from tkamb.units import MILLIMETRE
@@ -34,7 +33,7 @@ def ligament_strands(
     bundles = mechanics.ligaments
     if not bundles:
         return (), 0.0
-    links = {link for one in bundles for link in (one.proximal_link, one.distal_link)}
+    links = {link for one in bundles for link in (one.proximal.link, one.distal.link)}
     poses = {link: np.stack([state.pose(link) for state in states]) for link in links}
     strains = [one.strain(one.length(poses)) for one in bundles]
     limit = max(float(np.nanmax(strains)), 0.01)
@@ -48,7 +47,7 @@ def ligament_strands(
 
 
 def extensor_strands(mechanics: Mechanics, states: Sequence[ChainState]) -> tuple[Strand, ...]:
-    """Return quadriceps and patellar ligament, the part that lies on the bone in another colour."""
+    """Return muscle and patellar ligament, the part that lies on the bone in another colour."""
     extensor = mechanics.extensor
     if extensor is None:
         return ()
@@ -58,20 +57,21 @@ def extensor_strands(mechanics: Mechanics, states: Sequence[ChainState]) -> tupl
             paths.append(extensor.paths(state))
         except ComputationError:
             paths.append((None, None))
-    quadriceps, ligament = (list(found) for found in zip(*paths, strict=True))
-    return _tendon("quadriceps", quadriceps), _tendon("patellar ligament", ligament)
+    muscle, ligament = (list(found) for found in zip(*paths, strict=True))
+    name = extensor.muscle.name.replace("_", " ")
+    return _tendon(name, muscle), _tendon("patellar ligament", ligament)
 
 
 def _tendon(name: str, paths: list[TautPath | None]) -> Strand:
     """Return the strand of a taut path; its corners are doubled where the colour changes."""
-    lines = [_coloured(path) for path in paths]
+    lines = [_colour_path(path) for path in paths]
     most = max(len(points) for points, _ in lines)
     points = np.stack([np.pad(p, ((0, most - len(p)), (0, 0)), mode="edge") for p, _ in lines])
     colours = np.stack([np.pad(c, ((0, most - len(c)), (0, 0)), mode="edge") for _, c in lines])
     return Strand(name, "extensor lines", points, colours, TENDON_RADIUS)
 
 
-def _coloured(path: TautPath | None) -> tuple[Array, Colours]:
+def _colour_path(path: TautPath | None) -> tuple[Array, Colours]:
     """Return points and colours: free, on the bone, free."""
     free, wrapped = rgb(TENDON), rgb(WRAPPED)
     if path is None or not np.isfinite(path.points).all():
@@ -87,7 +87,7 @@ def _coloured(path: TautPath | None) -> tuple[Array, Colours]:
 
 def centres_of_pressure(results: "Results", insert: Surface) -> dict[str, Array]:
     """Return side -> (f, 3) m, on the undeformed insert; NaN beside it."""
-    rays, top = RayCaster(insert), float(insert.bounds[1, 1]) + MILLIMETRE
+    rays, top = insert.rays, float(insert.bounds[1, 1]) + MILLIMETRE
     found = {}
     for side in SIDE_COLOURS:
         x, z = (results[f"{side}_cop_{axis}_mm"] * MILLIMETRE for axis in ("ap", "ml"))

@@ -13,12 +13,10 @@ the set starts to cycle, only the worst node changes.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Mask
 
-Mask = NDArray[np.bool_]
 MOST_SETS = 200
 """Sets tried before the search gives up."""
 PATIENCE = 12
@@ -49,7 +47,7 @@ class ContactForces:
 def solve_contact(
     compliance: Array,
     gap: Array,
-    lean: Array,
+    normal_y: Array,
     load: float | None,
     active: Mask,
     approach: float = 0.0,
@@ -59,7 +57,7 @@ def solve_contact(
     Args:
         compliance: A (n, n), m/N.
         gap: (n,) m at zero force and approach.
-        lean: c (n,), y of the femoral normals, negative.
+        normal_y: c (n,), y of the femoral normals, negative.
         load: N along -y, or None when the approach is given.
         active: (n,) first guess of the nodes in contact.
         approach: m, used when the load is None.
@@ -70,9 +68,9 @@ def solve_contact(
     careful = False
     while True:
         if load is not None and not active.any():
-            active[np.argmin(gap / -lean)] = True
-        force, depth = _forces_of(compliance, gap, lean, load, active, approach)
-        opening = gap + compliance @ force + depth * lean
+            active[np.argmin(gap / -normal_y)] = True
+        force, depth = _forces_of(compliance, gap, normal_y, load, active, approach)
+        opening = gap + compliance @ force + depth * normal_y
         opening[active] = 0.0
         count += 1
         scale = 1e-12 * max(float(np.abs(force).max(initial=0)), 1e-300)
@@ -102,7 +100,12 @@ def _next_set(
 
 
 def _forces_of(
-    compliance: Array, gap: Array, lean: Array, load: float | None, active: Mask, approach: float
+    compliance: Array,
+    gap: Array,
+    normal_y: Array,
+    load: float | None,
+    active: Mask,
+    approach: float,
 ) -> tuple[Array, float]:
     """Return forces (n,) and approach that close the gap of the active nodes."""
     force = np.zeros(len(gap))
@@ -110,12 +113,12 @@ def _forces_of(
         return force, approach
     chosen = np.flatnonzero(active)
     among = compliance[chosen[:, None], chosen]
-    right = np.column_stack([-gap[chosen], -lean[chosen]])
+    right = np.column_stack([-gap[chosen], -normal_y[chosen]])
     *_, solved, failed = dposv(among, right, lower=True)
     if failed:
         raise np.linalg.LinAlgError("the compliance of the nodes in contact is singular")
     closing, per_depth = solved.T
     if load is not None:
-        approach = (load + lean[active] @ closing) / -(lean[active] @ per_depth)
+        approach = (load + normal_y[active] @ closing) / -(normal_y[active] @ per_depth)
     force[active] = closing + approach * per_depth
     return force, float(approach)

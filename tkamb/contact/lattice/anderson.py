@@ -35,4 +35,4 @@ class AndersonMixer:
         gram = differences @ differences.T
         gram[np.diag_indices(len(gram))] *= 1 + 1e-12
         weights = np.linalg.lstsq(gram, differences @ residual, rcond=1e-14)[0]
-        return np.asarray(value - weights @ np.stack(self._values))
+        return value - weights @ np.stack(self._values)

@@ -1,76 +1,52 @@
 """Contact models on a lattice of cells: the contract's prepare, evaluate and press."""
 
 from abc import abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.contact.lattice.cache import cached_operator
-from tkamb.contact.lattice.candidates import ResponsePool, choose_start, guessed_depth
-from tkamb.contact.lattice.femoral import FemoralFloor
-from tkamb.contact.lattice.grid import Lattice, build_grid
-from tkamb.contact.lattice.memory import Memory, Remembered
-from tkamb.contact.lattice.memory_need import TooLittleMemoryError, check_assembly_memory
+from tkamb.contact.lattice.flags import unseen_flags
+from tkamb.contact.lattice.initial_guess import (
+    InitialGuess,
+    WarmStart,
+    guessed_depth,
+    initial_guess,
+)
+from tkamb.contact.lattice.linear.cache import cached_operator
+from tkamb.contact.lattice.linear.compliance import ComplianceCache
+from tkamb.contact.lattice.linear.memory_need import TooLittleMemoryError, check_assembly_memory
+from tkamb.contact.lattice.linear.operator import ElasticOperator, fixed_unknowns, prepare_operator
+from tkamb.contact.lattice.linear.response import SINGLE
+from tkamb.contact.lattice.meshing.contact_map import contact_map
+from tkamb.contact.lattice.meshing.grid import Lattice, build_grid
 from tkamb.contact.lattice.newton import solve_by_newton
-from tkamb.contact.lattice.operator import ElasticOperator, fixed_unknowns, prepare_operator
-from tkamb.contact.lattice.pressure_map import ContactMap, contact_map
-from tkamb.contact.lattice.problem import ContactProblem, Direction, Footing, undeformed
-from tkamb.contact.lattice.report import PressureRule, result_of, unseen_flags, untouched
-from tkamb.contact.lattice.response import SINGLE
-from tkamb.contact.lattice.solid import Solid
-from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve
-from tkamb.contact.materials import Material
+from tkamb.contact.lattice.problem import (
+    ContactProblem,
+    Direction,
+    LatticeState,
+    SurfaceFromBelow,
+    TangentPlanes,
+    undeformed,
+)
+from tkamb.contact.lattice.report import PressureRule, result_of
+from tkamb.contact.lattice.solids.bbar import BbarHexahedra
+from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
+from tkamb.contact.lattice.solids.solid import Solid
+from tkamb.contact.lattice.solver import Solution, Tolerance, solve
+from tkamb.contact.materials import LinearElastic, Material
 from tkamb.contact.model import ContactModel
-from tkamb.contact.pair import ContactPair, PreparedContact
-from tkamb.contact.pressing import check_load, failed_result, pose_at_approach, within_insert
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.pressing import check_load, within_insert
 from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError, InputError
-from tkamb.geometry.condyles import condyle_split
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.units import MILLIMETRE
 
 MOST_GROWTHS = 8
 """How often the candidate set may grow before it counts as saturated."""
 REACH = 1.08
 """Candidates must cover this many times the approach that was found."""
-
-
-@dataclass(frozen=True, eq=False)
-class LatticeState(PreparedContact):
-    """What depends on geometry and material alone.
-
-    Args:
-        pair: the two bodies.
-        lattice: the insert's grid.
-        problem: solid, factorised operator and femoral component.
-        map: contact surface.
-        split: z between the condyles in the femoral frame, m, or None.
-    """
-
-    pair: ContactPair
-    lattice: Lattice
-    problem: ContactProblem
-    map: ContactMap
-    split: float | None
-    pool: ResponsePool
-    memory: Memory = field(default_factory=Memory)
-
-    @property
-    def points(self) -> Array:  # type: ignore[override]
-        """Map points (n, 3) m, insert frame: the undeformed contact nodes."""
-        return self.map.points
-
-    @property
-    def triangles(self) -> NDArray[np.int64]:  # type: ignore[override]
-        """Map triangles (k, 3)."""
-        return self.map.triangles
-
-    @property
-    def node_count(self) -> int:
-        """Nodes of the grid."""
-        return len(self.lattice.nodes)
 
 
 @dataclass(frozen=True)
@@ -86,9 +62,9 @@ class CellContact(ContactModel):
         tolerance: largest out-of-balance force relative to the contact force, and largest
             distance of an active node from the femoral surface relative to its displacement.
         pressure_rule: "tributary" (force over the node's own area) or "source" (force over
-            total area by number of nodes, section 4.5.6 of the source).
+            total area by number of nodes, Sharma 2008, section 4.5.6).
         newton: solve by full Newton steps (slow; the reference).
-        cache: keep prepared operators on disk, see `tkamb.contact.lattice.cache`.
+        cache: keep prepared operators on disk, see `tkamb.contact.lattice.linear.cache`.
     """
 
     resolution: float = 1e-3
@@ -111,20 +87,19 @@ class CellContact(ContactModel):
         held = fixed_unknowns(lattice.nodes, lattice.bottom_nodes, pair.bearing)
         nodes, surface = contact_map(lattice, pair.insert)
         operator = self._operator(solid, lattice, held, nodes)
-        floor = FemoralFloor(pair.femoral, pair.femoral_rays)
+        femoral = SurfaceFromBelow(pair.femoral, pair.femoral.rays)
         problem = ContactProblem(
-            solid, operator, lattice.index, held, floor, self.direction, surface.lift
+            solid, operator, lattice.index, held, femoral, self.direction, surface.lift
         )
         _rehearse(problem, pair)
-        pool = ResponsePool(operator.half)
-        return LatticeState(pair, lattice, problem, surface, condyle_split(pair.femoral), pool)
+        return LatticeState(pair, surface, lattice, problem, ComplianceCache(operator.half))
 
     def _operator(
         self,
         solid: Solid,
         lattice: Lattice,
-        held: NDArray[np.bool_],
-        nodes: NDArray[np.int64],
+        held: Mask,
+        nodes: Index,
     ) -> ElasticOperator:
         """Return the operator, from disk if it was made before.
 
@@ -154,12 +129,12 @@ class CellContact(ContactModel):
         """Return the contact at a pose; see `ContactModel`."""
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
-            return failed_result(state, pose, "the pose is not finite")
-        gaps, foot = undeformed(state.problem, pose)
+            return ContactResult.failed(state, pose, "the pose is not finite")
+        gaps, planes = undeformed(state.problem, pose)
         deepest = -float(gaps.min())
         if deepest <= 0:
-            return untouched(state, pose, gaps)
-        return self._solved(state, pose, None, (gaps, foot), deepest, guess)
+            return ContactResult.of(state, pose, np.zeros(len(gaps)), gaps)
+        return self._solved(state, pose, None, (gaps, planes), deepest, guess)
 
     def press(
         self, state: LatticeState, load: float, pose: Array, guess: ContactResult | None = None
@@ -168,31 +143,34 @@ class CellContact(ContactModel):
         check_load(load)
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
-            return failed_result(state, pose, "the pose is not finite")
-        gaps, foot = undeformed(state.problem, pose)
+            return ContactResult.failed(state, pose, "the pose is not finite")
+        gaps, planes = undeformed(state.problem, pose)
         lowest = float(gaps.min())
         if not np.isfinite(lowest):
-            return failed_result(state, pose, "the femoral component does not lie over the insert")
+            return ContactResult.failed(
+                state, pose, "the femoral component does not lie over the insert"
+            )
         if load == 0:
-            pose = pose_at_approach(state.pair, pose, 0.0)
-            return untouched(state, pose, undeformed(state.problem, pose)[0])
+            pose = state.pair.pose_at_approach(pose, 0.0)
+            gaps, _ = undeformed(state.problem, pose)
+            return ContactResult.of(state, pose, np.zeros(len(gaps)), gaps)
         pose[1, 3] -= lowest
-        gaps, foot = gaps - lowest, foot.raised(-lowest)
-        earlier = state.memory.of(guess)
-        if earlier is not None:
-            depth = earlier.depth
+        gaps, planes = gaps - lowest, planes.raised(-lowest)
+        warm = warm_start_of(state, guess)
+        if warm is not None:
+            depth = warm.depth
         elif guess is not None and guess.approach > 0:
             depth = guess.approach
         else:
-            depth = guessed_depth(state.problem, gaps, state.map.area, load)
-        return self._solved(state, pose, load, (gaps, foot), depth, guess)
+            depth = guessed_depth(state.problem, gaps, state.surface.area, load)
+        return self._solved(state, pose, load, (gaps, planes), depth, guess)
 
     def _solved(
         self,
         state: LatticeState,
         pose: Array,
         load: float | None,
-        rest: tuple[Array, Footing],
+        rest: tuple[Array, TangentPlanes],
         depth: float,
         guess: ContactResult | None,
     ) -> ContactResult:
@@ -200,62 +178,117 @@ class CellContact(ContactModel):
 
         `rest` is what `undeformed` says at the pose.
         """
-        gaps, foot = rest
+        gaps, planes = rest
         tolerance = Tolerance(self.tolerance)
-        earlier = state.memory.of(guess)
-        touched = None if guess is None else guess.pressure > 0
+        warm = warm_start_of(state, guess)
+        touched = guess.pressure > 0 if guess and len(guess.pressure) == len(gaps) else None
         for _ in range(MOST_GROWTHS):
-            start = choose_start(state.pool, gaps, foot, depth, load is None, touched, earlier)
-            problem = self._posed(state.problem, gaps, start)
-            solution = self._solution(problem, pose, load, start, tolerance)
+            start = initial_guess(
+                state.compliance, gaps, planes, depth, load is None, touched, warm
+            )
+            solution = self._solution(state.problem, pose, load, start, tolerance)
             covered = load is None or len(start.candidates) == np.isfinite(gaps).sum()
             below = -min(float(gaps.min()), 0.0)
             reached = solution.forces.approach * REACH + below
             if solution.converged:
-                moved = np.zeros_like(state.map.points)
+                moved = np.zeros_like(state.surface.points)
                 moved[solution.candidates] = solution.displacement
                 below += solution.forces.approach
-                earlier = Remembered(solution.lost, moved, below, solution.region)
+                warm = WarmStart(
+                    state.problem, solution.nonlinear_residual, moved, below, solution.region
+                )
             if covered or reached <= start.reach:
                 result = result_of(state, pose, load, gaps, solution, self.pressure_rule)
                 if load is not None:
                     sunk = solution.forces.approach + max(-float(gaps.min()), 0.0)
                     result = within_insert(state, result, *unseen_flags(state, result, sunk))
-                if solution.converged and earlier is not None:
-                    state.memory.keep(result, earlier)
-                return result
+                return replace(result, warm_start=warm) if solution.converged else result
             depth, touched = 1.1 * solution.forces.approach, None
-        return failed_result(state, pose, "the set of candidate nodes is saturated")
-
-    def _posed(self, problem: ContactProblem, gaps: Array, start: Start) -> ContactProblem:
-        """Return the problem as it is solved at one pose; gaps (c,) are vertical, m."""
-        return problem
+        return ContactResult.failed(state, pose, "the set of candidate nodes is saturated")
 
     def _solution(
         self,
         problem: ContactProblem,
         pose: Array,
         load: float | None,
-        start: Start,
+        guess: InitialGuess,
         tolerance: Tolerance,
     ) -> Solution:
         """Solve by the stored response; by Newton's method when that does not converge."""
         if self.newton:
-            return solve_by_newton(problem, pose, load, start, tolerance)
-        solution = solve(problem, pose, load, start, tolerance)
+            return solve_by_newton(problem, pose, load, guess, tolerance)
+        solution = solve(problem, pose, load, guess, tolerance)
         if solution.converged or problem.solid.material.is_linear:
             return solution
         try:
-            return solve_by_newton(problem, pose, load, start, tolerance, solution.field)
+            return solve_by_newton(problem, pose, load, guess, tolerance, solution.field)
         except ComputationError:
             return solution
+
+
+@dataclass(frozen=True)
+class CalibratedLattice(CellContact):
+    """The calibrated lattice: exact in the uniform-strain patch, any Poisson's ratio.
+
+    28 springs per cell weighted by the share of the cells that own them plus a cell volume
+    term; nonlinear by one secant shear modulus per cell (J2 deformation theory, elastic
+    bulk) from the material's curve, fed with small strain. See docs/lattice.md.
+    """
+
+    name: ClassVar[str] = "lattice"
+    assumes: ClassVar[str] = (
+        "a spring lattice calibrated to E, nu and the stress-strain curve; small strain, "
+        "no friction"
+    )
+    needs: ClassVar[str] = "a closed insert; seconds to prepare, then tenths of a second"
+
+    def solid(self, lattice: Lattice, material: Material) -> Solid:
+        """Return the calibrated network."""
+        return CalibratedNetwork(lattice.nodes, lattice.cells, lattice.spacing, material)
+
+
+@dataclass(frozen=True)
+class LinearLattice(CellContact):
+    """The calibrated lattice with Hooke's law: contact condensed to the surface nodes."""
+
+    name: ClassVar[str] = "lattice-linear"
+    assumes: ClassVar[str] = "a spring lattice calibrated to E and nu; linear, no friction"
+    needs: ClassVar[str] = "a closed insert; seconds to prepare, then milliseconds"
+
+    def solid(self, lattice: Lattice, material: Material) -> Solid:
+        """Return the calibrated network with the material's E and nu alone."""
+        linear = replace(material, law=LinearElastic())
+        return CalibratedNetwork(lattice.nodes, lattice.cells, lattice.spacing, linear)
+
+
+@dataclass(frozen=True)
+class FiniteElements(CellContact):
+    """B-bar hexahedra (mean dilatation), J2 deformation theory at eight Gauss points.
+
+    Grid, active set and pressure rules are those of the lattice; small strain.
+    """
+
+    name: ClassVar[str] = "fe"
+    assumes: ClassVar[str] = "finite elements (B-bar hexahedra) with J2 deformation theory"
+    needs: ClassVar[str] = "a closed insert; seconds to prepare, then tenths of a second"
+
+    def solid(self, lattice: Lattice, material: Material) -> Solid:
+        """Return the hexahedra."""
+        return BbarHexahedra(lattice.nodes, lattice.cells, lattice.spacing, material)
+
+
+def warm_start_of(state: LatticeState, guess: ContactResult | None) -> WarmStart | None:
+    """Return where the solver may begin; None unless the guess is a result of this state."""
+    warm = None if guess is None else guess.warm_start
+    mine = isinstance(warm, WarmStart) and warm.problem is state.problem
+    return warm if mine else None
 
 
 def _rehearse(problem: ContactProblem, pair: ContactPair) -> None:
     """Have built now what the first rays and the first look at the cells would build."""
     undeformed(problem, np.eye(4))
-    pair.first_touch.travel(np.eye(4))
+    pair.touch_at(np.eye(4))
     if not problem.solid.material.is_linear:
         still = np.zeros_like(problem.solid.nodes)
-        problem.solid.lost(still)
+        problem.solid.nonlinear_residual(still)
         problem.solid.least_principal_strain(still)

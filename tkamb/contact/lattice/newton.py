@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from tkamb.contact.lattice.active_set import ContactForces
-from tkamb.contact.lattice.operator import prepare_operator
-from tkamb.contact.lattice.problem import ContactProblem, Footing, Indices, Mask
-from tkamb.contact.lattice.response import ContactResponse
-from tkamb.contact.lattice.sliding import SlidingNodes
-from tkamb.contact.lattice.solver import Solution, Start, Tolerance, solve_pass
+from tkamb.contact.lattice.initial_guess import InitialGuess
+from tkamb.contact.lattice.linear.compliance import ContactResponse
+from tkamb.contact.lattice.linear.operator import prepare_operator
+from tkamb.contact.lattice.problem import ContactProblem, TangentPlanes
+from tkamb.contact.lattice.solver import SlidingNodes, Solution, Tolerance, solve_pass
 from tkamb.errors import ComputationError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 
 MOST_STEPS = 30
 
@@ -24,7 +24,7 @@ def solve_by_newton(
     problem: ContactProblem,
     pose: Array,
     load: float | None,
-    start: Start,
+    guess: InitialGuess,
     tolerance: Tolerance,
     field: Array | None = None,
 ) -> Solution:
@@ -34,38 +34,38 @@ def solve_by_newton(
         problem: solid, boundary and femoral component.
         pose: (4, 4) pose_femoral_in_insert.
         load: N along -y, or None.
-        start: candidates and first active set; its compliance is not used.
+        guess: candidates and first active set; its compliance is not used.
         tolerance: of force and femoral surface; its number of passes is not used.
         field: (n, 3) m, where to start; at rest by default.
 
     Raises:
         ComputationError: the tangent is not positive definite, or numbers overflow.
     """
-    solid, nodes = problem.solid, problem.contact_nodes[start.candidates]
-    points = problem.surface_points[start.candidates]
+    solid, nodes = problem.solid, problem.contact_nodes[guess.candidates]
+    points = problem.surface_points[guess.candidates]
     u = np.zeros_like(solid.nodes) if field is None else field
-    active, step, last, steps = start.active, 1.0, np.inf, 0
-    sliding = SlidingNodes(problem, points, u[nodes], pose, start.foot)
+    active, step, last, steps = guess.active, 1.0, np.inf, 0
+    sliding = SlidingNodes(problem, points, u[nodes], pose, guess.planes)
     while True:
         steps += 1
-        foot = sliding.foot
-        u_full, forces = _step(problem, nodes, points, u, foot, load, active)
+        planes = sliding.planes
+        u_full, forces = _step(problem, nodes, points, u, planes, load, active)
         u = u + step * (u_full - u)
         active = forces.active
-        residual = _imbalance(problem, nodes, u, forces.force[:, None] * foot.normals)
+        residual = _imbalance(problem, nodes, u, forces.force[:, None] * planes.normals)
         missed = sliding.follow(u[nodes], forces)
         done = not active.any() or max(residual, missed) <= tolerance.force
         if done or steps == MOST_STEPS:
             forces = replace(forces, converged=done and forces.converged)
-            lost = solid.correction(u)
-            lost[problem.held.reshape(-1, 3)] = 0.0
+            h = solid.residual_force(u)
+            h[problem.held.reshape(-1, 3)] = 0.0
             return Solution(
-                start.candidates, forces, foot, u[nodes], u, lost, steps, max(residual, missed)
+                guess.candidates, forces, planes, u[nodes], u, h, steps, max(residual, missed)
             )
         step, last = 0.5 if residual > 2 * last else 1.0, residual
 
 
-def _imbalance(problem: ContactProblem, nodes: Indices, u: Array, force: Array) -> float:
+def _imbalance(problem: ContactProblem, nodes: Index, u: Array, force: Array) -> float:
     """Return what is out of balance at u (n, 3) under forces (m, 3) on nodes, relative to them."""
     outside = -problem.solid.internal_force(u)
     outside[nodes] += force
@@ -78,10 +78,10 @@ def _imbalance(problem: ContactProblem, nodes: Indices, u: Array, force: Array) 
 
 def _step(
     problem: ContactProblem,
-    nodes: Indices,
+    nodes: Index,
     points: Array,
     u: Array,
-    foot: Footing,
+    planes: TangentPlanes,
     load: float | None,
     active: Mask,
 ) -> tuple[Array, ContactForces]:
@@ -90,7 +90,7 @@ def _step(
     operator = prepare_operator(solid.tangent(u), problem.index, problem.held, nodes)
     relaxed = u - operator.solve(solid.internal_force(u))
     response = ContactResponse.of(operator.half)
-    forces, _ = solve_pass(response, relaxed[nodes], points, foot, load, active)
+    forces, _ = solve_pass(response, relaxed[nodes], points, planes, load, active)
     pushed = np.zeros_like(u)
-    pushed[nodes] = forces.force[:, None] * foot.normals
+    pushed[nodes] = forces.force[:, None] * planes.normals
     return relaxed + operator.solve(pushed), forces

@@ -1,59 +1,22 @@
 """From a solution of the lattice to the contract's result: pressures, sums, flags."""
 
-from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.contact.lattice.coarse import beside, coarse_flags
-from tkamb.contact.lattice.covered import covered_areas
-from tkamb.contact.lattice.edges import edge_flags
-from tkamb.contact.lattice.problem import STEEPEST, Indices, footing
+from tkamb.contact.area import covered_areas
+from tkamb.contact.lattice.flags import strain_flags, unresolved_flags, unsettled_flag
+from tkamb.contact.lattice.problem import LEAST_NORMAL_Y, LatticeState, tangent_planes
 from tkamb.contact.lattice.solver import Solution
-from tkamb.contact.pressing import approach_at, failed_result
 from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.contact.summary import medial_points, summarise_condyles, wrench_of
-from tkamb.contact.validity import HALF, peak_flags
-from tkamb.geometry.frames import Array
-from tkamb.units import MILLIMETRE
+from tkamb.geometry.frames import Array, Index, Mask
 
-if TYPE_CHECKING:
-    from tkamb.contact.lattice.model import LatticeState
-
-Mask = NDArray[np.bool_]
 PressureRule = Literal["tributary", "source"]
-
-STRAIN_FLAG = -0.4
-"""Principal strain below which a result is flagged: the law has no barrier at -100 %."""
-MOST_UNSEEN = 0.2e-3
-"""m; a node of a 3 mm cell misses the bottom of a ball of 15 mm by 0.15 mm."""
-COLLAPSE = -1.0
-"""Principal strain at which a cell is compressed to nothing: out of range."""
-
-
-def untouched(state: "LatticeState", pose: Array, gaps: Array) -> ContactResult:
-    """Return a result without contact; gaps (c,) are vertical, m."""
-    nothing = np.zeros(len(gaps))
-    return ContactResult(
-        pose=pose,
-        points=state.map.points,
-        normals=state.map.normals,
-        pressure=nothing,
-        area=state.map.area,
-        gap=gaps,
-        nodal_force=np.zeros((len(gaps), 3)),
-        wrench_on_insert=np.zeros(6),
-        medial=None,
-        lateral=None,
-        approach=0.0,
-    )
 
 
 def result_of(
-    state: "LatticeState",
+    state: LatticeState,
     pose: Array,
     load: float | None,
     gaps: Array,
@@ -74,57 +37,32 @@ def result_of(
     pose = pose.copy()
     pose[1, 3] -= depth
     if solution.field is not None and not np.isfinite(solution.field).all():
-        return failed_result(state, pose, "the solver left the range of numbers")
-    flags, collapsed = _strain_flags(state, solution)
+        return ContactResult.failed(state, pose, "the solver left the range of numbers")
+    flags, collapsed = strain_flags(state, solution)
     if collapsed:
-        return failed_result(state, pose, *flags)
+        return ContactResult.failed(state, pose, *flags)
     if not solution.converged:
-        flags = (*flags, _unsettled(solution))
-    carried = _carried(state, pose, gaps - depth, solution, rule)
-    return replace(
-        carried,
-        status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
-        iterations=solution.passes,
-        residual=solution.residual,
-        flags=(*flags, *_peak_flags(state, carried)),
-        approach=partial(approach_at, state.pair, pose),  # type: ignore[arg-type]
-    )
-
-
-def _carried(
-    state: "LatticeState", pose: Array, gaps: Array, solution: Solution, rule: PressureRule
-) -> ContactResult:
-    """Return the map and its sums; gaps (c,) are those of the undeformed insert at the pose."""
-    surface = state.map
-    force, pressure, stood_on = _pressures(state, gaps, solution, rule)
-    gap = _gaps(state, pose, gaps, force, solution)
-    area = stood_on
+        flags = (*flags, unsettled_flag(solution))
+    force, pressure, area = _pressures(state, gaps - depth, solution, rule)
+    gap = _gaps(state, pose, gaps - depth, force, solution)
+    surface, covered = state.surface, area
     if rule == "tributary":
-        area = covered_areas(
+        covered = covered_areas(
             surface.points, surface.triangles, surface.triangle_area,
             pressure, gap, state.pair.material,
         )  # fmt: skip
-    medial, lateral = summarise_condyles(
-        medial_points(surface.points, pose, state.split),
-        surface.points, pressure, area, force, surface.thickness,
+    result = ContactResult.of(
+        state, pose, pressure, gap, force, area, covered,
+        status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
+        iterations=solution.passes,
+        residual=solution.residual,
+        flags=flags,
     )  # fmt: skip
-    return ContactResult(
-        pose=pose,
-        points=surface.points,
-        normals=surface.normals,
-        pressure=pressure,
-        area=stood_on,
-        gap=gap,
-        nodal_force=force,
-        wrench_on_insert=wrench_of(surface.points, force),
-        medial=medial,
-        lateral=lateral,
-        approach=0.0,
-    )
+    return replace(result, flags=(*result.flags, *unresolved_flags(state, result)))
 
 
 def _pressures(
-    state: "LatticeState", gaps: Array, solution: Solution, rule: PressureRule
+    state: LatticeState, gaps: Array, solution: Solution, rule: PressureRule
 ) -> tuple[Array, Array, Array]:
     """Return nodal forces (c, 3), pressures (c,) and the areas (c,) they stand on.
 
@@ -134,18 +72,16 @@ def _pressures(
         solution: what the solver found.
         rule: how a nodal force becomes a pressure.
     """
-    force, size = np.zeros_like(state.map.points), np.zeros(len(gaps))
-    force[solution.candidates] = solution.forces.force[:, None] * solution.footing.normals
+    force, size = np.zeros_like(state.surface.points), np.zeros(len(gaps))
+    force[solution.candidates] = solution.forces.force[:, None] * solution.planes.normals
     size[solution.candidates] = solution.forces.force
     area = _areas(state, gaps, size > 0, rule)
     if rule == "source":
-        size = np.maximum(-np.einsum("ij,ij->i", force, state.map.normals), 0.0)
+        size = np.maximum(-np.einsum("ij,ij->i", force, state.surface.normals), 0.0)
     return force, size / area, area
 
 
-def _gaps(
-    state: "LatticeState", pose: Array, gaps: Array, force: Array, solution: Solution
-) -> Array:
+def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution: Solution) -> Array:
     """Return the gaps (c,), m: of the deformed insert in and beside the contact and where the
     undeformed bodies overlap, of the undeformed one elsewhere.
 
@@ -160,7 +96,7 @@ def _gaps(
         solution: what the solver found.
     """
     loaded: Mask = np.asarray(force.any(axis=1), bool)
-    close = beside(state.map.triangles, loaded) | loaded | (gaps < 0)
+    close = beside(state.surface.triangles, loaded) | loaded | (gaps < 0)
     own = solution.candidates[close[solution.candidates]]
     gap = gaps.copy()
     gap[own] = solution.forces.gap[close[solution.candidates]]
@@ -172,7 +108,7 @@ def _gaps(
 
 
 def _gaps_of_others(
-    state: "LatticeState", pose: Array, nodes: Indices, force: Array, solution: Solution
+    state: LatticeState, pose: Array, nodes: Index, force: Array, solution: Solution
 ) -> Array:
     """Return the gaps (m,), m, of deformed nodes that are no candidates; inf: nothing above."""
     problem = state.problem
@@ -180,75 +116,26 @@ def _gaps_of_others(
         moved = solution.field[problem.contact_nodes[nodes]]
     else:
         pushed = np.flatnonzero(force.any(axis=1))
-        moved = state.pool.moved(nodes, pushed, force[pushed])
+        moved = state.compliance.moved(nodes, pushed, force[pushed])
     positions = problem.surface_points[nodes] + moved
-    foot = footing(problem, positions, pose, None)
-    return np.where(foot.lean < STEEPEST, foot.gap(positions), np.inf)
+    planes = tangent_planes(problem, positions, pose, None)
+    return np.where(planes.normal_y < LEAST_NORMAL_Y, planes.gap(positions), np.inf)
 
 
-def _areas(state: "LatticeState", gaps: Array, loaded: Mask, rule: PressureRule) -> Array:
+def _areas(state: LatticeState, gaps: Array, loaded: Mask, rule: PressureRule) -> Array:
     """Return the area (c,) that each node's force stands on, m².
 
-    The source's rule: area that overlaps the undeformed insert, shared evenly by the nodes in
+    Sharma's rule: area that overlaps the undeformed insert, shared evenly by the nodes in
     contact; the pressure is then the force along the insert's normal over it.
     """
     if rule == "tributary" or not loaded.any():
-        return state.map.area
-    overlap = float(state.map.area[gaps < 0].sum())
-    return np.where(loaded, overlap / loaded.sum(), state.map.area)
+        return state.surface.area
+    overlap = float(state.surface.area[gaps < 0].sum())
+    return np.where(loaded, overlap / loaded.sum(), state.surface.area)
 
 
-def _peak_flags(state: "LatticeState", carried: ContactResult) -> tuple[str, ...]:
-    """Return the flags of peaks that the cells do not resolve."""
-    medial = medial_points(carried.points, carried.pose, state.split)
-    sides = {"medial": medial, "lateral": ~medial}
-    pressures = {side: np.where(own, carried.pressure, 0.0) for side, own in sides.items()}
-    peaks = {
-        side: carried.points[np.argmax(pressure)]
-        for side, pressure in pressures.items()
-        if pressure.max(initial=0.0) > 0.0
-    }
-    floor, spacing = state.problem.floor, state.lattice.spacing
-    return (
-        *peak_flags(carried.medial, carried.lateral),
-        *coarse_flags(state.map.triangles, carried.pressure > 0, sides),
-        *edge_flags(floor, carried.pose, spacing, peaks),
-    )
-
-
-def _unsettled(solution: Solution) -> str:
-    """Return in words how far a solution that has not converged is from rest."""
-    return (
-        f"the solver has not converged: {100 * solution.residual:.2g} % of the force or of the way "
-        f"to the femoral surface is left after {solution.passes} passes; is the femoral mesh rough?"
-    )
-
-
-def unseen_flags(state: "LatticeState", result: ContactResult, depth: float) -> Iterator[str]:
-    """Yield a flag where much of the approach is seen by no node.
-
-    Args:
-        state: prepared contact.
-        result: of a press.
-        depth: m, how far the femoral component went below the first contact node.
-    """
-    unseen = result.approach - depth
-    if unseen > max(MOST_UNSEEN, HALF * result.approach):
-        yield (
-            f"the meshes first touch {unseen / MILLIMETRE:.2g} mm before any node does (cells of "
-            f"{state.lattice.spacing.max() / MILLIMETRE:.2g} mm); the approach counts from there: "
-            "is there a spike or a ridge in a mesh?"
-        )
-
-
-def _strain_flags(state: "LatticeState", solution: Solution) -> tuple[tuple[str, ...], bool]:
-    """Return the flags and whether the insert is compressed to nothing."""
-    if solution.field is not None:
-        least = state.problem.solid.least_principal_strain(solution.field)
-        kind = "principal strain"
-    else:
-        sunk = solution.displacement[:, 1] / state.map.thickness[solution.candidates]
-        least, kind = float(sunk.min(initial=0.0)), "mean strain of a column"
-    if least <= COLLAPSE:
-        return (f"{kind} {least:.2f}: the insert is compressed to nothing",), True
-    return ((f"{kind} {least:.2f} is below {STRAIN_FLAG}",) if least < STRAIN_FLAG else ()), False
+def beside(triangles: Index, touched: Mask) -> Mask:
+    """Return which nodes (n,) share a triangle with one in contact and are not in contact."""
+    found = np.zeros_like(touched)
+    found[triangles[touched[triangles].any(axis=1)]] = True
+    return found & ~touched

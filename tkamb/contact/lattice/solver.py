@@ -2,33 +2,35 @@
 
 Every pass fires the rays through the displaced contact nodes, solves the unilateral contact
 on the stored compliance of the linear operator (approach included), finds the displacement of
-all nodes, and replaces the forces h that the material has lost against the linear one:
+all nodes, and renews the nonlinear residual h, what the material carries less than the linear
+one:
 
     K u = f_contact + h,    h = K u - f_internal(u)
 
-(`tkamb.contact.lattice.lost_balance`). For a linear material h = 0 and the pass is repeated
-only until the sliding nodes rest.
+h is accelerated by Anderson's method; its change is the out-of-balance force. An element's
+share of h falls with a power of its strain (4.5 for polyethylene), so most of the insert is as
+good as linear: passes look at the `Region` where it counts, and at everything once, at the end.
+For a linear material h = 0 and the pass is repeated only until the sliding nodes rest.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.active_set import ContactForces, solve_contact
-from tkamb.contact.lattice.lost_balance import LostBalance
-from tkamb.contact.lattice.problem import ContactProblem, Footing
-from tkamb.contact.lattice.region import Region
-from tkamb.contact.lattice.response import ContactResponse
-from tkamb.contact.lattice.sliding import SlidingNodes
-from tkamb.geometry.frames import Array
-
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-
+from tkamb.contact.lattice.anderson import AndersonMixer
+from tkamb.contact.lattice.initial_guess import InitialGuess
+from tkamb.contact.lattice.linear.compliance import ContactResponse
+from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes, tangent_planes
+from tkamb.geometry.frames import Array, Index, Mask
 
 DIVERGED = 100.0
 """The iteration is given up when the imbalance is this many times the smallest so far."""
+SHARE = 0.1
+"""What elements left out may add to the imbalance, relative to the tolerance."""
+SLOW = 0.7
+"""When a pass leaves more than this share of the last distance, sliding steps are halved."""
+SMALLEST_SHARE = 0.125
 
 
 @dataclass(frozen=True)
@@ -45,53 +47,28 @@ class Tolerance:
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """Where the iteration starts.
-
-    Args:
-        candidates: (m,) positions among the contact nodes.
-        response: of the candidates to forces on them.
-        active: (m,) first guess of the active set.
-        foot: femoral planes under the undeformed candidates.
-        lost: (n, 3) h, N, of an earlier solution, or None.
-        moved: (m, 3) m, displacement of the candidates in an earlier solution, or None.
-        reach: m, every node with a smaller vertical gap is a candidate.
-        region: outside of which `lost` is zero, or None.
-    """
-
-    candidates: Indices
-    response: ContactResponse
-    active: Mask
-    foot: Footing
-    lost: Array | None = None
-    moved: Array | None = None
-    reach: float = np.inf
-    region: Region | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class Solution:
     """What the iteration found.
 
     Args:
         candidates: (m,) positions among the contact nodes.
         forces: along the normals, with approach and active set.
-        footing: femoral points and normals of the candidates.
+        planes: femoral points and normals of the candidates.
         displacement: (m, 3) of the candidates, m.
         field: (n, 3) displacement of all nodes, or None (linear material).
-        lost: (n, 3) h, N, where another pass would start, or None (linear material).
+        nonlinear_residual: (n, 3) h, N, where another pass would start, or None (linear).
         passes: how many.
         residual: out-of-balance force or distance from the femoral surface, the larger one,
             both relative.
-        region: outside of which `lost` is zero, or None.
+        region: outside of which h is zero, or None.
     """
 
-    candidates: Indices
+    candidates: Index
     forces: ContactForces
-    footing: Footing
+    planes: TangentPlanes
     displacement: Array
     field: Array | None
-    lost: Array | None
+    nonlinear_residual: Array | None
     passes: int
     residual: float
     region: Region | None = None
@@ -102,11 +79,49 @@ class Solution:
         return self.forces.converged
 
 
+def solve(
+    problem: ContactProblem,
+    pose: Array,
+    load: float | None,
+    guess: InitialGuess,
+    tolerance: Tolerance,
+) -> Solution:
+    """Return the contact at a pose under a load (N), or at approach 0 when load is None."""
+    if problem.solid.material.is_linear:
+        return _solve_linear(problem, pose, load, guess, tolerance)
+    chosen, active, passes = guess.candidates, guess.active, 0
+    balance = NonlinearBalance(problem, guess, tolerance.force)
+    points = problem.surface_points[chosen]
+    first = balance.offset if guess.moved is None else guess.moved
+    sliding = SlidingNodes(problem, points, first, pose, guess.planes)
+    best: Solution | None = None
+    while True:
+        passes += 1
+        planes = sliding.planes
+        forces, moved = solve_pass(guess.response, balance.offset, points, planes, load, active)
+        active = forces.active
+        balance.respond(forces.force[:, None] * planes.normals)
+        missed = sliding.follow(moved, forces)
+        if not active.any() or max(balance.residual, missed) <= tolerance.force:
+            balance.look_everywhere()
+        residual = max(balance.residual, missed)
+        done = not active.any() or residual <= tolerance.force
+        forces = replace(forces, converged=done and forces.converged)
+        field, h, region = balance.field, balance.h, balance.region
+        now = Solution(chosen, forces, planes, moved, field, h, passes, residual, region)
+        if done:
+            return now
+        best = now if best is None or residual < best.residual else best
+        if passes == tolerance.passes or not residual < DIVERGED * best.residual:
+            return _given_up(problem, best, passes)
+        balance.advance()
+
+
 def solve_pass(
     response: ContactResponse,
     offset: Array,
     points: Array,
-    foot: Footing,
+    planes: TangentPlanes,
     load: float | None,
     active: Mask,
 ) -> tuple[ContactForces, Array]:
@@ -116,58 +131,21 @@ def solve_pass(
         response: of the candidates.
         offset: (m, 3) their displacement without contact forces.
         points: (m, 3) undeformed.
-        foot: femoral planes.
+        planes: over them.
         load: N, or None for approach 0.
         active: first guess.
     """
-    along, pushed = response.along(foot.normals)
-    forces = solve_contact(along, foot.gap(points + offset), foot.lean, load, active)
+    along, pushed = response.along(planes.normals)
+    forces = solve_contact(along, planes.gap(points + offset), planes.normal_y, load, active)
     return forces, offset + response.moved(pushed, forces.force)
-
-
-def solve(
-    problem: ContactProblem,
-    pose: Array,
-    load: float | None,
-    start: Start,
-    tolerance: Tolerance,
-) -> Solution:
-    """Return the contact at a pose under a load (N), or at approach 0 when load is None."""
-    if problem.solid.material.is_linear:
-        return _solve_linear(problem, pose, load, start, tolerance)
-    chosen, active, passes = start.candidates, start.active, 0
-    balance = LostBalance(problem, start.response, tolerance.force, start.lost, start.region)
-    points = problem.surface_points[chosen]
-    first = balance.offset if start.moved is None else start.moved
-    sliding = SlidingNodes(problem, points, first, pose, start.foot)
-    best: Solution | None = None
-    while True:
-        passes += 1
-        foot = sliding.foot
-        forces, moved = solve_pass(start.response, balance.offset, points, foot, load, active)
-        active = forces.active
-        balance.respond(forces.force[:, None] * foot.normals)
-        missed = sliding.follow(moved, forces)
-        if not active.any() or max(balance.residual, missed) <= tolerance.force:
-            balance.look_everywhere()
-        residual = max(balance.residual, missed)
-        done = not active.any() or residual <= tolerance.force
-        forces = replace(forces, converged=done and forces.converged)
-        field, lost, region = balance.field, balance.lost, balance.region
-        now = Solution(chosen, forces, foot, moved, field, lost, passes, residual, region)
-        if done:
-            return now
-        best = now if best is None or residual < best.residual else best
-        if passes == tolerance.passes or not residual < DIVERGED * best.residual:
-            return _given_up(problem, best, passes)
-        balance.advance()
 
 
 def _given_up(problem: ContactProblem, best: Solution, passes: int) -> Solution:
     """Return the best pass with the displacements of the whole solid."""
-    applied = np.zeros_like(problem.solid.nodes) if best.lost is None else best.lost.copy()
+    h = best.nonlinear_residual
+    applied = np.zeros_like(problem.solid.nodes) if h is None else h.copy()
     applied[problem.contact_nodes[best.candidates]] += (
-        best.forces.force[:, None] * best.footing.normals
+        best.forces.force[:, None] * best.planes.normals
     )
     return replace(best, field=problem.operator.solve(applied), passes=passes)
 
@@ -176,21 +154,173 @@ def _solve_linear(
     problem: ContactProblem,
     pose: Array,
     load: float | None,
-    start: Start,
+    guess: InitialGuess,
     tolerance: Tolerance,
 ) -> Solution:
     """Repeat rays and contact until the sliding nodes rest."""
-    points = problem.surface_points[start.candidates]
-    nothing, active, passes = np.zeros_like(points), start.active, 0
-    first = nothing if start.moved is None else start.moved
-    sliding = SlidingNodes(problem, points, first, pose, start.foot)
+    points = problem.surface_points[guess.candidates]
+    nothing, active, passes = np.zeros_like(points), guess.active, 0
+    first = nothing if guess.moved is None else guess.moved
+    sliding = SlidingNodes(problem, points, first, pose, guess.planes)
     while True:
         passes += 1
-        foot = sliding.foot
-        forces, moved = solve_pass(start.response, nothing, points, foot, load, active)
+        planes = sliding.planes
+        forces, moved = solve_pass(guess.response, nothing, points, planes, load, active)
         active = forces.active
         missed = sliding.follow(moved, forces)
         done = missed <= tolerance.force
         if done or passes == tolerance.passes:
             forces = replace(forces, converged=done and forces.converged)
-            return Solution(start.candidates, forces, foot, moved, None, None, passes, missed)
+            return Solution(guess.candidates, forces, planes, moved, None, None, passes, missed)
+
+
+class NonlinearBalance:
+    """One solution's nonlinear residual h, brought into balance with what it causes.
+
+    A pass looks at the region where h counts; `look_everywhere` at the rest.
+
+    Args:
+        problem: solid and operator.
+        guess: response of the candidates; h of an earlier solution and its region.
+        tolerance: largest imbalance relative to the contact forces.
+
+    Attributes:
+        h: (n, 3) N, what the last pass asks for.
+        region: outside of which it is zero.
+        offset: (m, 3) m, displacement of the candidates without contact forces.
+        field: (n, 3) m, displacement of the nodes looked at, 0 elsewhere.
+        residual: imbalance of the elements looked at, relative to the contact forces.
+    """
+
+    def __init__(self, problem: ContactProblem, guess: InitialGuess, tolerance: float) -> None:
+        self._problem, self._response, self._tolerance = problem, guess.response, tolerance
+        self.region = Region.everywhere(problem) if guess.region is None else guess.region
+        self.h = np.zeros_like(problem.solid.nodes)
+        if guess.nonlinear_residual is not None:
+            self.h[self.region.nodes] = guess.nonlinear_residual[self.region.nodes]
+        self._mixer = AndersonMixer()
+        self._begin()
+
+    def respond(self, pushed: Array) -> None:
+        """Work out displacements and imbalance of the region under contact forces (m, 3), N."""
+        operator, region = self._problem.operator, self.region
+        self._size = max(float(np.linalg.norm(pushed)), 1e-300)
+        self._response.push(pushed, self._x)
+        operator.factor.backward(self._x, region.fronts)
+        self.field = np.zeros_like(self.h)
+        self.field[region.nodes] = operator.nodal(self._x)[region.nodes]
+        self._look(region)
+
+    def look_everywhere(self) -> None:
+        """Look at the rest of the solid, for the residual and the field of all of it."""
+        region, operator = self.region, self._problem.operator
+        if self._narrowed:
+            return
+        rest = np.setdiff1d(np.arange(len(operator.factor.fronts)), region.fronts)
+        operator.factor.backward(self._x, rest)
+        self.field = operator.nodal(self._x)
+        self._look(Region.everywhere(self._problem))
+
+    def advance(self) -> None:
+        """Take the next h."""
+        nodes = self.region.nodes
+        if self._narrowed:  # another set of unknowns: earlier differences do not apply
+            self._mixer = AndersonMixer()
+        mixed = self._mixer.next(self._taken[nodes].ravel(), self.h[nodes].ravel())
+        self.h = np.zeros_like(self.h)
+        self.h[nodes] = mixed.reshape(-1, 3)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Solve the first half, L x = P h."""
+        operator, self._taken, self._narrowed = self._problem.operator, self.h, False
+        self._x = operator.start(self.h, self.region.fronts)
+        self.offset = self._response.displacement(self._x)
+
+    def _look(self, region: Region) -> None:
+        """Find the imbalance of a region; of the whole, also which elements count."""
+        solid = self._problem.solid
+        forces = solid.nonlinear_residual(self.field, None if region.whole else region.elements)
+        value = self._summed(forces, region)
+        self.residual = float(np.linalg.norm(value - self._taken)) / self._size
+        if region.whole:
+            size = np.linalg.norm(forces, axis=1)
+            count = elements_that_count(size, SHARE * self._tolerance * self._size)
+            self.region = Region.of(self._problem, region.elements[count])
+            value = self._summed(forces[count], self.region)
+            self._narrowed = True
+        self.h = value
+
+    def _summed(self, forces: Array, region: Region) -> Array:
+        value = self._problem.solid.scatter.sum(forces, region.elements)
+        value[self._problem.held.reshape(-1, 3)] = 0.0
+        return value
+
+
+def elements_that_count(size: Array, allowed: float) -> Index:
+    """Return the elements (k,) without the smallest, which together are below a bound.
+
+    Args:
+        size: (c,) norm of each element's share of h, N.
+        allowed: N, root of the sum of squares of those left out.
+    """
+    order = np.argsort(size)
+    left_out = int(np.searchsorted(np.cumsum(size[order] ** 2), allowed**2, side="right"))
+    return np.sort(order[left_out:])
+
+
+class SlidingNodes:
+    """Femoral planes over the candidates, renewed as the nodes slide.
+
+    Each pass solves the contact on tangent planes; the rays are then fired from the displaced
+    nodes. Where the femoral normal turns quickly (a rim, a coarse triangle) the nodes could
+    swing to and fro: the next planes are then taken only part of the way towards them.
+
+    Args:
+        problem: solid and femoral component.
+        points: (m, 3) undeformed candidates, m.
+        moved: (m, 3) their first displacement, m.
+        pose: (4, 4) pose_femoral_in_insert.
+        planes: over the undeformed candidates.
+    """
+
+    def __init__(
+        self,
+        problem: ContactProblem,
+        points: Array,
+        moved: Array,
+        pose: Array,
+        planes: TangentPlanes,
+    ) -> None:
+        self._problem, self._points, self._pose = problem, points, pose
+        self._fired = points + moved
+        self._share, self._last = 1.0, np.inf
+        self.planes = planes
+        if moved.any():
+            self.planes = tangent_planes(problem, self._fired, pose, planes)
+
+    def follow(self, moved: Array, forces: ContactForces) -> float:
+        """Renew the planes for nodes displaced by moved (m, 3).
+
+        Returns:
+            The largest distance of an active node from the femoral surface where it now is
+            (overlap of the others counts too), relative to the largest displacement of an
+            active node.
+        """
+        if not forces.active.any():
+            return 0.0
+        positions = self._points + moved
+        there = tangent_planes(self._problem, positions, self._pose, self.planes)
+        gap = there.gap(positions) + forces.approach * there.normal_y
+        miss = np.where(forces.active, np.abs(gap), np.maximum(-gap, 0))
+        size = float(np.abs(moved[forces.active]).max())
+        missed = float(np.nan_to_num(miss, nan=0.0).max()) / max(size, 1e-300)
+        if missed > SLOW * self._last:
+            self._share = max(self._share / 2, SMALLEST_SHARE)
+        self._last = missed
+        if self._share == 1.0:
+            self._fired, self.planes = positions, there
+        else:
+            self._fired = self._fired + self._share * (positions - self._fired)
+            self.planes = tangent_planes(self._problem, self._fired, self._pose, self.planes)
+        return missed

@@ -161,7 +161,7 @@ function showNumbers() {
     });
   }
   [...element("titles").children].forEach((title, k) => {
-    const view = tkamb.views[k], place = tkamb.views.length > 1 ? ` · ${view.places[frames[k]]}` : "";
+    const view = tkamb.views[k], place = tkamb.views.length > 1 ? ` · ${view.labels[frames[k]]}` : "";
     title.textContent = `${view.title} · ${view.side} knee${place}`;
   });
   const words = tkamb.views.map((view, k) => view.statuses[frames[k]]);
@@ -169,7 +169,7 @@ function showNumbers() {
   element("status").textContent = [...new Set(plain)].join(" · ");
   element("status").hidden = plain.length === 0;
   element("place").textContent =
-    `frame ${tkamb.frame} of ${tkamb.frameCount() - 1}: ${tkamb.views[0].places[frames[0]]}`;
+    `frame ${tkamb.frame} of ${tkamb.frameCount() - 1}: ${tkamb.views[0].labels[frames[0]]}`;
   element("frame").value = tkamb.frame;
   element("caption").textContent = element("place").textContent;
 }

@@ -130,12 +130,12 @@ function unitHead() {
   return new MeshCat.THREE.ConeGeometry(1, 1, 24).translate(0, 0.5, 0);
 }
 
-tkamb.frameCount = () => Math.max(...tkamb.views.map((view) => view.places.length));
+tkamb.frameCount = () => Math.max(...tkamb.views.map((view) => view.labels.length));
 
 // The frame of a view at the page's frame: the nearest to the same share of the motion's time.
 tkamb.frameOf = function (view) {
-  const longest = tkamb.views.find((one) => one.places.length === tkamb.frameCount());
-  if (view.places.length === longest.places.length) return tkamb.frame;
+  const longest = tkamb.views.find((one) => one.labels.length === tkamb.frameCount());
+  if (view.labels.length === longest.labels.length) return tkamb.frame;
   const share = (times, k) => (times[k] - times[0]) / (times[times.length - 1] - times[0] || 1);
   const wanted = share(longest.times, tkamb.frame);
   let nearest = 0;

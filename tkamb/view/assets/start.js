@@ -2,28 +2,28 @@
 // Loads the drawings, from the page itself or from its server, and starts.
 
 tkamb.start = async function () {
-  const asked = JSON.parse(document.getElementById("asked").textContent);
-  for (const [key, value] of new URLSearchParams(location.hash.slice(1))) asked[key] = value;
-  const bytes = asked.live
+  const request = JSON.parse(document.getElementById("request").textContent);
+  for (const [key, value] of new URLSearchParams(location.hash.slice(1))) request[key] = value;
+  const bytes = request.live
     ? new Uint8Array(await (await fetch("scene.bin")).arrayBuffer())
     : Uint8Array.from(atob(document.getElementById("data").textContent), (c) => c.charCodeAt(0));
   const data = await tkamb.unpack(bytes);
-  tkamb.viewer = newViewer(document.getElementById("pane"), asked.figure || !softwareGraphics());
+  tkamb.viewer = newViewer(document.getElementById("pane"), request.figure || !softwareGraphics());
   tkamb.build(data);
   addCameras();
-  addLayers(asked.live && asked.live.length > 0);
+  addLayers(request.live && request.live.length > 0);
   addLegends();
   addNumbers();
   addPlayer();
   addKeys();
-  if (asked.live) tkamb.live = new Live(asked.live);
-  if (asked.figure) {
+  if (request.live) tkamb.live = new Live(request.live);
+  if (request.figure) {
     document.body.classList.add("figure");
     document.getElementById("stage").append(document.getElementById("force-box"));
   }
-  tkamb.look(asked.view || "oblique");
+  tkamb.look(request.view || "oblique");
   tkamb.viewer.set_3d_pane_size();
-  tkamb.go(Number(asked.frame || 0));
+  tkamb.go(Number(request.frame || 0));
   tkamb.viewer.render();
   document.body.dataset.ready = "yes";
 };
@@ -62,11 +62,11 @@ class Live {
     }
     document.getElementById("contact-choice").hidden = models.length === 0;
     this.choice.addEventListener("change", () => this.frameChanged());
-    this.asked = 0;
+    this.latest = 0;
   }
 
   frameChanged() {
-    const view = tkamb.views[0], number = ++this.asked;
+    const view = tkamb.views[0], number = ++this.latest;
     if (view.map !== view.runMap) {
       tkamb.showMap(view, view.runMap);
       tkamb.colourMap(view, tkamb.frameOf(view));
@@ -104,7 +104,7 @@ class Live {
     answer.textContent = `computing frame ${frame} with ${model} …`;
     const response = await this.ask("contact", {frame, model});
     const packed = response.ok && new Uint8Array(await response.arrayBuffer());
-    if (number !== this.asked) return;
+    if (number !== this.latest) return;
     if (!packed) {
       answer.textContent = await response.text();
       return;

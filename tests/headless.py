@@ -1,0 +1,57 @@
+"""Pages in a headless browser: playwright drives the chromium that is installed."""
+
+from contextlib import contextmanager
+
+import pytest
+
+from tkamb.errors import ComputationError
+
+READY = "document.body && document.body.dataset.ready"
+"""Holds on a page of the viewer that is drawn."""
+
+
+@contextmanager
+def chromium():
+    """Give a browser; the test is skipped where there is none."""
+    from tkamb.view.page import SOFTWARE_GRAPHICS, find_browser  # late: conftest imports this file
+
+    sync = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    try:
+        path = find_browser()
+    except ComputationError as error:
+        pytest.skip(str(error))
+    with sync.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=list(SOFTWARE_GRAPHICS))
+        yield browser
+        browser.close()
+
+
+class Page:
+    """A page of a browser.
+
+    Attributes:
+        problems: console errors, exceptions and failed requests so far.
+        requests: addresses that the page asked for.
+    """
+
+    def __init__(self, browser):
+        self.problems, self.requests = [], []
+        self._page = browser.new_page(viewport={"width": 1400, "height": 900})
+        self._page.on("request", lambda request: self.requests.append(request.url))
+        self._page.on("requestfailed", lambda request: self.problems.append(request.failure))
+        self._page.on("pageerror", lambda error: self.problems.append(str(error)))
+        self._page.on("console", self._console)
+        self.evaluate, self.close = self._page.evaluate, self._page.close
+
+    def open(self, url, ready=READY):
+        """Open an address and wait until a JavaScript expression holds."""
+        self._page.goto(url)
+        self.evaluate(
+            "new Promise((done) => { const t = setInterval(() => {"
+            f"if ({ready}) {{ clearInterval(t); done(true); }} }}, 20); }})"
+        )
+        return self
+
+    def _console(self, message):
+        if message.type in ("error", "assert"):
+            self.problems.append(message.text)

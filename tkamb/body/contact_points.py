@@ -1,0 +1,112 @@
+"""Where the condyles meet the insert: contact points, which of them are off, what is wrong."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.geometry.frames import Array
+from tkamb.units import DEGREE, MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.geometry.closest import ClosestPointQuery, CondyleGap, CondyleGaps
+
+LIFT_OFF_ANGLE = 0.5 * DEGREE
+LIFT_OFF_GAP = 0.5 * MILLIMETRE
+"""A condyle is off the insert where both its gap and the coronal angle of the two gaps exceed
+what fluoroscopy errs by (Sharma 2008, 4.3)."""
+
+FARTHEST_GAP = 3e-3
+"""m: a femoral component farther from the insert, or deeper in it, is misplaced."""
+
+
+STANDSTILL = 1e-3
+"""m/s: friction fades below this sliding speed, where its direction is not defined."""
+
+
+@dataclass(frozen=True, eq=False)
+class CondylePoint:
+    """Where one condyle touches the insert.
+
+    Args:
+        point: (3,) m.
+        normal: (3,) unit, out of the insert into the femur.
+        sliding: (3,) m/s, velocity of the femur's point relative to the insert's.
+        gap: m, positive when apart.
+    """
+
+    point: Array
+    normal: Array
+    sliding: Array
+    gap: float
+
+    def direction(self, friction: float) -> Array:
+        """Return the contact force on the femur (3,) per unit normal force.
+
+        n - mu t, with t = v / sqrt(|v|² + v0²) for the tangential velocity v: Coulomb
+        friction against the sliding, fading below v0 = 1 mm/s.
+        """
+        tangential = self.sliding - (self.sliding @ self.normal) * self.normal
+        speed = np.sqrt(tangential @ tangential + STANDSTILL**2)
+        return np.asarray(self.normal - friction * tangential / speed)
+
+
+@dataclass(frozen=True, eq=False)
+class ContactPoints:
+    """The femorotibial contact of one pose, as the equations take it.
+
+    Args:
+        condyles: side -> contact point; empty when contact is not modelled.
+        lifted: sides that are clearly off the insert.
+        problems: plain words; empty when all is well.
+    """
+
+    condyles: dict[str, CondylePoint]
+    lifted: frozenset[str]
+    problems: tuple[str, ...]
+
+
+NO_CONTACT = ContactPoints({}, frozenset(), ())
+"""Contact is not modelled."""
+
+
+def contact_points(
+    query: "ClosestPointQuery", pose: Array, sliding: Callable[[Array], Array]
+) -> ContactPoints:
+    """Return the contact points of a pose.
+
+    Args:
+        query: closest points of the pair.
+        pose: (4, 4) pose_femoral_in_insert.
+        sliding: point (3,) m, insert frame -> velocity (3,) m/s of the femur's relative to the
+            insert's there.
+    """
+    gaps = query.at(pose)
+    found = {"medial": gaps.medial} | ({"lateral": gaps.lateral} if gaps.lateral else {})
+    condyles = {side: _condyle(gap, sliding) for side, gap in found.items()}
+    nearest = nearest_gap(gaps)
+    problems: tuple[str, ...] = ()
+    if abs(nearest) > FARTHEST_GAP:
+        word = "apart" if nearest > 0 else "overlapping"
+        problems = (f"condyles {word} by {abs(nearest) / MILLIMETRE:.1f} mm",)
+    return ContactPoints(condyles, _find_lifted(condyles), problems)
+
+
+def nearest_gap(gaps: "CondyleGaps") -> float:
+    """Return the smallest gap (m) of the condyles."""
+    return min(gap.gap for gap in (gaps.medial, gaps.lateral) if gap is not None)
+
+
+def _condyle(gap: "CondyleGap", sliding: Callable[[Array], Array]) -> CondylePoint:
+    return CondylePoint(gap.centre, gap.normal, sliding(gap.centre), gap.gap)
+
+
+def _find_lifted(condyles: dict[str, CondylePoint]) -> frozenset[str]:
+    if len(condyles) < 2:
+        return frozenset()
+    medial, lateral = condyles["medial"], condyles["lateral"]
+    width = abs(lateral.point[2] - medial.point[2])
+    higher = "lateral" if lateral.gap > medial.gap else "medial"
+    tilted = abs(lateral.gap - medial.gap) > LIFT_OFF_ANGLE * width
+    return frozenset({higher} if tilted and condyles[higher].gap > LIFT_OFF_GAP else ())

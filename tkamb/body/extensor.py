@@ -1,0 +1,226 @@
+"""The extensor mechanism over all frames: where the patella is, and its lines of action."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from tkamb.body.chain import Chain, ChainState
+from tkamb.body.knee import Extensor
+from tkamb.body.load import PointForces
+from tkamb.body.muscles import Line, Muscle, PatellarLigament, Wrap, muscle_line, off_femur
+from tkamb.body.patella import ExtensorMechanism, PatellaState, patella_at, solve_patella
+from tkamb.body.patellofemoral import PatellofemoralContact
+from tkamb.body.unknowns import Unknown, muscle_load
+from tkamb.body.wrapping import TautPath, is_inside
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.frames import Array, inverse, transform
+from tkamb.geometry.sections import sagittal_outline
+from tkamb.geometry.surface import Surface
+from tkamb.units import DEGREE
+
+Rates = Callable[[Array, Array], tuple[Array, Array, Array]]
+
+
+@dataclass(frozen=True, eq=False)
+class ExtensorParts:
+    """What the extensor mechanism of a knee is made of.
+
+    Args:
+        muscle: the one that pulls the patella.
+        ligament: the patellar ligament.
+        chain: the patient.
+        femoral: femoral component, femur link.
+        button: patellar button, patella link.
+        insert: insert, insert frame; None: the ligament wraps nothing.
+    """
+
+    muscle: Muscle
+    ligament: PatellarLigament
+    chain: Chain
+    femoral: Surface
+    button: Surface
+    insert: Surface | None
+
+
+class ExtensorFrames:
+    """Muscle, patella and patellar ligament over the frames of a motion.
+
+    Args:
+        parts: the mechanism.
+        time: (f,) s.
+        poses: (f, 4, 4) pose_femur_in_insert.
+        recorded: (f, 3, 3) patella coordinates, rates and accelerations; None: to be found.
+        rates: from time (n,) and coordinates (n, 3) to them filtered, and their derivatives.
+
+    Attributes:
+        muscle: its line of action.
+        ligament: the patellar ligament's.
+        states: the patella at each frame.
+
+    Raises:
+        InputError: a line starts inside what it wraps, or the patella is found nowhere.
+    """
+
+    def __init__(
+        self, parts: ExtensorParts, time: Array, poses: Array, recorded: Array | None, rates: Rates
+    ) -> None:
+        self._parts, self._chain = parts, parts.chain
+        self.muscle = muscle_line(parts.muscle, parts.chain, parts.femoral)
+        self.ligament = self._ligament_line()
+        self._check_fixed_ends()
+        self._mechanism = self._build_mechanism()
+        self._recorded = recorded is not None
+        if recorded is not None:
+            self._joints = recorded
+            self.states = [
+                patella_at(self._mechanism, pose, coordinates)
+                for pose, coordinates in zip(poses, recorded[:, 0], strict=True)
+            ]
+        else:
+            self.states = _solve_all(self._mechanism, poses)
+            self._joints = self._differentiate(time, rates)
+
+    def joints(self, k: int) -> Array:
+        """Return patella coordinates, rates and accelerations (3, 3) of frame k; NaN if lost."""
+        return np.asarray(self._joints[k])
+
+    def patella(self, k: int, pose: Array, guess: Array | None = None) -> PatellaState:
+        """Return the patella of frame k with the femur at another pose (4, 4).
+
+        Recorded coordinates are kept; a solved patella is found anew, from `guess` (3,) or
+        from where it was at the recorded pose.
+        """
+        found = self.states[k].coordinates if guess is None else guess
+        if self._recorded:
+            return patella_at(self._mechanism, pose, self.states[k].coordinates)
+        return solve_patella(self._mechanism, pose, found)
+
+    def at(
+        self, k: int, flexion: float, state: ChainState, patella: PatellaState | None = None
+    ) -> tuple[Extensor, Unknown]:
+        """Return the mechanism and its muscle, both per unit tension.
+
+        Args:
+            k: frame.
+            flexion: rad, for messages.
+            state: the chain there.
+            patella: where it is, if not as at the recorded pose.
+
+        Raises:
+            ComputationError: no patella at this frame, or a line's end inside what it wraps.
+        """
+        patella = self.states[k] if patella is None else patella
+        if not patella.status.found:
+            raise ComputationError(
+                f"patella lost at {flexion / DEGREE:.1f} deg of flexion: {patella.status.value}"
+            )
+        muscle, ligament = self.paths(state)
+        extensor = Extensor(
+            tuple(_on_tibia(load) for load in self.ligament.loads(ligament)),
+            patella.contact_point,
+            patella.contact_normal,
+            (self.muscle.name,),
+            muscle.wrap_angle,
+        )
+        return extensor, Unknown(muscle_load(self.muscle.name), self.muscle.loads(muscle))
+
+    def paths(self, state: ChainState) -> tuple[TautPath, TautPath]:
+        """Return muscle and patellar ligament as they run, in the insert frame.
+
+        Raises:
+            ComputationError: a line's end inside what it wraps.
+        """
+        links = {point.link for line in (self.muscle, self.ligament) for point in line.points}
+        poses = {link: state.pose(link) for link in links | {"femur"}} | {"insert": np.eye(4)}
+        return self.muscle.path(poses), self.ligament.path(poses)
+
+    def _ligament_line(self) -> Line:
+        parts, wrap = self._parts, None
+        ligament = parts.ligament
+        if ligament.wrap is not None and parts.insert is not None:
+            tuberosity = transform(self._tibia_in_insert(), ligament.distal.position)
+            outline = ligament.wrap.outline(parts.insert, float(tuberosity[2]))
+            wrap = Wrap("insert", outline)
+        return Line("patellar_ligament", (ligament.proximal, ligament.distal), wrap)
+
+    def _tibia_in_insert(self) -> Array:
+        """Return the pose in the insert frame of the link that holds the ligament's end."""
+        on_tibia = self._chain.link_in(self._parts.ligament.distal.link, "tibia")
+        return inverse(self._chain.insert_in_tibia) @ on_tibia
+
+    def _check_fixed_ends(self) -> None:
+        """Raise if the end that does not move against an outline lies within it."""
+        ends, name = [], self.muscle.name
+        if self.muscle.wrap is not None:
+            last = self.muscle.points[self.muscle.wrap.stretch]
+            place = transform(self._chain.link_in(last.link, "femur"), last.position)
+            low, high = self._parts.femoral.bounds[:, 2]
+            whole = sagittal_outline([self._parts.femoral], 0.95 * np.linspace(low, high, 15))
+            ends.append((f"the origin of {name}", place, whole, "femur"))
+        if self.ligament.wrap is not None:
+            tuberosity = transform(self._tibia_in_insert(), self.ligament.points[1].position)
+            outline = self.ligament.wrap.outline
+            ends.append(("[patellar_ligament] distal", tuberosity, outline, "insert"))
+        for where, point, outline, bone in ends:
+            if is_inside(point, outline):
+                raise InputError(
+                    f"lies inside the outline of the {bone} that the line wraps",
+                    where,
+                    "move the point, or set wrap = false",
+                )
+
+    def _build_mechanism(self) -> ExtensorMechanism:
+        parts, chain = self._parts, self._chain
+        stretch = off_femur(self.muscle.points, chain)
+        origin, insertion = self.muscle.points[stretch : stretch + 2]
+        joint, (proximal, distal) = chain.patella_joint_in_femur, self.ligament.points
+        return ExtensorMechanism(
+            PatellofemoralContact(parts.femoral.moved(inverse(joint)), parts.button),
+            joint,
+            transform(chain.link_in(origin.link, "femur"), origin.position),
+            transform(chain.link_in(insertion.link, "patella"), insertion.position),
+            transform(chain.link_in(proximal.link, "patella"), proximal.position),
+            transform(self._tibia_in_insert(), distal.position),
+            parts.ligament.length,
+            None if self.muscle.wrap is None else self.muscle.wrap.outline,
+            None if self.ligament.wrap is None else self.ligament.wrap.outline,
+        )
+
+    def _differentiate(self, time: Array, rates: Rates) -> Array:
+        """Return the solved coordinates with their rates (f, 3, 3); NaN where it is lost.
+
+        Lost frames between found ones are bridged for the rates of their neighbours (shape-
+        preserving cubic): a patella of 0.1 kg turns an acceleration that is wrong by 1 m/s²
+        into 0.1 N.
+        """
+        places = np.array([state.coordinates for state in self.states])
+        found = np.flatnonzero(np.isfinite(places).all(axis=1))
+        if len(found) < 2:
+            raise InputError(
+                f"no place of the patella is found in {len(places) - len(found)} of "
+                f"{len(places)} frames; first: {self.states[0].status.value}",
+                "[patella]",
+                "check its mesh, the lines' points and length_mm",
+            )
+        part = slice(found[0], found[-1] + 1)
+        bridged = PchipInterpolator(time[found], places[found])(time[part])
+        result = np.full((len(places), 3, 3), np.nan)
+        result[part] = np.stack(rates(time[part], bridged), axis=1)
+        result[np.isnan(places).any(axis=1)] = np.nan
+        return result
+
+
+def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]:
+    """Solve frame after frame, each from the one before."""
+    states: list[PatellaState] = []
+    for pose in poses:
+        guess = states[-1].coordinates if states else None
+        states.append(solve_patella(mechanism, pose, guess))
+    return states
+
+
+def _on_tibia(load: PointForces) -> PointForces:
+    """Return the load with the insert, which the tibia carries, named as the tibia."""
+    return replace(load, link="tibia") if load.link == "insert" else load

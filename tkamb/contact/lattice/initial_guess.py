@@ -1,0 +1,124 @@
+"""Where a solution begins: which nodes may be touched, and what a neighbouring one left."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tkamb.contact.lattice.linear.compliance import MOST_STORED, ComplianceCache, ContactResponse
+from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes
+from tkamb.geometry.frames import Array, Index, Mask
+
+MARGIN = 0.25
+"""Nodes count as candidates this share of the depth beyond first touch."""
+SPARE = 1.6
+"""The stored compliance covers nodes down to this many times the depth asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class WarmStart:
+    """Where a solution ended: what its result carries for the next solution of the problem.
+
+    Handed back as `guess.warm_start`; it shortens the way and changes no answer beyond the
+    tolerance.
+
+    Args:
+        problem: whose solution it was; it serves no other.
+        nonlinear_residual: (n, 3) h, N, or None for a linear material.
+        moved: (c, 3) m, displacement of the contact nodes that were candidates, else 0.
+        depth: m, how far the femoral component went below the lowest contact node.
+        region: outside of which h is zero, or None.
+    """
+
+    problem: ContactProblem
+    nonlinear_residual: Array | None
+    moved: Array
+    depth: float
+    region: Region | None
+
+
+@dataclass(frozen=True, eq=False)
+class InitialGuess:
+    """Where the iteration starts.
+
+    Args:
+        candidates: (m,) positions among the contact nodes.
+        response: of the candidates to forces on them.
+        active: (m,) first guess of the active set.
+        planes: femoral planes over the undeformed candidates.
+        nonlinear_residual: (n, 3) h, N, of an earlier solution, or None.
+        moved: (m, 3) m, displacement of the candidates in an earlier solution, or None.
+        reach: m, every node with a smaller vertical gap is a candidate.
+        region: outside of which h is zero, or None.
+    """
+
+    candidates: Index
+    response: ContactResponse
+    active: Mask
+    planes: TangentPlanes
+    nonlinear_residual: Array | None = None
+    moved: Array | None = None
+    reach: float = np.inf
+    region: Region | None = None
+
+
+def initial_guess(
+    cache: ComplianceCache,
+    gaps: Array,
+    planes: TangentPlanes,
+    depth: float,
+    at_pose: bool,
+    touched: Mask | None,
+    warm: WarmStart | None,
+) -> InitialGuess:
+    """Return candidates, their response and a first active set.
+
+    Args:
+        cache: where responses come from.
+        gaps: (c,) vertical gaps, m.
+        planes: over all contact nodes, undeformed.
+        depth: m, how deep the femoral component may go below the lowest gap.
+        at_pose: the femoral component stays at the pose: candidates overlap it already.
+        touched: (c,) nodes in contact in a neighbouring solution, or None.
+        warm: where a neighbouring solution ended, or None.
+    """
+    lowest = float(gaps.min())
+    reach = lowest + (1 + MARGIN) * depth
+    nodes = np.flatnonzero(gaps <= reach)
+    spare = np.flatnonzero(gaps <= lowest + SPARE * depth)
+    if len(cache.nodes):
+        both = np.union1d(spare, cache.nodes)
+        spare = both if len(both) <= MOST_STORED else spare
+    level = 0.0 if at_pose else lowest + 0.6 * depth
+    active = gaps[nodes] < level
+    if touched is not None and touched[nodes].any():
+        active = touched[nodes]
+    guess = InitialGuess(nodes, cache.among(nodes, spare), active, planes.part(nodes), reach=reach)
+    if warm is None:
+        return guess
+    return replace(
+        guess,
+        nonlinear_residual=warm.nonlinear_residual,
+        moved=warm.moved[nodes],
+        region=warm.region,
+    )
+
+
+def guessed_depth(problem: ContactProblem, gaps: Array, areas: Array, load: float) -> float:
+    """Return a depth (m) at which an elastic foundation of modulus E would carry the load.
+
+    Args:
+        problem: for the material and the thickness under each node.
+        gaps: (c,) vertical gaps, m.
+        areas: (c,) m².
+        load: N.
+    """
+    stiffness = problem.solid.material.young_modulus * areas
+    stiffness = stiffness / np.maximum(problem.surface_points[:, 1], 1e-3)
+    order = np.argsort(gaps)
+    order = order[np.isfinite(gaps[order])]
+    height, k = gaps[order], stiffness[order]
+    total, moment = np.cumsum(k), np.cumsum(k * height)
+    # What all springs so far carry when the next one is reached.
+    last = int(np.searchsorted(total * height - moment, load))
+    last = max(min(last, len(order)) - 1, 0)
+    return float((load + moment[last]) / total[last] - height[0])

@@ -1,0 +1,298 @@
+"""Prepared operators on disk, found again by what they were made of.
+
+The key is the SHA-256 of everything that the operator depends on: nodes, cells, held unknowns,
+contact nodes, elastic constants, kind of solid, and the code that makes it. A file is
+
+    magic (16 bytes) | SHA-256 of all that follows | length of the header | header (JSON) | arrays
+
+and is written beside its place and moved there in one step, so that two processes at once see a
+whole file or none. A file is used only if it is a regular one of the user's own that nobody else
+may write, its size is what its header says, its SHA-256 and key are right, and its operator
+inverts the stiffness that is assembled afresh (`operator_error`). Any other is made again, with
+one notice. The least recently used go when the folder outgrows its limit, and with them what a
+killed process left half written.
+
+The folder is $TKAMB_CACHE_DIR, else $XDG_CACHE_HOME/tkamb, else ~/.cache/tkamb. Operators that
+are made again in about a second are not kept.
+"""
+
+import fcntl
+import hashlib
+import json
+import logging
+import os
+import stat
+import tempfile
+import time as clock
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.code_identity import code_identity
+from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor, Front
+from tkamb.contact.lattice.linear.operator import ElasticOperator, operator_error
+from tkamb.contact.lattice.linear.response import Block, HalfResponse
+from tkamb.contact.lattice.solids.solid import Solid
+from tkamb.errors import InputError
+from tkamb.files import open_regular
+from tkamb.geometry.frames import Array, Index, Mask
+
+MAGIC = b"tkamb operator 3"
+LONGEST_HEADER = 1_000_000
+"""Bytes; a header has some hundreds."""
+LEAST_UNKNOWNS = 20_000
+"""Smaller operators are not kept."""
+SIZE_LIMIT = 6e9
+"""Bytes that the folder may hold."""
+LARGEST_ERROR = 1e-5
+"""Of an operator that is read (`operator_error`): float32 leaves 5e-7, whatever nu or bearing."""
+ORPHAN_SECONDS = 60.0
+"""A half-written file that nobody has locked is an orphan after this time."""
+
+_log = logging.getLogger("tkamb")
+
+
+def cache_folder() -> Path:
+    """Return the folder of prepared operators."""
+    own = os.environ.get("TKAMB_CACHE_DIR")
+    if own:
+        return Path(own)
+    root = os.environ.get("XDG_CACHE_HOME")
+    return (Path(root) if root else Path.home() / ".cache") / "tkamb"
+
+
+def operator_key(solid: Solid, held: NDArray[Any], contact_nodes: NDArray[Any]) -> str:
+    """Return the content hash of an operator: of all that it depends on, and of the code."""
+    material = solid.material
+    made_by = code_identity("contact/lattice")
+    words = (made_by, type(solid).__name__, material.young_modulus, material.poisson_ratio)
+    digest = hashlib.sha256(repr(words).encode())
+    for array in (solid.nodes, solid.spacing, solid.cells, held, contact_nodes):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def cached_operator(
+    solid: Solid,
+    held: Mask,
+    contact_nodes: Index,
+    make: Callable[[], ElasticOperator],
+    limit: float = SIZE_LIMIT,
+) -> ElasticOperator:
+    """Return a solid's operator, from disk or newly made and kept.
+
+    A folder that cannot be written to only costs the time to make the operator again.
+
+    Args:
+        solid: cells and material.
+        held: (3n,) unknowns held by the boundary.
+        contact_nodes: (c,) nodes that can be touched.
+        make: makes the operator.
+        limit: bytes that the folder may hold; a larger operator is not kept.
+    """
+    if int((~held).sum()) < LEAST_UNKNOWNS:
+        return make()
+    key = operator_key(solid, held, contact_nodes)
+    path = cache_folder() / f"{key}.operator"
+    try:
+        found = read_operator(path, key, limit)
+        if found is not None:
+            check_operator(found, solid, held, contact_nodes)
+            return found
+    except DamagedOperator as damage:
+        _log.warning("%s: %s; the operator is made again", path, damage)
+    made = make()
+    if sum(block.nbytes for block in _floats(made)) <= limit:
+        try:
+            write_operator(path, key, made)
+            prune(path.parent, limit)
+        except OSError as error:
+            _log.warning("%s: not kept (%s)", path, error.strerror or error)
+    return made
+
+
+class DamagedOperator(Exception):
+    """A file is there, but it does not hold the operator that was asked for."""
+
+
+def check_operator(
+    operator: ElasticOperator,
+    solid: Solid,
+    held: Mask,
+    contact_nodes: Index,
+) -> None:
+    """Hold an operator that was read against the solid that it is to be of.
+
+    Raises:
+        DamagedOperator: it is of other unknowns, or does not invert the solid's stiffness.
+    """
+    same = np.array_equal(operator.free, ~held)
+    if not same or not np.array_equal(operator.contact_nodes, contact_nodes):
+        raise DamagedOperator("is of another boundary")
+    try:
+        error = operator_error(operator, solid)
+    except (ValueError, IndexError) as broken:  # indices that lead nowhere
+        raise DamagedOperator(f"is not an operator ({broken})") from None
+    if not error <= LARGEST_ERROR:
+        raise DamagedOperator(f"is off the assembled stiffness by {100 * error:.2g} %")
+
+
+def write_operator(path: Path, key: str, operator: ElasticOperator) -> None:
+    """Write beside the path, then move there in one step."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    arrays = [*_integers(operator), *_floats(operator)]
+    header = json.dumps(
+        {
+            "key": key,
+            "code": code_identity("contact/lattice"),
+            "arrays": [[array.dtype.str, list(array.shape)] for array in arrays],
+        }
+    ).encode()
+    digest = hashlib.sha256(len(header).to_bytes(8, "little") + header)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".tkamb-", suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)  # says that somebody is at it, until he closes or dies
+            file.write(MAGIC + bytes(32) + len(header).to_bytes(8, "little") + header)
+            for array in arrays:
+                content = np.ascontiguousarray(array).data.cast("B") if array.size else b""
+                digest.update(content)
+                file.write(content)
+            file.seek(len(MAGIC))
+            file.write(digest.digest())
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def _integers(operator: ElasticOperator) -> list[NDArray[Any]]:
+    fronts, blocks = operator.factor.fronts, operator.half.blocks
+    sizes = [[f.start, f.stop, f.parent, len(f.boundary)] for f in fronts]
+    rows = [[b.start, b.stop, b.first, b.last] for b in blocks]
+    return [
+        operator.free,
+        operator.contact_nodes,
+        operator.factor.order,
+        np.array(sizes, np.int64).reshape(-1, 4),
+        np.concatenate([np.zeros(0, np.int64), *(f.boundary for f in fronts)]),
+        operator.half.rank,
+        np.array(rows, np.int64).reshape(-1, 4),
+    ]
+
+
+def _floats(operator: ElasticOperator) -> list[Array]:
+    return [f.block for f in operator.factor.fronts] + [b.values for b in operator.half.blocks]
+
+
+def read_operator(path: Path, key: str, limit: float = SIZE_LIMIT) -> ElasticOperator | None:
+    """Return the operator in a file, None if there is no file.
+
+    Raises:
+        DamagedOperator: the file is not one that this user wrote whole, or of another key.
+    """
+    try:
+        descriptor = open_regular(path, 1.5 * limit, follow=False)
+    except InputError as error:
+        if not os.path.lexists(path):
+            return None
+        raise DamagedOperator(error.what) from None
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(file.fileno())
+        if status.st_uid != os.geteuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            raise DamagedOperator("is not the user's own")
+        try:
+            arrays = list(_arrays(file, status.st_size, key))
+            operator = _operator_of(arrays)
+        except (OSError, ValueError, KeyError, TypeError, IndexError, MemoryError) as error:
+            raise DamagedOperator(f"is damaged ({error})") from None
+    os.utime(path)
+    return operator
+
+
+def _arrays(file: BinaryIO, size: int, key: str) -> Iterator[NDArray[Any]]:
+    """Yield the arrays of a file of that size, after a look at its key and its SHA-256."""
+    start = file.read(len(MAGIC) + 40)
+    length = int.from_bytes(start[-8:], "little")
+    if len(start) < len(MAGIC) + 40 or start[: len(MAGIC)] != MAGIC or length > LONGEST_HEADER:
+        raise ValueError("no such header")
+    text = file.read(length)
+    header = json.loads(text)
+    if header["key"] != key or header["code"] != code_identity("contact/lattice"):
+        raise ValueError("another key or code")
+    shapes = [(np.dtype(kind), tuple(map(int, shape))) for kind, shape in header["arrays"]]
+    sizes = [kind.itemsize * int(np.prod(shape, dtype=object)) for kind, shape in shapes]
+    if any(n < 0 for n in sizes) or len(start) + length + sum(sizes) != size:
+        raise ValueError("another size than its header says")
+    content = np.fromfile(file, np.uint8)
+    digest = hashlib.sha256(start[-8:] + text)
+    digest.update(content.data)
+    if digest.digest() != start[len(MAGIC) : len(MAGIC) + 32]:
+        raise ValueError("another SHA-256")
+    ends = np.cumsum([0, *sizes])
+    for (kind, shape), first, last in zip(shapes, ends[:-1], ends[1:], strict=True):
+        # A copy where the bytes do not lie at a multiple of the item's size.
+        yield np.require(content[first:last].view(kind).reshape(shape), requirements="A")
+
+
+def _operator_of(arrays: list[NDArray[Any]]) -> ElasticOperator:
+    """Return the operator of the arrays of `_integers` and `_floats`, one after the other."""
+    free, contact_nodes, order, sizes, boundaries, rank, rows, *values = arrays
+    if len(values) != len(sizes) + len(rows):
+        raise ValueError("another number of blocks")
+    edge, fronts = 0, []
+    for (start, stop, parent, touched), block in zip(sizes.tolist(), values, strict=False):
+        boundary = boundaries[edge : edge + touched]
+        if block.shape != (stop - start + touched, stop - start) or len(boundary) != touched:
+            raise ValueError("a block of another shape")
+        fronts.append(Front(start, stop, boundary, parent, block))
+        edge += touched
+    blocks = []
+    for (start, stop, first, last), block in zip(rows.tolist(), values[len(sizes) :], strict=True):
+        if block.shape != (stop - start, last - first):
+            raise ValueError("a block of another shape")
+        blocks.append(Block(start, stop, first, last, block))
+    return ElasticOperator(
+        free, CholeskyFactor(order, fronts), contact_nodes, HalfResponse(rank, blocks)
+    )
+
+
+def prune(folder: Path, limit: float) -> None:
+    """Delete orphans, then the least recently used operators beyond the folder's limit."""
+    entries = []
+    for path in folder.glob("*.operator"):
+        try:
+            status = path.lstat()
+        except FileNotFoundError:
+            continue
+        entries.append((status.st_mtime, status.st_size, path))
+    total = sum(size for _, size, _ in entries) + _remove_orphans(folder)
+    for _, size, path in sorted(entries, key=lambda entry: entry[0]):
+        if total <= limit:
+            return
+        path.unlink(missing_ok=True)
+        total -= size
+
+
+def _remove_orphans(folder: Path) -> int:
+    """Remove what killed processes left half written; return the bytes of what stays."""
+    stays = removed = freed = 0
+    for path in [*folder.glob(".tkamb-*.part"), *folder.glob("tmp*.part")]:  # the latter: 0.1.0
+        try:
+            with os.fdopen(open_regular(path, float("inf"), follow=False), "rb") as file:
+                status = os.fstat(file.fileno())
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if clock.time() - status.st_mtime < ORPHAN_SECONDS:
+                    raise BlockingIOError
+                path.unlink(missing_ok=True)
+            removed, freed = removed + 1, freed + status.st_size
+        except BlockingIOError:
+            stays += status.st_size
+        except InputError:
+            continue
+    if removed:
+        _log.warning("%s: %d unfinished file(s) removed, %.0f MB", folder, removed, freed / 1e6)
+    return stays

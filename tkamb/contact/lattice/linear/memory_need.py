@@ -1,0 +1,115 @@
+"""The memory that a factorisation will take, counted before it begins.
+
+The fronts' sizes follow from the dissection and the pattern alone (symbolic factorisation, on
+nodes instead of unknowns). Nothing is known of a machine here but what it has left.
+"""
+
+import numpy as np
+import scipy.sparse as sparse
+
+from tkamb.contact.lattice.linear.multifrontal import Dissection
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Index, Mask
+from tkamb.memory import available_memory
+from tkamb.units import MILLIMETRE
+
+UNKNOWNS = 3
+"""Of a node; each boundary is counted as if all were free."""
+CELL_BYTES = 20_000
+"""Of a cell, while its stiffness is put into the global matrix (measured: 9 to 22 kB)."""
+MATRIX_BYTES = 36
+"""Of an entry of the global matrix: itself, its free part, and that in elimination order."""
+SPARE = 1.1
+"""For what the count leaves out."""
+LEAST_POWER = 3.0
+"""Memory falls at least with this power of the cells' size (measured: 3.7)."""
+STEP = 0.05e-3
+"""m; sizes that are proposed are multiples of it."""
+COARSEST = 5e-3
+"""m; larger cells are no answer."""
+
+
+class TooLittleMemoryError(ComputationError):
+    """What is to be computed does not fit into the memory that is left.
+
+    Args:
+        need: bytes.
+        left: bytes.
+        likely: bytes that it will come to in the end, where more follows.
+    """
+
+    def __init__(self, need: float, left: float, likely: float) -> None:
+        self.left, self.likely = left, max(need, likely)
+        what = f"{need / 1e9:.2g} GB of memory are needed, {max(left, 0) / 1e9:.2g} GB are left"
+        super().__init__(what, "lattice", "take a coarser resolution")
+
+    def hint(self, size: float) -> str:
+        """Return what to do about it: the cells that fit, for those of a size (m) that do not."""
+        fits = size * (self.likely / max(self.left, 1.0)) ** (1.0 / LEAST_POWER)
+        if fits > COARSEST:
+            return "free some memory"
+        return f"take {np.ceil(fits / STEP * (1.0 - 1e-9)) * STEP / MILLIMETRE:g} mm or coarser"
+
+
+def check_memory(need: float, likely: float = 0.0) -> None:
+    """Raise unless so many bytes are left.
+
+    Args:
+        need: bytes.
+        likely: bytes that it will come to in the end, where more follows; for the advice.
+
+    Raises:
+        TooLittleMemoryError: they are not left.
+    """
+    left = available_memory()
+    if SPARE * need > left:
+        raise TooLittleMemoryError(SPARE * need, left, SPARE * likely)
+
+
+def check_assembly_memory(cells: int) -> None:
+    """Raise unless the stiffness of so many cells can be assembled.
+
+    Raises:
+        TooLittleMemoryError: the memory is not left.
+    """
+    need = CELL_BYTES * cells
+    # A factor grows as cells^1.25 and overtakes at about 3,000 cells (measured on inserts).
+    check_memory(need, likely=1.5 * need * max(cells / 3000, 1.0) ** 0.25)
+
+
+def factor_memory(
+    tree: Dissection, joined: sparse.csr_matrix, touched: Mask, itemsize: int
+) -> float:
+    """Return the bytes that factor and half response take at their peak.
+
+    Args:
+        tree: dissection of n nodes.
+        joined: (n, n) pattern: which nodes are joined.
+        touched: (n,) nodes whose response is wanted.
+        itemsize: bytes of a number that is kept; they are worked out in 8.
+    """
+    rank = np.empty(joined.shape[0], np.int64)
+    rank[np.concatenate(tree.own)] = np.arange(len(rank))
+    kept = live = peak = response = 0.0
+    columns = np.zeros(len(tree.own))
+    below: dict[int, list[Index]] = {}
+    start = 0
+    for member, own in enumerate(tree.own):
+        stop, parent = start + len(own), tree.parent[member]
+        children = below.pop(member, [])
+        later = np.unique(np.concatenate([rank[joined[own].indices], *children]))
+        boundary = later[later >= stop]
+        k, m = UNKNOWNS * len(own), UNKNOWNS * len(boundary)
+        # W in 8 bytes twice (its parts, then joined), the update (m, m), and those not taken yet.
+        peak = max(peak, itemsize * kept + 8.0 * (live + 2.0 * (k + m) * k + float(m) * m))
+        kept += float(k + m) * k
+        live += float(m) * m - sum((UNKNOWNS * len(child)) ** 2.0 for child in children)
+        columns[member] += UNKNOWNS * touched[own].sum()
+        response += k * columns[member]
+        if parent >= 0:
+            columns[parent] += columns[member]
+            if len(boundary):
+                below.setdefault(parent, []).append(boundary)
+        start = stop
+    entries = UNKNOWNS**2 * joined.nnz
+    return MATRIX_BYTES * entries + max(peak, itemsize * kept + 8.0 * response)

@@ -1,0 +1,189 @@
+"""The linear operator of one insert: factor, boundary conditions, response of contact nodes."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sparse
+
+from tkamb.contact.lattice.linear.memory_need import check_memory, factor_memory
+from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor, dissect, factorise
+from tkamb.contact.lattice.linear.response import HalfResponse, half_response
+from tkamb.contact.lattice.solids.solid import Solid
+from tkamb.contact.pair import Bearing
+from tkamb.geometry.frames import Array, Index, Mask
+
+SEED = 20_240_501
+
+
+@dataclass(frozen=True, eq=False)
+class ElasticOperator:
+    """K = L Lᵀ on the free unknowns, and L⁻¹ of unit forces at the contact nodes.
+
+    Args:
+        free: (3n,) which unknowns are free.
+        factor: of the free part of the stiffness matrix.
+        contact_nodes: (c,) nodes that the femoral component may touch.
+        half: L⁻¹ E of their 3c unit forces.
+    """
+
+    free: Mask
+    factor: CholeskyFactor
+    contact_nodes: Index
+    half: HalfResponse
+
+    def solve(self, force: Array) -> Array:
+        """Return the displacement (n, 3), m, under nodal forces (n, 3), N."""
+        y = self.start(force)
+        self.factor.backward(y)
+        return self.nodal(y)
+
+    def start(self, force: Array, fronts: Index | None = None) -> Array:
+        """Return y = L⁻¹ f in elimination order, for nodal forces (n, 3).
+
+        Args:
+            force: N; zero but on the nodes that the fronts are for.
+            fronts: from `fronts_of`; all by default.
+        """
+        y = force.ravel()[self.free][self.factor.order]
+        self.factor.forward(y, fronts)
+        return y
+
+    def nodal(self, x: Array) -> Array:
+        """Return nodal values (n, 3) of a vector in elimination order, 0 where held."""
+        inner = np.empty_like(x)
+        inner[self.factor.order] = x
+        result = np.zeros(len(self.free))
+        result[self.free] = inner
+        return result.reshape(-1, 3)
+
+    def fronts_of(self, nodes: Index) -> Index:
+        """Return the fronts of the factor that eliminate the nodes, and all above them."""
+        fronts = self.factor.fronts
+        needed = np.zeros(len(fronts) + 1, bool)
+        needed[self._front_of_node[nodes]] = True
+        for member, front in enumerate(fronts):
+            if needed[member]:
+                needed[front.parent] = True
+        return np.flatnonzero(needed[:-1])
+
+    @cached_property
+    def _front_of_node(self) -> Index:
+        """Front (n,) that eliminates each node; -1 for a node that is held."""
+        fronts = self.factor.fronts
+        member = np.repeat(np.arange(len(fronts)), [f.stop - f.start for f in fronts])
+        unknown = np.flatnonzero(self.free)[self.factor.order]
+        result = np.full(len(self.free) // 3, -1)
+        result[unknown // 3] = member
+        return result
+
+
+def fixed_unknowns(nodes: Array, bottom: Index, bearing: Bearing) -> Mask:
+    """Return which of the 3n unknowns are held.
+
+    Fixed bearing: all of the bottom nodes' unknowns. Mobile bearing: their y, and x and z of
+    the two end nodes along z, which takes away the rigid modes (those nearest to x = 0).
+    """
+    held = np.zeros((len(nodes), 3), bool)
+    if bearing == "fixed":
+        held[bottom] = True
+        return held.ravel()
+    held[bottom, 1] = True
+    x, z = np.abs(nodes[bottom, 0]), nodes[bottom, 2]
+    tolerance = 1e-9 + 1e-6 * np.ptp(z)
+    for end in (z.min(), z.max()):
+        at_end = bottom[np.abs(z - end) <= tolerance]
+        held[at_end[np.argmin(x[np.abs(z - end) <= tolerance])], [0, 2]] = True
+    return held.ravel()
+
+
+def prepare_operator(
+    stiffness: sparse.csr_matrix,
+    index: Index,
+    held: Mask,
+    contact_nodes: Index,
+    precision: type[np.floating] = np.float64,
+) -> ElasticOperator:
+    """Factorise a stiffness matrix (3n, 3n) and work out the contact nodes' half response.
+
+    Args:
+        stiffness: symmetric, positive definite on the free unknowns.
+        index: (n, 3) lattice index of each node.
+        held: (3n,) unknowns that are zero.
+        contact_nodes: (c,).
+        precision: in which the numbers are kept; they are worked out in float64.
+
+    Raises:
+        TooLittleMemoryError: they do not fit into the memory that is left.
+        ComputationError: the matrix is not positive definite.
+    """
+    free = ~held
+    number = np.cumsum(free) - 1
+    some = np.flatnonzero(free.reshape(-1, 3).any(axis=1))
+    joined = stiffness.tobsr((3, 3))
+    joined = sparse.csr_matrix(
+        (np.ones(len(joined.indices), np.int8), joined.indices, joined.indptr),
+        (len(index), len(index)),
+    )
+    joined = joined[some][:, some]
+    tree = dissect(index[some], joined)
+    touched = np.isin(some, contact_nodes)
+    check_memory(factor_memory(tree, joined, touched, np.dtype(precision).itemsize))
+    unknowns = []
+    for own in tree.own:
+        wanted = (3 * some[own][:, None] + np.arange(3)).ravel()
+        unknowns.append(number[wanted[free[wanted]]])
+    factor = factorise(stiffness[free][:, free], tree, unknowns, precision)
+    rank = np.full(len(free), -1)
+    rank[np.flatnonzero(free)[factor.order]] = np.arange(len(factor.order))
+    wanted = rank[(3 * contact_nodes[:, None] + np.arange(3)).ravel()]
+    return ElasticOperator(free, factor, contact_nodes, half_response(factor, wanted, precision))
+
+
+def operator_error(operator: ElasticOperator, solid: Solid) -> float:
+    """Return how far an operator is from its solid's stiffness K, relative.
+
+    The largest of
+
+        |K ũ - f| / |f|            f = K u of a random u, ũ = L⁻ᵀ L⁻¹ f
+        |fᵀũ - ũᵀK ũ| / fᵀũ        f pressing on every contact node
+        |Z g - L⁻¹ E g| / |L⁻¹ E g|    g random on the contact nodes
+
+    with K summed from the cells. A random u is as rough as the grid, so that f is as large as
+    K and u allow and float32 leaves 1e-6 of it whatever the condition of K; the second looks at
+    the soft, smooth displacements, and the third holds the stored response against the factor.
+    Nothing of factor or response is left out by random numbers.
+
+    Args:
+        operator: to be looked at.
+        solid: that it should be of.
+    """
+    chance = np.random.default_rng(SEED)
+    nodes, shape = operator.contact_nodes, solid.nodes.shape
+    pressed, touched = np.zeros(shape), np.zeros(shape)
+    pressed[nodes, 1] = -1.0
+    touched[nodes] = chance.normal(size=(len(nodes), 3))
+    moved = np.where(operator.free.reshape(-1, 3), chance.normal(size=shape), 0.0)
+    force = _carried(operator, solid, moved)
+    missing = _carried(operator, solid, operator.solve(force)) - force
+    sunk = operator.solve(pressed)
+    work, energy = (float((f * sunk).sum()) for f in (pressed, _carried(operator, solid, sunk)))
+    directly = operator.start(touched)
+    stored = np.zeros_like(directly)
+    operator.half.apply(touched[nodes].ravel(), stored)
+    return max(
+        _ratio(np.linalg.norm(missing), np.linalg.norm(force)),
+        _ratio(work - energy, work),
+        _ratio(np.linalg.norm(stored - directly), np.linalg.norm(directly)),
+    )
+
+
+def _carried(operator: ElasticOperator, solid: Solid, displacement: Array) -> Array:
+    """Return K u, N, (n, 3), on the free unknowns; 0 where held."""
+    return np.where(operator.free.reshape(-1, 3), solid.linear_force(displacement), 0.0)
+
+
+def _ratio(part: float | np.floating, whole: float | np.floating) -> float:
+    """Return |part / whole|; inf where that is no number, so that it passes no comparison."""
+    value = abs(float(part)) / max(abs(float(whole)), 1e-300)
+    return value if np.isfinite(value) else float("inf")

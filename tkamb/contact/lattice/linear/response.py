@@ -1,0 +1,182 @@
+"""Response of the contact nodes to unit forces on them, from half a solve.
+
+With K = L Lᵀ and Z = L⁻¹ E (E picks the contact nodes' unknowns) the compliance between them
+is Eᵀ K⁻¹ E = Zᵀ Z: the backward half of the solves is never done. A column of Z is zero but on
+the path from its node to the root of the elimination tree, and the columns of one subtree
+follow each other, so Z is kept as one dense block per member of the tree.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor
+from tkamb.geometry.frames import Array, Index
+
+Precision = type[np.floating[Any]]
+
+SINGLE: Precision = np.float32
+"""What a stored operator is kept in: it halves what every solve has to read."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Rows [start, stop) of Z in its columns [first, last), the columns in sorted order.
+
+    Args:
+        start: first row, in elimination order.
+        stop: one past the last row.
+        first: first column.
+        last: one past the last column.
+        values: (stop - start, last - first), float64 or float32.
+    """
+
+    start: int
+    stop: int
+    first: int
+    last: int
+    values: Array
+
+
+@dataclass(frozen=True, eq=False)
+class HalfResponse:
+    """Z = L⁻¹ E of q unknowns.
+
+    Args:
+        rank: (q,) sorted column of each unknown as the caller numbers them; -1 if it is held.
+        blocks: rows of Z that are not zero.
+    """
+
+    rank: Index
+    blocks: list[Block]
+
+    def apply(self, force: Array, y: Array) -> None:
+        """Add Z f to y (in elimination order), for forces (q,) on the unknowns."""
+        ordered = np.zeros(self.columns)
+        ordered[self.rank[self.rank >= 0]] = force[self.rank >= 0]
+        for block in self.blocks:
+            part = ordered[block.first : block.last].astype(block.values.dtype)
+            if part.any():
+                y[block.start : block.stop] += np.einsum("ij,j->i", block.values, part)
+
+    def project(self, y: Array) -> Array:
+        """Return Zᵀ y (q,): displacement of the unknowns under the load whose L⁻¹ f is y."""
+        ordered = np.zeros(self.columns)
+        for block in self.blocks:
+            part = y[block.start : block.stop].astype(block.values.dtype)
+            if part.any():
+                ordered[block.first : block.last] += np.einsum("ij,i->j", block.values, part)
+        return np.where(self.rank >= 0, ordered[np.maximum(self.rank, 0)], 0.0)
+
+    def among(self, unknowns: Index) -> "HalfResponse":
+        """Return the response of some of the unknowns (u,) alone."""
+        wanted = self.rank[unknowns]
+        live = np.flatnonzero(wanted >= 0)
+        order = live[np.argsort(wanted[live])]
+        rank = np.full(len(unknowns), -1)
+        rank[order] = np.arange(len(order))
+        blocks, columns = [], wanted[order]
+        for block in self.blocks:
+            a, b = (int(n) for n in np.searchsorted(columns, [block.first, block.last]))
+            if b > a:
+                values = np.take(block.values, columns[a:b] - block.first, axis=1)
+                blocks.append(Block(block.start, block.stop, a, b, values))
+        return HalfResponse(rank, blocks)
+
+    def compliance(self, some: Index | None = None) -> Array:
+        """Return the compliance (s, q), m/N, of some unknowns, by default all, to all."""
+        rank = self.rank if some is None else self.rank[some]
+        rows, live = np.unique(rank[rank >= 0]), self.rank >= 0
+        inner = np.zeros((len(rows), self.columns))
+        for block in self.blocks:
+            a, b = np.searchsorted(rows, [block.first, block.last])
+            if b > a:
+                part = block.values.astype(np.float64)
+                inner[a:b, block.first : block.last] += part[:, rows[a:b] - block.first].T @ part
+        result = np.zeros((len(rank), len(self.rank)))
+        index = np.searchsorted(rows, rank[rank >= 0])
+        result[np.ix_(rank >= 0, live)] = inner[np.ix_(index, self.rank[live])]
+        return result
+
+    @property
+    def entries(self) -> int:
+        """How many numbers Z holds."""
+        return sum(block.values.size for block in self.blocks)
+
+    @property
+    def columns(self) -> int:
+        """How many columns Z has."""
+        return int((self.rank >= 0).sum())
+
+
+def unknowns_of(nodes: Index) -> Index:
+    """Return the three unknowns of each node (n,), one node after the other (3n,)."""
+    return (3 * nodes[:, None] + np.arange(3)).ravel()
+
+
+def half_response(
+    factor: CholeskyFactor, unknowns: Index, precision: Precision = np.float64
+) -> HalfResponse:
+    """Return L⁻¹ of unit forces on unknowns given in elimination order (q,), -1 = held.
+
+    Work and memory go along the paths to the root only. It is worked out in float64 and kept
+    in `precision`.
+    """
+    live = np.flatnonzero(unknowns >= 0)
+    order = live[np.argsort(unknowns[live])]
+    rows = unknowns[order]
+    rank = np.full(len(unknowns), -1)
+    rank[order] = np.arange(len(order))
+    spans = _column_spans(factor, rows)
+    values = {
+        member: np.zeros((front.stop - front.start, span[1] - span[0]), order="F")
+        for member, (front, span) in enumerate(zip(factor.fronts, spans, strict=True))
+        if span[1] > span[0]
+    }
+    blocks = []
+    for member, right in values.items():
+        front, (first, last) = factor.fronts[member], spans[member]
+        a, b = np.searchsorted(rows, [front.start, front.stop])
+        right[rows[a:b] - front.start, np.arange(a, b) - first] += 1.0
+        product = front.block @ right
+        _pass_up(factor, values, spans, member, product[front.stop - front.start :])
+        done: Array = np.ascontiguousarray(product[: front.stop - front.start], dtype=precision)
+        blocks.append(Block(front.start, front.stop, first, last, done))
+        values[member] = done
+    return HalfResponse(rank, blocks)
+
+
+def _column_spans(factor: CholeskyFactor, rows: Index) -> list[tuple[int, int]]:
+    """Return for each member the columns [first, last) whose path to the root meets it."""
+    spans = [
+        (int(np.searchsorted(rows, f.start)), int(np.searchsorted(rows, f.stop)))
+        for f in factor.fronts
+    ]
+    for member, front in enumerate(factor.fronts):
+        first, last = spans[member]
+        if front.parent >= 0 and last > first:
+            begin, end = spans[front.parent]
+            empty = end == begin
+            spans[front.parent] = (first if empty else min(begin, first), max(last, end))
+    return spans
+
+
+def _pass_up(
+    factor: CholeskyFactor,
+    values: dict[int, Array],
+    spans: list[tuple[int, int]],
+    member: int,
+    passed: Array,
+) -> None:
+    """Take a member's products (m, columns) from the right-hand sides of those above it."""
+    boundary, above, at = factor.fronts[member].boundary, factor.fronts[member].parent, 0
+    first, last = spans[member]
+    while at < len(boundary):
+        upper = factor.fronts[above]
+        end = int(np.searchsorted(boundary, upper.stop))
+        if end > at:
+            start = spans[above][0]
+            local = boundary[at:end] - upper.start
+            values[above][local, first - start : last - start] -= passed[at:end]
+        above, at = upper.parent, end

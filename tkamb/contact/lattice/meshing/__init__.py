@@ -1,0 +1,1 @@
+"""From an insert to cells: the grid, its columns and walls, and the surface that is touched."""

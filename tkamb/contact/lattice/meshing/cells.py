@@ -1,0 +1,199 @@
+"""Cells of eight nodes: corners, springs to the 26 neighbours, quality, shape functions.
+
+Corners are in VTK hexahedron order with the cell's own axes along x, y and z.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.geometry.frames import Array, Index
+
+CORNERS = np.array(
+    [
+        [0, 0, 0],
+        [1, 0, 0],
+        [1, 1, 0],
+        [0, 1, 0],
+        [0, 0, 1],
+        [1, 0, 1],
+        [1, 1, 1],
+        [0, 1, 1],
+    ]
+)
+"""Corner offsets (i, j, k) of a cell in the order of VTK's hexahedron."""
+
+PAIRS = np.array([(a, b) for a in range(8) for b in range(a + 1, 8)])
+"""The 28 pairs of a cell's corners that are joined by springs."""
+
+PAIR_AXES = np.abs(np.diff(CORNERS[PAIRS], axis=1))[:, 0]
+"""Axes along which the ends of each pair differ (28, 3), 0 or 1: 1 edge, 2 face, 3 body."""
+
+_GAUSS = 0.5 + (CORNERS - 0.5) / np.sqrt(3.0)
+
+DIRECTIONS = np.array(
+    [
+        [1, 0, 0],
+        [0, 1, 0],
+        [0, 0, 1],
+        [1, 1, 0],
+        [1, -1, 0],
+        [0, 1, 1],
+        [0, 1, -1],
+        [1, 0, 1],
+        [1, 0, -1],
+        [1, 1, 1],
+        [1, 1, -1],
+        [1, -1, 1],
+        [-1, 1, 1],
+    ]
+)
+"""The 13 directions of springs: edges x, y, z; face diagonals xy, yz, xz; body diagonals."""
+
+FAMILY_SHARE = np.array([0.25] * 3 + [0.5] * 6 + [1.0] * 4)
+"""Share of one cell in a spring of each direction: four cells meet in an edge, two in a face."""
+
+FACES = np.array(
+    [[0, 3, 7, 4], [1, 2, 6, 5], [0, 1, 5, 4], [3, 2, 6, 7], [0, 1, 2, 3], [4, 5, 6, 7]]
+)
+"""Corners of the six faces: -x, +x, -y, +y, -z, +z."""
+
+
+EDGES = np.array(
+    [
+        (a, b)
+        for axis in range(3)
+        for a in range(8)
+        for b in range(8)
+        if (CORNERS[b] - CORNERS[a]).tolist() == np.eye(3, dtype=int)[axis].tolist()
+    ]
+)
+"""The 12 edges of a cell as pairs of corners: four along x, four along y, four along z."""
+
+
+@dataclass(frozen=True, eq=False)
+class Springs:
+    """Every spring once, and where each cell finds its 28.
+
+    Args:
+        ends: (s, 2) nodes.
+        family: (s,) row of DIRECTIONS.
+        owners: (s,) number of cells that own it.
+        of_cell: (c, 28) spring of each of the cell's PAIRS.
+    """
+
+    ends: Index
+    family: NDArray[np.int8]
+    owners: Index
+    of_cell: Index
+
+
+def join_springs(cells: Index, node_count: int) -> Springs:
+    """Return the springs of cells (c, 8), each once; no sorting, the grid gives the keys."""
+    offset = CORNERS[PAIRS[:, 1]] - CORNERS[PAIRS[:, 0]]
+    forward = (offset[:, None, :] == DIRECTIONS).all(axis=2)
+    backward = (-offset[:, None, :] == DIRECTIONS).all(axis=2)
+    family = (forward | backward).argmax(axis=1)
+    start = np.where(forward.any(axis=1), PAIRS[:, 0], PAIRS[:, 1])
+    end = np.where(forward.any(axis=1), PAIRS[:, 1], PAIRS[:, 0])
+    key = cells[:, start] * len(DIRECTIONS) + family
+    owners = np.bincount(key.ravel(), minlength=node_count * len(DIRECTIONS))
+    used = np.flatnonzero(owners)
+    number = np.full(len(owners), -1)
+    number[used] = np.arange(len(used))
+    of_cell = number[key]
+    ends = np.empty((len(used), 2), np.int64)
+    ends[of_cell] = np.stack([cells[:, start], cells[:, end]], axis=-1)
+    return Springs(ends, (used % len(DIRECTIONS)).astype(np.int8), owners[used], of_cell)
+
+
+def scaled_jacobians(points: Array) -> Array:
+    """Return the least scaled Jacobian (c,) of cells (c, 8, 3): 1 for a box, <= 0 inverted."""
+    result = np.full(len(points), np.inf)
+    for corner, offset in enumerate(CORNERS):
+        x, y, z = _edges_at(points, corner, offset)
+        lengths = np.prod([np.linalg.norm(e, axis=1) for e in (x, y, z)], axis=0)
+        volume = np.einsum("ci,ci->c", np.cross(x, y), z)
+        result = np.minimum(result, np.divide(volume, lengths, where=lengths > 0, out=-lengths))
+    return result
+
+
+def _edges_at(points: Array, corner: int, offset: Index) -> list[Array]:
+    """Return the edges along +x, +y and +z of the cell that meet at one corner."""
+    edges = []
+    for axis in range(3):
+        other = offset.copy()
+        other[axis] = 1 - other[axis]
+        neighbour = int((other == CORNERS).all(axis=1).argmax())
+        sign = 1.0 if offset[axis] == 0 else -1.0
+        edges.append(sign * (points[:, neighbour] - points[:, corner]))
+    return edges
+
+
+def shortest_edges(points: Array) -> Array:
+    """Return the length (c,) of the shortest edge of cells (c, 8, 3), m."""
+    edges = points[:, EDGES[:, 1]] - points[:, EDGES[:, 0]]
+    return np.linalg.norm(edges, axis=2).min(axis=1)
+
+
+def cell_volumes(points: Array) -> Array:
+    """Return the exact volumes (c,) of trilinear cells (c, 8, 3), by 2 x 2 x 2 Gauss points."""
+    return np.linalg.det(_jacobians(points)).sum(axis=1) / 8
+
+
+def shape_gradients(at: Array) -> Array:
+    """Return reference gradients (8, 3) of the trilinear shape functions at a point of [0, 1]³."""
+    factor = np.where(CORNERS == 1, at, 1 - at)
+    sign = np.where(CORNERS == 1, 1.0, -1.0)
+    return np.stack(
+        [sign[:, d] * factor[:, (d + 1) % 3] * factor[:, (d + 2) % 3] for d in range(3)], axis=1
+    )
+
+
+REFERENCE_GRADIENTS = np.stack([shape_gradients(at) for at in _GAUSS])
+"""(8 points, 8 nodes, 3) of the shape functions at the 2 x 2 x 2 Gauss points of [0, 1]³."""
+
+
+def _jacobians(corners: Array) -> Array:
+    """Return the Jacobians (s, 8 points, 3, 3), m, of cells (s, 8, 3)."""
+    return np.einsum("gnd,snx->sgdx", REFERENCE_GRADIENTS, corners)
+
+
+def gauss_gradients(corners: Array) -> tuple[Array, Array]:
+    """Return shape-function gradients and weights at the 2×2×2 Gauss points.
+
+    Args:
+        corners: (s, 8, 3) m.
+
+    Returns:
+        Gradients (s, 8 points, 8 nodes, 3), 1/m, and weights (s, 8), m³, whose sum is the
+        cell's volume. A weight that is not positive marks an inverted cell.
+    """
+    jacobian = _jacobians(corners)
+    weights = np.linalg.det(jacobian) / 8
+    gradients = np.einsum("sgxd,gnd->sgnx", np.linalg.inv(jacobian), REFERENCE_GRADIENTS)
+    return gradients, weights
+
+
+def mean_gradient(corners: Array) -> tuple[Array, Array]:
+    """Return the volume-averaged gradients (s, 8, 3), 1/m, and the volume (s,), m³.
+
+    They reproduce a linear field exactly: sum_i x_i g_i = identity
+    (Flanagan & Belytschko, Int J Numer Meth Eng 17:679, 1981).
+    """
+    gradients, weights = gauss_gradients(corners)
+    volume = weights.sum(axis=1)
+    return np.einsum("sg,sgnx->snx", weights, gradients) / volume[:, None, None], volume
+
+
+def group_shapes(corners: Array, tolerance: float = 1e-9) -> tuple[Array, Index]:
+    """Return the distinct cell shapes (s, 8, 3) and each cell's shape (c,).
+
+    Cells of a regular lattice repeat: what depends on shape alone is worked out once. Two
+    shapes are the same when their corners differ by less than about `tolerance` (m).
+    """
+    relative = corners - corners[:, :1]
+    keys = np.round(relative.reshape(len(corners), 24) / tolerance).astype(np.int64)
+    _, first, shape = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    return relative[first], shape.reshape(-1).astype(np.int64)

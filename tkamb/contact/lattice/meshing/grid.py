@@ -1,0 +1,267 @@
+"""From any closed insert to a lattice: nodes, cells, springs and the contact surface.
+
+After Sharma (2008), section 4.1: a grid over the bounding box, as cubic as the box permits;
+rays along its lines; nodes moved onto the surface by at most half a cell; classes; connectivity.
+"""
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from tkamb.contact.lattice.meshing.cells import (
+    CORNERS,
+    FACES,
+    Springs,
+    join_springs,
+    scaled_jacobians,
+    shortest_edges,
+)
+from tkamb.contact.lattice.meshing.columns import NodeField, settle_columns
+from tkamb.contact.lattice.meshing.walls import inside, settle_walls
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, Index, Mask
+from tkamb.geometry.post import find_post
+from tkamb.geometry.surface import Surface
+from tkamb.units import MILLIMETRE
+
+_log = logging.getLogger("tkamb")
+
+
+INTERNAL, CONTACT, BOTTOM, OTHER = 0, 1, 2, 3
+"""Node classes: inside, top surface, flat bottom, any other surface (walls, underside)."""
+
+MAX_EDGE_RATIO = 1.4
+"""Longest over shortest edge of a grid cell."""
+FLATNESS = 5e-5
+"""m: nodes this near the plane of the flat bottom lie in it."""
+MOST_CELLS = 1_000_000
+"""Of a grid over the bounding box: a knee's at 0.35 mm, more than fifty gigabytes."""
+LEAST_JACOBIAN = 0.05
+"""A surface cell with a smaller scaled Jacobian is left out."""
+LEAST_EDGE = 0.2
+"""A surface cell with an edge shorter than this share of the spacing is left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """Nodes and cells of an insert, insert frame, SI.
+
+    Args:
+        nodes: (n, 3) m.
+        index: (n, 3) index (i, j, k) in the structured grid.
+        node_class: (n,) INTERNAL, CONTACT, BOTTOM or OTHER.
+        spacing: (3,) m, of the undistorted grid.
+        origin: (3,) m, of the grid's node (0, 0, 0).
+        cells: (c, 8) nodes in the order of VTK's hexahedron.
+        springs: (s, 2) nodes, every spring once.
+        spring_family: (s,) row of `cells.DIRECTIONS`.
+        spring_owners: (s,) number of cells that own the spring.
+        cell_springs: (c, 28) spring of each of a cell's `cells.PAIRS`.
+        contact_triangles: (k, 3) nodes, outward, over the contact nodes.
+        dropped_nodes: members of the part that belong to no cell, left out.
+        dropped_cells: cells left out (inverted, bridging a gap, or loose).
+        mended_rays: (3,) lines along x, y, z mended from their neighbours.
+        closed_gaps: gaps narrower than a cell, filled.
+        thin_intervals: parts thinner than half a cell, left out or held by one node.
+    """
+
+    nodes: Array
+    index: Index
+    node_class: NDArray[np.int8]
+    spacing: Array
+    origin: Array
+    cells: Index
+    springs: Index
+    spring_family: NDArray[np.int8]
+    spring_owners: Index
+    cell_springs: Index
+    contact_triangles: Index
+    dropped_nodes: int
+    dropped_cells: int
+    mended_rays: int
+    closed_gaps: int
+    thin_intervals: int
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What was mended, filled or left out, in plain words; empty when nothing was."""
+        counts = (
+            (self.mended_rays, "{} rays with an odd number of crossings mended from neighbours"),
+            (self.closed_gaps, "{} gaps narrower than a cell filled"),
+            (self.thin_intervals, "{} intervals thinner than half a cell held by one node"),
+            (self.dropped_cells, "{} cells left out: flat, inverted, across a gap, or loose"),
+            (self.dropped_nodes, "{} nodes left out that no cell holds"),
+        )
+        return tuple(phrase.format(count) for count, phrase in counts if count)
+
+    @property
+    def contact_nodes(self) -> Index:
+        """Numbers of the contact nodes."""
+        return np.flatnonzero(self.node_class == CONTACT)
+
+    @property
+    def bottom_nodes(self) -> Index:
+        """Numbers of the nodes in the flat bottom."""
+        return np.flatnonzero(self.node_class == BOTTOM)
+
+
+def build_grid(insert: Surface, target_size: float) -> Lattice:
+    """Return the lattice of a closed insert.
+
+    Mended rays and a post (cam-post contact is not modelled) are told on the logger "tkamb".
+
+    Args:
+        insert: closed surface in the insert frame (flat bottom in y = 0 facing -y).
+        target_size: wanted edge of a cell, m.
+
+    Raises:
+        InputError: the surface is open beyond mending, thinner than the cells, or they are
+            more than `MOST_CELLS`.
+    """
+    extent = insert.bounds[1] - insert.bounds[0]
+    spacing = grid_spacing(extent, target_size)
+    count = float((extent / spacing).prod())
+    if count > MOST_CELLS:
+        raise InputError(
+            f"cells of {target_size / MILLIMETRE:g} mm make {count:.2g} of them",
+            insert.name,
+            f"take larger ones ({MOST_CELLS:.0e} at most), and check the mesh's unit",
+        )
+    field = settle_columns(insert, spacing)
+    settle_walls(field, insert)
+    if field.mended:
+        _log.warning("%s: %d rays through gaps in the mesh mended", insert.name, field.mended)
+    post = find_post(insert)
+    if post is not None:
+        _log.warning("%s: %s", insert.name, post.notice)
+    cells, dropped_cells = _sound_cells(field, insert)
+    if not len(cells):
+        raise InputError(
+            f"no cell of {target_size / MILLIMETRE:g} mm fits into the part",
+            insert.name,
+            "use smaller cells",
+        )
+    return _assemble(field, cells, dropped_cells)
+
+
+def grid_spacing(extent: Array, target_size: float) -> Array:
+    """Return the edges (3,) of the grid cells that divide a box (3,) evenly, m.
+
+    The target is kept unless the box is so thin that the edge ratio would pass 1.4; then the
+    nearest size (by ratio) that keeps it is taken.
+    """
+    if target_size <= 0.0:
+        raise InputError(
+            f"a cell size of {target_size / MILLIMETRE:g} mm", mend="give a positive size"
+        )
+    for percent in range(400):
+        for size in (target_size / 1.01**percent, target_size * 1.01**percent):
+            spacing = extent / np.maximum(np.round(extent / size), 1.0)
+            if spacing.max() / spacing.min() <= MAX_EDGE_RATIO:
+                return spacing
+    raise InputError(
+        f"a box of {np.round(extent / MILLIMETRE, 3)} mm cannot be divided into near-cubic cells"
+    )
+
+
+def _sound_cells(field: NodeField, insert: Surface) -> tuple[Index, int]:
+    """Return the cells (c, 8) by flat grid number that fill the part, and how many were left."""
+    shape = field.member.shape
+    corner = np.argwhere(_all_corners(field.member))
+    grid = corner[:, None, :] + CORNERS
+    cells = np.ravel_multi_index(tuple(np.moveaxis(grid, -1, 0)), shape)
+    found = len(cells)
+    cells = cells[~_bridges_gap(field, cells)]
+    points = field.points.reshape(-1, 3)
+    cells = cells[scaled_jacobians(points[cells]) > LEAST_JACOBIAN]
+    cells = cells[shortest_edges(points[cells]) > LEAST_EDGE * field.spacing.min()]
+    cells = cells[inside(insert.rays, points[cells].mean(axis=1))]
+    cells = cells[_largest_piece(cells)]
+    return cells, found - len(cells)
+
+
+def _all_corners(member: Mask) -> Mask:
+    whole = member[:-1] & member[1:]
+    whole = whole[:, :-1] & whole[:, 1:]
+    return whole[:, :, :-1] & whole[:, :, 1:]
+
+
+def _bridges_gap(field: NodeField, cells: Index) -> Mask:
+    """Say which cells have an upright edge whose ends lie in different intervals of a line."""
+    number = field.interval.ravel()[cells]
+    low, high = number[:, [0, 1, 4, 5]], number[:, [3, 2, 7, 6]]
+    return ((low >= 0) & (high >= 0) & (low != high)).any(axis=1)
+
+
+def _largest_piece(cells: Index) -> Mask:
+    """Say which cells belong to the largest piece joined through whole faces."""
+    if not len(cells):
+        return np.ones(0, bool)
+    faces = np.sort(cells[:, FACES].reshape(-1, 4), axis=1)[:, [0, 3]]
+    owner = np.repeat(np.arange(len(cells)), len(FACES))
+    order = np.lexsort((faces[:, 1], faces[:, 0]))
+    faces, owner = faces[order], owner[order]
+    shared = (faces[1:] == faces[:-1]).all(axis=1)
+    a, b = owner[:-1][shared], owner[1:][shared]
+    graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(len(cells), len(cells)))
+    label = connected_components(graph, directed=False)[1]
+    return label == np.bincount(label).argmax()
+
+
+def _assemble(field: NodeField, cells: Index, dropped_cells: int) -> Lattice:
+    shape = field.member.shape
+    used = np.zeros(field.member.size, bool)
+    used[cells] = True
+    number = np.cumsum(used) - 1
+    flat = np.flatnonzero(used)
+    springs: Springs = join_springs(number[cells], len(flat))
+    node_class = _classes(field, cells)[flat]
+    index = np.column_stack(np.unravel_index(flat, shape))
+    return Lattice(
+        nodes=field.points.reshape(-1, 3)[flat],
+        index=index,
+        node_class=node_class,
+        spacing=field.spacing,
+        origin=np.array([field.lines[0][0], 0.0, field.lines[1][0]]),
+        cells=number[cells],
+        springs=springs.ends,
+        spring_family=springs.family,
+        spring_owners=springs.owners,
+        cell_springs=springs.of_cell,
+        contact_triangles=_contact_triangles(index, node_class, shape),
+        dropped_nodes=int(field.member.sum() - len(flat)),
+        dropped_cells=dropped_cells,
+        mended_rays=field.mended,
+        closed_gaps=field.closed_gaps,
+        thin_intervals=field.thin,
+    )
+
+
+def _classes(field: NodeField, cells: Index) -> NDArray[np.int8]:
+    """Return the class of every grid node (flat); a node in fewer than 8 cells is outside."""
+    outside = np.bincount(cells.ravel(), minlength=field.member.size) < 8
+    result = np.where(outside, OTHER, INTERNAL).astype(np.int8)
+    result[field.top.ravel()] = CONTACT
+    height = field.points[..., 1].ravel()
+    flat = np.abs(height) <= max(FLATNESS, 0.02 * field.spacing[1])
+    result[field.lower_end.ravel() & flat] = BOTTOM
+    return result
+
+
+def _contact_triangles(index: Index, node_class: NDArray[np.int8], shape: tuple) -> Index:
+    """Return outward triangles over squares of four contact columns without a cliff."""
+    number = np.full((shape[0], shape[2]), -1)
+    height = np.zeros((shape[0], shape[2]), np.int64)
+    contact = np.flatnonzero(node_class == CONTACT)
+    number[index[contact, 0], index[contact, 2]] = contact
+    height[index[contact, 0], index[contact, 2]] = index[contact, 1]
+    corner = np.argwhere(_all_corners(number[:, None, :].repeat(2, axis=1) >= 0)[:, 0])
+    i, k = corner.T
+    square = np.stack([number[i, k], number[i, k + 1], number[i + 1, k + 1], number[i + 1, k]])
+    levels = np.stack([height[i, k], height[i, k + 1], height[i + 1, k + 1], height[i + 1, k]])
+    square = square[:, np.ptp(levels, axis=0) <= 1].T
+    return np.concatenate([square[:, [0, 1, 2]], square[:, [0, 2, 3]]])

@@ -1,0 +1,207 @@
+"""Nodes moved sideways onto walls, which rays along y cannot see.
+
+Where a node has no cell beside it, a ray along z or x from the node finds the wall. Nearer than
+half a cell, the node is moved onto it; farther, the node outside is pulled in.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tkamb.contact.lattice.meshing.columns import NodeField, Nodes, inside, refired_inwards
+from tkamb.contact.lattice.meshing.notches import fill_notches
+from tkamb.geometry.frames import Array, Mask
+from tkamb.geometry.height_field import inside_intervals
+from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.surface import Surface
+
+STEPS = ((0, 1), (0, -1), (2, 1), (2, -1))
+"""Axis and sign of the four ways sideways."""
+INSET = 1e-6
+"""Cells that a node stays inside the wall it is moved to, so that rays along y still hit."""
+FIRE_AT = 0.1
+"""Rays sideways start this share of a cell inside the surface that the node lies on."""
+
+
+@dataclass(frozen=True, eq=False)
+class WallHits:
+    """For each node and way sideways: is there no cell, and how far is the wall (m)."""
+
+    open: Mask
+    distance: Array
+
+
+def settle_walls(field: NodeField, surface: Surface) -> None:
+    """Move nodes of `field` sideways onto the walls, and admit nodes outside (in place)."""
+    rays = surface.rays
+    before = field.points.copy()
+    firing = _firing_points(field)
+    hits = _walls_beside(field, firing, rays, surface)
+    _move_out(field, firing, hits, rays)
+    _pull_in(field, before, hits, rays)
+    fill_notches(field, before, rays)
+
+
+def _firing_points(field: NodeField) -> Array:
+    """Return the nodes' points, those at the ends of intervals moved into the part."""
+    result = field.points.copy()
+    height = field.points[..., 1]
+    for end, step in ((field.upper_end, -1), (field.lower_end, 1)):
+        i, j, k = np.nonzero(end & ~(field.upper_end & field.lower_end))
+        result[i, j, k, 1] += FIRE_AT * (height[i, j + step, k] - height[i, j, k])
+    return result
+
+
+def _filled_cells(field: NodeField, surface: Surface) -> Mask:
+    """Say which cells have eight members and their centre in the part (before walls)."""
+    m, y = field.member, field.points[..., 1]
+    whole = np.ones(tuple(n - 1 for n in m.shape), bool)
+    centre = np.zeros(whole.shape)
+    for i, j, k in np.ndindex(2, 2, 2):
+        corner = tuple(slice(o, o + n) for o, n in zip((i, j, k), whole.shape, strict=True))
+        whole &= m[corner]
+        centre += y[corner] / 8.0
+    x, z = ((line[1:] + line[:-1]) / 2.0 for line in field.lines)
+    found = inside_intervals(surface, 1, z, x)
+    filled = np.zeros_like(whole)
+    a, b = found.second, found.first
+    rank = np.arange(len(a)) - np.searchsorted(b * len(x) + a, b * len(x) + a)
+    for r in range(int(rank.max(initial=-1)) + 1):
+        at = rank == r
+        low, high = np.full((len(x), len(z)), np.inf), np.full((len(x), len(z)), -np.inf)
+        low[a[at], b[at]], high[a[at], b[at]] = found.lower[at], found.upper[at]
+        filled |= (centre > low[:, None]) & (centre < high[:, None])
+    return whole & filled
+
+
+def _walls_beside(
+    field: NodeField, firing: Array, rays: RayCaster, surface: Surface
+) -> list[WallHits]:
+    """Return, for each of STEPS, which members have no cell that way and where the wall is."""
+    cells = np.pad(_filled_cells(field, surface), 1)
+    result = []
+    for axis, sign in STEPS:
+        beside = cells[1:] if sign > 0 else cells[:-1]
+        if axis == 2:
+            beside = cells[:, :, 1:] if sign > 0 else cells[:, :, :-1]
+        other = 2 - axis
+        joined = beside[:, 1:] | beside[:, :-1]
+        joined = np.moveaxis(joined, other, 0)
+        joined = np.moveaxis(joined[1:] | joined[:-1], 0, other)
+        free = field.member & ~joined
+        above, below = np.zeros_like(free), np.zeros_like(free)
+        above[:, :-1], below[:, 1:] = free[:, 1:], free[:, :-1]
+        free &= ~(field.upper_end & ~below) & ~(field.lower_end & ~above)
+        distance = np.full(free.shape, np.inf)
+        direction = np.zeros(3)
+        direction[axis] = sign
+        t, face = rays.first(firing[free], direction)
+        leaving = rays.surface.face_normals[face][:, axis] * sign > 0.0
+        distance[free] = np.where(leaving, t, np.inf)
+        result.append(WallHits(free, distance))
+    return result
+
+
+def _move_out(field: NodeField, firing: Array, hits: list[WallHits], rays: RayCaster) -> None:
+    """Move members that have a wall within half a cell onto it."""
+    move = np.zeros((*field.member.shape, 2))
+    for column, axis in ((0, 0), (1, 2)):
+        forth, back = (hit.distance for hit in hits[axis : axis + 2])
+        near = np.minimum(forth, back)
+        chosen = near <= 0.5 * field.spacing[axis]
+        move[..., column] = np.where(chosen, np.where(forth <= back, forth, -back), 0.0)
+        _leave_far_side(hits[axis : axis + 2], chosen & (forth > back), chosen & (forth <= back))
+    moved: Nodes = np.nonzero((move != 0.0).any(axis=-1))
+    target = _corner_or_wall(firing[moved], move[moved], rays)
+    height = refired_inwards(field, moved, target, -move[moved], rays)
+    good = np.isfinite(height)
+    moved = tuple(index[good] for index in moved)
+    target[:, 1] = height
+    field.points[moved] = target[good]
+
+
+def _leave_far_side(pair: list[WallHits], forth_left: Mask, back_left: Mask) -> None:
+    """Keep the wall on the far side of a thin part for the node outside it; drop the used."""
+    pair[0].distance[back_left] = np.inf
+    pair[1].distance[forth_left] = np.inf
+
+
+def _corner_or_wall(start: Array, move: Array, rays: RayCaster) -> Array:
+    """Return where nodes go that have walls at `move` (n, 2) along x and z (0: no wall).
+
+    With two walls: the corner, if it is in the part, else the foot on the line between hits.
+    """
+    move = move * (1.0 - INSET)
+    corner = start.copy()
+    corner[:, [0, 2]] += move
+    both = np.flatnonzero((move != 0.0).all(axis=1))
+    if both.size:
+        tested = corner[both].copy()
+        tested[:, [0, 2]] -= 1e-3 * move[both]
+        cut = both[~inside(rays, tested)]
+        u, w = move[cut].T
+        foot = np.column_stack([u * w**2, w * u**2]) / (u**2 + w**2)[:, None]
+        corner[cut[:, None], [0, 2]] = start[cut][:, [0, 2]] + foot
+    return corner
+
+
+def _pull_in(field: NodeField, before: Array, hits: list[WallHits], rays: RayCaster) -> None:
+    """Admit nodes outside that have a wall within half a cell, seen from a member beside."""
+    move = np.zeros((*field.member.shape, 2))
+    upper, lower, top = (np.ones(field.member.shape, bool) for _ in range(3))
+    height = np.full(field.member.shape, np.nan)
+    for (axis, sign), hit in zip(STEPS, hits, strict=True):
+        spacing = field.spacing[axis]
+        near = hit.open & (hit.distance < spacing)
+        i, j, k = np.nonzero(near)
+        to = [i, j, k]
+        to[axis] = to[axis] + sign
+        fits = (to[axis] >= 0) & (to[axis] < field.member.shape[axis])
+        node: Nodes = (i[fits], j[fits], k[fits])
+        goal: Nodes = (to[0][fits], to[1][fits], to[2][fits])
+        outside = ~field.member[goal]
+        node, goal = tuple(n[outside] for n in node), tuple(g[outside] for g in goal)
+        column = 0 if axis == 0 else 1
+        move[..., column][goal] = -sign * (spacing - hit.distance[node])
+        upper[goal] &= field.upper_end[node]
+        lower[goal] &= field.lower_end[node]
+        top[goal] &= field.top[node]
+        height[goal] = before[..., 1][node]
+    pulled = np.nonzero((move != 0.0).any(axis=-1))
+    _admit_at(field, pulled, before, move[pulled], (lower, upper, top), height, rays)
+
+
+def _admit_at(
+    field: NodeField,
+    nodes: Nodes,
+    before: Array,
+    move: Array,
+    ends: tuple[Mask, Mask, Mask],
+    height: Array,
+    rays: RayCaster,
+) -> None:
+    start = before[nodes]
+    target = start.copy()
+    target[:, [0, 2]] += _foot(move)
+    field.lower_end[nodes], field.upper_end[nodes] = ends[0][nodes], ends[1][nodes]
+    at_end = field.lower_end[nodes] | field.upper_end[nodes]
+    field.points[..., 1][nodes] = np.where(at_end, height[nodes], start[:, 1])
+    settled = refired_inwards(field, nodes, target, move, rays)
+    good = np.isfinite(settled)
+    bad = tuple(n[~good] for n in nodes)
+    field.lower_end[bad] = field.upper_end[bad] = False
+    nodes = tuple(n[good] for n in nodes)
+    target[:, 1] = settled
+    field.points[nodes] = target[good]
+    field.member[nodes] = True
+    field.top[nodes] = ends[2][nodes] & ~field.has_top(nodes)
+
+
+def _foot(move: Array) -> Array:
+    """Return the foot of the node on the line through its two hits, or its only hit."""
+    move = move * (1.0 + INSET)
+    both = (move != 0.0).all(axis=1)
+    result = move.copy()
+    u, w = move[both].T
+    result[both] = np.column_stack([u * w**2, w * u**2]) / (u**2 + w**2)[:, None]
+    return result

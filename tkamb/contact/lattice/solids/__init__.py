@@ -1,0 +1,1 @@
+"""Cells with a material: stiffness, nonlinear residual, tangent."""

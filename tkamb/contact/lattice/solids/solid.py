@@ -1,0 +1,246 @@
+"""A solid made of cells: linear stiffness, what nonlinearity takes away, tangent."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sparse
+
+from tkamb.contact.lattice.meshing.cells import group_shapes, mean_gradient
+from tkamb.contact.materials import Material
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, Index
+
+DEVIATORIC = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
+DEVIATORIC[:3, :3] -= 2 / 3
+"""2 dev eps : dev eps as a form (6, 6) in [xx, yy, zz, 2xy, 2yz, 2zx]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """Where the node pairs of each element (cell or spring) go in the global matrix.
+
+    Args:
+        indptr: (n + 1,) start of each node's row.
+        indices: (b,) column node of each block.
+        slot: (c, p²) block of each ordered node pair of each element of p nodes.
+    """
+
+    indptr: Index
+    indices: Index
+    slot: Index
+
+    @classmethod
+    def of(cls, elements: Index, nodes: int) -> "Pattern":
+        """Return the pattern of elements (c, p) on so many nodes."""
+        count = elements.shape[1]
+        rows = np.repeat(elements, count, axis=1).ravel().astype(np.int64)
+        columns = np.tile(elements, (1, count)).ravel()
+        keys, slot = np.unique(rows * nodes + columns, return_inverse=True)
+        indptr = np.searchsorted(keys, np.arange(nodes + 1) * nodes)
+        return cls(indptr, keys % nodes, slot.reshape(len(elements), count**2))
+
+    @property
+    def nodes(self) -> int:
+        """How many nodes."""
+        return len(self.indptr) - 1
+
+    def assemble(self, matrices: Array, shape: Index | None = None) -> sparse.csr_matrix:
+        """Return the sum (3n, 3n) of the elements' matrices.
+
+        Args:
+            matrices: (c, 3p, 3p), or (s, 3p, 3p) with `shape`.
+            shape: (c,) which matrix each element takes.
+        """
+        count = matrices.shape[1] // 3
+        blocks = matrices.reshape(-1, count, 3, count, 3).transpose(2, 4, 0, 1, 3)
+        blocks = blocks.reshape(9, -1, count**2)
+        data = np.empty((len(self.indices), 9))
+        flat = self.slot.ravel()
+        for entry in range(9):
+            values = blocks[entry] if shape is None else blocks[entry][shape]
+            data[:, entry] = np.bincount(flat, values.ravel(), len(self.indices))
+        return sparse.bsr_matrix(
+            (data.reshape(-1, 3, 3), self.indices, self.indptr), (3 * self.nodes, 3 * self.nodes)
+        ).tocsr()
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """Sums the elements' nodal vectors into global ones.
+
+    Args:
+        elements: (c, p) nodes of each element (cell or spring).
+        nodes: how many nodes.
+    """
+
+    elements: Index
+    nodes: int
+
+    def gather(self, displacement: Array, chosen: Index | None = None) -> Array:
+        """Return (k, 3p) of the chosen elements, by default of all, from nodal (n, 3)."""
+        elements = self.elements if chosen is None else self.elements[chosen]
+        return displacement[elements].reshape(len(elements), 3 * elements.shape[1])
+
+    def sum(self, forces: Array, chosen: Index | None = None) -> Array:
+        """Return nodal (n, 3) from (k, 3p) of the chosen elements, by default of all."""
+        flat = (self.elements if chosen is None else self.elements[chosen]).ravel()
+        parts = forces.reshape(-1, 3)
+        total = np.zeros((self.nodes, 3))
+        for axis in range(3) if len(flat) else ():
+            total[:, axis] = np.bincount(flat, parts[:, axis], self.nodes)
+        return total
+
+
+class Solid(ABC):
+    """Cells of eight nodes with a material, small strain.
+
+    Args:
+        nodes: (n, 3) m.
+        cells: (c, 8), VTK hexahedron order.
+        spacing: (3,) m, edges of the lattice's box cell.
+        material: its E, nu and stress-strain law.
+
+    Raises:
+        InputError: a cell is turned inside out.
+    """
+
+    def __init__(self, nodes: Array, cells: Index, spacing: Array, material: Material) -> None:
+        self.nodes, self.cells, self.spacing, self.material = nodes, cells, spacing, material
+        self.shapes, self.shape_of_cell = group_shapes(nodes[cells])
+        _, volume = mean_gradient(self.shapes)
+        if not (volume > 0).all():
+            raise InputError(
+                f"{int((volume <= 0)[self.shape_of_cell].sum())} cells are turned inside out",
+                "lattice",
+                "take a finer resolution",
+            )
+        self.scatter = Scatter(cells, len(nodes))
+
+    @cached_property
+    def pattern(self) -> Pattern:
+        """Where cell matrices go in the global one."""
+        return Pattern.of(self.cells, len(self.nodes))
+
+    @property
+    @abstractmethod
+    def stiffness(self) -> sparse.csr_matrix:
+        """Linear stiffness (3n, 3n), N/m."""
+
+    @abstractmethod
+    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
+        """Return linear forces minus the material's own, N, of elements of `scatter` (k, 3p).
+
+        Args:
+            displacement: (n, 3) m; only the chosen elements' nodes are looked at.
+            chosen: (k,) elements; all by default.
+        """
+
+    def residual_force(self, displacement: Array) -> Array:
+        """Return h = K u - f(u), N, (n, 3): linear forces minus the material's own."""
+        if self.material.is_linear:
+            return np.zeros_like(displacement)
+        return self.scatter.sum(self.nonlinear_residual(displacement))
+
+    @abstractmethod
+    def tangent(self, displacement: Array) -> sparse.csr_matrix:
+        """Return d f / d u (3n, 3n), N/m."""
+
+    def internal_force(self, displacement: Array) -> Array:
+        """Return nodal internal forces f(u), N, (n, 3)."""
+        linear = (self.stiffness @ displacement.ravel()).reshape(-1, 3)
+        return linear - self.residual_force(displacement)
+
+    @abstractmethod
+    def linear_force(self, displacement: Array) -> Array:
+        """Return K u, N, (n, 3), summed element by element: no matrix is assembled."""
+
+    def least_principal_strain(self, displacement: Array) -> float:
+        """Return the smallest principal strain of the cells' mean gradients.
+
+        It is no smaller than minus the norm of its tensor: where the cell of largest norm is
+        compressed, only cells whose norm exceeds that compression are looked at.
+        """
+        strain = self.strain(displacement)
+        norm = np.linalg.norm(strain, axis=(1, 2))
+        first = float(np.linalg.eigvalsh(strain[norm.argmax()])[0])
+        return float(np.linalg.eigvalsh(strain[norm >= -first])[:, 0].min())
+
+    def strain(self, displacement: Array) -> Array:
+        """Return each cell's mean strain (c, 3, 3)."""
+        common, others, gradients = self._mean_gradients
+        local = displacement[self.cells].reshape(-1, 24)
+        gradient = (local @ common).reshape(-1, 3, 3)
+        for a in range(3):
+            for b in range(3):
+                along = np.einsum("cn,nc->c", local[others, a::3], gradients[:, b])
+                gradient[others, a, b] = along
+        return (gradient + np.swapaxes(gradient, 1, 2)) / 2
+
+    @cached_property
+    def _mean_gradients(self) -> tuple[Array, Index, Array]:
+        """Mean gradients of the commonest shape as (24, 9), the other cells, theirs (8, 3, k)."""
+        gradients, (common, others) = mean_gradient(self.shapes)[0], self.kinds
+        matrix = np.einsum("nb,ac->ncab", gradients[common], np.eye(3)).reshape(24, 9)
+        theirs = gradients[self.shape_of_cell[others]]
+        return matrix, others, np.ascontiguousarray(theirs.transpose(1, 2, 0))
+
+    @cached_property
+    def kinds(self) -> tuple[int, Index]:
+        """The commonest shape, and the cells (k,) of all others."""
+        common = int(np.bincount(self.shape_of_cell).argmax())
+        return common, np.flatnonzero(self.shape_of_cell != common)
+
+
+class CellSolid(Solid):
+    """A solid whose cells are a shear part and an elastic bulk K V g gᵀ, shape by shape.
+
+    Attributes:
+        dilatation: (s, 24) g, 1/m: the mean dilatation of a cell is g · u.
+        volume: (s,) V, m³.
+    """
+
+    dilatation: Array
+    volume: Array
+
+    @abstractmethod
+    def shape_stiffness(self) -> Array:
+        """Return the linear stiffness of each shape (s, 24, 24), N/m."""
+
+    @cached_property
+    def stiffness(self) -> sparse.csr_matrix:
+        """Linear stiffness (3n, 3n), N/m."""
+        return self.pattern.assemble(self.shape_stiffness(), self.shape_of_cell)
+
+    def linear_force(self, displacement: Array) -> Array:
+        """Return K u, N, (n, 3); see `Solid`."""
+        matrices, local = self.shape_stiffness(), self.scatter.gather(displacement)
+        common, others = self.kinds
+        force = local @ matrices[common]
+        force[others] = np.einsum("cij,cj->ci", matrices[self.shape_of_cell[others]], local[others])
+        return self.scatter.sum(force)
+
+    @cached_property
+    def bulk(self) -> Array:
+        """K V g gᵀ of each shape (s, 24, 24), N/m."""
+        g, scale = self.dilatation, self.material.bulk_modulus * self.volume
+        return scale[:, None, None] * g[:, :, None] * g[:, None, :]
+
+    @cached_property
+    def index_among_others(self) -> Index:
+        """Index (c,) of each cell among those that are not of the commonest shape, or -1."""
+        others = self.kinds[1]
+        index = np.full(len(self.cells), -1)
+        index[others] = np.arange(len(others))
+        return index
+
+
+def strain_matrix(gradients: Array) -> Array:
+    """Return B (..., 6, 24) with strain [xx, yy, zz, 2xy, 2yz, 2zx] = B u from (..., 8, 3)."""
+    matrix = np.zeros((*gradients.shape[:-2], 6, 8, 3))
+    for row, (k, m) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0)]):
+        matrix[..., row, :, k] += gradients[..., m]
+        if k != m:
+            matrix[..., row, :, m] += gradients[..., k]
+    return matrix.reshape(*gradients.shape[:-2], 6, 24)

@@ -1,0 +1,1 @@
+"""The lattice of Sharma (2008), kept for comparison."""

@@ -1,0 +1,204 @@
+"""The insert's articular surface, sampled on a regular grid."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from tkamb.contact.pair import ContactSurface, PreparedContact
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, Index, Mask, inverse, rotate, transform
+from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.surface import Surface
+
+DOWN = np.array([0.0, -1.0, 0.0])
+DEEPEST = 0.5
+"""Share of the thickness that a penetration is seen to: rays against the femur start there."""
+RIM_RAYS = 8
+"""Rays per edge of a cell at the rim, to find how much of it is covered."""
+STEEPEST = 0.1
+"""Smallest n_y taken for a tributary area: 84 deg from the horizontal."""
+SKIN = 1e-6
+"""m; rays into the insert start so far below its surface."""
+MOST_CELLS = 4_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceSamples(ContactSurface):
+    """Map points on the surface that rays from above see first, eminence and post included.
+
+    The points lie on the mesh itself, the normals are `Surface.smooth_normals`. A point's area is
+    the part of its grid cell that the insert covers, divided by n_y: under a uniform pressure the
+    vertical force is exactly pressure times covered projection.
+
+    Args:
+        depth: (n,) m, along the inward normal to where the insert ends.
+        resolution: m, edge of the grid cells.
+    """
+
+    depth: Array
+    resolution: float
+
+    def part(self, chosen: Mask) -> "SurfaceSamples":
+        """Return the chosen points (n,) without triangles."""
+        return SurfaceSamples(
+            self.points[chosen],
+            self.normals[chosen],
+            self.area[chosen],
+            self.thickness[chosen],
+            np.empty((0, 3), np.int64),
+            self.depth[chosen],
+            self.resolution,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SampledContact(PreparedContact):
+    """A prepared contact whose map stands on samples of the insert's surface."""
+
+    surface: SurfaceSamples
+
+
+def sample_surface(insert: Surface, resolution: float) -> SurfaceSamples:
+    """Sample the upper surface of the insert by vertical rays on an x-z grid.
+
+    One point per cell, at its centre; at the rim at the centre of what is covered. Cells lie
+    symmetrically about x = 0 and z = 0. Walls parallel to y are seen by no vertical ray and
+    carry no point. The midpoint rule makes integrals over them second-order in the
+    resolution: on two real implants 1 mm gives force within 0.5 %, peak within 2 % and area
+    within 4 % of 0.25 mm, where the centroids of the mesh's own triangles give 2 to 6 % and
+    2 to 10 % for force and area.
+
+    Args:
+        insert: closed, in the insert frame.
+        resolution: edge of the cells, m.
+
+    Raises:
+        InputError: the insert is not closed, or the resolution does not suit its size.
+    """
+    centres, shape = _grid(insert, resolution)
+    caster = insert.rays
+    hit = np.isfinite(_first(caster, centres)[0])
+    xz, covered, cell = _cells(caster, centres, hit.reshape(shape), resolution)
+    points, face, thickness = _through(caster, xz, insert)
+    normals = insert.smooth_normals(points, face)
+    area = covered * resolution**2 / np.maximum(normals[:, 1], STEEPEST)
+    triangles = _grid_triangles(cell, shape)
+    depth = SKIN + caster.first(points - SKIN * normals, -normals)[0]
+    depth = np.where(np.isfinite(depth), depth, thickness)
+    return SurfaceSamples(points, normals, area, thickness, triangles, depth, resolution)
+
+
+def gaps_along_normals(samples: SurfaceSamples, femoral: Surface, pose: Array) -> Array:
+    """Return the gap (n,) m along the insert's normals; negative = penetration.
+
+    Rays start half-way through the insert, outside the femoral component, and go up along
+    the normal; the first crossing counts. inf where no femoral surface lies above, -inf
+    where the femoral component reaches deeper than where the rays start.
+    """
+    return gaps_and_facets(samples, femoral, pose)[0]
+
+
+def gaps_and_facets(samples: SurfaceSamples, femoral: Surface, pose: Array) -> tuple[Array, Array]:
+    """Return the gap (n,), see `gaps_along_normals`, and the normals (n, 3) of what is met.
+
+    The normals are those of the femoral facets, in the insert frame.
+    """
+    back = inverse(pose)
+    normals = rotate(back, samples.normals)
+    below = DEEPEST * np.minimum(samples.thickness, samples.depth)
+    origins = transform(back, samples.points) - below[:, None] * normals
+    distance, face = femoral.rays.first(origins, normals)
+    met = femoral.face_normals[face]
+    facing = np.einsum("ij,ij->i", normals, met)
+    gap = np.where((face >= 0) & (facing > 0), -np.inf, distance - below)
+    return gap, rotate(pose, met)
+
+
+def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:
+    """Return cell centres (n, 2) as x, z, and how many there are along x and z."""
+    half = np.abs(insert.bounds[:, [0, 2]]).max(axis=0)
+    count = np.maximum(np.ceil(half / resolution), 1)
+    if 4 * count.prod() > MOST_CELLS:
+        raise InputError(
+            f"a resolution of {resolution * 1e3:g} mm makes {4 * count.prod():.2g} cells",
+            insert.name,
+            "take a coarser one, and check the mesh's unit",
+        )
+    x, z = (resolution * (np.arange(-int(n), int(n)) + 0.5) for n in count)
+    centres = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1)
+    return centres.reshape(-1, 2), (len(x), len(z))
+
+
+def _cells(
+    caster: RayCaster, centres: Array, hit: Mask, resolution: float
+) -> tuple[Array, Array, Index]:
+    """Return per covered cell: its point (n, 2), covered share (n,) and cell number (n,)."""
+    around = [np.roll(np.pad(hit, 1), (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    some, every = np.any(around, axis=0)[1:-1, 1:-1], np.all(around, axis=0)[1:-1, 1:-1]
+    rim = np.flatnonzero(some & ~every)
+    ticks = (np.arange(RIM_RAYS) + 0.5) / RIM_RAYS - 0.5
+    offsets = resolution * np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
+    rays = centres[rim, None] + offsets
+    on = np.isfinite(_first(caster, rays.reshape(-1, 2))[0]).reshape(len(rim), RIM_RAYS**2)
+    count = on.sum(axis=1)
+    mean = np.einsum("ij,ijk->ik", on, rays) / np.maximum(count, 1)[:, None]
+    away = np.where(on, np.linalg.norm(rays - mean[:, None], axis=2), np.inf)
+    nearest = rays[np.arange(len(rim)), away.argmin(axis=1)]
+    on_mean = np.isfinite(_first(caster, mean)[0])[:, None]
+    xz, share = centres.copy(), every.ravel().astype(float)
+    xz[rim], share[rim] = np.where(on_mean, mean, nearest), count / RIM_RAYS**2
+    cell = np.flatnonzero(share > 0)
+    if not cell.size:
+        raise InputError(
+            f"no ray of a {resolution * 1e3:g} mm grid meets it", caster.surface.name,
+            "take a finer resolution, and check the mesh's unit",
+        )  # fmt: skip
+    return xz[cell], share[cell], cell
+
+
+def _first(caster: RayCaster, xz: Array) -> tuple[Array, Index]:
+    return caster.first(_above(caster.surface, xz), DOWN)
+
+
+def _above(surface: Surface, xz: Array) -> Array:
+    """Return points (n, 3) over the surface at x, z (n, 2)."""
+    return np.stack([xz[:, 0], np.full(len(xz), surface.bounds[1, 1] + 1e-3), xz[:, 1]], axis=1)
+
+
+def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Index, Array]:
+    """Return first hits (n, 3), their faces (n,) and the thickness (n,) below them."""
+    origins = _above(insert, xz)
+    distance, face = caster.first(origins, DOWN)
+    ray, along, crossed = caster.all(origins, DOWN)
+    leaves = insert.face_normals[crossed, 1] < 0
+    exit_ = np.full(len(xz), np.inf)
+    np.minimum.at(exit_, ray[leaves], along[leaves])
+    thickness = exit_ - distance
+    lost = ~np.isfinite(thickness)
+    if lost.mean() > 0.01:
+        raise InputError(
+            f"{lost.mean():.0%} of vertical rays enter it and never leave",
+            insert.name,
+            "the insert must be a closed surface with outward normals",
+        )
+    keep = np.flatnonzero(~lost)
+    if lost.any():
+        thickness[lost] = thickness[keep[cKDTree(xz[keep]).query(xz[lost])[1]]]
+    return origins + distance[:, None] * DOWN, face, thickness
+
+
+def _grid_triangles(cell: Index, shape: tuple[int, int]) -> Index:
+    """Return triangles between neighbouring points, facing +y."""
+    number = np.full(shape, -1)
+    number.ravel()[cell] = np.arange(len(cell))
+    a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
+    c, d = number[1:, :-1].ravel(), number[1:, 1:].ravel()
+    lower = np.where((a < 0)[:, None], np.stack([b, d, c], 1), np.stack([a, b, c], 1))
+    upper = np.where((a < 0)[:, None], -1, np.stack([b, d, c], 1))
+    without_b, without_c = (b < 0)[:, None], (c < 0)[:, None]
+    lower = np.where(without_b, np.stack([a, d, c], 1), lower)
+    lower = np.where(without_c & ~without_b, np.stack([a, b, d], 1), lower)
+    upper = np.where(without_b | without_c, -1, upper)
+    triangles = np.concatenate([lower, upper])
+    return triangles[(triangles >= 0).all(axis=1)]

@@ -1,0 +1,307 @@
+"""The body side of a case: geometry of each frame in, loads of each frame out."""
+
+import time as clock
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.body.chain import ChainMotion, ChainState
+from tkamb.body.contact_points import (
+    FARTHEST_GAP,
+    NO_CONTACT,
+    ContactPoints,
+    contact_points,
+    nearest_gap,
+)
+from tkamb.body.knee import KneeGeometry, KneeLoads, solve_knee, unsolved
+from tkamb.body.load import PointForces
+from tkamb.errors import ComputationError, InputError, TkambError
+from tkamb.geometry.frames import SIDES, Array, knee_pose, knee_twist
+from tkamb.scene.case import Case
+from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.body.adjustment_effect import AdjustmentEffect
+    from tkamb.body.extensor import ExtensorFrames
+    from tkamb.body.ligaments import Ligament
+    from tkamb.body.patella import PatellaState
+    from tkamb.body.slip import CondyleSlip
+    from tkamb.geometry.adjustment import Adjustment
+    from tkamb.geometry.closest import ClosestPointQuery
+
+STRAIN_FLEXIONS = (0.0, 60.0, 90.0)
+"""deg: where the strains of the ligaments are shown."""
+
+NAN = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameLoads:
+    """The body side of one frame.
+
+    Args:
+        geometry: what the equations worked on.
+        loads: what they say.
+        adjustment: the femoral adjustment, if asked for and possible.
+        query_seconds: computing time of the closest points on the meshes.
+        seconds: computing time of the equations, contact points given.
+        effect: what the adjustment does to the forces; None without one, or where the recorded
+            pose has no solution.
+    """
+
+    geometry: KneeGeometry
+    loads: KneeLoads
+    adjustment: "Adjustment | None"
+    query_seconds: float
+    seconds: float
+    effect: "AdjustmentEffect | None" = None
+
+
+class Mechanics:
+    """The rigid-body mechanics of a case, frame by frame.
+
+    Args:
+        case: the scene with its files read.
+
+    Attributes:
+        poses: (f, 4, 4) recorded pose_femur_in_insert.
+        friction: Coulomb coefficient of the femorotibial contact.
+        extensor: patella and lines of action of all frames; None if not modelled.
+        ligaments: the bundles, with their slack lengths.
+        strains: bundle -> strain at the flexions of `STRAIN_FLEXIONS`; NaN if not recorded.
+    """
+
+    def __init__(self, case: Case) -> None:
+        self.case = case
+        self.poses = knee_pose(case.motion.coordinates)
+        self.friction = case.scene.contact.friction if case.scene.contact else 0.0
+        self.query = _contact_query(case)
+        self._check_near()
+        self.extensor = None
+        if case.scene.patella:
+            self.extensor = extensor_frames(case, self.poses)
+        self.ligaments, self.strains = self._build_ligaments()
+
+    def _check_near(self) -> None:
+        """Raise where the condyles are nowhere near the insert, whatever the frame."""
+        contact = self.case.scene.contact
+        if self.query is None or contact is None or contact.released:
+            return
+        middle, last = len(self.poses) // 2, len(self.poses) - 1
+        nearest = [nearest_gap(self.query.at(self.poses[k])) for k in (0, middle, last)]
+        if all(abs(gap) > FARTHEST_GAP for gap in nearest):
+            gap = min(nearest, key=abs)
+            raise InputError(
+                f"neither condyle is near the insert (nearest {abs(gap) / MILLIMETRE:.0f} mm "
+                f"{'apart' if gap > 0 else 'inside'})",
+                "[motion] with [implant.femoral] and [implant.insert]",
+                "check which mesh is which, their units, axes and places, and the motion's",
+            )
+
+    def frame(self, k: int, adjustment: "Adjustment | None" = None) -> FrameLoads:
+        """Return the loads of frame k; a frame that cannot be solved holds NaN.
+
+        Args:
+            k: frame.
+            adjustment: the femoral adjustment, if it is decided; None: as the scene asks.
+        """
+        start = clock.perf_counter()
+        if adjustment is None:
+            adjustment, problems = self._adjust(k)
+        else:
+            problems = ()
+        pose = adjustment.pose if adjustment else self.poses[k]
+        points = NO_CONTACT if problems else self._contact_points(k, pose)
+        recorded = self._contact_points(k, self.poses[k]) if adjustment else None
+        queried = clock.perf_counter()
+        geometry = self.geometry(k)
+        problems += points.problems + geometry.problems
+        geometry = replace(
+            geometry, condyles=points.condyles, lifted=points.lifted, problems=problems
+        )
+        loads = unsolved(problems) if problems else solve_knee(geometry, self.friction)
+        done = clock.perf_counter()
+        effect = self._effect(geometry, loads, recorded) if recorded else None
+        return FrameLoads(geometry, loads, adjustment, queried - start, done - queried, effect)
+
+    def geometry(
+        self, k: int, coordinates: Array | None = None, patella: "PatellaState | None" = None
+    ) -> KneeGeometry:
+        """Return frame k without its contact, perhaps at other coordinates than recorded.
+
+        Rates and accelerations stay as recorded.
+
+        Args:
+            k: frame.
+            coordinates: (6,) m and rad; None: as recorded.
+            patella: where the patella is with the femur there; None: as recorded.
+        """
+        recorded = self.case.motion.coordinates[k]
+        place = recorded if coordinates is None else coordinates
+        state = self.case.chain.at(self._chain_motion(k, place, patella))
+        poses = {link: state.pose(link) for link in self._attachment_links()}
+        tensions, known = self._pulls(poses)
+        geometry = KneeGeometry(
+            state, self._ground(k, state), known, coordinates=place, tensions=tensions
+        )
+        if self.extensor is None:
+            return geometry
+        try:
+            extensor, muscle = self.extensor.at(k, recorded[5], state, patella)
+        except ComputationError as error:
+            return replace(geometry, problems=(str(error),))
+        return replace(geometry, extensor=extensor, muscles=(muscle,))
+
+    def sliding(self, k: int, coordinates: Array, point: Array) -> Array:
+        """Return the velocity (3,) m/s of the femur's point relative to the insert's.
+
+        Args:
+            k: frame; the rates are the recorded ones.
+            coordinates: (6,) where the knee is.
+            point: (3,) m, insert frame.
+        """
+        velocity, spin = knee_twist(coordinates, self.case.motion.velocity[k])
+        return np.asarray(velocity + np.cross(spin, point - coordinates[:3]))
+
+    def slips(self) -> "dict[str, CondyleSlip]":
+        """Return side -> rolling and slipping of all frames; empty without the two surfaces."""
+        case = self.case
+        if self.query is None or case.femoral is None or case.insert is None:
+            return {}
+        from tkamb.body.slip import condyle_slip
+
+        found = condyle_slip(case.femoral, case.insert, case.split, case.motion.coordinates)
+        sides = zip(SIDES, found, strict=True)
+        return {side: slip for side, slip in sides if slip is not None}
+
+    def _chain_motion(
+        self, k: int, coordinates: Array, patella: "PatellaState | None" = None
+    ) -> ChainMotion:
+        motion, tibia = self.case.motion, self.case.tibia
+        joints = np.stack([coordinates, motion.velocity[k], motion.acceleration[k]])
+        if self.extensor:
+            own = self.extensor.joints(k)
+            if patella is not None:
+                own = np.concatenate([patella.coordinates[None], own[1:]])
+            joints = np.hstack([joints, own])
+        if tibia is None:
+            return ChainMotion(np.eye(4), np.zeros(6), np.zeros(6), joints)
+        return ChainMotion(tibia.pose[k], tibia.velocity[k], tibia.acceleration[k], joints)
+
+    def _ground(self, k: int, state: ChainState) -> PointForces | None:
+        ground, table = self.case.ground, self.case.scene.ground_reaction
+        if ground is None or table is None:
+            return None
+        if table.applied == "ankle":
+            tibia = self.case.tibia
+            assert tibia is not None
+            return state.ground_reaction(ground.force[k], tibia.pose[k][:3, 3], np.zeros(3))
+        return state.ground_reaction(ground.force[k], ground.point[k], ground.moment[k])
+
+    def _adjust(self, k: int) -> "tuple[Adjustment | None, tuple[str, ...]]":
+        """Return the femoral adjustment, if asked for, and why it is not possible."""
+        contact = self.case.scene.contact
+        if self.query is None or contact is None or not contact.adjust:
+            return None, ()
+        from tkamb.geometry.adjustment import adjust
+
+        try:
+            return adjust(self.query, self.poses[k]), ()
+        except TkambError as error:
+            return None, (error.what,)
+
+    def _contact_points(self, k: int, pose: Array) -> ContactPoints:
+        """Return where the condyles touch at a pose (4, 4), with the rates of frame k."""
+        if self.query is None:
+            return NO_CONTACT
+        place = self.case.motion.coordinates[k]
+        return contact_points(self.query, pose, lambda point: self.sliding(k, place, point))
+
+    def _effect(
+        self, geometry: KneeGeometry, loads: KneeLoads, recorded: ContactPoints
+    ) -> "AdjustmentEffect | None":
+        """Return what the adjustment changed; None where either pose has no solution."""
+        if loads.problems or recorded.problems:
+            return None
+        from tkamb.body.adjustment_effect import adjustment_effect
+
+        there = replace(geometry, condyles=recorded.condyles, lifted=recorded.lifted)
+        before = solve_knee(there, self.friction)
+        if before.problems:
+            return None
+        return adjustment_effect(loads, before, geometry.condyles, recorded.condyles)
+
+    def _pulls(self, poses: dict[str, Array]) -> tuple[dict[str, float], tuple[PointForces, ...]]:
+        """Return the ligaments' tensions (N) by name, and what they do to the links."""
+        if not self.ligaments:
+            return {}, ()
+        from tkamb.body.ligaments import ligament_loads
+
+        tensions, loads = ligament_loads(self.ligaments, poses)
+        names = [bundle.name for bundle in self.ligaments]
+        return dict(zip(names, tensions.tolist(), strict=True)), loads
+
+    def _build_ligaments(
+        self,
+    ) -> "tuple[tuple[Ligament, ...], dict[str, tuple[float, ...]]]":
+        """Return the bundles, and their strains so that a wrong insertion is seen."""
+        if not self.case.ligaments:
+            return (), {}
+        from tkamb.body.ligaments import build_ligaments, strain_table
+
+        poses = self.recorded_poses()
+        flexion = self.case.motion.coordinates[:, 5]
+        bundles = build_ligaments(self.case.ligaments, poses, flexion)
+        return bundles, strain_table(bundles, poses, flexion, STRAIN_FLEXIONS)
+
+    def recorded_poses(self) -> dict[str, Array]:
+        """Return link -> pose_link_in_insert (f, 4, 4) as recorded, of links with attachments."""
+        recorded, ligament = self.case.motion.coordinates, self.case.patellar_ligament
+        states = [self.case.chain.at(self._chain_motion(k, x)) for k, x in enumerate(recorded)]
+        links = self._attachment_links()
+        if ligament is not None:
+            links |= {ligament.proximal.link, ligament.distal.link}
+        return {link: np.stack([state.pose(link) for state in states]) for link in links}
+
+    def _attachment_links(self) -> set[str]:
+        bundles = self.case.ligaments
+        return {end.link for bundle in bundles for end in (bundle.proximal, bundle.distal)}
+
+
+def extensor_frames(case: Case, poses: Array) -> "ExtensorFrames":
+    """Return the extensor mechanism of a case with [patella].
+
+    Raises:
+        InputError: no patella was recorded, or see `ExtensorFrames`.
+    """
+    from tkamb.body.extensor import ExtensorFrames, ExtensorParts
+
+    assert case.patellar_ligament is not None and case.scene.patella is not None
+    assert case.femoral is not None and case.patella is not None
+    (muscle,) = case.muscles
+    parts = ExtensorParts(
+        muscle, case.patellar_ligament, case.chain, case.femoral, case.patella, case.insert
+    )
+    motion, recorded = case.motion, None
+    if case.scene.patella.motion == "recorded":
+        if motion.patella is None:
+            raise InputError(
+                "has no patella columns",
+                case.scene.motion.file,
+                "record patella_ap, patella_si, patella_rotation or set [patella] motion = "
+                "'solved'",
+            )
+        assert motion.patella_velocity is not None and motion.patella_acceleration is not None
+        rates = (motion.patella_velocity, motion.patella_acceleration)
+        recorded = np.stack([motion.patella, *rates], axis=1)
+    return ExtensorFrames(parts, motion.time, poses, recorded, case.rates)
+
+
+def _contact_query(case: Case) -> "ClosestPointQuery | None":
+    if case.scene.contact is None:
+        return None
+    from tkamb.geometry.closest import ClosestPointQuery
+
+    assert case.femoral is not None and case.insert is not None
+    return ClosestPointQuery(case.femoral, case.insert, case.split)

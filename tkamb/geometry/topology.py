@@ -1,0 +1,185 @@
+"""How a triangulated surface hangs together: its edges, open loops, parts and bodies."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError
+
+from tkamb.geometry.frames import Array, Index
+
+
+@dataclass(frozen=True, eq=False)
+class BoundaryLoop:
+    """One closed loop of open edges, walked as its triangles walk them.
+
+    Args:
+        vertices: (n,) vertex indices in order; the loop closes from the last to the first.
+        centre: (3,) mean of its vertices, units of the surface.
+        width: smallest distance between two parallel lines that enclose the loop in its
+            best-fitting plane, units of the surface.
+        perimeter: length of the loop, units of the surface.
+    """
+
+    vertices: Index
+    centre: Array
+    width: float
+    perimeter: float
+
+
+def half_edges(faces: Index) -> Index:
+    """Return the directed edges (3k, 2) of the faces (k, 3), face by face."""
+    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+def edge_use(faces: Index) -> tuple[Index, Index]:
+    """Return for every half edge its undirected edge (3k,), and how many faces use each edge."""
+    ends = np.sort(half_edges(faces), axis=1)
+    key = ends[:, 0] * (int(faces.max(initial=0)) + 1) + ends[:, 1]
+    _, edge, count = np.unique(key, return_inverse=True, return_counts=True)
+    return edge.reshape(-1), count
+
+
+def open_edges(faces: Index) -> Index:
+    """Return the directed edges (m, 2) that only one face uses."""
+    edge, count = edge_use(faces)
+    return half_edges(faces)[count[edge] == 1]
+
+
+def boundary_loops(vertices: Array, faces: Index) -> list[BoundaryLoop]:
+    """Return the loops of open edges, widest first.
+
+    Two holes that touch in a vertex come out as two loops. Chains that do not close (where
+    the winding is inconsistent) are returned as if they did.
+    """
+    loops = [_measured(vertices, loop) for loop in _traced(open_edges(faces))]
+    return sorted(loops, key=lambda loop: -loop.width)
+
+
+def _traced(edges: Index) -> list[Index]:
+    following: dict[int, list[int]] = {}
+    for start, end in edges.tolist():
+        following.setdefault(start, []).append(end)
+    loops: list[Index] = []
+    while following:
+        path = [next(iter(following))]
+        position = {path[0]: 0}
+        while path:
+            ends = following.get(path[-1])
+            if not ends:
+                if len(path) > 1:
+                    loops.append(np.array(path, np.int64))
+                break
+            end = ends.pop()
+            if not ends:
+                del following[path[-1]]
+            if end in position:
+                start = position[end]
+                loops.append(np.array(path[start:], np.int64))
+                for vertex in path[start + 1 :]:
+                    del position[vertex]
+                del path[start + 1 :]
+                if end not in following:
+                    if start == 0:
+                        break
+                    continue
+            else:
+                position[end] = len(path)
+                path.append(end)
+    return loops
+
+
+def _measured(vertices: Array, loop: Index) -> BoundaryLoop:
+    points = vertices[loop]
+    centre = points.mean(axis=0)
+    perimeter = float(np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
+    return BoundaryLoop(loop, centre, _width(points - centre), perimeter)
+
+
+def _width(points: Array) -> float:
+    plane = np.linalg.svd(points, full_matrices=False)[2][:2]
+    flat = points @ plane.T
+    try:
+        hull = flat[ConvexHull(flat).vertices]
+    except (QhullError, ValueError):
+        return 0.0
+    along = np.roll(hull, -1, axis=0) - hull
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return float(np.ptp(hull @ across.T, axis=0).min())
+
+
+def connected_parts(faces: Index) -> Index:
+    """Return for every face (k,) the number of the connected part that it belongs to."""
+    n = int(faces.max(initial=0)) + 1
+    edges = half_edges(faces)
+    graph = coo_matrix((np.ones(len(edges), bool), edges.T), shape=(n, n))
+    label = connected_components(graph, directed=False)[1]
+    return np.unique(label[faces[:, 0]], return_inverse=True)[1].reshape(-1)
+
+
+def signed_volumes(vertices: Array, faces: Index) -> Array:
+    """Return the volume (k,) that each face spans with the centre of the vertices, m³."""
+    a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
+    return np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A connected part of a surface, with the voids within it.
+
+    Args:
+        faces: (m,) indices of its faces.
+        extents: (3,) size along the axes, units of the surface.
+        centre: (3,) of its bounding box, units of the surface.
+        area: of its outer skin, square units of the surface.
+        closed: whether its skin has no open edge.
+    """
+
+    faces: Index
+    extents: Array
+    centre: Array
+    area: float
+    closed: bool
+
+
+def separate_bodies(vertices: Array, faces: Index) -> list[Body]:
+    """Return the bodies of a surface, the one with the largest skin first.
+
+    A closed part of negative volume (its normals point to its inside) whose bounding box lies
+    within another closed part's is a void of that one, not a body.
+
+    Args:
+        vertices: (n, 3).
+        faces: (k, 3), as `tkamb.geometry.repair.repair` leaves them.
+    """
+    label = connected_parts(faces)
+    parts = [np.flatnonzero(label == part) for part in range(int(label.max(initial=-1)) + 1)]
+    loose = np.unique(open_edges(faces))
+    found = [_body(vertices, faces, part, loose) for part in parts]
+    volume = np.bincount(label, signed_volumes(vertices, faces))
+    outer = [k for k in range(len(found)) if volume[k] >= 0 or not found[k].closed]
+    held: dict[int, list[Index]] = {k: [found[k].faces] for k in outer}
+    for k in set(range(len(found))) - set(outer):
+        around = [q for q in outer if found[q].closed and _within(found[k], found[q])]
+        held.setdefault(min(around, key=lambda q: found[q].area, default=k), []).append(parts[k])
+    bodies = [
+        Body(np.sort(np.concatenate(own)), b.extents, b.centre, b.area, b.closed)
+        for b, own in ((found[k], own) for k, own in held.items())
+    ]
+    return sorted(bodies, key=lambda body: -body.area)
+
+
+def _body(vertices: Array, faces: Index, part: Index, loose: Index) -> Body:
+    corners = vertices[faces[part]]
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = float(np.linalg.norm(cross, axis=1).sum() / 2.0)
+    closed = not np.isin(faces[part], loose).any()
+    return Body(part, high - low, (low + high) / 2.0, area, closed)
+
+
+def _within(inner: Body, outer: Body) -> bool:
+    reach = np.abs(inner.centre - outer.centre) + inner.extents / 2.0
+    return bool((reach < outer.extents / 2.0).all())

@@ -1,0 +1,262 @@
+"""The pressure maps of a run: contact.h5, written frame by frame, or kept in memory.
+
+Per frame: the maps are appended and flushed, then the time. `/time_s` is therefore as long
+as the number of whole frames, also when the run was killed. Compressed chunks of one frame
+keep what earlier frames wrote untouched.
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tkamb.atomic import replaced_file
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+
+UNITS = "SI: m, s, Pa, N; poses 4x4"
+COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+PER_FRAME = ("pressure_Pa", "gap_m", "nodal_force_N", "femoral_pose", "time_s")
+
+
+class MapWriter:
+    """Grows contact.h5 by one frame at a time; a kill leaves the frames before it readable.
+
+    Args:
+        path: the file; an older one is replaced. None: the file is in memory alone.
+        points: (n, 3) m, insert frame.
+        triangles: (k, 3) indices into the points.
+        attributes: frame, model, version, scene hash, ...: text or numbers.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | Path | None,
+        points: ArrayLike,
+        triangles: ArrayLike,
+        attributes: Mapping[str, Any],
+    ) -> None:
+        self.path = None if path is None else Path(path)
+        points = np.asarray(points, float)
+        options: dict[str, Any] = {} if path else {"driver": "core", "backing_store": False}
+        with self._written():
+            self._file = h5py.File(path or "memory", "w", **options)
+            self._begin(points, np.asarray(triangles, np.int64), attributes)
+
+    def _begin(
+        self, points: Array, triangles: NDArray[np.int64], attributes: Mapping[str, Any]
+    ) -> None:
+        self._file.attrs["units"] = UNITS
+        for name, value in attributes.items():
+            self._file.attrs[name] = value
+        self._file.create_dataset("points_m", data=points)
+        self._file.create_dataset("triangles", data=triangles)
+        n = len(points)
+        shapes = ((n,), (n,), (n, 3), (4, 4))
+        for name, shape in zip(PER_FRAME, shapes, strict=False):
+            self._grow(name, shape)
+        self._file.create_dataset("time_s", (0,), float, maxshape=(None,), chunks=(256,))
+        self._file.flush()
+
+    def _grow(self, name: str, shape: tuple[int, ...]) -> None:
+        self._file.create_dataset(
+            name,
+            (0, *shape),
+            float,
+            maxshape=(None, *shape),
+            chunks=(1, *shape),
+            **(COMPRESSION if self.path else {}),
+        )
+
+    def append(
+        self,
+        time: float,
+        pressure: ArrayLike,
+        gap: ArrayLike,
+        nodal_force: ArrayLike,
+        femoral_pose: ArrayLike,
+    ) -> None:
+        """Add one frame and flush it.
+
+        Args:
+            time: s.
+            pressure: (n,) Pa.
+            gap: (n,) m.
+            nodal_force: (n, 3) N on the insert.
+            femoral_pose: (4, 4) pose_femoral_in_insert at which the map holds.
+        """
+        values = (pressure, gap, nodal_force, femoral_pose)
+        with self._written():
+            frame = len(self)
+            for name, value in zip(PER_FRAME, values, strict=False):
+                dataset = self._file[name]
+                dataset.resize(frame + 1, axis=0)
+                dataset[frame] = value
+            self._file.flush()
+            self._file["time_s"].resize(frame + 1, axis=0)
+            self._file["time_s"][frame] = time
+            self._file.flush()
+
+    def append_failed(self, time: float) -> None:
+        """Add a frame without a result: NaN everywhere but the time."""
+        nan = float("nan")
+        self.append(time, nan, nan, nan, nan)
+
+    def __len__(self) -> int:
+        return int(self._file["time_s"].shape[0])
+
+    @property
+    def maps(self) -> "ContactMaps":
+        """What was written so far."""
+        if self.path is not None:
+            return ContactMaps(self.path)
+        arrays = {name: dataset[()] for name, dataset in self._file.items()}
+        return ContactMaps(arrays, dict(self._file.attrs))
+
+    def close(self) -> None:
+        """Close the file; nothing can be appended after it.
+
+        Raises:
+            InputError: what was appended could not be written.
+        """
+        with self._written():
+            self._file.close()
+
+    @contextmanager
+    def _written(self) -> Iterator[None]:
+        """Have what HDF5 says of a disk that is full or gone in one line."""
+        try:
+            yield
+        except (OSError, RuntimeError) as error:
+            reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+            raise InputError(f"cannot be written ({reason})", self.path) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            self.close()
+        except InputError:
+            if error is None:  # else the block has said it already
+                raise
+
+
+@dataclass(frozen=True, eq=False)
+class ContactMaps:
+    """The maps of a run: arrays in memory, or a contact.h5 that is read when first asked.
+
+    f frames, n points, k triangles; insert frame, SI. A failed frame holds NaN.
+
+    Args:
+        source: path of contact.h5, or the arrays by their names in the file.
+        given_attributes: only with arrays in memory; a file has its own.
+    """
+
+    source: Path | Mapping[str, ArrayLike]
+    given_attributes: Mapping[str, Any] | None = None
+
+    @cached_property
+    def points_m(self) -> Array:
+        """(n, 3) map points."""
+        return self._array("points_m")
+
+    @cached_property
+    def triangles(self) -> NDArray[np.int64]:
+        """(k, 3) indices into the points."""
+        return np.asarray(self._array("triangles"), np.int64)
+
+    @cached_property
+    def time_s(self) -> Array:
+        """(f,) times of the whole frames."""
+        return self._array("time_s")
+
+    @cached_property
+    def pressure_Pa(self) -> Array:
+        """(f, n) pressure."""
+        return self._array("pressure_Pa", len(self.time_s))
+
+    @cached_property
+    def gap_m(self) -> Array:
+        """(f, n) gap, positive when apart."""
+        return self._array("gap_m", len(self.time_s))
+
+    @cached_property
+    def nodal_force_N(self) -> Array:
+        """(f, n, 3) force on the insert."""
+        return self._array("nodal_force_N", len(self.time_s))
+
+    @cached_property
+    def femoral_pose(self) -> Array:
+        """(f, 4, 4) pose_femoral_in_insert at which each map holds."""
+        return self._array("femoral_pose", len(self.time_s))
+
+    @cached_property
+    def attributes(self) -> dict[str, Any]:
+        """Units, frame, model, version, scene hash."""
+        if not isinstance(self.source, Path):
+            return {"units": UNITS, **(self.given_attributes or {})}
+        with _open(self.source) as file:
+            return dict(file.attrs)
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def _array(self, name: str, frames: int | None = None) -> Any:
+        if not isinstance(self.source, Path):
+            return np.asarray(self.source[name])
+        with _open(self.source) as file:
+            if name not in file:
+                raise InputError(f"has no '{name}'", self.source, "is it a contact.h5 of tkamb?")
+            return file[name][:frames]
+
+
+def read_maps(path: str | Path) -> ContactMaps:
+    """Open a contact.h5, finished or left by a kill.
+
+    Raises:
+        InputError: no such file, or not an HDF5 file.
+    """
+    maps = ContactMaps(Path(path))
+    len(maps)
+    return maps
+
+
+def write_maps(maps: ContactMaps, path: Path) -> None:
+    """Write maps that are in memory as a whole contact.h5.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    points, triangles, attributes = maps.points_m, maps.triangles, maps.attributes
+    with (
+        replaced_file(path) as temporary,
+        MapWriter(temporary, points, triangles, attributes) as writer,
+    ):
+        for k, time in enumerate(maps.time_s):
+            frame = (maps.pressure_Pa[k], maps.gap_m[k], maps.nodal_force_N[k])
+            writer.append(time, *frame, maps.femoral_pose[k])
+
+
+def _open(path: Path) -> Any:
+    try:
+        return h5py.File(path, "r")
+    except FileNotFoundError:
+        raise InputError("no such file", path) from None
+    except OSError as error:
+        raise InputError(f"cannot be read as HDF5 ({error})", path) from None

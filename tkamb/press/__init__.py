@@ -1,1 +1,0 @@
-"""Contact alone: two meshes, a pose, a load."""

@@ -1,0 +1,249 @@
+"""A case: the scene with its files read, in SI, as a right knee. Only what the scene asks for."""
+
+import logging
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.body.chain import Chain
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, pose
+from tkamb.inputs.motion import KneeMotion, load_motion
+from tkamb.inputs.patient import load_urdf
+from tkamb.scene.scene import Scene
+from tkamb.scene.si import in_si
+from tkamb.scene.tables import FemoralImplantTable, PatellarImplantTable
+from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.body.ligaments import Ligament
+    from tkamb.body.muscles import Muscle, PatellarLigament
+    from tkamb.geometry.surface import Surface
+    from tkamb.inputs.ground_reaction import GroundReaction
+    from tkamb.inputs.tibia import BodyMotion
+
+logger = logging.getLogger("tkamb")
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What a run works on. Absent in the scene: None.
+
+    Args:
+        scene: the scene, as its file has it.
+        chain: the patient in Pinocchio.
+        motion: knee (and recorded patella) coordinates per frame.
+        tibia: the shank in the laboratory; None: upright and at rest.
+        ground: ground reaction in the laboratory.
+        femoral: femoral component in the femur link's frame.
+        insert: insert in the insert frame.
+        patella: patellar button in the patella link's frame.
+        ligaments: the bundles, generic ones among them; slack lengths where the scene has them.
+        muscles: the muscles.
+        patellar_ligament: the patellar ligament.
+    """
+
+    scene: Scene
+    chain: Chain
+    motion: KneeMotion
+    tibia: "BodyMotion | None"
+    ground: "GroundReaction | None"
+    femoral: "Surface | None"
+    insert: "Surface | None"
+    patella: "Surface | None"
+    ligaments: "tuple[Ligament, ...]" = ()
+    muscles: "tuple[Muscle, ...]" = ()
+    patellar_ligament: "PatellarLigament | None" = None
+
+    @cached_property
+    def split(self) -> float | None:
+        """z (m, femoral frame) between the condyles; None if there is only one."""
+        from tkamb.geometry.condyles import condyle_split
+
+        return condyle_split(self.femoral) if self.femoral else None
+
+    def rates(self, time: Array, places: Array) -> tuple[Array, Array, Array]:
+        """Return places of the patella (n, 3) filtered as the recording is, and derivatives."""
+        from tkamb.inputs.filtering import differentiate_coordinates
+
+        cutoff = self.scene.motion.cutoff_Hz
+        return differentiate_coordinates(time, places, cutoff, name="places of the patella")
+
+    @property
+    def bone(self) -> "Surface | None":
+        """The bone that a muscle wraps, femur link; None without one."""
+        return next((m.wrap.bone for m in self.muscles if m.wrap and m.wrap.bone), None)
+
+    @property
+    def body_weight(self) -> float:
+        """N."""
+        return self.scene.patient.mass_kg * -float(self.chain.model.gravity.linear[1])
+
+
+def load_case(scene: Scene) -> Case:
+    """Read the files that the scene names, and no other.
+
+    Raises:
+        InputError: whatever is wrong with them, in one line.
+    """
+    with_patella = scene.patella is not None
+    chain = Chain(load_urdf(in_si(scene.patient), with_patella), with_patella)
+    parts = _Parts(scene)
+    released = scene.contact.released if scene.contact else ()
+    motion = load_motion(
+        in_si(scene.motion),
+        scene.patient.side,
+        parts.insert_mesh_in_insert,
+        parts.femoral_mesh_in_femur,
+        (*released, "si") if released else (),
+        chain.insert_in_tibia,
+    )
+    if motion.unrecorded:
+        from tkamb.scene.derived_motion import seated_motion
+
+        assert parts.femoral is not None and parts.insert is not None
+        motion = seated_motion(motion, parts.femoral, parts.insert, scene.motion.cutoff_Hz)
+    if scene.motion.motion == "roll-slip":
+        from tkamb.scene.derived_motion import rolling_motion
+
+        assert parts.femoral is not None and parts.insert is not None
+        table = scene.motion
+        motion = rolling_motion(
+            motion, parts.femoral, parts.insert, table.slip_share, table.cutoff_Hz
+        )
+    tibia = ground = None
+    if scene.tibia:
+        from tkamb.inputs.tibia import load_tibia
+
+        tibia = load_tibia(
+            in_si(scene.tibia), motion.time, scene.patient.side, scene.motion.cutoff_Hz
+        )
+    elif motion.markers:
+        cutoff = scene.motion.cutoff_Hz
+        tibia = motion.markers.shank_motion(cutoff, motion.time, str(scene.motion.file))
+    if scene.ground_reaction:
+        from tkamb.inputs.ground_reaction import check_under_foot, load_ground_reaction
+
+        ground = load_ground_reaction(in_si(scene.ground_reaction), motion.time, scene.patient.side)
+        if tibia and scene.ground_reaction.applied == "cop":
+            check_under_foot(ground, tibia.pose[:, :3, 3], scene.ground_reaction.file)
+    muscles: tuple[Muscle, ...] = ()
+    patellar_ligament = None
+    if scene.patella:
+        from tkamb.scene import lines
+
+        muscles, patellar_ligament = lines.muscles(scene, chain), lines.patellar_ligament(scene)
+    return Case(
+        scene,
+        chain,
+        motion,
+        tibia,
+        ground,
+        parts.femoral,
+        parts.insert,
+        parts.patella,
+        _ligaments(scene, parts, chain),
+        muscles,
+        patellar_ligament,
+    )
+
+
+def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, ...]":
+    """Return the scene's bundles and the generic ones that it asks for."""
+    bundles: tuple[Ligament, ...] = ()
+    if scene.ligament:
+        from tkamb.scene import lines
+
+        bundles = lines.ligaments(scene)
+    if scene.generic_ligaments:
+        from tkamb.body.generic_ligaments import generic_ligaments
+
+        assert parts.femoral is not None and parts.insert is not None
+        wanted = scene.generic_ligaments.ligaments
+        bundles += generic_ligaments(parts.femoral, parts.insert, chain.insert_in_tibia, wanted)
+    return bundles
+
+
+class _Parts:
+    """The implant's surfaces in their own frames, and where their meshes' axes lie."""
+
+    def __init__(self, scene: Scene) -> None:
+        implant, self._left = scene.implant, scene.patient.side == "left"
+        wants_insert = (
+            scene.contact is not None
+            or scene.generic_ligaments is not None
+            or scene.motion.interpretation == "pose"
+            or scene.motion.motion == "roll-slip"
+        )
+        wants_femoral = wants_insert or scene.patella is not None
+        self.femoral: Surface | None = None
+        self.insert: Surface | None = None
+        self.patella: Surface | None = None
+        self.insert_mesh_in_insert = self.femoral_mesh_in_femur = np.eye(4)
+        if wants_insert:
+            if not implant.insert:
+                raise InputError(
+                    "interpretation = 'pose' is in the insert mesh's axes",
+                    "[motion]",
+                    "give [implant.insert] and [implant.femoral]",
+                )
+            self._place_insert(scene)
+        if wants_femoral:
+            if not implant.femoral:
+                raise InputError("is missing", "[implant.femoral]", "the patella rides on it")
+            self.femoral, self.femoral_mesh_in_femur = self._place(
+                "femoral component", implant.femoral
+            )
+        if scene.patella is not None:
+            if not implant.patella:
+                raise InputError("is missing", "[implant.patella]", "[patella] needs its mesh")
+            self.patella, _ = self._place("patellar button", implant.patella)
+
+    def _place_insert(self, scene: Scene) -> None:
+        from tkamb.geometry.flat_bottom import insert_placement
+        from tkamb.inputs.meshes import axes_rotation, load_surface
+
+        table = scene.implant.insert
+        assert table is not None
+        surface = load_surface(table.mesh, table.unit, table.axes, name="insert", closed=True)
+        try:
+            placement = insert_placement(surface, axes_rotation(table.axes))
+        except InputError as error:
+            if scene.implant.femoral and self._could_be_insert(scene.implant.femoral):
+                question = "are the meshes of [implant.femoral] and [implant.insert] exchanged?"
+                raise InputError(error.what, error.where, question) from None
+            raise
+        self.insert_mesh_in_insert = placement @ pose(axes_rotation(table.axes), np.zeros(3))
+        self.insert = self._right(surface.moved(placement))
+
+    def _could_be_insert(self, table: FemoralImplantTable) -> bool:
+        """Say whether the mesh that the scene calls femoral has an insert's flat bottom."""
+        from tkamb.geometry.flat_bottom import insert_placement
+        from tkamb.inputs.meshes import axes_rotation, load_surface
+
+        try:
+            surface = load_surface(table.mesh, table.unit, table.axes, name="femoral component")
+            insert_placement(surface, axes_rotation(table.axes))
+        except InputError:
+            return False
+        return True
+
+    def _place(
+        self, name: str, table: FemoralImplantTable | PatellarImplantTable
+    ) -> "tuple[Surface, Array]":
+        from scipy.spatial.transform import Rotation
+
+        from tkamb.inputs.meshes import axes_rotation, load_surface
+
+        surface = load_surface(table.mesh, table.unit, table.axes, name=name)
+        turn = Rotation.from_euler("XYZ", table.rotation_deg, degrees=True).as_matrix()
+        placement = pose(turn, np.array(table.position_mm) * MILLIMETRE)
+        mesh_in_link = placement @ pose(axes_rotation(table.axes), np.zeros(3))
+        return self._right(surface.moved(placement)), mesh_in_link
+
+    def _right(self, surface: "Surface") -> "Surface":
+        from tkamb.inputs.meshes import mirrored
+
+        return mirrored(surface) if self._left else surface

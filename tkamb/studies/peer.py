@@ -1,0 +1,228 @@
+"""CalculiX beside the built-in models: the same hexahedra, pose and load, another program.
+
+It starts without any answer of the lattice's: the femoral component begins where an elastic
+foundation would carry the load. Each position begins anew, so that its cold and warm times are the
+same. Its contact nodes lie on the smooth surface that the insert's mesh stands for, as those of the
+lattice do; the femoral component is faceted. Its pressures act on the deformed faces; here they
+become nodal forces, and those, over the undeformed tributary areas, pressures as the built-in
+models define them.
+
+Strain: linear cases have small strain on both sides. CalculiX's Ramberg-Osgood law wants finite
+strain (true stress over the Eulerian strain of the deformed shape), the built-in models keep
+small strain: a nonlinear comparison is one of the two measures as well.
+"""
+
+import time as clock
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from tkamb.contact.area import covered_areas
+from tkamb.contact.lattice.meshing.contact_map import ContactMap, contact_map
+from tkamb.contact.lattice.meshing.grid import Lattice, build_grid
+from tkamb.contact.lattice.problem import SurfaceFromBelow
+from tkamb.contact.pair import ContactPair, PreparedContact
+from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactResult
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Array, Index, Mask
+from tkamb.geometry.surface import Surface
+from tkamb.studies.calculix import LONGEST_SECONDS, Deck, PeerRun, run_calculix
+from tkamb.studies.cases import StudyCase
+from tkamb.studies.measures import Measure
+from tkamb.studies.quantities import quantities, raster_map
+from tkamb.units import MEGAPASCAL, MILLIMETRE
+
+ELEMENT = "C3D8I"
+TOUCHABLE_WITHIN = 2.0
+"""Nodes whose gap at first touch is within this many times the guessed depth can be touched."""
+LARGEST_NORMAL_Y = -0.3
+"""Largest y of a femoral normal that takes part."""
+LARGEST_IMBALANCE = 0.01
+"""Largest difference of the summed contact forces from the load, over the load."""
+
+
+@dataclass(frozen=True, eq=False)
+class PeerAnswer:
+    """What CalculiX found.
+
+    Args:
+        result: on the contact nodes of the lattice's grid, by the contract's definitions.
+        run: its times, memory and iterations.
+        prepare_seconds: for the grid, the guess and the input.
+        nodes: of the insert.
+        balance: vertical contact forces over the load.
+    """
+
+    result: ContactResult
+    run: PeerRun
+    prepare_seconds: float
+    nodes: int
+    balance: float
+
+
+def measure_by_calculix(
+    case: StudyCase, grid_mm: float, longest: float = LONGEST_SECONDS
+) -> Measure:
+    """Return CalculiX's measure of a case; its status says why there is none.
+
+    Args:
+        case: what to press.
+        grid_mm: edge of the hexahedra.
+        longest: s, after which it is stopped.
+    """
+    try:
+        answer = press_by_calculix(case.pair, case.load, case.pose, grid_mm, longest=longest)
+    except ComputationError as error:
+        return Measure(str(error))
+    seconds = answer.run.seconds
+    return Measure(
+        "ok",
+        answer.prepare_seconds,
+        seconds,
+        seconds,
+        answer.run.peak_rss_MB,
+        answer.run.iterations,
+        answer.nodes,
+        quantities(answer.result),
+        {f"{i} {j}": p for (i, j), p in raster_map(answer.result).items()},
+    )
+
+
+def press_by_calculix(
+    pair: ContactPair,
+    load: float,
+    pose: Array,
+    grid_mm: float,
+    element: str = ELEMENT,
+    longest: float = LONGEST_SECONDS,
+) -> PeerAnswer:
+    """Press a femoral component on an insert by CalculiX.
+
+    Args:
+        pair: the two bodies.
+        load: N, along -y.
+        pose: (4, 4) pose_femoral_in_insert; its y does not matter.
+        grid_mm: edge of the hexahedra.
+        element: "C3D8I" or "C3D8".
+        longest: s, after which CalculiX is stopped.
+
+    Raises:
+        InputError: CalculiX is not installed, or has no such material or bearing.
+        ComputationError: it failed, or what it found does not carry the load.
+    """
+    start = clock.perf_counter()
+    problem = _problem(pair, load, pose, grid_mm)
+    deck = Deck(problem.lattice, problem.patch, pair.material, pair.bearing, load, element)
+    text = deck.text
+    prepared = clock.perf_counter() - start
+    run = run_calculix(text, longest)
+    result, balance = _result(problem, load, run)
+    return PeerAnswer(result, run, prepared, len(problem.lattice.nodes), balance)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The grid, and the femoral component where CalculiX begins.
+
+    Args:
+        pair: the two bodies.
+        lattice: grid of the insert, its contact nodes on the smooth surface.
+        nodes: (c,) contact nodes.
+        map: contact surface.
+        floor: femoral component from below.
+        pose: (4, 4) at the guessed depth.
+        depth: m, guessed.
+        touchable: (c,) contact nodes over which `patch` lies.
+        patch: femoral triangles, insert frame.
+    """
+
+    pair: ContactPair
+    lattice: Lattice
+    nodes: Index
+    map: ContactMap
+    floor: SurfaceFromBelow
+    pose: Array
+    depth: float
+    touchable: Mask
+    patch: Surface
+
+
+def _problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -> _Problem:
+    lattice = build_grid(pair.insert, grid_mm * MILLIMETRE)
+    nodes, surface = contact_map(lattice, pair.insert)
+    smooth = lattice.nodes.copy()
+    smooth[nodes, 1] += surface.lift
+    floor = SurfaceFromBelow(pair.femoral, pair.femoral.rays)
+    guess = contact_model("foundation", grid_mm)
+    depth = guess.press(guess.prepare(pair), load, pose).approach
+    if not depth > 0:
+        raise ComputationError("needs a load that presses the bodies together", "CalculiX")
+    places, _ = floor.over(surface.points, pair.pose_at_approach(pose, 0.0))
+    near = places[:, 1] - surface.points[:, 1] < TOUCHABLE_WITHIN * depth
+    placed = pair.pose_at_approach(pose, depth)
+    patch = _patch(pair.femoral.moved(placed), surface.points[near], grid_mm * MILLIMETRE)
+    lattice = replace(lattice, nodes=smooth)
+    return _Problem(pair, lattice, nodes, surface, floor, placed, depth, near, patch)
+
+
+def _patch(femoral: Surface, points: Array, spacing: float) -> Surface:
+    """Return the downward triangles that lie within a cell of points, seen from above."""
+    down = np.flatnonzero(femoral.face_normals[:, 1] < LARGEST_NORMAL_Y)
+    middle = femoral.triangles[down].mean(axis=1)[:, ::2]
+    away, _ = cKDTree(points[:, ::2]).query(middle, distance_upper_bound=spacing)
+    used, faces = np.unique(femoral.faces[down[np.isfinite(away)]], return_inverse=True)
+    return Surface(femoral.vertices[used], faces.reshape(-1, 3).astype(np.int64), "patch")
+
+
+def _result(problem: _Problem, load: float, run: PeerRun) -> tuple[ContactResult, float]:
+    """Return what CalculiX found by the contract's definitions, and its forces over the load."""
+    if not {"NREF", "NINSERT", "contact"} <= run.blocks.keys():
+        raise ComputationError("gave no contact stress", "CalculiX")
+    approach = problem.depth - float(run.blocks["NREF"][-1, 2]) * MILLIMETRE
+    pose = problem.pair.pose_at_approach(problem.pose, approach)
+    bent = _bent(problem, run)
+    force = _nodal_forces(problem, pose, run, bent)
+    balance = -float(force[:, 1].sum()) / load
+    if not abs(balance - 1) <= LARGEST_IMBALANCE:
+        raise ComputationError(f"gave pressures that sum to {balance:.4f} of the load", "CalculiX")
+    surface = problem.map
+    pressure = np.linalg.norm(force, axis=1) / surface.area
+    gap = _gaps(problem, pose, bent)
+    covered = covered_areas(
+        surface.points, surface.triangles, surface.triangle_area,
+        pressure, gap, problem.pair.material,
+    )  # fmt: skip
+    result = ContactResult.of(
+        PreparedContact(problem.pair, surface), pose, pressure, gap, force, covered=covered,
+        iterations=run.iterations, residual=abs(balance - 1),
+    )  # fmt: skip
+    return result, balance
+
+
+def _bent(problem: _Problem, run: PeerRun) -> ContactMap:
+    """Return the deformed contact surface."""
+    moved = run.blocks["NINSERT"]
+    moved = moved[np.argsort(moved[:, 0]), 1:] * MILLIMETRE
+    deformed = replace(problem.lattice, nodes=problem.lattice.nodes + moved)
+    return contact_map(deformed, problem.pair.insert)[1]
+
+
+def _gaps(problem: _Problem, pose: Array, bent: ContactMap) -> Array:
+    """Return the vertical gaps (c,) above the deformed nodes, m, inf where nothing is above."""
+    above, _ = problem.floor.over(bent.points, pose)
+    return np.nan_to_num(above[:, 1] - bent.points[:, 1], nan=np.inf)
+
+
+def _nodal_forces(problem: _Problem, pose: Array, run: PeerRun, bent: ContactMap) -> Array:
+    """Return the forces (c, 3) on the contact nodes, N: pressure times deformed area."""
+    stress = run.blocks["contact"]
+    pressure = np.zeros(len(bent.points))
+    place = np.searchsorted(problem.nodes, stress[:, 0].astype(np.int64) - 1)
+    pressure[place] = np.maximum(stress[:, 1], 0.0) * MEGAPASCAL
+    loaded = pressure > 0
+    if not problem.touchable[loaded].all():
+        raise ComputationError("touches beyond the femoral patch it was given", "CalculiX")
+    _, normals = problem.floor.over(bent.points, pose)
+    return np.where(loaded[:, None], (pressure * bent.area)[:, None] * normals, 0.0)
