@@ -18,7 +18,7 @@ DRAWING = {
     "datasets": set(),
     "starter": set(),
     "geometry": set(),
-    "opensim": {"geometry"},
+    "opensim": {"geometry", "inputs"},
     "body": {"geometry"},
     "contact": {"geometry"},
     "inputs": {"geometry", "scene"},
