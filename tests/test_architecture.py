@@ -19,8 +19,6 @@ DRAWING = {
     "starter": set(),
     "geometry": set(),
     "opensim": {"geometry", "inputs"},
-    "muscles": {"geometry", "importing", "inputs", "opensim"},
-    "designs": {"contact", "geometry"},
     "body": {"geometry"},
     "contact": {"geometry"},
     "inputs": {"geometry"},
