@@ -1,5 +1,6 @@
 """C3D recordings: what a plate measured, on which clock, and what is refused."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -210,7 +211,19 @@ def cut(path: Path, share: float) -> Path:
     return path
 
 
+def stating(path: Path, analog_rate: float) -> Path:
+    """Change ANALOG:RATE in the file's bytes, the second RATE after POINT's."""
+    content = bytearray(path.read_bytes())
+    at = content.index(b"RATE", content.index(b"RATE") + 4) + 8
+    content[at : at + 4] = struct.pack("<f", analog_rate)
+    path.write_bytes(content)
+    return path
+
+
 REFUSED = {
+    "analog rate no multiple": (lambda d: stating(written(d), 1050.0), "no multiple"),
+    "analog rate of other samples": (lambda d: stating(written(d), 2000.0), "10 samples a frame"),
+    "analog rate below the markers'": (lambda d: stating(written(d), 50.0), "no multiple"),
     "half of the file": (lambda d: cut(written(d), 0.5), "cut short"),
     "no parameters": (lambda d: cut(written(d), 0.02), "C3D"),
     "text": (lambda d: text(d, "not a recording at all" * 100), "not a C3D file"),

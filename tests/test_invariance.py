@@ -239,6 +239,7 @@ def scaled_case(case: Case) -> Case:
 
 def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
     """Lengths, masses and times scaled, gravity and the model's own lengths along."""
+    shipped_loads()  # before anything is scaled: they are kept
     monkeypatch.setattr(contact_points, "STANDSTILL", contact_points.STANDSTILL * LENGTH / TIME)
     own_lengths = {
         knee: ("RESIDUAL_SHIFT",),

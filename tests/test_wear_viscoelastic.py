@@ -50,8 +50,8 @@ def bodies():
 
 def moved(bodies, speed):
     """Move a loaded ball 8 mm along x, in steps of half a millimetre; the last pressures."""
-    bed, ball = bodies
-    columns = ViscoelasticBed(bed, ball, 2e9, PronySeries((0.6,), (1.0,)))
+    bed, femoral = bodies
+    columns = ViscoelasticBed(bed, femoral, 2e9, PronySeries((0.6,), (1.0,)))
     for place in np.arange(-4e-3, 4.1e-3, 5e-4):
         pressure = columns.press(300.0, pose(np.eye(3), [place, 0, 0]), 5e-4 / speed)
     force = pressure * bed.area
@@ -77,10 +77,10 @@ def test_a_moving_load_is_carried_ahead_of_its_middle_and_only_at_middling_speed
 
 
 def test_slow_presses_like_the_relaxed_columns_and_fast_like_the_fresh_ones(bodies, runs):
-    bed, ball = bodies
+    bed, femoral = bodies
     place = pose(np.eye(3), [4e-3, 0, 0])
     for name, modulus in (("slow", 0.4 * 2e9), ("fast", 2e9)):
-        elastic = ViscoelasticBed(bed, ball, modulus, PronySeries((1e-9,), (1.0,)))
+        elastic = ViscoelasticBed(bed, femoral, modulus, PronySeries((1e-9,), (1.0,)))
         expected = elastic.press(300.0, place, 1.0)
         peak = expected.max()
         assert np.abs(runs[name][0] - expected).max() < 0.02 * peak

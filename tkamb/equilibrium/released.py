@@ -41,7 +41,8 @@ KNEE_CHANGE = 2e-6
 """m: the knee moves less than this when the patella is found anew."""
 FORCE_CHANGE = 0.1
 """N: neither does the contact force."""
-MOST_PASSES = 8
+MOST_PASSES = 20
+"""Passes by which knee and patella settle; each halves what is left where the knee is soft."""
 TINY = 1e-7
 """m: step of the finite differences of axes and ligaments."""
 
@@ -145,7 +146,9 @@ class ReleasedKnee:
         balance = forces.balance(before.balance.stiffness if before else None)
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
         if balance.status is not BalanceStatus.OK:
-            problem = problem or f"released: {balance.status.value}"
+            problem = problem or f"released: {balance.status.value}" + (
+                " (quadriceps slack, flexors not modelled)" if slack else ""
+            )
         knee = KneeEquilibrium(
             forces.at(balance),
             geometry,

@@ -20,7 +20,7 @@ GRID = (-0.012, -0.006, 0.0, 0.006, 0.012)
 """m along x where the search for the dwell position begins."""
 GRID_ACROSS = 0.002
 """m along z, likewise."""
-SEARCH = {"initial_simplex": None, "xatol": 1e-5, "fatol": 1e-9, "maxfev": 120}
+SEARCH = {"xatol": 1e-5, "fatol": 1e-9, "maxfev": 120}
 """The search ends within 10 µm."""
 
 
