@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from tkamb.contact.foundation import THINNEST, gaps_along_normals
-from tkamb.contact.samples import SurfaceSamples
+from tkamb.contact.foundation import THINNEST
+from tkamb.contact.samples import SurfaceSamples, gaps_along_normals
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface
