@@ -21,7 +21,7 @@ DRAWING = {
     "opensim": {"geometry"},
     "body": {"geometry"},
     "contact": {"geometry"},
-    "inputs": {"geometry", "scene"},
+    "inputs": {"geometry"},
     "scene": {"body", "geometry", "inputs"},
     "equilibrium": {"body", "contact", "geometry", "scene"},
     "plausibility": {"geometry", "inputs", "scene"},
