@@ -18,7 +18,9 @@ DRAWING = {
     "datasets": set(),
     "starter": set(),
     "geometry": set(),
-    "opensim": {"geometry"},
+    "opensim": {"geometry", "inputs"},
+    "muscles": {"geometry", "importing", "inputs", "opensim"},
+    "designs": {"contact", "geometry"},
     "body": {"geometry"},
     "contact": {"geometry"},
     "inputs": {"geometry"},
@@ -26,11 +28,13 @@ DRAWING = {
     "equilibrium": {"body", "contact", "geometry", "scene"},
     "plausibility": {"geometry", "inputs", "scene"},
     "importing": {"geometry", "inputs", "opensim", "scene"},
-    "press": {"contact", "equilibrium", "geometry", "inputs"},
     "run": {*KNEE, *SHOWN} - {"results"},
     "output": {"columns", "contact", "geometry", "run"},
     "view": {*KNEE, *SHOWN, "run", "simulation"} - {"columns"},
     "studies": {*KNEE, "inputs", "output", "run", "simulation"} - {"body"},
+    "wear": {"contact", "geometry", "inputs", "output", "results_folder", "run", "scene"}
+    | {"simulation"},
+    "validation": {"contact", "designs", "geometry", "simulation", "studies"},
 }
 """Which folder knows which folders and which modules beside them: inputs → body → (equilibrium ⇄
 contact) → results → output, view and studies; the scene is where files become bodies."""

@@ -1,5 +1,6 @@
 """C3D recordings: what a plate measured, on which clock, and what is refused."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -116,6 +117,33 @@ def test_one_foot_on_two_plates_is_their_summed_wrench_at_one_centre_of_pressure
     assert ground.loaded.all()
 
 
+def test_on_a_step_the_point_moves_along_the_line_of_action(tmp_path):
+    """What the foot bears is the same wrench, given at the level that it stands on."""
+    path = two_plates(tmp_path)
+    both = {}
+    for surface in (0.0, 400.0):
+        table = GroundReactionTable(
+            file=path,
+            plates=(1, 2),
+            laboratory_axes="+x,+z,-y",
+            cutoff_Hz="none",
+            surface_mm=surface,
+        )
+        both[surface] = load_ground_reaction(table, np.array([0.05, 0.1]), "right")
+    flat, step = both.values()
+    np.testing.assert_allclose(step.force, flat.force)
+    np.testing.assert_allclose(step.point[:, 1] - flat.point[:, 1], 0.4)
+    shift = step.point - flat.point
+    np.testing.assert_allclose(np.cross(shift, flat.force)[:, [0, 2]], 0.0, atol=1e-9)
+    for found in both.values():
+        about = found.moment + np.cross(found.point, found.force)
+        np.testing.assert_allclose(about, flat.moment + np.cross(flat.point, flat.force), atol=1e-9)
+        np.testing.assert_allclose(found.moment[:, [0, 2]], 0.0, atol=1e-9)
+    table = GroundReactionTable(file=tmp_path / "x.mot", cutoff_Hz="none", surface_mm=1.0)
+    with pytest.raises(InputError, match="surface_mm"):
+        load_ground_reaction(table, np.array([0.05]), "right")
+
+
 def test_below_the_threshold_the_point_is_held_and_the_wrench_kept(tmp_path):
     path = two_plates(tmp_path)
     table = GroundReactionTable(
@@ -183,7 +211,19 @@ def cut(path: Path, share: float) -> Path:
     return path
 
 
+def stating(path: Path, analog_rate: float) -> Path:
+    """Change ANALOG:RATE in the file's bytes, the second RATE after POINT's."""
+    content = bytearray(path.read_bytes())
+    at = content.index(b"RATE", content.index(b"RATE") + 4) + 8
+    content[at : at + 4] = struct.pack("<f", analog_rate)
+    path.write_bytes(content)
+    return path
+
+
 REFUSED = {
+    "analog rate no multiple": (lambda d: stating(written(d), 1050.0), "no multiple"),
+    "analog rate of other samples": (lambda d: stating(written(d), 2000.0), "10 samples a frame"),
+    "analog rate below the markers'": (lambda d: stating(written(d), 50.0), "no multiple"),
     "half of the file": (lambda d: cut(written(d), 0.5), "cut short"),
     "no parameters": (lambda d: cut(written(d), 0.02), "C3D"),
     "text": (lambda d: text(d, "not a recording at all" * 100), "not a C3D file"),

@@ -11,6 +11,7 @@ import pinocchio as pin
 import pytest
 import trimesh
 
+from tkamb.designs.sagittal import normal
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
 from tkamb.inputs.meshes import load_surface
@@ -23,7 +24,11 @@ WEIGHT, HEIGHT = 75.0 * 9.80665, 1.75
 
 sys.path.insert(0, str(ROOT / "scripts"))
 
-from deep_knee_bend import comparison, femoral, insert, model, sagittal  # noqa: E402
+from deep_knee_bend import comparison, model  # noqa: E402
+from deep_knee_bend import dimensions as d  # noqa: E402
+from deep_knee_bend.implant import FEMORAL, INSERT  # noqa: E402
+
+PROFILE = FEMORAL.profile
 
 
 def columns(name):
@@ -93,12 +98,12 @@ def test_insert_frame_is_the_middle_of_the_flat_bottom():
 
 
 def test_sagittal_arcs_meet_with_a_common_tangent():
-    for joint in sagittal.JOINTS:
-        below, above = (sagittal.point(joint + step) for step in (-1e-9, 1e-9))
+    for joint in PROFILE.joints:
+        below, above = (PROFILE.point(joint + step) for step in (-1e-9, 1e-9))
         assert np.linalg.norm(above - below) < 1e-6
-    phi = np.linspace(*sagittal.PHI_RANGE, 500)[1:-1]
-    tangent = sagittal.point(phi + 1e-6) - sagittal.point(phi - 1e-6)
-    np.testing.assert_allclose(np.sum(tangent * sagittal.normal(phi), axis=1), 0.0, atol=1e-10)
+    phi = np.linspace(*PROFILE.range, 500)[1:-1]
+    tangent = PROFILE.point(phi + 1e-6) - PROFILE.point(phi - 1e-6)
+    np.testing.assert_allclose(np.sum(tangent * normal(phi), axis=1), 0.0, atol=1e-10)
 
 
 def test_facets_are_within_five_micrometres_where_the_condyles_meet():
@@ -106,16 +111,16 @@ def test_facets_are_within_five_micrometres_where_the_condyles_meet():
     middles = mesh.triangles_center[np.abs(np.abs(mesh.triangles_center[:, 2]) - 23.0) < 7.0]
     error = []
     for (start, end), centre, radius in zip(
-        np.radians([arc[:2] for arc in femoral.d.SAGITTAL_ARCS]),
-        sagittal.CENTRES,
-        sagittal.RADII,
+        np.radians([arc[:2] for arc in d.SAGITTAL_ARCS]),
+        PROFILE.centres,
+        PROFILE.radii,
         strict=True,
     ):
         arm = middles[:, :2] - centre
         phi, reach = np.arctan2(-arm[:, 0], -arm[:, 1]), np.linalg.norm(arm, axis=1)
         low, high = max(start, np.radians(-12.0)), min(end, np.radians(134.0))
         here = (phi > low) & (phi < high) & (np.abs(reach - radius) < 3.5)
-        exact = radius - femoral.depth(phi[here], middles[here, 2])
+        exact = radius - FEMORAL.depth(phi[here], middles[here, 2])
         error.append(exact - reach[here])
     error = np.concatenate(error)
     assert len(error) > 5000
@@ -124,7 +129,7 @@ def test_facets_are_within_five_micrometres_where_the_condyles_meet():
     mesh = trimesh.load(MODEL / "insert.stl")
     x, y, z = mesh.triangles_center.T
     dish = (np.abs(x) < 14.0) & (np.abs(np.abs(z) - 23.0) < 8.0) & (y > 5.0)
-    assert np.abs(y[dish] - insert.height(x[dish], z[dish])).max() < 5e-3
+    assert np.abs(y[dish] - INSERT.height(x[dish], z[dish])).max() < 5e-3
 
 
 def test_both_condyles_touch_in_every_frame(poses):

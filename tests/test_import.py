@@ -163,25 +163,40 @@ def test_the_models_own_chain_gives_the_coordinates_back(tmp_path):
 
 
 def test_the_models_normal_equations_are_those_of_its_markers(tmp_path):
-    model = read_osim(pendulum_osim(tmp_path / "leg.osim"))
+    check_normal_equations(read_osim(pendulum_osim(tmp_path / "leg.osim")))
+
+
+@needs_jw
+def test_they_are_with_joints_passed_backwards_and_couplers():
+    check_normal_equations(read_osim(JW / "JW.osim"))
+
+
+def check_normal_equations(model):
+    """Gradient and Hessian of the cost by finite differences of the markers and of the gradient."""
     chain = ModelChain(model, list(model.markers))
     rng = np.random.default_rng(2)
-    q = rng.normal(0.0, 0.3, (3, len(model.coordinates)))
-    target = chain.places(q) + rng.normal(0.0, 0.02, (3, 14, 3))
-    weights = rng.uniform(0.5, 2.0, (3, 14))
-    jacobian = np.zeros((3, 14, 3, len(chain.free)))
+    q = chain.kinematics.coupled(rng.normal(0.0, 0.3, (3, len(model.coordinates))))
+    count = len(model.markers)
+    target = chain.places(q) + rng.normal(0.0, 0.02, (3, count, 3))
+    weights = rng.uniform(0.5, 2.0, (3, count))
+    jacobian = np.zeros((3, count, 3, len(chain.free)))
+    hessian = np.zeros((3, len(chain.free), len(chain.free)))
     for k in range(len(chain.free)):
         step = np.zeros((3, len(chain.free)))
         step[:, k] = 1e-6
-        ahead, behind = (chain.places(chain.moved(q, s * step)) for s in (1, -1))
+        moved = [chain.moved(q, s * step) for s in (1, -1)]
+        ahead, behind = (chain.places(state) for state in moved)
         jacobian[..., k] = (ahead - behind) / 2e-6
+        ahead, behind = (chain.normal(state, target, weights).right for state in moved)
+        hessian[..., k] = -(ahead - behind) / 2e-6
     found = chain.normal(q, target, weights)
     off = target - chain.places(q)
     np.testing.assert_allclose(found.cost, np.einsum("fm,fmi,fmi->f", weights, off, off))
     right = np.einsum("fm,fmin,fmi->fn", weights, jacobian, off)
     np.testing.assert_allclose(found.right, right, atol=1e-8)
     matrix = np.einsum("fm,fmin,fmik->fnk", weights, jacobian, jacobian)
-    np.testing.assert_allclose(found.matrix, matrix, atol=1e-8)
+    np.testing.assert_allclose(found.matrix, matrix, atol=1e-7)
+    np.testing.assert_allclose(found.matrix + found.curvature, hessian, atol=1e-7)
 
 
 def test_a_motion_in_the_models_coordinates_is_read_through_its_kinematics(tmp_path, capsys):
@@ -272,6 +287,8 @@ MISTAKES = {
 SPOILT = {
     "no markers in common": ({"rename": lambda n: n[::-1]}, "markers of the shank"),
     "markers ten times too far": ({"stretch": 10.0}, "fit only to"),
+    "markers in mm, said to be m": ({"stretch": 1000.0}, "fit only to"),
+    "the other foot's labels": ({"osim": {"-0.04 -0.1 0.08": "-0.04 -0.1 0.48"}}, "swapped"),
     "no hip": ({"osim": {"BallJoint": "WeldJoint"}}, ""),
     "model of no mass": ({"osim": {"<mass>40.0</mass>": "<mass>-40.0</mass>"}}, "mass"),
     "mass that is a word": ({"osim": {"<mass>9.0</mass>": "<mass>nine</mass>"}}, "number"),

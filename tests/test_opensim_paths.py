@@ -243,6 +243,29 @@ def test_no_length_jumps_over_an_ellipsoid(coordinate, muscles):
     assert (np.abs(np.diff(found.lengths_m, axis=0)) < bound).all()
 
 
+def test_a_string_never_turns_back_where_it_leaves():
+    """JW's biceps at 136-144 deg: its end is 1 mm off the ellipsoid; the string ran past it."""
+    chain = kinematics("JW")
+    column = chain.coordinates["knee_flexion"]
+    degrees = np.arange(-136.0, -144.1, -0.5)
+    q = np.tile(chain.vector({}), (len(degrees), 1))
+    q[:, column] = np.radians(degrees)
+    found = LineSet(chain, ["bflh"]).at(q)
+    step = (
+        np.radians(0.5)
+        * 0.5
+        * (found.moment_arms[1:, 0, column] + found.moment_arms[:-1, 0, column])
+    )
+    np.testing.assert_allclose(np.diff(found.lengths_m[:, 0]), step, atol=1e-6)
+    # an end close to the surface: the shorter of the two ways that end there tangent to it
+    axes, end = np.array([0.034, 0.083, 0.022]), np.array([0.856, 0.534, 0.071])
+    start = np.array([[-6.0, -0.15, 7.5]]) * axes
+    strings = shortest_strings(start, end[None] * axes, axes, np.array([0.0, 0.0, -1.0]))
+    leaving = end * axes - strings.exit[0]
+    assert strings.converged[0] and (strings.exit[0] / axes)[2] < end[2]
+    assert leaving @ (strings.exit[0] - strings.entry[0]) > 0.0
+
+
 def test_an_unknown_line_is_refused():
     with pytest.raises(InputError, match="no muscle or ligament 'biceps'"):
         LineSet(kinematics("old_layout"), ["biceps"])

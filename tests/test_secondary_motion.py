@@ -94,15 +94,32 @@ def test_flexion_stays_as_recorded_and_what_is_kept_too(bend):
 def test_starts_5_mm_and_5_deg_away_reach_the_same_rest(bend, resting, away):
     home = resting[60][1].equilibrium.coordinates
     start = bend.on_the_insert(home + np.append(away, 0.0))
-    again = bend.released.settle(60, start)
+    again = bend.released.find(60, start)
     assert again.problem == ""
     assert np.abs((again.coordinates - home) * SCALE).max() < 2e-5
+
+
+def test_a_frame_that_needs_flexors_rests_with_the_quadriceps_slack(bend):
+    """A ground reaction 0.2 m ahead: a line that may push drives the knee off the insert first."""
+    ground = replace(bend.case.ground, point=bend.case.ground.point + np.array([0.2, 0, 0]))
+    case = replace(bend.case, ground=ground)
+    side = ContactSide(case, Mechanics(case))
+    for k in (5, 40):
+        body, contact = side.frame(k)
+        knee = contact.equilibrium
+        assert knee.problem == "" and body.loads.values["quadriceps"] == 0.0
+        assert knee.balance.status is BalanceStatus.OK and knee.patella.status.found
+        assert body.loads.values["residual_flexion"] < -10.0
+        away = np.array([2e-3, 0, 1e-3, 0, np.radians(1), 0])
+        start = side.on_the_insert(knee.coordinates + away)
+        again = side.released.find(k, start)
+        assert np.abs((again.coordinates - knee.coordinates) * SCALE).max() < 2e-5
 
 
 def test_a_start_over_the_rim_says_that_it_did_not_arrive(bend, resting):
     home = resting[60][1].equilibrium.coordinates
     start = bend.on_the_insert(home + np.array([-5e-3, 0, 5e-3, np.radians(-5), 0, 0]))
-    assert bend.released.settle(60, start).problem == ("released: out of the contact model's range")
+    assert bend.released.find(60, start).problem == ("released: out of the contact model's range")
 
 
 def test_friction_drags_the_knee_back(bend, resting):
@@ -122,7 +139,7 @@ def test_without_anything_that_holds_it_a_frame_fails_with_the_reason(bend):
     side = ContactSide(case, Mechanics(case))
     start = case.motion.coordinates[60].copy()
     start[0] += 60e-3
-    ended = side.released.settle(60, start)
+    ended = side.released.find(60, start)
     assert ended.problem.startswith("released")
 
 

@@ -1,13 +1,15 @@
 """Static optimisation against closed forms, the optimality conditions and another solver."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from tkamb.body.static_optimisation import LoadSharing, share_load
 from tkamb.errors import ComputationError
+from tkamb.muscles.static_optimisation import LoadSharing, kkt_residual, share_load
 
 FREE = np.inf
 
@@ -58,6 +60,16 @@ def test_a_reserve_takes_what_its_price_says():
     # d/da: 2 a + 2 (M - r F a)(-r F) / reserve^2 = 0
     arm = r * strength / reserve
     assert a == pytest.approx(arm * (moment / reserve) / (1 + arm**2))
+
+
+def test_an_optimum_inside_all_bounds_is_judged_by_the_terms_that_cancel():
+    free = {"lower": np.array([-FREE]), "upper": np.array([FREE]), "reserve": np.array([3.0])}
+    problem = joint([0.0266], [50.0], 7.2, **free)
+    found = share_load(problem)
+    assert abs(problem.gradient(found.activation)[0]) < 1e-14
+    assert found.kkt_residual < 1e-14
+    moved = replace(found, activation=found.activation + 1e-6)
+    assert kkt_residual(problem, moved) > 1e-7
 
 
 def test_emg_pulls_by_its_spread():

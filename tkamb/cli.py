@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from tkamb.datasets.command import add_data
+from tkamb.export_command import add_export
 from tkamb.guard import guarded
 from tkamb.importing.command import add_import
 from tkamb.mesh_command import add_contact, add_mesh, add_no_cache, add_press, without_cache
 from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
 from tkamb.view.command import add_view
+from tkamb.wear.command import add_wear
 
 if TYPE_CHECKING:
     from tkamb.scene import Scene
@@ -67,9 +69,11 @@ def _parser() -> argparse.ArgumentParser:
     _add_scene(commands)
     add_import(commands)
     add_data(commands)
+    add_export(commands)
     add_view(commands)
     add_tradeoff(commands)
     add_stability(commands)
+    add_wear(commands)
     return parser
 
 

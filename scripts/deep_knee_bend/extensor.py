@@ -12,9 +12,11 @@ from functools import lru_cache
 import numpy as np
 from scipy.optimize import brentq
 
-from deep_knee_bend import button, femoral
+from deep_knee_bend import button
 from deep_knee_bend import dimensions as d
+from deep_knee_bend.implant import FEMORAL
 from tkamb.body.wrapping import taut_path
+from tkamb.designs.sagittal import normal as normal_at
 from tkamb.geometry.frames import inverse, knee_pose, transform
 from tkamb.geometry.sections import sagittal_outline
 from tkamb.geometry.surface import Surface
@@ -39,15 +41,15 @@ class PatellaPose:
 
 def groove_frame(phi):
     """Point (2,) and outward unit normal (2,) of the groove's floor."""
-    tangent = femoral.groove(phi + STEP) - femoral.groove(phi - STEP)
+    tangent = FEMORAL.groove(phi + STEP) - FEMORAL.groove(phi - STEP)
     normal = np.array([tangent[1], -tangent[0]]) / np.linalg.norm(tangent)
-    return femoral.groove(phi), normal * np.sign(normal @ femoral.sagittal.normal(phi))
+    return FEMORAL.groove(phi), normal * np.sign(normal @ normal_at(phi))
 
 
 @lru_cache(maxsize=1)
 def outline():
     """Outline (n, 2) mm that the quadriceps wraps: the component's sections in its path."""
-    vertices, faces = femoral.mesh()
+    vertices, faces = FEMORAL.mesh()
     stations = np.linspace(-d.QUADRICEPS_WIDTH_HALF, d.QUADRICEPS_WIDTH_HALF, 7)
     return sagittal_outline(
         [Surface(vertices, faces)], stations, d.QUADRICEPS_HALF_THICKNESS, d.QUADRICEPS_ORIGIN[1]

@@ -1,14 +1,16 @@
 """All files of the model, made in order."""
 
-from deep_knee_bend import button, chain, femoral, insert, readme, scene, solids, tables
+from deep_knee_bend import button, chain, readme, scene, tables
 from deep_knee_bend.extensor import patella_motion
+from deep_knee_bend.implant import FEMORAL, INSERT
 from deep_knee_bend.motion import knee_motion
 from deep_knee_bend.squat import squat
+from tkamb.designs import solids
 
 
 def make(folder):
     """Write every made file into the folder."""
-    for name, part in (("femoral_component", femoral), ("insert", insert)):
+    for name, part in (("femoral_component", FEMORAL), ("insert", INSERT)):
         solids.write_stl(folder / f"{name}.stl", *part.mesh())
     solids.write_stl(folder / "patellar_button.stl", *button.mesh())
     motion = knee_motion()

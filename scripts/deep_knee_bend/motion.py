@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import root
 
 from deep_knee_bend import dimensions as d
-from deep_knee_bend.touch import touch
+from deep_knee_bend.implant import ARTICULATION
 
 KNOTS = np.radians([0.0, 6.0, 12.0, 24.0, 36.0, 60.0, 90.0, 120.0])
 
@@ -48,28 +48,40 @@ def contact_path_at(flexion):
     return d.CONTACT_AP_START + (d.CONTACT_AP_END - d.CONTACT_AP_START) * s * (2.0 - s)
 
 
-def _settled(flexion):
+def _settled(articulation, flexion):
     """AP and ML (mm) at a flexion: mean contact on its path, ML slopes under it balanced."""
     rotation, wanted = axial_rotation_at(flexion), contact_path_at(flexion)
+    wanted += articulation.insert.low_point_ap - d.DISH_LOW_POINT_AP
 
     def miss(place):
-        medial, lateral = touch(*place, rotation, flexion).points
+        medial, lateral = articulation.touch(*place, rotation, flexion).points
         inward = medial[2] + lateral[2]
         return [(medial[0] + lateral[0]) / 2.0 - wanted, inward]
 
-    found = root(miss, [-5.0, 0.0], method="hybr", options={"eps": 1e-3, "xtol": 1e-6})
+    found = root(
+        miss,
+        [_start(articulation, flexion, wanted), 0.0],
+        method="hybr",
+        options={"eps": 1e-3, "xtol": 1e-6},
+    )
     return [round(float(x), 3) for x in found.x]
 
 
-def knee_motion():
-    """Return the KneeMotion of all frames."""
-    time = np.linspace(0.0, d.DURATION_S, d.FRAMES)
+def _start(articulation, flexion, wanted):
+    """AP place (mm) at which the medial ridge's lowest point is where contact is wanted."""
+    anterior, superior = articulation.femoral.profile.point(flexion)
+    return wanted - (anterior * np.cos(flexion) - superior * np.sin(flexion))
+
+
+def knee_motion(articulation=ARTICULATION, frames=d.FRAMES):
+    """Return the KneeMotion of all frames; the contact path starts at the dishes' low point."""
+    time = np.linspace(0.0, d.DURATION_S, frames)
     flexion = flexion_at(time)
-    place_at = CubicSpline(KNOTS, [_settled(f) for f in KNOTS], bc_type="natural")
+    place_at = CubicSpline(KNOTS, [_settled(articulation, f) for f in KNOTS], bc_type="natural")
     coordinates, contact, guess = [], [], 0.0
     for angle in flexion:
         (ap, ml), rotation = place_at(angle), float(axial_rotation_at(angle))
-        found = touch(ap, ml, rotation, angle, guess)
+        found = articulation.touch(ap, ml, rotation, angle, guess)
         guess = found.adduction
         coordinates.append([ap, found.si, ml, rotation, found.adduction, angle])
         contact.append(found.points)

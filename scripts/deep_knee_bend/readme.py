@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from deep_knee_bend import anthropometry as body
-from deep_knee_bend import button, femoral, insert, ligaments, squat
+from deep_knee_bend import button, ligaments, squat
 from deep_knee_bend import dimensions as d
+from deep_knee_bend.implant import FEMORAL, INSERT
 
 TEMPLATE = Path(__file__).with_name("README.template.md")
 ANGLES = np.arange(0, 121, 15)
@@ -59,8 +60,8 @@ def _implant():
         "ridge": d.CONDYLE_SPACING_HALF,
         "ridge_top": d.RIDGE_HALF_AT_FLANGE_TOP,
         "groove": d.GROOVE_RADIUS,
-        "groove_top": round(float(femoral.groove_depth(top)), 1),
-        "groove_distal": round(float(femoral.groove_depth(distal)), 1),
+        "groove_top": round(float(FEMORAL.groove_depth(top)), 1),
+        "groove_distal": round(float(FEMORAL.groove_depth(distal)), 1),
         "notch": d.NOTCH_PHI[0],
         "notch_width": d.NOTCH_WIDTH_HALF,
         "thickness": d.FEMORAL_THICKNESS,
@@ -80,8 +81,8 @@ def _implant():
     return {
         **{key: _number(value) for key, value in words.items()},
         "arcs": "\n".join(arcs),
-        "femoral_size": _size(femoral),
-        "insert_size": _size(insert),
+        "femoral_size": _size(FEMORAL),
+        "insert_size": _size(INSERT),
     }
 
 

@@ -41,7 +41,8 @@ KNEE_CHANGE = 2e-6
 """m: the knee moves less than this when the patella is found anew."""
 FORCE_CHANGE = 0.1
 """N: neither does the contact force."""
-MOST_PASSES = 8
+MOST_PASSES = 20
+"""Passes by which knee and patella settle; each halves what is left where the knee is soft."""
 TINY = 1e-7
 """m: step of the finite differences of axes and ligaments."""
 
@@ -127,7 +128,9 @@ class ReleasedKnee:
             middle = _middle(knee.contact, points, place)
             shift = np.abs(middle - last).max() if self._keeps else 0.0
             if pushes:
-                slack = True
+                # a line that pushes drives the knee away: slack, it begins where this began
+                slack, knee = True, before
+                place, middle, force = np.array(start, float), np.array(start[:3]), force * np.nan
             elif knee.problem or (max(moved, shift) < KNEE_CHANGE and change < FORCE_CHANGE):
                 return knee
         assert knee is not None
@@ -143,7 +146,9 @@ class ReleasedKnee:
         balance = forces.balance(before.balance.stiffness if before else None)
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
         if balance.status is not BalanceStatus.OK:
-            problem = problem or f"released: {balance.status.value}"
+            problem = problem or f"released: {balance.status.value}" + (
+                " (quadriceps slack, flexors not modelled)" if slack else ""
+            )
         knee = KneeEquilibrium(
             forces.at(balance),
             geometry,

@@ -8,16 +8,20 @@ follow. Ranges are not imposed. The same least squares as for a leg
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.importing.markers import recorded_labels
-from tkamb.inputs.inverse_kinematics import ChainFit, Index, NormalEquations, fit_chain, put, skew
+from tkamb.inputs.inverse_kinematics import ChainFit, Index, NormalEquations, fit_chain, put
+from tkamb.inputs.laboratory import laboratory_rotation
 from tkamb.inputs.markers import marker_trajectories, matched_labels
 from tkamb.inputs.tables import Table
-from tkamb.opensim.kinematics import Kinematics
-from tkamb.opensim.model import OpenSimModel
+from tkamb.opensim.kinematics import Kinematics, cross
+from tkamb.opensim.model import Joint, OpenSimModel
 
+BLOCK = 128
+"""Frames that are fitted at once."""
 COARSE = 8
 """Frames between those that are fitted first."""
 
@@ -36,7 +40,6 @@ class ModelChain:
     ) -> None:
         self.kinematics = Kinematics(model)
         self._at = [self.kinematics.bodies[model.markers[name].body] for name in markers]
-        self._groups = {b: np.flatnonzero(np.array(self._at) == b) for b in set(self._at)}
         self._points = np.array([model.markers[name].location for name in markers])
         index = self.kinematics.coordinates
         followers = {coupler.dependent for coupler in model.couplers}
@@ -48,6 +51,19 @@ class ModelChain:
         self._couplers = [
             (index[c.dependent], index[c.independent], c.function) for c in model.couplers
         ]
+        # what moves: the free ones first, then what follows them
+        follow = [d for d, i, _ in self._couplers if i in self.free]
+        self._moving = [*self.free, *follow]
+        self._after = [
+            (self._moving.index(d), self._moving.index(i), i, f)
+            for d, i, f in self._couplers
+            if d in follow
+        ]
+        carries, above = _tree(self.kinematics, self._at)
+        self._carries, self._above = (
+            carries[self._moving],
+            above[np.ix_(self._moving, self._moving)],
+        )
 
     def default(self, frames: int) -> Array:
         """Return the coordinates (f, n) at their defaults."""
@@ -55,45 +71,87 @@ class ModelChain:
 
     def places(self, state: Array) -> Array:
         """Return the markers (f, m, 3) m."""
-        poses = self.kinematics.poses(state)[:, self._at]
+        return self._markers_at(self.kinematics.poses(state))
+
+    def _markers_at(self, poses: Array) -> Array:
+        own = poses[:, self._at]
         return np.asarray(
-            np.einsum("fmij,mj->fmi", poses[..., :3, :3], self._points) + poses[..., :3, 3]
+            np.einsum("fmij,mj->fmi", own[..., :3, :3], self._points) + own[..., :3, 3]
         )
 
     def normal(self, state: Array, target: Array, weights: Array) -> NormalEquations:
         """Return the least squares to markers (f, m, 3) m with weights (f, m).
 
-        A body moves by its twist (ω, v) at ground's origin and its marker at x by v + ω × x.
-        With A = [-[x]×, I] that is A (ω, v), so that a body's markers enter by two sums, of
-        Aᵀ w A (6, 6) and Aᵀ w (p - x) (6,): no marker needs its own Jacobian.
+        With s = (a, b) a coordinate's twist in ground (rotation a, velocity b of ground's
+        origin), a marker at x that hangs on its joint moves by u = b + a × x. For i above j in
+        the chain, sums over the markers that j carries,
+
+            (Jᵀ W J)_ij = s_i · Σ w (x × u_j, u_j)
+            residuals' curvature_ij = -Σ w r · (a_i × u_j) = -a_i · Σ w u_j × r,   r = p - x
+
+        so that a coordinate needs the moments Σ w, Σ w x, Σ w x xᵀ, Σ w r and Σ w x rᵀ of what
+        it carries, and no marker needs its own Jacobian. How the splines of a joint bend is
+        left out of the curvature.
         """
-        motion = self.kinematics.motion(state)
-        poses = motion.poses[:, self._at]
-        x = np.einsum("fmij,mj->fmi", poses[..., :3, :3], self._points) + poses[..., :3, 3]
+        poses, twists = self.kinematics.joint_twists(state)
+        twists = twists[:, self._moving]
+        x = self._markers_at(poses)
         off = target - x
         pull = weights[:, :, None] * off
-        cost = np.sum(pull * off, axis=(1, 2))
-        freedoms = len(self.free)
-        matrix = np.zeros((len(x), freedoms, freedoms))
-        right = np.zeros((len(x), freedoms))
-        for body, own in self._groups.items():
-            twist = self._free_twists(motion.twists[:, body], state)
-            sums = _wrench_matrix(x[:, own], weights[:, own])
-            moment = np.cross(x[:, own], pull[:, own]).sum(axis=1)
-            wrench = np.concatenate([moment, pull[:, own].sum(axis=1)], axis=1)
-            turned = np.swapaxes(twist, 1, 2)
-            matrix += turned @ (sums @ twist)
-            right += np.einsum("fni,fi->fn", turned, wrench)
-        return NormalEquations(cost, matrix, right)
+        moments = np.concatenate(
+            [
+                weights[:, :, None],
+                weights[:, :, None] * x,
+                pull,
+                (x[..., :, None] * (weights[:, :, None] * x)[..., None, :]).reshape(
+                    *x.shape[:2], 9
+                ),
+                (x[..., :, None] * pull[..., None, :]).reshape(*x.shape[:2], 9),
+            ],
+            axis=2,
+        )
+        return self._assembled(
+            state, twists, self._carries @ moments, np.einsum("fmi,fmi->f", pull, off)
+        )
 
-    def _free_twists(self, twists: Array, state: Array) -> Array:
-        """Return a body's twists (f, 6, free), with what follows a free coordinate in it."""
-        if self._couplers:
-            twists = twists.copy()
-            for dependent, independent, function in self._couplers:
-                slope = function.slope(state[:, independent])[:, None]
-                twists[..., independent] += twists[..., dependent] * slope
-        return twists[..., self.free]
+    def _assembled(
+        self, state: Array, twists: Array, carried: Array, cost: Array
+    ) -> NormalEquations:
+        """Return the equations of the free coordinates from what each coordinate carries."""
+        a, b = twists[..., :3], twists[..., 3:]
+        weight, first, pull = carried[..., :1], carried[..., 1:4], carried[..., 4:7]
+        second = carried[..., 7:16].reshape(*weight.shape[:2], 3, 3)
+        turning = carried[..., 16:25].reshape(*weight.shape[:2], 3, 3)
+        force = weight * b + cross(a, first)
+        moment = cross(first, b) + _trace(second) * a - _product(second, a)
+        matrix = twists @ np.concatenate([moment, force], axis=-1).swapaxes(1, 2)
+        # Σ w u_j × r, of which (a × x) × r = x (a·r) - a (x·r)
+        lever = cross(b, pull) + _product(turning, a) - _trace(turning) * a
+        bent = -a @ lever.swapaxes(1, 2)
+        torque = np.stack(
+            [turning[..., i, j] - turning[..., j, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=-1
+        )
+        right = np.einsum("fni,fni->fn", a, torque) + np.einsum("fni,fni->fn", b, pull)
+        matrix, bent = (self._free_part(self._symmetric(part), state) for part in (matrix, bent))
+        return NormalEquations(cost, matrix, self._free_part(right[..., None], state)[..., 0], bent)
+
+    def _symmetric(self, matrix: Array) -> Array:
+        """Return the matrix (f, n, n) whose rows i are right where i is above column j."""
+        upper = matrix * self._above
+        return np.asarray(upper + upper.swapaxes(1, 2))
+
+    def _free_part(self, values: Array, state: Array) -> Array:
+        """Return rows, and columns of a square matrix, by the free coordinates.
+
+        What follows a free coordinate is added to it, by the chain rule.
+        """
+        square, free = values.shape[1] == values.shape[2], len(self.free)
+        for dependent, independent, coordinate, function in self._after:
+            slope = function.slope(state[:, coordinate])[:, None]
+            values[:, independent] += slope * values[:, dependent]
+            if square:
+                values[:, :, independent] += slope * values[:, :, dependent]
+        return values[:, :free, :free] if square else values[:, :free]
 
     def moved(self, state: Array, step: Array) -> Array:
         """Return the coordinates (f, n) after a step (f, free) of the free ones."""
@@ -110,18 +168,39 @@ class ModelChain:
         return put(state, frames, part)
 
 
-def _wrench_matrix(x: Array, weights: Array) -> Array:
-    """Return the sums (f, 6, 6) of Aᵀ w A over markers at x (f, m, 3), A = [-[x]×, I]."""
-    total = weights.sum(axis=1)
-    first = np.einsum("fm,fmi->fi", weights, x)
-    second = np.einsum("fm,fmi,fmj->fij", weights, x, x)
-    result = np.zeros((len(x), 6, 6))
-    trace = np.trace(second, axis1=1, axis2=2)
-    result[:, :3, :3] = trace[:, None, None] * np.eye(3) - second
-    result[:, 3:, 3:] = total[:, None, None] * np.eye(3)
-    cross = skew(first)
-    result[:, :3, 3:], result[:, 3:, :3] = cross, -cross
-    return result
+def _tree(kinematics: Kinematics, at: Sequence[int]) -> tuple[Array, Array]:
+    """Return which markers hang on a coordinate's joint (n, m), and which coordinate is above.
+
+    The second (n, n) is 1 at i, j where i turns the axis of j, and 1/2 where i is j. Within a
+    joint the translations come first, for they are along axes of its inner frame; in one that
+    is passed backwards the order is turned round.
+    """
+    model, bodies = kinematics.model, kinematics.bodies
+    hanging: dict[Joint, set[int]] = {}  # bodies outboard of each joint
+    for joint in reversed(model.joints):  # from the ends inwards
+        own = {bodies[joint.outboard]}
+        own.update(*(h for j, h in hanging.items() if j.inboard == joint.outboard))
+        hanging[joint] = own
+    count = len(kinematics.coordinates)
+    carries, above = np.zeros((count, len(at))), 0.5 * np.eye(count)
+    order = []  # coordinates from ground outwards, with what hangs on them
+    for joint in model.joints:
+        axes = (*joint.translations, *joint.rotations)[:: -1 if joint.backwards else 1]
+        names = dict.fromkeys(axis.coordinate for axis in axes if axis.coordinate)
+        order += [(kinematics.coordinates[name], joint) for name in names]
+    for k, (i, joint) in enumerate(order):
+        carries[i] = [body in hanging[joint] for body in at]
+        for j, other in order[k + 1 :]:
+            above[i, j] = bodies[other.outboard] in hanging[joint]
+    return carries, above
+
+
+def _trace(matrix: Array) -> Array:
+    return np.trace(matrix, axis1=-2, axis2=-1)[..., None]
+
+
+def _product(matrix: Array, vector: Array) -> Array:
+    return np.einsum("...ij,...j->...i", matrix, vector)
 
 
 def fit_model(
@@ -129,16 +208,17 @@ def fit_model(
     recorded: Table,
     weights: Mapping[str, float] | None = None,
     locked: Sequence[str] = (),
+    laboratory_axes: str = "+x,+y,+z",
 ) -> tuple[ModelChain, ChainFit[Array]]:
     """Return a model's chain fitted to a recording, all frames at once.
-
-    The recording's axes must be the model's ground (or the root joint must be free to turn).
 
     Args:
         model: the model.
         recorded: table of markers.
         weights: marker -> weight of its squared distance, where not 1.
         locked: coordinates kept at their default.
+        laboratory_axes: axes of the file that are the model's ground x, y and z (forward, up
+            and right), as "-x,+z,+y".
 
     Raises:
         InputError: fewer than three markers in common.
@@ -152,14 +232,27 @@ def fit_model(
         )
     chain = ModelChain(model, list(match), locked)
     scale = recorded.unit_scale(None, "length_unit")
-    measured = marker_trajectories(recorded, list(match.values()), scale)
+    turn = laboratory_rotation(laboratory_axes, recorded.path)
+    measured = marker_trajectories(recorded, list(match.values()), scale) @ turn.T
     values = np.array([(weights or {}).get(name, 1.0) for name in match])
     first = int(np.argmax(np.isfinite(measured).all(axis=2).sum(axis=1)))
     begin = fit_chain(chain, measured[first : first + 1], values, chain.default(1))
     # some frames first, from the best seen; between them the others are nearly there
     coarse = np.unique(np.append(np.arange(0, len(measured), COARSE), len(measured) - 1))
-    frames = np.arange(len(measured))
     start = np.tile(begin.state, (len(coarse), 1))
-    knots = fit_chain(chain, measured[coarse], values, start).state
-    between = np.stack([np.interp(frames, coarse, knots[:, k]) for k in range(knots.shape[1])], 1)
-    return chain, fit_chain(chain, measured, values, between)
+    knots = fit_in_blocks(chain, measured[coarse], values, start).state
+    between = CubicSpline(coarse, knots)(np.arange(len(measured))) if len(coarse) > 2 else start
+    return chain, fit_in_blocks(chain, measured, values, between)
+
+
+def fit_in_blocks(
+    chain: ModelChain, measured: Array, weights: Array, start: Array
+) -> ChainFit[Array]:
+    """Return `fit_chain` of many frames, so many at once as the processor's cache holds."""
+    parts = [slice(k, k + BLOCK) for k in range(0, len(measured), BLOCK)]
+    fits = [fit_chain(chain, measured[part], weights, start[part]) for part in parts]
+    state, rms, distance, solved = (
+        np.concatenate([getattr(fit, name) for fit in fits])
+        for name in ("state", "rms", "distance", "solved")
+    )
+    return ChainFit(state, rms, distance, solved, max(fit.steps for fit in fits))

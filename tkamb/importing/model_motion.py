@@ -16,6 +16,7 @@ from tkamb.geometry.frames import (
 from tkamb.importing.links import Links
 from tkamb.inputs.tables import Table
 from tkamb.opensim.kinematics import Kinematics
+from tkamb.opensim.motion import read_coordinates
 from tkamb.units import DEGREE, MILLIMETRE
 
 MOTION_FILE = "motion.csv"
@@ -59,22 +60,10 @@ def model_motion(links: Links, recorded: Table) -> ModelMotion:
     Raises:
         InputError: no coordinate of the knee, or angles of unknown unit.
     """
-    leg, model = links.leg, links.leg.model
-    kinematics = Kinematics(model)
+    leg = links.leg
+    kinematics = Kinematics(leg.model)
     time = recorded.time()
-    q = np.tile(kinematics.vector({}), (len(time), 1))
-    missing = []
-    for name, coordinate in model.coordinates.items():
-        column = next((c for c in recorded.columns if name in (c, *c.split("/")[-2:-1])), None)
-        if column is None:
-            missing.append(name)
-            continue
-        values = recorded.complete_column(column)
-        if coordinate.rotational:
-            if recorded.in_degrees is None:
-                raise InputError("does not say inDegrees", recorded.path, "add it to its header")
-            values = values * (DEGREE if recorded.in_degrees else 1.0)
-        q[:, kinematics.coordinates[name]] = values
+    q, missing = read_coordinates(kinematics, recorded)
     if leg.flexion is None or leg.flexion in missing:
         raise InputError(f"has no column '{leg.flexion}' for the knee's flexion", recorded.path)
     poses = kinematics.poses(kinematics.coupled(q))
@@ -94,7 +83,7 @@ def model_motion(links: Links, recorded: Table) -> ModelMotion:
         ],
         axis=1,
     )
-    return ModelMotion(time, values, tuple(missing))
+    return ModelMotion(time, values, missing)
 
 
 def motion_tables(flexion_alone: bool) -> list[str]:

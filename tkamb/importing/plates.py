@@ -17,6 +17,12 @@ SHORTEST_S = 0.1
 """A load that lasts less is a knock."""
 UNDER_FOOT = 0.25
 """m; horizontally, between a centre of pressure and the middle of the foot's markers."""
+ON_A_STEP = 0.15
+"""m; a foot whose markers are this far above the plate stands on something."""
+MIDDLE = 0.055
+"""m; the middle of a foot's markers is about as high above what it stands on."""
+SAME_STEP = 0.05
+"""m; heights that differ by less are those of one step."""
 STILL = 0.15
 """m/s; a foot that moves less, off the plates, stands on something that nobody measured."""
 
@@ -32,7 +38,7 @@ class Load:
         end: s.
         distance: m, median, between the centre of pressure and that foot's markers.
         other: m, the same to the other foot's; NaN if that has no markers.
-        height: m, median, of the middle of that foot's markers above the plate.
+        surface: m, about how high above the plate that foot stands: zero, or a step.
     """
 
     plate: int
@@ -41,7 +47,7 @@ class Load:
     end: float
     distance: float
     other: float
-    height: float
+    surface: float
 
 
 def plate_loads(recording: Recording, axes: str, feet: dict[str, list[str]]) -> list[Load]:
@@ -74,7 +80,10 @@ def plate_loads(recording: Recording, axes: str, feet: dict[str, list[str]]) -> 
         for first, last in _runs(loaded):
             if time[last] - time[first] >= SHORTEST_S:
                 part = slice(first, last + 1)
-                loads.append(_load(plate.number, time[part], point[part], middles, part, recording))
+                line = (time[part], point[part], force[part])
+                loads.append(
+                    _load(plate.number, *line, {s: m[part] for s, m in middles.items()}, recording)
+                )
     return sorted(loads, key=lambda load: load.start)
 
 
@@ -82,13 +91,18 @@ def _load(
     number: int,
     time: Array,
     point: Array,
+    force: Array,
     middles: dict[str, Array],
-    part: slice,
     recording: Recording,
 ) -> Load:
-    away = {}
+    """Return a load; a foot on a step is compared with the force's line on the step's level."""
+    away, surface = {}, {}
     for side, middle in middles.items():
-        distance = np.linalg.norm((point - middle[part])[:, [0, 2]], axis=1)
+        above = middle[:, 1] - point[:, 1]
+        height = float(np.nanmedian(above)) if np.isfinite(above).any() else 0.0
+        surface[side] = height - MIDDLE if height > ON_A_STEP else 0.0
+        there = point + force / force[:, 1:2] * surface[side]
+        distance = np.linalg.norm((there - middle)[:, [0, 2]], axis=1)
         away[side] = float(np.nanmedian(distance)) if np.isfinite(distance).any() else np.nan
     nearest = min(away, key=lambda side: np.nan_to_num(away[side], nan=np.inf))
     if not away[nearest] < UNDER_FOOT:
@@ -99,8 +113,8 @@ def _load(
             "check --laboratory-axes and the foot's labels, or give --plates",
         )
     rest = [distance for side, distance in away.items() if side != nearest]
-    height = float(np.nanmedian(middles[nearest][part, 1] - point[:, 1]))
-    return Load(number, nearest, float(time[0]), float(time[-1]), away[nearest], rest[0], height)
+    start, end = float(time[0]), float(time[-1])
+    return Load(number, nearest, start, end, away[nearest], rest[0], surface[nearest])
 
 
 def own_plates(loads: list[Load], side: str, recording: Recording) -> tuple[int, ...]:
@@ -118,6 +132,12 @@ def own_plates(loads: list[Load], side: str, recording: Recording) -> tuple[int,
             what, recording.path, "give --plates and --interval, or take another trial"
         )
     return tuple(own)
+
+
+def common_surface(loads: list[Load], plates: tuple[int, ...]) -> float:
+    """Return how high (m) the foot stands above its plates; zero where that differs."""
+    heights = [load.surface for load in loads if load.plate in plates]
+    return float(np.mean(heights)) if np.ptp(heights) < SAME_STEP else 0.0
 
 
 def known_interval(

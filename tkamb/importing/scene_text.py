@@ -27,13 +27,17 @@ class Meshes:
 
 @dataclass(frozen=True, eq=False)
 class GroundFile:
-    """Where the ground reaction stands: plates of a C3D file, or columns of a table."""
+    """Where the ground reaction stands: plates of a C3D file, or columns of a table.
+
+    A foot on a step stands `surface` (m) above its plates.
+    """
 
     path: Path
     axes: str
     plates: tuple[int, ...] = ()
     columns: tuple[tuple[str, str], ...] = ()
     length_unit: str | None = None
+    surface: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +154,9 @@ class SceneText:
             f"cutoff_Hz = {self.cutoff_Hz:g}",
             "unloaded_N = 40.0",
         ]
+        if g.surface:
+            lines.append("# the foot stands on a step, about as high above the plate")
+            lines.append(f"surface_mm = {round(g.surface * 1e3, -1):.0f}")
         if g.columns:
             lines += ["", "[ground_reaction.columns]"]
             lines += [f"{role} = {_text(column)}" for role, column in g.columns]

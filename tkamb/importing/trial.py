@@ -12,7 +12,14 @@ from tkamb.importing.anatomy import OTHER, Leg
 from tkamb.importing.links import Links
 from tkamb.importing.markers import Facing, ModelSegment, facing, feet, model_segments
 from tkamb.importing.model_motion import MOTION_FILE, ModelMotion, model_motion
-from tkamb.importing.plates import Load, known_interval, own_plates, plate_loads, unmeasured
+from tkamb.importing.plates import (
+    Load,
+    common_surface,
+    known_interval,
+    own_plates,
+    plate_loads,
+    unmeasured,
+)
 from tkamb.importing.request import ImportRequest
 from tkamb.importing.scene_text import GroundFile, MarkerFile
 from tkamb.inputs.c3d import Recording, read_c3d
@@ -20,9 +27,6 @@ from tkamb.inputs.tables import Table, read_table
 
 FRAMES_PER_CUTOFF = 5.0
 """Frames per period of the cut-off: what is low-passed holds nothing between them."""
-
-ON_A_STEP = 0.15
-"""m; the middle of a foot's markers is some 50 mm above what it stands on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +123,8 @@ def _ground(
     interval = request.interval or known_interval(loads, plates, recording)
     lines = [*(_load_line(load) for load in loads), _interval_line(request, interval)]
     lines += _unmeasured_line(loads, plates, recording, sides[leg.side], interval)
-    return GroundFile(request.recording, axes, plates), interval, lines
+    surface = common_surface(loads, plates)
+    return GroundFile(request.recording, axes, plates, surface=surface), interval, lines
 
 
 def _thinned(
@@ -149,9 +154,9 @@ def _thinned(
 def _load_line(load: Load) -> str:
     other = "" if np.isnan(load.other) else f", {load.other * 1e3:.0f} mm from the other's"
     step = (
-        f"; the foot is {load.height * 1e3:.0f} mm above it: a step stands on the plate, whose "
-        "wrench is taken as it is, with its point at the plate's level"
-        if load.height > ON_A_STEP
+        f"; the foot stands on a step, about {load.surface:.2f} m above the plate: the wrench is "
+        "taken as it is, with its point on that level"
+        if load.surface
         else ""
     )
     return (

@@ -87,7 +87,7 @@ def read_c3d(path: str | Path) -> Recording:
 @lru_cache(maxsize=2)
 def _read(path: Path, changed: int) -> Recording:
     """Read the file as it was at `changed`; markers and plates of one trial are asked apart."""
-    _check_whole(path)
+    held = _check_whole(path)
     content = _parsed(path)
     parameters, header = content["parameters"], content["header"]
     points, data = header["points"], content["data"]
@@ -102,7 +102,7 @@ def _read(path: Path, changed: int) -> Recording:
     residual = np.asarray(data["meta_points"]["residuals"], float)[0].T * scale
     gap = ~np.isfinite(trajectories).all(axis=2) | (residual < 0) | (trajectories == 0).all(axis=2)
     trajectories[gap], residual[gap] = np.nan, np.nan
-    analog_rate, channels, units = _channels(content, rate, path)
+    analog_rate, channels, units = _channels(content, rate, held, path)
     plates = _plates(parameters, channels, units, scale, path)
     used = {name for plate in plates for name in plate.channels}
     return Recording(
@@ -119,10 +119,13 @@ def _read(path: Path, changed: int) -> Recording:
     )
 
 
-def _check_whole(path: Path) -> None:
+def _check_whole(path: Path) -> int:
     """Raise unless the file is C3D and as long as its own header says.
 
     ezc3d fills what is missing with zeros, or worse.
+
+    Returns:
+        Analog samples a frame, by the header; 0 without any or in another machine's numbers.
     """
     content = path.read_bytes()
     if len(content) < _BLOCK or content[1] != _KEY:
@@ -131,9 +134,9 @@ def _check_whole(path: Path) -> None:
     if start < _BLOCK or len(content) < start + 4:
         raise InputError("is cut short: its parameters are missing", path, "copy it again")
     if content[start + 3] != _INTEL:
-        return  # another machine's numbers: ezc3d turns them
+        return 0  # another machine's numbers: ezc3d turns them
     markers, analog, first, last = struct.unpack("<4H", content[2:10])
-    scale, data_block = struct.unpack("<fH", content[12:18])
+    scale, data_block, samples = struct.unpack("<fHH", content[12:20])
     frames, size = last - first + 1, (4 * markers + analog) * (4 if scale < 0 else 2)
     there = max(len(content) - (data_block - 1) * _BLOCK, 0)
     if last < _LONGEST and there < frames * size:
@@ -141,6 +144,7 @@ def _check_whole(path: Path) -> None:
         raise InputError(
             f"is cut short: it holds {share:.0f} % of its {frames} frames", path, "copy it again"
         )
+    return int(samples) if analog else 0
 
 
 def _parsed(path: Path) -> Any:
@@ -177,13 +181,32 @@ def _metres(unit: str | None, path: Path) -> float:
 
 
 def _channels(
-    content: Any, rate: float, path: Path
+    content: Any, rate: float, held: int, path: Path
 ) -> tuple[float, dict[str, Array], dict[str, str]]:
-    """Return rate (Hz), samples and units of the analog channels, by name."""
+    """Return rate (Hz), samples and units of the analog channels, by name.
+
+    `held` is how many samples a frame the header counts; 0 if it says nothing.
+    """
     group, values = content["parameters"].get("ANALOG", {}), content["data"]["analogs"][0]
+    stated = _first(group, "RATE")
+    if held and stated:
+        _check_rates(float(stated), rate, held, path)
     if not values.shape[0] or not values.shape[1]:
         return rate, {}, {}
-    analog_rate = float(content["header"]["analogs"]["frame_rate"])
+    analog_rate = float(stated or content["header"]["analogs"]["frame_rate"])
+    names = [name or f"channel {k}" for k, name in enumerate(_labels(group, path), 1)]
+    names += [f"channel {k}" for k in range(len(names) + 1, values.shape[0] + 1)]
+    stated = [str(unit).strip() for unit in group["UNITS"]["value"]] if "UNITS" in group else []
+    units = [*stated, *[""] * len(names)]
+    columns = dict(zip(names, np.asarray(values, float), strict=False))
+    return analog_rate, columns, dict(zip(names, units, strict=False))
+
+
+def _check_rates(analog_rate: float, rate: float, held: int, path: Path) -> None:
+    """Raise unless the rates that a file states are those of what it holds.
+
+    ezc3d goes by the rates: where they are wrong it takes samples for markers.
+    """
     ratio = analog_rate / rate
     if ratio < 1 or abs(ratio - round(ratio)) > 1e-6:
         raise InputError(
@@ -191,12 +214,13 @@ def _channels(
             path,
             _EXPORT,
         )
-    names = [name or f"channel {k}" for k, name in enumerate(_labels(group, path), 1)]
-    names += [f"channel {k}" for k in range(len(names) + 1, values.shape[0] + 1)]
-    stated = [str(unit).strip() for unit in group["UNITS"]["value"]] if "UNITS" in group else []
-    units = [*stated, *[""] * len(names)]
-    columns = dict(zip(names, np.asarray(values, float), strict=False))
-    return analog_rate, columns, dict(zip(names, units, strict=False))
+    if round(ratio) != held:
+        raise InputError(
+            f"states an analog rate of {analog_rate:g} Hz, but holds {held} samples a frame of "
+            f"{rate:g} Hz",
+            path,
+            _EXPORT,
+        )
 
 
 def _plates(

@@ -77,6 +77,12 @@ def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> Gro
     if from_plates:
         stamps, force, point, moment = _read_plates(source)
     else:
+        if source.surface:
+            raise InputError(
+                "is for plates of a .c3d: a table states its points itself",
+                "[ground_reaction] surface_mm",
+                "leave it out",
+            )
         recorded = read_table(source.file, source.format)
         stamps = recorded.time(source.columns.get("time", "time"))
         force, point, moment = _read_columns(source, recorded)
@@ -177,7 +183,8 @@ def _read_plates(source: ForceRecording) -> tuple[Array, Array, Array, Array]:
     """Return times (k,) s, force, point and free moment, each (k, 3), of a recording's plates.
 
     The wrenches are summed about the laboratory's origin and kept: the point lies on the level
-    of the plates' surface, carried over in time while the vertical force is below `unloaded_N`.
+    of the plates' surface or that of a step on them, `surface_mm` above it, and is carried over
+    in time while the vertical force is below `unloaded_N`.
     """
     recording = read_c3d(source.file)
     check_roles(source.columns, (), source.file, "ground_reaction")
@@ -199,7 +206,8 @@ def _read_plates(source: ForceRecording) -> tuple[Array, Array, Array, Array]:
         raise InputError("the plates lie at different levels", source.file, "give them one by one")
     point = np.full_like(force, np.nan)
     loaded = force[:, 1] >= source.unloaded
-    point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], levels[0])
+    level = levels[0] + source.surface
+    point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], level)
     point = _hold_point(recording.analog_time, point, loaded, source.file)
     return recording.analog_time, force, point, about_origin - np.cross(point, force)
 

@@ -5,7 +5,8 @@ chain's markers x_m(q),
 
     min_q  sum_m w_m |x_m(q) - p_m|²
 
-by Gauss-Newton with Levenberg's damping and analytic Jacobians. Frames are independent of each
+by Gauss-Newton with Levenberg's damping and analytic Jacobians, and by Newton's method near
+the solution where the chain brings the residuals' curvature. Frames are independent of each
 other and solved all at once: every array has the frames as its first axis. Bounds are not
 imposed: a coordinate that wants to leave its range is a finding.
 
@@ -22,6 +23,8 @@ from tkamb.geometry.frames import Array
 
 SETTLED = 1e-6
 """Step (m and rad) below which a frame is solved."""
+NEAR = 0.1
+"""Step (m and rad) after which the residuals' curvature is taken in: Newton's method."""
 MOST_STEPS = 60
 
 State = TypeVar("State")
@@ -36,11 +39,18 @@ class NormalEquations:
         cost: (f,) m², sum of weighted squared distances.
         matrix: (f, n, n) Jᵀ W J.
         right: (f, n) Jᵀ W (p - x).
+        curvature: (f, n, n) what the residuals add to the Hessian; None: not known.
     """
 
     cost: Array
     matrix: Array
     right: Array
+    curvature: Array | None = None
+
+    def of(self, frames: Index) -> "NormalEquations":
+        """Return the equations of some frames."""
+        bent = None if self.curvature is None else self.curvature[frames]
+        return NormalEquations(self.cost[frames], self.matrix[frames], self.right[frames], bent)
 
     def replaced(self, frames: Index, part: "NormalEquations") -> "NormalEquations":
         """Return the equations with some frames as in `part`."""
@@ -48,6 +58,9 @@ class NormalEquations:
             put(self.cost, frames, part.cost),
             put(self.matrix, frames, part.matrix),
             put(self.right, frames, part.right),
+            None
+            if self.curvature is None or part.curvature is None
+            else put(self.curvature, frames, part.curvature),
         )
 
 
@@ -102,22 +115,27 @@ def fit_chain(
     """
     seen = np.isfinite(measured).all(axis=2)
     target, each = np.nan_to_num(measured), np.where(seen, weights, 0.0)
-    damping = np.full(len(measured), 1e-6)
+    damping, last = np.full(len(measured), 1e-6), np.full(len(measured), np.inf)
     left, steps = np.arange(len(measured)), 0
     state, here = start, chain.normal(start, target, each)
-    while steps < MOST_STEPS and len(left):
-        step = _step(here, left, damping[left])
+    while steps < MOST_STEPS:
+        step = _step(here.of(left), damping[left], last[left] < NEAR)
         trial = chain.moved(chain.chosen(state, left), step)
+        size = np.abs(step).max(axis=1)
+        done = size < SETTLED
+        state = chain.replaced(state, left[done], chain.chosen(trial, np.flatnonzero(done)))
+        left, size, steps = left[~done], size[~done], steps + 1
+        if not len(left):
+            break
+        trial = chain.chosen(trial, np.flatnonzero(~done))
         there = chain.normal(trial, target[left], each[left])
         # a frame that would get worse stays where it is
         better = there.cost <= here.cost[left] * (1.0 + 1e-12) + 1e-24
         taken, kept = left[better], np.flatnonzero(better)
         state = chain.replaced(state, taken, chain.chosen(trial, kept))
-        part = NormalEquations(there.cost[kept], there.matrix[kept], there.right[kept])
-        here = here.replaced(taken, part)
+        here = here.replaced(taken, there.of(kept))
         damping[left] = np.clip(damping[left] * np.where(better, 0.1, 10.0), 1e-12, 1e6)
-        left = left[np.abs(step).max(axis=1) >= SETTLED]
-        steps += 1
+        last[left] = np.where(better, size, np.inf)
     distance = np.where(seen, np.linalg.norm(chain.places(state) - target, axis=2), np.nan)
     count = seen.sum(axis=1)
     rms = np.sqrt(np.nansum(distance**2, axis=1) / np.maximum(count, 1))
@@ -126,15 +144,23 @@ def fit_chain(
     return ChainFit(state, np.where(count > 0, rms, np.nan), distance, solved, steps)
 
 
-def _step(equations: NormalEquations, frames: Index, damping: Array) -> Array:
-    """Return the damped Gauss-Newton steps (f, n) of some frames."""
-    matrix = equations.matrix[frames].copy()
+def _step(equations: NormalEquations, damping: Array, near: NDArray[np.bool_]) -> Array:
+    """Return the damped steps (f, n) of some frames: Newton's where `near`, else Gauss-Newton's.
+
+    A Newton step that would not descend is replaced.
+    """
+    matrix, right = equations.matrix, equations.right
     diagonal = np.einsum("fii->fi", matrix)
     # the floor keeps what no marker sees where it is
     floor = 1e-9 * diagonal.max(axis=1, keepdims=True, initial=1e-12)
-    each = np.arange(matrix.shape[1])
-    matrix[:, each, each] += damping[:, None] * diagonal + floor
-    return np.asarray(np.linalg.solve(matrix, equations.right[frames][:, :, None])[:, :, 0])
+    added = (damping[:, None] * diagonal + floor)[:, :, None] * np.eye(matrix.shape[1])
+    step = np.zeros_like(right)
+    if equations.curvature is not None and near.any():
+        whole = (matrix + equations.curvature + added)[near]
+        step[near] = np.linalg.solve(whole, right[near][:, :, None])[:, :, 0]
+    uphill = np.einsum("fi,fi->f", step, right) <= 0.0
+    step[uphill] = np.linalg.solve((matrix + added)[uphill], right[uphill][:, :, None])[:, :, 0]
+    return step
 
 
 def put(values: Array, frames: Index, part: Array) -> Array:

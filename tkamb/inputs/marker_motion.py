@@ -22,6 +22,7 @@ from tkamb.geometry.frames import (
     Array,
     inverse,
     knee_coordinates,
+    transform,
 )
 from tkamb.inputs.filtering import Cutoff, differentiate_poses
 from tkamb.inputs.inverse_kinematics import ChainFit, fit_chain
@@ -35,6 +36,8 @@ from tkamb.units import MILLIMETRE
 
 Method = Literal["segments", "chain"]
 KNEE_SEGMENTS = ("shank", "thigh")
+JOINT_APART = 0.1
+"""m; skin moves by a third of this at the hip, the other foot is farther."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +103,7 @@ def load_marker_motion(
         raise InputError(
             f"the chain of segments does not settle at {time[int(np.argmin(whole.solved))]:.4f} s",
             recorded.path,
-            "check the joints in [motion.markers]",
+            "are labels swapped? check labels and joints in [motion.markers]",
         )
     blind = np.isnan(whole.rms)[:, None, None]
     readings: dict[Method, tuple[Array, Array]] = {
@@ -124,6 +127,7 @@ def both_fits(
     """Return each segment's own fit (poses and rms), and that of the chain."""
     fits = {s.name: fit_seen(measured[s.name], s.points, s.weights, s.name) for s in segments}
     _check_fits({name: fit[1] for name, fit in fits.items()}, recorded)
+    _check_joints(segments, {name: fit[0] for name, fit in fits.items()}, recorded)
     points = np.concatenate([measured[s.name] for s in segments], axis=1)
     weights = np.concatenate([s.weights for s in segments])
     start = chain.start({name: fit[0] for name, fit in fits.items()}, neutral)
@@ -181,6 +185,22 @@ def _check_fits(rms: dict[str, Array], recorded: Table) -> None:
                 f"markers of the {name} fit only to {np.median(known) / MILLIMETRE:.0f} mm",
                 recorded.path,
                 "check names and positions in [motion.markers], and length_unit",
+            )
+
+
+def _check_joints(segments: list[Segment], poses: dict[str, Array], recorded: Table) -> None:
+    """Raise where a segment's markers put its joint far from where its neighbour has it."""
+    for own in segments:
+        if own.joint is None or own.centre is None:
+            continue
+        ends = transform(poses[own.joined_to], own.joint) - transform(poses[own.name], own.centre)
+        apart = np.linalg.norm(ends, axis=1)
+        if np.isfinite(apart).any() and np.nanmedian(apart) > JOINT_APART:
+            raise InputError(
+                f"markers of the {own.name} put its joint with the {own.joined_to} "
+                f"{np.nanmedian(apart) / MILLIMETRE:.0f} mm from where the {own.joined_to}'s do",
+                recorded.path,
+                "are left and right labels swapped? check the labels in [motion.markers]",
             )
 
 

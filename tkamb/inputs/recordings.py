@@ -174,6 +174,7 @@ class ForceRecording:
         length_unit: of the file.
         laboratory_axes: axes of the file that point forward, up and right.
         unloaded: N, vertical force below which the centre of pressure is held.
+        surface: m, of a C3D file: height above the plates of what the foot stands on.
     """
 
     file: Path
@@ -184,3 +185,4 @@ class ForceRecording:
     length_unit: str | None
     laboratory_axes: str
     unloaded: float
+    surface: float

@@ -30,6 +30,8 @@ from tkamb.opensim.plane_strings import dot, planar_starts
 ITERATIONS = 30
 TOLERANCE = 1e-11
 """Of the direction in which the string arrives, rad."""
+PAST = 0.05
+"""Of the same: below, a string that arrives backwards is one that has gone too far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,14 +107,18 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
         shot = _Shot(
             start[waiting], end[waiting], axes, hub[waiting], radial[waiting], sideways[waiting]
         )
-        residual, jacobian, entry[waiting], leave[waiting] = shot.fire(
+        residual, jacobian, entry[waiting], leave[waiting], ahead = shot.fire(
             turned, arc[waiting, None] * shares[waiting]
         )
-        done = np.abs(residual).max(axis=1) < TOLERANCE
+        small = np.abs(residual).max(axis=1)
+        done = (small < TOLERANCE) & (ahead > 0.0)
         converged[waiting[done]] = True
         if done.all():
             break
         step = -np.linalg.solve(jacobian[~done], residual[~done][..., None])[..., 0]
+        # a string that would turn back has gone past where it leaves, by as far as it must return
+        past = ((small < PAST) & (ahead <= 0.0))[~done]
+        step[past] = np.column_stack([np.zeros(past.sum()), 2.0 * ahead[~done][past]])
         waiting = waiting[~done]
         # A long step is cut short: far from the solution the derivatives mislead.
         share = np.minimum(1.0, 0.4 / np.maximum(np.abs(step[:, 0]), 1e-300))
@@ -135,8 +141,11 @@ class _Shot:
     radial: Array
     sideways: Array
 
-    def fire(self, angle: Array, pieces: Array) -> tuple[Array, Array, Array, Array]:
-        """Return residuals (f, 2), their derivatives (f, 2, 2), entries and exits (f, 3)."""
+    def fire(self, angle: Array, pieces: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """Return residuals (f, 2), their derivatives (f, 2, 2), entries and exits (f, 3).
+
+        Last how far ahead `end` lies (f,) m: where that is negative, the string would turn back.
+        """
         cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
         entry = self.axes * (self.hub + cosine * self.radial + sine * self.sideways)
         moved = self.axes * (cosine * self.sideways - sine * self.radial)
@@ -164,7 +173,7 @@ class _Shot:
             - rate * dot(rest, direction)
         )
         jacobian[:, 1, 1] = dot(rest, np.cross(by_arc, direction))
-        return residual, jacobian, entry, leave
+        return residual, jacobian, entry, leave, reach[:, 0] * dot(rest, direction)
 
     def _turn(self, velocity: Array, normal: Array, slope: Array) -> Array:
         """Return the rate (f, 3) of the unit normal where a point moves with a velocity."""
@@ -190,20 +199,21 @@ def _along_geodesic(state: Array, pieces: Array, axes: Array) -> Array:
     inverse_squares = 1.0 / axes**2
     curvature = inverse_squares.prod()
 
-    def rate(y: Array) -> Array:
-        gradient = y[:, :3] * inverse_squares
-        squared = (gradient**2).sum(axis=1)
-        pull = (y[:, 3:6] ** 2) @ inverse_squares / squared
-        result = np.empty_like(y)
-        result[:, :3] = y[:, 3:6]
-        result[:, 3:6] = -pull[:, None] * gradient
-        result[:, 6] = y[:, 7]
-        result[:, 7] = -curvature / squared**2 * y[:, 6]
-        return result
+    def rate(y: Array, result: Array) -> None:
+        gradient, velocity = y[:3] * inverse_squares[:, None], y[3:6]
+        squared = np.einsum("if,if->f", gradient, gradient)
+        result[:3] = velocity
+        result[3:6] = gradient * (inverse_squares @ (velocity * velocity) / -squared)
+        result[6] = y[7]
+        result[7] = y[6] * (-curvature / (squared * squared))
 
-    stages = np.empty((DOP853.n_stages, *state.shape))
-    for step in pieces.T[..., None]:
+    # Components first and stages in one row each: a step's sums are products of small matrices.
+    y = np.ascontiguousarray(state.T)
+    stages = np.empty((DOP853.n_stages, *y.shape))
+    rows = stages.reshape(DOP853.n_stages, -1)
+    for step in pieces.T:
         for k, weights in enumerate(DOP853.A):
-            stages[k] = rate(state + step * np.tensordot(weights[:k], stages[:k], 1))
-        state = state + step * np.tensordot(DOP853.B, stages, 1)
-    return state
+            moved = (weights[:k] @ rows[:k]).reshape(y.shape)
+            rate(y + step * moved, stages[k])
+        y = y + step * (DOP853.B @ rows).reshape(y.shape)
+    return y.T

@@ -40,11 +40,35 @@ def inverse_dynamics(
             origin, such as the ground reaction on a foot.
     """
     motion = kinematics.motion(q)
+    needed = required_wrenches(kinematics, motion, q, rates, accelerations, wrenches)
+    return np.einsum("fbin,fbi->fn", motion.twists, needed)
+
+
+def required_wrenches(
+    kinematics: Kinematics,
+    motion: Motion,
+    q: Array,
+    rates: Array,
+    accelerations: Array,
+    wrenches: Mapping[str, Array] | None = None,
+) -> Array:
+    """Return what else must act on each body (f, b, 6), beside gravity and the given wrenches.
+
+    Moment (N·m) above force (N), in ground at ground's origin; zero for ground. Over the bodies
+    beyond a joint, this sums up to what muscles, ligaments and the joint itself exert on them.
+
+    Args:
+        kinematics: of the model.
+        motion: at q.
+        q: (f, n) coordinates.
+        rates: (f, n) their rates.
+        accelerations: (f, n) their second derivatives by time.
+        wrenches: body -> (f, 6), as in `inverse_dynamics`.
+    """
     twists = np.einsum("fbin,fn->fbi", motion.twists, rates)
-    result = np.zeros_like(q)
-    bodies = kinematics.model.bodies
+    result = np.zeros_like(twists)
     spins = _accelerations(kinematics, motion, twists, q, rates, accelerations)
-    for name, body in bodies.items():
+    for name, body in kinematics.model.bodies.items():
         b = kinematics.bodies[name]
         rotation = motion.poses[:, b, :3, :3]
         centre = rotation @ body.centre + motion.poses[:, b, :3, 3]
@@ -55,10 +79,9 @@ def inverse_dynamics(
         force = body.mass_kg * (pull - kinematics.model.gravity)
         spin = np.einsum("fij,fj->fi", tensor, omega)
         moment = np.einsum("fij,fj->fi", tensor, alpha) + np.cross(omega, spin)
-        wrench = np.hstack([np.cross(centre, force) + moment, force])
+        result[:, b] = np.hstack([np.cross(centre, force) + moment, force])
         if wrenches is not None and name in wrenches:
-            wrench = wrench - wrenches[name]
-        result += np.einsum("fin,fi->fn", motion.twists[:, b], wrench)
+            result[:, b] -= wrenches[name]
     return result
 
 

@@ -13,7 +13,7 @@ of the pull on their own motion.
 Reference: Sherman, Seth & Delp, Proc ASME IDETC (2013), doi:10.1115/DETC2013-13633.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +23,8 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.opensim.kinematics import Kinematics, Motion
 from tkamb.opensim.lines import ConditionalPathPoint, Ligament, MovingPathPoint, Muscle, Path
-from tkamb.opensim.strings import WrappedStrings, strings_over
+from tkamb.opensim.strings import strings_over
+from tkamb.opensim.tension import StraightParts, Tension
 from tkamb.opensim.wrapping import Index
 
 CONDITION_SLACK = 1e-5
@@ -46,6 +47,21 @@ class Lines:
     names: tuple[str, ...]
     lengths_m: Array
     moment_arms: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Pulls(Lines):
+    """Taut paths, and what unit tension in them does to g groups of bodies.
+
+    Args:
+        wrenches: (..., m, g, 6) moment above force, N per N and N·m per N, on each group, in
+            ground at ground's origin.
+        crossings: straight parts from one group to another; `bodies` holds groups, -1 for
+            bodies of no group.
+    """
+
+    wrenches: Array
+    crossings: StraightParts
 
 
 class LineSet:
@@ -81,17 +97,48 @@ class LineSet:
     def at(self, q: Mapping[str, float] | ArrayLike) -> Lines:
         """Return lengths and moment arms at coordinates q (..., n)."""
         q = self.kinematics.vector(q)
-        flat = q.reshape(-1, q.shape[-1])
-        parts = [
-            self._measure(flat[first : first + FRAMES_AT_ONCE])
-            for first in range(0, len(flat), FRAMES_AT_ONCE)
-        ]
-        lengths, arms = (np.concatenate(part) for part in zip(*parts, strict=True))
-        shape = (*q.shape[:-1], len(self.names))
-        return Lines(self.names, lengths.reshape(shape), arms.reshape(*shape, q.shape[-1]))
+        chunks = [self._measure(chunk)[:2] for _, chunk in self._chunks(q)]
+        length, arm = self._joined(q, *zip(*chunks, strict=True))
+        return Lines(self.names, length, arm)
 
-    def _measure(self, q: Array) -> tuple[Array, Array]:
-        """Return lengths (f, m) and moment arms (f, m, n) at q (f, n)."""
+    def pulls(self, q: Mapping[str, float] | ArrayLike, groups: Sequence[Collection[str]]) -> Pulls:
+        """Return lengths, moment arms, wrenches on groups of bodies and where paths cross.
+
+        Args:
+            q: (..., n) coordinates.
+            groups: names of the bodies that move together, g times.
+        """
+        q = self.kinematics.vector(q)
+        group = np.full(len(self.kinematics.bodies), -1)
+        for k, bodies in enumerate(groups):
+            group[[self.kinematics.bodies[name] for name in bodies]] = k
+        member = (group[:, None] == np.arange(len(groups))).astype(float)
+        lengths, arms, wrenches, parts = [], [], [], []
+        for first, chunk in self._chunks(q):
+            length, arm, work = self._measure(chunk)
+            lengths.append(length)
+            arms.append(arm)
+            wrenches.append(np.einsum("fmbi,bg->fmgi", work.wrenches, member))
+            part = work.parts()
+            ends = group[part.bodies]
+            part = StraightParts(part.frame + first, part.line, ends, part.ends)
+            parts.append(part.chosen(np.flatnonzero(ends[:, 0] != ends[:, 1])))
+        length, arm, wrench = self._joined(q, lengths, arms, wrenches)
+        return Pulls(self.names, length, arm, wrench, StraightParts.joined(parts))
+
+    def _chunks(self, q: Array) -> Iterator[tuple[int, Array]]:
+        """Yield (first, q (f, n)) of a few frames at a time."""
+        flat = q.reshape(-1, q.shape[-1])
+        for first in range(0, len(flat), FRAMES_AT_ONCE):
+            yield first, flat[first : first + FRAMES_AT_ONCE]
+
+    def _joined(self, q: Array, *columns: Sequence[Array]) -> list[Array]:
+        """Return chunks (f, m, ...) put together again, with the leading shape of q."""
+        whole = [np.concatenate(parts) for parts in columns]
+        return [values.reshape(*q.shape[:-1], *values.shape[1:]) for values in whole]
+
+    def _measure(self, q: Array) -> tuple[Array, Array, Tension]:
+        """Return lengths (f, m), moment arms (f, m, n) and tensions at q (f, n)."""
         motion = self.kinematics.motion(q)
         locations, rates = self._own_motion(q)
         poses = motion.poses[:, self._body]
@@ -101,7 +148,7 @@ class LineSet:
         there = follower[rows, here]
         wrapped = np.zeros(len(rows), bool)
         count = len(self.names), len(self.kinematics.bodies)
-        work = _Tension(points, np.zeros((len(q), *count, 6)))
+        work = Tension(points, self._owner, self._body, count)
         for path, first in zip(self._paths, self._first, strict=True):
             for k in range(first, first + len(path.points) - 1) if path.wraps else ():
                 chosen = here == k
@@ -109,7 +156,7 @@ class LineSet:
                 self._wrap(path, first, k, rows[chosen], there[chosen], motion, work)
         straight = ~wrapped
         work.pull(rows[straight], here[straight], there[straight])
-        work.press_points(self._owner, self._body)
+        work.press_points()
         shape = len(q), len(self.names), -1
         twists = motion.twists.reshape(len(q), -1, q.shape[1])
         arms = work.wrenches.reshape(shape) @ twists
@@ -118,7 +165,7 @@ class LineSet:
             arms[:, self._owner[k], c] += (work.pulls[:, k] * moved).sum(axis=1)
         lengths = np.add.reduceat(work.lengths, self._first, axis=1)
         arms[np.isnan(lengths)] = np.nan
-        return lengths, arms
+        return lengths, arms, work
 
     def _own_motion(self, q: Array) -> tuple[Array, list[tuple[int, int, Array]]]:
         """Return points (f, k, 3) in their bodies, and (point, coordinate, dp/dq (f, 3))."""
@@ -164,7 +211,7 @@ class LineSet:
         rows: Index,
         there: Index,
         motion: Motion,
-        work: "_Tension",
+        work: Tension,
     ) -> None:
         """Add the strings from point k to points `there` of some rows, over the path's wraps."""
         objects = self.kinematics.model.wrap_objects
@@ -182,74 +229,4 @@ class LineSet:
         ends = np.stack([np.full(len(rows), self._body[k]), self._body[there]], axis=1)
         moves = ends[:, None, :] != np.array(bodies)[:, None]
         found = strings_over(wraps, poses, start, end, allowed, moves)
-        work.pull_wrapped(self._owner[k], rows, k, there, found, np.array(bodies))
-
-
-class _Tension:
-    """What strings of unit tension do to the points and bodies they pass, summed up.
-
-    Args:
-        points: (f, k, 3) m, path points in ground.
-        wrenches: (f, m, b, 6) of each path on each body, at ground's origin; added to.
-    """
-
-    def __init__(self, points: Array, wrenches: Array) -> None:
-        self.points, self.wrenches = points, wrenches
-        self.pulls = np.zeros_like(points)
-        self.lengths = np.zeros(points.shape[:2])
-
-    def pull(self, rows: Index, here: Index, there: Index) -> None:
-        """Add straight strings between points of some rows."""
-        u, distance = _direction(self.points[rows, here], self.points[rows, there])
-        self.lengths[rows, here] += distance
-        self.pulls[rows, here] += u
-        self.pulls[rows, there] -= u
-
-    def pull_wrapped(
-        self, owner: int, rows: Index, k: int, there: Index, strings: WrappedStrings, bodies: Index
-    ) -> None:
-        """Add strings from point k to others of some rows, over objects fixed to bodies."""
-        at = np.arange(len(rows))
-        place, last = self.points[rows, k], np.full(len(rows), -1)
-        for gap in range(len(bodies) + 1):
-            upcoming = strings.order[at, gap] if gap < len(bodies) else np.full(len(rows), -1)
-            touching = upcoming >= 0
-            target = np.where(
-                touching[:, None], strings.entry[at, upcoming], self.points[rows, there]
-            )
-            u, distance = _direction(place, target)
-            self.lengths[rows, k] += distance
-            if gap == 0:
-                self.pulls[rows, k] += u
-            else:
-                self._press(owner, rows, bodies[last], place, u)
-            on = touching
-            self._press(owner, rows[on], bodies[upcoming[on]], target[on], -u[on])
-            self.pulls[rows[~on], there[~on]] -= u[~on]
-            rows, there, last, at = rows[on], there[on], upcoming[on], at[on]
-            self.lengths[rows, k] += strings.arc_m[at, last]
-            for end, points in enumerate((np.full(len(rows), k), there)):
-                push = strings.push[at, last, end]
-                self.pulls[rows, points] += push
-                self._press(owner, rows, bodies[last], self.points[rows, points], -push)
-            place = strings.exit[at, last]
-
-    def _press(self, owner: int, rows: Index, bodies: Index, points: Array, forces: Array) -> None:
-        self.wrenches[rows, owner, bodies] += np.hstack([np.cross(points, forces), forces])
-
-    def press_points(self, owner: Index, bodies: Index) -> None:
-        """Add the pulls on the path points to the wrenches."""
-        wrenches = np.concatenate([np.cross(self.points, self.pulls), self.pulls], axis=-1)
-        count = self.wrenches.shape[2]
-        place = owner * count + bodies
-        by_place = np.argsort(place, kind="stable")
-        places, first = np.unique(place[by_place], return_index=True)
-        sums = np.add.reduceat(wrenches[:, by_place], first, axis=1)
-        self.wrenches[:, places // count, places % count] += sums
-
-
-def _direction(start: Array, end: Array) -> tuple[Array, Array]:
-    """Return unit vectors (f, 3) from start to end, 0 where they coincide, and distances (f,)."""
-    step = end - start
-    distance = np.linalg.norm(step, axis=-1)
-    return step / np.maximum(distance, 1e-300)[:, None], distance
+        work.pull_wrapped(rows, k, there, found, np.array(bodies))

@@ -2,12 +2,20 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tkamb.atomic import write_text
+from tkamb.columns import KINDS
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
+from tkamb.output.metrics import failed, flagged
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
+
+STORAGE = (".sto", ".mot")
 
 
 def write_storage(path: Path, columns: Mapping[str, Array], in_degrees: bool) -> None:
@@ -39,6 +47,41 @@ def write_storage(path: Path, columns: Mapping[str, Array], in_degrees: bool) ->
         *("\t".join(f"{value:.10g}" for value in row) for row in rows),
     ]
     write_text(path, "\n".join(lines) + "\n")
+
+
+def write_results_storage(results: "Results", path: Path) -> str:
+    """Write the numbers of a run as a storage file.
+
+    Columns keep their names, units (`_N`, `_mm`, `_deg`) and order; `time_s` is called `time`.
+    What has no number is `nan`. Instead of the status' words there is `status`: 0 "ok", 1 to be
+    read with care, 2 failed.
+
+    Args:
+        results: of a run.
+        path: a new file, .sto or .mot.
+
+    Returns:
+        What was written, in a line.
+
+    Raises:
+        InputError: another format, a file that is there already, times that do not rise, or no
+            place to write.
+    """
+    if path.suffix.lower() not in STORAGE:
+        raise InputError(f"is none of {', '.join(STORAGE)}", path, "name a file that ends so")
+    if path.exists():
+        raise InputError("is there already", path, "give a new file: nothing of yours is replaced")
+    numbers = {name: v for name, v in results.columns.items() if KINDS.get(name) != "text"}
+    time = numbers.pop("time_s")
+    if not (np.diff(time) > 0).all():
+        raise InputError("holds times that do not rise, as OpenSim wants them", results.directory)
+    lost, doubtful = failed(results), flagged(results)
+    status = np.where(lost, 2.0, np.where(doubtful, 1.0, 0.0))
+    write_storage(path, {"time": time, **numbers, "status": status}, in_degrees=True)
+    return (
+        f"{len(status)} frames ({doubtful.sum()} to be read with care, {lost.sum()} failed: nan), "
+        f"{len(numbers) + 2} columns"
+    )
 
 
 def write_trc(path: Path, time: Array, markers: Mapping[str, Array], rate_Hz: float) -> None:

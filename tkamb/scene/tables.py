@@ -340,6 +340,13 @@ class GroundReactionTable(SceneTable):
     unloaded_N: Number = Field(
         20.0, gt=0, le=200, description="below this vertical force the centre of pressure is held"
     )
+    surface_mm: Number = Field(
+        0.0,
+        ge=0,
+        le=3000,
+        description="of a .c3d: height above the plates of what the foot stands on, a step say; "
+        "the wrench stays as measured, the centre of pressure is given on that level",
+    )
 
 
 class FemoralImplantTable(SceneTable):

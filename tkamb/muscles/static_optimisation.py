@@ -152,13 +152,17 @@ def share_load(problem: LoadSharing) -> Shared:
 def kkt_residual(problem: LoadSharing, shared: Shared) -> float:
     """Return the largest violation of the conditions of an optimum, relative.
 
-    Stationarity (gradient + multipliers = 0, over the largest gradient), feasibility and
-    complementarity (multiplier times distance from its bound), each over its own scale.
+    Stationarity (gradient + multipliers = 0, over the largest term of the gradient: their sum
+    vanishes where no bound is active), feasibility and complementarity (multiplier times distance
+    from its bound), each over its own scale.
     """
     a, y = shared.activation, shared.others
     slope = problem.gradient(a)
+    hessian, pull, _ = problem._quadratic()
+    own = problem.exponent * problem.weight * np.abs(a) ** (problem.exponent - 1)
     still = slope + shared.own_multiplier + problem.gain.T @ shared.other_multiplier
-    size = max(float(np.abs(slope).max(initial=0.0)), 1e-12)
+    terms = np.concatenate([own, hessian @ a, pull])
+    size = max(float(np.abs(terms).max(initial=0.0)), 1e-12)
     scale = _row_scale(problem)
     found = [float(np.abs(still).max(initial=0.0)) / size]
     for value, low, high, multiplier, unit in (

@@ -1,13 +1,27 @@
 """Closed solids from two structured sheets, and binary STL files with fixed bytes."""
 
+from collections.abc import Sequence
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from tkamb.geometry.frames import Array
+
+Ids = NDArray[np.int64]
+Node = tuple[int, int]
 HEADER = b"tkamb deep knee bend, millimetres".ljust(80)
+"""Of every STL file; it names the first model that was written with it."""
 
 
-def close_sheets(outer, inner, rows_kept, columns_kept, fork=None):
+def close_sheets(
+    outer: Array,
+    inner: Array,
+    rows_kept: Sequence[int],
+    columns_kept: Sequence[int],
+    fork: int | None = None,
+) -> tuple[Array, Ids]:
     """Join two sheets of points (rows, columns, 3) into one closed triangulation.
 
     Args:
@@ -39,7 +53,7 @@ def close_sheets(outer, inner, rows_kept, columns_kept, fork=None):
     return vertices, faces if signed_volume(vertices, faces) > 0 else faces[:, ::-1]
 
 
-def _ids(rows, columns, fork, start):
+def _ids(rows: int, columns: int, fork: int | None, start: int) -> Ids:
     """Vertex number of every grid node; the middle columns are welded up to the fork."""
     ids = start + np.arange(rows * columns).reshape(rows, columns)
     if fork is not None:
@@ -47,7 +61,7 @@ def _ids(rows, columns, fork, start):
     return ids
 
 
-def _sheet(ids, rows, columns, middle):
+def _sheet(ids: Ids, rows: Ids, columns: Ids, middle: int | None) -> Ids:
     """Triangles of the grid, none between the two middle columns."""
     pairs = [(a, b) for a, b in pairwise(columns) if a != middle]
     left, right = np.array(pairs).T
@@ -57,7 +71,7 @@ def _sheet(ids, rows, columns, middle):
     return np.concatenate([t.reshape(-1, 3) for t in triangles])
 
 
-def _loop(rows, columns, fork):
+def _loop(rows: list[int], columns: list[int], fork: int | None) -> list[Node]:
     """Grid nodes (row, column) along the sheet's edge, once around."""
     last = rows[-1]
     path = [(rows[0], c) for c in columns] + [(r, columns[-1]) for r in rows[1:]]
@@ -73,10 +87,10 @@ def _loop(rows, columns, fork):
     return path + [(r, columns[0]) for r in rows[-2::-1]]
 
 
-def _wall(top, bottom, kept, fork):
+def _wall(top: Ids, bottom: Ids, kept: tuple[Ids, Ids], fork: int | None) -> Ids:
     """Triangles between the whole edge of one sheet and the thinned edge of the other."""
-    whole = _loop(np.arange(top.shape[0]), np.arange(top.shape[1]), fork)
-    thin = set(_loop(*kept, fork))
+    whole = _loop(list(range(top.shape[0])), list(range(top.shape[1])), fork)
+    thin = set(_loop(kept[0].tolist(), kept[1].tolist(), fork))
     stations = [i for i, node in enumerate(whole) if node in thin]
     triangles = []
     for start, end in pairwise(stations):
@@ -89,13 +103,13 @@ def _wall(top, bottom, kept, fork):
     return np.array([t for t in triangles if len(set(t)) == 3])
 
 
-def signed_volume(vertices, faces):
+def signed_volume(vertices: Array, faces: Ids) -> float:
     """Volume, positive when the faces turn outwards."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    return np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0
+    return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
 
 
-def write_stl(path, vertices, faces):
+def write_stl(path: Path, vertices: Array, faces: Ids) -> None:
     """Write a binary STL."""
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("pad", "<u2")])
     triangles = np.zeros(len(faces), record)

@@ -1,0 +1,130 @@
+"""Six parametric implants: closed meshes in millimetres whose radii are those documented."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from tkamb.cli import main
+from tkamb.contact.registry import contact_model
+from tkamb.designs.design import load_design
+from tkamb.designs.radii import circle_radius, measured_radii
+from tkamb.designs.sagittal import SagittalProfile
+from tkamb.errors import InputError
+from tkamb.geometry.post import find_post
+from tkamb.inputs.meshes import load_surface
+from tkamb.validation.design_cells import Assumption, PressedDesign, nominal, table_force
+from tkamb.validation.design_tables import FOLDERS, pairs_in_order
+from tkamb.validation.dissertation import designs
+
+ROOT = Path(__file__).parents[1] / "models" / "designs"
+
+
+@pytest.fixture(scope="module", params=FOLDERS.values())
+def design(request):
+    return load_design(ROOT / request.param)
+
+
+def test_there_is_a_design_for_every_column_of_the_tables():
+    assert tuple(FOLDERS) == designs()
+
+
+def test_radii_measured_back_from_the_meshes(design):
+    found = measured_radii(design)
+    assert len(found) >= 18
+    for radius in found:
+        assert radius.measured == pytest.approx(radius.documented, abs=0.05), radius.name
+
+
+def test_meshes_are_closed_and_turn_outwards(design):
+    for vertices, faces in (design.femoral.mesh(), design.insert.mesh(), design.insert.tray()):
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        assert mesh.is_watertight
+        assert mesh.is_winding_consistent
+        assert mesh.volume > 0
+        assert mesh.body_count == 1
+
+
+def test_symmetry_bearing_and_post_are_those_of_the_source(design):
+    """Chapter 6: symmetric Sigmas and LPS-Flex, one mobile bearing, three designs with a post."""
+    name = design.name
+    assert design.symmetric == (name in ("sigma_fb", "sigma_mb", "lps_flex"))
+    assert design.bearing == ("mobile" if name == "sigma_mb" else "fixed")
+    assert (design.insert.post is not None) == (name in ("sigma_fb", "sigma_mb", "lps_flex"))
+    assert {"sagittal", "coronal", "range", "rest"} <= set(design.sources)
+
+
+def test_deep_flexion_radii_are_ordered_as_the_source_says():
+    radius = {}
+    for title, folder in FOLDERS.items():
+        profile = load_design(ROOT / folder).femoral.profile
+        radius[title] = profile.radii[np.searchsorted(profile.joints, np.radians(100.0))]
+    assert radius["LPS-Flex"] < radius["CR-Flex"] < radius["Sigma FB"] == radius["Sigma MB"]
+    assert radius["NKII CP"] == radius["NKII UCP"] < radius["Sigma FB"]
+
+
+def test_mesh_check_passes_and_the_post_is_found(tmp_path, capsys):
+    design = load_design(ROOT / "lps_flex")
+    files = design.write_meshes(tmp_path)
+    assert main(["mesh", "check", *map(str, files)]) == 0
+    said = capsys.readouterr().out
+    assert said.count("watertight") == 3
+    assert "millimetres?" in said
+    insert = load_surface(tmp_path / "insert.stl", "mm", "+x,+y,+z", name="insert", closed=True)
+    assert find_post(insert) is not None
+    flat = replace(design.insert, post=None)
+    assert flat.mesh()[0][:, 1].max() < design.insert.mesh()[0][:, 1].max()
+
+
+def test_a_circle_is_measured_exactly():
+    angle = np.linspace(0.1, 0.9, 20)
+    points = np.array([3.0, -7.0]) + 22.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    assert circle_radius(points) == pytest.approx(22.0, rel=1e-9)
+
+
+def test_arcs_that_do_not_follow_each_other_are_refused(tmp_path):
+    with pytest.raises(InputError, match="do not follow"):
+        SagittalProfile([(-90.0, 0.0, 30.0), (10.0, 90.0, 20.0)])
+    text = (ROOT / "nkii_cp" / "design.toml").read_text()
+    (tmp_path / "design.toml").write_text(text.replace("thickness_mm", "thickness"))
+    with pytest.raises(InputError, match="unknown key 'thickness'"):
+        load_design(tmp_path)
+
+
+def test_a_larger_size_is_the_same_problem_in_other_units():
+    """Pressed as a scaled mesh, area and pressure are those of the scaling law within 1 %."""
+    design, size, load = load_design(ROOT / "nkii_cp"), 1.07, 900.0
+    pressed = PressedDesign(design, 4.0)
+    case = Assumption(0.5, 0.5, 0.0, 0.0, size)
+    scaled = pressed.cell("medial", 0.0, load, case)
+    pair = pressed.pair("medial")
+    femoral, insert = (
+        replace(body, vertices=body.vertices * size) for body in (pair.femoral, pair.insert)
+    )
+    pose = pressed.pose("medial", 0.0, case)
+    pose[:3, 3] *= size
+    model = contact_model("lattice", 4.0 * size, cache=False)
+    state = model.prepare(replace(pair, femoral=femoral, insert=insert))
+    direct = model.press(state, load, pose).medial
+    assert scaled.area == pytest.approx(direct.area, rel=0.01)
+    assert scaled.mean_pressure == pytest.approx(direct.mean_pressure, rel=0.01)
+
+
+def test_a_condyle_pressed_alone_carries_like_half_of_a_symmetric_pair():
+    pressed = PressedDesign(load_design(ROOT / "lps_flex"), 4.0)
+    alone = pressed.press_alone("medial", 1.0, 1000.0).medial
+    both = pressed.press_both(1.0, 2000.0)
+    assert both.medial.force == pytest.approx(both.lateral.force, rel=2e-3)
+    assert both.medial.area == pytest.approx(alone.area, rel=5e-3)
+    assert both.medial.peak_pressure == pytest.approx(alone.peak_pressure, rel=5e-3)
+
+
+def test_table_force_is_the_tables_body_weights_times_the_implied_mass():
+    assert table_force("LPS-Flex", "medial", 10) == pytest.approx(2.61 * 70.3 * 9.80665, rel=0.01)
+    assert nominal().axial_rotation == 0.0 and nominal().size == 1.0
+
+
+def test_pairs_in_order():
+    assert pairs_in_order(np.array([1.0, 2.0, 3.0]), np.array([10.0, 30.0, 20.0])) == (2, 3)

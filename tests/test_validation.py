@@ -1,0 +1,121 @@
+"""The page of published numbers: made of its JSON, and about a tenth of it computed anew."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tkamb.designs.design import load_design
+from tkamb.validation import benchmarks, dissertation
+from tkamb.validation.design_cells import PressedDesign, in_public_units, nominal, table_force
+from tkamb.validation.design_tables import FOLDERS, QUANTITIES, pressed_row
+from tkamb.validation.film import PressureFilm, hertz_field, worst_errors
+from tkamb.validation.page import badge, hit, page, published
+
+ROOT = Path(__file__).parents[1]
+STORED = json.loads((ROOT / "docs" / "validation.json").read_text(encoding="utf-8"))
+VALUES = {row["id"]: row for row in published()["value"]}
+
+
+def stored_row(design, condyle, percent):
+    key = (design, condyle, percent)
+    rows = STORED["tables"]
+    return next(r for r in rows if (r["design"], r["condyle"], r["percent"]) == key)
+
+
+def test_page_is_what_its_numbers_make():
+    assert (ROOT / "docs" / "validation.md").read_text(encoding="utf-8") == page(STORED)
+
+
+def test_every_published_value_has_ours_a_source_and_a_band():
+    sources = {row["key"] for row in published()["source"]}
+    assert set(VALUES) == set(STORED["values"])
+    assert {row["source"] for row in VALUES.values()} == sources
+    assert len(VALUES) >= 10 and len(sources) >= 5
+    for row in VALUES.values():
+        assert row["low"] < row["high"]
+    assert np.isfinite(list(STORED["values"].values())).all()
+
+
+def test_badge_counts_hits():
+    within = sum(hit(row, STORED["values"][name]) for name, row in VALUES.items())
+    assert badge(STORED["values"]).startswith(f"**{within} of {len(VALUES)} ")
+
+
+def test_cheap_values_are_computed_anew():
+    anew = {**benchmarks.film(), **benchmarks.patch()}
+    for name, value in anew.items():
+        assert value == pytest.approx(STORED["values"][name], rel=1e-3), name
+
+
+def test_a_tenth_of_the_cells_is_pressed_anew():
+    """Nominal cases of one design along the bend, and the ranges of one cell."""
+    name = "NKII CP"
+    pressed = PressedDesign(load_design(ROOT / "models" / "designs" / FOLDERS[name]))
+    percent = dissertation.table(1).percent
+    for row in range(11):
+        cell = pressed.cell("medial", percent[row], table_force(name, "medial", row), nominal())
+        stored = stored_row(name, "medial", percent[row])
+        ours = dict(zip(QUANTITIES, in_public_units([cell])[0], strict=True))
+        for quantity, value in ours.items():
+            assert value == pytest.approx(stored[quantity][0], rel=5e-3), (row, quantity)
+    row = pressed_row(pressed, name, "medial", 10)
+    for quantity in QUANTITIES:
+        np.testing.assert_allclose(
+            row[quantity], stored_row(name, "medial", 100.0)[quantity], rtol=5e-3
+        )
+
+
+@pytest.mark.slow
+def test_all_values_are_computed_anew():
+    designs = ROOT / "models" / "designs"
+    anew = {
+        **benchmarks.spheres(),
+        **benchmarks.against_fe(designs),
+        **benchmarks.foundation(designs),
+        **benchmarks.given_load_or_approach(),
+        **benchmarks.conformity(designs),
+        **benchmarks.measured_stress(designs),
+        **benchmarks.thickness_and_plane(designs),
+    }
+    for name, value in anew.items():
+        assert value == pytest.approx(STORED["values"][name], rel=0.01), name
+
+
+def test_film_converges_to_the_ellipse_with_its_cells():
+    """The worst error of the area falls in proportion to the cell, at least with power 0.8."""
+    cells = np.array([2e-3, 1e-3, 0.5e-3])
+    errors = [worst_errors((8e-3, 5e-3), cell, places=8)["area"] for cell in cells]
+    assert np.polyfit(np.log(cells), np.log(errors), 1)[0] > 0.8
+
+
+def test_film_reads_a_uniform_pressure_by_counting_cells():
+    """A square of 10 × 10 cells at 3 MPa: force, area and perimeter exactly."""
+    cell = 1e-3
+
+    def field(x, z):
+        return np.where((np.abs(x) < 5e-3) & (np.abs(z) < 5e-3), 3e6, 0.0)
+
+    read = PressureFilm(cell).read(field, np.full(2, -5e-3), np.full(2, 5e-3))
+    assert read.cells == 100 and read.perimeter_cells == 36
+    assert read.force == pytest.approx(300.0)
+    assert read.mean_pressure == pytest.approx(3e6)
+    assert (
+        PressureFilm(cell, threshold=4e6).read(field, np.full(2, -5e-3), np.full(2, 5e-3)).cells
+        == 0
+    )
+
+
+def test_film_errors_grow_with_the_perimeter_share():
+    """What the sensor's paper found: errors follow perimeter cells over cells."""
+    share, area = [], []
+    for size in (4e-3, 6e-3, 9e-3, 14e-3):
+        axes = (size, size / 1.5)
+        reach = np.array(axes)
+        share.append(
+            PressureFilm(1.27e-3).read(hertz_field(axes, 1.0), -reach, reach).perimeter_share
+        )
+        area.append(worst_errors(axes, 1.27e-3, places=8)["area"])
+    assert (np.diff(share) < 0.0).all()
+    assert np.corrcoef(np.log(share), np.log(area))[0, 1] > 0.9

@@ -1,0 +1,264 @@
+"""`tkamb wear` from the command line: what it writes, what it refuses, and a kill on the way."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import trimesh
+
+import shapes
+from scenes import write_scene
+from tkamb.cli import main
+from tkamb.errors import InputError
+from tkamb.geometry.frames import knee_coordinates
+from tkamb.wear import run as wear_run
+from tkamb.wear.materials import material_names, wear_material
+from tkamb.wear.motion import CycleMotion
+from tkamb.wear.profile import read_profile
+from tkamb.wear.registry import law_names, wear_law
+from tkamb.wear.setup import wear_setup
+
+CYCLE = """cycle_percent,axial_force_N,flexion_deg,ap_mm,axial_rotation_deg
+0,300,0,0,0
+15,1800,15,-1,1
+45,1600,8,1,2
+70,200,58,-3,4
+100,300,0,0,0
+"""
+QUICK = ("--resolution", "4", "--frames-per-cycle", "5", "--updates", "2")
+
+
+@pytest.fixture(scope="module")
+def profile(tmp_path_factory):
+    path = tmp_path_factory.mktemp("profile") / "cycle.csv"
+    path.write_text(CYCLE, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """The shipped scene with two balls on two dishes: few triangles, quickly worn."""
+    folder = tmp_path_factory.mktemp("balls")
+    bodies = {
+        "balls.stl": shapes.joined(*(shapes.sphere(0.022, 3, (0, 0, z)) for z in (-0.022, 0.022))),
+        "dishes.stl": shapes.two_dishes(),
+    }
+    path = write_scene(
+        folder,
+        drop=("patella", "quadriceps", "patellar_ligament"),
+        implant__femoral__mesh="balls.stl",
+        implant__insert__mesh="dishes.stl",
+    )
+    for name, body in bodies.items():
+        trimesh.Trimesh(body.vertices * 1e3, body.faces).export(folder / name)
+    return path
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory, profile, scene):
+    out = tmp_path_factory.mktemp("wear") / "out"
+    worn = ["wear", str(scene), "--simulator", str(profile), *QUICK]
+    assert main([*worn, "--cycles", "100000", "--out", str(out)]) == 0
+    return out
+
+
+def refused(capsys, *arguments):
+    assert main(["wear", *map(str, arguments)]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    return said[0]
+
+
+def test_table_summary_maps_and_mesh_tell_of_one_volume(written, scene):
+    names = {path.name for path in written.iterdir()}
+    assert names == {".tkamb", "wear.csv", "wear.json", "wear.vtp", "worn_insert.stl", "wear.png"}
+    found = json.loads((written / "wear.json").read_text())
+    with open(written / "wear.csv", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert float(rows[-1]["volume_mm3"]) == found["volume_mm3"] > 0
+    assert float(rows[-1]["cycles"]) == found["cycles"] == 100_000
+    assert found["mass_mg"] == pytest.approx(0.93 * found["volume_mm3"])
+    assert found["creep_depth_mm"] is None and rows[-1]["creep_depth_mm"] == ""
+    assert found["mesh_volume_lost_mm3"] == pytest.approx(found["volume_mm3"], rel=1e-6)
+    worn, new = (
+        trimesh.load(p) for p in (written / "worn_insert.stl", scene.parent / "dishes.stl")
+    )
+    # single precision in the files: 1e-7 of the insert
+    assert new.volume - worn.volume == pytest.approx(found["volume_mm3"], abs=2e-6 * new.volume)
+    assert worn.is_watertight
+
+
+def test_doubling_the_wear_factor_doubles_the_first_cycles_and_is_said(
+    capsys, tmp_path, profile, scene, written
+):
+    single = json.loads((written / "wear.json").read_text())
+    worn = ["wear", str(scene), "--simulator", str(profile), *QUICK, "--json"]
+    assert main([*worn, "--cycles", "100", "--wear-factor", "7e-6", "--out", str(tmp_path)]) == 0
+    double = json.loads(capsys.readouterr().out)
+    assert double["volume_mm3_per_Mc"] == pytest.approx(2 * single["volume_mm3_per_Mc"], rel=0.01)
+    assert double["law_parameters"]["wear_factor_mm3_per_Nm"] == 7e-6
+
+
+def test_a_killed_simulation_goes_on_to_the_same_end(monkeypatch, capsys, tmp_path, profile, scene):
+    worn = ["wear", str(scene), "--simulator", str(profile), *QUICK, "--cycles", "60000"]
+    assert main([*worn, "--out", str(tmp_path / "whole")]) == 0
+    keep, left = wear_run.keep_state, iter([True])
+
+    def keep_and_stop(*given):
+        keep(*given)
+        if next(left):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(wear_run, "keep_state", keep_and_stop)
+    assert main([*worn, "--out", str(tmp_path / "part")]) == 130
+    assert "go on with --resume" in capsys.readouterr().err
+    monkeypatch.undo()
+    other = [*worn[:-1], "70000", "--out", str(tmp_path / "part"), "--resume"]
+    assert main(other) == 2
+    assert "another simulation" in capsys.readouterr().err
+    assert main([*worn, "--out", str(tmp_path / "part"), "--resume"]) == 0
+    whole, part = (
+        (tmp_path / name / "wear.csv").read_text(encoding="utf-8") for name in ("whole", "part")
+    )
+    assert part == whole
+
+
+def test_bad_input_is_one_line_and_leaves_no_folder(capsys, tmp_path, profile, scene):
+    out = tmp_path / "out"
+    cases = {
+        ("--cycles", "0"): "0 cycles",
+        ("--updates", "0"): "0 updates",
+        ("--wear-factor=-1e-7",): "-1e-07",
+        ("--wear-factor", "nan"): "nan",
+        ("--wear-factor", "3.5"): "is the unit",
+        ("--law", "archerd"): "did you mean archard",
+        ("--law", "contact-area"): "has no parameters",
+        ("--material", "conventionnal"): "did you mean conventional",
+        ("--material", "none.toml"): "no such",
+        ("--frames-per-cycle", "1"): "at least 2",
+        ("--period", "0"): "--period",
+        ("--contact", "latice"): "did you mean lattice",
+    }
+    for options, words in cases.items():
+        said = refused(capsys, scene, "--simulator", profile, *options, "--out", out)
+        assert words in said, options
+        assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("turned", "words"),
+    [
+        (("100,300,0,0,0", "100,300,5,0,0"), "does not close: 'flexion_deg'"),
+        (("100,300,0,0,0", "99,300,0,0,0"), "runs from 0 to 99"),
+        (("15,1800", "15,-1800"), "'axial_force_N' is -1800"),
+        (("58,-3", "580,-3"), "'flexion_deg' is 580"),
+        (("ap_mm", "ap_m"), "unknown column 'ap_m'"),
+        (("70,200", "70,"), "missing or non-finite"),
+        (("45,1600", "12,1600"), "does not rise"),
+        (("axial_force_N", "adduction_deg"), "no column 'axial_force_N'"),
+    ],
+)
+def test_a_profile_that_is_none_is_refused(tmp_path, turned, words):
+    path = tmp_path / "cycle.csv"
+    path.write_text(CYCLE.replace(*turned), encoding="utf-8")
+    with pytest.raises(InputError, match=words):
+        read_profile(path, 10)
+
+
+def test_a_profile_moves_the_femur_about_its_dwell_position(profile, scene):
+    setup = wear_setup(scene, simulator=profile, resolution_mm=3.0, frames=101)
+    found = knee_coordinates(setup.motion.poses)
+    assert np.degrees(found[[0, 15, 70, 100], 5]) == pytest.approx([0, 15, 58, 0], abs=1e-9)
+    assert (found[:, 0] - found[0, 0])[[15, 45, 70]] == pytest.approx([-1e-3, 1e-3, -3e-3])
+    assert setup.motion.load[[0, 15, 70]] == pytest.approx([300, 1800, 200])
+    # two balls over two dishes: the middle, within the facets
+    assert (found[0, 0], found[0, 2]) == pytest.approx((0.0, 0.0), abs=1e-3)
+
+
+@pytest.mark.slow
+def test_a_folder_of_results_and_its_scene_wear_the_same(tmp_path):
+    scene = write_scene(tmp_path / "scene", contact__resolution_mm=3.0)
+    assert main(["run", str(scene), "--frames", "0:101:17", "--out", str(tmp_path / "run")]) == 0
+    folder = wear_setup(tmp_path / "run", frames=6)
+    again = wear_setup(scene, frames=6)
+    assert folder.motion.poses == pytest.approx(again.motion.poses[: len(folder.motion)], abs=1e-9)
+    assert folder.motion.passes == 2  # a bend does not close: there and back
+    scene.write_text(scene.read_text().replace("75.0", "76.0"), encoding="utf-8")
+    with pytest.raises(InputError, match="another scene"):
+        wear_setup(tmp_path / "run")
+
+
+def test_a_scene_without_contact_is_refused(tmp_path):
+    scene = write_scene(tmp_path / "scene", drop=("contact",))
+    with pytest.raises(InputError, match=r"no \[contact\]"):
+        wear_setup(scene)
+
+
+def test_frames_whose_ends_meet_are_a_closed_cycle_and_failed_ones_are_said():
+    poses = np.repeat(np.eye(4)[None], 9, axis=0)
+    poses[:, 0, 3] = 0.01 * np.sin(np.linspace(0, 2 * np.pi, 9))
+    load = np.full(9, 100.0)
+    closed = CycleMotion.of_frames(np.linspace(0, 0.8, 9), poses, load)
+    assert (closed.passes, len(closed), closed.duration) == (1, 10, pytest.approx(0.9))
+    open_ = CycleMotion.of_frames(np.linspace(0, 0.4, 5), poses[:5] * [1, 1, 1, 2], load[:5])
+    assert open_.passes == 1  # a half sine returns to where it began
+    bend = CycleMotion.of_frames(np.linspace(0, 0.2, 3), poses[:3], load[:3])
+    assert (bend.passes, bend.duration) == (2, pytest.approx(0.4))
+    load[4] = np.nan
+    assert "1 of 9 frames failed" in CycleMotion.of_frames(np.arange(9.0), poses, load).notes[0]
+
+
+def test_every_built_in_material_names_its_sources_and_has_its_law():
+    for name in material_names():
+        found = wear_material(name)
+        assert found.sources and found.caution
+        for law in found.laws:
+            assert found.wear_law(law).name == law
+
+
+def test_a_material_file_brings_laws_and_creep(tmp_path):
+    path = tmp_path / "mine.toml"
+    text = """
+density_kg_per_m3 = 940
+law = "archard"
+sources = ["measured here"]
+[laws.archard]
+wear_factor_mm3_per_Nm = 2e-7
+[creep]
+compliance_per_MPa = 3e-3
+per_decade_per_MPa = 8e-4
+reference_min = 1000.0
+"""
+    path.write_text(text, encoding="utf-8")
+    found = wear_material(path)
+    assert found.wear_law().wear_factor_mm3_per_Nm == 2e-7
+    assert found.wear_law("archard", 4e-7).wear_factor_mm3_per_Nm == 4e-7
+    assert found.creep.per_decade_per_MPa == 8e-4
+    for old, new, words in (
+        ("2e-7", "-2e-7", "cannot be -2e-07"),
+        ("940", "0.94", "density"),
+        ("reference_min", "reference_s", "not complete"),
+        ("archard]", "archerd]", "no wear law"),
+        ("sources", "source", "unknown key 'source'"),
+    ):
+        path.write_text(text.replace(old, new), encoding="utf-8")
+        with pytest.raises(InputError, match=words):
+            wear_material(path)
+
+
+def test_laws_say_which_parameter_is_missing_or_unknown():
+    assert set(law_names()) >= {"archard", "cross-shear", "pressure-cross-shear", "contact-area"}
+    with pytest.raises(InputError, match="does not give 'across_to_along'"):
+        wear_law("cross-shear", {"wear_factor_mm3_per_Nm": 1e-6})
+    with pytest.raises(InputError, match="has no parameter 'k'"):
+        wear_law("archard", {"k": 1e-6})
+    with pytest.raises(InputError, match="row per cross-shear"):
+        wear_law(
+            "pressure-cross-shear",
+            {
+                "cross_shear": [0.0, 0.5],
+                "pressure_MPa": [1.0, 2.0],
+                "wear_factor_mm3_per_Nm": [[1e-7, 1e-7]],
+            },
+        )

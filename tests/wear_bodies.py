@@ -1,0 +1,76 @@
+"""Small wear cases: bodies, motions, and contacts that are known without a contact model."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import shapes
+from tkamb.contact.materials import material
+from tkamb.contact.registry import contact_model
+from tkamb.geometry.frames import inverse, pose, transform
+from tkamb.geometry.surface import Surface
+from tkamb.wear.engine import ContactEngine, CycleMaps
+from tkamb.wear.laws import Archard
+from tkamb.wear.motion import CycleMotion
+from tkamb.wear.simulation import WearCase
+from tkamb.wear.worn_surface import ArticularSurface
+
+MM = 1e-3
+DENSITY = 930.0
+
+
+def stroke(length, frames, load, passes=2):
+    """A translation along x by `length`, there (and back)."""
+    places = np.zeros((frames, 3))
+    places[:, 0] = np.linspace(-length / 2, length / 2, frames)
+    turn = np.broadcast_to(np.eye(3), (frames, 3, 3))
+    return CycleMotion(pose(turn, places), np.full(frames, load), 1.0, passes)
+
+
+def swing(angle, frames, load):
+    """A turn about the z axis through the femoral origin, there and back."""
+    turns = np.outer(np.linspace(-angle / 2, angle / 2, frames), [0.0, 0.0, 1.0])
+    rotation = Rotation.from_rotvec(turns).as_matrix()
+    return CycleMotion(pose(rotation, np.zeros((frames, 3))), np.full(frames, load), 1.0, 2)
+
+
+@dataclass
+class Pressed:
+    """A contact whose pressure is `force` over the part of the map where `under` is true.
+
+    Args:
+        under: of points (n, 3) in the femoral frame, which are pressed.
+    """
+
+    under: object
+    fails_below: float = -1.0
+
+    def maps(self, insert: Surface, motion: CycleMotion) -> CycleMaps:
+        points = insert.vertices[insert.vertices[:, 1] > insert.bounds[1, 1] / 2]
+        if points[:, 1].min() < self.fails_below:
+            return CycleMaps(points, None, None, motion.poses, {0: "it is gone"})
+        inside = [self.under(transform(inverse(place), points)) for place in motion.poses]
+        pressure = np.array(inside, float) * 1e6
+        return CycleMaps(points, np.zeros((0, 3), np.int64), pressure, motion.poses, {})
+
+
+def always(points):
+    return np.ones(len(points), bool)
+
+
+def plate_case(motion, law, under=always, creep=None, thickness=0.01, **more):
+    """A plate under a contact that is known."""
+    articular = ArticularSurface.of_insert(shapes.plate(thickness), 2 * MM)
+    return WearCase(Pressed(under, **more), articular, motion, law, DENSITY, creep)
+
+
+def ball_case(insert, radius, motion, wear_factor, resolution=1.0, facets=3):
+    """A sphere, by a contact model."""
+    engine = ContactEngine(
+        contact_model("foundation", resolution),
+        shapes.sphere(radius, facets),
+        material("polyethylene"),
+    )
+    articular = ArticularSurface.of_insert(insert, resolution * MM)
+    return WearCase(engine, articular, motion, Archard(wear_factor), DENSITY)

@@ -1,0 +1,1 @@
+"""Published numbers as data, and what tkamb makes of the same cases."""

@@ -1,0 +1,33 @@
+"""The shipped deep knee bend beside what the dissertation reports of its subjects' forces."""
+
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.simulation import simulate
+
+EVERY = 10
+"""Of the 101 frames; contact by Hertz, since only the body's forces are compared."""
+
+
+def bend(scene: Path) -> dict[str, float]:
+    """Return {id of published.toml: value} of the shipped knee bend, from first to last frame."""
+    found = simulate(scene, contact="hertz", frames=slice(0, 101, EVERY))
+    total, si = (np.asarray(found[f"force_{name}_N"]) for name in ("total", "si"))
+    tension, ligament, patella = (
+        np.asarray(found[f"{name}_N"])
+        for name in ("quadriceps", "patellar_ligament", "patellofemoral")
+    )
+    flexion = np.asarray(found["flexion_deg"])
+    ratio = tension / ligament
+    return {
+        "si_share": 100.0 * float((np.abs(si) / total).min()),
+        "peak_force": float(np.asarray(found["force_total_BW"])[-1]),
+        "pl_q_start": float(ligament[0] / tension[0]),
+        "pl_q_end": float(ligament[-1] / tension[-1]),
+        "pf_q_start": float(patella[0] / tension[0]),
+        "pf_q_end": float(patella[-1] / tension[-1]),
+        "medial_share": 100.0 * float(np.median(found["medial_share_equilibrium"])),
+        "q_pt_10": float(np.interp(10.0, flexion, ratio)),
+        "q_pt_70": float(np.interp(70.0, flexion, ratio)),
+    }

@@ -1,0 +1,93 @@
+"""`tkamb wear`: arguments in, exit status out."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+CYCLES, UPDATES, FRAMES = 5_000_000, 10, 40
+
+
+def add_wear(commands: Any) -> None:
+    """Add `wear` to the command line."""
+    wear = commands.add_parser("wear", help="wear and creep of the insert over many cycles")
+    wear.add_argument(
+        "case", type=Path, metavar="SCENE|DIR", help="scene.toml, or a folder that `run` wrote"
+    )
+    wear.add_argument(
+        "--simulator",
+        type=Path,
+        metavar="PROFILE",
+        help="CSV of load and displacements per cent of the cycle, instead of the scene's motion",
+    )
+    wear.add_argument("--cycles", type=int, default=CYCLES, metavar="N")
+    wear.add_argument(
+        "--updates", type=int, default=UPDATES, metavar="M", help="of the geometry; default 10"
+    )
+    wear.add_argument("--law", metavar="NAME", help="wear law; default: the material's own")
+    wear.add_argument(
+        "--material", default="conventional", metavar="NAME|F", help="or a material file (.toml)"
+    )
+    wear.add_argument(
+        "--wear-factor", type=float, metavar="K", help="mm3/(N m), instead of the material's"
+    )
+    wear.add_argument("--contact", metavar="NAME", help="contact model, instead of the scene's")
+    wear.add_argument("--resolution", type=float, metavar="MM", help="spacing of the map points")
+    wear.add_argument(
+        "--frames-per-cycle", type=int, default=FRAMES, metavar="N", help="at most; default 40"
+    )
+    wear.add_argument(
+        "--period", type=float, default=1.0, metavar="S", help="of a simulator's cycle; for creep"
+    )
+    wear.add_argument("--out", type=Path, metavar="DIR", help="output folder")
+    wear.add_argument(
+        "--force", action="store_true", help="write into a folder that is not tkamb's"
+    )
+    wear.add_argument("--resume", action="store_true", help="go on with an interrupted simulation")
+    wear.add_argument("--json", action="store_true", help="print wear.json")
+    wear.set_defaults(command=_wear)
+
+
+def _wear(options: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from tkamb.claim import claimed_directory
+    from tkamb.wear.run import prepare_wear
+
+    run = prepare_wear(
+        options.case,
+        cycles=options.cycles,
+        updates=options.updates,
+        law=options.law,
+        material=options.material,
+        wear_factor=options.wear_factor,
+        simulator=options.simulator,
+        contact=options.contact,
+        resolution_mm=options.resolution,
+        frames=options.frames_per_cycle,
+        period=options.period,
+        progress=lambda frames: tqdm(frames, "running", unit="frame", disable=None),
+    )
+    folder = options.out or Path("out") / f"{_stem(options.case)}_wear"
+    with claimed_directory(folder, options.force) as claimed:
+        with tqdm(total=options.cycles, desc="wearing", unit="cycle", disable=None) as bar:
+            report = run.compute(
+                claimed,
+                resume=options.resume,
+                progress=lambda cycles: bar.update(cycles - bar.n),
+            )
+        report.write(claimed)
+    for question in report.questions():
+        print(f"tkamb: question: {question}", file=sys.stderr)
+    if report.state.end:
+        print(f"tkamb: {report.state.end}", file=sys.stderr)
+    if options.json:
+        print((folder / "wear.json").read_text(encoding="utf-8"), end="")
+    else:
+        print("\n".join([*report.lines(), f"maps: {folder / 'wear.vtp'}"]))
+    return 0
+
+
+def _stem(case: Path) -> str:
+    place = case.resolve()
+    return place.name if place.is_dir() else place.parent.name

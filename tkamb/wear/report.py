@@ -1,0 +1,194 @@
+"""What a wear simulation writes: table, summary, maps, the worn insert, a picture."""
+
+import csv
+import io
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from tkamb.atomic import replaced_together, write_synced
+from tkamb.code_identity import code_identity
+from tkamb.geometry.frames import MIRROR, Array
+from tkamb.geometry.surface import Surface
+from tkamb.output.vtk import write_triangles
+from tkamb.units import MEGAPASCAL, MILLIMETRE
+from tkamb.wear.kept import STATE_NAME
+from tkamb.wear.materials import WearMaterial
+from tkamb.wear.setup import WearSetup
+from tkamb.wear.simulation import CycleWear, WearCase, WearState
+
+MILLION = 1e6
+DEAREST_CORRECTION = 0.05
+"""Correction of a map's force beyond which the map is too coarse."""
+PUBLISHED_RATES = (1.6, 4.4)
+"""mm³ per million cycles of one whole knee in two tests: Dreyer et al. (2023),
+doi:10.1101/2023.05.09.23289712."""
+FAR_FROM_PUBLISHED = 3.0
+"""Times the published rates beyond which a rate is asked about."""
+
+
+@dataclass(frozen=True, eq=False)
+class WearReport:
+    """A finished wear simulation.
+
+    Args:
+        setup: bodies, motion, contact.
+        case: what was worn, by what law.
+        material: with sources.
+        state: at the end.
+        last: what the next cycle would do.
+        cycles: asked for.
+        updates: asked for.
+    """
+
+    setup: WearSetup
+    case: WearCase
+    material: WearMaterial
+    state: WearState
+    last: CycleWear
+    cycles: int
+    updates: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `tkamb wear --json` prints; None stands for what is not modelled."""
+        last = {key: _known(value) for key, value in self.state.rows[-1].items()}
+        law = self.case.law
+        return {
+            **last,
+            "status": self.state.end or "ok",
+            "cycles_asked": self.cycles,
+            "updates": self.updates,
+            "blocks": len(self.state.rows) - 1,
+            "volume_mm3_per_Mc": self.rate,
+            "mass_mg_per_Mc": self.rate * self.case.density * 1e-3,
+            "law": law.name,
+            "law_parameters": vars(law),
+            "material": self.material.name,
+            "sources": list(self.material.sources),
+            "creep": None if self.case.creep is None else vars(self.case.creep),
+            "contact": self.setup.contact,
+            "resolution_mm": self.setup.resolution_mm,
+            "source": self.setup.source,
+            "side": self.setup.side,
+            "frames": len(self.case.motion),
+            "passes_per_cycle": self.case.motion.passes,
+            "seconds_per_cycle": self.case.motion.duration,
+            "largest_force_correction": self.state.map_error,
+            "mean_cross_shear": _known(self._mean_cross_shear()),
+            "notes": list(self.case.motion.notes),
+            "questions": self.questions(),
+            "rows": [{k: _known(v) for k, v in row.items()} for row in self.state.rows],
+            "code": code_identity(),
+        }
+
+    @property
+    def rate(self) -> float:
+        """Volume per cycle, mm³ per million cycles."""
+        last = self.state.rows[-1]
+        return last["volume_mm3"] * MILLION / last["cycles"] if last["cycles"] else 0.0
+
+    def questions(self) -> list[str]:
+        """Return what a reader must know before using the numbers."""
+        asked = [] if not self.material.caution else [self.material.caution]
+        if self.state.map_error > DEAREST_CORRECTION:
+            asked.append(
+                f"maps had to be scaled by up to {self.state.map_error:.0%} to carry their load: "
+                "take a finer resolution"
+            )
+        if self.state.unsettled:
+            asked.append(
+                f"in {self.state.unsettled} blocks the pressure moved away from what it wore, "
+                "however short they were: take more --updates"
+            )
+        low, high = PUBLISHED_RATES
+        if not low / FAR_FROM_PUBLISHED <= self.rate <= high * FAR_FROM_PUBLISHED:
+            asked.append(
+                f"{self.rate:.3g} mm3 a million cycles is far from a whole knee's {low:g} (ISO) to "
+                f"{high:g} (in-vivo loads) mm3 (Dreyer 2023): does the wear factor suit it?"
+            )
+        if self.setup.engine.bearing == "mobile":
+            asked.append("the backside of a mobile bearing wears too and is not modelled")
+        if self.case.creep is None:
+            asked.append("creep is not modelled: the material gives no [creep]")
+        return asked
+
+    def lines(self) -> list[str]:
+        """Return the report as lines of text."""
+        found = self.as_dict()
+        creep = found["creep_depth_mm"]
+        said = "not modelled" if creep is None else f"{creep:.4g} mm deep"
+        return [
+            f"{found['cycles']:.6g} cycles in {found['blocks']} blocks, {found['law']}, "
+            f"{found['material']}: {found['status']}",
+            f"worn off {found['volume_mm3']:.4g} mm3, {found['mass_mg']:.4g} mg, "
+            f"{found['max_depth_mm']:.4g} mm deep at most, over {found['worn_area_mm2']:.4g} mm2",
+            f"rate {self.rate:.4g} mm3 per million cycles; creep {said}",
+            *(f"note: {note}" for note in found["notes"]),
+        ]
+
+    def write(self, folder: Path) -> None:
+        """Write wear.csv, wear.json, wear.vtp, worn_insert.stl and wear.png, all or none.
+
+        Raises:
+            InputError: the folder cannot be written.
+        """
+        from tkamb.wear.picture import draw_maps
+
+        surface, maps = self._worn(), self._maps()
+        with replaced_together(folder) as files:
+            write_synced(files.path("wear.csv"), _table(self.state.rows))
+            write_synced(files.path("wear.json"), json.dumps(self.as_dict(), indent=2) + "\n")
+            write_triangles(files.path("wear.vtp"), surface.vertices, surface.faces, maps)
+            in_mm = trimesh.Trimesh(surface.vertices / MILLIMETRE, surface.faces, process=False)
+            in_mm.export(files.path("worn_insert.stl"), file_type="stl")
+            draw_maps(surface, maps, files.path("wear.png"))
+            files.remove(STATE_NAME)
+
+    def _worn(self) -> Surface:
+        """Return the worn insert; a left knee's as it is, not mirrored."""
+        surface = self.case.articular.lowered(self.state.fall)
+        if self.setup.side == "right":
+            return surface
+        return Surface(surface.vertices @ MIRROR, surface.faces[:, ::-1], surface.name)
+
+    def _maps(self) -> dict[str, Array]:
+        """Return the maps over all vertices of the insert, zero where nothing can wear."""
+        state, places = self.state, self.case.articular.vertices
+        named = {
+            "wear_depth_mm": state.wear / MILLIMETRE,
+            "creep_depth_mm": state.creep / MILLIMETRE,
+            "sliding_mm_per_cycle": self.last.history.distance / MILLIMETRE,
+            "cross_shear_ratio": self.last.history.cross_shear,
+            "peak_pressure_MPa": self.last.peak_pressure / MEGAPASCAL,
+        }
+        maps = {}
+        for name, values in named.items():
+            maps[name] = np.zeros(len(self.case.articular.surface.vertices))
+            maps[name][places] = values
+        return maps
+
+    def _mean_cross_shear(self) -> float:
+        """Return the mean cross-shear ratio, weighted by what the last cycle wears off."""
+        weight = self.last.rate * self.last.area
+        total = float(weight.sum())
+        return float(weight @ self.last.history.cross_shear) / total if total else math.nan
+
+
+def _table(rows: Sequence[dict[str, float]]) -> str:
+    """Return the rows as CSV; NaN is an empty cell."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(rows[0])
+    for row in rows:
+        writer.writerow(["" if math.isnan(value) else repr(value) for value in row.values()])
+    return buffer.getvalue()
+
+
+def _known(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,120 @@
+"""A wear simulation from what a user says to what is written."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tkamb.errors import InputError
+from tkamb.wear.kept import keep_state, kept_state, wear_identity
+from tkamb.wear.materials import WearMaterial, wear_material
+from tkamb.wear.report import WearReport
+from tkamb.wear.setup import WearSetup, wear_setup
+from tkamb.wear.simulation import WearCase, WearState, check_blocks, simulate_wear
+
+
+@dataclass(frozen=True, eq=False)
+class WearRun:
+    """A wear simulation that is ready to begin.
+
+    Args:
+        setup: bodies, motion, contact.
+        case: what is worn, by what law.
+        material: with sources.
+        cycles: how many.
+        updates: of the geometry.
+    """
+
+    setup: WearSetup
+    case: WearCase
+    material: WearMaterial
+    cycles: int
+    updates: int
+
+    def compute(
+        self,
+        folder: Path | None = None,
+        *,
+        resume: bool = False,
+        progress: Callable[[float], None] = lambda cycles: None,
+    ) -> WearReport:
+        """Simulate and return the report.
+
+        Args:
+            folder: where the state is kept after each block; None: nowhere.
+            resume: go on with the state that the folder keeps.
+            progress: is told the cycles that are done.
+
+        Raises:
+            InputError: what the folder keeps is of another simulation, or no contact is found.
+            KeyboardInterrupt: with a folder, saying what is kept there.
+        """
+        state = None
+
+        kept = 0.0
+
+        def keep(done: WearState) -> None:
+            nonlocal kept
+            progress(done.cycles)
+            if folder is not None:
+                keep_state(folder, done, identity)
+                kept = done.cycles
+
+        if folder is not None:
+            identity = wear_identity(self.setup, self.case, self.cycles, self.updates)
+            state = kept_state(folder, identity) if resume else None
+        try:
+            state, last = simulate_wear(
+                self.case, self.cycles, self.updates, state=state, keep=keep
+            )
+        except KeyboardInterrupt:
+            if not kept:
+                raise
+            raise KeyboardInterrupt(f"{kept:.6g} cycles are kept; go on with --resume") from None
+        return WearReport(
+            self.setup, self.case, self.material, state, last, self.cycles, self.updates
+        )
+
+
+def prepare_wear(
+    path: str | Path,
+    *,
+    cycles: int,
+    updates: int = 10,
+    law: str | None = None,
+    material: str | Path = "conventional",
+    wear_factor: float | None = None,
+    period: float = 1.0,
+    **setup: Any,
+) -> WearRun:
+    """Return a wear simulation, everything about it checked.
+
+    Args:
+        path: a scene file, or a folder that `tkamb run` wrote.
+        cycles: how many.
+        updates: how often the insert's geometry follows.
+        law: a name of `tkamb.wear.registry`; None: the material's own.
+        material: a name of `tkamb.wear.materials`, or a material file.
+        wear_factor: mm³/(N m), in place of the material's.
+        period: s of a simulator's cycle.
+        setup: see `tkamb.wear.setup.wear_setup`.
+
+    Raises:
+        InputError: whatever of it cannot be used.
+    """
+    check_blocks(cycles, updates)
+    if not (math.isfinite(period) and 0.05 <= period <= 3600):
+        raise InputError(f"{period} s", "--period", "give 0.05 to 3600 s a cycle")
+    made_of = wear_material(material)
+    chosen = made_of.wear_law(law, wear_factor)
+    ready = wear_setup(path, period=period, **setup)
+    case = WearCase(
+        ready.engine,
+        ready.articular,
+        ready.motion,
+        chosen,
+        made_of.density_kg_per_m3,
+        made_of.creep,
+    )
+    return WearRun(ready, case, made_of, cycles, updates)

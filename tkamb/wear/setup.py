@@ -1,0 +1,170 @@
+"""From a scene, a folder of results or a simulator's profile to what is worn by what."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tkamb.contact.materials import material
+from tkamb.contact.registry import contact_model, contact_options
+from tkamb.errors import InputError
+from tkamb.output.maps import ContactMaps
+from tkamb.results_folder import read_results
+from tkamb.run.summary import scene_hash
+from tkamb.scene import Scene, load_scene
+from tkamb.scene.case import Case, load_case
+from tkamb.scene.tables import ContactTable
+from tkamb.simulation import simulate
+from tkamb.units import MILLIMETRE
+from tkamb.wear.engine import ContactEngine
+from tkamb.wear.motion import CycleMotion
+from tkamb.wear.profile import read_profile
+from tkamb.wear.worn_surface import ArticularSurface
+
+Progress = Callable[[Sequence[int]], Iterable[int]]
+
+
+@dataclass(frozen=True, eq=False)
+class WearSetup:
+    """The bodies, the motion and the contact of a wear simulation.
+
+    Args:
+        engine: contact model, femoral component, material.
+        articular: the insert's surface.
+        motion: one cycle.
+        side: of the knee; the bodies of a left one are mirrored.
+        contact: name of the contact model.
+        resolution_mm: of its map.
+        source: the file or folder that the motion comes from.
+    """
+
+    engine: ContactEngine
+    articular: ArticularSurface
+    motion: CycleMotion
+    side: str
+    contact: str
+    resolution_mm: float
+    source: str
+
+
+def wear_setup(
+    path: str | Path,
+    *,
+    simulator: str | Path | None = None,
+    contact: str | None = None,
+    resolution_mm: float | None = None,
+    frames: int = 40,
+    period: float = 1.0,
+    progress: Progress = lambda indices: indices,
+) -> WearSetup:
+    """Return what is worn.
+
+    Args:
+        path: a scene file, or a folder that `tkamb run` wrote.
+        simulator: a profile (`tkamb.wear.profile`) in place of the scene's motion.
+        contact: contact model, in place of the scene's.
+        resolution_mm: in place of the scene's.
+        frames: most frames of a cycle.
+        period: s of a simulator's cycle.
+        progress: wraps the frames of a scene that has to be run.
+
+    Raises:
+        InputError: the scene, folder or profile cannot be used, or has no contact.
+    """
+    if frames < 2:
+        raise InputError(f"{frames} frames", "--frames-per-cycle", "give at least 2")
+    path = Path(path)
+    motion: CycleMotion | None
+    if path.is_dir() and simulator is None:
+        case, motion = _of_results(path)
+    else:
+        if path.is_dir():
+            path = _scene_of(read_results(path).summary, path)
+        case = load_case(_with_contact(load_scene(path), contact, resolution_mm, path))
+        motion = None if simulator else _of_scene(case.scene, path, frames, progress)
+    table = _with_contact(case.scene, contact, resolution_mm, path).contact
+    assert table is not None and case.femoral is not None and case.insert is not None
+    engine = _engine(case, table)
+    if simulator is not None:
+        profile = read_profile(simulator, frames)
+        poses = profile.poses((0.0, 0.0))
+        poses = profile.poses(engine.dwell(case.insert, poses[0, :3, :3]))
+        note = "a simulator's cycle in displacement control; AP and ML from the dwell position"
+        motion = CycleMotion(poses, profile.load, period, 1, (note,))
+    assert motion is not None
+    return WearSetup(
+        engine=engine,
+        articular=ArticularSurface.of_insert(case.insert, table.resolution_mm * MILLIMETRE),
+        motion=motion.thinned(frames),
+        side=case.scene.patient.side,
+        contact=table.model,
+        resolution_mm=table.resolution_mm,
+        source=str(simulator or path),
+    )
+
+
+def _of_scene(scene: Scene, path: Path, most: int, progress: Progress) -> CycleMotion:
+    """Run a scene, or every so many of its frames, and return its cycle."""
+    count = len(load_case(scene).motion.time)
+    step = max(1, -(-count // most))
+    results = simulate(scene, frames=slice(0, count, step), scene_path=path, progress=progress)
+    assert results.maps is not None
+    motion = _of_maps(results.maps)
+    if step == 1:
+        return motion
+    note = f"every {step}th frame of the scene's {count} is computed"
+    return replace(motion, notes=(*motion.notes, note))
+
+
+def _of_results(folder: Path) -> tuple[Case, CycleMotion]:
+    """Return the case and the cycle of a folder of results."""
+    results = read_results(folder)
+    if results.maps is None:
+        raise InputError("has no contact maps", folder, "run the scene with [contact]")
+    scene = load_scene(_scene_of(results.summary, folder))
+    table = results.summary.get("contact")
+    if isinstance(table, dict):
+        scene = scene.model_copy(update={"contact": ContactTable.model_validate(table)})
+    case = load_case(scene)
+    if scene_hash(case) != results.summary.get("scene_sha256"):
+        what = "was run with another scene than its file says now"
+        raise InputError(what, folder, "run it again, or give the scene")
+    return case, _of_maps(results.maps)
+
+
+def _scene_of(summary: dict[str, Any], folder: Path) -> Path:
+    scene = summary.get("scene")
+    if not isinstance(scene, str):
+        raise InputError("does not say which scene it is of", folder, "give the scene")
+    return Path(scene)
+
+
+def _of_maps(maps: ContactMaps) -> CycleMotion:
+    load = -np.asarray(maps.nodal_force_N)[:, :, 1].sum(axis=1)
+    return CycleMotion.of_frames(maps.time_s, np.asarray(maps.femoral_pose), load)
+
+
+def _with_contact(
+    scene: Scene, model: str | None, resolution_mm: float | None, path: Path
+) -> Scene:
+    """Return the scene with another contact model; the former one's options do not go along."""
+    if scene.contact is None:
+        raise InputError("the scene has no [contact]", path, "add the table: wear needs pressure")
+    changes: dict[str, Any] = {}
+    if model is not None and model != scene.contact.model:
+        changes = {"model": model, "options": {}}
+    if resolution_mm is not None:
+        changes["resolution_mm"] = resolution_mm
+    return scene.model_copy(update={"contact": scene.contact.model_copy(update=changes)})
+
+
+def _engine(case: Case, table: ContactTable) -> ContactEngine:
+    insert = case.scene.implant.insert
+    assert insert is not None and case.femoral is not None
+    options = dict(table.options)
+    if "cache" in contact_options(table.model):
+        options["cache"] = False  # every update has an operator of its own, used once
+    model = contact_model(table.model, table.resolution_mm, **options)
+    return ContactEngine(model, case.femoral, material(table.material), insert.bearing)

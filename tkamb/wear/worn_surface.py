@@ -1,0 +1,107 @@
+"""The insert's articular surface as wear and creep change it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.surface import Surface
+from tkamb.wear.refine import refined
+
+DOWN = np.array([0.0, -1.0, 0.0])
+STEEPEST = 0.1
+"""Smallest n_y of a face that can be worn from above: 84 deg from the horizontal."""
+SKIN = 1e-6
+"""m; rays through the insert start so far below its surface."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArticularSurface:
+    """The vertices of the insert that face upwards, and what of the surface each stands for.
+
+    A vertex owns a third of each of its triangles. Its normal n is the direction of the summed
+    area vectors of those that face upwards, its area the sum of the y components of all over
+    n_y: a rim has the normal of the surface, not of the wall. A depth h along the normal is
+    taken off by moving the vertex down by h/n_y. x and z of no vertex change, and the volume of
+    a closed surface is linear in y then, so that
+
+        volume removed = sum over vertices of h times area
+
+    exactly, however far it is worn.
+
+    Args:
+        surface: the insert, refined where it can be worn, insert frame.
+        vertices: (n,) numbers of the vertices that can be worn.
+        thickness: (n,) m of the unworn insert below each, along y.
+    """
+
+    surface: Surface
+    vertices: NDArray[np.int64]
+    thickness: Array
+
+    @classmethod
+    def of_insert(cls, insert: Surface, spacing: float) -> "ArticularSurface":
+        """Return the articular surface of an insert with no edge longer than `spacing` (m).
+
+        Raises:
+            InputError: nothing of the insert faces upwards.
+        """
+        merged = insert.mesh.copy()
+        merged.merge_vertices()
+        surface = refined(
+            Surface(np.asarray(merged.vertices), np.asarray(merged.faces), insert.name),
+            spacing,
+            lambda s: s.face_normals[:, 1] > STEEPEST,
+        )
+        upward, whole = area_vectors(surface)
+        length = np.linalg.norm(upward, axis=1)
+        up = np.flatnonzero((upward[:, 1] > STEEPEST * length) & (whole[:, 1] > 0))
+        points = surface.vertices[up]
+        caster = RayCaster(surface)
+        above = points.copy()
+        above[:, 1] = surface.bounds[1, 1] + 1e-3
+        first = caster.first(above, DOWN)[0]
+        top = np.abs(above[:, 1] - first - points[:, 1]) < 10 * SKIN
+        thickness = SKIN + caster.first(points + SKIN * DOWN, DOWN)[0]
+        seen = top & np.isfinite(thickness)
+        if not seen.any():
+            raise InputError("no part of it faces upwards", insert.name, "check the mesh's axes")
+        return cls(surface, up[seen], thickness[seen])
+
+    def lowered(self, fall: Array) -> Surface:
+        """Return the insert with its articular vertices moved down by `fall` (n,) m."""
+        vertices = self.surface.vertices.copy()
+        vertices[self.vertices, 1] -= fall
+        return Surface(vertices, self.surface.faces, self.surface.name)
+
+    def normals_and_areas(self, lowered: Surface) -> tuple[Array, Array]:
+        """Return unit normals (n, 3) and areas (n,) m² of the vertices of a lowered surface."""
+        upward, whole = (vectors[self.vertices] for vectors in area_vectors(lowered))
+        normals = upward / np.linalg.norm(upward, axis=1)[:, None]
+        return normals, whole[:, 1] / normals[:, 1]
+
+
+def area_vectors(surface: Surface) -> tuple[Array, Array]:
+    """Return a third of the area vectors of each vertex's triangles, summed, (n, 3) m².
+
+    Returns:
+        The sums over those that face upwards, and over all.
+    """
+    a, b, c = np.moveaxis(surface.triangles, 1, 0)
+    vector = np.cross(b - a, c - a) / 6.0
+    corners, count = surface.faces.T.ravel(), len(surface.vertices)
+
+    def summed(each: Array) -> Array:
+        return np.stack([np.bincount(corners, np.tile(v, 3), count) for v in each.T], axis=1)
+
+    up = surface.face_normals[:, 1] > STEEPEST
+    return summed(np.where(up[:, None], vector, 0.0)), summed(vector)
+
+
+def volume(surface: Surface) -> float:
+    """Return the volume inside a closed surface, m³."""
+    a, b, c = np.moveaxis(surface.triangles - surface.bounds.mean(axis=0), 1, 0)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
