@@ -30,6 +30,8 @@ DRAWING = {
     "output": {"columns", "contact", "geometry", "run"},
     "view": {*KNEE, *SHOWN, "run", "simulation"} - {"columns"},
     "studies": {*KNEE, "inputs", "output", "run", "simulation"} - {"body"},
+    "muscles": {"geometry", "importing", "inputs", "opensim"},
+    "designs": {"contact", "geometry"},
     "wear": {"contact", "geometry", "inputs", "output", "results_folder", "run", "scene"}
     | {"simulation"},
     "validation": {"contact", "designs", "geometry", "simulation", "studies"},
