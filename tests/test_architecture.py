@@ -18,20 +18,23 @@ DRAWING = {
     "datasets": set(),
     "starter": set(),
     "geometry": set(),
-    "opensim": {"geometry"},
-    "muscles": {"geometry", "opensim"},
+    "opensim": {"geometry", "inputs"},
     "body": {"geometry"},
     "contact": {"geometry"},
-    "inputs": {"geometry", "scene"},
+    "inputs": {"geometry"},
     "scene": {"body", "geometry", "inputs"},
     "equilibrium": {"body", "contact", "geometry", "scene"},
     "plausibility": {"geometry", "inputs", "scene"},
     "importing": {"geometry", "inputs", "opensim", "scene"},
-    "press": {"contact", "equilibrium", "geometry", "inputs"},
     "run": {*KNEE, *SHOWN} - {"results"},
     "output": {"columns", "contact", "geometry", "run"},
     "view": {*KNEE, *SHOWN, "run", "simulation"} - {"columns"},
     "studies": {*KNEE, "inputs", "output", "run", "simulation"} - {"body"},
+    "muscles": {"geometry", "importing", "inputs", "opensim"},
+    "designs": {"contact", "geometry"},
+    "wear": {"contact", "geometry", "inputs", "output", "results_folder", "run", "scene"}
+    | {"simulation"},
+    "validation": {"contact", "designs", "geometry", "simulation", "studies"},
 }
 """Which folder knows which folders and which modules beside them: inputs → body → (equilibrium ⇄
 contact) → results → output, view and studies; the scene is where files become bodies."""

@@ -239,6 +239,7 @@ def scaled_case(case: Case) -> Case:
 
 def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
     """Lengths, masses and times scaled, gravity and the model's own lengths along."""
+    unscaled = shipped_loads()  # with the model's own lengths as they are
     monkeypatch.setattr(contact_points, "STANDSTILL", contact_points.STANDSTILL * LENGTH / TIME)
     own_lengths = {
         knee: ("RESIDUAL_SHIFT",),
@@ -256,7 +257,7 @@ def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
     scaled = (ml, lateral_yield * LENGTH, tilt_yield / LENGTH)
     monkeypatch.setattr(patella, "__defaults__", scaled)
     mechanics = Mechanics(scaled_case(shipped()))
-    for k, before in zip(FRAMES, shipped_loads(), strict=True):
+    for k, before in zip(FRAMES, unscaled, strict=True):
         after = mechanics.frame(k)
         assert not after.loads.problems
         for name, value in before.loads.values.items():

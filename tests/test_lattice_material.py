@@ -112,4 +112,4 @@ def test_linear_material_loses_nothing():
     nodes, _, cells, _ = block((2, 2, 2), edges)
     for solid in SOLIDS:
         made = solid(nodes, cells, edges, material("polyethylene-linear"))
-        assert not made.correction(np.ones_like(nodes)).any()
+        assert not made.residual_force(np.ones_like(nodes)).any()

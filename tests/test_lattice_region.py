@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from lattice_bodies import condyles, dished_insert, pair
-from tkamb.contact.lattice.initial_guess import initial_guess
+from tkamb.contact.lattice.initial_guess import WarmStart, initial_guess
+from tkamb.contact.lattice.linear.compliance import ComplianceCache
+from tkamb.contact.lattice.model import warm_start_of
 from tkamb.contact.lattice.problem import Region, undeformed
 from tkamb.contact.lattice.solver import Tolerance, elements_that_count, solve
 from tkamb.contact.materials import material
@@ -96,3 +98,26 @@ def test_the_approach_is_that_of_the_pose(state):
     deeper = replace(result, pose=state.pair.pose_at_approach(POSE, 2e-4))
     assert deeper.approach == pytest.approx(2e-4, abs=1e-15)
     assert np.isnan(ContactResult.failed(state, POSE, "why").approach)
+
+
+def test_compliance_at_hand_changes_no_answer(state):
+    """Pressed with what other poses have left, and with nothing."""
+    model = contact_model("lattice", 2.0)
+    for x in (4e-3, -3e-3):
+        moved = POSE.copy()
+        moved[0, 3] += x
+        model.press(state, LOAD, moved)
+    bare = replace(state, compliance=ComplianceCache(state.problem.operator.half))
+    used, fresh = model.press(state, LOAD, POSE), model.press(bare, LOAD, POSE)
+    assert used.approach == pytest.approx(fresh.approach, rel=1e-9)
+    assert used.pressure == pytest.approx(fresh.pressure, rel=1e-6, abs=1.0)
+
+
+def test_a_warm_start_of_another_insert_is_not_used(state):
+    """A guess of another state saves nothing and harms nothing."""
+    model = contact_model("lattice", 2.0)
+    other = replace(state, problem=replace(state.problem))
+    stranger = model.press(other, LOAD, POSE)
+    assert isinstance(stranger.warm_start, WarmStart)
+    assert warm_start_of(state, stranger) is None
+    assert warm_start_of(other, stranger) is stranger.warm_start

@@ -46,7 +46,7 @@ def test_the_matrix_is_wide_enough():
 def test_every_quick_case_has_a_stored_verdict():
     stored = stored_verdicts()
     assert set(stored.values()) <= set(PASSED_KINDS)
-    quick = {f"{case.model}: {case.says}" for case in stability_cases(quick=True)}
+    quick = {f"{case.model}: {case.label}" for case in stability_cases(quick=True)}
     assert not quick - set(stored)
 
 

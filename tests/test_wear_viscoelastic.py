@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 import shapes
-from tkamb.contact.bed import sample_bed
+from tkamb.contact.samples import sample_surface
 from tkamb.errors import InputError
 from tkamb.geometry.frames import pose
-from tkamb.geometry.rays import RayCaster
 from tkamb.wear.viscoelastic import PronySeries, ViscoelasticBed
 
 SERIES = PronySeries((0.4, 0.3), (0.5, 20.0))
@@ -46,13 +45,13 @@ def test_what_is_no_series_is_refused(fractions, times):
 @pytest.fixture(scope="module")
 def bodies():
     plate = shapes.block(lambda x, z: 0.01 + 0 * x, 0.02, 0.012, 2e-3)
-    return sample_bed(plate, 1e-3), RayCaster(shapes.sphere(0.02, 4, (0.0, 0.03, 0.0)))
+    return sample_surface(plate, 1e-3), shapes.sphere(0.02, 4, (0.0, 0.03, 0.0))
 
 
 def moved(bodies, speed):
     """Move a loaded ball 8 mm along x, in steps of half a millimetre; the last pressures."""
-    bed, rays = bodies
-    columns = ViscoelasticBed(bed, rays, 2e9, PronySeries((0.6,), (1.0,)))
+    bed, femoral = bodies
+    columns = ViscoelasticBed(bed, femoral, 2e9, PronySeries((0.6,), (1.0,)))
     for place in np.arange(-4e-3, 4.1e-3, 5e-4):
         pressure = columns.press(300.0, pose(np.eye(3), [place, 0, 0]), 5e-4 / speed)
     force = pressure * bed.area
@@ -78,10 +77,10 @@ def test_a_moving_load_is_carried_ahead_of_its_middle_and_only_at_middling_speed
 
 
 def test_slow_presses_like_the_relaxed_columns_and_fast_like_the_fresh_ones(bodies, runs):
-    bed, rays = bodies
+    bed, femoral = bodies
     place = pose(np.eye(3), [4e-3, 0, 0])
     for name, modulus in (("slow", 0.4 * 2e9), ("fast", 2e9)):
-        elastic = ViscoelasticBed(bed, rays, modulus, PronySeries((1e-9,), (1.0,)))
+        elastic = ViscoelasticBed(bed, femoral, modulus, PronySeries((1e-9,), (1.0,)))
         expected = elastic.press(300.0, place, 1.0)
         peak = expected.max()
         assert np.abs(runs[name][0] - expected).max() < 0.02 * peak

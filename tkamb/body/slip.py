@@ -199,7 +199,7 @@ def roll_slip_motion(
     coordinates: Array,
     slip: Array,
 ) -> Array:
-    """Return the source's motion: rotations given, AP from rolling plus slip, SI from contact.
+    """Return the motion of Sharma (2008): rotations given, AP rolls and slips, SI from contact.
 
     The mean of the condyles' contact points moves backwards by the femoral arc less the
     slip, along the insert; the femur comes down to first touch in every frame. The first

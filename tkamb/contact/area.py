@@ -1,12 +1,9 @@
 """How much of a surface is in contact, and how much of it is above a pressure."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.materials import Material
-from tkamb.geometry.frames import Array
-
-Indices = NDArray[np.int64]
+from tkamb.geometry.frames import Array, Index
 
 NO_EDGE = 0.5
 """Share of a side where the femoral surface ends, or rises more than it goes along, before the
@@ -17,7 +14,7 @@ LEAST_GAP = 1e-12
 
 def covered_areas(
     points: Array,
-    triangles: Indices,
+    triangles: Index,
     triangle_area: Array,
     pressure: Array,
     gap: Array,
@@ -68,8 +65,8 @@ def covered_areas(
 
 def _share(
     points: Array,
-    inside: Indices,
-    outside: Indices,
+    inside: Index,
+    outside: Index,
     pressure: Array,
     gap: Array,
     material: Material,
@@ -85,7 +82,7 @@ def _share(
     return np.where(smooth, np.minimum(square * root**3 / distance, 1.0), NO_EDGE)
 
 
-def area_above(points: Array, triangles: NDArray[np.int64], pressure: Array, level: float) -> float:
+def area_above(points: Array, triangles: Index, pressure: Array, level: float) -> float:
     """Return the area (m²) where the pressure exceeds a level.
 
     On each triangle q = p² is linear between the corners, plus the mean by which a curved q
@@ -102,8 +99,8 @@ def area_above(points: Array, triangles: NDArray[np.int64], pressure: Array, lev
     near = np.zeros(len(points), bool)
     near[triangles[(pressure[triangles] > 0).any(axis=1)]] = True
     corners = triangles[near[triangles].any(axis=1)]
-    square, places = (pressure**2)[corners], points[corners]
-    edges = np.roll(places, -2, axis=1) - np.roll(places, -1, axis=1)  # opposite each corner
+    square, positions = (pressure**2)[corners], points[corners]
+    edges = np.roll(positions, -2, axis=1) - np.roll(positions, -1, axis=1)  # opposite each corner
     cross = np.cross(edges[:, 0], edges[:, 1])
     size = 0.5 * np.linalg.norm(cross, axis=1)
     across = np.cross(cross[:, None], edges)

@@ -177,7 +177,7 @@ class FoundationProbe:
 
     def __init__(self, law: Law, state: SampledContact) -> None:
         self._law, self._state = law, state
-        self._corners = _corners(state.pair.femoral.rays.surface.bounds)
+        self._corners = _corners(state.pair.femoral.bounds)
         self._near, self._centre = state.surface, np.full((4, 4), np.nan)
 
     def at(self, pose: Array) -> ProbedContact:

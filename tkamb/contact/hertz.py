@@ -5,14 +5,13 @@ from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.curvature import OsculatingContact, osculate
 from tkamb.contact.ellipse import ContactEllipse, contact_ellipse
 from tkamb.contact.model import ContactModel
 from tkamb.contact.result import CondyleContact, ContactResult, peak_flags, thickness_under
 from tkamb.contact.samples import STEEPEST, SampledContact, SurfaceSamples, gaps_along_normals
-from tkamb.geometry.frames import SIDES, Array
+from tkamb.geometry.frames import SIDES, Array, Index
 
 SHORT_AXIS_SUB_CELLS = 10
 """Sub-cells on the ellipse's short semi-axis, over which the pressure is averaged."""
@@ -156,7 +155,7 @@ def map_pressure(
 
 def _cell_means(
     samples: SurfaceSamples,
-    near: NDArray[np.int64],
+    near: Index,
     contact: OsculatingContact,
     patch: ContactEllipse,
 ) -> Array:
@@ -169,8 +168,8 @@ def _cell_means(
     slope = -normals[:, [0, 2]] / np.maximum(normals[:, 1:2], STEEPEST)
     rise = slope[:, :1] * dx + slope[:, 1:] * dz
     offset = np.stack(np.broadcast_arrays(dx, rise, dz), axis=-1)
-    places = (samples.points[near] - contact.point)[:, None] + offset
-    u, v = np.moveaxis(places @ contact.axes.T, -1, 0)
+    positions = (samples.points[near] - contact.point)[:, None] + offset
+    u, v = np.moveaxis(positions @ contact.axes.T, -1, 0)
     inside = 1 - (u / patch.long_axis) ** 2 - (v / patch.short_axis) ** 2
     return np.sqrt(np.maximum(inside, 0.0)).mean(axis=1)
 

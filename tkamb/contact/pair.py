@@ -6,12 +6,11 @@ from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.materials import Material
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.first_touch import FirstTouch, Touch
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.surface import Surface
 
 Bearing = Literal["fixed", "mobile"]
@@ -97,7 +96,7 @@ class ContactSurface:
     normals: Array
     area: Array
     thickness: Array
-    triangles: NDArray[np.int64]
+    triangles: Index
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +117,7 @@ class PreparedContact:
         return self.surface.points
 
     @property
-    def triangles(self) -> NDArray[np.int64]:
+    def triangles(self) -> Index:
         """Map triangles (k, 3)."""
         return self.surface.triangles
 

@@ -261,14 +261,14 @@ def compression(pair: ContactPair, touch: Touch, result: ContactResult) -> tuple
         result: a contact with an approach.
     """
     condyles = {"medial": result.medial, "lateral": result.lateral}
-    places = {"where the meshes first touch": touch.point} | {
+    positions = {"where the meshes first touch": touch.point} | {
         f"under the {side} condyle": condyle.centre_of_pressure
         for side, condyle in condyles.items()
         if condyle is not None
     }
-    thickness = thickness_near(pair, np.array(list(places.values())))
+    thickness = thickness_near(pair, np.array(list(positions.values())))
     worst = int(thickness.argmin())
-    where, (x, _, z) = list(places.items())[worst]
+    where, (x, _, z) = list(positions.items())[worst]
     return result.approach / float(thickness[worst]), (
         f"an approach of {result.approach / MILLIMETRE:.3g} mm {where} (x = {x / MILLIMETRE:.1f}, "
         f"z = {z / MILLIMETRE:.1f} mm), where the insert is {thickness[worst] / MILLIMETRE:.3g} mm "
@@ -276,21 +276,21 @@ def compression(pair: ContactPair, touch: Touch, result: ContactResult) -> tuple
     )
 
 
-def thickness_near(pair: ContactPair, places: Array) -> Array:
-    """Return the insert's thickness (n,), m, along y at places (n, 3), from its top down.
+def thickness_near(pair: ContactPair, positions: Array) -> Array:
+    """Return the insert's thickness (n,), m, along y at positions (n, 3), from its top down.
 
     To where it ends first. Near a rim it is the largest within `AROUND`; the height above the
     bottom where no column meets the insert.
     """
     low, high = pair.insert.bounds[:, 1]
-    columns = (places[:, None] + COLUMNS).reshape(-1, 3)
+    columns = (positions[:, None] + COLUMNS).reshape(-1, 3)
     columns[:, 1] = high + AROUND
     enter, _ = pair.insert.rays.first(columns, DOWN)
     met = np.isfinite(enter)
     columns[met, 1] -= enter[met] + SKIN
     leave, _ = pair.insert.rays.first(columns, DOWN)
     met &= np.isfinite(leave)
-    thick = np.where(met, leave + SKIN, 0.0).reshape(len(places), -1)
+    thick = np.where(met, leave + SKIN, 0.0).reshape(len(positions), -1)
     whole = met.reshape(thick.shape).all(axis=1)
     found = np.where(whole, thick[:, 0], thick.max(axis=1))
-    return np.maximum(np.where(found > 0, found, places[:, 1] - low), SKIN)
+    return np.maximum(np.where(found > 0, found, positions[:, 1] - low), SKIN)

@@ -8,13 +8,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.pair import ContactPair, PreparedContact
-from tkamb.geometry.frames import Array, inverse, transform
+from tkamb.geometry.frames import Array, Mask, inverse, transform
 from tkamb.units import MEGAPASCAL
-
-Mask = NDArray[np.bool_]
 
 HIGHEST_KNOWN = 100.0 * MEGAPASCAL
 """Peak pressure beyond which polyethylene's curves are extrapolated (they end at 40 to 60 MPa)."""
@@ -236,12 +233,12 @@ def _summed(
     return CondyleContact(force, covered, force / covered, peak, centre, under)
 
 
-def thickness_under(place: Array, points: Array, thickness: Array) -> float:
-    """Return the insert's thickness (m) under a place (3,), between the nearest map points.
+def thickness_under(position: Array, points: Array, thickness: Array) -> float:
+    """Return the insert's thickness (m) under a position (3,), between the nearest map points.
 
     Inverse-distance weights of the four points nearest in x and z.
     """
-    away = np.hypot(*(points[:, [0, 2]] - place[[0, 2]]).T)
+    away = np.hypot(*(points[:, [0, 2]] - position[[0, 2]]).T)
     near = np.argpartition(away, 3)[:4] if len(points) > 4 else np.arange(len(points))
     weight = 1.0 / np.maximum(away[near], 1e-9)
     return float(weight @ thickness[near] / weight.sum())

@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tkamb.contact.pair import ContactSurface, PreparedContact
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array, inverse, rotate, transform
+from tkamb.geometry.frames import Array, Index, Mask, inverse, rotate, transform
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
@@ -40,7 +39,7 @@ class SurfaceSamples(ContactSurface):
     depth: Array
     resolution: float
 
-    def part(self, chosen: NDArray[np.bool_]) -> "SurfaceSamples":
+    def part(self, chosen: Mask) -> "SurfaceSamples":
         """Return the chosen points (n,) without triangles."""
         return SurfaceSamples(
             self.points[chosen],
@@ -132,8 +131,8 @@ def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:
 
 
 def _cells(
-    caster: RayCaster, centres: Array, hit: NDArray[np.bool_], resolution: float
-) -> tuple[Array, Array, NDArray[np.int64]]:
+    caster: RayCaster, centres: Array, hit: Mask, resolution: float
+) -> tuple[Array, Array, Index]:
     """Return per covered cell: its point (n, 2), covered share (n,) and cell number (n,)."""
     around = [np.roll(np.pad(hit, 1), (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     some, every = np.any(around, axis=0)[1:-1, 1:-1], np.all(around, axis=0)[1:-1, 1:-1]
@@ -158,7 +157,7 @@ def _cells(
     return xz[cell], share[cell], cell
 
 
-def _first(caster: RayCaster, xz: Array) -> tuple[Array, NDArray[np.int64]]:
+def _first(caster: RayCaster, xz: Array) -> tuple[Array, Index]:
     return caster.first(_above(caster.surface, xz), DOWN)
 
 
@@ -167,9 +166,7 @@ def _above(surface: Surface, xz: Array) -> Array:
     return np.stack([xz[:, 0], np.full(len(xz), surface.bounds[1, 1] + 1e-3), xz[:, 1]], axis=1)
 
 
-def _through(
-    caster: RayCaster, xz: Array, insert: Surface
-) -> tuple[Array, NDArray[np.int64], Array]:
+def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Index, Array]:
     """Return first hits (n, 3), their faces (n,) and the thickness (n,) below them."""
     origins = _above(insert, xz)
     distance, face = caster.first(origins, DOWN)
@@ -191,7 +188,7 @@ def _through(
     return origins + distance[:, None] * DOWN, face, thickness
 
 
-def _grid_triangles(cell: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.int64]:
+def _grid_triangles(cell: Index, shape: tuple[int, int]) -> Index:
     """Return triangles between neighbouring points, facing +y."""
     number = np.full(shape, -1)
     number.ravel()[cell] = np.arange(len(cell))

@@ -9,7 +9,8 @@ attachments. Their wrenches are those whose virtual work is the moment arm,
     Σ_bones J_boneᵀ w_bone = -dL/dq.
 
 Where a wrap object yields to a point that moves into it (see docs/opensim.md) the wrenches hold
-what it pushes with, which no straight part shows.
+what it pushes with, which no straight part shows. Path points that a model moves within their
+bone (gait2392's quadriceps) add work of their own to -dL/dq, which is no wrench on any bone.
 """
 
 from collections.abc import Sequence

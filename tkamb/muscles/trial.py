@@ -32,7 +32,7 @@ from tkamb.muscles.leg import (
 )
 from tkamb.muscles.sharing import FrameProblems, Sharing
 from tkamb.opensim.inverse_dynamics import required_wrenches
-from tkamb.opensim.kinematics import Kinematics
+from tkamb.opensim.kinematics import Kinematics, Motion
 from tkamb.opensim.model import OpenSimModel
 from tkamb.opensim.motion import CoordinateMotion
 from tkamb.opensim.paths import LineSet, Pulls
@@ -144,9 +144,6 @@ def solve_trial(
     activation, reserve, residual = (
         np.array([frame[part] for frame in frames]) for part in range(3)
     )
-    places = [[kinematics.bodies[name] for name in bodies] for bodies in groups.values()]
-    demand = np.stack([needed[:, place].sum(axis=1) for place in places], axis=1)
-    poses = placed.poses[:, [place[0] for place in places]]
     return MuscleTrial(
         motion.time,
         names,
@@ -158,8 +155,18 @@ def solve_trial(
         reserve,
         residual,
         tuple(frame[3] for frame in frames),
-        Bones(tuple(groups), names, poses, pulls.wrenches, demand, pulls.crossings),
+        _bones(groups, placed, needed, pulls),
     )
+
+
+def _bones(
+    groups: Mapping[str, Sequence[str]], placed: Motion, needed: Array, pulls: Pulls
+) -> Bones:
+    """Return the bones, of what each body needs (f, bodies, 6) and the muscles' pulls on groups."""
+    places = [[placed.bodies[name] for name in bodies] for bodies in groups.values()]
+    demand = np.stack([needed[:, place].sum(axis=1) for place in places], axis=1)
+    poses = placed.poses[:, [place[0] for place in places]]
+    return Bones(tuple(groups), pulls.names, poses, pulls.wrenches, demand, pulls.crossings)
 
 
 def _strength(

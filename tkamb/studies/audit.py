@@ -98,13 +98,13 @@ def peer_distances(extreme: Extreme, result: ContactResult) -> dict[str, float]:
     Raises:
         InputError: the case has changed since it was asked.
     """
-    if extreme.model not in PEER_MODELS or extreme.says not in stored_answers():
+    if extreme.model not in PEER_MODELS or extreme.label not in stored_answers():
         return {}
-    known, answer = stored_answers()[extreme.says]
+    known, answer = stored_answers()[extreme.label]
     if known != body_hash(extreme):
         raise InputError(
             "CalculiX's answer is to an earlier version of the case",
-            f"case '{extreme.says}'",
+            f"case '{extreme.label}'",
             "run scripts/make_stability_answers",
         )
     found = errors(quantities(result), answer)

@@ -40,7 +40,7 @@ class StudyCase:
 
     Args:
         name: of the case.
-        says: one line.
+        label: one line.
         pair: the two bodies.
         pose: (4, 4) pose_femoral_in_insert; its y does not matter.
         load: N, along -y.
@@ -48,7 +48,7 @@ class StudyCase:
     """
 
     name: str
-    says: str
+    label: str
     pair: ContactPair
     pose: Array
     load: float
@@ -117,33 +117,20 @@ def _sphere(name: str) -> StudyCase:
 
 
 def _two_condyles(name: str) -> StudyCase:
-    says = "two condyles of 22 mm in dishes of 34 mm, nonlinear"
-    return StudyCase(name, says, _bicondylar(34e-3), np.eye(4), 2000.0)
+    """Return two condyles of 22 mm, 22 mm apart, on a nonlinear insert of 8 mm."""
+    label, dish_radius, varus_deg = BICONDYLAR[name]
+    insert = block(dishes(8e-3, dish_radius, 11e-3), (30e-3, 46e-3))
+    pair = ContactPair(balls(22e-3, 11e-3), insert, material("polyethylene"))
+    return StudyCase(name, label, pair, knee_pose([0, 0, 0, 0, varus_deg * DEGREE, 0]), 2000.0)
 
 
-def _conforming(name: str) -> StudyCase:
-    says = "two condyles of 22 mm in dishes of 24 mm, nonlinear"
-    return StudyCase(name, says, _bicondylar(24e-3), np.eye(4), 2000.0)
-
-
-def _varus(name: str) -> StudyCase:
-    pose = knee_pose([0, 0, 0, 0, 0.3 * DEGREE, 0])
-    says = "two condyles, 0.3 deg of varus, nonlinear"
-    return StudyCase(name, says, _bicondylar(34e-3), pose, 2000.0)
-
-
-def _bicondylar(radius: float) -> ContactPair:
-    apart = 11e-3
-    insert = block(dishes(8e-3, radius, apart), (30e-3, 46e-3))
-    return ContactPair(balls(22e-3, apart), insert, material("polyethylene"))
-
-
-_ANALYTIC = {
-    "sphere": _sphere,
-    "two condyles": _two_condyles,
-    "conforming": _conforming,
-    "varus": _varus,
+BICONDYLAR = {
+    "two condyles": ("two condyles of 22 mm in dishes of 34 mm, nonlinear", 34e-3, 0.0),
+    "conforming": ("two condyles of 22 mm in dishes of 24 mm, nonlinear", 24e-3, 0.0),
+    "varus": ("two condyles, 0.3 deg of varus, nonlinear", 34e-3, 0.3),
 }
+"""Name -> label, radius of the dishes (m), varus (deg)."""
+_ANALYTIC = {"sphere": _sphere, **dict.fromkeys(BICONDYLAR, _two_condyles)}
 
 
 def _shipped(name: str) -> StudyCase:
@@ -161,7 +148,7 @@ def _shipped(name: str) -> StudyCase:
     insert = load_surface(folder / "insert.stl", "mm", name="insert", closed=True)
     insert = insert.moved(insert_placement(insert))
     pair = ContactPair(femoral, insert, material(stored["material"]), stored["bearing"])
-    return StudyCase(name, stored["says"], pair, np.array(stored["pose"]), stored["load_N"])
+    return StudyCase(name, stored["label"], pair, np.array(stored["pose"]), stored["load_N"])
 
 
 def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
@@ -179,8 +166,8 @@ def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
     if not load > 0:
         raise InputError(f"frame {k} has no compressive contact force", path)
     pair = ContactPair(case.femoral, case.insert, material(table.material), insert.bearing)
-    says = f"{path.parent.name} at {case.motion.coordinates[k, 5] / DEGREE:.0f} deg, {load:.0f} N"
-    return StudyCase(name, says, pair, mechanics.poses[k], load)
+    label = f"{path.parent.name} at {case.motion.coordinates[k, 5] / DEGREE:.0f} deg, {load:.0f} N"
+    return StudyCase(name, label, pair, mechanics.poses[k], load)
 
 
 def copied_scene(folder: Path) -> Path:

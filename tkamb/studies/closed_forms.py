@@ -90,7 +90,7 @@ class ClosedForm:
     resolution_mm: float = 3.0
 
     @property
-    def says(self) -> str:
+    def label(self) -> str:
         """The case in words: "plate: load_N=1"."""
         base = vars(ClosedForm(self.kind, self.model))
         changed = [f"{k}={v}" for k, v in vars(self).items() if v != base[k]]
@@ -140,7 +140,7 @@ def press_closed_form(case: ClosedForm) -> tuple[ContactResult, ContactPair]:
         state = model.prepare(pair)
         files = len(list(Path(folder).glob("*.operator")))
         if files != 2:
-            raise ComputationError(f"{files} operators are kept of two materials", case.says)
+            raise ComputationError(f"{files} operators are kept of two materials", case.label)
         return model.press(state, case.load_N, np.eye(4)), pair
 
 

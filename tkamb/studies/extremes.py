@@ -105,7 +105,7 @@ class Extreme:
         return knee_pose([self.ap_mm * MILLIMETRE, 0.0, self.ml_mm * MILLIMETRE, *angles])
 
     @property
-    def says(self) -> str:
+    def label(self) -> str:
         """What differs from the base case: "load_N=1, nu=0.499"."""
         base, own = vars(replace(Extreme(), model=self.model)), vars(self)
         return ", ".join(f"{k}={v}" for k, v in own.items() if v != base[k]) or "base case"

@@ -57,7 +57,7 @@ class SceneExtreme:
     value: Any
 
     @property
-    def says(self) -> str:
+    def label(self) -> str:
         """The case in words."""
         return f"run: {self.kind} {self.value}"
 
@@ -86,16 +86,16 @@ def judge_scene(extreme: SceneExtreme) -> Verdict:
         except TkambError as error:
             seconds = clock.perf_counter() - start
             reason = str(error).replace(f"{folder}/", "")
-            return Verdict(extreme.says, "run", "flagged", reason, seconds=seconds)
+            return Verdict(extreme.label, "run", "flagged", reason, seconds=seconds)
     words = sorted({status for status in results.status if status != "ok"})
     flags = "; ".join(words)
     if any(status.startswith(FAILED) for status in results.status):
-        return Verdict(extreme.says, "run", "flagged", flags, seconds=seconds)
+        return Verdict(extreme.label, "run", "flagged", flags, seconds=seconds)
     right = math.isfinite(apart) and apart <= WRONG
     kind = "converged" if right else "flagged" if flags else "unflagged_wrong"
     reason = flags if right or flags else f"{100 * apart:.3g} % from what it must be"
     known = apart if math.isfinite(apart) else None
-    return Verdict(extreme.says, "run", kind, reason, known, seconds)
+    return Verdict(extreme.label, "run", kind, reason, known, seconds)
 
 
 def _run(scene: Path, overrides: dict[str, Any]) -> "Results":

@@ -133,7 +133,7 @@ class _Judges:
         except EOFError:
             process.join()
             if self._stopped:
-                raise ComputationError("was stopped", case.says) from None
+                raise ComputationError("was stopped", case.label) from None
             reason = f"the process ended with status {process.exitcode}"
             return _ended(case, "exception", reason)
         finally:
@@ -164,7 +164,7 @@ def _send_verdict(case: Case, sender: Connection) -> None:
 
 
 def _ended(case: Case, kind: str, reason: str) -> Verdict:
-    return Verdict(case.says, getattr(case, "model", "run"), kind, reason)
+    return Verdict(case.label, getattr(case, "model", "run"), kind, reason)
 
 
 def judge_safely(case: Case, pressed: Callable[[], None] = lambda: None) -> Verdict:

@@ -185,7 +185,7 @@ def references_for(
         if case.name.startswith("scene"):
             found[case.name] = _own_reference(case, announce, kept)
         elif recompute:
-            announce(f"reference of case '{case.name}': {case.says}")
+            announce(f"reference of case '{case.name}': {case.label}")
             stored[case.name] = found[case.name] = compute_reference(case)
             write_references(stored, STORED)
         else:
@@ -200,7 +200,7 @@ def _own_reference(
     row = kept.get(key) if kept else None
     if row is not None:
         return Reference(**row | {"grids_mm": tuple(row["grids_mm"])})
-    announce(f"reference of case '{case.name}': {case.says}")
+    announce(f"reference of case '{case.name}': {case.label}")
     found = compute_reference(case)
     if kept:
         kept.put(key, asdict(found))

@@ -94,7 +94,7 @@ def judge(extreme: Extreme, pressed: Callable[[], None] = lambda: None) -> Verdi
         result = model.press(state, extreme.load_N, extreme.pose)
     except TkambError as error:
         seconds = clock.perf_counter() - start
-        return Verdict(extreme.says, extreme.model, "flagged", str(error), seconds=seconds)
+        return Verdict(extreme.label, extreme.model, "flagged", str(error), seconds=seconds)
     seconds = clock.perf_counter() - start
     pressed()
     if result.status is not ContactStatus.OK:
@@ -178,7 +178,7 @@ def _verdict(
     result: ContactResult,
 ) -> Verdict:
     known = distance if distance is not None and math.isfinite(distance) else None
-    return Verdict(case.says, case.model, kind, reason, known, seconds, int(result.iterations))
+    return Verdict(case.label, case.model, kind, reason, known, seconds, int(result.iterations))
 
 
 def _model(extreme: Extreme, **options: Any) -> ContactModel:

@@ -63,9 +63,11 @@ def hit(value: Row, ours: float) -> bool:
 
 def badge(values: dict[str, float]) -> str:
     """Return the line that counts what lies within its own stated uncertainty."""
-    rows = published()["value"]
+    rows = [row for row in published()["value"] if row["id"] in values]
     within = sum(hit(row, values[row["id"]]) for row in rows)
-    return f"**{within} of {len(rows)} published values within their own stated uncertainty.**"
+    line = f"**{within} of {len(rows)} published values within their own stated uncertainty.**"
+    left = len(published()["value"]) - len(rows)
+    return line if not left else f"{line} {left} more are not computed yet."
 
 
 def page(stored: dict[str, Any]) -> str:
@@ -106,12 +108,14 @@ def _values(values: dict[str, float]) -> list[str]:
         "| --- | --- | ---: | ---: | --- |",
     ]
     for row in published()["value"]:
-        source, ours = sources[row["source"]], values[row["id"]]
         unit = f" {row['unit']}" if row["unit"] else ""
         told = f"{_band(row['low'], row['high'])}{unit} ({row['band']})"
-        verdict = "hit" if hit(row, ours) else "**missed**"
-        name = source["cited"].split(",")[0].split(" (")[0]
-        lines.append(f"| {name} | {row['says']} | {told} | {_number(ours)}{unit} | {verdict} |")
+        ours, verdict = "", "not computed yet"
+        if row["id"] in values:
+            ours = f"{_number(values[row['id']])}{unit}"
+            verdict = "hit" if hit(row, values[row["id"]]) else "**missed**"
+        name = sources[row["source"]]["cited"].split(",")[0].split(" (")[0]
+        lines.append(f"| {name} | {row['says']} | {told} | {ours} | {verdict} |")
     lines += ["", "Read where:", ""]
     for source in sources.values():
         doi = f", doi:{source['doi']}" if source["doi"] else ""

@@ -51,7 +51,7 @@ def add_wear(commands: Any) -> None:
 def _wear(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
-    from tkamb.output.claim import claimed_directory
+    from tkamb.claim import claimed_directory
     from tkamb.wear.run import prepare_wear
 
     run = prepare_wear(

@@ -9,7 +9,6 @@ from scipy.optimize import minimize
 from tkamb.contact.materials import Material
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import Bearing, ContactPair
-from tkamb.contact.pressing import first_touch_height
 from tkamb.contact.result import ContactStatus
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
@@ -21,7 +20,7 @@ GRID = (-0.012, -0.006, 0.0, 0.006, 0.012)
 """m along x where the search for the dwell position begins."""
 GRID_ACROSS = 0.002
 """m along z, likewise."""
-SEARCH = {"initial_simplex": None, "xatol": 1e-5, "fatol": 1e-9, "maxfev": 120}
+SEARCH = {"xatol": 1e-5, "fatol": 1e-9, "maxfev": 120}
 """The search ends within 10 µm."""
 
 
@@ -92,7 +91,7 @@ class ContactEngine:
         pair = ContactPair(self.femoral, insert, self.material, self.bearing)
 
         def height(place: Array) -> float:
-            found = first_touch_height(pair, pose_of(rotation, [place[0], 0.0, place[1]]))
+            found = pair.first_touch_height(pose_of(rotation, [place[0], 0.0, place[1]]))
             return found if np.isfinite(found) else 1.0
 
         middle = self.femoral.moved(pose_of(rotation, [0.0] * 3)).bounds.mean(axis=0)

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from tkamb.atomic import replaced_file
 from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
 from tkamb.files import MESH_LIMIT, read_bytes
-from tkamb.output.atomic import replaced_file
 from tkamb.wear.setup import WearSetup
 from tkamb.wear.simulation import WearCase, WearState
 
@@ -21,9 +21,9 @@ STATE_NAME = ".wear.npz"
 def wear_identity(setup: WearSetup, case: WearCase, cycles: int, updates: int) -> str:
     """Return what makes two simulations the same: bodies, motion, laws, numbers, code."""
     digest = hashlib.sha256()
-    for surface in (setup.engine.femoral, case.articular.surface):
-        digest.update(surface.content_hash.encode())
-    for array in (case.motion.poses, case.motion.load):
+    bodies = (setup.engine.femoral, case.articular.surface)
+    arrays = [array for body in bodies for array in (body.vertices, body.faces)]
+    for array in (*arrays, case.motion.poses, case.motion.load):
         digest.update(np.ascontiguousarray(array, "<f8").tobytes())
     words = (setup.engine.model, setup.engine.material, setup.engine.bearing, case.law, case.creep)
     numbers = (case.density, case.motion.duration, case.motion.passes, cycles, updates)

@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.geometry.boundary import edge_use
 from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.topology import edge_use
 
 Chosen = Callable[[Surface], NDArray[np.bool_]]
 

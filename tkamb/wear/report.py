@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from tkamb.atomic import replaced_together, write_synced
 from tkamb.code_identity import code_identity
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.geometry.surface import Surface
-from tkamb.output.atomic import replaced_together, write_synced
 from tkamb.output.vtk import write_triangles
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 from tkamb.wear.kept import STATE_NAME

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from tkamb.case import Case, load_case
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model, contact_options
 from tkamb.errors import InputError
-from tkamb.output.maps_file import ContactMaps
-from tkamb.results import read_results
+from tkamb.output.maps import ContactMaps
+from tkamb.results_folder import read_results
 from tkamb.run.summary import scene_hash
 from tkamb.scene import Scene, load_scene
-from tkamb.scene_tables import ContactTable
+from tkamb.scene.case import Case, load_case
+from tkamb.scene.tables import ContactTable
 from tkamb.simulation import simulate
 from tkamb.units import MILLIMETRE
 from tkamb.wear.engine import ContactEngine

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from tkamb.contact.bed import Bed
-from tkamb.contact.foundation import THINNEST, gaps_along_normals
+from tkamb.contact.foundation import THINNEST
+from tkamb.contact.samples import SurfaceSamples, gaps_along_normals
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.surface import Surface
 
 DEEPEST = 5e-3
 """m; the farthest that a load may press the femoral component into the bed in one step."""
@@ -90,7 +90,7 @@ class PronySeries:
 class ViscoelasticBed:
     """Columns of springs and dampers under a rigid femoral component, step by step.
 
-    Each column of the bed (`tkamb.contact.bed`) has the linear foundation's pressure p = M d/h
+    Each column of the bed (`tkamb.contact.samples`) has the linear foundation's pressure p = M d/h
     with M relaxing as a Prony series. A column that the femur leaves carries nothing and creeps
     back: its strain is then what makes its stress zero. The load acts along -y.
 
@@ -98,15 +98,15 @@ class ViscoelasticBed:
 
     Args:
         bed: the sampled articular surface.
-        femoral_rays: of the femoral component, in its own frame.
+        femoral: the femoral component, in its own frame.
         modulus: M_0, Pa, instantaneous and confined.
         series: its relaxation.
     """
 
     def __init__(
-        self, bed: Bed, femoral_rays: RayCaster, modulus: float, series: PronySeries
+        self, bed: SurfaceSamples, femoral: Surface, modulus: float, series: PronySeries
     ) -> None:
-        self._bed, self._rays, self._modulus, self._series = bed, femoral_rays, modulus, series
+        self._bed, self._femoral, self._modulus, self._series = bed, femoral, modulus, series
         self._strain = np.zeros(len(bed.points))
         self._memory = np.zeros((len(series.times), len(bed.points)))
 
@@ -134,7 +134,7 @@ class ViscoelasticBed:
         """Return strains and pressures (n,) with the femur `fall` below its pose."""
         moved = np.array(pose, float)
         moved[1, 3] -= fall
-        gap = gaps_along_normals(self._bed, self._rays, moved)
+        gap = gaps_along_normals(self._bed, self._femoral, moved)
         asked = -gap / np.maximum(self._bed.thickness, THINNEST)
         slope, decay, kept = self._series.response(step)
         carried = decay @ self._memory - kept.sum() * self._strain

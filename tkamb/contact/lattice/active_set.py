@@ -13,12 +13,10 @@ the set starts to cycle, only the worst node changes.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Mask
 
-Mask = NDArray[np.bool_]
 MOST_SETS = 200
 """Sets tried before the search gives up."""
 PATIENCE = 12

@@ -10,11 +10,11 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.problem import Indices, LatticeState, Mask, SurfaceFromBelow
+from tkamb.contact.lattice.problem import LatticeState, SurfaceFromBelow
 from tkamb.contact.lattice.solver import Solution
 from tkamb.contact.pressing import HALF
 from tkamb.contact.result import ContactResult, medial_points
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.units import DEGREE, MILLIMETRE
 
 REACH = 2.0
@@ -94,7 +94,7 @@ def _sharpness(normals: NDArray[np.float64]) -> str:
 
 
 def coarse_flags(
-    triangles: Indices,
+    triangles: Index,
     touched: Mask,
     sides: Mapping[str, Mask],
 ) -> Iterator[str]:
@@ -114,7 +114,7 @@ def coarse_flags(
             )
 
 
-def surrounded(triangles: Indices, touched: Mask) -> Mask:
+def surrounded(triangles: Index, touched: Mask) -> Mask:
     """Return which nodes (n,) have contact all around: at every corner of their triangles."""
     a, b, c = touched[triangles.T]
     edge = triangles[(a | b | c) & ~(a & b & c)]

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tkamb.contact.lattice.linear.compliance import MOST_STORED, ComplianceCache, ContactResponse
-from tkamb.contact.lattice.problem import ContactProblem, Indices, Mask, Region, TangentPlanes
-from tkamb.geometry.frames import Array
+from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes
+from tkamb.geometry.frames import Array, Index, Mask
 
 MARGIN = 0.25
 """Nodes count as candidates this share of the depth beyond first touch."""
@@ -51,7 +51,7 @@ class InitialGuess:
         region: outside of which h is zero, or None.
     """
 
-    candidates: Indices
+    candidates: Index
     response: ContactResponse
     active: Mask
     planes: TangentPlanes

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.flags import unseen_flags
 from tkamb.contact.lattice.initial_guess import (
@@ -41,7 +40,7 @@ from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import check_load, within_insert
 from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError, InputError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.units import MILLIMETRE
 
 MOST_GROWTHS = 8
@@ -99,8 +98,8 @@ class CellContact(ContactModel):
         self,
         solid: Solid,
         lattice: Lattice,
-        held: NDArray[np.bool_],
-        nodes: NDArray[np.int64],
+        held: Mask,
+        nodes: Index,
     ) -> ElasticOperator:
         """Return the operator, from disk if it was made before.
 

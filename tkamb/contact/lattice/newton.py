@@ -12,10 +12,10 @@ from tkamb.contact.lattice.active_set import ContactForces
 from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.linear.compliance import ContactResponse
 from tkamb.contact.lattice.linear.operator import prepare_operator
-from tkamb.contact.lattice.problem import ContactProblem, Indices, Mask, TangentPlanes
+from tkamb.contact.lattice.problem import ContactProblem, TangentPlanes
 from tkamb.contact.lattice.solver import SlidingNodes, Solution, Tolerance, solve_pass
 from tkamb.errors import ComputationError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 
 MOST_STEPS = 30
 
@@ -65,7 +65,7 @@ def solve_by_newton(
         step, last = 0.5 if residual > 2 * last else 1.0, residual
 
 
-def _imbalance(problem: ContactProblem, nodes: Indices, u: Array, force: Array) -> float:
+def _imbalance(problem: ContactProblem, nodes: Index, u: Array, force: Array) -> float:
     """Return what is out of balance at u (n, 3) under forces (m, 3) on nodes, relative to them."""
     outside = -problem.solid.internal_force(u)
     outside[nodes] += force
@@ -78,7 +78,7 @@ def _imbalance(problem: ContactProblem, nodes: Indices, u: Array, force: Array) 
 
 def _step(
     problem: ContactProblem,
-    nodes: Indices,
+    nodes: Index,
     points: Array,
     u: Array,
     planes: TangentPlanes,

@@ -5,7 +5,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.linear.compliance import ComplianceCache
 from tkamb.contact.lattice.linear.operator import ElasticOperator
@@ -14,12 +13,9 @@ from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.contact.pair import PreparedContact
 from tkamb.geometry.curved import CurvedSurface
-from tkamb.geometry.frames import Array, inverse, rotate, transform
+from tkamb.geometry.frames import Array, Index, Mask, inverse, rotate, transform
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
-
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 Direction = Literal["normal", "vertical"]
 
@@ -96,14 +92,14 @@ class ContactProblem:
 
     solid: Solid
     operator: ElasticOperator
-    index: Indices
+    index: Index
     held: Mask
     femoral: SurfaceFromBelow
     direction: Direction = "normal"
     lift: Array | float = 0.0
 
     @property
-    def contact_nodes(self) -> Indices:
+    def contact_nodes(self) -> Index:
         """Nodes (c,) that can be touched."""
         return self.operator.contact_nodes
 
@@ -137,7 +133,7 @@ class TangentPlanes:
         """y of the normals (m,), negative."""
         return self.normals[:, 1]
 
-    def part(self, nodes: Indices) -> "TangentPlanes":
+    def part(self, nodes: Index) -> "TangentPlanes":
         """Return the planes over some of the nodes."""
         return TangentPlanes(self.points[nodes], self.normals[nodes])
 
@@ -184,13 +180,13 @@ class Region:
         whole: these are all elements.
     """
 
-    elements: Indices
-    nodes: Indices
-    fronts: Indices
+    elements: Index
+    nodes: Index
+    fronts: Index
     whole: bool
 
     @classmethod
-    def of(cls, problem: ContactProblem, elements: Indices) -> "Region":
+    def of(cls, problem: ContactProblem, elements: Index) -> "Region":
         """Return the region of some elements of the problem's solid."""
         scatter = problem.solid.scatter
         touched = np.zeros(scatter.nodes, bool)

@@ -7,16 +7,10 @@ import numpy as np
 
 from tkamb.contact.area import covered_areas
 from tkamb.contact.lattice.flags import strain_flags, unresolved_flags, unsettled_flag
-from tkamb.contact.lattice.problem import (
-    LEAST_NORMAL_Y,
-    Indices,
-    LatticeState,
-    Mask,
-    tangent_planes,
-)
+from tkamb.contact.lattice.problem import LEAST_NORMAL_Y, LatticeState, tangent_planes
 from tkamb.contact.lattice.solver import Solution
 from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 
 PressureRule = Literal["tributary", "source"]
 
@@ -114,7 +108,7 @@ def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution:
 
 
 def _gaps_of_others(
-    state: LatticeState, pose: Array, nodes: Indices, force: Array, solution: Solution
+    state: LatticeState, pose: Array, nodes: Index, force: Array, solution: Solution
 ) -> Array:
     """Return the gaps (m,), m, of deformed nodes that are no candidates; inf: nothing above."""
     problem = state.problem
@@ -140,7 +134,7 @@ def _areas(state: LatticeState, gaps: Array, loaded: Mask, rule: PressureRule) -
     return np.where(loaded, overlap / loaded.sum(), state.surface.area)
 
 
-def beside(triangles: Indices, touched: Mask) -> Mask:
+def beside(triangles: Index, touched: Mask) -> Mask:
     """Return which nodes (n,) share a triangle with one in contact and are not in contact."""
     found = np.zeros_like(touched)
     found[triangles[touched[triangles].any(axis=1)]] = True

@@ -21,15 +21,8 @@ from tkamb.contact.lattice.active_set import ContactForces, solve_contact
 from tkamb.contact.lattice.anderson import AndersonMixer
 from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.linear.compliance import ContactResponse
-from tkamb.contact.lattice.problem import (
-    ContactProblem,
-    Indices,
-    Mask,
-    Region,
-    TangentPlanes,
-    tangent_planes,
-)
-from tkamb.geometry.frames import Array
+from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes, tangent_planes
+from tkamb.geometry.frames import Array, Index, Mask
 
 DIVERGED = 100.0
 """The iteration is given up when the imbalance is this many times the smallest so far."""
@@ -70,7 +63,7 @@ class Solution:
         region: outside of which h is zero, or None.
     """
 
-    candidates: Indices
+    candidates: Index
     forces: ContactForces
     planes: TangentPlanes
     displacement: Array
@@ -264,7 +257,7 @@ class NonlinearBalance:
         return value
 
 
-def elements_that_count(size: Array, allowed: float) -> Indices:
+def elements_that_count(size: Array, allowed: float) -> Index:
     """Return the elements (k,) without the smallest, which together are below a bound.
 
     Args:

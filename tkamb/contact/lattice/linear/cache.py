@@ -38,7 +38,7 @@ from tkamb.contact.lattice.linear.response import Block, HalfResponse
 from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.errors import InputError
 from tkamb.files import open_regular
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 
 MAGIC = b"tkamb operator 3"
 LONGEST_HEADER = 1_000_000
@@ -77,8 +77,8 @@ def operator_key(solid: Solid, held: NDArray[Any], contact_nodes: NDArray[Any]) 
 
 def cached_operator(
     solid: Solid,
-    held: NDArray[np.bool_],
-    contact_nodes: NDArray[np.int64],
+    held: Mask,
+    contact_nodes: Index,
     make: Callable[[], ElasticOperator],
     limit: float = SIZE_LIMIT,
 ) -> ElasticOperator:
@@ -121,8 +121,8 @@ class DamagedOperator(Exception):
 def check_operator(
     operator: ElasticOperator,
     solid: Solid,
-    held: NDArray[np.bool_],
-    contact_nodes: NDArray[np.int64],
+    held: Mask,
+    contact_nodes: Index,
 ) -> None:
     """Hold an operator that was read against the solid that it is to be of.
 

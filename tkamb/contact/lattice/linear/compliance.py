@@ -4,12 +4,9 @@ from dataclasses import dataclass, field
 from threading import Lock
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.linear.response import SINGLE, HalfResponse, unknowns_of
-from tkamb.geometry.frames import Array
-
-Indices = NDArray[np.int64]
+from tkamb.geometry.frames import Array, Index
 
 MOST_STORED = 1500
 """Nodes of the stored compliance: 80 MB."""
@@ -27,7 +24,7 @@ class ContactResponse:
     """
 
     half: HalfResponse
-    index: Indices
+    index: Index
     compliance: Array
 
     @classmethod
@@ -82,12 +79,12 @@ class ComplianceCache:
     """
 
     whole: HalfResponse
-    nodes: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
+    nodes: Index = field(default_factory=lambda: np.zeros(0, np.int64))
     half: HalfResponse | None = None
     compliance: Array = field(default_factory=lambda: np.zeros((3, 0, 3, 0), SINGLE))
     _lock: Lock = field(default_factory=Lock)
 
-    def among(self, wanted: Indices, spare: Indices) -> ContactResponse:
+    def among(self, wanted: Index, spare: Index) -> ContactResponse:
         """Return the response among contact nodes.
 
         Args:
@@ -99,10 +96,10 @@ class ComplianceCache:
                 self._take(spare if len(spare) <= MOST_STORED else wanted)
             nodes, half, compliance = self.nodes, self.half, self.compliance
         assert half is not None
-        place = np.searchsorted(nodes, wanted)
-        return ContactResponse(half, place, _taken(_taken(compliance, place, 1), place, 3))
+        index = np.searchsorted(nodes, wanted)
+        return ContactResponse(half, index, _taken(_taken(compliance, index, 1), index, 3))
 
-    def moved(self, nodes: Indices, pushed: Indices, force: Array) -> Array:
+    def moved(self, nodes: Index, pushed: Index, force: Array) -> Array:
         """Return the displacement (m, 3), m, of contact nodes under forces on contact nodes.
 
         Args:
@@ -120,14 +117,14 @@ class ComplianceCache:
             compliance = self.compliance[np.ix_(axes, here, axes, there)]
         return np.einsum("aibj,jb->ia", compliance, force)
 
-    def _take(self, nodes: Indices) -> None:
+    def _take(self, nodes: Index) -> None:
         """Take nodes, with what is known of their compliance already."""
         half = self.whole.among(unknowns_of(nodes))
         _, here, there = np.intersect1d(nodes, self.nodes, True, True)
         new = np.setdiff1d(np.arange(len(nodes)), here, assume_unique=True)
         compliance: Array = np.empty((3, len(nodes), 3, len(nodes)), SINGLE)
         axes = np.arange(3)
-        known, had = ((axes, places, axes, places) for places in (here, there))
+        known, had = ((axes, index, axes, index) for index in (here, there))
         compliance[np.ix_(*known)] = self.compliance[np.ix_(*had)]
         rows = half.compliance(unknowns_of(new)).reshape(len(new), 3, len(nodes), 3)
         compliance[:, new] = rows.transpose(1, 0, 3, 2)
@@ -135,6 +132,6 @@ class ComplianceCache:
         self.nodes, self.half, self.compliance = nodes, half, compliance
 
 
-def _taken(values: Array, places: Indices, axis: int) -> Array:
-    """Return some places along an axis; "clip" spares numpy a copy, all are in range."""
-    return np.take(values, places, axis=axis, mode="clip")
+def _taken(values: Array, index: Index, axis: int) -> Array:
+    """Return some entries along an axis; "clip" spares numpy a copy, all are in range."""
+    return np.take(values, index, axis=axis, mode="clip")

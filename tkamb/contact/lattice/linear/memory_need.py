@@ -6,14 +6,12 @@ nodes instead of unknowns). Nothing is known of a machine here but what it has l
 
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.linear.multifrontal import Dissection
 from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Index, Mask
 from tkamb.memory import available_memory
 from tkamb.units import MILLIMETRE
-
-Indices = NDArray[np.int64]
 
 UNKNOWNS = 3
 """Of a node; each boundary is counted as if all were free."""
@@ -80,7 +78,7 @@ def check_assembly_memory(cells: int) -> None:
 
 
 def factor_memory(
-    tree: Dissection, joined: sparse.csr_matrix, touched: NDArray[np.bool_], itemsize: int
+    tree: Dissection, joined: sparse.csr_matrix, touched: Mask, itemsize: int
 ) -> float:
     """Return the bytes that factor and half response take at their peak.
 
@@ -94,7 +92,7 @@ def factor_memory(
     rank[np.concatenate(tree.own)] = np.arange(len(rank))
     kept = live = peak = response = 0.0
     columns = np.zeros(len(tree.own))
-    below: dict[int, list[Indices]] = {}
+    below: dict[int, list[Index]] = {}
     start = 0
     for member, own in enumerate(tree.own):
         stop, parent = start + len(own), tree.parent[member]

@@ -19,13 +19,10 @@ from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
 from tkamb.errors import ComputationError
-from tkamb.geometry.frames import Array
-
-Indices = NDArray[np.int64]
+from tkamb.geometry.frames import Array, Index
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +34,11 @@ class Dissection:
         parent: index of the parent of each member, -1 for a root.
     """
 
-    own: list[Indices]
+    own: list[Index]
     parent: list[int]
 
 
-def dissect(index: Indices, joined: sparse.csr_matrix, leaf: int = 48) -> Dissection:
+def dissect(index: Index, joined: sparse.csr_matrix, leaf: int = 48) -> Dissection:
     """Return the dissection of the nodes with lattice index (n, 3).
 
     Args:
@@ -49,10 +46,10 @@ def dissect(index: Indices, joined: sparse.csr_matrix, leaf: int = 48) -> Dissec
         joined: (n, n) pattern: which nodes are joined.
         leaf: parts of at most so many nodes are not cut further.
     """
-    own: list[Indices] = []
+    own: list[Index] = []
     parent: list[int] = []
 
-    def cut(part: Indices) -> int:
+    def cut(part: Index) -> int:
         """Append the members of a part; return the position of its topmost one."""
         halves = None if len(part) <= leaf else _halves(index, joined, part)
         if halves is None:
@@ -73,8 +70,8 @@ def dissect(index: Indices, joined: sparse.csr_matrix, leaf: int = 48) -> Dissec
 
 
 def _halves(
-    index: Indices, joined: sparse.csr_matrix, part: Indices
-) -> tuple[Indices, Indices, Indices] | None:
+    index: Index, joined: sparse.csr_matrix, part: Index
+) -> tuple[Index, Index, Index] | None:
     """Return (low, high, separator), or None if no plane leaves two sides."""
     position = index[part]
     for axis in np.argsort(-np.ptp(position, axis=0), kind="stable"):
@@ -92,7 +89,7 @@ def _halves(
     return part[low], part[high], part[~(low | high)]
 
 
-def _along_columns(index: Indices, part: Indices) -> Indices:
+def _along_columns(index: Index, part: Index) -> Index:
     """Return the part sorted so that a stretch of columns is a stretch of the list."""
     i, j, k = index[part].T
     return part[np.lexsort((j, k, i)) if np.ptp(i) >= np.ptp(k) else np.lexsort((j, i, k))]
@@ -112,7 +109,7 @@ class Front:
 
     start: int
     stop: int
-    boundary: Indices
+    boundary: Index
     parent: int
     block: Array
 
@@ -126,7 +123,7 @@ class CholeskyFactor:
         fronts: members, children before parents.
     """
 
-    order: Indices
+    order: Index
     fronts: list[Front]
 
     @property
@@ -143,7 +140,7 @@ class CholeskyFactor:
         result[self.order] = x
         return result
 
-    def forward(self, x: Array, fronts: Indices | None = None) -> None:
+    def forward(self, x: Array, fronts: Index | None = None) -> None:
         """Turn x (n,) into L⁻¹ x in place, in elimination order.
 
         Args:
@@ -156,7 +153,7 @@ class CholeskyFactor:
             x[front.start : front.stop] = y[: len(own)]
             x[front.boundary] -= y[len(own) :]
 
-    def backward(self, x: Array, fronts: Indices | None = None) -> None:
+    def backward(self, x: Array, fronts: Index | None = None) -> None:
         """Turn x (n,) into L⁻ᵀ x in place, in elimination order.
 
         Args:
@@ -168,14 +165,14 @@ class CholeskyFactor:
             own = own.astype(front.block.dtype)
             x[front.start : front.stop] = np.einsum("ij,i->j", front.block, own)
 
-    def _chosen(self, fronts: Indices | None) -> list[Front]:
+    def _chosen(self, fronts: Index | None) -> list[Front]:
         return self.fronts if fronts is None else [self.fronts[f] for f in fronts.tolist()]
 
 
 def factorise(
     matrix: sparse.csr_matrix,
     tree: Dissection,
-    unknowns: list[Indices],
+    unknowns: list[Index],
     precision: type[np.floating] = np.float64,
 ) -> CholeskyFactor:
     """Return the Cholesky factor.
@@ -192,14 +189,14 @@ def factorise(
     order = np.concatenate(unknowns)
     permuted = matrix[order][:, order].tocsc()
     permuted.sort_indices()
-    updates: dict[int, list[tuple[Indices, Array]]] = {}
-    place = np.empty(len(order), np.int64)
+    updates: dict[int, list[tuple[Index, Array]]] = {}
+    row = np.empty(len(order), np.int64)
     fronts: list[Front] = []
     start = 0
     for member, own in enumerate(unknowns):
         stop = start + len(own)
         front, update = _eliminate(
-            permuted, start, stop, updates.pop(member, []), place, tree.parent[member]
+            permuted, start, stop, updates.pop(member, []), row, tree.parent[member]
         )
         block = np.ascontiguousarray(front.block, dtype=precision)
         fronts.append(replace(front, block=block))
@@ -213,8 +210,8 @@ def _eliminate(
     matrix: sparse.csc_matrix,
     start: int,
     stop: int,
-    children: list[tuple[Indices, Array]],
-    place: Indices,
+    children: list[tuple[Index, Array]],
+    row: Index,
     parent: int,
 ) -> tuple[Front, Array]:
     """Return a member's front and the update for its parent."""
@@ -230,11 +227,11 @@ def _eliminate(
     own, mixed, rest = (np.zeros(size, order="F") for size in ((k, k), (m, k), (m, m)))
     inside = (rows >= start) & ~below
     own[rows[inside] - start, columns[inside]] = values[inside]
-    place[boundary] = np.arange(m)
-    mixed[place[rows[below]], columns[below]] = values[below]
+    row[boundary] = np.arange(m)
+    mixed[row[rows[below]], columns[below]] = values[below]
     for indices, update in children:
         split = int(np.searchsorted(indices, stop))
-        here, there = indices[:split] - start, place[indices[split:]]
+        here, there = indices[:split] - start, row[indices[split:]]
         _extend_add(own, here, here, update[:split, :split])
         _extend_add(mixed, there, here, update[split:, :split])
         _extend_add(rest, there, there, update[split:, split:])
@@ -250,14 +247,14 @@ def _eliminate(
     return Front(start, stop, boundary, parent, block), rest
 
 
-def _extend_add(target: Array, rows: Indices, columns: Indices, update: Array) -> None:
+def _extend_add(target: Array, rows: Index, columns: Index, update: Array) -> None:
     """Add update to target[rows, columns], run by run of consecutive indices."""
     for a, b in _runs(rows):
         for c, d in _runs(columns):
             target[rows[a] : rows[b - 1] + 1, columns[c] : columns[d - 1] + 1] += update[a:b, c:d]
 
 
-def _runs(indices: Indices) -> list[tuple[int, int]]:
+def _runs(indices: Index) -> list[tuple[int, int]]:
     """Return the stretches [a, b) of consecutive values of an increasing list."""
     if not len(indices):
         return []

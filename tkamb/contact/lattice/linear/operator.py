@@ -5,16 +5,13 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.linear.memory_need import check_memory, factor_memory
 from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor, dissect, factorise
 from tkamb.contact.lattice.linear.response import HalfResponse, half_response
 from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.contact.pair import Bearing
-from tkamb.geometry.frames import Array
-
-Indices = NDArray[np.int64]
+from tkamb.geometry.frames import Array, Index, Mask
 
 SEED = 20_240_501
 
@@ -30,9 +27,9 @@ class ElasticOperator:
         half: L⁻¹ E of their 3c unit forces.
     """
 
-    free: NDArray[np.bool_]
+    free: Mask
     factor: CholeskyFactor
-    contact_nodes: Indices
+    contact_nodes: Index
     half: HalfResponse
 
     def solve(self, force: Array) -> Array:
@@ -41,7 +38,7 @@ class ElasticOperator:
         self.factor.backward(y)
         return self.nodal(y)
 
-    def start(self, force: Array, fronts: Indices | None = None) -> Array:
+    def start(self, force: Array, fronts: Index | None = None) -> Array:
         """Return y = L⁻¹ f in elimination order, for nodal forces (n, 3).
 
         Args:
@@ -60,7 +57,7 @@ class ElasticOperator:
         result[self.free] = inner
         return result.reshape(-1, 3)
 
-    def fronts_of(self, nodes: Indices) -> Indices:
+    def fronts_of(self, nodes: Index) -> Index:
         """Return the fronts of the factor that eliminate the nodes, and all above them."""
         fronts = self.factor.fronts
         needed = np.zeros(len(fronts) + 1, bool)
@@ -71,7 +68,7 @@ class ElasticOperator:
         return np.flatnonzero(needed[:-1])
 
     @cached_property
-    def _front_of_node(self) -> Indices:
+    def _front_of_node(self) -> Index:
         """Front (n,) that eliminates each node; -1 for a node that is held."""
         fronts = self.factor.fronts
         member = np.repeat(np.arange(len(fronts)), [f.stop - f.start for f in fronts])
@@ -81,7 +78,7 @@ class ElasticOperator:
         return result
 
 
-def fixed_unknowns(nodes: Array, bottom: Indices, bearing: Bearing) -> NDArray[np.bool_]:
+def fixed_unknowns(nodes: Array, bottom: Index, bearing: Bearing) -> Mask:
     """Return which of the 3n unknowns are held.
 
     Fixed bearing: all of the bottom nodes' unknowns. Mobile bearing: their y, and x and z of
@@ -102,16 +99,16 @@ def fixed_unknowns(nodes: Array, bottom: Indices, bearing: Bearing) -> NDArray[n
 
 def prepare_operator(
     stiffness: sparse.csr_matrix,
-    index: Indices,
-    held: NDArray[np.bool_],
-    contact_nodes: Indices,
+    index: Index,
+    held: Mask,
+    contact_nodes: Index,
     precision: type[np.floating] = np.float64,
 ) -> ElasticOperator:
     """Factorise a stiffness matrix (3n, 3n) and work out the contact nodes' half response.
 
     Args:
         stiffness: symmetric, positive definite on the free unknowns.
-        index: (n, 3) place of each node in the lattice.
+        index: (n, 3) lattice index of each node.
         held: (3n,) unknowns that are zero.
         contact_nodes: (c,).
         precision: in which the numbers are kept; they are worked out in float64.
@@ -137,9 +134,9 @@ def prepare_operator(
         wanted = (3 * some[own][:, None] + np.arange(3)).ravel()
         unknowns.append(number[wanted[free[wanted]]])
     factor = factorise(stiffness[free][:, free], tree, unknowns, precision)
-    place = np.full(len(free), -1)
-    place[np.flatnonzero(free)[factor.order]] = np.arange(len(factor.order))
-    wanted = place[(3 * contact_nodes[:, None] + np.arange(3)).ravel()]
+    rank = np.full(len(free), -1)
+    rank[np.flatnonzero(free)[factor.order]] = np.arange(len(factor.order))
+    wanted = rank[(3 * contact_nodes[:, None] + np.arange(3)).ravel()]
     return ElasticOperator(free, factor, contact_nodes, half_response(factor, wanted, precision))
 
 

@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 
-Indices = NDArray[np.int64]
 Precision = type[np.floating[Any]]
 
 SINGLE: Precision = np.float32
@@ -50,7 +48,7 @@ class HalfResponse:
         blocks: rows of Z that are not zero.
     """
 
-    rank: Indices
+    rank: Index
     blocks: list[Block]
 
     def apply(self, force: Array, y: Array) -> None:
@@ -71,7 +69,7 @@ class HalfResponse:
                 ordered[block.first : block.last] += np.einsum("ij,i->j", block.values, part)
         return np.where(self.rank >= 0, ordered[np.maximum(self.rank, 0)], 0.0)
 
-    def among(self, unknowns: Indices) -> "HalfResponse":
+    def among(self, unknowns: Index) -> "HalfResponse":
         """Return the response of some of the unknowns (u,) alone."""
         wanted = self.rank[unknowns]
         live = np.flatnonzero(wanted >= 0)
@@ -86,7 +84,7 @@ class HalfResponse:
                 blocks.append(Block(block.start, block.stop, a, b, values))
         return HalfResponse(rank, blocks)
 
-    def compliance(self, some: Indices | None = None) -> Array:
+    def compliance(self, some: Index | None = None) -> Array:
         """Return the compliance (s, q), m/N, of some unknowns, by default all, to all."""
         rank = self.rank if some is None else self.rank[some]
         rows, live = np.unique(rank[rank >= 0]), self.rank >= 0
@@ -97,8 +95,8 @@ class HalfResponse:
                 part = block.values.astype(np.float64)
                 inner[a:b, block.first : block.last] += part[:, rows[a:b] - block.first].T @ part
         result = np.zeros((len(rank), len(self.rank)))
-        place = np.searchsorted(rows, rank[rank >= 0])
-        result[np.ix_(rank >= 0, live)] = inner[np.ix_(place, self.rank[live])]
+        index = np.searchsorted(rows, rank[rank >= 0])
+        result[np.ix_(rank >= 0, live)] = inner[np.ix_(index, self.rank[live])]
         return result
 
     @property
@@ -112,13 +110,13 @@ class HalfResponse:
         return int((self.rank >= 0).sum())
 
 
-def unknowns_of(nodes: Indices) -> Indices:
+def unknowns_of(nodes: Index) -> Index:
     """Return the three unknowns of each node (n,), one node after the other (3n,)."""
     return (3 * nodes[:, None] + np.arange(3)).ravel()
 
 
 def half_response(
-    factor: CholeskyFactor, unknowns: Indices, precision: Precision = np.float64
+    factor: CholeskyFactor, unknowns: Index, precision: Precision = np.float64
 ) -> HalfResponse:
     """Return L⁻¹ of unit forces on unknowns given in elimination order (q,), -1 = held.
 
@@ -149,7 +147,7 @@ def half_response(
     return HalfResponse(rank, blocks)
 
 
-def _column_spans(factor: CholeskyFactor, rows: Indices) -> list[tuple[int, int]]:
+def _column_spans(factor: CholeskyFactor, rows: Index) -> list[tuple[int, int]]:
     """Return for each member the columns [first, last) whose path to the root meets it."""
     spans = [
         (int(np.searchsorted(rows, f.start)), int(np.searchsorted(rows, f.stop)))

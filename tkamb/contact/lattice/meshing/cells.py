@@ -8,10 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.geometry.frames import Array
-
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from tkamb.geometry.frames import Array, Index
 
 CORNERS = np.array(
     [
@@ -190,7 +187,7 @@ def mean_gradient(corners: Array) -> tuple[Array, Array]:
     return np.einsum("sg,sgnx->snx", weights, gradients) / volume[:, None, None], volume
 
 
-def group_shapes(corners: Array, tolerance: float = 1e-9) -> tuple[Array, NDArray[np.int64]]:
+def group_shapes(corners: Array, tolerance: float = 1e-9) -> tuple[Array, Index]:
     """Return the distinct cell shapes (s, 8, 3) and each cell's shape (c,).
 
     Cells of a regular lattice repeat: what depends on shape alone is worked out once. Two

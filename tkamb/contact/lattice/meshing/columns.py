@@ -7,16 +7,13 @@ is moved onto the surface (half-cell rule); intervals thinner than a cell follow
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.meshing.levels import follow_top
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.height_field import Intervals, inside_intervals
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 Nodes = tuple[Index, ...]
 
 TIE = 1e-6

@@ -4,16 +4,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.pair import ContactSurface
 from tkamb.geometry.curved import CurvedSurface
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
-
-Indices = NDArray[np.int64]
 
 ABOVE = 1e-4
 """m: rays that ask which triangle a node lies on start so far above it."""
@@ -42,7 +39,7 @@ class ContactMap(ContactSurface):
         return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
-def contact_map(lattice: Lattice, insert: Surface) -> tuple[Indices, ContactMap]:
+def contact_map(lattice: Lattice, insert: Surface) -> tuple[Index, ContactMap]:
     """Return the contact nodes (c,) that carry a triangle, and their map."""
     nodes, triangles = np.unique(lattice.contact_triangles, return_inverse=True)
     triangles = triangles.reshape(-1, 3).astype(np.int64)

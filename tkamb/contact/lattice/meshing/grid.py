@@ -23,15 +23,13 @@ from tkamb.contact.lattice.meshing.cells import (
 from tkamb.contact.lattice.meshing.columns import NodeField, settle_columns
 from tkamb.contact.lattice.meshing.walls import inside, settle_walls
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.post import find_post
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
 _log = logging.getLogger("tkamb")
 
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 INTERNAL, CONTACT, BOTTOM, OTHER = 0, 1, 2, 3
 """Node classes: inside, top surface, flat bottom, any other surface (walls, underside)."""
@@ -54,7 +52,7 @@ class Lattice:
 
     Args:
         nodes: (n, 3) m.
-        index: (n, 3) place (i, j, k) in the structured grid.
+        index: (n, 3) index (i, j, k) in the structured grid.
         node_class: (n,) INTERNAL, CONTACT, BOTTOM or OTHER.
         spacing: (3,) m, of the undistorted grid.
         origin: (3,) m, of the grid's node (0, 0, 0).

@@ -14,14 +14,11 @@ grid's own. H is the top where that is smooth, and is carried on underneath what
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
-from tkamb.geometry.frames import Array
-
-Mask = NDArray[np.bool_]
+from tkamb.geometry.frames import Array, Index
 
 MAX_EDGE_RATIO = 1.4
 """Longest over shortest edge of a cell, before its nodes are moved onto the surface."""
@@ -49,8 +46,8 @@ class Levels:
     spacing: float
     count: int
 
-    def position(self, height: Array, i: NDArray[np.int64], k: NDArray[np.int64]) -> Array:
-        """Return the place of heights (m,) among the layers of columns (i, k); a fraction."""
+    def position(self, height: Array, i: Index, k: Index) -> Array:
+        """Return the position of heights (m,) among the layers of columns (i, k); a fraction."""
         reference = self.reference[i, k]
         within = np.clip(height, 0.0, reference) * self.layers / reference
         outside = np.minimum(height, 0.0) + np.maximum(height - reference, 0.0)

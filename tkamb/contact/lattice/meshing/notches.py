@@ -8,14 +8,10 @@ the surface runs straight on, almost onto the line between its two neighbours.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.meshing.columns import NodeField, Nodes, inside, refired
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.rays import RayCaster
-
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 BULGE = 0.1
 """How far the node stays short of the line: on it the cell's corner would be flat."""

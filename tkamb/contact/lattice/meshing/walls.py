@@ -7,17 +7,13 @@ half a cell, the node is moved onto it; farther, the node outside is pulled in.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.meshing.columns import NodeField, Nodes, inside, refired_inwards
 from tkamb.contact.lattice.meshing.notches import fill_notches
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Mask
 from tkamb.geometry.height_field import inside_intervals
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
-
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 STEPS = ((0, 1), (0, -1), (2, 1), (2, -1))
 """Axis and sign of the four ways sideways."""

@@ -8,21 +8,20 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.meshing.cells import gauss_gradients, mean_gradient
 from tkamb.contact.lattice.solids.curve import ShearCurve
-from tkamb.contact.lattice.solids.solid import DEVIATORIC, Indices, Solid, strain_matrix
+from tkamb.contact.lattice.solids.solid import DEVIATORIC, CellSolid, strain_matrix
 from tkamb.contact.materials import Material
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 
 _VALUES, _VECTORS = np.linalg.eigh(DEVIATORIC)
 _ROOT = (_VECTORS * np.sqrt(np.maximum(_VALUES, 0))).T[_VALUES > 1e-12]
 """(5, 6) with rootᵀ root = the form 2 dev eps : dev eps."""
 
 
-class BbarHexahedra(Solid):
+class BbarHexahedra(CellSolid):
     """Mean-dilatation hexahedra, small strain, J2 deformation theory at the Gauss points.
 
     At each point e² = (2/3) dev eps : dev eps and 3 mu_s = q(e)/e; the bulk stays elastic.
@@ -32,9 +31,7 @@ class BbarHexahedra(Solid):
         InputError: the Jacobian is not positive at a Gauss point.
     """
 
-    def __init__(
-        self, nodes: Array, cells: NDArray[np.int64], spacing: Array, material: Material
-    ) -> None:
+    def __init__(self, nodes: Array, cells: Index, spacing: Array, material: Material) -> None:
         super().__init__(nodes, cells, spacing, material)
         gradients, self.weights = gauss_gradients(self.shapes)
         if not (self.weights > 0).all():
@@ -44,21 +41,12 @@ class BbarHexahedra(Solid):
         self.dilatation = mean.reshape(-1, 24)
         self.curve = ShearCurve.of(material)
 
-    @cached_property
-    def stiffness(self) -> sparse.csr_matrix:
-        """Linear stiffness (3n, 3n), N/m."""
-        return self.pattern.assemble(self.shape_stiffness(), self.shape_of_cell)
-
     def shape_stiffness(self) -> Array:
         """Return the linear stiffness of each shape (s, 24, 24), N/m."""
         shear = np.einsum("sg,sgri,sgrj->sij", self.weights, self.shear, self.shear, optimize=True)
-        return self.material.shear_modulus * shear + self._bulk
+        return self.material.shear_modulus * shear + self.bulk
 
-    def linear_force(self, displacement: Array) -> Array:
-        """Return K u, N, (n, 3); see `Solid`."""
-        return self._cells_force(self.shape_stiffness(), displacement)
-
-    def nonlinear_residual(self, displacement: Array, chosen: Indices | None = None) -> Array:
+    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return the Gauss points' (mu - mu_s) times unit shear forces, N, (k, 24)."""
         strain, equivalent = self._state(displacement, chosen)
         softened = self.material.shear_modulus - self.curve.modulus(equivalent)
@@ -71,7 +59,7 @@ class BbarHexahedra(Solid):
         strain, equivalent = self._state(displacement)
         shape = self.shape_of_cell
         secant, softening = self.curve.modulus(equivalent), self.curve.softening(equivalent)
-        matrices = self._bulk[shape]
+        matrices = self.bulk[shape]
         for point in range(8):
             weight, shear = self.weights[shape, point], self.shear[shape, point]
             matrices += (weight * secant[:, point])[:, None, None] * (
@@ -83,31 +71,20 @@ class BbarHexahedra(Solid):
         return self.pattern.assemble(matrices)
 
     @cached_property
-    def _bulk(self) -> Array:
-        g = self.dilatation
-        scale = self.material.bulk_modulus * self.volume
-        return scale[:, None, None] * g[:, :, None] * g[:, None, :]
-
-    @cached_property
-    def _others(self) -> tuple[Array, Array, Indices]:
-        """Shear matrices (40, 24) of the commonest shape and of other cells, and their places.
-
-        Of the latter, -1 for a cell of the commonest shape.
-        """
+    def _others(self) -> tuple[Array, Array]:
+        """Shear matrices (40, 24) of the commonest shape and of the cells of other shapes."""
         common, others = self.kinds
-        place = np.full(len(self.cells), -1)
-        place[others] = np.arange(len(others))
         flat = self.shear.reshape(-1, 40, 24)
-        return flat[common], flat[self.shape_of_cell[others]], place
+        return flat[common], flat[self.shape_of_cell[others]]
 
-    def _sorted(self, chosen: Indices | None) -> tuple[Array, Indices, Array]:
+    def _sorted(self, chosen: Index | None) -> tuple[Array, Index, Array]:
         """Return the common matrix, which of the chosen cells are others, and their matrices."""
-        matrix, matrices, place = self._others
-        place = place if chosen is None else place[chosen]
-        others = np.flatnonzero(place >= 0)
-        return matrix, others, matrices if chosen is None else matrices[place[others]]
+        matrix, matrices = self._others
+        index = self.index_among_others if chosen is None else self.index_among_others[chosen]
+        others = np.flatnonzero(index >= 0)
+        return matrix, others, matrices if chosen is None else matrices[index[others]]
 
-    def _state(self, displacement: Array, chosen: Indices | None = None) -> tuple[Array, Array]:
+    def _state(self, displacement: Array, chosen: Index | None = None) -> tuple[Array, Array]:
         """Return scaled deviatoric strain (k, 8, 5) and equivalent strain (k, 8)."""
         local = self.scatter.gather(displacement, chosen)
         matrix, others, matrices = self._sorted(chosen)
@@ -116,7 +93,7 @@ class BbarHexahedra(Solid):
         strain = flat.reshape(-1, 8, 5)
         return strain, np.sqrt(np.einsum("cgr,cgr->cg", strain, strain) / 3)
 
-    def _per_cell_forces(self, stress: Array, chosen: Indices | None) -> Array:
+    def _per_cell_forces(self, stress: Array, chosen: Index | None) -> Array:
         """Return (k, 24) from weighted scaled stresses (k, 8, 5)."""
         flat = stress.reshape(-1, 40)
         matrix, others, matrices = self._sorted(chosen)

@@ -6,14 +6,11 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.meshing.cells import group_shapes, mean_gradient
 from tkamb.contact.materials import Material
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array
-
-Indices = NDArray[np.int64]
+from tkamb.geometry.frames import Array, Index
 
 DEVIATORIC = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 DEVIATORIC[:3, :3] -= 2 / 3
@@ -30,12 +27,12 @@ class Pattern:
         slot: (c, p²) block of each ordered node pair of each element of p nodes.
     """
 
-    indptr: Indices
-    indices: Indices
-    slot: Indices
+    indptr: Index
+    indices: Index
+    slot: Index
 
     @classmethod
-    def of(cls, elements: Indices, nodes: int) -> "Pattern":
+    def of(cls, elements: Index, nodes: int) -> "Pattern":
         """Return the pattern of elements (c, p) on so many nodes."""
         count = elements.shape[1]
         rows = np.repeat(elements, count, axis=1).ravel().astype(np.int64)
@@ -49,7 +46,7 @@ class Pattern:
         """How many nodes."""
         return len(self.indptr) - 1
 
-    def assemble(self, matrices: Array, shape: Indices | None = None) -> sparse.csr_matrix:
+    def assemble(self, matrices: Array, shape: Index | None = None) -> sparse.csr_matrix:
         """Return the sum (3n, 3n) of the elements' matrices.
 
         Args:
@@ -78,15 +75,15 @@ class Scatter:
         nodes: how many nodes.
     """
 
-    elements: Indices
+    elements: Index
     nodes: int
 
-    def gather(self, displacement: Array, chosen: Indices | None = None) -> Array:
+    def gather(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return (k, 3p) of the chosen elements, by default of all, from nodal (n, 3)."""
         elements = self.elements if chosen is None else self.elements[chosen]
         return displacement[elements].reshape(len(elements), 3 * elements.shape[1])
 
-    def sum(self, forces: Array, chosen: Indices | None = None) -> Array:
+    def sum(self, forces: Array, chosen: Index | None = None) -> Array:
         """Return nodal (n, 3) from (k, 3p) of the chosen elements, by default of all."""
         flat = (self.elements if chosen is None else self.elements[chosen]).ravel()
         parts = forces.reshape(-1, 3)
@@ -109,7 +106,7 @@ class Solid(ABC):
         InputError: a cell is turned inside out.
     """
 
-    def __init__(self, nodes: Array, cells: Indices, spacing: Array, material: Material) -> None:
+    def __init__(self, nodes: Array, cells: Index, spacing: Array, material: Material) -> None:
         self.nodes, self.cells, self.spacing, self.material = nodes, cells, spacing, material
         self.shapes, self.shape_of_cell = group_shapes(nodes[cells])
         _, volume = mean_gradient(self.shapes)
@@ -132,7 +129,7 @@ class Solid(ABC):
         """Linear stiffness (3n, 3n), N/m."""
 
     @abstractmethod
-    def nonlinear_residual(self, displacement: Array, chosen: Indices | None = None) -> Array:
+    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return linear forces minus the material's own, N, of elements of `scatter` (k, 3p).
 
         Args:
@@ -159,14 +156,6 @@ class Solid(ABC):
     def linear_force(self, displacement: Array) -> Array:
         """Return K u, N, (n, 3), summed element by element: no matrix is assembled."""
 
-    def _cells_force(self, matrices: Array, displacement: Array) -> Array:
-        """Return K u, N, (n, 3), from the stiffness of each shape (s, 24, 24)."""
-        local = self.scatter.gather(displacement)
-        common, others = self.kinds
-        force = local @ matrices[common]
-        force[others] = np.einsum("cij,cj->ci", matrices[self.shape_of_cell[others]], local[others])
-        return self.scatter.sum(force)
-
     def least_principal_strain(self, displacement: Array) -> float:
         """Return the smallest principal strain of the cells' mean gradients.
 
@@ -190,7 +179,7 @@ class Solid(ABC):
         return (gradient + np.swapaxes(gradient, 1, 2)) / 2
 
     @cached_property
-    def _mean_gradients(self) -> tuple[Array, Indices, Array]:
+    def _mean_gradients(self) -> tuple[Array, Index, Array]:
         """Mean gradients of the commonest shape as (24, 9), the other cells, theirs (8, 3, k)."""
         gradients, (common, others) = mean_gradient(self.shapes)[0], self.kinds
         matrix = np.einsum("nb,ac->ncab", gradients[common], np.eye(3)).reshape(24, 9)
@@ -198,10 +187,53 @@ class Solid(ABC):
         return matrix, others, np.ascontiguousarray(theirs.transpose(1, 2, 0))
 
     @cached_property
-    def kinds(self) -> tuple[int, Indices]:
+    def kinds(self) -> tuple[int, Index]:
         """The commonest shape, and the cells (k,) of all others."""
         common = int(np.bincount(self.shape_of_cell).argmax())
         return common, np.flatnonzero(self.shape_of_cell != common)
+
+
+class CellSolid(Solid):
+    """A solid whose cells are a shear part and an elastic bulk K V g gᵀ, shape by shape.
+
+    Attributes:
+        dilatation: (s, 24) g, 1/m: the mean dilatation of a cell is g · u.
+        volume: (s,) V, m³.
+    """
+
+    dilatation: Array
+    volume: Array
+
+    @abstractmethod
+    def shape_stiffness(self) -> Array:
+        """Return the linear stiffness of each shape (s, 24, 24), N/m."""
+
+    @cached_property
+    def stiffness(self) -> sparse.csr_matrix:
+        """Linear stiffness (3n, 3n), N/m."""
+        return self.pattern.assemble(self.shape_stiffness(), self.shape_of_cell)
+
+    def linear_force(self, displacement: Array) -> Array:
+        """Return K u, N, (n, 3); see `Solid`."""
+        matrices, local = self.shape_stiffness(), self.scatter.gather(displacement)
+        common, others = self.kinds
+        force = local @ matrices[common]
+        force[others] = np.einsum("cij,cj->ci", matrices[self.shape_of_cell[others]], local[others])
+        return self.scatter.sum(force)
+
+    @cached_property
+    def bulk(self) -> Array:
+        """K V g gᵀ of each shape (s, 24, 24), N/m."""
+        g, scale = self.dilatation, self.material.bulk_modulus * self.volume
+        return scale[:, None, None] * g[:, :, None] * g[:, None, :]
+
+    @cached_property
+    def index_among_others(self) -> Index:
+        """Index (c,) of each cell among those that are not of the commonest shape, or -1."""
+        others = self.kinds[1]
+        index = np.full(len(self.cells), -1)
+        index[others] = np.arange(len(others))
+        return index
 
 
 def strain_matrix(gradients: Array) -> Array:

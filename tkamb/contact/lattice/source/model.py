@@ -24,13 +24,13 @@ from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.linear.operator import prepare_operator
 from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.lattice.model import CellContact
-from tkamb.contact.lattice.problem import ContactProblem, Direction, Indices, Mask, TangentPlanes
+from tkamb.contact.lattice.problem import ContactProblem, Direction, TangentPlanes
 from tkamb.contact.lattice.report import PressureRule
 from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.contact.lattice.solver import SlidingNodes, Solution, Tolerance
 from tkamb.contact.lattice.source.springs import SourceNetwork
 from tkamb.contact.materials import LinearElastic, Material
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index, Mask
 
 MOST_LOOPS = 60
 MOST_STEPS = 30
@@ -161,7 +161,7 @@ def _next_active(
 
 def _press(
     problem: ContactProblem,
-    nodes: Indices,
+    nodes: Index,
     points: Array,
     planes: TangentPlanes,
     active: Mask,
@@ -200,7 +200,7 @@ def _press(
     return _Pressed(everywhere, u, slope, residual)
 
 
-def _slope(problem: ContactProblem, held: Mask, chosen: Indices) -> float:
+def _slope(problem: ContactProblem, held: Mask, chosen: Index) -> float:
     """Return the reaction (N) to a unit dummy displacement of the chosen unknowns, per metre."""
     dummy = np.zeros(len(held))
     dummy[chosen] = -1.0
@@ -209,7 +209,7 @@ def _slope(problem: ContactProblem, held: Mask, chosen: Indices) -> float:
 
 
 def _balance(
-    problem: ContactProblem, u: Array, held: Mask, chosen: Indices
+    problem: ContactProblem, u: Array, held: Mask, chosen: Index
 ) -> tuple[Array, float, Array]:
     """Return the forces on the chosen unknowns, the relative imbalance and internal forces."""
     internal = problem.solid.internal_force(u).ravel()
@@ -232,7 +232,7 @@ def _solution(
     forces: ContactForces,
     planes: TangentPlanes,
     pressed: _Pressed,
-    nodes: Indices,
+    nodes: Index,
     loops: int,
     missed: float,
     done: bool,

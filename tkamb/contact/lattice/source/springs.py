@@ -17,12 +17,11 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.meshing.cells import DIRECTIONS
 from tkamb.contact.lattice.solids.solid import Pattern, Scatter, Solid
 from tkamb.contact.materials import Material
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 
 VERTICAL = 1
 """Row of the superior-inferior direction in [xx, yy, zz, 2xy, 2yz, 2zx]."""
@@ -52,10 +51,10 @@ class SourceNetwork(Solid):
     def __init__(
         self,
         nodes: Array,
-        cells: NDArray[np.int64],
+        cells: Index,
         spacing: Array,
         material: Material,
-        springs: NDArray[np.int64],
+        springs: Index,
     ) -> None:
         super().__init__(nodes, cells, spacing, material)
         self.springs = springs
@@ -78,9 +77,7 @@ class SourceNetwork(Solid):
         pull = (self.material.young_modulus * self.factor * longer)[:, None] * straight
         return self.scatter.sum(np.hstack([-pull, pull]))
 
-    def nonlinear_residual(
-        self, displacement: Array, chosen: NDArray[np.int64] | None = None
-    ) -> Array:
+    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return linear forces minus those of the springs as they lie, N, (k, 6)."""
         springs = slice(None) if chosen is None else chosen
         strain, direction = self._state(displacement, springs)
@@ -112,7 +109,7 @@ class SourceNetwork(Solid):
         return self._spring_pattern.assemble(matrices)
 
     def _state(
-        self, displacement: Array, springs: NDArray[np.int64] | slice = slice(None)
+        self, displacement: Array, springs: Index | slice = slice(None)
     ) -> tuple[Array, Array]:
         """Return strain (k,) and unit direction (k, 3) of springs as they lie."""
         a, b = self.springs[springs].T
