@@ -34,6 +34,7 @@ DRAWING = {
     "designs": {"contact", "geometry"},
     "wear": {"contact", "geometry", "inputs", "output", "results_folder", "run", "scene"}
     | {"simulation"},
+    "uncertainty": {*KNEE, "columns", "results", "results_folder", "run", "simulation"},
     "validation": {"contact", "designs", "geometry", "simulation", "studies"},
 }
 """Which folder knows which folders and which modules beside them: inputs → body → (equilibrium ⇄

@@ -18,6 +18,7 @@ from tkamb.importing.command import add_import
 from tkamb.mesh_command import add_contact, add_mesh, add_no_cache, add_press, without_cache
 from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
+from tkamb.uncertainty.command import add_uncertainty
 from tkamb.view.command import add_view
 from tkamb.wear.command import add_wear
 
@@ -74,6 +75,7 @@ def _parser() -> argparse.ArgumentParser:
     add_tradeoff(commands)
     add_stability(commands)
     add_wear(commands)
+    add_uncertainty(commands, _slice, _setting)
     return parser
 
 

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 CSV_NAME, SUMMARY_NAME, REPORT_NAME = "results.csv", "summary.json", "report.html"
 MAPS_NAME = "contact.h5"
+BANDS_NAME, TORNADO_NAME, SAMPLES_NAME = "bands.csv", "tornado.csv", "samples.h5"
+UNCERTAINTY_NAMES = (BANDS_NAME, TORNADO_NAME, SAMPLES_NAME)
+"""Stand beside the results that they belong to, and go with them."""
 SUMMARY_LIMIT = 256 * MEGABYTE
 """Bytes of a summary: a line for every failed frame."""
 
@@ -76,7 +79,7 @@ def differences(directory: Path, summary: Mapping[str, Any]) -> list[str]:
         return []
     if summary.get("summary_sha256") != _summary_hash(summary):
         messages.append(f"{SUMMARY_NAME} has changed since it was written")
-    for name in (CSV_NAME, MAPS_NAME):
+    for name in (CSV_NAME, MAPS_NAME, *UNCERTAINTY_NAMES):
         there = (directory / name).exists()
         if there and name not in recorded:
             messages.append(f"{name} does not belong to these results")
@@ -87,7 +90,13 @@ def differences(directory: Path, summary: Mapping[str, Any]) -> list[str]:
     return messages
 
 
-def write_results(results: Results, directory: str | Path, *, force: bool = False) -> None:
+def write_results(
+    results: Results,
+    directory: str | Path,
+    *,
+    force: bool = False,
+    more: Mapping[str, Callable[[Path], object]] | None = None,
+) -> None:
     """Write results.csv, summary.json, contact.h5 and report.html: all of them or none.
 
     Without maps, a contact.h5 of an earlier run in that folder is removed, since it would pass
@@ -97,6 +106,7 @@ def write_results(results: Results, directory: str | Path, *, force: bool = Fals
         results: what to write.
         directory: the folder; made if it is not there.
         force: write even into a folder that holds things that are not tkamb's.
+        more: of `UNCERTAINTY_NAMES`, what writes the file at a path; those left out are removed.
 
     Raises:
         InputError: the folder cannot be claimed (`tkamb.claim`) or written.
@@ -107,17 +117,20 @@ def write_results(results: Results, directory: str | Path, *, force: bool = Fals
     with claimed_directory(directory, force) as folder:
         with replaced_together(folder) as files:
             _put_maps(results.maps, files)
+            for name, write in (more or {}).items():
+                write(files.path(name))
             put_numbers(results, files)
             write_synced(files.path(REPORT_NAME), report_html(results))
         remove_shards(folder)
 
 
 def put_numbers(results: Results, files: Replacement) -> None:
-    """Write results.csv and summary.json with what becomes results.csv's and contact.h5's SHA-256.
+    """Write results.csv and summary.json with the SHA-256 of the files that stand beside it.
 
     Args:
         results: what to write.
-        files: among which a new contact.h5 is already; else the one in place is kept.
+        files: among which a new contact.h5 is already, else the one in place is kept; so are
+            the bands of these results, else those in place are removed.
     """
     write_synced(files.path(CSV_NAME), csv_text(results.columns))
     recorded = {CSV_NAME: sha256_of(files.path(CSV_NAME))}
@@ -125,6 +138,11 @@ def put_numbers(results: Results, files: Replacement) -> None:
         files.remove(MAPS_NAME)
     else:
         recorded[MAPS_NAME] = sha256_of(files.current(MAPS_NAME))
+    for name in UNCERTAINTY_NAMES:
+        if files.current(name) == files.folder / name:  # of an earlier run
+            files.remove(name)
+        else:
+            recorded[name] = sha256_of(files.current(name))
     summary = _plain(results.summary) | {"files": recorded}
     summary["summary_sha256"] = _summary_hash(summary)
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)

@@ -65,7 +65,7 @@ def simulate(
         scene_path, scene = scene, load_scene(scene)
     start = clock.perf_counter()
     case = load_case(_with_contact(scene, contact, resolution_mm))
-    indices = _chosen(frames, len(case.motion.time))
+    indices = chosen_frames(frames, len(case.motion.time))
     identity = run_identity(case, indices)
     if directory is None and resume:
         raise InputError("there is no folder to go on in", "resume", "give a directory")
@@ -191,7 +191,7 @@ def _with_contact(scene: Scene, model: str | None, resolution_mm: float | None) 
     return scene.model_copy(update={"contact": scene.contact.model_copy(update=changes)})
 
 
-def _chosen(frames: slice | None, count: int) -> range:
+def chosen_frames(frames: slice | None, count: int) -> range:
     """Return the frames of a slice; its ends must lie inside the motion."""
     if frames is None:
         return range(count)

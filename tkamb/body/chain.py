@@ -4,6 +4,7 @@ The root is always free (a free-flyer), so that the measured ground reaction ent
 load; an ankle joint in the URDF is locked, its motion is the root's.
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -65,6 +66,26 @@ class Chain:
         base = model.getJointId(KNEE_JOINT_NAMES[0])
         self._insert_in_root = model.jointPlacements[base].homogeneous
         self._tibia_in_root = model.frames[self.frame_id("tibia")].placement.homogeneous
+
+    def changed(self, mass_factor: float, insert_shift: Array) -> "Chain":
+        """Return the chain with other masses, and the insert elsewhere on the tibia.
+
+        Args:
+            mass_factor: of every segment's mass; its inertia changes alike.
+            insert_shift: (3,) m, in the insert's axes; the femur goes with the insert.
+        """
+        other, model = copy.copy(self), pin.Model(self.model)
+        for joint in range(1, model.njoints):
+            inertia = model.inertias[joint]
+            model.inertias[joint] = pin.Inertia(
+                mass_factor * inertia.mass, inertia.lever, mass_factor * inertia.inertia
+            )
+        base = model.getJointId(KNEE_JOINT_NAMES[0])
+        placement = model.jointPlacements[base]
+        model.jointPlacements[base] = placement * pin.SE3(np.eye(3), insert_shift)
+        other.model = model
+        other._insert_in_root = model.jointPlacements[base].homogeneous
+        return other
 
     def frame_id(self, link: str) -> int:
         """Return Pinocchio's id of a link's frame, or raise InputError naming the links."""

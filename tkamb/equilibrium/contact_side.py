@@ -65,9 +65,14 @@ class ContactSide:
     Args:
         case: a case with [contact].
         mechanics: its body side.
+        state: what the model's `prepare` returned for these surfaces, if there is one already.
+        sensitivity: whether each frame tells how its split changes with the adduction, which
+            takes one more press.
     """
 
-    def __init__(self, case: Case, mechanics: Mechanics) -> None:
+    def __init__(
+        self, case: Case, mechanics: Mechanics, state: Any = None, sensitivity: bool = True
+    ) -> None:
         table = case.scene.contact
         insert = case.scene.implant.insert
         assert table is not None and insert is not None
@@ -76,9 +81,10 @@ class ContactSide:
         self.model = contact_model(table.model, table.resolution_mm, **table.options)
         pair = ContactPair(case.femoral, case.insert, material(table.material), insert.bearing)
         start = clock.perf_counter()
-        self.state = self.model.prepare(pair)
+        self.state = self.model.prepare(pair) if state is None else state
         self.prepare_seconds = clock.perf_counter() - start
 
+        self._sensitivity = sensitivity and "adduction" not in table.released
         self.released = None
         if table.released:
             from tkamb.equilibrium.released import ReleasedKnee
@@ -99,7 +105,7 @@ class ContactSide:
             body, contact = self._release(self.released, k, before)
         if contact.result is None or body.loads.problems or self.case.split is None:
             return body, contact
-        if "adduction" in self.table.released:
+        if not self._sensitivity:
             return body, contact
         start = clock.perf_counter()
         sensitivity = split_sensitivity(self.model, self.state, contact.result)

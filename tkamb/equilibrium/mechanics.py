@@ -63,6 +63,7 @@ class Mechanics:
 
     Args:
         case: the scene with its files read.
+        query: of closest points between the case's two surfaces, if there is one already.
 
     Attributes:
         poses: (f, 4, 4) recorded pose_femur_in_insert.
@@ -72,11 +73,11 @@ class Mechanics:
         strains: bundle -> strain at the flexions of `STRAIN_FLEXIONS`; NaN if not recorded.
     """
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: Case, query: "ClosestPointQuery | None" = None) -> None:
         self.case = case
         self.poses = knee_pose(case.motion.coordinates)
         self.friction = case.scene.contact.friction if case.scene.contact else 0.0
-        self.query = _contact_query(case)
+        self.query = query or _contact_query(case)
         self._check_near()
         self.extensor = None
         if case.scene.patella:

@@ -30,6 +30,7 @@ from tkamb.scene.tables import (
     SceneTable,
     TibiaTable,
 )
+from tkamb.scene.uncertainty import UncertaintyTable
 
 
 class Scene(SceneTable):
@@ -55,6 +56,7 @@ class Scene(SceneTable):
     patella: PatellaTable | None = None
     contact: ContactTable | None = None
     output: OutputTable = OutputTable()
+    uncertainty: UncertaintyTable | None = None
 
     @model_validator(mode="after")
     def _belongs_together(self) -> Self:

@@ -1,0 +1,79 @@
+"""The scene's table [uncertainty]: by how much each input errs, as a standard deviation.
+
+Every key is one standard deviation of a normal distribution in the key's unit; those called
+relative are of a positive factor of mean 1 (lognormal). Zero: that input does not vary.
+"""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from tkamb.scene.tables import Count, Number, SceneTable
+
+Length = Annotated[Number, Field(ge=0, le=50)]
+Angle = Annotated[Number, Field(ge=0, le=20)]
+Share = Annotated[Number, Field(ge=0, le=1)]
+
+_FLUOROSCOPY = "of the recorded pose; default: single-plane fluoroscopy, Mahfouz et al. 2003"
+_GIVE = "; no default: give what your laboratory knows"
+
+
+class UncertaintyTable(SceneTable):
+    """By how much the inputs err, for `tkamb uncertainty`; each key is a standard deviation.
+
+    A pose error is one offset per sample plus noise per frame; all other errors are one draw per
+    sample. Inputs are independent of each other.
+    """
+
+    seed: Count = Field(1, ge=0, description="of all draws; the same seed gives the same samples")
+    ap_mm: Length = Field(0.473, description=_FLUOROSCOPY)
+    si_mm: Length = Field(0.449, description="likewise")
+    ml_mm: Length = Field(3.031, description="likewise: out of the image plane")
+    axial_rotation_deg: Angle = Field(0.771, description="likewise")
+    adduction_deg: Angle = Field(0.942, description="likewise")
+    flexion_deg: Angle = Field(0.841, description="likewise")
+    constant_share: Annotated[Number, Field(ge=0, le=1)] = Field(
+        0.5,
+        description="share of a pose error's variance that is the same in all frames; the rest "
+        "is noise per frame. An assumption, without a source",
+    )
+    correlation_s: Annotated[Number, Field(ge=0, le=100)] = Field(
+        0.1,
+        description="correlation time of that noise: AR(1) with exp(-dt/correlation_s); 0 is "
+        "white. An assumption, without a source",
+    )
+    ground_reaction: Share = Field(0.0, description="relative, force and free moment" + _GIVE)
+    centre_of_pressure_ap_mm: Length = Field(
+        3.0, description="laboratory x; default: Exell et al. 2012, 3 ± 2 mm"
+    )
+    centre_of_pressure_ml_mm: Length = Field(3.0, description="laboratory z; likewise")
+    segment_mass: Share = Field(0.0, description="relative, all segments together" + _GIVE)
+    ligament_stiffness: Share = Field(0.0, description="relative, each bundle by itself" + _GIVE)
+    ligament_strain: Annotated[Number, Field(ge=0, le=0.1)] = Field(
+        0.0,
+        description="of each bundle by itself: added to its reference strain, or by which its "
+        "slack length is divided: L0/(1 + e)" + _GIVE,
+    )
+    friction: Annotated[Number, Field(ge=0, le=0.5)] = Field(
+        0.017,
+        description="of the coefficient, which stays at or above 0; default: as wide as a "
+        "uniform distribution over 0.039 to 0.099, measured for CoCr on UHMWPE",
+    )
+    young_modulus: Share = Field(
+        0.0,
+        description="relative, of the insert; each sample then prepares its contact anew" + _GIVE,
+    )
+    femoral_placement_mm: Length = Field(
+        0.0,
+        description="AP, SI and ML each: the femur's ligament and muscle attachments against the "
+        "femoral component" + _GIVE,
+    )
+    insert_placement_mm: Length = Field(
+        0.0, description="AP, SI and ML each: the insert on the tibia" + _GIVE
+    )
+    tuberosity_mm: Length = Field(
+        0.0, description="AP, SI and ML each: the patellar ligament's distal end" + _GIVE
+    )
+    dome_mm: Length = Field(
+        0.0, description="AP and SI each: a recorded patella on the femur" + _GIVE
+    )

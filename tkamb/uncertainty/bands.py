@@ -1,0 +1,127 @@
+"""From samples to bands and to which input moves what."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tkamb.geometry.frames import SIDES, Array
+
+PERCENTILES = {"p05": 5.0, "p50": 50.0, "p95": 95.0}
+FEWEST = 20
+"""Numbers below which a 5th percentile is not even between the two smallest of them."""
+MOST_FAILED = 0.5
+"""Share of samples: where more fail, the rest says too little."""
+SAMPLES_PER_INPUT = 3
+"""Fewer per input leave a regression undetermined: its shares would be those of chance."""
+
+
+def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Array]:
+    """Return p05, p50 and p95 over samples, each of the shape of one sample.
+
+    Of the samples that have a number (linear between order statistics); NaN where fewer than
+    `FEWEST` have one, or where more than `MOST_FAILED` of all failed.
+
+    Args:
+        values: (n, ...) NaN where a sample has no number.
+        failed: (n, ...) of the last axes of `values`, which samples failed; None: none.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # nothing but NaN, hidden below
+        found = np.nanpercentile(values, list(PERCENTILES.values()), axis=0)
+    hidden = np.isfinite(values).sum(axis=0) < FEWEST
+    if failed is not None:
+        hidden = hidden | (failed.mean(axis=0) > MOST_FAILED)
+    found[:, hidden] = np.nan
+    return dict(zip(PERCENTILES, found, strict=True))
+
+
+def band_columns(
+    time: Array, names: Sequence[str], values: Array, failed: np.ndarray
+) -> dict[str, Array]:
+    """Return the columns of bands.csv, one entry per frame.
+
+    Args:
+        time: (f,) s.
+        names: (m,) columns of results.csv.
+        values: (n, m, f) of each sample.
+        failed: (n, f) which frames of which samples failed.
+    """
+    columns = {"time_s": time, "failed_share": failed.mean(axis=0)}
+    solved = np.maximum((~failed).sum(axis=0), 1)
+    for side in SIDES:
+        if f"{side}_force_N" in names:
+            force = values[:, list(names).index(f"{side}_force_N")]
+            columns[f"{side}_unloaded_share"] = (force == 0.0).sum(axis=0) / solved
+    for index, name in enumerate(names):
+        for ending, found in percentiles(values[:, index], failed).items():
+            columns[f"{name}_{ending}"] = found
+    return columns
+
+
+@dataclass(frozen=True)
+class Influence:
+    """What one input does to one result.
+
+    Args:
+        result: column of results.csv.
+        name: of the input; "rest" for what no straight line through the inputs explains.
+        share: of the result's variance over samples, all frames together.
+        change: of the result per standard deviation of the input, where the result's median is
+            largest; NaN for the rest.
+    """
+
+    result: str
+    name: str
+    share: float
+    change: float
+
+
+def influences(
+    results: Sequence[str], inputs: Sequence[str], values: Array, errors: Array
+) -> list[Influence]:
+    """Return the tornado table: each input's share in each result's variance, largest first.
+
+    Standardised regression: at each frame y = a + sum_i b_i x_i + e by least squares, x_i the
+    errors in standard deviations. With independent inputs b_i² var(x_i) is the input's share of
+    var(y); shares and variances are summed over the frames. What is left, 1 - sum of shares, is
+    the rest: kinks, interactions and chance. Empty with fewer than `SAMPLES_PER_INPUT` samples
+    per input.
+
+    Args:
+        results: (m,) names.
+        inputs: (d,) names.
+        values: (n, m, f) NaN where a sample has no number.
+        errors: (n, f, d) in standard deviations.
+    """
+    found: list[Influence] = []
+    for index, result in enumerate(results):
+        of_frames = [_regression(values[:, index, k], errors[:, k]) for k in range(errors.shape[1])]
+        frames = [(k, *one) for k, one in enumerate(of_frames) if one is not None]
+        total = sum(variance for _, _, _, variance in frames)
+        if not frames or not total > 0:
+            continue
+        explained = np.sum([parts for _, _, parts, _ in frames], axis=0) / total
+        medians = [np.nanmedian(values[:, index, k]) for k, *_ in frames]
+        slopes = frames[int(np.argmax(medians))][1]
+        rows = [
+            Influence(result, name, float(share), float(slope))
+            for name, share, slope in zip(inputs, explained, slopes, strict=True)
+        ]
+        rows.sort(key=lambda one: -one.share)
+        found += [*rows, Influence(result, "rest", float(1.0 - explained.sum()), float("nan"))]
+    return found
+
+
+def _regression(y: Array, errors: Array) -> tuple[Array, Array, float] | None:
+    """Return slopes (d,), the variance that each explains (d,), and y's; None: too few."""
+    there = np.isfinite(y)
+    if there.sum() < max(FEWEST, SAMPLES_PER_INPUT * errors.shape[1]):
+        return None
+    y, x = y[there], errors[there]
+    variance = float(y.var())
+    centred: Any = x - x.mean(axis=0)
+    slopes, *_ = np.linalg.lstsq(centred, y - y.mean(), rcond=None)
+    return slopes, slopes**2 * x.var(axis=0), variance

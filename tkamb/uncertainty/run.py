@@ -1,0 +1,205 @@
+"""All samples of a scene: over worker processes, kept as they are finished, then made bands."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tkamb.claim import claimed_directory
+from tkamb.columns import KINDS
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.results import Results
+from tkamb.run.shards import Shard, Shards
+from tkamb.scene import Scene, load_scene
+from tkamb.scene.case import Case, load_case
+from tkamb.simulation import chosen_frames, simulate
+from tkamb.uncertainty.bands import FEWEST, Influence, band_columns, influences
+from tkamb.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
+from tkamb.uncertainty.kept import write_uncertainty
+from tkamb.uncertainty.sample import Sample
+from tkamb.uncertainty.sampling import normal_samples
+from tkamb.uncertainty.workers import Progress, finished_samples
+
+SAMPLES = 256
+MOST_SAMPLES, MOST_WORKERS = 100_000, 256
+TORNADO_RESULTS = (
+    *("force_total_N", "medial_force_N", "lateral_force_N", "medial_share_equilibrium"),
+    *("medial_peak_pressure_MPa", "lateral_peak_pressure_MPa", "quadriceps_N"),
+)
+NO_BAND = (
+    *("time_s", "cycle_percent", "iterations", "coupling_iterations", "coupling_change_N"),
+    *("coupling_change_mm", "contact_trials", "split_determined", "condition_number"),
+    *("medial_force_per_adduction_N_per_deg", "adjust_restored"),
+)
+"""What is no result of the knee, or is not computed for a sample."""
+NOT_SAMPLED = ("_seconds", "_slip_mm", "_velocity_mm_per_s")
+"""Endings: computing time, and what adds up over frames that a sample does not compute."""
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """What `estimate_uncertainty` found.
+
+    Args:
+        results: of the scene as it stands; its summary says what varied.
+        bands: columns of bands.csv.
+        tornado: which input moves what.
+        names: columns of results.csv that have a band.
+        inputs: those that varied.
+        samples: in the order of their numbers.
+    """
+
+    results: Results
+    bands: dict[str, Array]
+    tornado: list[Influence]
+    names: list[str]
+    inputs: tuple[VariedInput, ...]
+    samples: list[Sample]
+
+
+def estimate_uncertainty(
+    scene: Scene | str | Path,
+    *,
+    samples: int = SAMPLES,
+    workers: int = 1,
+    method: str = "lhs",
+    frames: slice | None = None,
+    directory: str | Path | None = None,
+    scene_path: str | Path | None = None,
+    resume: bool = False,
+    force: bool = False,
+    progress: Progress = lambda samples, count: samples,
+) -> Uncertainty:
+    """Vary the inputs of a scene as its table [uncertainty] says and return bands.
+
+    The same numbers whatever the number of workers; more samples keep the earlier ones.
+
+    Args:
+        scene: a scene, or the path of its file.
+        samples: how many, at least 20.
+        workers: processes; 1 computes in this one.
+        method: "lhs" or "sobol", see `tkamb.uncertainty.sampling`.
+        frames: which frames; default all.
+        directory: folder for all results; None keeps them in memory.
+        scene_path: where the scene came from, for the summary.
+        resume: go on with the samples that an interrupted run left in the folder.
+        force: write into the folder even if it holds things that are not tkamb's.
+        progress: wraps the samples as they come.
+
+    Raises:
+        InputError: bad input, another run to resume, or a folder that cannot be claimed.
+        ComputationError: a worker ended before its sample.
+        KeyboardInterrupt: what is finished is kept in the folder.
+    """
+    if isinstance(scene, str | Path):
+        scene_path, scene = scene, load_scene(scene)
+    _check_numbers(samples, workers)
+    if directory is None and resume:
+        raise InputError("there is no folder to go on in", "resume", "give a directory")
+    case = load_case(scene)
+    chosen = chosen_frames(frames, len(case.motion.time))
+    inputs = varied_inputs(case)
+    normal = normal_samples(method, samples, len(inputs), uncertainty_of(case).seed)
+    nominal = simulate(scene, frames=frames, scene_path=scene_path)
+    job = _Job(case, chosen, nominal, inputs, normal, method, workers, progress)
+    if directory is None:
+        return job.run(None)
+    with claimed_directory(directory, force) as folder:
+        identity = nominal.summary["identity"] | {"method of sampling": method}
+        found = job.run(Shards(folder, identity, resume))
+        write_uncertainty(
+            found.results, found.bands, found.tornado, found.names, inputs, found.samples, folder
+        )
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """The samples of one scene."""
+
+    case: Case
+    frames: range
+    nominal: Results
+    inputs: tuple[VariedInput, ...]
+    normal: Array
+    method: str
+    workers: int
+    progress: Progress
+
+    def run(self, shards: Shards | None) -> Uncertainty:
+        """Compute the samples that are not there yet and return all with their bands."""
+        names = banded_names(self.nominal)
+        count = len(self.normal)
+        done = _kept(shards, count)
+        left = [n for n in range(count) if n not in done]
+        arguments = (self.case.scene, self.frames, names)
+        new = finished_samples(arguments, [(n, self.normal[n]) for n in left], self.workers)
+        try:
+            for number, sample in self.progress(new, len(left)):
+                done[number] = sample
+                if shards is not None:
+                    shards.put(number, Shard({}, vars(sample)))
+        except KeyboardInterrupt:
+            if shards is None or not done:
+                raise
+            kept = f"{len(done)} of {count} samples are kept; go on with --resume"
+            raise KeyboardInterrupt(kept) from None
+        return self._found(names, [done[n] for n in range(count)])
+
+    def _found(self, names: list[str], samples: list[Sample]) -> Uncertainty:
+        values = np.array([one.values for one in samples])
+        failed = np.array([one.failed for one in samples])
+        errors = np.array([one.errors for one in samples])
+        bands = band_columns(self.nominal["time_s"], names, values, failed)
+        wanted = [name for name in TORNADO_RESULTS if name in names]
+        rows = [names.index(name) for name in wanted]
+        input_names = [one.name for one in self.inputs]
+        tornado = influences(wanted, input_names, values[:, rows], errors)
+        self.nominal.summary["uncertainty"] = self._summary(failed)
+        return Uncertainty(self.nominal, bands, tornado, names, self.inputs, samples)
+
+    def _summary(self, failed: np.ndarray) -> dict[str, Any]:
+        return {
+            "samples": len(failed),
+            "method": self.method,
+            "table": uncertainty_of(self.case).model_dump(mode="json"),
+            "varied": [one.name for one in self.inputs],
+            "not_varied": held_inputs(self.case),
+            "failed_share": float(failed.mean()),
+            "largest_failed_share": float(failed.mean(axis=0).max()),
+        }
+
+
+def banded_names(results: Results) -> list[str]:
+    """Return the columns that get a band: numbers that the scene models and a sample computes."""
+    return [
+        name
+        for name in results.columns
+        if KINDS.get(name) != "text"
+        and name not in (*NO_BAND, *results.not_modelled)
+        and not name.endswith(NOT_SAMPLED)
+    ]
+
+
+def _kept(shards: Shards | None, count: int) -> dict[int, Sample]:
+    """Return the samples that an earlier run left."""
+    found: dict[int, Sample] = {}
+    for number in range(count) if shards is not None and shards.resumed else ():
+        shard = shards.get(number) if shards is not None else None
+        if shard is not None and shard.contact is not None:
+            found[number] = Sample(**shard.contact)
+    return found
+
+
+def _check_numbers(samples: int, workers: int) -> None:
+    """Raise where there are too few or too many of either."""
+    wanted: Mapping[str, tuple[int, int, int]] = {
+        "--samples": (samples, FEWEST, MOST_SAMPLES),
+        "--workers": (workers, 1, MOST_WORKERS),
+    }
+    for option, (given, least, most) in wanted.items():
+        if not least <= given <= most:
+            raise InputError(f"{given} is not within {least} to {most}", option)

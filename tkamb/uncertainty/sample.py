@@ -1,0 +1,155 @@
+"""One sample of a scene: the varied case through body and contact, its results as one array.
+
+Meshes, their search trees and the prepared contact are those of the scene as it stands: no
+input that varies changes them, but the insert's modulus, for which the contact is prepared anew.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from tkamb.equilibrium.contact_side import ContactSide
+from tkamb.equilibrium.frame_contact import FrameContact
+from tkamb.equilibrium.mechanics import Mechanics
+from tkamb.errors import TkambError
+from tkamb.geometry.frames import Array
+from tkamb.run.status import FAILED, frame_status
+from tkamb.run.tabulate import frame_row
+from tkamb.scene import Scene
+from tkamb.scene.case import Case, load_case
+from tkamb.uncertainty.inputs import (
+    Draw,
+    VariedInput,
+    pose_names,
+    thinnable,
+    thinned,
+    uncertainty_of,
+    varied_case,
+    varied_inputs,
+)
+from tkamb.uncertainty.sampling import noise
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """What one sample gives.
+
+    Args:
+        values: (names, frames) in the order asked for; NaN where a frame failed or has no number.
+        failed: (frames,) whether the frame failed.
+        errors: (frames, d) the inputs' errors in their standard deviations.
+    """
+
+    values: Array
+    failed: np.ndarray
+    errors: Array
+
+
+class Sampler:
+    """Computes samples of one scene.
+
+    Args:
+        scene: the scene.
+        frames: of the motion.
+        names: columns of results.csv that are wanted.
+
+    Attributes:
+        case: as it stands.
+        inputs: that vary.
+    """
+
+    def __init__(self, scene: Scene, frames: range, names: Sequence[str]) -> None:
+        whole = load_case(scene)
+        self._time = whole.motion.time
+        self._chosen, self._names = frames, list(names)
+        self.case, self._frames = (
+            (thinned(whole, frames), range(len(frames))) if thinnable(whole) else (whole, frames)
+        )
+        self.inputs: tuple[VariedInput, ...] = varied_inputs(self.case)
+        self._split = self.case.split
+
+    @cached_property
+    def _mechanics(self) -> Mechanics:
+        return Mechanics(self.case)
+
+    @cached_property
+    def _side(self) -> ContactSide | None:
+        return ContactSide(self.case, self._mechanics) if self.case.scene.contact else None
+
+    def draw(self, number: int, normal: Array) -> Draw:
+        """Return what the sample of a number makes of the inputs.
+
+        Args:
+            number: of the sample.
+            normal: (d,) its standard normal inputs.
+        """
+        table = uncertainty_of(self.case)
+        count = len(pose_names(self.inputs))
+        # on the whole recording's clock: the same whichever frames are asked for
+        per_frame = noise(number, self._time, count, table.correlation_s, table.seed)
+        if len(self.case.motion.time) < len(self._time):
+            per_frame = per_frame[list(self._chosen)]
+        return Draw(self.inputs, normal, per_frame, table.constant_share)
+
+    def sample(self, number: int, normal: Array) -> Sample:
+        """Return the sample; a frame begins its search at the frame before of the same sample.
+
+        Args:
+            number: of the sample.
+            normal: (d,) its standard normal inputs.
+        """
+        draw = self.draw(number, normal)
+        errors = draw.standardised()[list(self._frames)]
+        values = np.full((len(self._names), len(self._frames)), np.nan)
+        failed = np.ones(len(self._frames), bool)
+        try:
+            case = self._varied(draw)
+            mechanics = Mechanics(case, self._mechanics.query)
+            side = self._contact(case, mechanics, draw)
+        except TkambError:  # the moved inputs cannot be used: no frame has a number
+            return Sample(values, failed, errors)
+        before: list[FrameContact] = []
+        for column, k in enumerate(self._frames):
+            row = _frame(case, mechanics, side, k, before)
+            failed[column] = row["status"].startswith(FAILED)
+            if not failed[column]:
+                values[:, column] = [row.get(name, np.nan) for name in self._names]
+        return Sample(values, failed, errors)
+
+    def _varied(self, draw: Draw) -> Case:
+        case = varied_case(self.case, draw)
+        case.__dict__["split"] = self._split  # of the same femoral component: found once
+        return case
+
+    def _contact(self, case: Case, mechanics: Mechanics, draw: Draw) -> ContactSide | None:
+        """Return the contact side, with the contact that is prepared already where it serves."""
+        if self._side is None:
+            return None
+        factor = draw.factor("young_modulus")
+        state = self._side.state
+        if factor != 1.0:
+            material = state.pair.material
+            stiffer = replace(material, young_modulus=material.young_modulus * factor)
+            state = self._side.model.prepare(replace(state.pair, material=stiffer))
+        return ContactSide(case, mechanics, state, sensitivity=False)
+
+
+def _frame(
+    case: Case,
+    mechanics: Mechanics,
+    side: ContactSide | None,
+    k: int,
+    before: list[FrameContact],
+) -> dict[str, Any]:
+    """Return the row of results.csv of frame k; its contact joins those before it."""
+    contact = None
+    if side is None:
+        body = mechanics.frame(k)
+    else:
+        body, contact = side.frame(k, before)
+        before.append(contact)
+        del before[:-2]
+    return frame_row(case, k, body, contact, {}, frame_status(case, k, body, contact))

@@ -1,0 +1,80 @@
+"""Samples of standard normal inputs, each found by its number alone.
+
+Sample number n is the same whatever the count of samples and whoever asks for it, so adding
+samples keeps the old ones and the order in which workers finish does not matter.
+"""
+
+from typing import Literal, get_args
+
+import numpy as np
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from tkamb.errors import InputError, names_near
+from tkamb.geometry.frames import Array
+
+Method = Literal["lhs", "sobol"]
+BLOCK = 64
+"""Samples of one Latin hypercube; the next ones make the next hypercube."""
+SMALLEST_TAIL = 1e-9
+"""Of a normal distribution: Sobol' points may be 0, whose quantile is not finite."""
+NOISE = 1
+"""Tells the seeds of the noise from those of the hypercubes."""
+
+
+def normal_samples(method: str, count: int, dimensions: int, seed: int) -> Array:
+    """Return samples (count, dimensions) of independent standard normal inputs.
+
+    "lhs": Latin hypercubes of 64 samples each, every one with a seed of its own. "sobol": one
+    scrambled Sobol' sequence. Both are mapped through the normal quantile.
+
+    Args:
+        method: "lhs" or "sobol".
+        count: of samples, at least 1.
+        dimensions: inputs.
+        seed: of all draws.
+
+    Raises:
+        InputError: unknown method, or no samples.
+    """
+    if count < 1:
+        raise InputError(f"{count} is no number of samples", "--samples", "give at least 1")
+    if method == "sobol":
+        # random_base2 draws whole powers of two, for which the sequence is balanced
+        uniform = qmc.Sobol(dimensions, seed=seed).random_base2((count - 1).bit_length())
+    elif method == "lhs":
+        uniform = np.concatenate(
+            [
+                qmc.LatinHypercube(dimensions, seed=np.random.default_rng([seed, 0, block])).random(
+                    BLOCK
+                )
+                for block in range(-(-count // BLOCK))
+            ]
+        )
+    else:
+        raise InputError(
+            f"unknown method '{method}'", "--method", names_near(method, get_args(Method))
+        )
+    return ndtri(np.clip(uniform[:count], SMALLEST_TAIL, 1.0 - SMALLEST_TAIL))
+
+
+def noise(number: int, time: Array, dimensions: int, correlation_time: float, seed: int) -> Array:
+    """Return AR(1) noise (f, dimensions) of unit variance, that of one sample.
+
+    x_0 = e_0, x_k = rho_k x_{k-1} + sqrt(1 - rho_k²) e_k, rho_k = exp(-(t_k - t_{k-1})/tau):
+    stationary whatever the steps in time.
+
+    Args:
+        number: of the sample.
+        time: (f,) s, rising.
+        dimensions: independent series.
+        correlation_time: tau, s; 0: white.
+        seed: of all draws.
+    """
+    draws = np.random.default_rng([seed, NOISE, number]).standard_normal((len(time), dimensions))
+    if correlation_time == 0.0:
+        return draws
+    rho = np.exp(-np.diff(time) / correlation_time)
+    for k in range(1, len(time)):
+        draws[k] = rho[k - 1] * draws[k - 1] + np.sqrt(1.0 - rho[k - 1] ** 2) * draws[k]
+    return draws
