@@ -1,0 +1,215 @@
+"""Bands: known propagation, samples by number alone, and the case with its inputs moved."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tkamb.cli import main
+from tkamb.results_folder import BANDS_NAME, UNCERTAINTY_NAMES, write_results
+from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
+from tkamb.simulation import simulate
+from tkamb.uncertainty.bands import band_columns, influences, percentiles
+from tkamb.uncertainty.inputs import Draw
+from tkamb.uncertainty.run import estimate_uncertainty
+from tkamb.uncertainty.sample import Sampler
+from tkamb.uncertainty.sampling import noise, normal_samples
+
+SCENE = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
+SLOPES = np.array([3.0, -2.0, 1.0, 0.5])
+LINEAR_SD = float(np.linalg.norm(SLOPES))
+Z95 = 1.6448536269514722
+
+
+def knee(**more):
+    """Return the shipped knee on a coarse foundation."""
+    coarse = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
+    return load_scene(SCENE, coarse | {key.replace("__", "."): v for key, v in more.items()})
+
+
+def bodies_alone(**more):
+    """Return it without contact, muscles and patella: no mesh is read."""
+    parts = ("contact", "quadriceps", "patellar_ligament", "patella")
+    return knee(**more).model_copy(update=dict.fromkeys(parts))
+
+
+@pytest.mark.parametrize("method", ["lhs", "sobol"])
+def test_a_linear_map_of_gaussian_inputs_has_its_known_distribution(method):
+    count = 1024
+    y = 10.0 + normal_samples(method, count, len(SLOPES), seed=3) @ SLOPES
+    assert y.mean() == pytest.approx(10.0, abs=3 * LINEAR_SD / np.sqrt(count))
+    assert y.std() == pytest.approx(LINEAR_SD, rel=3 / np.sqrt(2 * count))
+    found = percentiles(y)
+    # standard error of a quantile: sqrt(p (1 - p) / n) / density there
+    error = np.sqrt(0.05 * 0.95 / count) / (np.exp(-0.5 * Z95**2) / np.sqrt(2 * np.pi))
+    assert found["p05"] == pytest.approx(10.0 - Z95 * LINEAR_SD, abs=3 * error * LINEAR_SD)
+    assert found["p50"] == pytest.approx(10.0, abs=3 * 1.2533 * LINEAR_SD / np.sqrt(count))
+    assert found["p95"] == pytest.approx(10.0 + Z95 * LINEAR_SD, abs=3 * error * LINEAR_SD)
+
+
+def test_the_90_percent_band_covers_the_truth_in_85_to_95_percent_of_trials():
+    rng, covered = np.random.default_rng(0), 0
+    for trial in range(200):
+        recorded = rng.standard_normal(len(SLOPES))  # of a truth whose inputs are all 0
+        y = (recorded + normal_samples("lhs", 256, len(SLOPES), seed=trial)) @ SLOPES
+        band = percentiles(y)
+        covered += band["p05"] <= 0.0 <= band["p95"]
+    assert 0.85 <= covered / 200 <= 0.95
+
+
+def test_shares_of_a_linear_map_are_its_squared_slopes_and_noise_is_the_rest():
+    rng = np.random.default_rng(1)
+    x = normal_samples("lhs", 2048, len(SLOPES), seed=1)
+    y = x @ SLOPES + 2.0 * rng.standard_normal(len(x))
+    found = influences(["y"], list("abcd"), y[:, None, None], x[:, None, :])
+    shares = {one.name: one.share for one in found}
+    total = LINEAR_SD**2 + 4.0
+    for name, slope in zip("abcd", SLOPES, strict=True):
+        assert shares[name] == pytest.approx(slope**2 / total, abs=0.03)
+    assert shares["rest"] == pytest.approx(4.0 / total, abs=0.03)
+    assert [one.name for one in found] == ["a", "b", "c", "d", "rest"]
+    assert found[1].change == pytest.approx(-2.0, abs=0.15)
+
+
+@pytest.mark.parametrize("method", ["lhs", "sobol"])
+def test_more_samples_keep_the_earlier_ones(method):
+    many = normal_samples(method, 300, 5, seed=7)
+    np.testing.assert_array_equal(normal_samples(method, 70, 5, seed=7), many[:70])
+    assert not np.array_equal(normal_samples(method, 70, 5, seed=8), many[:70])
+
+
+def test_the_noise_is_stationary_with_its_correlation_time():
+    time, tau = np.array([0.0, 0.05, 0.30]), 0.1
+    x = np.array([noise(n, time, 2, tau, seed=1) for n in range(4000)])
+    np.testing.assert_allclose(x.var(axis=0), 1.0, atol=0.1)
+    for first, second in ((0, 1), (1, 2)):
+        rho = np.exp(-(time[second] - time[first]) / tau)
+        assert np.mean(x[:, first] * x[:, second]) == pytest.approx(rho, abs=0.04)
+    assert np.mean(x[:, :, 0] * x[:, :, 1]) == pytest.approx(0.0, abs=0.04)
+    np.testing.assert_array_equal(noise(5, time, 2, tau, seed=1), x[5])
+
+
+def test_a_frame_that_failed_in_most_samples_has_no_band_and_others_say_how_many_failed():
+    values = np.tile(np.arange(100.0)[:, None, None], (1, 1, 2))
+    failed = np.zeros((100, 2), bool)
+    failed[:60, 0] = failed[:10, 1] = True
+    values[failed[:, None, :]] = np.nan
+    found = band_columns(np.arange(2.0), ["force_total_N"], values, failed)
+    np.testing.assert_allclose(found["failed_share"], [0.6, 0.1])
+    assert np.isnan(found["force_total_N_p50"][0])
+    assert found["force_total_N_p50"][1] == pytest.approx(54.5)  # of 10 to 99
+
+
+def draw_of(sampler, **normal):
+    """Return a draw that moves the named inputs alone, by so many standard deviations."""
+    names = [one.name for one in sampler.inputs]
+    values = np.zeros(len(names))
+    for name, value in normal.items():
+        values[names.index(name.replace("__", "."))] = value
+    frames = len(sampler.case.motion.time)
+    return Draw(sampler.inputs, values, np.zeros((frames, 6)), 1.0)
+
+
+def sampled(sampler, monkeypatch, **normal):
+    """Return the values of the sample that moves these inputs."""
+    monkeypatch.setattr(sampler, "draw", lambda number, z: draw_of(sampler, **normal))
+    return sampler.sample(0, np.zeros(0)).values
+
+
+def test_a_sample_is_the_run_of_the_scene_with_its_inputs_moved(monkeypatch):
+    names = ["force_total_N", "medial_force_N", "ligament_LCL_N", "quadriceps_N"]
+    table = {"uncertainty__ligament_strain": 0.02, "uncertainty__tuberosity_mm": 2.0}
+    scene, frames = knee(**table), slice(0, 61, 60)
+    sampler = Sampler(scene, range(0, 61, 60), names)
+    nominal = simulate(scene, frames=frames)
+    still = sampled(sampler, monkeypatch)
+    np.testing.assert_allclose(still, [nominal[name] for name in names], rtol=1e-12)
+
+    moved = {"ligament_strain__LCL": 2.0, "tuberosity__ap": -1.0, "friction": 1.0}
+    bundles = tuple(
+        one.model_copy(update={"slack_length_mm": one.slack_length_mm / 1.04})
+        if one.name == "LCL"
+        else one
+        for one in scene.ligament
+    )
+    assert scene.patellar_ligament is not None and scene.contact is not None
+    x, y, z = scene.patellar_ligament.distal.point_mm
+    distal = scene.patellar_ligament.distal.model_copy(update={"point_mm": (x - 2.0, y, z)})
+    by_hand = scene.model_copy(
+        update={
+            "ligament": bundles,
+            "patellar_ligament": scene.patellar_ligament.model_copy(update={"distal": distal}),
+            "contact": scene.contact.model_copy(update={"friction": 0.05 + 0.017}),
+        }
+    )
+    expected = simulate(by_hand, frames=frames)
+    found = sampled(sampler, monkeypatch, **moved)
+    np.testing.assert_allclose(found, [expected[name] for name in names], rtol=1e-9)
+    assert np.abs(found - still).max() > 1.0
+
+
+def test_the_chain_with_other_masses_and_another_insert():
+    chain, shift = load_case(bodies_alone()).chain, np.array([1e-3, 2e-3, -3e-3])
+    other = chain.changed(1.5, shift)
+    for link in ("tibia", "femur"):
+        (mass, centre, inertia), (more, there, turning) = chain.segment(link), other.segment(link)
+        assert more == pytest.approx(1.5 * mass)
+        np.testing.assert_allclose(turning, 1.5 * inertia)
+        np.testing.assert_allclose(there, centre)
+    turn = chain.insert_in_tibia[:3, :3]
+    np.testing.assert_allclose(
+        other.insert_in_tibia[:3, 3], chain.insert_in_tibia[:3, 3] + turn @ shift
+    )
+
+
+def test_interrupted_and_resumed_by_two_workers_it_is_what_one_worker_finds(tmp_path):
+    scene = bodies_alone(uncertainty__ligament_strain=0.02, uncertainty__segment_mass=0.1)
+    folder, options = tmp_path / "out", {"samples": 40, "frames": slice(0, 101, 25)}
+
+    def break_off(samples, count):
+        for index, one in enumerate(samples):
+            if index == 4:
+                raise KeyboardInterrupt
+            yield one
+
+    with pytest.raises(KeyboardInterrupt, match="4 of 40 samples are kept"):
+        estimate_uncertainty(scene, **options, directory=folder, progress=break_off)
+    assert not (folder / BANDS_NAME).exists()
+    one = estimate_uncertainty(scene, **options)
+    two = estimate_uncertainty(scene, **options, directory=folder, resume=True, workers=2)
+    for name, band in one.bands.items():
+        np.testing.assert_array_equal(band, two.bands[name])
+    for mine, other in zip(one.samples, two.samples, strict=True):
+        np.testing.assert_array_equal(mine.values, other.values)
+        np.testing.assert_array_equal(mine.errors, other.errors)
+    assert main(["verify", str(folder)]) == 0
+    write_results(one.results, folder)  # another run: its bands go
+    assert not any((folder / name).exists() for name in UNCERTAINTY_NAMES)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--samples", "0"], "0 is not within 20"),
+        (["--workers", "0"], "0 is not within 1"),
+        (["--method", "dice"], "unknown method 'dice'"),
+        (["--set", "uncertainty.ap_mm=-1"], "greater than or equal to 0"),
+        (["--set", "uncertainty.ap=1"], "unknown key 'uncertainty.ap'"),
+        (["--frames", "500:600"], "not in the motion"),
+    ],
+)
+def test_bad_input_is_one_line_and_nothing_is_written(arguments, words, tmp_path, capsys):
+    folder = tmp_path / "out"
+    assert main(["uncertainty", str(SCENE), "--out", str(folder), *arguments]) == 2
+    said = capsys.readouterr().err.strip()
+    assert words in said and "\n" not in said
+    assert not folder.exists()
+
+
+def test_a_scene_in_which_nothing_varies_is_refused():
+    none = [f"uncertainty__{key}" for key in ("ap_mm", "si_mm", "ml_mm", "friction")]
+    none += [f"uncertainty__{key}_deg" for key in ("axial_rotation", "adduction", "flexion")]
+    none += [f"uncertainty__centre_of_pressure_{axis}_mm" for axis in ("ap", "ml")]
+    with pytest.raises(Exception, match="no input varies"):
+        estimate_uncertainty(bodies_alone(**dict.fromkeys(none, 0.0)), samples=20)
