@@ -22,7 +22,7 @@ class ModelSegment:
     Args:
         name: "shank", "thigh", "foot" or "pelvis".
         points: label in the recording -> (3,) m in the segment's link (shank, thigh) or body.
-        missing: markers of the model that the recording does not show, or that were left out.
+        missing: markers of the model that the recording does not show.
         joined_to: "shank" or "thigh" for a neighbour.
         joint: (3,) m, the ball joint in that segment's link.
         centre: (3,) m, the same in the neighbour's body.
@@ -89,19 +89,16 @@ def seen_segments(
         ("foot", (foot,), "shank", np.zeros(3), in_foot),
         ("pelvis", (leg.pelvis,), "thigh", links.hip, in_pelvis),
     ]
-    labels = [
-        label
-        for label in recorded_labels(recorded)
-        if np.isfinite(recorded.columns[f"{label}_x"]).any()
-    ]
-    dropped = matched_labels(without, recorded_labels(recorded))
+    there = recorded_labels(recorded)
+    dropped = matched_labels(without, there)
     if unknown := [name for name in without if name not in dropped]:
         raise InputError(
             f"holds no marker '{unknown[0]}', which is to be left out",
             recorded.path,
-            f"it has {', '.join(labels[:12])}, …",
+            f"it has {', '.join(there[:12])}, …",
         )
-    labels = [label for label in labels if label not in dropped.values()]
+    seen = [name for name in there if np.isfinite(recorded.columns[f"{name}_x"]).any()]
+    labels = [name for name in seen if name not in dropped.values()]
     found = {}
     for name, bodies, joined_to, joint, centre in wanted:
         own = {m.name: m for m in leg.model.markers.values() if m.body in bodies}
@@ -113,7 +110,8 @@ def seen_segments(
             for m in own
             if m in match
         }
-        missing = tuple(m for m in own if m not in match)
+        left_out = matched_labels(own, dropped.values())
+        missing = tuple(m for m in own if m not in match and m not in left_out)
         found[name] = ModelSegment(name, points, missing, joined_to, joint, centre)
     return found
 

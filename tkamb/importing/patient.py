@@ -163,7 +163,7 @@ def marker_lines(case: Case) -> tuple[str, ...]:
     """Return how well the markers fit, by both readings, and how far the knee centres are apart."""
     found = case.motion.markers
     if found is None:
-        rms = case.tibia.residual
+        rms = case.tibia.residual if case.tibia else None
         if rms is None:
             return ()
         return (

@@ -1,6 +1,7 @@
 """A trial: markers or coordinates, which way the subject faces, which plates bear the foot."""
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -63,7 +64,7 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
     markers = MarkerFile(
         request.recording, seen.axes, tuple(segments), request.method, "hinge", interval, frames
     )
-    matched = [_segment_line(segment) for segment in segments]
+    matched = _segment_lines(segments, request.without)
     said = (*matched, _facing_line(request, seen), *stood, thinned)
     return Trial(ground, said, markers)
 
@@ -82,7 +83,7 @@ def from_poses(
     shank = shank_markers(links, segments, stance, request.recording, seen.axes)
     covered = replace(request, interval=(float(poses.time[0]), float(poses.time[-1])))
     ground, _, stood = _ground(covered, leg, recorded, seen.axes)
-    matched = [_segment_line(segment) for segment in segments.values()]
+    matched = _segment_lines(segments.values(), request.without)
     said = (*poses.said, *matched, _facing_line(request, seen), *shank.said, *stood)
     return Trial(ground, said, poses=poses, shank=shank)
 
@@ -122,9 +123,13 @@ def _facing_line(request: ImportRequest, seen: Facing) -> str:
     )
 
 
-def _segment_line(segment: ModelSegment) -> str:
-    missing = f"; not recorded: {', '.join(segment.missing)}" if segment.missing else ""
-    return f"markers of the {segment.name}: {', '.join(segment.points)}{missing}"
+def _segment_lines(segments: Iterable[ModelSegment], without: tuple[str, ...]) -> list[str]:
+    lines = []
+    for segment in segments:
+        missing = f"; not recorded: {', '.join(segment.missing)}" if segment.missing else ""
+        own = ", ".join(segment.points) or "none"
+        lines.append(f"markers of the {segment.name}: {own}{missing}")
+    return lines + ([f"markers left out, as given: {', '.join(without)}"] if without else [])
 
 
 def _ground(
