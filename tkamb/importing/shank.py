@@ -11,24 +11,8 @@ from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.importing.links import Links
 from tkamb.importing.markers import ModelSegment
 from tkamb.importing.toml_text import toml_markers, toml_mm, toml_text
+from tkamb.inputs.recordings import JointCentre
 from tkamb.units import MILLIMETRE
-
-
-@dataclass(frozen=True, eq=False)
-class CarriedCentre:
-    """A joint centre that a neighbour's markers carry: one more marker of the shank.
-
-    Args:
-        name: of the centre.
-        points: label -> (3,) m in the neighbour's body.
-        centre: (3,) m in the neighbour's body.
-        in_tibia: (3,) m in the tibia link.
-    """
-
-    name: str
-    points: dict[str, Array]
-    centre: Array
-    in_tibia: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +30,7 @@ class ShankMarkers:
     path: Path
     axes: str
     points: dict[str, Array]
-    centres: tuple[CarriedCentre, ...]
+    centres: tuple[JointCentre, ...]
     said: tuple[str, ...]
 
     def lines(self, path: str) -> list[str]:
@@ -55,9 +39,9 @@ class ShankMarkers:
         lines += [f'laboratory_axes = "{self.axes}"', f"markers_mm = {toml_markers(self.points)}"]
         for centre in self.centres:
             lines += ["", "[[tibia.joint_centre]]", f"name = {toml_text(centre.name)}"]
-            lines.append(f"markers_mm = {toml_markers(centre.points)}")
+            lines.append(f"markers_mm = {toml_markers(centre.markers)}")
             lines.append(f"centre_mm = {toml_mm(centre.centre)}")
-            lines.append(f"tibia_mm = {toml_mm(centre.in_tibia)}")
+            lines.append(f"tibia_mm = {toml_mm(centre.tibia)}")
         return lines
 
 
@@ -84,7 +68,7 @@ def shank_markers(
         InputError: fewer than three points.
     """
     points = segments["shank"].points
-    centres: list[CarriedCentre] = []
+    centres: list[JointCentre] = []
     said: list[str] = []
     if len(points) < 3:
         centres, said = _carried(links, segments, femur)
@@ -100,12 +84,12 @@ def shank_markers(
 
 def _carried(
     links: Links, segments: Mapping[str, ModelSegment], femur: Array
-) -> tuple[list[CarriedCentre], list[str]]:
+) -> tuple[list[JointCentre], list[str]]:
     """Return the joint centres that foot and thigh carry, and lines on them."""
     foot, thigh, leg = segments["foot"], segments["thigh"], links.leg
     centres, said = [], []
     if len(foot.points) >= 3 and foot.centre is not None:
-        centres.append(CarriedCentre("ankle_centre", foot.points, foot.centre, np.zeros(3)))
+        centres.append(JointCentre("ankle_centre", foot.points, foot.centre, np.zeros(3)))
         said.append(f"shank: its ankle centre is carried by the foot's {len(foot.points)} markers")
     if len(thigh.points) >= 3:
         own = {name: transform(links.femur, point) for name, point in thigh.points.items()}
@@ -113,7 +97,7 @@ def _carried(
         places = transform(femur, centre)
         mean = places.mean(axis=0)
         apart = np.sqrt(((places - mean) ** 2).sum(axis=1).mean()) / MILLIMETRE
-        centres.append(CarriedCentre("knee_centre", own, centre, mean))
+        centres.append(JointCentre("knee_centre", own, centre, mean))
         said.append(
             f"shank: its knee centre is carried by the thigh's {len(own)} markers, at the mean of "
             f"{len(places)} recorded poses ({apart:.1f} mm rms about it)"
