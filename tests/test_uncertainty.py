@@ -24,7 +24,7 @@ Z95 = 1.6448536269514722
 
 def knee(**more):
     """Return the shipped knee on a coarse foundation."""
-    coarse = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
+    coarse = {"contact.model": "foundation", "contact.resolution_mm": 4.0}
     return load_scene(SCENE, coarse | {key.replace("__", "."): v for key, v in more.items()})
 
 
@@ -120,8 +120,8 @@ def sampled(sampler, monkeypatch, **normal):
 def test_a_sample_is_the_run_of_the_scene_with_its_inputs_moved(monkeypatch):
     names = ["force_total_N", "medial_force_N", "ligament_LCL_N", "quadriceps_N"]
     table = {"uncertainty__ligament_strain": 0.02, "uncertainty__tuberosity_mm": 2.0}
-    scene, frames = knee(**table), slice(0, 61, 60)
-    sampler = Sampler(scene, range(0, 61, 60), names)
+    scene, frames = knee(**table), slice(60, 61)
+    sampler = Sampler(scene, range(60, 61), names)
     nominal = simulate(scene, frames=frames)
     still = sampled(sampler, monkeypatch)
     np.testing.assert_allclose(still, [nominal[name] for name in names], rtol=1e-12)
