@@ -70,6 +70,8 @@ def test_shares_of_a_linear_map_are_its_squared_slopes_and_noise_is_the_rest():
     assert shares["rest"] == pytest.approx(4.0 / total, abs=0.03)
     assert [one.name for one in found] == ["a", "b", "c", "d", "rest"]
     assert found[1].change == pytest.approx(-2.0, abs=0.15)
+    either_way = (x[:, 0] ** 2)[:, None, None]  # var(x²) = 2, all of it the first input's
+    assert influences(["y"], list("abcd"), either_way, x[:, None, :])[0].share > 0.999
 
 
 @pytest.mark.parametrize("method", ["lhs", "sobol"])

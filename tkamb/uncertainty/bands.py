@@ -14,7 +14,7 @@ FEWEST = 20
 """Numbers below which a 5th percentile is not even between the two smallest of them."""
 MOST_FAILED = 0.5
 """Share of samples: where more fail, the rest says too little."""
-SAMPLES_PER_INPUT = 3
+SAMPLES_PER_INPUT = 6
 """Fewer per input leave a regression undetermined: its shares would be those of chance."""
 
 
@@ -67,10 +67,10 @@ class Influence:
 
     Args:
         result: column of results.csv.
-        name: of the input; "rest" for what no straight line through the inputs explains.
+        name: of the input; "rest" for what no function of one input explains.
         share: of the result's variance over samples, all frames together.
-        change: of the result per standard deviation of the input, where the result's median is
-            largest; NaN for the rest.
+        change: of the result per standard deviation of the input, its linear part, where the
+            result's median is largest; NaN for the rest.
     """
 
     result: str
@@ -84,11 +84,12 @@ def influences(
 ) -> list[Influence]:
     """Return the tornado table: each input's share in each result's variance, largest first.
 
-    Standardised regression: at each frame y = a + sum_i b_i x_i + e by least squares, x_i the
-    errors in standard deviations. With independent inputs b_i² var(x_i) is the input's share of
-    var(y); shares and variances are summed over the frames. What is left, 1 - sum of shares, is
-    the rest: kinks, interactions and chance. Empty with fewer than `SAMPLES_PER_INPUT` samples
-    per input.
+    Regression: at each frame y = a + sum_i (b_i x_i + c_i x_i²) + e by least squares, x_i the
+    errors in standard deviations; the square is for what rises either way, as a force does up
+    either flank. x_i and x_i² of independent normal inputs are uncorrelated, so that
+    b_i² var(x_i) + c_i² var(x_i²) is the input's part of var(y); parts and variances are summed
+    over the frames. What is left is the rest: kinks, interactions and chance. Empty with fewer
+    than `SAMPLES_PER_INPUT` samples per input.
 
     Args:
         results: (m,) names.
@@ -117,11 +118,13 @@ def influences(
 
 def _regression(y: Array, errors: Array) -> tuple[Array, Array, float] | None:
     """Return slopes (d,), the variance that each explains (d,), and y's; None: too few."""
-    there = np.isfinite(y)
-    if there.sum() < max(FEWEST, SAMPLES_PER_INPUT * errors.shape[1]):
+    there, count = np.isfinite(y), errors.shape[1]
+    if there.sum() < max(FEWEST, SAMPLES_PER_INPUT * count):
         return None
     y, x = y[there], errors[there]
     variance = float(y.var())
-    centred: Any = x - x.mean(axis=0)
-    slopes, *_ = np.linalg.lstsq(centred, y - y.mean(), rcond=None)
-    return slopes, slopes**2 * x.var(axis=0), variance
+    terms: Any = np.hstack([x, x**2])
+    terms = terms - terms.mean(axis=0)
+    slopes, *_ = np.linalg.lstsq(terms, y - y.mean(), rcond=None)
+    parts = slopes**2 * terms.var(axis=0)
+    return slopes[:count], parts[:count] + parts[count:], variance

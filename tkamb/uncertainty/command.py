@@ -94,7 +94,7 @@ def headline(found: "Uncertainty") -> list[str]:
         rows = [row for row in found.tornado if row.result == result][:SHOWN]
         parts = ", ".join(f"{row.name} {row.share:.0%}" for row in rows if row.share >= 0.01)
         if parts:
-            lines.append(f"{result} varies by {parts} (shares of variance, linear regression)")
+            lines.append(f"{result} varies by {parts} (shares of variance, by regression)")
     return lines
 
 
@@ -114,5 +114,5 @@ def warnings_of(found: "Uncertainty") -> list[str]:
             "hold for the poses that are possible, see failed_share"
         )
     if not found.tornado:
-        lines.append("too few samples for tornado.csv: give 3 per input or more")
+        lines.append("too few samples for tornado.csv: give 6 per input or more")
     return lines
