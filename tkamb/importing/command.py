@@ -38,8 +38,19 @@ def add_import(commands: Any) -> None:
         help="mesh axes that point anterior, superior, right; write --mesh-axes=-x,+y,-z",
     )
     _add_poses(p)
+    _add_inferred(p)
     p.add_argument("--out", type=Path, required=True, metavar="DIR")
     p.add_argument("--scene", default="scene.toml", metavar="NAME", help="name of the scene file")
+    p.add_argument("--contact", choices=("foundation", "lattice"), default="foundation")
+    p.add_argument("--note", action="append", default=[], metavar="TEXT", help="for the report")
+    scale = p.add_mutually_exclusive_group()
+    scale.add_argument("--scale-mass", dest="scale", action="store_true", default=None)
+    scale.add_argument("--keep-mass", dest="scale", action="store_false", default=None)
+    p.set_defaults(command=_import)
+
+
+def _add_inferred(p: argparse.ArgumentParser) -> None:
+    """Add the options that stand instead of what is inferred."""
     p.add_argument("--knee", metavar="JOINT", help="the femorotibial joint of the model")
     p.add_argument("--plates", type=_numbers, metavar="2,3", help="under the foot")
     p.add_argument("--interval", type=_interval, metavar="A:B", help="s, part of the recording")
@@ -47,12 +58,6 @@ def add_import(commands: Any) -> None:
     p.add_argument("--without", type=_names, default=(), metavar="A,B", help="markers not used")
     p.add_argument("--method", choices=("segments", "chain"), default="segments")
     p.add_argument("--cutoff-hz", type=float, default=6.0, metavar="HZ")
-    p.add_argument("--contact", choices=("foundation", "lattice"), default="foundation")
-    p.add_argument("--note", action="append", default=[], metavar="TEXT", help="for the report")
-    scale = p.add_mutually_exclusive_group()
-    scale.add_argument("--scale-mass", dest="scale", action="store_true", default=None)
-    scale.add_argument("--keep-mass", dest="scale", action="store_false", default=None)
-    p.set_defaults(command=_import)
 
 
 def _add_poses(p: argparse.ArgumentParser) -> None:
@@ -120,6 +125,10 @@ def import_request(options: argparse.Namespace) -> "ImportRequest":
         raise InputError(f"{options.mass_kg:g} kg is no mass", "--mass-kg")
     if not options.cutoff_hz > 0:
         raise InputError(f"{options.cutoff_hz:g} Hz is no frequency", "--cutoff-hz")
+    if options.c3d and options.grf:
+        raise InputError("goes with --trc or --motion: a C3D file's plates are its own", "--grf")
+    if options.grf_force and not options.grf:
+        raise InputError("needs --grf", "--grf-force")
     return ImportRequest(
         options.model,
         options.side,

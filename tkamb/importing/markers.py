@@ -89,16 +89,7 @@ def seen_segments(
         ("foot", (foot,), "shank", np.zeros(3), in_foot),
         ("pelvis", (leg.pelvis,), "thigh", links.hip, in_pelvis),
     ]
-    there = recorded_labels(recorded)
-    dropped = matched_labels(without, there)
-    if unknown := [name for name in without if name not in dropped]:
-        raise InputError(
-            f"holds no marker '{unknown[0]}', which is to be left out",
-            recorded.path,
-            f"it has {', '.join(there[:12])}, …",
-        )
-    seen = [name for name in there if np.isfinite(recorded.columns[f"{name}_x"]).any()]
-    labels = [name for name in seen if name not in dropped.values()]
+    labels, dropped = _seen_labels(recorded, without)
     found = {}
     for name, bodies, joined_to, joint, centre in wanted:
         own = {m.name: m for m in leg.model.markers.values() if m.body in bodies}
@@ -110,10 +101,25 @@ def seen_segments(
             for m in own
             if m in match
         }
-        left_out = matched_labels(own, dropped.values())
+        left_out = matched_labels(own, dropped)
         missing = tuple(m for m in own if m not in match and m not in left_out)
         found[name] = ModelSegment(name, points, missing, joined_to, joint, centre)
     return found
+
+
+def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the labels of the markers that were ever seen, and those that are left out."""
+    there = recorded_labels(recorded)
+    dropped = matched_labels(without, there)
+    if unknown := [name for name in without if name not in dropped]:
+        raise InputError(
+            f"holds no marker '{unknown[0]}', which is to be left out",
+            recorded.path,
+            f"it has {', '.join(there[:12])}, …",
+        )
+    left_out = list(dropped.values())
+    seen = [name for name in there if np.isfinite(recorded.columns[f"{name}_x"]).any()]
+    return [name for name in seen if name not in left_out], left_out
 
 
 def segments_of(recording: Path, segments: list[ModelSegment]) -> list[ModelSegment]:

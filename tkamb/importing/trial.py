@@ -144,7 +144,9 @@ def _ground(
     recording = read_c3d(request.recording)
     if not recording.plates:
         raise InputError(
-            "holds no force plates", request.recording, "give the ground reaction with --grf"
+            "holds no force plates",
+            request.recording,
+            "give its markers with --trc and the ground reaction with --grf",
         )
     sides = feet(leg, recorded, OTHER[leg.side])
     if request.plates is not None:
