@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tkamb.body.contact_points import CondylePoint
-from tkamb.body.knee import solve_knee, unsolved
+from tkamb.body.knee import KneeGeometry, solve_knee, unsolved
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import within_insert
@@ -33,6 +33,7 @@ from tkamb.geometry.frames import Array, knee_pose
 from tkamb.scene.case import Case
 
 if TYPE_CHECKING:
+    from tkamb.body.crossing import MuscleShare
     from tkamb.equilibrium.released import KneeEquilibrium, ReleasedKnee
 
 from typing import Any
@@ -48,6 +49,8 @@ LOAD_CHANGE = 0.1
 POINT_CHANGE = 1e-6
 """m, of the centres of pressure between them."""
 MOST_ITERATIONS = 20
+MOST_SHARINGS = 12
+"""Turns in which muscles and a released knee come to agree."""
 ASTRAY = (BalanceStatus.OUT_OF_RANGE, BalanceStatus.NOT_CONVERGED)
 """Ends of a search that another start may mend."""
 FIRST_DEPTH = 5e-5
@@ -155,9 +158,8 @@ class ContactSide:
             load, points = body.loads.contact_force[1], _points(body)
             found = self._resultants(k, place, contact.result)
             geometry = replace(body.geometry, condyles=body.geometry.condyles | found)
-            body = replace(
-                body, geometry=geometry, loads=solve_knee(geometry, self.mechanics.friction)
-            )
+            geometry, loads = self.mechanics.solved(k, geometry)
+            body = replace(body, geometry=geometry, loads=loads)
             contact = self.carry(body, self.mechanics.poses[k], contact.result)
             seconds += contact.seconds
             change = abs(float(body.loads.contact_force[1] - load))
@@ -180,14 +182,66 @@ class ContactSide:
         self, released: "ReleasedKnee", k: int, before: Sequence[FrameContact]
     ) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact with the released coordinates at rest."""
-        start = clock.perf_counter()
         good = [contact for contact in before if contact.equilibrium and contact.result][-2:]
+        if self.mechanics.muscles is None:
+            return self._rest(released, k, good)
+        start, share = clock.perf_counter(), self._first_share(k, good)
+        for _ in range(MOST_SHARINGS):
+            if share.status != "ok":
+                problem = f"muscles: {share.status.removeprefix('failed: ')}"
+                break
+            body, contact = self._rest(released, k, good, share)
+            if body.loads.problems or contact.equilibrium is None:
+                return body, contact
+            last = share
+            share = self._share(k, body.geometry, body.loads.lifted)
+            if last.agrees(share):
+                seconds = clock.perf_counter() - start
+                return body, replace(contact, seconds=seconds)
+            good = [*good[-1:], contact]
+        else:
+            problem = "muscles and knee do not come to agree"
+        body = replace(self.mechanics.frame(k), loads=unsolved([problem]))
+        return body, self._nothing(problem)
+
+    def _first_share(self, k: int, good: Sequence[FrameContact]) -> "MuscleShare":
+        """Return the muscles' forces with contact where it was in the frame before."""
+        place, condyles = self.case.motion.coordinates[k].copy(), {}
+        if good and good[-1].equilibrium and good[-1].result:
+            assert self.released is not None
+            rows = list(self.released.released)
+            place[rows] = good[-1].equilibrium.coordinates[rows]
+            condyles = self._resultants(k, place, good[-1].result)
+        geometry = replace(self.mechanics.geometry(k, place), condyles=condyles)
+        lost = {"medial", "lateral"} - set(condyles) if condyles else set[str]()
+        return self._share(k, geometry, frozenset(lost))
+
+    def _share(self, k: int, geometry: KneeGeometry, lifted: frozenset[str]) -> "MuscleShare":
+        assert self.mechanics.muscles is not None
+        return self.mechanics.muscles.share(k, geometry, self.mechanics.friction, lifted)
+
+    def _rest(
+        self,
+        released: "ReleasedKnee",
+        k: int,
+        good: Sequence[FrameContact],
+        share: "MuscleShare | None" = None,
+    ) -> tuple[FrameLoads, FrameContact]:
+        """Return body and contact at rest under given muscle forces.
+
+        Args:
+            released: which coordinates are.
+            k: frame.
+            good: the last two contacts that were found, where the search begins.
+            share: the other muscles' forces.
+        """
+        start = clock.perf_counter()
         earlier, guess = (good[-1].equilibrium, good[-1].result) if good else (None, None)
         points = {} if len(released.released) == 5 else self._nearest_points(k)
         knee = None
         for place in self._starts(k, [c.equilibrium.coordinates for c in good if c.equilibrium]):
             if np.isfinite(place).all():
-                knee = released.find(k, place, points, earlier)
+                knee = released.find(k, place, points, earlier, share)
                 if knee.balance.status not in ASTRAY:
                     break
         if knee is None:
