@@ -66,4 +66,6 @@ def flexion_row(
     name = unknowns.muscle_load(geometry.extensor.muscles[0])
     change = system.response(geometry.state.generalised(groups))[system.names.index(name)]
     gains, slope = change[:-1], float(change[-1])
-    return FlexionRow(-system.solution.values[name] / slope, -1.0 / slope, np.asarray(gains / slope))
+    return FlexionRow(
+        -system.solution.values[name] / slope, -1.0 / slope, np.asarray(gains / slope)
+    )

@@ -205,16 +205,24 @@ class ContactSide:
         return body, self._nothing(problem)
 
     def _first_share(self, k: int, good: Sequence[FrameContact]) -> "MuscleShare":
-        """Return the muscles' forces with contact where it was in the frame before."""
+        """Return the muscles' forces with contact where it was in the frame before.
+
+        Without one, or where it makes the equations singular, the knee's forces pass through
+        the femoral origin. It is where the search begins, no more.
+        """
         place, condyles = self.case.motion.coordinates[k].copy(), {}
         if good and good[-1].equilibrium and good[-1].result:
             assert self.released is not None
             rows = list(self.released.released)
             place[rows] = good[-1].equilibrium.coordinates[rows]
             condyles = self._resultants(k, place, good[-1].result)
-        geometry = replace(self.mechanics.geometry(k, place), condyles=condyles)
-        lost = {"medial", "lateral"} - set(condyles) if condyles else set[str]()
-        return self._share(k, geometry, frozenset(lost))
+        geometry = self.mechanics.geometry(k, place)
+        if condyles:
+            lost = frozenset({"medial", "lateral"} - set(condyles))
+            share = self._share(k, replace(geometry, condyles=condyles), lost)
+            if share.status == "ok":
+                return share
+        return self._share(k, geometry, frozenset())
 
     def _share(self, k: int, geometry: KneeGeometry, lifted: frozenset[str]) -> "MuscleShare":
         assert self.mechanics.muscles is not None

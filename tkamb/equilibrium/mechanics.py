@@ -84,7 +84,11 @@ class Mechanics:
         if case.scene.patella:
             self.extensor = extensor_frames(case, self.poses)
         self.ligaments, self.strains = self._build_ligaments()
-        self.muscles = shared_muscles(case) if case.scene.muscles else None
+        self.muscles: SharedMuscles | None = None
+        if case.scene.muscles:
+            from tkamb.equilibrium.shared_muscles import load_muscles
+
+            self.muscles = load_muscles(case)
 
     def _check_near(self) -> None:
         """Raise where the condyles are nowhere near the insert, whatever the frame."""
@@ -312,13 +316,6 @@ def extensor_frames(case: Case, poses: Array) -> "ExtensorFrames":
         rates = (motion.patella_velocity, motion.patella_acceleration)
         recorded = np.stack([motion.patella, *rates], axis=1)
     return ExtensorFrames(parts, motion.time, poses, recorded, case.rates)
-
-
-def shared_muscles(case: Case) -> "SharedMuscles":
-    """Return the muscles of a case with [muscles]."""
-    from tkamb.equilibrium.shared_muscles import SharedMuscles
-
-    return SharedMuscles(case)
 
 
 def _contact_query(case: Case) -> "ClosestPointQuery | None":

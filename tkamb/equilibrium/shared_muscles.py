@@ -27,20 +27,14 @@ MOST_SHARINGS = 8
 
 
 class SharedMuscles:
-    """Shares the load of a case's frames among its muscles.
+    """Shares the load of frames among the muscles of a leg.
 
     Args:
-        case: a case with [muscles].
-        trial: the muscles over its frames; None: read from the scene's files.
-
-    Raises:
-        InputError: files that cannot be used, or a model that is not the URDF's.
+        trial: the muscles over the frames.
+        left: a left leg's, whose knee is computed as its mirror image.
     """
 
-    def __init__(self, case: Case, trial: KneeTrial | None = None) -> None:
-        if trial is None:
-            trial = _read(case)
-        left = case.scene.patient.side == "left"
+    def __init__(self, trial: KneeTrial, left: bool = False) -> None:
         flip = MIRROR if left else np.eye(3)
         self._trial, self._names = trial, trial.muscles
         self._shank, self._thigh = trial.shank @ flip, trial.thigh @ flip
@@ -118,11 +112,11 @@ class SharedMuscles:
         )
 
 
-def _read(case: Case) -> KneeTrial:
-    """Return the trial of the scene's files, checked against its URDF.
+def load_muscles(case: Case) -> SharedMuscles:
+    """Return the muscles of a case with [muscles], checked against its URDF.
 
     Raises:
-        InputError: see `SharedMuscles`.
+        InputError: files that cannot be used, or a model that is not the URDF's.
     """
     scene, table = case.scene, case.scene.muscles
     assert table is not None
@@ -153,7 +147,7 @@ def _read(case: Case) -> KneeTrial:
     )
     links, trial = load_knee_trial(source, case.motion.time)
     _check_links(case, links.insert_in_tibia, links.hip)
-    return trial
+    return SharedMuscles(trial, scene.patient.side == "left")
 
 
 def _check_links(case: Case, insert_in_tibia: Array, hip: Array) -> None:

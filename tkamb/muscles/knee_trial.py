@@ -126,9 +126,12 @@ def _crossing_lines(
     column = np.searchsorted(crossing, part.line)
     rows = np.arange(len(chosen))
     first = np.where(below[chosen, 0], 0, 1)  # which end lies below the knee
-    for side, end, bone, own in ((0, first, "tibia", links.tibia), (1, 1 - first, "femur", links.femur)):
+    for side, end, bone, own in (
+        (0, first, "tibia", links.tibia),
+        (1, 1 - first, "femur", links.femur),
+    ):
         here = bones.poses[part.frame, bones.index(bone)] @ own
-        ends[side, part.frame, column] = transform(
-            inverse(here), part.ends[rows, end][:, None]
-        )[:, 0]
+        ends[side, part.frame, column] = transform(inverse(here), part.ends[rows, end][:, None])[
+            :, 0
+        ]
     return crossing, ends[0], ends[1]
