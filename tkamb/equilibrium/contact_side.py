@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tkamb.body.contact_points import CondylePoint
-from tkamb.body.knee import KneeGeometry, solve_knee, unsolved
+from tkamb.body.knee import solve_knee, unsolved
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import within_insert
@@ -34,7 +34,7 @@ from tkamb.scene.case import Case
 
 if TYPE_CHECKING:
     from tkamb.body.crossing import MuscleShare
-    from tkamb.equilibrium.released import KneeEquilibrium, ReleasedKnee
+    from tkamb.equilibrium.released import KneeEquilibrium
 
 from typing import Any
 
@@ -49,8 +49,6 @@ LOAD_CHANGE = 0.1
 POINT_CHANGE = 1e-6
 """m, of the centres of pressure between them."""
 MOST_ITERATIONS = 20
-MOST_SHARINGS = 12
-"""Turns in which muscles and a released knee come to agree."""
 ASTRAY = (BalanceStatus.OUT_OF_RANGE, BalanceStatus.NOT_CONVERGED)
 """Ends of a search that another start may mend."""
 FIRST_DEPTH = 5e-5
@@ -99,7 +97,7 @@ class ContactSide:
         if self.released is None:
             body, contact = self._press_recorded(k, before)
         else:
-            body, contact = self._release(self.released, k, before)
+            body, contact = self._release(k, before)
         if contact.result is None or body.loads.problems or self.case.split is None:
             return body, contact
         if "adduction" in self.table.released:
@@ -133,9 +131,9 @@ class ContactSide:
         """
         load = float(body.loads.contact_force[1])
         if not np.isfinite(load):
-            return self._nothing("no load from the equations")
+            return self.nothing("no load from the equations")
         if load <= 0:
-            return self._nothing("no compressive load")
+            return self.nothing("no compressive load")
         start = clock.perf_counter()
         adjustment, query = body.adjustment, self.mechanics.query
         if adjustment is None or query is None:
@@ -156,7 +154,7 @@ class ContactSide:
             if contact.result is None:
                 return body, contact
             load, points = body.loads.contact_force[1], _points(body)
-            found = self._resultants(k, place, contact.result)
+            found = self.resultants(k, place, contact.result)
             geometry = replace(body.geometry, condyles=body.geometry.condyles | found)
             geometry, loads = self.mechanics.solved(k, geometry)
             body = replace(body, geometry=geometry, loads=loads)
@@ -178,72 +176,27 @@ class ContactSide:
             contact, result=None, problem=problem
         )
 
-    def _release(
-        self, released: "ReleasedKnee", k: int, before: Sequence[FrameContact]
-    ) -> tuple[FrameLoads, FrameContact]:
+    def _release(self, k: int, before: Sequence[FrameContact]) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact with the released coordinates at rest."""
         good = [contact for contact in before if contact.equilibrium and contact.result][-2:]
         if self.mechanics.muscles is None:
-            return self._rest(released, k, good)
-        start, share = clock.perf_counter(), self._first_share(k, good)
-        for _ in range(MOST_SHARINGS):
-            if share.status != "ok":
-                problem = f"muscles: {share.status.removeprefix('failed: ')}"
-                break
-            body, contact = self._rest(released, k, good, share)
-            if body.loads.problems or contact.equilibrium is None:
-                return body, contact
-            last = share
-            share = self._share(k, body.geometry, body.loads.lifted)
-            if last.agrees(share):
-                seconds = clock.perf_counter() - start
-                return body, replace(contact, seconds=seconds)
-            good = [*good[-1:], contact]
-        else:
-            problem = "muscles and knee do not come to agree"
-        body = replace(self.mechanics.frame(k), loads=unsolved([problem]))
-        return body, self._nothing(problem)
+            return self.rest(k, good)
+        from tkamb.equilibrium.muscles_at_rest import rest_with_muscles
 
-    def _first_share(self, k: int, good: Sequence[FrameContact]) -> "MuscleShare":
-        """Return the muscles' forces with contact where it was in the frame before.
+        return rest_with_muscles(self, self.mechanics.muscles, k, good)
 
-        Without one, or where it makes the equations singular, the knee's forces pass through
-        the femoral origin. It is where the search begins, no more.
-        """
-        place, condyles = self.case.motion.coordinates[k].copy(), {}
-        if good and good[-1].equilibrium and good[-1].result:
-            assert self.released is not None
-            rows = list(self.released.released)
-            place[rows] = good[-1].equilibrium.coordinates[rows]
-            condyles = self._resultants(k, place, good[-1].result)
-        geometry = self.mechanics.geometry(k, place)
-        if condyles:
-            lost = frozenset({"medial", "lateral"} - set(condyles))
-            share = self._share(k, replace(geometry, condyles=condyles), lost)
-            if share.status == "ok":
-                return share
-        return self._share(k, geometry, frozenset())
-
-    def _share(self, k: int, geometry: KneeGeometry, lifted: frozenset[str]) -> "MuscleShare":
-        assert self.mechanics.muscles is not None
-        return self.mechanics.muscles.share(k, geometry, self.mechanics.friction, lifted)
-
-    def _rest(
-        self,
-        released: "ReleasedKnee",
-        k: int,
-        good: Sequence[FrameContact],
-        share: "MuscleShare | None" = None,
+    def rest(
+        self, k: int, good: Sequence[FrameContact], share: "MuscleShare | None" = None
     ) -> tuple[FrameLoads, FrameContact]:
-        """Return body and contact at rest under given muscle forces.
+        """Return body and contact with the released coordinates at rest.
 
         Args:
-            released: which coordinates are.
             k: frame.
             good: the last two contacts that were found, where the search begins.
             share: the other muscles' forces.
         """
-        start = clock.perf_counter()
+        released, start = self.released, clock.perf_counter()
+        assert released is not None
         earlier, guess = (good[-1].equilibrium, good[-1].result) if good else (None, None)
         points = {} if len(released.released) == 5 else self._nearest_points(k)
         knee = None
@@ -253,10 +206,10 @@ class ContactSide:
                 if knee.balance.status not in ASTRAY:
                     break
         if knee is None:
-            contact = self._nothing("the femoral component does not lie over the insert")
+            contact = self.nothing("the femoral component does not lie over the insert")
             body = self.mechanics.frame(k)
             return replace(body, loads=unsolved([contact.problem])), contact
-        result, contact = None, self._nothing(knee.problem)
+        result, contact = None, self.nothing(knee.problem)
         if not knee.problem:
             result = self.model.evaluate(self.state, knee_pose(knee.coordinates), guess)
             result = within_insert(self.state, result)
@@ -299,7 +252,7 @@ class ContactSide:
             separated = {
                 side: CondylePoint(point, up, still, NAN) for side, point in points.items()
             }
-            touching = self._resultants(k, knee.coordinates, contact.result)
+            touching = self.resultants(k, knee.coordinates, contact.result)
             sides = {"medial"} if self.case.split is None else {"medial", "lateral"}
             geometry = replace(
                 geometry, condyles=separated | touching, lifted=frozenset(sides - set(touching))
@@ -308,7 +261,7 @@ class ContactSide:
         seconds = clock.perf_counter() - start
         return FrameLoads(geometry, loads, None, 0.0, seconds)
 
-    def _resultants(self, k: int, place: Array, result: ContactResult) -> dict[str, CondylePoint]:
+    def resultants(self, k: int, place: Array, result: ContactResult) -> dict[str, CondylePoint]:
         """Return the contact's resultants as the contact points of the equations."""
         return {
             side: CondylePoint(
@@ -336,7 +289,8 @@ class ContactSide:
             result, medial, adjustment, seconds, "", result.flags, triangles=self.state.triangles
         )
 
-    def _nothing(self, problem: str) -> FrameContact:
+    def nothing(self, problem: str) -> FrameContact:
+        """Return a contact that could not be computed, and why."""
         none = np.zeros(len(self.state.points), bool)
         return FrameContact(None, none, None, 0.0, problem, ())
 

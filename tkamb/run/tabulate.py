@@ -138,7 +138,7 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
         row |= {
             f"ground_reaction_{a}_N": g for a, g in zip(("ap", "si", "ml"), ground, strict=True)
         }
-    if frame.geometry.share is not None:
+    if frame.geometry.share is not None and not loads.problems:
         row |= _muscle_row(frame.geometry.share)
     return row | {
         ligament_column(name): tension for name, tension in frame.geometry.tensions.items()
@@ -147,7 +147,7 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
 
 def _muscle_row(share: "MuscleShare") -> dict[str, float]:
     """Return what each muscle carries, and what none does."""
-    row = {}
+    row: dict[str, float] = {}
     for family, names, values in (
         ("muscle_<name>_N", share.muscles, share.force),
         ("activation_<name>", share.muscles, share.activation),
