@@ -13,10 +13,11 @@ from shared_trials import STRENGTHS, two_flexors
 from tkamb.body.crossing import CrossingLines, MuscleShare
 from tkamb.body.knee import solve_knee
 from tkamb.body.load import PointForces, total_wrench
-from tkamb.columns import belongs, family_column, in_a_family, ordered_names
+from tkamb.columns import MUSCLE_FORCE, RESERVE, belongs, family_column, in_a_family, ordered_names
 from tkamb.equilibrium.shared_muscles import SharedMuscles
 from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_axes, knee_pose, transform
+from tkamb.run.summary import reserves
 from tkamb.scene import load_scene
 
 FRICTION = 0.05
@@ -150,9 +151,20 @@ def test_without_the_table_no_muscles_are_imported():
 
 
 def test_columns_of_muscles_stand_in_their_places():
-    name = family_column("muscle_<name>_N", "soleus_r")
+    name = family_column(MUSCLE_FORCE, "soleus_r")
     assert name == "muscle_soleus_r_N"
     assert in_a_family("reserve_knee_angle_r_Nm")
-    assert not belongs("reserve__Nm".replace("__", "_"), "reserve_<coordinate>_Nm")
+    assert not belongs("reserve_Nm", RESERVE)
     names = ordered_names([name, "ligament_PCL_N"])
     assert names.index("ligament_PCL_N") < names.index(name)
+
+
+def test_the_summary_says_how_much_no_muscle_carries():
+    columns = {
+        "reserve_knee_Nm": np.array([0.1, -3.0, np.nan]),
+        "joint_moment_knee_Nm": np.array([-40.0, 20.0, np.nan]),
+    }
+    told = reserves(columns)["knee"]
+    assert told["largest_Nm"] == 3.0
+    assert told["percent_of_largest_moment"] == pytest.approx(7.5)
+    assert told["frames_above_5_percent"] == 1

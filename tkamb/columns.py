@@ -38,13 +38,11 @@ _ADJUST = "[contact] with adjust = true"
 
 LIGAMENT = "ligament_<name>_N"
 """Stands for one column per [[ligament]], in the scene's order."""
-FAMILIES = (
-    LIGAMENT,
-    "muscle_<name>_N",
-    "activation_<name>",
-    "reserve_<coordinate>_Nm",
-    "joint_moment_<coordinate>_Nm",
-)
+MUSCLE_FORCE = "muscle_<name>_N"
+ACTIVATION = "activation_<name>"
+RESERVE = "reserve_<coordinate>_Nm"
+JOINT_MOMENT = "joint_moment_<coordinate>_Nm"
+FAMILIES = (LIGAMENT, MUSCLE_FORCE, ACTIVATION, RESERVE, JOINT_MOMENT)
 """Each stands for one column per ligament, muscle or coordinate."""
 
 COLUMNS: tuple[Column, ...] = (
@@ -187,16 +185,16 @@ COLUMNS: tuple[Column, ...] = (
         "between the knee centres that shank and thigh markers carry, each by itself",
         _MARKERS,
     ),
-    Column("muscle_<name>_N", "force of the muscle <name> of the model", _MUSCLES),
-    Column("activation_<name>", "its activation, 0 to 1", _MUSCLES),
+    Column(MUSCLE_FORCE, "force of the muscle <name> of the model", _MUSCLES),
+    Column(ACTIVATION, "its activation, 0 to 1", _MUSCLES),
     Column(
-        "reserve_<coordinate>_Nm",
+        RESERVE,
         "moment about <coordinate> that no muscle carries; the knee's acts on the tibia about "
         "insert z, beside residual_flexion_Nm",
         _MUSCLES,
     ),
     Column(
-        "joint_moment_<coordinate>_Nm",
+        JOINT_MOMENT,
         "moment about <coordinate> that muscles and reserve carry together; the knee's about the "
         "axis on which contact and patella leave it",
         _MUSCLES,
@@ -227,6 +225,12 @@ def family_column(family: str, name: str) -> str:
     return f"{before}{name}{after}"
 
 
+def name_in(column: str, family: str) -> str:
+    """Return the name in a family's column."""
+    before, after = _ends(family)
+    return column.removeprefix(before).removesuffix(after)
+
+
 def is_ligament(name: str) -> bool:
     """Return whether the column holds a ligament's tension."""
     return belongs(name, LIGAMENT)
@@ -244,8 +248,7 @@ def ligament_column(name: str) -> str:
 
 def ligament_of(column: str) -> str:
     """Return the bundle's name of a ligament column."""
-    before, after = _ends(LIGAMENT)
-    return column.removeprefix(before).removesuffix(after)
+    return name_in(column, LIGAMENT)
 
 
 def ordered_names(present: Iterable[str]) -> tuple[str, ...]:

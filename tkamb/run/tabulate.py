@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.body.knee import dome_sensitivity
-from tkamb.columns import family_column, ligament_column
+from tkamb.columns import (
+    ACTIVATION,
+    JOINT_MOMENT,
+    MUSCLE_FORCE,
+    RESERVE,
+    family_column,
+    ligament_column,
+)
 from tkamb.equilibrium.mechanics import FrameLoads
 from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, knee_coordinates
 from tkamb.run.agreement import normal_force, share_by_equilibrium, split_determined
@@ -149,10 +156,10 @@ def _muscle_row(share: "MuscleShare") -> dict[str, float]:
     """Return what each muscle carries, and what none does."""
     row: dict[str, float] = {}
     for family, names, values in (
-        ("muscle_<name>_N", share.muscles, share.force),
-        ("activation_<name>", share.muscles, share.activation),
-        ("reserve_<coordinate>_Nm", share.coordinates, share.reserve),
-        ("joint_moment_<coordinate>_Nm", share.coordinates, share.moment),
+        (MUSCLE_FORCE, share.muscles, share.force),
+        (ACTIVATION, share.muscles, share.activation),
+        (RESERVE, share.coordinates, share.reserve),
+        (JOINT_MOMENT, share.coordinates, share.moment),
     ):
         row |= {family_column(family, n): float(v) for n, v in zip(names, values, strict=True)}
     return row
