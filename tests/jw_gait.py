@@ -17,6 +17,7 @@ from tkamb.muscles.leg import foot_loads
 from tkamb.opensim.kinematics import Kinematics
 from tkamb.opensim.motion import CoordinateMotion
 from tkamb.opensim.read import read_osim
+from tkamb.scene.si import in_si
 from tkamb.scene.tables import GroundReactionTable
 
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw"
@@ -51,8 +52,10 @@ def gait(start: float = 1.9, end: float = 4.2) -> Gait:
     q = differentiate_coordinates(time, fit.state, CUTOFF_HZ, inside)[0]
     reactions = {
         side: load_ground_reaction(
-            GroundReactionTable(
-                file=path, plates=plates, laboratory_axes=AXES, cutoff_Hz=CUTOFF_HZ
+            in_si(
+                GroundReactionTable(
+                    file=path, plates=plates, laboratory_axes=AXES, cutoff_Hz=CUTOFF_HZ
+                )
             ),
             inside,
             "right",
