@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parents[1] / "tkamb"
 
 KNOWN_TO_ALL = {
     *("atomic", "claim", "code_identity", "defaults", "errors", "files", "guard"),
-    *("command_options", "known_errors", "memory", "units"),
+    *("known_errors", "memory", "units"),
 }
 """Modules without knees: numbers, files, memory, messages."""
 KNEE = {"body", "contact", "equilibrium", "geometry", "scene"}
@@ -38,7 +38,7 @@ DRAWING = {
 }
 """Which folder knows which folders and which modules beside them: inputs → body → (equilibrium ⇄
 contact) → results → output, view and studies; the scene is where files become bodies."""
-SEES_BODY_AND_CONTACT = {"contact_side.py", "simulation.py"}
+SEES_BODY_AND_CONTACT = {"contact_side.py"}
 
 
 def imported(path):
@@ -89,7 +89,7 @@ def test_the_layer_test_can_fail():
 
 
 def test_only_two_files_see_body_and_contact():
-    folders = ("equilibrium", "run", "press", "scene")
+    folders = ("equilibrium", "run", "scene")
     for path in [*PACKAGE.glob("*.py"), *(p for f in folders for p in (PACKAGE / f).glob("*.py"))]:
         names = imported(path)
         sees = {

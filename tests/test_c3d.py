@@ -129,7 +129,7 @@ def test_on_a_step_the_point_moves_along_the_line_of_action(tmp_path):
             cutoff_Hz="none",
             surface_mm=surface,
         )
-        both[surface] = load_ground_reaction(table, np.array([0.05, 0.1]), "right")
+        both[surface] = load_ground_reaction(in_si(table), np.array([0.05, 0.1]), "right")
     flat, step = both.values()
     np.testing.assert_allclose(step.force, flat.force)
     np.testing.assert_allclose(step.point[:, 1] - flat.point[:, 1], 0.4)
@@ -141,7 +141,7 @@ def test_on_a_step_the_point_moves_along_the_line_of_action(tmp_path):
         np.testing.assert_allclose(found.moment[:, [0, 2]], 0.0, atol=1e-9)
     table = GroundReactionTable(file=tmp_path / "x.mot", cutoff_Hz="none", surface_mm=1.0)
     with pytest.raises(InputError, match="surface_mm"):
-        load_ground_reaction(table, np.array([0.05]), "right")
+        load_ground_reaction(in_si(table), np.array([0.05]), "right")
 
 
 def test_below_the_threshold_the_point_is_held_and_the_wrench_kept(tmp_path):

@@ -174,6 +174,19 @@ def test_every_unknown_equals_its_finite_difference_virtual_work():
         np.testing.assert_allclose(analytic, numeric, rtol=0, atol=2e-8, err_msg=unknown.name)
 
 
+def test_what_acts_within_the_leg_does_not_move_the_whole_of_it():
+    """Action equals reaction: only the hip's loads have a part along the free-flyer."""
+    chain = leg()
+    rng = np.random.default_rng(6)
+    state = chain.at(random_motion(chain, rng))
+    for unknown in all_unknowns(state, rng):
+        whole = state.generalised([unknown.loads])[:6, 0]
+        if unknown.name.startswith("hip"):
+            assert np.abs(whole).max() > 0.1
+        else:
+            np.testing.assert_allclose(whole, 0.0, atol=1e-12, err_msg=unknown.name)
+
+
 def _virtual_work(chain, state, load, index, step=1e-6):
     """Return dW/dq of one load: forces fixed in the laboratory, points fixed in the link."""
     model = chain.model

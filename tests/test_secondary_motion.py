@@ -107,7 +107,7 @@ def test_a_frame_that_needs_flexors_rests_with_the_quadriceps_slack(bend):
     for k in (5, 40):
         body, contact = side.frame(k)
         knee = contact.equilibrium
-        assert knee.problem == "" and body.loads.values["quadriceps"] == 0.0
+        assert knee.problem == "" and body.loads.values["muscle_quadriceps"] == 0.0
         assert knee.balance.status is BalanceStatus.OK and knee.patella.status.found
         assert body.loads.values["residual_flexion"] < -10.0
         away = np.array([2e-3, 0, 1e-3, 0, np.radians(1), 0])

@@ -19,6 +19,7 @@ from tkamb.studies.extremes import Extreme, extremes
 from tkamb.studies.kept_rows import KeptRows, row_key
 from tkamb.studies.scene_extremes import SceneExtreme, judge_scene, scene_extremes
 from tkamb.studies.stability import (
+    _Judges,
     judge_safely,
     picture,
     run_stability,
@@ -110,9 +111,11 @@ def test_an_exception_is_a_verdict():
     assert verdict.kind == "exception" and "Error" in verdict.reason
 
 
-def test_a_hang_is_stopped_and_the_next_case_judged():
+def test_a_hang_is_stopped_and_the_next_case_judged(monkeypatch):
+    """The one has no time at all, the next all it needs, however busy the machine is."""
     slow, quick = replace(SMALL, resolution_mm=0.5), replace(SMALL, model="nothing")
-    verdicts = list(run_stability([slow, quick], longest=4.0))
+    monkeypatch.setattr(_Judges, "limit", lambda self, case: 0.0 if case is slow else 600.0)
+    verdicts = list(run_stability([slow, quick]))
     assert [v.kind for v in verdicts] == ["hang", "flagged"]
 
 

@@ -218,7 +218,7 @@ def check_muscles(muscles: Sequence[Muscle], chain: "Chain") -> None:
     if len(muscles) > 1:
         raise InputError(
             f"{len(muscles)} muscles cross the knee ({', '.join(m.name for m in muscles)}): "
-            "static optimisation, which shares the load among them, is not there yet",
+            "static optimisation, which shares the load among them, does not reach scenes yet",
             "[[muscle]]",
             "keep the one that inserts on the patella",
         )
@@ -227,7 +227,7 @@ def check_muscles(muscles: Sequence[Muscle], chain: "Chain") -> None:
         if ends != ["femur", "patella"]:
             raise InputError(
                 f"runs from {ends[0]} to {ends[1]}: static optimisation, which such a muscle "
-                "needs, is not there yet",
+                "needs, does not reach scenes yet",
                 f"[[muscle]] {muscle.name}",
                 "the only muscle must run from the femur to the patella",
             )

@@ -1,4 +1,4 @@
-"""Body and contact together: the only file that sees both.
+"""Body and contact together: the only file where both meet in the computation.
 
 - `coupling = "none"`: the body's equations give the superior-inferior contact force, with
   contact points from the undeformed meshes, and the contact model presses that load in at
@@ -12,13 +12,14 @@
 import time as clock
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tkamb.body.contact_points import CondylePoint
 from tkamb.body.knee import solve_knee, unsolved
 from tkamb.contact.materials import material
+from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import within_insert
 from tkamb.contact.probe import condyle_wrenches
@@ -29,18 +30,13 @@ from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.frame_contact import FrameContact
 from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.geometry.adjustment import Adjustment
-from tkamb.geometry.frames import Array, knee_pose
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates, knee_pose
 from tkamb.scene.case import Case
+from tkamb.units import DEGREE
 
 if TYPE_CHECKING:
     from tkamb.body.crossing import MuscleShare
     from tkamb.equilibrium.released import KneeEquilibrium
-
-from typing import Any
-
-from tkamb.contact.model import ContactModel
-from tkamb.geometry.frames import KNEE_COORDINATES, knee_coordinates
-from tkamb.units import DEGREE
 
 NAN = float("nan")
 

@@ -116,6 +116,10 @@ class _Judges:
         self._kept.put(key, asdict(found))
         return found
 
+    def limit(self, case: Case) -> float:
+        """Return after how many seconds a case counts as hanging."""
+        return self._longest
+
     def stop(self) -> None:
         """End the processes; the cases that they judge get no verdict."""
         self._stopped = True
@@ -145,8 +149,8 @@ class _Judges:
         """Return what a process sends within the limits of time; see `_send_verdict`."""
         if self._stopped:
             raise EOFError
-        if not receiver.poll(self._longest):
-            return _ended(case, "hang", f"no answer in {self._longest:g} s")
+        if not receiver.poll(self.limit(case)):
+            return _ended(case, "hang", f"no answer in {self.limit(case):g} s")
         found = receiver.recv()
         if found == PRESSED:
             if not receiver.poll(LONGEST_REFERENCE_SECONDS):

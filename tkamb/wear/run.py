@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,14 +53,10 @@ class WearRun:
         """
         state = None
 
-        kept = 0.0
-
         def keep(done: WearState) -> None:
-            nonlocal kept
             progress(done.cycles)
             if folder is not None:
                 keep_state(folder, done, identity)
-                kept = done.cycles
 
         if folder is not None:
             identity = wear_identity(self.setup, self.case, self.cycles, self.updates)
@@ -69,9 +66,14 @@ class WearRun:
                 self.case, self.cycles, self.updates, state=state, keep=keep
             )
         except KeyboardInterrupt:
-            if not kept:
+            kept = None
+            if folder is not None:
+                with suppress(InputError):  # what another simulation left is not ours to tell of
+                    kept = kept_state(folder, identity)
+            if kept is None:
                 raise
-            raise KeyboardInterrupt(f"{kept:.6g} cycles are kept; go on with --resume") from None
+            done = f"{kept.cycles:.6g} cycles are kept"
+            raise KeyboardInterrupt(f"{done}; go on with --resume") from None
         return WearReport(
             self.setup, self.case, self.material, state, last, self.cycles, self.updates
         )
