@@ -261,6 +261,7 @@ def test_package_finds_the_patella_where_the_script_put_it(motion):
         assert np.degrees(rotation) == pytest.approx(motion["patella_rotation_deg"][k], abs=0.1)
 
 
+@pytest.mark.slow
 def test_script_makes_what_is_shipped(tmp_path):
     model.make(tmp_path)
     assert comparison.differences(tmp_path, MODEL) == []

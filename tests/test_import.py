@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import tkamb
+from pendulum_leg import changed, moving_leg, pendulum_osim, recorded_leg
 from recordings import write_c3d
 from tkamb.cli import main
 from tkamb.errors import InputError
@@ -25,103 +26,11 @@ from tkamb.scene import load_scene
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data"
-JW, DM = DATA / "jw", DATA / "dm"
+JW = DATA / "jw"
 needs_jw = pytest.mark.skipif(
     not JW.is_dir(), reason="subject JW's files are not beside the project"
 )
-needs_dm = pytest.mark.skipif(
-    not DM.is_dir(), reason="subject DM's files are not beside the project"
-)
 AXES = "-x,+y,-z"
-
-
-def pendulum_osim(path: Path, changes: dict[str, str] | None = None) -> Path:
-    """Write a leg of four bodies: pelvis (free), femur, tibia, foot, with markers."""
-    joints = [
-        ("FreeJoint", "root", "/ground", "/bodyset/pelvis", "0 0 0", 6),
-        ("BallJoint", "hip_r", "/bodyset/pelvis", "/bodyset/femur_r", "-0.04 -0.1 0.08", 3),
-        ("PinJoint", "knee_r", "/bodyset/femur_r", "/bodyset/tibia_r", "0 -0.4 0", 1),
-        ("PinJoint", "ankle_r", "/bodyset/tibia_r", "/bodyset/foot_r", "0 -0.42 0", 1),
-    ]
-    masses = {"pelvis": 40.0, "femur_r": 9.0, "tibia_r": 3.5, "foot_r": 1.0}
-    bodies = "".join(
-        f'<Body name="{n}"><mass>{m}</mass><mass_center>0 -0.1 0</mass_center>'
-        "<inertia>0.1 0.05 0.1 0 0 0</inertia></Body>"
-        for n, m in masses.items()
-    )
-    sets = "".join(_joint(*joint) for joint in joints)
-    rng = np.random.default_rng(5)
-    markers = ""
-    for body, count in (("pelvis", 4), ("femur_r", 3), ("tibia_r", 3), ("foot_r", 4)):
-        for k in range(count):
-            place = " ".join(f"{v:.4f}" for v in rng.normal(0, 0.06, 3) - [0, 0.1, 0])
-            markers += (
-                f'<Marker name="M.{body}.{k}"><socket_parent_frame>/bodyset/{body}'
-                f"</socket_parent_frame><location>{place}</location></Marker>"
-            )
-    text = (
-        '<?xml version="1.0"?><OpenSimDocument Version="40000"><Model name="leg">'
-        f'<gravity>0 -9.80665 0</gravity><BodySet name="b"><objects>{bodies}</objects></BodySet>'
-        f'<JointSet name="j"><objects>{sets}</objects></JointSet>'
-        f'<MarkerSet name="m"><objects>{markers}</objects></MarkerSet></Model></OpenSimDocument>'
-    )
-    for old, new in (changes or {}).items():
-        assert old in text
-        text = text.replace(old, new)
-    path.write_text(text)
-    return path
-
-
-def _joint(kind: str, name: str, parent: str, child: str, place: str, count: int) -> str:
-    coordinates = "".join(
-        f'<Coordinate name="{name}_{k}"><default_value>0</default_value>'
-        "<range>-3 3</range><clamped>false</clamped><locked>false</locked></Coordinate>"
-        for k in range(count)
-    )
-    frames = "".join(
-        f'<PhysicalOffsetFrame name="{name}_{end}"><socket_parent>{body}</socket_parent>'
-        f"<translation>{at}</translation><orientation>0 0 0</orientation></PhysicalOffsetFrame>"
-        for end, body, at in (("p", parent, place), ("c", child, "0 0 0"))
-    )
-    return (
-        f'<{kind} name="{name}"><socket_parent_frame>{name}_p</socket_parent_frame>'
-        f"<socket_child_frame>{name}_c</socket_child_frame>"
-        f"<coordinates>{coordinates}</coordinates><frames>{frames}</frames></{kind}>"
-    )
-
-
-def moving_leg(osim: Path, frames: int = 60) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return coordinates (n, 11) of a knee bend and the markers there, ground axes."""
-    model = read_osim(osim)
-    chain = ModelChain(model, list(model.markers))
-    q = chain.default(frames)
-    names = list(model.coordinates)
-    q[:, names.index("knee_r_0")] = -np.linspace(0.1, 1.2, frames)
-    q[:, names.index("hip_r_2")] = np.linspace(0.0, 0.5, frames)
-    q[:, names.index("ankle_r_0")] = 0.2
-    q[:, names.index("root_4")] = 0.95
-    places = chain.places(q)
-    return q, dict(zip(model.markers, np.moveaxis(places, 1, 0), strict=True))
-
-
-def recorded_leg(tmp_path: Path, **changes) -> list[str]:
-    """Write model and recording, and return the arguments of an import without implant."""
-    osim = pendulum_osim(tmp_path / "leg.osim", changes.pop("osim", None))
-    _, markers = moving_leg(pendulum_osim(tmp_path / "plain.osim"))
-    rename = changes.pop("rename", lambda name: "S:" + name.replace(".", ""))
-    write_trc(
-        tmp_path / "leg.trc",
-        np.arange(60) / 60.0,
-        {rename(name): path * changes.get("stretch", 1.0) for name, path in markers.items()},
-        60.0,
-    )
-    arguments = {
-        "--trc": tmp_path / "leg.trc",
-        "--side": "right",
-        "--mass-kg": "53.5",
-        "--out": tmp_path / "out",
-    }
-    return ["import", str(osim), *(str(v) for pair in arguments.items() for v in pair)]
 
 
 def test_a_model_without_implant_becomes_a_scene_that_loads_and_bends(tmp_path, capsys):
@@ -222,19 +131,6 @@ def bomb(path: Path) -> None:
     entities = "".join(f'<!ENTITY a{k} "{"".join([f"&a{k - 1};"] * 10)}">' for k in range(1, 9))
     head = f'<!DOCTYPE x [<!ENTITY a0 "x">{entities}]>'
     path.write_text(f"{head}<OpenSimDocument>&a8;</OpenSimDocument>")
-
-
-def changed(arguments: list[str], **options: str | None) -> list[str]:
-    """Return the arguments with options replaced, added or (None) dropped."""
-    result = list(arguments)
-    for name, value in options.items():
-        option = "--" + name.replace("_", "-")
-        if option in result:
-            at = result.index(option)
-            del result[at : at + 2]
-        if value is not None:
-            result += [f"{option}={value}"]
-    return result
 
 
 MISTAKES = {
@@ -367,30 +263,6 @@ def test_widely_used_models_have_legs_too(name, side):
     assert 0.3 < links.insert_in_tibia[1, 3] < 0.5  # m, from the ankle up to the knee
     assert 0.3 < links.hip[1] < 0.5  # and from there to the hip
     ElementTree.fromstring(patient_urdf(links, 1.0, ""))
-
-
-@needs_dm
-def test_dms_urdf_is_the_one_that_was_made_by_hand():
-    model = read_osim(DM / "DM.osim")
-    mesh = load_surface(DM / "geometry/tibial_insert.stl", "m", AXES, name="insert")
-    links = find_links(find_leg(model, "right"), mesh, AXES, {}, True)
-    made = joints_of(ElementTree.fromstring(patient_urdf(links, 1.0, "")))
-    byhand = joints_of(ElementTree.parse(ROOT / "models/dm/patient.urdf").getroot())
-    for name, values in byhand.items():
-        if name != "hip_mount":  # its axes: nothing reads them
-            np.testing.assert_allclose(made[name], values, atol=1e-8, err_msg=name)
-    assert len(soft_tissue(links).bundles) == 88
-    assert soft_tissue(links).ligament_length == pytest.approx(0.075986, abs=1e-6)
-
-
-def joints_of(robot: ElementTree.Element) -> dict[str, np.ndarray]:
-    found = {}
-    for joint in robot.findall("joint"):
-        origin = joint.find("origin")
-        found[joint.get("name")] = np.array(
-            [float(v) for key in ("xyz", "rpy") for v in origin.get(key).split()]
-        )
-    return found
 
 
 @needs_jw

@@ -1,10 +1,15 @@
 """`tkamb import`: its arguments, and what it prints."""
 
 import argparse
+import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tkamb.errors import InputError
+from tkamb.units import ANGLE, LENGTH
+
+if TYPE_CHECKING:
+    from tkamb.importing.request import ImportRequest
 
 
 def add_import(commands: Any) -> None:
@@ -16,30 +21,72 @@ def add_import(commands: Any) -> None:
     source.add_argument("--trc", type=Path, metavar="F", help="markers alone")
     source.add_argument("--motion", type=Path, metavar="F", help="the model's coordinates")
     p.add_argument("--grf", type=Path, metavar="F", help=".mot or .sto of the ground reactions")
+    p.add_argument(
+        "--grf-force", metavar="NAME", help="how the foot's columns in it begin: ground_force_2"
+    )
     p.add_argument("--static", type=Path, metavar="F", help="standing trial: where markers sit")
     p.add_argument("--side", choices=("right", "left"), required=True)
     p.add_argument("--mass-kg", type=float, required=True, metavar="KG", help="of the subject")
     for part in ("femoral", "insert", "patella"):
         p.add_argument(f"--{part}", type=Path, metavar="F", help="mesh")
         p.add_argument(f"--{part}-frame", metavar="NAME", help="body or frame of its mesh")
+    p.add_argument("--femur-bone", type=Path, metavar="F", help="mesh that the muscle may wrap")
     p.add_argument("--mesh-unit", choices=("m", "cm", "mm"))
     p.add_argument(
         "--mesh-axes",
         metavar="ANT,SUP,RIGHT",
         help="mesh axes that point anterior, superior, right; write --mesh-axes=-x,+y,-z",
     )
+    _add_poses(p)
+    _add_inferred(p)
     p.add_argument("--out", type=Path, required=True, metavar="DIR")
     p.add_argument("--scene", default="scene.toml", metavar="NAME", help="name of the scene file")
-    p.add_argument("--knee", metavar="JOINT", help="the femorotibial joint of the model")
-    p.add_argument("--plates", type=_numbers, metavar="2,3", help="under the foot")
-    p.add_argument("--interval", type=_interval, metavar="A:B", help="s, part of the recording")
-    p.add_argument("--laboratory-axes", metavar="FORWARD,UP,RIGHT", help="of the recording")
-    p.add_argument("--method", choices=("segments", "chain"), default="segments")
-    p.add_argument("--cutoff-hz", type=float, default=6.0, metavar="HZ")
+    p.add_argument("--contact", choices=("foundation", "lattice"), default="foundation")
+    p.add_argument("--note", action="append", default=[], metavar="TEXT", help="for the report")
     scale = p.add_mutually_exclusive_group()
     scale.add_argument("--scale-mass", dest="scale", action="store_true", default=None)
     scale.add_argument("--keep-mass", dest="scale", action="store_false", default=None)
     p.set_defaults(command=_import)
+
+
+def _add_inferred(p: argparse.ArgumentParser) -> None:
+    """Add the options that stand instead of what is inferred."""
+    p.add_argument("--knee", metavar="JOINT", help="the femorotibial joint of the model")
+    p.add_argument("--plates", type=_numbers, metavar="2,3", help="under the foot")
+    p.add_argument("--interval", type=_interval, metavar="A:B", help="s, part of the recording")
+    p.add_argument("--laboratory-axes", metavar="FORWARD,UP,RIGHT", help="of the recording")
+    p.add_argument("--without", type=_names, default=(), metavar="A,B", help="markers not used")
+    p.add_argument("--method", choices=("segments", "chain"), default="segments")
+    p.add_argument("--cutoff-hz", type=float, default=6.0, metavar="HZ")
+
+
+def _add_poses(p: argparse.ArgumentParser) -> None:
+    """Add the options of recorded poses of the implant."""
+    p.add_argument("--poses", type=Path, metavar="F", help="of the femoral mesh in the insert mesh")
+    p.add_argument(
+        "--pose-columns", type=_names, metavar="R1,R2,R3,X,Y,Z", help="its angles and places"
+    )
+    p.add_argument("--pose-sequence", metavar="XYZ", help="upper case: intrinsic (Rx Ry Rz)")
+    p.add_argument("--pose-units", type=_names, metavar="rad,m", help="of angles and places")
+    p.add_argument(
+        "--pose-signs-turned", type=_names, default=(), metavar="ROLES", help="rotation_1, …"
+    )
+    p.add_argument(
+        "--stride",
+        type=_interval,
+        metavar="A:B",
+        help="s of the recording where 0 and 100 %% of the poses' time lie",
+    )
+    p.add_argument(
+        "--stance",
+        type=_interval,
+        metavar="A:B",
+        help="part of the poses' time over which the knee centre in the shank is averaged",
+    )
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(","))
 
 
 def _numbers(text: str) -> tuple[int, ...]:
@@ -53,24 +100,44 @@ def _interval(text: str) -> tuple[float, float]:
     try:
         start, end = (float(part) for part in text.split(":"))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is not A:B in seconds") from None
+        raise argparse.ArgumentTypeError(f"'{text}' is not two numbers A:B") from None
     return start, end
 
 
 def _import(options: argparse.Namespace) -> int:
     from tkamb.importing.patient import import_patient, write_patient
+
+    patient = import_patient(import_request(options), options.out)
+    markers = write_patient(patient, options.out, options.scene)
+    print("\n".join([*patient.report, *markers, f"scene: {options.out / options.scene}"]))
+    return 0
+
+
+def import_request(options: argparse.Namespace) -> "ImportRequest":
+    """Return what a command line asks for.
+
+    Raises:
+        InputError: options that do not go together, or numbers that cannot be.
+    """
     from tkamb.importing.request import ImportRequest
 
     if not options.mass_kg > 0:
         raise InputError(f"{options.mass_kg:g} kg is no mass", "--mass-kg")
     if not options.cutoff_hz > 0:
         raise InputError(f"{options.cutoff_hz:g} Hz is no frequency", "--cutoff-hz")
-    request = ImportRequest(
+    if options.c3d and options.grf:
+        raise InputError("goes with --trc or --motion: a C3D file's plates are its own", "--grf")
+    if options.grf_force and not options.grf:
+        raise InputError("needs --grf", "--grf-force")
+    return ImportRequest(
         options.model,
         options.side,
         options.mass_kg,
         options.c3d or options.trc or options.motion,
         grf=options.grf,
+        grf_force=options.grf_force,
+        poses=_poses(options),
+        without=options.without,
         static=options.static,
         meshes=_meshes(options),
         knee=options.knee,
@@ -85,11 +152,9 @@ def _import(options: argparse.Namespace) -> int:
         scale_mass=options.scale,
         method=options.method,
         cutoff_Hz=options.cutoff_hz,
+        contact=options.contact,
+        notes=tuple(options.note),
     )
-    patient = import_patient(request, options.out)
-    markers = write_patient(patient, options.out, options.scene)
-    print("\n".join([*patient.report, *markers, f"scene: {options.out / options.scene}"]))
-    return 0
 
 
 def _meshes(options: argparse.Namespace) -> Any:
@@ -97,12 +162,47 @@ def _meshes(options: argparse.Namespace) -> Any:
 
     given = (options.femoral, options.insert)
     if not any(given):
-        if options.patella:
-            raise InputError("needs --femoral and --insert", "--patella")
+        for name in ("patella", "femur_bone"):
+            if getattr(options, name):
+                option = f"--{name.replace('_', '-')}"
+                raise InputError("needs --femoral and --insert", option)
         return None
     if not all(given):
         raise InputError("go together", "--femoral and --insert", "give both or none")
     if options.mesh_unit is None or options.mesh_axes is None:
         missing = "--mesh-unit" if options.mesh_unit is None else "--mesh-axes"
         raise InputError("is not given, and is not guessed", missing, "`tkamb mesh check` helps")
-    return Meshes(*given, options.patella, options.mesh_unit, options.mesh_axes)
+    return Meshes(*given, options.patella, options.mesh_unit, options.mesh_axes, options.femur_bone)
+
+
+def _poses(options: argparse.Namespace) -> Any:
+    from tkamb.importing.recorded_poses import ROLES, PoseRecording
+
+    of_poses = ("pose_columns", "pose_sequence", "pose_units", "pose_signs_turned")
+    if options.poses is None:
+        for name in (*of_poses, "stride", "stance"):
+            if getattr(options, name):
+                raise InputError("needs --poses", f"--{name.replace('_', '-')}")
+        return None
+    columns = options.pose_columns or ROLES
+    if len(columns) != len(ROLES):
+        raise InputError(
+            f"has {len(columns)} names", "--pose-columns", "three angles, then x, y, z"
+        )
+    if not re.fullmatch("[xyz]{3}|[XYZ]{3}", options.pose_sequence or ""):
+        raise InputError("is not three axes, and is not guessed", "--pose-sequence", "as in XYZ")
+    angle, _, length = ",".join(options.pose_units or ()).partition(",")
+    if angle not in ANGLE or length not in LENGTH:
+        raise InputError("are not two units, and are not guessed", "--pose-units", "as in rad,m")
+    if options.stride and options.interval:
+        raise InputError("excludes --interval", "--stride", "give one of them")
+    return PoseRecording(
+        options.poses,
+        tuple(columns),
+        options.pose_sequence,
+        angle,
+        length,
+        options.pose_signs_turned,
+        options.stride,
+        options.stance,
+    )

@@ -1,5 +1,6 @@
 """The leg's markers in a recording: matched to the model's, and what they say of the laboratory."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +22,7 @@ class ModelSegment:
     Args:
         name: "shank", "thigh", "foot" or "pelvis".
         points: label in the recording -> (3,) m in the segment's link (shank, thigh) or body.
-        missing: markers of the model that the recording does not hold.
+        missing: markers of the model that the recording does not show.
         joined_to: "shank" or "thigh" for a neighbour.
         joint: (3,) m, the ball joint in that segment's link.
         centre: (3,) m, the same in the neighbour's body.
@@ -35,11 +36,46 @@ class ModelSegment:
     centre: Array | None = None
 
 
-def model_segments(links: Links, recorded: Table) -> list[ModelSegment]:
+def model_segments(
+    links: Links, recorded: Table, without: Sequence[str] = ()
+) -> list[ModelSegment]:
     """Return shank, thigh, and of foot and pelvis those with three markers or more.
+
+    Args:
+        links: of the leg.
+        recorded: table of markers.
+        without: labels that are not to be used.
 
     Raises:
         InputError: shank or thigh with fewer than three markers in the recording.
+    """
+    found = seen_segments(links, recorded, without)
+    for name in ("shank", "thigh"):
+        segment = found[name]
+        if len(segment.points) < 3:
+            labels = recorded_labels(recorded)
+            raise InputError(
+                f"the model and the recording share {len(segment.points)} markers of the "
+                f"{segment.name}, three are needed",
+                recorded.path,
+                f"the model has {', '.join(segment.missing) or 'no others'}; "
+                f"the recording {', '.join(labels[:12])}, …",
+            )
+    return [segment for segment in found.values() if len(segment.points) >= 3]
+
+
+def seen_segments(
+    links: Links, recorded: Table, without: Sequence[str] = ()
+) -> dict[str, ModelSegment]:
+    """Return shank, thigh, foot and pelvis with those of their markers that were ever seen.
+
+    Args:
+        links: of the leg.
+        recorded: table of markers.
+        without: labels that are not to be used.
+
+    Raises:
+        InputError: a label of `without` that the recording does not hold.
     """
     leg = links.leg
     foot = _with_most_markers(leg, leg.foot)
@@ -53,8 +89,8 @@ def model_segments(links: Links, recorded: Table) -> list[ModelSegment]:
         ("foot", (foot,), "shank", np.zeros(3), in_foot),
         ("pelvis", (leg.pelvis,), "thigh", links.hip, in_pelvis),
     ]
-    labels = recorded_labels(recorded)
-    found = []
+    labels, dropped = _seen_labels(recorded, without)
+    found = {}
     for name, bodies, joined_to, joint, centre in wanted:
         own = {m.name: m for m in leg.model.markers.values() if m.body in bodies}
         match = matched_labels(own, labels)
@@ -65,18 +101,25 @@ def model_segments(links: Links, recorded: Table) -> list[ModelSegment]:
             for m in own
             if m in match
         }
-        missing = tuple(m for m in own if m not in match)
-        found.append(ModelSegment(name, points, missing, joined_to, joint, centre))
-    for segment in found[:2]:
-        if len(segment.points) < 3:
-            raise InputError(
-                f"the model and the recording share {len(segment.points)} markers of the "
-                f"{segment.name}, three are needed",
-                recorded.path,
-                f"the model has {', '.join(segment.missing) or 'no others'}; "
-                f"the recording {', '.join(labels[:12])}, …",
-            )
-    return [segment for segment in found if len(segment.points) >= 3]
+        left_out = matched_labels(own, dropped)
+        missing = tuple(m for m in own if m not in match and m not in left_out)
+        found[name] = ModelSegment(name, points, missing, joined_to, joint, centre)
+    return found
+
+
+def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the labels of the markers that were ever seen, and those that are left out."""
+    there = recorded_labels(recorded)
+    dropped = matched_labels(without, there)
+    if unknown := [name for name in without if name not in dropped]:
+        raise InputError(
+            f"holds no marker '{unknown[0]}', which is to be left out",
+            recorded.path,
+            f"it has {', '.join(there[:12])}, …",
+        )
+    left_out = list(dropped.values())
+    seen = [name for name in there if np.isfinite(recorded.columns[f"{name}_x"]).any()]
+    return [name for name in seen if name not in left_out], left_out
 
 
 def segments_of(recording: Path, segments: list[ModelSegment]) -> list[ModelSegment]:

@@ -7,17 +7,17 @@ import numpy as np
 
 from tkamb.atomic import claim_directory, write_text
 from tkamb.errors import InputError
+from tkamb.geometry.surface import Surface
 from tkamb.importing.anatomy import Leg, find_leg
 from tkamb.importing.links import Links, find_links
-from tkamb.importing.markers import (
-    recorded_labels,
-)
+from tkamb.importing.markers import recorded_labels
 from tkamb.importing.model_motion import MOTION_FILE
+from tkamb.importing.recorded_poses import read_poses
 from tkamb.importing.request import ImportRequest
 from tkamb.importing.scene_text import SceneText
 from tkamb.importing.soft_tissue import soft_tissue
 from tkamb.importing.standing import with_static_markers
-from tkamb.importing.trial import from_coordinates, from_markers
+from tkamb.importing.trial import Trial, from_coordinates, from_markers, from_poses
 from tkamb.importing.urdf import patient_urdf
 from tkamb.inputs.meshes import load_surface
 from tkamb.inputs.tables import read_table
@@ -74,12 +74,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
     )
     scale, weighed = _mass_scale(request, leg)
     tissue = soft_tissue(links)
-    recorded = read_table(request.recording)
-    found = (
-        from_markers(request, leg, links, recorded)
-        if recorded_labels(recorded)
-        else from_coordinates(request, leg, links, recorded)
-    )
+    found = _trial(request, leg, links, insert)
     scene = SceneText(
         _title(request),
         folder,
@@ -89,19 +84,48 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         request.cutoff_Hz,
         links,
         found.markers,
+        found.poses,
+        found.shank,
         found.ground,
         meshes,
         tissue,
-        _notes(scale, found.ground is not None, bool(tissue.bundles), meshes is not None),
+        request.contact,
+        (*_notes(request, scale, found, bool(tissue.bundles)), *request.notes),
     )
     report = [*_leg_lines(leg), weighed, *links.said, *_patella_line(links)]
     report += [*found.said, *tissue.said]
-    if request.static is not None and found.markers is not None:
+    if request.static is not None:
+        if found.markers is None:
+            raise InputError(
+                "is for a knee whose motion comes from markers", "--static", "leave it out"
+            )
         scene, line = with_static_markers(scene, request.static, list(found.markers.segments))
         report.append(line)
     comment = f"Made by tkamb import from {request.model.name}, {request.side} leg (m, kg)"
     motion = found.motion.text() if found.motion else None
     return ImportedPatient(patient_urdf(links, scale, comment), scene, motion, tuple(report))
+
+
+def _trial(request: ImportRequest, leg: Leg, links: Links, insert: Surface | None) -> Trial:
+    """Return the recording: markers, poses with markers, or the model's coordinates."""
+    recorded = read_table(request.recording)
+    labels = recorded_labels(recorded)
+    if request.poses is not None:
+        if insert is None or request.meshes is None or not labels:
+            raise InputError(
+                "needs the meshes whose poses these are, and a recording of markers",
+                "--poses",
+                "give --femoral, --insert, and --c3d or --trc",
+            )
+        poses = read_poses(
+            request.poses, links, insert, request.meshes.axes, request.cutoff_Hz, request.interval
+        )
+        return from_poses(request, leg, links, recorded, poses)
+    if labels:
+        return from_markers(request, leg, links, recorded)
+    if request.without:
+        raise InputError("holds no markers to be left out", recorded.path, "drop --without")
+    return from_coordinates(request, leg, links, recorded)
 
 
 def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[str, ...]:
@@ -139,7 +163,13 @@ def marker_lines(case: Case) -> tuple[str, ...]:
     """Return how well the markers fit, by both readings, and how far the knee centres are apart."""
     found = case.motion.markers
     if found is None:
-        return ()
+        rms = case.tibia.residual if case.tibia else None
+        if rms is None:
+            return ()
+        return (
+            f"markers and joint centres of the shank: rms {np.median(rms) / MILLIMETRE:.1f} mm "
+            f"(at most {rms.max() / MILLIMETRE:.1f})",
+        )
     lines = []
     for method, words in (("segments", "rigid fits of shank and thigh"), ("chain", "the chain")):
         rms = found.at(found.rms[method], case.motion.time) / MILLIMETRE  # type: ignore[index]
@@ -199,30 +229,55 @@ def _patella_line(links: Links) -> list[str]:
 
 
 def _title(request: ImportRequest) -> tuple[str, ...]:
+    poses = f", poses of {request.poses.file.name}" if request.poses else ""
     return (
-        f"The {request.side} knee of {request.model.name}, {request.recording.name}.",
+        f"The {request.side} knee of {request.model.name}, {request.recording.name}{poses}.",
         "Written by `tkamb import`; what it inferred stands here as given. The recording and the",
         "meshes are read where they lie.",
     )
 
 
-def _notes(scale: float, ground: bool, own: bool, implant: bool) -> tuple[str, ...]:
+def _notes(
+    request: ImportRequest, scale: float, found: Trial, own_ligaments: bool
+) -> tuple[str, ...]:
     notes = [
         "Only the quadriceps acts: where hamstrings and gastrocnemius act too, the contact force "
         "is too low and the quadriceps force is what the joint moment needs at least.",
-        "Shank and flexion come from skin markers; the columns marker_rms_*, flexion_* and "
-        "knee_centre_distance_mm say how far the skin has moved.",
+        *_motion_notes(request, found),
         "Foot and shank are one body with the ankle at its neutral angle.",
     ]
-    if implant:
+    if request.meshes and not found.poses:
         notes.append(
             "Adduction, axial rotation, AP and ML of the femur are where contact, ligaments and "
             "muscle line leave them; nobody recorded them."
         )
-    if implant and not own:
+    if request.meshes and not own_ligaments:
         notes.append("The ligaments are a generic set scaled to the implant, nobody's own.")
     if scale != 1.0:
         notes.append(f"Segment masses are the model's times {scale:.4f}.")
-    if not ground:
+    if found.ground is None:
         notes.append("No ground reaction: the shank hangs in the air.")
     return tuple(notes)
+
+
+def _motion_notes(request: ImportRequest, found: Trial) -> list[str]:
+    if request.poses is None or found.shank is None:
+        return [
+            "Shank and flexion come from skin markers; the columns marker_rms_*, flexion_* and "
+            "knee_centre_distance_mm say how far the skin has moved."
+        ]
+    notes = []
+    if request.poses.turned:
+        turned = ", ".join(request.poses.turned)
+        notes.append(f"The poses are read with the other sign of {turned}.")
+    if request.poses.stride:
+        notes.append(
+            "The knee's motion is of another recording than ground reaction and shank, laid on "
+            "one stride of theirs phase for phase: an assumption."
+        )
+    if centres := [centre.name.replace("_", " ") for centre in found.shank.centres]:
+        notes.append(
+            f"The shank shows {len(found.shank.points)} markers; {' and '.join(centres)}, which "
+            "the neighbours' markers carry, complete it. Its lean is less certain for that."
+        )
+    return notes

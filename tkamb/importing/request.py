@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tkamb.importing.recorded_poses import PoseRecording
 from tkamb.importing.scene_text import Meshes
 
 
@@ -16,6 +17,10 @@ class ImportRequest:
         mass_kg: of the subject.
         recording: .c3d or .trc; .mot or .sto of the model's coordinates.
         grf: table of ground reactions, beside a .trc.
+        grf_force: how the columns of the foot's force begin in it.
+        poses: of the femoral component in the insert; then the recording's markers place the
+            shank alone.
+        without: labels of markers that are not to be used.
         static: recording of a standing trial, from which the markers' places are calibrated.
         meshes: the implant's.
         knee: the femorotibial joint's name.
@@ -26,7 +31,8 @@ class ImportRequest:
         scale_mass: whether the model's masses are scaled to the subject's.
         method: reading of the markers that is used.
         cutoff_Hz: of markers and plates.
-        scene_name: of the scene file.
+        contact: the scene's contact model.
+        notes: of the user, for the report.
     """
 
     model: Path
@@ -34,6 +40,9 @@ class ImportRequest:
     mass_kg: float
     recording: Path
     grf: Path | None = None
+    grf_force: str | None = None
+    poses: PoseRecording | None = None
+    without: tuple[str, ...] = ()
     static: Path | None = None
     meshes: Meshes | None = None
     knee: str | None = None
@@ -44,4 +53,5 @@ class ImportRequest:
     scale_mass: bool | None = None
     method: str = "segments"
     cutoff_Hz: float = 6.0
-    scene_name: str = "scene.toml"
+    contact: str = "foundation"
+    notes: tuple[str, ...] = ()

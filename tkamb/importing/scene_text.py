@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,19 +9,24 @@ from tkamb.geometry.frames import Array
 from tkamb.importing.links import Links
 from tkamb.importing.markers import ModelSegment
 from tkamb.importing.model_motion import MOTION_FILE, motion_tables
-from tkamb.importing.soft_tissue import End, SoftTissue
+from tkamb.importing.recorded_poses import RecordedPoses
+from tkamb.importing.shank import ShankMarkers
+from tkamb.importing.soft_tissue import SoftTissue
+from tkamb.importing.toml_text import toml_end, toml_markers, toml_mm, toml_numbers, toml_text
+from tkamb.importing.urdf import body_link
 from tkamb.units import DEGREE
 
 
 @dataclass(frozen=True)
 class Meshes:
-    """The implant's files, their unit and axes."""
+    """The implant's files, their unit and axes; the femur's bone, in its body's own axes."""
 
     femoral: Path
     insert: Path
     patella: Path | None
     unit: str
     axes: str
+    femur_bone: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +69,14 @@ class SceneText:
         urdf: name of the URDF beside the scene.
         cutoff_Hz: of markers and plates.
         links: of the leg.
-        markers: the recording; None: the model's own coordinates, in `motion.csv`.
+        markers: the recording of the knee's markers, if they are the motion.
+        poses: of the femoral component, if they are; the model's own coordinates, in
+            `motion.csv`, if neither is.
+        shank: markers that place the shank, with poses.
         ground: the ground reaction; None without.
         meshes: the implant; None without.
         tissue: muscles and ligaments.
+        contact: the contact model.
         notes: for the report.
     """
 
@@ -80,9 +88,12 @@ class SceneText:
     cutoff_Hz: float
     links: Links
     markers: MarkerFile | None
+    poses: RecordedPoses | None
+    shank: ShankMarkers | None
     ground: GroundFile | None
     meshes: Meshes | None
     tissue: SoftTissue
+    contact: str
     notes: tuple[str, ...]
 
     def text(self) -> str:
@@ -92,6 +103,7 @@ class SceneText:
             self._patient(),
             self._motion(),
             *(_segment(s) for s in (self.markers.segments if self.markers else ())),
+            self.shank.lines(self._path(self.shank.path)) if self.shank else [],
             self._ground(),
             *self._implant(),
             self._muscles(),
@@ -102,18 +114,20 @@ class SceneText:
         return "\n\n".join("\n".join(lines) for lines in tables if lines) + "\n"
 
     def _path(self, path: Path) -> str:
-        return _text(Path(os.path.relpath(path.absolute(), self.folder.absolute())).as_posix())
+        return toml_text(Path(os.path.relpath(path.absolute(), self.folder.absolute())).as_posix())
 
     def _patient(self) -> list[str]:
         return [
             "[patient]",
-            f"urdf = {_text(self.urdf)}",
+            f"urdf = {toml_text(self.urdf)}",
             f'side = "{self.side}"',
             f"mass_kg = {self.mass_kg:g}",
         ]
 
     def _motion(self) -> list[str]:
         m, neutral = self.markers, self.links.neutral
+        if self.poses is not None:
+            return self.poses.motion_lines(self._path(self.poses.given.file), self.cutoff_Hz)
         if m is None:
             head = ["[motion]", f'file = "{MOTION_FILE}"', 'interpretation = "coordinates"']
             head += ['angle_unit = "deg"', 'length_unit = "mm"', f"cutoff_Hz = {self.cutoff_Hz:g}"]
@@ -136,8 +150,8 @@ class SceneText:
             f'knee = "{m.knee}"',
             f"coordinates = {json.dumps(coordinates)}",
             "# where the model keeps the straight knee",
-            f"neutral_mm = {_mm(neutral[:3])}",
-            f"neutral_deg = {_numbers(neutral[3:5] / DEGREE)}",
+            f"neutral_mm = {toml_mm(neutral[:3])}",
+            f"neutral_deg = {toml_numbers(neutral[3:5] / DEGREE)}",
             f'laboratory_axes = "{m.axes}"',
         ]
         return lines
@@ -159,7 +173,7 @@ class SceneText:
             lines.append(f"surface_mm = {round(g.surface * 1e3, -1):.0f}")
         if g.columns:
             lines += ["", "[ground_reaction.columns]"]
-            lines += [f"{role} = {_text(column)}" for role, column in g.columns]
+            lines += [f"{role} = {toml_text(column)}" for role, column in g.columns]
         return lines
 
     def _implant(self) -> list[list[str]]:
@@ -186,16 +200,28 @@ class SceneText:
         assert t.quadriceps is not None and t.patellar_ligament is not None
         return [
             "[quadriceps]",
-            _end("origin", t.quadriceps[0]),
-            _end("insertion", t.quadriceps[1]),
+            toml_end("origin", t.quadriceps[0]),
+            toml_end("insertion", t.quadriceps[1]),
+            *self._bone(),
             "",
             "[patellar_ligament]",
-            _end("proximal", t.patellar_ligament[0]),
-            _end("distal", t.patellar_ligament[1]),
+            toml_end("proximal", t.patellar_ligament[0]),
+            toml_end("distal", t.patellar_ligament[1]),
             f"length_mm = {t.ligament_length * 1e3:.3f}",
             "",
             "[patella]",
             'motion = "solved"',
+        ]
+
+    def _bone(self) -> list[str]:
+        m = self.meshes
+        if m is None or m.femur_bone is None:
+            return []
+        link = toml_text(body_link(self.links.leg.femur[0]))
+        mesh = f'mesh = {self._path(m.femur_bone)}, unit = "{m.unit}"'
+        return [
+            "# what the line may wrap besides the component",
+            f"bone = {{ {mesh}, link = {link} }}",
         ]
 
     @property
@@ -207,8 +233,13 @@ class SceneText:
         if self.tissue.bundles:
             lines: list[str] = []
             for b in self.tissue.bundles:
-                lines += ["", "[[ligament]]", f"name = {_text(b.name)}", 'law = "quadratic-toe"']
-                lines += [_end("proximal", b.proximal), _end("distal", b.distal)]
+                lines += [
+                    "",
+                    "[[ligament]]",
+                    f"name = {toml_text(b.name)}",
+                    'law = "quadratic-toe"',
+                ]
+                lines += [toml_end("proximal", b.proximal), toml_end("distal", b.distal)]
                 lines.append(f"stiffness_N_per_strain = {b.stiffness_N:g}")
                 lines.append(f"slack_length_mm = {b.slack_length_m * 1e3:.4f}")
             return lines[1:]
@@ -223,18 +254,24 @@ class SceneText:
     def _contact(self) -> list[str]:
         if self.meshes is None:
             return []
-        return [
+        lines = [
             "[contact]",
-            'model = "foundation"',
+            f'model = "{self.contact}"',
             "resolution_mm = 1.0",
             'material = "polyethylene"',
+        ]
+        if self.poses is not None:
+            return lines
+        return [
+            *lines,
             "# nobody recorded these: contact, ligaments and muscle line find them",
             'released = ["adduction", "axial_rotation", "ap", "ml"]',
         ]
 
     def _output(self) -> list[str]:
-        lines = ["[output]", 'axis = "time"', "notes = ["]
-        return [*lines, *(f"    {_text(note)}," for note in self.notes), "]"]
+        cycle = self.poses is not None and self.poses.given.stride is not None
+        lines = ["[output]", f'axis = "{"cycle" if cycle else "time"}"', "notes = ["]
+        return [*lines, *(f"    {toml_text(note)}," for note in self.notes), "]"]
 
 
 _ALL = ["flexion", "adduction", "axial_rotation", "ap", "si", "ml"]
@@ -245,11 +282,10 @@ def _segment(segment: ModelSegment) -> list[str]:
     if segment.joint is not None and segment.centre is not None:
         lines += [
             f'joined_to = "{segment.joined_to}"',
-            f"joint_mm = {_mm(segment.joint)}",
-            f"centre_mm = {_mm(segment.centre)}",
+            f"joint_mm = {toml_mm(segment.joint)}",
+            f"centre_mm = {toml_mm(segment.centre)}",
         ]
-    points = [f"{_key(name)} = {_mm(point)}" for name, point in segment.points.items()]
-    return [*lines, f"markers_mm = {{ {', '.join(points)} }}"]
+    return [*lines, f"markers_mm = {toml_markers(segment.points)}"]
 
 
 def _button(in_patella: Array | None) -> list[str]:
@@ -258,26 +294,4 @@ def _button(in_patella: Array | None) -> list[str]:
     if in_patella is None:
         return []
     angles = Rotation.from_matrix(in_patella[:3, :3]).as_euler("XYZ") / DEGREE
-    return [f"position_mm = {_mm(in_patella[:3, 3])}", f"rotation_deg = {_numbers(angles)}"]
-
-
-def _end(key: str, end: End) -> str:
-    return f"{key} = {{ link = {_text(end.link)}, point_mm = {_mm(end.point)} }}"
-
-
-def _key(label: str) -> str:
-    """Return a marker's label without the subject's prefix, quoted where TOML wants it."""
-    plain = label.rpartition(":")[2]
-    return plain if re.fullmatch(r"[A-Za-z0-9_-]+", plain) else _text(plain)
-
-
-def _text(value: str) -> str:
-    return json.dumps(value, ensure_ascii=False)
-
-
-def _mm(point: Array) -> str:
-    return _numbers(point * 1e3)
-
-
-def _numbers(values: Array) -> str:
-    return "[" + ", ".join(f"{round(float(v), 3) + 0.0:.3f}" for v in values) + "]"
+    return [f"position_mm = {toml_mm(in_patella[:3, 3])}", f"rotation_deg = {toml_numbers(angles)}"]

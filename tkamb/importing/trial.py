@@ -1,7 +1,8 @@
 """A trial: markers or coordinates, which way the subject faces, which plates bear the foot."""
 
 import re
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,14 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.importing.anatomy import OTHER, Leg
 from tkamb.importing.links import Links
-from tkamb.importing.markers import Facing, ModelSegment, facing, feet, model_segments
+from tkamb.importing.markers import (
+    Facing,
+    ModelSegment,
+    facing,
+    feet,
+    model_segments,
+    seen_segments,
+)
 from tkamb.importing.model_motion import MOTION_FILE, ModelMotion, model_motion
 from tkamb.importing.plates import (
     Load,
@@ -20,8 +28,10 @@ from tkamb.importing.plates import (
     plate_loads,
     unmeasured,
 )
+from tkamb.importing.recorded_poses import RecordedPoses
 from tkamb.importing.request import ImportRequest
 from tkamb.importing.scene_text import GroundFile, MarkerFile
+from tkamb.importing.shank import ShankMarkers, shank_markers
 from tkamb.inputs.c3d import Recording, read_c3d
 from tkamb.inputs.tables import Table, read_table
 
@@ -33,10 +43,12 @@ FRAMES_PER_CUTOFF = 5.0
 class Trial:
     """What a recording gives: markers or coordinates, ground reaction, and lines on them."""
 
-    markers: MarkerFile | None
-    motion: ModelMotion | None
     ground: GroundFile | None
     said: tuple[str, ...]
+    markers: MarkerFile | None = None
+    motion: ModelMotion | None = None
+    poses: RecordedPoses | None = None
+    shank: ShankMarkers | None = None
 
 
 def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> Trial:
@@ -45,16 +57,35 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
     Raises:
         InputError: markers, plates or interval that cannot be used.
     """
-    segments = model_segments(links, recorded)
+    segments = model_segments(links, recorded, request.without)
     seen = _facing(request, segments, recorded)
     ground, interval, stood = _ground(request, leg, recorded, seen.axes)
     interval, frames, thinned = _thinned(recorded.time(), interval, request.cutoff_Hz)
     markers = MarkerFile(
         request.recording, seen.axes, tuple(segments), request.method, "hinge", interval, frames
     )
-    matched = [_segment_line(segment) for segment in segments]
+    matched = _segment_lines(segments, request.without)
     said = (*matched, _facing_line(request, seen), *stood, thinned)
-    return Trial(markers, None, ground, said)
+    return Trial(ground, said, markers)
+
+
+def from_poses(
+    request: ImportRequest, leg: Leg, links: Links, recorded: Table, poses: RecordedPoses
+) -> Trial:
+    """Return recorded poses of the knee, with a recording of markers that place the shank.
+
+    Raises:
+        InputError: markers or plates that cannot be used.
+    """
+    segments = seen_segments(links, recorded, request.without)
+    seen = _facing(request, [s for s in segments.values() if len(s.points) >= 3], recorded)
+    stance = poses.femur[poses.in_stance]
+    shank = shank_markers(links, segments, stance, request.recording, seen.axes)
+    covered = replace(request, interval=(float(poses.time[0]), float(poses.time[-1])))
+    ground, _, stood = _ground(covered, leg, recorded, seen.axes)
+    matched = _segment_lines(segments.values(), request.without)
+    said = (*poses.said, *matched, _facing_line(request, seen), *shank.said, *stood)
+    return Trial(ground, said, poses=poses, shank=shank)
 
 
 def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> Trial:
@@ -69,11 +100,11 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
         said.append(f"not in the motion, so at their defaults: {', '.join(motion.missing)}")
     ground = None
     if request.grf is not None:
-        ground, line = _table_ground(request.grf, leg.side, "+x,+y,+z")
+        ground, line = _table_ground(request.grf, leg.side, "+x,+y,+z", request.grf_force)
         said.append(line + "; laboratory: the model's ground, x forward, y up")
     else:
         said.append("no ground reaction given: none is modelled")
-    return Trial(None, motion, ground, tuple(said))
+    return Trial(ground, tuple(said), motion=motion)
 
 
 def _facing(request: ImportRequest, segments: list[ModelSegment], recorded: Table) -> Facing:
@@ -92,9 +123,13 @@ def _facing_line(request: ImportRequest, seen: Facing) -> str:
     )
 
 
-def _segment_line(segment: ModelSegment) -> str:
-    missing = f"; not recorded: {', '.join(segment.missing)}" if segment.missing else ""
-    return f"markers of the {segment.name}: {', '.join(segment.points)}{missing}"
+def _segment_lines(segments: Iterable[ModelSegment], without: tuple[str, ...]) -> list[str]:
+    lines = []
+    for segment in segments:
+        missing = f"; not recorded: {', '.join(segment.missing)}" if segment.missing else ""
+        own = ", ".join(segment.points) or "none"
+        lines.append(f"markers of the {segment.name}: {own}{missing}")
+    return lines + ([f"markers left out, as given: {', '.join(without)}"] if without else [])
 
 
 def _ground(
@@ -104,12 +139,14 @@ def _ground(
     if request.recording.suffix.lower() != ".c3d":
         if request.grf is None:
             return None, request.interval, ["no ground reaction given: none is modelled"]
-        ground, line = _table_ground(request.grf, leg.side, axes)
+        ground, line = _table_ground(request.grf, leg.side, axes, request.grf_force)
         return ground, request.interval, [line]
     recording = read_c3d(request.recording)
     if not recording.plates:
         raise InputError(
-            "holds no force plates", request.recording, "give the ground reaction with --grf"
+            "holds no force plates",
+            request.recording,
+            "give its markers with --trc and the ground reaction with --grf",
         )
     sides = feet(leg, recorded, OTHER[leg.side])
     if request.plates is not None:
@@ -186,18 +223,10 @@ def _unmeasured_line(
     ]
 
 
-def _table_ground(path: Path, side: str, axes: str) -> tuple[GroundFile, str]:
+def _table_ground(path: Path, side: str, axes: str, force: str | None) -> tuple[GroundFile, str]:
     """Return the columns of one foot's ground reaction in a table of OpenSim's style."""
     table = read_table(path)
-    stems = [n[:-2] for n in table.columns if n.endswith("vy") and f"{n[:-2]}vx" in table.columns]
-    own = [s for s in stems if re.search(rf"(^|_){side[0]}(_|$)|{side}", s.lower())]
-    if len(own) != 1:
-        raise InputError(
-            f"does not say which force is the {side} foot's (it has {', '.join(stems) or 'none'})",
-            path,
-            f"name its columns after the foot, like ground_force_{side[0]}_vx",
-        )
-    stem = own[0]
+    stem = _force_stem(table, side, force)
     columns = [("time", "time")]
     columns += [(f"force_{k}", f"{stem}v{a}") for k, a in enumerate("xyz", 1)]
     columns += [(f"point_{k}", f"{stem}p{a}") for k, a in enumerate("xyz", 1)]
@@ -206,7 +235,29 @@ def _table_ground(path: Path, side: str, axes: str) -> tuple[GroundFile, str]:
     if all(name in table.columns for name in found):
         columns += [(f"moment_{k}", name) for k, name in enumerate(found, 1)]
     ground = GroundFile(path, axes, (), tuple(columns), "m")
-    return ground, f"ground reaction: columns {stem}v*, {stem}p* of {path.name}, m"
+    why = "as given" if force else "by their name"
+    return ground, (
+        f"ground reaction of the {side} foot: columns {stem}v*, {stem}p* of {path.name}, m, {why}"
+    )
+
+
+def _force_stem(table: Table, side: str, force: str | None) -> str:
+    """Return what the columns of a foot's force begin with: as given, or named after the foot."""
+    stems = [n[:-2] for n in table.columns if n.endswith("vy") and f"{n[:-2]}vx" in table.columns]
+    there = ", ".join(stems) or "none"
+    if force is not None:
+        own = [s for s in stems if s.rstrip("_") == force.removesuffix("_v").rstrip("_")]
+        if len(own) != 1:
+            raise InputError(f"has no force '{force}' (it has {there})", table.path, "--grf-force")
+        return own[0]
+    own = [s for s in stems if re.search(rf"(^|_){side[0]}(_|$)|{side}", s.lower())]
+    if len(own) != 1:
+        raise InputError(
+            f"does not say which force is the {side} foot's (it has {there})",
+            table.path,
+            f"give --grf-force, or name its columns after the foot: ground_force_{side[0]}_vx",
+        )
+    return own[0]
 
 
 def _listed(numbers: tuple[int, ...]) -> str:
