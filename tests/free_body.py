@@ -1,6 +1,6 @@
 """Free-body balance of one leg: shank and foot, patella, thigh. numpy alone, nothing of tkamb."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,6 +22,9 @@ class Lent:
         quadriceps: (link, point (3,), force (3,) per newton of tension), wraps included.
         patellar_ligament: likewise.
         patellofemoral: (point (3,), unit normal (3,) into the patella).
+        others: (start (3,) m in the tibia link, end (3,) m in the femur link, N) of further
+            muscles from shank to thigh.
+        reserve: N·m on the shank about insert z.
     """
 
     condyles: dict
@@ -30,6 +33,8 @@ class Lent:
     quadriceps: list
     patellar_ligament: list
     patellofemoral: tuple
+    others: list = field(default_factory=list)
+    reserve: float = 0.0
 
 
 class FreeBodies:
@@ -58,7 +63,7 @@ class FreeBodies:
         patella (6): force and moment at the hip, on the femur.
         """
         columns = self._on_shank()
-        known = self.leg.ground(self.t) + self._ligaments(1)
+        known = self.leg.ground(self.t) + self._ligaments(1) + self._others()
         right = self.leg.needed("tibia", self.t) - known
         values = dict(
             zip(columns, np.linalg.solve(np.stack([*columns.values()], 1), right), strict=True)
@@ -69,6 +74,7 @@ class FreeBodies:
             values.update(self._patella(patellar))
         on_thigh = (
             self._ligaments(0)
+            - self._others()
             - shank
             + patellar
             * (
@@ -144,6 +150,17 @@ class FreeBodies:
         for force, *ends in self.strands:
             pull = ends[1 - end] - ends[end]
             total += wrench(ends[end], force * pull / np.linalg.norm(pull))
+        return total
+
+    def _others(self):
+        """Return the wrench on the shank of muscles whose force is known, and of the reserve."""
+        total = np.append(np.zeros(3), self.lent.reserve * self.axes[:, 2])
+        for start, end, force in self.lent.others:
+            start, end = (
+                (self.leg.in_laboratory(link, self.t) @ np.append(point, 1.0))[:3]
+                for link, point in (("tibia", start), ("femur", end))
+            )
+            total += wrench(start, force * (end - start) / np.linalg.norm(end - start))
         return total
 
     def _line(self, loads, body):

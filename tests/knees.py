@@ -4,7 +4,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tkamb.body.chain import Chain, ChainMotion
-from tkamb.geometry.frames import pose
+from tkamb.body.contact_points import CondylePoint
+from tkamb.body.knee import Extensor, KneeGeometry
+from tkamb.body.load import PointForces
+from tkamb.body.unknowns import Unknown
+from tkamb.geometry.frames import pose, transform
 
 INERTIA = {
     "tibia": (4.2, "0.01 0.22 0.005", "0.06 0.008 0.061 0.001 0.0004 -0.0006"),
@@ -88,3 +92,43 @@ def random_motion(chain: Chain, rng: np.random.Generator) -> ChainMotion:
         rng.uniform(-9, 9, 6),
         joints,
     )
+
+
+FLEXION = np.radians(30.0)
+UP = np.array([0.0, 1.0, 0.0])
+HALF = 0.024
+"""m: half the distance of the condyles' contact points."""
+
+
+def bent_knee():
+    """Return a leg at rest, upright, 30 deg bent, with all its lines and no ground reaction."""
+    chain = leg()
+    joints = np.zeros((3, 9))
+    joints[0] = [0.0, 0.03, 0.0, 0.0, 0.0, FLEXION, 0.045, 0.01, -0.3]
+    state = chain.at(ChainMotion(pose(np.eye(3), np.zeros(3)), np.zeros(6), np.zeros(6), joints))
+    at = {
+        "origin": transform(state.pose("femur"), np.array([0.03, 0.2, 0.0])),
+        "insertion": transform(state.pose("patella"), np.array([0.008, 0.02, 0.0])),
+        "proximal": transform(state.pose("patella"), np.array([0.006, -0.02, 0.0])),
+        "tuberosity": np.array([0.04, -0.04, 0.0]),
+        "contact": transform(state.pose("patella"), np.array([-0.006, 0.0, 0.0])),
+    }
+    pull = line("femur", at["origin"], "patella", at["insertion"])
+    extensor = Extensor(
+        line("patella", at["proximal"], "tibia", at["tuberosity"]),
+        at["contact"],
+        state.pose("patella")[:3, 0],
+        ("quadriceps",),
+    )
+    condyles = {
+        side: CondylePoint(np.array([0.0, 0.0, z]), UP, np.array([0.02, 0.0, 0.0]), 0.0)
+        for side, z in (("medial", -HALF), ("lateral", HALF))
+    }
+    muscle = Unknown("muscle_quadriceps", pull)
+    return KneeGeometry(state, None, (), condyles, frozenset(), extensor, (muscle,))
+
+
+def line(link, start, other, end):
+    """Return a newton of tension between two points."""
+    pull = ((end - start) / np.linalg.norm(end - start))[None]
+    return PointForces(link, start[None], pull), PointForces(other, end[None], -pull)

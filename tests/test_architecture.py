@@ -23,7 +23,7 @@ DRAWING = {
     "contact": {"geometry"},
     "inputs": {"geometry"},
     "scene": {"body", "geometry", "inputs"},
-    "equilibrium": {"body", "contact", "geometry", "scene"},
+    "equilibrium": {"body", "contact", "geometry", "muscles", "scene"},
     "plausibility": {"geometry", "inputs", "scene"},
     "importing": {"geometry", "inputs", "opensim", "scene"},
     "run": {*KNEE, *SHOWN} - {"results"},

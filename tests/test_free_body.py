@@ -21,7 +21,9 @@ import pytest
 
 from free_body import FreeBodies, Lent
 from raw_leg import Leg
+from shared_trials import two_flexors
 from tkamb.equilibrium.mechanics import Mechanics
+from tkamb.equilibrium.shared_muscles import SharedMuscles
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import pose
 from tkamb.inputs.meshes import axes_rotation, load_surface
@@ -69,6 +71,15 @@ def test_the_shipped_knee_is_in_balance_on_free_bodies(shipped, k):
     assert_same_loads(leg, mechanics.frame(k), time[k])
 
 
+@pytest.mark.parametrize("k", SHIPPED_FRAMES[1::2])
+def test_it_stays_so_with_muscles_across_the_knee(shipped, monkeypatch, k):
+    leg, mechanics, time = shipped
+    monkeypatch.setattr(mechanics, "muscles", SharedMuscles(two_flexors(len(time))))
+    frame = mechanics.frame(k)
+    assert frame.geometry.share.force[1:].min() > 20.0
+    assert_same_loads(leg, frame, time[k])
+
+
 @needs_dm
 @pytest.mark.parametrize("k", DM_FRAMES)
 def test_dm_is_in_balance_on_free_bodies(dm, k):
@@ -106,7 +117,14 @@ def lent(frame):
         quadriceps,
         ligament,
         (geometry.extensor.contact_point, geometry.extensor.contact_normal),
+        *(([], 0.0) if geometry.share is None else lent_muscles(geometry.share)),
     )
+
+
+def lent_muscles(share):
+    """Return ends and forces of the muscles across the knee, and the knee's reserve."""
+    ends = (share.lines.shank, share.lines.thigh, share.force[share.crossing])
+    return list(zip(*ends, strict=True)), share.reserve[share.flexion]
 
 
 def test_lines_that_wrap_nothing_run_between_the_scenes_points(shipped):

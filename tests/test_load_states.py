@@ -8,19 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from knees import leg
-from tkamb.body.chain import ChainMotion
-from tkamb.body.contact_points import CondylePoint
-from tkamb.body.knee import Extensor, KneeGeometry, solve_knee
+from knees import HALF, UP, bent_knee
+from tkamb.body.knee import solve_knee
 from tkamb.body.load import PointForces
-from tkamb.body.unknowns import Unknown
-from tkamb.geometry.frames import pose, transform
 
 FRICTION = 0.05
-FLEXION = np.radians(30.0)
-UP = np.array([0.0, 1.0, 0.0])
-HALF = 0.024
-"""m: half the distance of the condyles' contact points."""
 CARRIED = (
     "medial_normal",
     "lateral_normal",
@@ -32,37 +24,7 @@ CARRIED = (
 
 @pytest.fixture(scope="module")
 def knee():
-    """Return a leg at rest, upright, 30 deg bent, with all its lines and no ground reaction."""
-    chain = leg()
-    joints = np.zeros((3, 9))
-    joints[0] = [0.0, 0.03, 0.0, 0.0, 0.0, FLEXION, 0.045, 0.01, -0.3]
-    state = chain.at(ChainMotion(pose(np.eye(3), np.zeros(3)), np.zeros(6), np.zeros(6), joints))
-    at = {
-        "origin": transform(state.pose("femur"), np.array([0.03, 0.2, 0.0])),
-        "insertion": transform(state.pose("patella"), np.array([0.008, 0.02, 0.0])),
-        "proximal": transform(state.pose("patella"), np.array([0.006, -0.02, 0.0])),
-        "tuberosity": np.array([0.04, -0.04, 0.0]),
-        "contact": transform(state.pose("patella"), np.array([-0.006, 0.0, 0.0])),
-    }
-    pull = line("femur", at["origin"], "patella", at["insertion"])
-    extensor = Extensor(
-        line("patella", at["proximal"], "tibia", at["tuberosity"]),
-        at["contact"],
-        state.pose("patella")[:3, 0],
-        ("quadriceps",),
-    )
-    condyles = {
-        side: CondylePoint(np.array([0.0, 0.0, z]), UP, np.array([0.02, 0.0, 0.0]), 0.0)
-        for side, z in (("medial", -HALF), ("lateral", HALF))
-    }
-    muscle = Unknown("muscle_quadriceps", pull)
-    return KneeGeometry(state, None, (), condyles, frozenset(), extensor, (muscle,))
-
-
-def line(link, start, other, end):
-    """Return a newton of tension between two points."""
-    pull = ((end - start) / np.linalg.norm(end - start))[None]
-    return PointForces(link, start[None], pull), PointForces(other, end[None], -pull)
+    return bent_knee()
 
 
 def loaded(knee, force, point, moment=(0.0, 0.0, 0.0)):

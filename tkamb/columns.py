@@ -31,12 +31,19 @@ _MUSCLE = "[quadriceps], [patellar_ligament], [patella]"
 _COUPLED = "[contact] coupling or released"
 _POINTS = "[contact] coupling = 'points'"
 _FREE = "[contact] released"
+_MUSCLES = "[muscles]"
 _RECORDED = "[contact] with adduction not released"
 _MARKERS = "[motion.markers]"
 _ADJUST = "[contact] with adjust = true"
 
 LIGAMENT = "ligament_<name>_N"
 """Stands for one column per [[ligament]], in the scene's order."""
+MUSCLE_FORCE = "muscle_<name>_N"
+ACTIVATION = "activation_<name>"
+RESERVE = "reserve_<coordinate>_Nm"
+JOINT_MOMENT = "joint_moment_<coordinate>_Nm"
+FAMILIES = (LIGAMENT, MUSCLE_FORCE, ACTIVATION, RESERVE, JOINT_MOMENT)
+"""Each stands for one column per ligament, muscle or coordinate."""
 
 COLUMNS: tuple[Column, ...] = (
     Column("time_s", "time of the frame"),
@@ -178,36 +185,81 @@ COLUMNS: tuple[Column, ...] = (
         "between the knee centres that shank and thigh markers carry, each by itself",
         _MARKERS,
     ),
+    Column(MUSCLE_FORCE, "force of the muscle <name> of the model", _MUSCLES),
+    Column(ACTIVATION, "its activation, 0 to 1", _MUSCLES),
+    Column(
+        RESERVE,
+        "moment about <coordinate> that no muscle carries; the knee's acts on the tibia about "
+        "insert z, beside residual_flexion_Nm",
+        _MUSCLES,
+    ),
+    Column(
+        JOINT_MOMENT,
+        "moment about <coordinate> that muscles and reserve carry together; the knee's about the "
+        "axis on which contact and patella leave it",
+        _MUSCLES,
+    ),
 )
 
 RENAMED = {"softest_N_per_mm": "smallest_stiffness_N_per_mm"}
 """Names in results of earlier releases, and today's."""
 
 KINDS: dict[str, Kind] = {column.name: column.kind for column in COLUMNS}
-_PREFIX, _SUFFIX = LIGAMENT.split("<name>")
+
+
+def _ends(family: str) -> tuple[str, str]:
+    """Return what stands before and after the name in a family's columns."""
+    return family[: family.index("<")], family[family.index(">") + 1 :]
+
+
+def belongs(column: str, family: str) -> bool:
+    """Return whether a column is one of a family's."""
+    before, after = _ends(family)
+    inside = len(column) > len(before) + len(after)
+    return inside and column.startswith(before) and column.endswith(after)
+
+
+def family_column(family: str, name: str) -> str:
+    """Return the column of a family that stands for `name`."""
+    before, after = _ends(family)
+    return f"{before}{name}{after}"
+
+
+def name_in(column: str, family: str) -> str:
+    """Return the name in a family's column."""
+    before, after = _ends(family)
+    return column.removeprefix(before).removesuffix(after)
 
 
 def is_ligament(name: str) -> bool:
     """Return whether the column holds a ligament's tension."""
-    return name.startswith(_PREFIX) and name.endswith(_SUFFIX) and len(name) > len(LIGAMENT) - 6
+    return belongs(name, LIGAMENT)
+
+
+def in_a_family(name: str) -> bool:
+    """Return whether the column is one of a family's."""
+    return any(belongs(name, family) for family in FAMILIES)
 
 
 def ligament_column(name: str) -> str:
     """Return the column of the ligament bundle `name`."""
-    return f"{_PREFIX}{name}{_SUFFIX}"
+    return family_column(LIGAMENT, name)
 
 
 def ligament_of(column: str) -> str:
     """Return the bundle's name of a ligament column."""
-    return column.removeprefix(_PREFIX).removesuffix(_SUFFIX)
+    return name_in(column, LIGAMENT)
 
 
 def ordered_names(present: Iterable[str]) -> tuple[str, ...]:
-    """Return every fixed column in order, with the ligament columns of `present` in place."""
-    ligaments = [name for name in present if is_ligament(name)]
+    """Return every fixed column in order, with the families' columns of `present` in place."""
+    given = list(present)
     names: list[str] = []
     for column in COLUMNS:
-        names.extend(ligaments if column.name == LIGAMENT else [column.name])
+        if column.name in FAMILIES:
+            names.extend(name for name in given if belongs(name, column.name))
+        else:
+            names.append(column.name)
     return tuple(names)
 
 

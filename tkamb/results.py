@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.columns import KINDS, RENAMED, is_ligament, ordered_names
+from tkamb.columns import KINDS, RENAMED, in_a_family, ordered_names
 from tkamb.errors import InputError, names_near
 from tkamb.files import TABLE_LIMIT, read_text
 from tkamb.geometry.frames import Array
@@ -161,7 +161,7 @@ def _cell(name: str, value: Any) -> str:
 def _parse(name: str, cells: tuple[str, ...], path: Path) -> Any:
     if KINDS.get(name) == "text":
         return list(cells)
-    if name not in KINDS and not is_ligament(name):
+    if name not in KINDS and not in_a_family(name):
         raise InputError(f"unknown column '{name}'", path, names_near(name, KINDS))
     try:
         return np.array([float(cell) if cell else math.nan for cell in cells])

@@ -2,9 +2,9 @@
 
 Across the knee, femur and shank exchange one wrench: what ground, weight and inertia leave
 unbalanced on the shank. It does not depend on the knee coordinates, for the shank moves as
-recorded. Contact, ligaments and the patellar ligament must add up to it:
+recorded. Contact, ligaments, muscles and the patellar ligament must add up to it:
 
-    R(q, y) = w_external + w_ligaments(q) + w_contact(q) + B y = 0        (on the insert)
+    R(q, y) = w_external + w_ligaments(q) + w_muscles(q) + w_contact(q) + B y = 0   (on the insert)
 
 The columns B are the loads that may keep the prescribed coordinates in place: the patellar
 ligament's line (flexion), and the residuals of the equations of motion for the others. The
@@ -17,12 +17,13 @@ J of `knee_axes`: zero at equilibrium, and along +q_i where the femur wants to g
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tkamb.body import unknowns
+from tkamb.body.crossing import MuscleShare
 from tkamb.body.knee import KneeGeometry
 from tkamb.body.load import wrench_of
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_axes, knee_pose, transform
@@ -59,6 +60,8 @@ class JointEquilibrium:
         line: the patellar ligament, which balances flexion; None: a moment does.
         keeping: (6, m) the other columns of B, of unit magnitude.
         released: indices of the n released coordinates.
+        share: the muscles across the knee beside the quadriceps, if modelled.
+        tibia: (4, 4) pose of the tibia link in the insert frame.
     """
 
     external: Array
@@ -66,6 +69,8 @@ class JointEquilibrium:
     line: PatellarLine | None
     keeping: Array
     released: tuple[int, ...]
+    share: MuscleShare | None = None
+    tibia: Array = field(default_factory=lambda: np.eye(4))
 
     def imbalance(self, coordinates: Array, contact: Array) -> Array:
         """Return r (..., n): generalised forces on the released coordinates.
@@ -99,6 +104,8 @@ class JointEquilibrium:
         """Return axes (..., 6, 6), columns B (..., 6, 6 - n) and wrench (..., 6)."""
         poses = knee_pose(coordinates)
         wrench = self.external + contact + self.ligaments.wrench(poses)
+        if self.share is not None:
+            wrench = wrench + self.share.wrench(self.tibia, poses)
         columns = np.broadcast_to(self.keeping, (*wrench.shape[:-1], *self.keeping.shape))
         if self.line is not None:
             columns = np.concatenate([columns, self.line.wrench(poses)[..., None]], axis=-1)
@@ -141,6 +148,8 @@ def joint_equilibrium(
         line,
         np.array(columns).reshape(-1, 6).T,
         released,
+        geometry.share,
+        geometry.state.pose("tibia"),
     )
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from tkamb.body import unknowns
 from tkamb.body.chain import ChainState
 from tkamb.body.contact_points import CondylePoint
+from tkamb.body.crossing import MuscleShare
 from tkamb.body.load import PointForces
 from tkamb.body.load_state import LoadState, contradictions, load_states, wrong_signs
 from tkamb.body.unknowns import Unknown, muscle_load, solve
@@ -69,6 +70,7 @@ class KneeGeometry:
         muscles: one newton of tension on each muscle's line of action.
         coordinates: (6,) knee coordinates, m and rad, at which all this stands.
         tensions: ligament name -> N.
+        share: the other muscles, with their forces, if modelled.
         problems: plain words, why the equations cannot be set up; empty when all is well.
     """
 
@@ -81,6 +83,7 @@ class KneeGeometry:
     muscles: tuple[Unknown, ...] = ()
     coordinates: Array = field(default_factory=lambda: np.full(6, np.nan))
     tensions: dict[str, float] = field(default_factory=dict)
+    share: MuscleShare | None = None
     problems: tuple[str, ...] = ()
 
 
@@ -127,13 +130,13 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
     off = geometry.lifted
     extensors = geometry.extensor.muscles if geometry.extensor else ()
     first, *others = load_states(geometry.condyles, off, extensors)
-    full = _System(geometry, friction, first)
+    full = KneeSystem(geometry, friction, first)
     condition = full.solution.condition
     if not full.solution.regular:
         return replace(unsolved(("singular equations",)), condition=condition)
     if not wrong_signs(first, full.solution):
         return full.loads()
-    systems = {first: full} | {state: _System(geometry, friction, state) for state in others}
+    systems = {first: full} | {state: KneeSystem(geometry, friction, state) for state in others}
     solutions = {state: system.solution for state, system in systems.items()}
     wrong = {state: contradictions(state, solutions, off) for state in systems}
     held = [system for state, system in systems.items() if not wrong[state]]
@@ -188,7 +191,7 @@ def dome_sensitivity(geometry: KneeGeometry, friction: float) -> tuple[float, fl
     return float(slopes[0]), float(slopes[1])
 
 
-class _System:
+class KneeSystem:
     """The square system of one frame under given assumptions, solved.
 
     Args:
@@ -206,11 +209,13 @@ class _System:
         self.names = [unknown.name for unknown in found]
         ground = [geometry.ground] if geometry.ground else []
         couples = [unknowns.moment_pair("tibia", "femur", unknowns.AXES[a]) for a in ("ap", "ml")]
-        groups = [*(unknown.loads for unknown in found), *couples, ground, geometry.ligaments]
+        pulls = geometry.share.loads(state) if geometry.share else ()
+        known = (*geometry.ligaments, *pulls)
+        groups = [*(unknown.loads for unknown in found), *couples, ground, known]
         columns = state.generalised(groups)
         self._columns, self._couples = columns[:, :-4], columns[:, -4:-2]
-        self._without_ligaments = state.inertial - columns[:, -2]
-        self._right = self._without_ligaments - columns[:, -1]
+        self._outside = state.inertial - columns[:, -2]
+        self._right = self._outside - columns[:, -1]
         self.solution = solve(self.names, self._columns, self._right)
 
     @property
@@ -245,6 +250,10 @@ class _System:
         ]
         return np.asarray(np.sum(forces, axis=0))
 
+    def response(self, loads: Array) -> Array:
+        """Return what one unit of each known load, columns (k, n), adds to the unknowns (k, n)."""
+        return np.asarray(-np.linalg.solve(self._columns, loads))
+
     def sensitivity(self) -> float:
         """Return the largest change (N) of the total force as the residuals' point moves.
 
@@ -273,8 +282,8 @@ class _System:
         centre is the femoral origin, where the three axes meet.
         """
         hip = self._columns[:, :6]
-        at_hip = np.linalg.solve(hip[:6], self._without_ligaments[:6])
-        knee = self._without_ligaments - hip @ at_hip
+        at_hip = np.linalg.solve(hip[:6], self._outside[:6])
+        knee = self._outside - hip @ at_hip
         rows = self.geometry.state.chain.knee_columns()
         return -float(knee[rows[5]]), -float(knee[rows[4]])
 

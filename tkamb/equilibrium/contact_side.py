@@ -35,7 +35,8 @@ from tkamb.scene.case import Case
 from tkamb.units import DEGREE
 
 if TYPE_CHECKING:
-    from tkamb.equilibrium.released import KneeEquilibrium, ReleasedKnee
+    from tkamb.body.crossing import MuscleShare
+    from tkamb.equilibrium.released import KneeEquilibrium
 
 NAN = float("nan")
 
@@ -98,7 +99,7 @@ class ContactSide:
         if self.released is None:
             body, contact = self._press_recorded(k, before)
         else:
-            body, contact = self._release(self.released, k, before)
+            body, contact = self._release(k, before)
         if contact.result is None or body.loads.problems or self.case.split is None:
             return body, contact
         if not self._sensitivity:
@@ -132,9 +133,9 @@ class ContactSide:
         """
         load = float(body.loads.contact_force[1])
         if not np.isfinite(load):
-            return self._nothing("no load from the equations")
+            return self.nothing("no load from the equations")
         if load <= 0:
-            return self._nothing("no compressive load")
+            return self.nothing("no compressive load")
         start = clock.perf_counter()
         adjustment, query = body.adjustment, self.mechanics.query
         if adjustment is None or query is None:
@@ -155,11 +156,10 @@ class ContactSide:
             if contact.result is None:
                 return body, contact
             load, points = body.loads.contact_force[1], _points(body)
-            found = self._resultants(k, place, contact.result)
+            found = self.resultants(k, place, contact.result)
             geometry = replace(body.geometry, condyles=body.geometry.condyles | found)
-            body = replace(
-                body, geometry=geometry, loads=solve_knee(geometry, self.mechanics.friction)
-            )
+            geometry, loads = self.mechanics.solved(k, geometry)
+            body = replace(body, geometry=geometry, loads=loads)
             contact = self.carry(body, self.mechanics.poses[k], contact.result)
             seconds += contact.seconds
             change = abs(float(body.loads.contact_force[1] - load))
@@ -178,25 +178,40 @@ class ContactSide:
             contact, result=None, problem=problem
         )
 
-    def _release(
-        self, released: "ReleasedKnee", k: int, before: Sequence[FrameContact]
-    ) -> tuple[FrameLoads, FrameContact]:
+    def _release(self, k: int, before: Sequence[FrameContact]) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact with the released coordinates at rest."""
-        start = clock.perf_counter()
         good = [contact for contact in before if contact.equilibrium and contact.result][-2:]
+        if self.mechanics.muscles is None:
+            return self.rest(k, good)
+        from tkamb.equilibrium.muscles_at_rest import rest_with_muscles
+
+        return rest_with_muscles(self, self.mechanics.muscles, k, good)
+
+    def rest(
+        self, k: int, good: Sequence[FrameContact], share: "MuscleShare | None" = None
+    ) -> tuple[FrameLoads, FrameContact]:
+        """Return body and contact with the released coordinates at rest.
+
+        Args:
+            k: frame.
+            good: the last two contacts that were found, where the search begins.
+            share: the other muscles' forces.
+        """
+        released, start = self.released, clock.perf_counter()
+        assert released is not None
         earlier, guess = (good[-1].equilibrium, good[-1].result) if good else (None, None)
         points = {} if len(released.released) == 5 else self._nearest_points(k)
         knee = None
         for place in self._starts(k, [c.equilibrium.coordinates for c in good if c.equilibrium]):
             if np.isfinite(place).all():
-                knee = released.find(k, place, points, earlier)
+                knee = released.find(k, place, points, earlier, share)
                 if knee.balance.status not in ASTRAY:
                     break
         if knee is None:
-            contact = self._nothing("the femoral component does not lie over the insert")
+            contact = self.nothing("the femoral component does not lie over the insert")
             body = self.mechanics.frame(k)
             return replace(body, loads=unsolved([contact.problem])), contact
-        result, contact = None, self._nothing(knee.problem)
+        result, contact = None, self.nothing(knee.problem)
         if not knee.problem:
             result = self.model.evaluate(self.state, knee_pose(knee.coordinates), guess)
             result = within_insert(self.state, result)
@@ -239,7 +254,7 @@ class ContactSide:
             separated = {
                 side: CondylePoint(point, up, still, NAN) for side, point in points.items()
             }
-            touching = self._resultants(k, knee.coordinates, contact.result)
+            touching = self.resultants(k, knee.coordinates, contact.result)
             sides = {"medial"} if self.case.split is None else {"medial", "lateral"}
             geometry = replace(
                 geometry, condyles=separated | touching, lifted=frozenset(sides - set(touching))
@@ -248,7 +263,7 @@ class ContactSide:
         seconds = clock.perf_counter() - start
         return FrameLoads(geometry, loads, None, 0.0, seconds)
 
-    def _resultants(self, k: int, place: Array, result: ContactResult) -> dict[str, CondylePoint]:
+    def resultants(self, k: int, place: Array, result: ContactResult) -> dict[str, CondylePoint]:
         """Return the contact's resultants as the contact points of the equations."""
         return {
             side: CondylePoint(
@@ -276,7 +291,8 @@ class ContactSide:
             result, medial, adjustment, seconds, "", result.flags, triangles=self.state.triangles
         )
 
-    def _nothing(self, problem: str) -> FrameContact:
+    def nothing(self, problem: str) -> FrameContact:
+        """Return a contact that could not be computed, and why."""
         none = np.zeros(len(self.state.points), bool)
         return FrameContact(None, none, None, 0.0, problem, ())
 

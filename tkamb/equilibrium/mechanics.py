@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from tkamb.body.ligaments import Ligament
     from tkamb.body.patella import PatellaState
     from tkamb.body.slip import CondyleSlip
+    from tkamb.equilibrium.shared_muscles import SharedMuscles
     from tkamb.geometry.adjustment import Adjustment
     from tkamb.geometry.closest import ClosestPointQuery
 
@@ -71,6 +72,7 @@ class Mechanics:
         extensor: patella and lines of action of all frames; None if not modelled.
         ligaments: the bundles, with their slack lengths.
         strains: bundle -> strain at the flexions of `STRAIN_FLEXIONS`; NaN if not recorded.
+        muscles: those that share the load; None if the quadriceps alone acts.
     """
 
     def __init__(self, case: Case, query: "ClosestPointQuery | None" = None) -> None:
@@ -83,6 +85,11 @@ class Mechanics:
         if case.scene.patella:
             self.extensor = extensor_frames(case, self.poses)
         self.ligaments, self.strains = self._build_ligaments()
+        self.muscles: SharedMuscles | None = None
+        if case.scene.muscles:
+            from tkamb.equilibrium.shared_muscles import load_muscles
+
+            self.muscles = load_muscles(case)
 
     def _check_near(self) -> None:
         """Raise where the condyles are nowhere near the insert, whatever the frame."""
@@ -121,10 +128,23 @@ class Mechanics:
         geometry = replace(
             geometry, condyles=points.condyles, lifted=points.lifted, problems=problems
         )
-        loads = unsolved(problems) if problems else solve_knee(geometry, self.friction)
+        geometry, loads = self.solved(k, geometry)
         done = clock.perf_counter()
         effect = self._effect(geometry, loads, recorded) if recorded else None
         return FrameLoads(geometry, loads, adjustment, queried - start, done - queried, effect)
+
+    def solved(self, k: int, geometry: KneeGeometry) -> tuple[KneeGeometry, KneeLoads]:
+        """Return frame k with the muscles' shares in it, and its loads.
+
+        Args:
+            k: frame.
+            geometry: the frame, with its contact points.
+        """
+        if geometry.problems:
+            return geometry, unsolved(geometry.problems)
+        if self.muscles is None:
+            return geometry, solve_knee(geometry, self.friction)
+        return self.muscles.solve(k, geometry, self.friction)
 
     def geometry(
         self, k: int, coordinates: Array | None = None, patella: "PatellaState | None" = None

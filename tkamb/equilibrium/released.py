@@ -31,6 +31,7 @@ from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_axes, knee_pose
 
 if TYPE_CHECKING:
+    from tkamb.body.crossing import MuscleShare
     from tkamb.body.patella import PatellaState
     from tkamb.contact.probe import Probe, ProbedContact
 
@@ -106,6 +107,7 @@ class ReleasedKnee:
         start: Array,
         points: dict[str, Array] | None = None,
         before: KneeEquilibrium | None = None,
+        share: "MuscleShare | None" = None,
     ) -> KneeEquilibrium:
         """Return frame k at rest.
 
@@ -115,11 +117,12 @@ class ReleasedKnee:
             points: side -> (3,) m, where a condyle that carries nothing is nearest to the
                 insert: residual forces act in the middle of both condyles' points.
             before: the frame before, whose patella and stiffness are guesses.
+            share: the forces of the other muscles, which follow the knee.
         """
         place, middle, force = np.array(start, float), np.array(start[:3]), np.full(3, np.nan)
         knee, slack, trials, passes = before, False, 0, 0
         while passes < MOST_PASSES:
-            knee, pushes = self._pass(k, place, middle, slack, knee)
+            knee, pushes = self._pass(k, place, middle, slack, knee, share)
             passes, trials = passes + 1, trials + knee.balance.trials
             change = float(np.linalg.norm(knee.contact.wrench[:3] - force))
             knee = replace(knee, passes=passes, trials=trials, change=change)
@@ -137,17 +140,23 @@ class ReleasedKnee:
         return replace(knee, problem="knee and patella do not settle together")
 
     def _pass(
-        self, k: int, place: Array, middle: Array, slack: bool, before: KneeEquilibrium | None
+        self,
+        k: int,
+        place: Array,
+        middle: Array,
+        slack: bool,
+        before: KneeEquilibrium | None,
+        share: "MuscleShare | None",
     ) -> tuple[KneeEquilibrium, bool]:
         """Return the knee at rest with the patella as at `place`, and whether it would push."""
         patella = self._patella(k, place, before.patella if before else None)
-        geometry = self._mechanics.geometry(k, place, patella)
+        geometry = replace(self._mechanics.geometry(k, place, patella), share=share)
         forces = self._forces(k, geometry, middle, slack)
         balance = forces.balance(before.balance.stiffness if before else None)
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
         if balance.status is not BalanceStatus.OK:
             problem = problem or f"released: {balance.status.value}" + (
-                " (quadriceps slack, flexors not modelled)" if slack else ""
+                " (quadriceps slack, flexors not modelled)" if slack and not share else ""
             )
         knee = KneeEquilibrium(
             forces.at(balance),

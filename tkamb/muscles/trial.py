@@ -20,7 +20,7 @@ import numpy as np
 
 from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array
-from tkamb.importing.anatomy import find_leg
+from tkamb.importing.anatomy import Leg, find_leg
 from tkamb.muscles.bones import Bones
 from tkamb.muscles.hill import rigid_tendon_strength
 from tkamb.muscles.leg import (
@@ -124,12 +124,48 @@ def solve_trial(
         InputError: no such side, muscle, coordinate or body, or options out of range.
     """
     sharing = Sharing() if sharing is None else sharing
-    leg, kinematics = find_leg(model, side), Kinematics(model)
+    leg = find_leg(model, side)
+    balanced = leg_coordinates(leg) if sharing.coordinates is None else sharing.coordinates
+    if leg.flexion in balanced:
+        check_extensors(leg, leg_muscles(leg) if sharing.muscles is None else sharing.muscles)
+    problem, bones = trial_problems(leg, motion, loads, sharing)
+    frames = [problem.solved(k) for k in range(len(motion.q))]
+    activation, reserve, residual = (
+        np.array([frame[part] for frame in frames]) for part in range(3)
+    )
+    return MuscleTrial(
+        motion.time,
+        bones.muscles,
+        balanced,
+        activation,
+        activation * problem.active + problem.passive,
+        problem.arms,
+        problem.moment,
+        reserve,
+        residual,
+        tuple(frame[3] for frame in frames),
+        bones,
+    )
+
+
+def trial_problems(
+    leg: Leg, motion: CoordinateMotion, loads: Mapping[str, Array], sharing: Sharing
+) -> tuple[FrameProblems, Bones]:
+    """Return what every frame asks of a leg's muscles, and what acts on the bones.
+
+    Args:
+        leg: the leg.
+        motion: as in `solve_trial`, as the others.
+        loads: likewise.
+        sharing: likewise.
+
+    Raises:
+        InputError: no such muscle, coordinate or body, or options out of range.
+    """
+    model, kinematics = leg.model, Kinematics(leg.model)
     names = leg_muscles(leg) if sharing.muscles is None else sharing.muscles
     balanced = leg_coordinates(leg) if sharing.coordinates is None else sharing.coordinates
     _check(kinematics, motion, loads, names, balanced, sharing)
-    if leg.flexion in balanced:
-        check_extensors(leg, names)
     q, groups = motion.q, leg_bones(leg)
     placed = kinematics.motion(q)
     needed = required_wrenches(kinematics, placed, q, motion.rates, motion.accelerations, loads)
@@ -140,23 +176,7 @@ def solve_trial(
     active, passive = _strength(kinematics, motion, sharing, pulls)
     muscles = [model.muscles[name] for name in names]
     problem = FrameProblems(muscles, balanced, sharing, moment, arms, active, passive)
-    frames = [problem.solved(k) for k in range(len(q))]
-    activation, reserve, residual = (
-        np.array([frame[part] for frame in frames]) for part in range(3)
-    )
-    return MuscleTrial(
-        motion.time,
-        names,
-        balanced,
-        activation,
-        activation * active + passive,
-        arms,
-        moment,
-        reserve,
-        residual,
-        tuple(frame[3] for frame in frames),
-        _bones(groups, placed, needed, pulls),
-    )
+    return problem, _bones(groups, placed, needed, pulls)
 
 
 def _bones(

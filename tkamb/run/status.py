@@ -52,7 +52,7 @@ def frame_status(
     words = [*_motion_flags(case, k), *_flank_flags(body), *_adjustment_flags(case, body)]
     released = contact is not None and contact.equilibrium is not None
     words += [_lift_off(body, side, released) for side in sorted(body.loads.lifted)]
-    if body.loads.slack:
+    if body.loads.slack and body.geometry.share is None:
         words.append("flexors needed, which are not modelled: quadriceps slack")
     if body.loads.ambiguous:
         words.append("several load states balance: the one that leaves out fewest is taken")

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from tkamb.code_identity import code_identity
+from tkamb.columns import JOINT_MOMENT, RESERVE, belongs, family_column, name_in
 from tkamb.equilibrium.mechanics import STRAIN_FLEXIONS
 from tkamb.files import sha256_of
 from tkamb.known_errors import as_json, known_error
 from tkamb.run.status import FAILED
 from tkamb.scene.case import Case
-from tkamb.scene.tables import ContactTable
+from tkamb.scene.tables import ContactTable, MusclesTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 RESIDUALS = (
@@ -25,6 +26,9 @@ RESIDUALS = (
     "needs at the midpoint of the contact points; an exact model would leave none. "
     "residual_sensitivity_N is the change of the total force when that point moves by 10 mm in y."
 )
+
+MUCH_RESERVE = 0.05
+"""Of the coordinate's largest moment."""
 
 LIBRARIES = ("pin", "numpy", "scipy", "trimesh", "python-fcl")
 
@@ -54,6 +58,8 @@ def summary_of(
         summary["ligament_strain"] = {"flexion_deg": STRAIN_FLEXIONS, "strain": strains}
     if scene.patella:
         summary["first_wrapping_flexion_deg"] = _first_wrapping(columns)
+    if scene.muscles:
+        summary["reserves"] = reserves(columns)
     if scene.contact:
         table = scene.contact
         error = known_error(table.model, table.resolution_mm, table.material, table.options)
@@ -208,6 +214,8 @@ def assumptions(case: Case) -> list[str]:
         sentences.append(
             "No muscles: the knee's flexion moment is carried by nothing (a residual)."
         )
+    if scene.muscles:
+        sentences.append(_sharing(scene.muscles))
     if scene.contact:
         sentences.append(_agreement(scene.contact))
     if scene.patient.side == "left":
@@ -232,6 +240,17 @@ def _marker_reading(case: Case) -> str:
     )
 
 
+def _sharing(table: MusclesTable) -> str:
+    """Return how the muscles share the load."""
+    weights = "volume-weighted" if table.weights == "volume" else "equally weighted"
+    return (
+        f"The muscles of {table.model.name} share the joint moments at the least "
+        f"{weights} sum of "
+        f"activations to the power {table.exponent:g}, with reserves ({table.law} strength); hip "
+        "loads stay the intersegmental ones."
+    )
+
+
 def _agreement(table: ContactTable) -> str:
     """Return how body and contact were brought together."""
     if table.released:
@@ -241,6 +260,30 @@ def _agreement(table: ContactTable) -> str:
     if table.coupling == "points":
         return sentence + "the deformed contact's resultants act in the body's equations."
     return sentence + "it does not feed back into the body."
+
+
+def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """Return coordinate -> what its muscles leave to a reserve, and how often it is much.
+
+    Args:
+        columns: of results.csv, those of the reserves and the joints' moments among them.
+    """
+    found = {}
+    for column in columns:
+        if not belongs(column, RESERVE):
+            continue
+        name = name_in(column, RESERVE)
+        reserve = np.abs(columns[column])
+        moment = np.abs(columns[family_column(JOINT_MOMENT, name)])
+        if not np.isfinite(moment).any():
+            continue
+        largest = float(np.nanmax(moment))
+        found[name] = {
+            "largest_Nm": float(np.nanmax(reserve)),
+            "percent_of_largest_moment": 100.0 * float(np.nanmax(reserve)) / largest,
+            "frames_above_5_percent": int((reserve > MUCH_RESERVE * largest).sum()),
+        }
+    return found
 
 
 def _first_wrapping(columns: dict[str, Any]) -> float | None:

@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.body.knee import dome_sensitivity
-from tkamb.columns import ligament_column
+from tkamb.columns import (
+    ACTIVATION,
+    JOINT_MOMENT,
+    MUSCLE_FORCE,
+    RESERVE,
+    family_column,
+    ligament_column,
+)
 from tkamb.equilibrium.mechanics import FrameLoads
 from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, knee_coordinates
 from tkamb.run.agreement import normal_force, share_by_equilibrium, split_determined
@@ -16,6 +23,7 @@ from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.body.contact_points import CondylePoint
+    from tkamb.body.crossing import MuscleShare
     from tkamb.body.slip import CondyleSlip
     from tkamb.equilibrium.frame_contact import FrameContact
     from tkamb.inputs.marker_motion import MarkerKinematics
@@ -137,9 +145,24 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
         row |= {
             f"ground_reaction_{a}_N": g for a, g in zip(("ap", "si", "ml"), ground, strict=True)
         }
+    if frame.geometry.share is not None and not loads.problems:
+        row |= _muscle_row(frame.geometry.share)
     return row | {
         ligament_column(name): tension for name, tension in frame.geometry.tensions.items()
     }
+
+
+def _muscle_row(share: "MuscleShare") -> dict[str, float]:
+    """Return what each muscle carries, and what none does."""
+    row: dict[str, float] = {}
+    for family, names, values in (
+        (MUSCLE_FORCE, share.muscles, share.force),
+        (ACTIVATION, share.muscles, share.activation),
+        (RESERVE, share.coordinates, share.reserve),
+        (JOINT_MOMENT, share.coordinates, share.moment),
+    ):
+        row |= {family_column(family, n): float(v) for n, v in zip(names, values, strict=True)}
+    return row
 
 
 def _slip_row(

@@ -21,6 +21,7 @@ from tkamb.scene.tables import (
     ImplantTable,
     LigamentTable,
     MotionTable,
+    MusclesTable,
     MuscleTable,
     OutputTable,
     PatellarLigamentTable,
@@ -52,6 +53,7 @@ class Scene(SceneTable):
     generic_ligaments: GenericLigamentsTable | None = None
     muscle: tuple[MuscleTable, ...] = ()
     quadriceps: QuadricepsTable | None = None
+    muscles: MusclesTable | None = None
     patellar_ligament: PatellarLigamentTable | None = None
     patella: PatellaTable | None = None
     contact: ContactTable | None = None
@@ -76,6 +78,8 @@ class Scene(SceneTable):
                 "[quadriceps] (or [[muscle]]), [patellar_ligament] and [patella] go together: "
                 "give all or none"
             )
+        if self.muscles and not self.patella:
+            raise ValueError("[muscles] needs [quadriceps], [patellar_ligament] and [patella]")
         ligament = self.patellar_ligament
         solved = self.patella is not None and self.patella.motion == "solved"
         if solved and (ligament is None or ligament.length_mm is None):

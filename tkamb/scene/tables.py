@@ -512,6 +512,34 @@ class QuadricepsTable(SceneTable):
     band_mm: Number = Field(5.0, ge=0, le=50, description=BAND)
 
 
+class MusclesTable(SceneTable):
+    """All muscles of the leg, from the OpenSim model that the URDF was made from.
+
+    They share the joint moments of hip, knee, ankle and subtalar joint by static optimisation;
+    those that cross the knee act on it. The quadriceps' force is the knee's own, see
+    docs/muscles.md. Without this table only the quadriceps acts.
+    """
+
+    model: Path = Field(description="the .osim file")
+    coordinates: Path | None = Field(
+        None,
+        description=".mot or .sto of the model's coordinates; default: fitted to the markers of "
+        "[motion] file",
+    )
+    exponent: Number = Field(2.0, ge=2, le=10, description="p of the cost: sum of w a^p")
+    weights: Literal["volume", "equal"] = Field(
+        "volume", description="w: optimal fibre length times strength over the mean, or 1"
+    )
+    reserve_Nm: Annotated[Number, Field(ge=0, le=10000)] | dict[str, Number] = Field(
+        10.0,
+        description="the reserve moment that costs as much as one fully active muscle of weight "
+        "1, of every balanced coordinate or of each by name; 0 forbids it",
+    )
+    law: Literal["isometric", "hill"] = Field(
+        "isometric", description="strength: the maximal isometric force, or force-length-velocity"
+    )
+
+
 class PatellarLigamentTable(SceneTable):
     """Patellar ligament line: from the patella to the tibial tuberosity.
 

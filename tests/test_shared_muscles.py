@@ -1,0 +1,170 @@
+"""Muscles across the knee: the sharing and the knee's own equations say the same."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from knees import UP, bent_knee
+from shared_trials import STRENGTHS, two_flexors
+from tkamb.body.crossing import CrossingLines, MuscleShare
+from tkamb.body.knee import solve_knee
+from tkamb.body.load import PointForces, total_wrench
+from tkamb.columns import MUSCLE_FORCE, RESERVE, belongs, family_column, in_a_family, ordered_names
+from tkamb.equilibrium.shared_muscles import SharedMuscles
+from tkamb.errors import InputError
+from tkamb.geometry.frames import knee_axes, knee_pose, transform
+from tkamb.run.summary import reserves
+from tkamb.scene import load_scene
+
+FRICTION = 0.05
+SHIPPED = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
+PLACES = {"behind": [-0.06, -0.45, 0.0], "ahead": [0.06, -0.45, 0.0], "aside": [-0.05, -0.45, 0.12]}
+
+
+def stood_upon(place):
+    """Return the bent knee with 700 N of the ground at a place (3,) m, insert frame."""
+    force = PointForces("tibia", np.array([place]), 700 * UP[None])
+    return replace(bent_knee(), ground=force)
+
+
+@pytest.mark.parametrize("where", PLACES)
+def test_the_quadriceps_of_the_sharing_is_the_quadriceps_of_the_knee(where):
+    muscles = SharedMuscles(two_flexors(1))
+    geometry, loads = muscles.solve(0, stood_upon(PLACES[where]), FRICTION)
+    assert loads.problems == ()
+    assert geometry.share.force.min() > 50.0
+    quadriceps = geometry.extensor.tension(loads.values)
+    assert quadriceps == pytest.approx(geometry.share.force[0], abs=1e-6)
+
+
+def test_flexors_carry_what_a_slack_quadriceps_leaves():
+    """Ground ahead of the knee: without them a residual, with them a reserve of 1 % of it."""
+    knee = stood_upon([0.06, -0.45, 0.0])
+    alone = solve_knee(knee, FRICTION)
+    geometry, loads = SharedMuscles(two_flexors(1, reserve=0.5, least=0.0)).solve(0, knee, FRICTION)
+    assert alone.slack
+    assert alone.values["residual_flexion"] < -10.0
+    assert geometry.share.force[0] < 1e-6
+    assert abs(geometry.share.reserve[0]) < 0.02 * abs(alone.values["residual_flexion"])
+    assert abs(loads.values.get("residual_flexion", 0.0)) < 0.25  # the patella's own weight
+    assert np.linalg.norm(loads.contact_force) > np.linalg.norm(alone.contact_force) + 200.0
+
+
+def test_without_strength_of_the_others_nothing_changes():
+    knee = stood_upon(PLACES["behind"])
+    trial = two_flexors(1, strengths=(6000.0, 1e-9, 1e-9), reserve=1e-3, least=0.0)
+    geometry, loads = SharedMuscles(trial).solve(0, knee, FRICTION)
+    alone = solve_knee(knee, FRICTION)
+    assert loads.values == pytest.approx(alone.values, rel=1e-6, abs=1e-4)
+    assert geometry.share.reserve[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_two_flexors_share_by_strength_and_the_arms_of_the_knee():
+    """The optimum of one row without reserve: a_i as R_i F_i."""
+    knee = stood_upon(PLACES["ahead"])
+    trial = two_flexors(1, reserve=1e-3, least=0.0)
+    share = SharedMuscles(trial).share(0, knee, FRICTION, frozenset())
+    force, step = share.force, 1.0
+    pulled = []
+    for i in (1, 2):  # the arms by differences of the whole knee's equations
+        more = np.zeros(3)
+        more[i] = step
+        loaded = replace(knee, share=replace(share, force=more, reserve=np.zeros(1)))
+        pulled.append(_taut_quadriceps(loaded))
+    none = replace(knee, share=replace(share, force=np.zeros(3), reserve=np.zeros(1)))
+    arms = np.array(pulled) - _taut_quadriceps(none)
+    expected = arms * np.array(STRENGTHS[1:]) ** 2
+    assert force[1] / force[2] == pytest.approx(expected[0] / expected[1], rel=1e-6)
+
+
+def _taut_quadriceps(geometry):
+    """Return the quadriceps' tension, negative where it would push."""
+    from tkamb.body.knee import KneeSystem
+    from tkamb.body.load_state import LoadState
+
+    taut = LoadState(frozenset(), frozenset())
+    return KneeSystem(geometry, FRICTION, taut).solution.values["muscle_quadriceps"]
+
+
+def test_the_work_of_a_line_is_that_of_its_shortening():
+    """Generalised force on each knee coordinate: -F dL/dq, by differences of the length."""
+    rng = np.random.default_rng(3)
+    shank, thigh = rng.normal(scale=0.1, size=(2, 2, 3))
+    force, tibia = np.array([700.0, 300.0]), np.eye(4)
+    share = MuscleShare(
+        ("a", "b"), force, force, ("knee",), np.zeros(1), np.zeros(1), 0, np.arange(2),
+        CrossingLines(shank, thigh),
+    )  # fmt: skip
+    place = np.array([0.003, 0.04, -0.002, 0.1, -0.05, 0.7])
+
+    def lengths(q):
+        return np.linalg.norm(transform(knee_pose(q), thigh) - shank, axis=1)
+
+    step = 1e-6
+    slopes = [(lengths(place + e) - lengths(place - e)) / (2 * step) for e in step * np.eye(6)]
+    on_femur = -knee_axes(place) @ share.wrench(tibia, knee_pose(place))
+    np.testing.assert_allclose(on_femur, -np.array(slopes) @ force, rtol=1e-7, atol=1e-6)
+
+
+def test_the_wrench_of_the_released_knee_is_that_of_the_equations():
+    trial, knee = two_flexors(1), stood_upon(PLACES["behind"])
+    share = SharedMuscles(trial).share(0, knee, FRICTION, frozenset())
+    state = knee.state
+    on_tibia = [load for load in share.loads(state) if load.link == "tibia"]
+    wrench = share.wrench(state.pose("tibia"), state.pose("femur"))
+    np.testing.assert_allclose(wrench, total_wrench(on_tibia, np.zeros(3)), atol=1e-9)
+
+
+def test_a_muscle_without_a_path_fails_its_frame_by_name():
+    trial = two_flexors(1)
+    trial.problems.arms[0, 1] = np.nan
+    geometry, loads = SharedMuscles(trial).solve(0, stood_upon(PLACES["behind"]), FRICTION)
+    assert "no taut path of hamstring" in loads.problems[0]
+    assert np.isnan(loads.contact_force).all()
+    assert np.isnan(geometry.share.force).all()
+
+
+def test_a_scene_with_muscles_needs_its_own_patella(tmp_path):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        '[patient]\nurdf = "a.urdf"\nside = "right"\nmass_kg = 70.0\n'
+        '[motion]\nfile = "a.csv"\nangle_unit = "deg"\nlength_unit = "mm"\ncutoff_Hz = 6.0\n'
+        '[muscles]\nmodel = "a.osim"\n'
+    )
+    with pytest.raises(InputError, match=r"\[muscles\] needs \[quadriceps\]"):
+        load_scene(scene)
+
+
+def test_without_the_table_no_muscles_are_imported():
+    code = (
+        "import sys; from tkamb.scene import load_scene; from tkamb.scene.case import load_case; "
+        "from tkamb.equilibrium.mechanics import Mechanics; "
+        f"m = Mechanics(load_case(load_scene({str(SHIPPED)!r}))); assert m.muscles is None; "
+        "print([n for n in sys.modules if n.startswith(('tkamb.muscles', 'tkamb.opensim'))])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_columns_of_muscles_stand_in_their_places():
+    name = family_column(MUSCLE_FORCE, "soleus_r")
+    assert name == "muscle_soleus_r_N"
+    assert in_a_family("reserve_knee_angle_r_Nm")
+    assert not belongs("reserve_Nm", RESERVE)
+    names = ordered_names([name, "ligament_PCL_N"])
+    assert names.index("ligament_PCL_N") < names.index(name)
+
+
+def test_the_summary_says_how_much_no_muscle_carries():
+    columns = {
+        "reserve_knee_Nm": np.array([0.1, -3.0, np.nan]),
+        "joint_moment_knee_Nm": np.array([-40.0, 20.0, np.nan]),
+    }
+    told = reserves(columns)["knee"]
+    assert told["largest_Nm"] == 3.0
+    assert told["percent_of_largest_moment"] == pytest.approx(7.5)
+    assert told["frames_above_5_percent"] == 1

@@ -1,0 +1,113 @@
+"""Muscles across the knee whose forces are known: all but those that end on the patella.
+
+A taut line crosses from the shank at p to the thigh, or the pelvis above it, at q. With force F it
+pulls the shank at p along u = (q - p)/|q - p|, and the thigh at q along -u. Foot and shank are
+one body, so that a line which ends on the foot pulls that body where it leaves the foot. What
+pulls from the pelvis is carried by the femur and the loads across the hip, which take up
+whatever acts on the thigh. Both ends are fixed to their links and follow the knee.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.body import unknowns
+from tkamb.body.load import PointForces, wrench_of
+from tkamb.geometry.frames import Array, transform
+
+if TYPE_CHECKING:
+    from tkamb.body.chain import ChainState
+
+
+AGREED = 1.0
+"""N: muscle forces that change by less from one sharing to the next agree with the knee."""
+
+
+@dataclass(frozen=True, eq=False)
+class CrossingLines:
+    """Lines from the shank to the thigh at one frame.
+
+    Args:
+        shank: (c, 3) m, where they leave the shank or the foot, tibia link.
+        thigh: (c, 3) m, where they reach the thigh or the pelvis, femur link.
+    """
+
+    shank: Array
+    thigh: Array
+
+    def unit_loads(self, state: "ChainState") -> list[tuple[PointForces, ...]]:
+        """Return what one newton of each does to tibia and femur, insert frame."""
+        start = transform(state.pose("tibia"), self.shank)
+        end = transform(state.pose("femur"), self.thigh)
+        along = end - start
+        along /= np.linalg.norm(along, axis=-1, keepdims=True)
+        return [
+            (PointForces("tibia", p[None], u[None]), PointForces("femur", q[None], -u[None]))
+            for p, q, u in zip(start, end, along, strict=True)
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class MuscleShare:
+    """What each muscle of a leg carries at one frame.
+
+    Args:
+        muscles: m names.
+        activation: (m,).
+        force: (m,) N.
+        coordinates: n names of those that are balanced.
+        moment: (n,) N·m, what muscles and reserves carry together.
+        reserve: (n,) N·m, what no muscle carries.
+        flexion: place of the knee's flexion among the coordinates.
+        crossing: (c,) places of the muscles that cross the knee, but for the extensor group.
+        lines: theirs.
+        status: "ok" or "failed: …".
+    """
+
+    muscles: tuple[str, ...]
+    activation: Array
+    force: Array
+    coordinates: tuple[str, ...]
+    moment: Array
+    reserve: Array
+    flexion: int
+    crossing: np.ndarray
+    lines: CrossingLines
+    status: str = "ok"
+
+    def agrees(self, other: "MuscleShare") -> bool:
+        """Return whether two shares of a frame are the same to `AGREED`."""
+        return bool(np.abs(self.force - other.force).max() < AGREED)
+
+    def loads(self, state: "ChainState") -> tuple[PointForces, ...]:
+        """Return what the crossing muscles and the knee's reserve do to tibia and femur."""
+        scaled = [
+            PointForces(load.link, load.points, force * load.forces)
+            for force, pair in zip(
+                self.force[self.crossing], self.lines.unit_loads(state), strict=True
+            )
+            for load in pair
+        ]
+        return (*scaled, *unknowns.moment_pair("tibia", "femur", self._knee_reserve))
+
+    def wrench(self, tibia: Array, femur: Array) -> Array:
+        """Return the wrench (..., 6) of the same on the insert, about its origin.
+
+        Args:
+            tibia: (4, 4) pose of the tibia link in the insert frame.
+            femur: (..., 4, 4) poses of the femur link in it.
+        """
+        start = transform(tibia, self.lines.shank)
+        total = np.zeros((*femur.shape[:-2], 6))
+        for p, q, force in zip(start, self.lines.thigh, self.force[self.crossing], strict=True):
+            along = transform(femur, q) - p
+            along = along / np.linalg.norm(along, axis=-1, keepdims=True)
+            total = total + force * wrench_of(p, along)
+        total[..., 3:] += self._knee_reserve
+        return np.asarray(total)
+
+    @property
+    def _knee_reserve(self) -> Array:
+        """(3,) N·m on the tibia, about the insert's z as the residual moment of flexion is."""
+        return self.reserve[self.flexion] * unknowns.AXES["ml"]

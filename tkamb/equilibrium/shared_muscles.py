@@ -1,0 +1,169 @@
+"""The muscles of a scene with [muscles]: shared frame by frame, in agreement with the knee.
+
+Hip, ankle and subtalar rows of the static optimisation are the OpenSim model's, made once for all
+frames. The flexion row is the knee's own (`tkamb.body.extensor_response`), so that the tension of
+the extensor group which the optimisation finds is the one that the knee's equations give back.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from tkamb.body.crossing import CrossingLines, MuscleShare
+from tkamb.body.extensor_response import flexion_row
+from tkamb.body.knee import KneeGeometry, KneeLoads, solve_knee, unsolved
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.frames import MIRROR, Array, mirrored_pose
+from tkamb.muscles.knee_trial import KneeTrial
+from tkamb.muscles.recording import LegRecording, load_knee_trial
+from tkamb.muscles.sharing import Sharing
+from tkamb.scene.case import Case
+from tkamb.scene.si import in_si
+from tkamb.units import MILLIMETRE
+
+SAME_PLACE = 0.5 * MILLIMETRE
+"""How far the URDF's insert and hip may lie from the model's."""
+MOST_SHARINGS = 8
+
+
+class SharedMuscles:
+    """Shares the load of frames among the muscles of a leg.
+
+    Args:
+        trial: the muscles over the frames.
+        left: a left leg's, whose knee is computed as its mirror image.
+    """
+
+    def __init__(self, trial: KneeTrial, left: bool = False) -> None:
+        flip = MIRROR if left else np.eye(3)
+        self._trial, self._names = trial, trial.muscles
+        self._shank, self._thigh = trial.shank @ flip, trial.thigh @ flip
+
+    def share(
+        self, k: int, geometry: KneeGeometry, friction: float, lifted: frozenset[str]
+    ) -> MuscleShare:
+        """Return what each muscle carries in frame k with the knee as it stands.
+
+        Args:
+            k: frame.
+            geometry: the knee, with contact points where contact is modelled.
+            friction: Coulomb coefficient.
+            lifted: sides that carry nothing.
+        """
+        trial, lines = self._trial, CrossingLines(self._shank[k], self._thigh[k])
+        names = trial.problems.coordinates
+        try:
+            row = flexion_row(geometry, lines, friction, lifted)
+        except ComputationError as error:
+            return self._failed(lines, f"failed: {error.what}")
+        problem, (activation, reserve, _, status) = trial.solved(
+            k, row.moment, row.extensor_arm, row.arms
+        )
+        if status != "ok":
+            return self._failed(lines, status)
+        force = trial.force(k, activation)
+        return MuscleShare(
+            self._names,
+            activation,
+            force,
+            names,
+            problem.moment[0],
+            reserve,
+            trial.flexion,
+            trial.crossing,
+            lines,
+        )
+
+    def solve(
+        self, k: int, geometry: KneeGeometry, friction: float
+    ) -> tuple[KneeGeometry, KneeLoads]:
+        """Return frame k with the muscles' forces, and all loads.
+
+        Contact points and lines stay, so the sharing is exact at once; again where a condyle
+        turns out to carry nothing.
+        """
+        lifted = geometry.lifted
+        for _ in range(MOST_SHARINGS):
+            share = self.share(k, geometry, friction, lifted)
+            geometry = replace(geometry, share=share)
+            if share.status != "ok":
+                return geometry, unsolved([f"muscles: {share.status.removeprefix('failed: ')}"])
+            loads = solve_knee(geometry, friction)
+            if loads.problems or loads.lifted == lifted:
+                return geometry, loads
+            lifted = loads.lifted
+        return geometry, unsolved(["muscles and load state do not come to agree"])
+
+    def _failed(self, lines: CrossingLines, status: str) -> MuscleShare:
+        nothing = np.full(len(self._names), np.nan)
+        names = self._trial.problems.coordinates
+        rest = np.full(len(names), np.nan)
+        return MuscleShare(
+            self._names,
+            nothing,
+            nothing,
+            names,
+            rest,
+            rest,
+            self._trial.flexion,
+            self._trial.crossing,
+            lines,
+            status,
+        )
+
+
+def load_muscles(case: Case) -> SharedMuscles:
+    """Return the muscles of a case with [muscles], checked against its URDF.
+
+    Raises:
+        InputError: files that cannot be used, or a model that is not the URDF's.
+    """
+    scene, table = case.scene, case.scene.muscles
+    assert table is not None
+    ground, markers, insert = scene.ground_reaction, scene.motion.markers, scene.implant.insert
+    if ground is not None and ground.applied == "ankle":
+        raise InputError(
+            "applied = 'ankle' leaves the ankle without its moment",
+            "[ground_reaction] with [muscles]",
+            "apply the force at the centre of pressure",
+        )
+    source = LegRecording(
+        model=table.model,
+        side=scene.patient.side,
+        coordinates=table.coordinates,
+        markers=scene.motion.file if markers else None,
+        laboratory_axes=markers.laboratory_axes if markers else "+x,+y,+z",
+        cutoff=scene.motion.cutoff_Hz,
+        ground=None if ground is None else in_si(ground),
+        insert=None if insert is None else insert.mesh,
+        mesh_unit="m" if insert is None else insert.unit,
+        mesh_axes="+x,+y,+z" if insert is None else insert.axes,
+        sharing=Sharing(
+            reserve=table.reserve_Nm,
+            exponent=table.exponent,
+            weights=table.weights,
+            law=table.law,
+        ),
+    )
+    links, trial = load_knee_trial(source, case.motion.time)
+    _check_links(case, links.insert_in_tibia, links.hip)
+    return SharedMuscles(trial, scene.patient.side == "left")
+
+
+def _check_links(case: Case, insert_in_tibia: Array, hip: Array) -> None:
+    """Raise unless the model's insert and hip lie where the URDF has them."""
+    left, table = case.scene.patient.side == "left", case.scene.muscles
+    assert table is not None
+    insert = mirrored_pose(insert_in_tibia) if left else insert_in_tibia
+    centre = MIRROR @ hip if left else hip
+    for name, here, there in (
+        ("insert", insert[:3, 3], case.chain.insert_in_tibia[:3, 3]),
+        ("hip", centre, case.chain.link_in("hip", "femur")[:3, 3]),
+    ):
+        apart = float(np.linalg.norm(here - there))
+        if apart > SAME_PLACE:
+            raise InputError(
+                f"has its {name} {apart / MILLIMETRE:.1f} mm from where the URDF has it",
+                table.model,
+                "make the URDF from this model with `tkamb import`",
+            )

@@ -1,0 +1,109 @@
+"""A leg's muscles from files: model, coordinates or markers, ground reaction."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.importing.anatomy import find_leg
+from tkamb.importing.links import Links, find_links
+from tkamb.importing.model_fit import fit_model
+from tkamb.inputs.filtering import Cutoff
+from tkamb.inputs.ground_reaction import load_ground_reaction
+from tkamb.inputs.meshes import load_surface
+from tkamb.inputs.recordings import ForceRecording, Side
+from tkamb.inputs.tables import read_table
+from tkamb.muscles.knee_trial import KneeTrial, knee_trial
+from tkamb.muscles.leg import foot_loads
+from tkamb.muscles.sharing import Sharing
+from tkamb.opensim.kinematics import Kinematics
+from tkamb.opensim.motion import CoordinateMotion, coordinate_motion, read_coordinates
+from tkamb.opensim.read import read_osim
+
+
+@dataclass(frozen=True, eq=False)
+class LegRecording:
+    """What is read of a leg and its muscles.
+
+    Args:
+        model: the .osim file.
+        side: of the knee.
+        coordinates: .mot or .sto of the model's coordinates; None: they are fitted to markers.
+        markers: recording of markers, where they are.
+        laboratory_axes: the markers' axes that point forward, up and right.
+        cutoff: Hz, of the coordinates.
+        ground: what the ground exerts on the foot; None: nothing.
+        insert: the insert's mesh; None without an implant.
+        mesh_unit: of length, of the mesh.
+        mesh_axes: its axes that point anterior, superior and right.
+        sharing: options.
+    """
+
+    model: Path
+    side: Side
+    coordinates: Path | None
+    markers: Path | None
+    laboratory_axes: str
+    cutoff: Cutoff
+    ground: ForceRecording | None
+    insert: Path | None
+    mesh_unit: str
+    mesh_axes: str
+    sharing: Sharing
+
+
+def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial]:
+    """Return where the links stand in the model's bodies, and the trial at some times.
+
+    Args:
+        source: what is read.
+        time: (f,) s, on the recordings' clock.
+
+    Raises:
+        InputError: whatever cannot be used.
+    """
+    model = read_osim(source.model)
+    leg = find_leg(model, source.side)
+    insert = None
+    if source.insert is not None:
+        insert = load_surface(
+            source.insert, source.mesh_unit, source.mesh_axes, name="insert", closed=True
+        )
+    links = find_links(leg, insert, source.mesh_axes, {}, False)
+    motion = _motion(source, Kinematics(model), time)
+    loads = {}
+    if source.ground is not None:
+        # the model's own side, so that nothing is mirrored
+        reaction = load_ground_reaction(source.ground, time, "right")
+        loads = foot_loads(model, {source.side: reaction})
+    return links, knee_trial(links, motion, loads, source.sharing)
+
+
+def _motion(source: LegRecording, kinematics: Kinematics, time: Array) -> CoordinateMotion:
+    if source.coordinates is not None:
+        recorded = read_table(source.coordinates)
+        q, _ = read_coordinates(kinematics, recorded)
+        stamps = recorded.time()
+    else:
+        if source.markers is None:
+            raise InputError("is missing", "[muscles] coordinates", "name a .mot or .sto file")
+        recorded = read_table(source.markers)
+        stamps = recorded.time()
+        _, fit = fit_model(kinematics.model, recorded, laboratory_axes=source.laboratory_axes)
+        if not fit.solved.all():
+            raise InputError(
+                f"the model's chain is not found in {int((~fit.solved).sum())} frames",
+                source.markers,
+                "give [muscles] coordinates",
+            )
+        q = fit.state
+    if time[0] < stamps[0] - 1e-9 or time[-1] > stamps[-1] + 1e-9:
+        raise InputError(
+            f"covers {stamps[0]:g} to {stamps[-1]:g} s, the frames {time[0]:g} to {time[-1]:g} s",
+            recorded.path,
+        )
+    return coordinate_motion(
+        kinematics, stamps, np.asarray(q), source.cutoff, time, "coordinates of the model"
+    )
