@@ -100,6 +100,7 @@ def test_doubling_the_wear_factor_doubles_the_first_cycles_and_is_said(
     assert double["law_parameters"]["wear_factor_mm3_per_Nm"] == 7e-6
 
 
+@pytest.mark.slow
 def test_a_killed_simulation_goes_on_to_the_same_end(monkeypatch, capsys, tmp_path, profile, scene):
     worn = ["wear", str(scene), "--simulator", str(profile), *QUICK, "--cycles", "60000"]
     assert main([*worn, "--out", str(tmp_path / "whole")]) == 0
