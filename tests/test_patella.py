@@ -200,9 +200,9 @@ def test_gap_is_smooth_through_touch() -> None:
 
 def test_groove_shares_the_force_and_never_jumps() -> None:
     """Centred: half each, no lateral force. Off centre: the share moves, smoothly."""
-    shares, normals = [], []
+    shares, normals, bodies = [], [], (groove(), dome())
     for beside in np.linspace(-2e-3, 2e-3, 21):
-        contact = PatellofemoralContact(groove(), dome(), ml=float(beside))
+        contact = PatellofemoralContact(*bodies, ml=float(beside))
         found = contact.at(np.array([0.0368, 0.0, 0.0]))
         shares.append(found.share_left)
         normals.append(found.normal)
