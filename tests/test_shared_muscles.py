@@ -128,6 +128,13 @@ def test_a_muscle_without_a_path_fails_its_frame_by_name():
     assert np.isnan(geometry.share.force).all()
 
 
+def test_a_frame_without_its_patella_fails_by_name():
+    lost = replace(stood_upon(PLACES["behind"]), extensor=None, problems=("patella lost",))
+    geometry, loads = SharedMuscles(two_flexors(1)).solve(0, lost, FRICTION)
+    assert "patella lost" in loads.problems[0]
+    assert np.isnan(geometry.share.force).all()
+
+
 def test_a_scene_with_muscles_needs_its_own_patella(tmp_path):
     scene = tmp_path / "scene.toml"
     scene.write_text(

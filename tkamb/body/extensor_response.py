@@ -54,9 +54,10 @@ def flexion_row(
         lifted: sides that carry nothing.
 
     Raises:
-        ComputationError: the equations are singular.
+        ComputationError: the patella has no place there, or the equations are singular.
     """
-    assert geometry.extensor is not None
+    if geometry.extensor is None:
+        raise ComputationError("; ".join(geometry.problems) or "no patella", "muscles")
     alone = replace(geometry, share=None)
     system = KneeSystem(alone, friction, LoadState(lifted, frozenset()))
     if not system.solution.regular:
