@@ -17,8 +17,8 @@ from tkamb.muscles.leg import foot_loads
 from tkamb.opensim.kinematics import Kinematics
 from tkamb.opensim.motion import CoordinateMotion
 from tkamb.opensim.read import read_osim
+from tkamb.scene.recording_tables import GroundReactionTable
 from tkamb.scene.si import in_si
-from tkamb.scene.tables import GroundReactionTable
 
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw"
 AXES = "-x,+z,+y"

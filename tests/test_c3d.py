@@ -12,8 +12,8 @@ from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.ground_reaction import load_ground_reaction
 from tkamb.inputs.markers import matched_labels
 from tkamb.inputs.tables import read_table
+from tkamb.scene.recording_tables import GroundReactionTable
 from tkamb.scene.si import in_si
-from tkamb.scene.tables import GroundReactionTable
 
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw" / "motion"
 COUNT, RATIO = 20, 10

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tkamb.contact import registry
+from tkamb import named_classes
 from tkamb.contact.foundation import ElasticFoundation
 from tkamb.contact.registry import (
     BUILT_IN,
@@ -79,7 +79,7 @@ def test_a_name_clash_is_an_error(name, monkeypatch):
         EntryPoint(name, "first.module:Model", "tkamb.contact"),
         EntryPoint(name, "second.module:Model", "tkamb.contact"),
     ]
-    monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    monkeypatch.setattr(named_classes, "entry_points", lambda group: points)
     with pytest.raises(InputError, match=f"two contact models are called '{name}'"):
         contact_names()
 
@@ -87,7 +87,7 @@ def test_a_name_clash_is_an_error(name, monkeypatch):
 @pytest.mark.parametrize("value", ["not_there.at_all:Model", "tkamb.units:DEGREE"])
 def test_an_offer_that_is_no_model_is_an_input_error(value, monkeypatch):
     offer = EntryPoint("broken", value, "tkamb.contact")
-    monkeypatch.setattr(registry, "entry_points", lambda group: [offer])
+    monkeypatch.setattr(named_classes, "entry_points", lambda group: [offer])
     with pytest.raises(InputError, match="contact model 'broken'"):
         contact_class("broken")
     assert "broken" in contact_descriptions()["broken"]

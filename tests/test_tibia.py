@@ -8,8 +8,8 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, mirrored_pose, pose, transform
 from tkamb.inputs.markers import fit_rigid
 from tkamb.inputs.tibia import load_tibia
+from tkamb.scene.recording_tables import JointCentreTable, TibiaTable
 from tkamb.scene.si import in_si
-from tkamb.scene.tables import JointCentreTable, TibiaTable
 
 STAMPS = np.arange(241) / 120
 AT = np.linspace(0.5, 1.5, 21)

@@ -9,15 +9,12 @@ package offers a model through the entry-point group `tkamb.contact`:
 
 import math
 from dataclasses import fields
-from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tkamb.contact.model import ContactModel
 from tkamb.errors import InputError, names_near
+from tkamb.named_classes import NamedClasses
 from tkamb.units import MILLIMETRE
-
-ENTRY_POINT_GROUP = "tkamb.contact"
 
 COARSEST_MM = 10.0
 """A condyle's contact is 5 to 20 mm across: a coarser map resolves nothing."""
@@ -32,6 +29,13 @@ BUILT_IN = {
     "fe": "tkamb.contact.lattice.model:FiniteElements",
 }
 
+CONTACT_MODELS = NamedClasses(
+    "contact model",
+    ContactModel,  # type: ignore[type-abstract]
+    "tkamb.contact",
+    BUILT_IN,
+)
+
 
 def contact_names() -> tuple[str, ...]:
     """Return the names of all contact models, built-in ones first.
@@ -39,7 +43,7 @@ def contact_names() -> tuple[str, ...]:
     Raises:
         InputError: two packages offer the same name.
     """
-    return tuple(_offers())
+    return CONTACT_MODELS.names()
 
 
 def contact_class(name: str) -> type[ContactModel]:
@@ -48,18 +52,7 @@ def contact_class(name: str) -> type[ContactModel]:
     Raises:
         InputError: no such name, a name clash, or the class cannot be imported.
     """
-    offers = _offers()
-    if name not in offers:
-        raise InputError(f"no contact model '{name}'", mend=names_near(name, offers))
-    where = f"contact model '{name}' ({offers[name]})"
-    module, _, attribute = offers[name].partition(":")
-    try:
-        found = getattr(import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise InputError(f"cannot be loaded ({error})", where, "install what it needs") from error
-    if not (isinstance(found, type) and issubclass(found, ContactModel)):
-        raise InputError("is not a subclass of tkamb.contact.model.ContactModel", where)
-    return found
+    return CONTACT_MODELS.find(name)
 
 
 def contact_model(name: str, resolution_mm: float = 1.0, **options: Any) -> ContactModel:
@@ -134,20 +127,3 @@ def contact_descriptions() -> dict[str, str]:
         except InputError as error:
             lines[name] = str(error)
     return lines
-
-
-def _offers() -> dict[str, str]:
-    """Return name -> "module:Class"."""
-    offers = dict(BUILT_IN)
-    for point in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: p.name):
-        known = offers.setdefault(point.name, point.value)
-        if known != point.value:
-            raise InputError(
-                f"two contact models are called '{point.name}': {known} and {_origin(point)}",
-                mend="uninstall or rename one",
-            )
-    return offers
-
-
-def _origin(point: EntryPoint) -> str:
-    return point.value if point.dist is None else f"{point.value} of {point.dist.name}"

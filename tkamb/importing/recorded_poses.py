@@ -14,8 +14,8 @@ from tkamb.importing.links import Links
 from tkamb.importing.toml_text import toml_text
 from tkamb.inputs.meshes import axes_rotation
 from tkamb.inputs.motion import KneeMotion, load_motion
+from tkamb.scene.recording_tables import MotionTable
 from tkamb.scene.si import in_si
-from tkamb.scene.tables import MotionTable
 from tkamb.units import DEGREE
 
 ROLES = tuple(f"{kind}_{k}" for kind in ("rotation", "translation") for k in (1, 2, 3))

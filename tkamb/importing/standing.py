@@ -15,8 +15,8 @@ from tkamb.inputs.marker_motion import both_fits, leg_segments, neutral_coordina
 from tkamb.inputs.markers import matched_labels, plain_label
 from tkamb.inputs.tables import read_table
 from tkamb.scene import Scene
+from tkamb.scene.recording_tables import MarkersTable
 from tkamb.scene.si import in_si
-from tkamb.scene.tables import MarkersTable
 
 
 def with_static_markers(

@@ -14,13 +14,13 @@ from pydantic_core import ErrorDetails
 
 from tkamb.errors import InputError, names_near
 from tkamb.files import read_text
+from tkamb.scene.recording_tables import GroundReactionTable, MotionTable, TibiaTable
+from tkamb.scene.table import SceneTable
 from tkamb.scene.tables import (
     ContactTable,
     GenericLigamentsTable,
-    GroundReactionTable,
     ImplantTable,
     LigamentTable,
-    MotionTable,
     MusclesTable,
     MuscleTable,
     OutputTable,
@@ -28,8 +28,6 @@ from tkamb.scene.tables import (
     PatellaTable,
     PatientTable,
     QuadricepsTable,
-    SceneTable,
-    TibiaTable,
 )
 from tkamb.scene.uncertainty import UncertaintyTable
 

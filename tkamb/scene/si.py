@@ -7,27 +7,28 @@ from typing import Any
 import numpy as np
 
 from tkamb.inputs import recordings
-from tkamb.scene import tables
+from tkamb.scene import recording_tables, tables
+from tkamb.scene.table import SceneTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 SCALES = {"_mm": MILLIMETRE, "_deg": DEGREE, "_Hz": 1.0, "_s": 1.0, "_N": 1.0, "_kg": 1.0}
 """Unit at the end of a key -> what one of it is in SI."""
 
-CLASSES: dict[type[tables.SceneTable], type] = {
+CLASSES: dict[type[SceneTable], type] = {
     tables.PatientTable: recordings.Patient,
-    tables.MotionTable: recordings.MotionRecording,
-    tables.MarkersTable: recordings.MarkerSet,
-    tables.MarkerSegmentTable: recordings.MarkerSegment,
-    tables.TibiaTable: recordings.ShankRecording,
-    tables.JointCentreTable: recordings.JointCentre,
-    tables.GroundReactionTable: recordings.ForceRecording,
+    recording_tables.MotionTable: recordings.MotionRecording,
+    recording_tables.MarkersTable: recordings.MarkerSet,
+    recording_tables.MarkerSegmentTable: recordings.MarkerSegment,
+    recording_tables.TibiaTable: recordings.ShankRecording,
+    recording_tables.JointCentreTable: recordings.JointCentre,
+    recording_tables.GroundReactionTable: recordings.ForceRecording,
 }
 
 NAMES = {"neutral_mm": "neutral_translation", "neutral_deg": "neutral_rotation"}
 """Two keys that differ by their unit alone."""
 
 
-def in_si(table: tables.SceneTable) -> Any:
+def in_si(table: SceneTable) -> Any:
     """Return what stands for a table below the scene, see `CLASSES`.
 
     Keys that the class does not have concern the scene alone.
@@ -45,12 +46,12 @@ def in_si(table: tables.SceneTable) -> Any:
 
 def _value(value: Any, scale: float) -> Any:
     """Return a key's value with its numbers scaled; three in a row are a vector."""
-    if isinstance(value, tables.SceneTable):
+    if isinstance(value, SceneTable):
         return in_si(value)
     if isinstance(value, dict):
         return {name: _value(one, scale) for name, one in value.items()}
     if isinstance(value, tuple):
-        if value and isinstance(value[0], tables.SceneTable):
+        if value and isinstance(value[0], SceneTable):
             return tuple(in_si(one) for one in value)
         return value if scale == 1.0 else np.array(value) * scale
     if value is None or scale == 1.0 or isinstance(value, str | Path):

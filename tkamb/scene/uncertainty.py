@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from tkamb.scene.tables import Count, Number, SceneTable
+from tkamb.scene.table import Count, Number, SceneTable
 
 Length = Annotated[Number, Field(ge=0, le=50)]
 Angle = Annotated[Number, Field(ge=0, le=20)]

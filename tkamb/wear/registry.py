@@ -6,14 +6,11 @@ my-law = "my_package.my_module:MyLaw"
 
 from collections.abc import Mapping
 from dataclasses import fields
-from importlib import import_module
-from importlib.metadata import entry_points
 from typing import Any
 
 from tkamb.errors import InputError, names_near
+from tkamb.named_classes import NamedClasses
 from tkamb.wear.laws import WearLaw
-
-ENTRY_POINT_GROUP = "tkamb.wear"
 
 BUILT_IN = {
     "archard": "tkamb.wear.laws:Archard",
@@ -22,10 +19,17 @@ BUILT_IN = {
     "contact-area": "tkamb.wear.laws:ContactArea",
 }
 
+WEAR_LAWS = NamedClasses(
+    "wear law",
+    WearLaw,  # type: ignore[type-abstract]
+    "tkamb.wear",
+    BUILT_IN,
+)
+
 
 def law_names() -> tuple[str, ...]:
     """Return the names of all wear laws, built-in ones first."""
-    return tuple(_offers())
+    return WEAR_LAWS.names()
 
 
 def law_class(name: str) -> type[WearLaw]:
@@ -34,18 +38,7 @@ def law_class(name: str) -> type[WearLaw]:
     Raises:
         InputError: no such name, a name clash, or the class cannot be loaded or is no law.
     """
-    offers = _offers()
-    if name not in offers:
-        raise InputError(f"no wear law '{name}'", mend=names_near(name, offers))
-    where = f"wear law '{name}' ({offers[name]})"
-    module, _, attribute = offers[name].partition(":")
-    try:
-        found = getattr(import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise InputError(f"cannot be loaded ({error})", where, "install what it needs") from error
-    if not (isinstance(found, type) and issubclass(found, WearLaw)):
-        raise InputError("is not a subclass of tkamb.wear.laws.WearLaw", where)
-    return found
+    return WEAR_LAWS.find(name)
 
 
 def wear_law(name: str, parameters: Mapping[str, Any], where: object = None) -> WearLaw:
@@ -72,16 +65,3 @@ def wear_law(name: str, parameters: Mapping[str, Any], where: object = None) -> 
         return found(**parameters)
     except InputError as error:
         raise InputError(error.what, f"{table}: {error.where}", error.mend) from None
-
-
-def _offers() -> dict[str, str]:
-    """Return name -> "module:Class"."""
-    offers = dict(BUILT_IN)
-    for point in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: p.name):
-        known = offers.setdefault(point.name, point.value)
-        if known != point.value:
-            raise InputError(
-                f"two wear laws are called '{point.name}': {known} and {point.value}",
-                mend="uninstall or rename one",
-            )
-    return offers
