@@ -25,6 +25,8 @@ DRAWING = {
     "scene": {"body", "geometry", "inputs"},
     "equilibrium": {"body", "contact", "geometry", "muscles", "scene"},
     "plausibility": {"geometry", "inputs", "scene"},
+    "check": {*KNEE, "output", "plausibility", "run"},
+    "compare": {*SHOWN, "geometry"},
     "importing": {"geometry", "inputs", "opensim", "scene"},
     "run": {*KNEE, *SHOWN} - {"results"},
     "output": {"columns", "contact", "geometry", "run"},
