@@ -56,6 +56,7 @@ class LegFrame:
         lines: name -> (n, 3) ligaments and tendons, with their colours.
         force: (3,) N on the foot; None without a plate.
         point: (3,) where it acts.
+        loaded: whether the foot stands on the plate; else no arrow is drawn.
     """
 
     frame: int
@@ -64,6 +65,7 @@ class LegFrame:
     lines: tuple[tuple[Array, str], ...]
     force: Array | None
     point: Array
+    loaded: bool
 
 
 def shown_frames(mechanics: Mechanics) -> list[int]:
@@ -107,7 +109,8 @@ def leg_frame(mechanics: Mechanics, k: int) -> LegFrame:
         if case.scene.ground_reaction and case.scene.ground_reaction.applied == "cop":
             point = case.ground.point[k]
     joints = transform(to_laboratory, np.array(in_insert))
-    return LegFrame(k, joints, bodies, tuple(lines), force, point)
+    loaded = case.ground is not None and bool(case.ground.loaded[k])
+    return LegFrame(k, joints, bodies, tuple(lines), force, point, loaded)
 
 
 def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str]]:
@@ -181,6 +184,8 @@ def _caption(mechanics: Mechanics, one: LegFrame) -> str:
     words = f"frame {one.frame}, {motion.time[one.frame]:.2f} s\nflexion {flexion:.0f} deg"
     if one.force is None:
         return f"{words}, no force plate"
+    if not one.loaded:
+        return f"{words}, plate not loaded"
     return f"{words}, plate {np.linalg.norm(one.force) / mechanics.case.body_weight:.2f} BW"
 
 
@@ -194,12 +199,13 @@ def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
         _draw_surface(axes, surface, view, colour)
     for points, colour in one.lines:
         axes.plot(*view.page(points).T, color=colour, linewidth=1.3)
-    if one.force is not None:
+    if one.force is not None and one.loaded:
         tip = one.point + one.force / weight * METRES_PER_BW
         arrow = {"arrowstyle": "-|>", "color": BLUE, "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0}
         axes.annotate("", view.page(tip), view.page(one.point), arrowprops=arrow)
-        axes.axhline(one.point[1], color=GREY, linewidth=1)
         shown += [tip[None], one.point[None]]
+    if one.force is not None:
+        axes.axhline(one.point[1], color=GREY, linewidth=1)
     extent = view.page(np.concatenate(shown))
     low, high = extent.min(axis=0) - MARGIN, extent.max(axis=0) + MARGIN
     axes.set_xlim(low[0], high[0])

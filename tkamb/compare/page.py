@@ -108,9 +108,9 @@ def _rows(comparison: Comparison, found: Sequence[Difference]) -> list[list[str]
             one.run,
             one.column,
             f"{one.max_abs:.4g}",
-            f"{one.at_frame} ({one.at:.4g}{unit})",
+            f"{one.at_frame} ({one.at:.4g}{unit})" if one.max_abs else "–",
             f"{one.rms:.4g}",
-            f"{one.mean:+.4g}",
+            f"{one.mean:+.4g}" if one.mean else "0",
             str(one.frames),
         ]
         for one in found
