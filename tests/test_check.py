@@ -4,8 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from tkamb.check.leg_picture import leg_frame, shown_frames
+from tkamb.check.page import check_html
 from tkamb.check.scene_check import check_scene
 from tkamb.cli import main
 from tkamb.starter import lay_out
@@ -82,9 +84,9 @@ def test_bad_input_is_one_line(scene, tmp_path, monkeypatch, capfd, arguments, w
     assert not list(tmp_path.iterdir())
 
 
-def test_the_page_holds_questions_picture_and_files(scene, tmp_path):
-    page = tmp_path / "check.html"
-    assert main(["check", str(scene), "--out", str(page)]) == 0
-    text = page.read_text(encoding="utf-8")
+def test_the_page_holds_questions_picture_and_files(checked):
+    figure = Figure()
+    figure.add_subplot()
+    text = check_html(checked, figure)
     assert "ground_reaction.csv" in text and "<svg" in text
     assert "http://" not in text.replace("http://www.w3.org", "")

@@ -34,6 +34,11 @@ class ComputationError(TkambError):
     """Sound input, but nothing could be computed from it: exit status 1."""
 
 
+def not_installed(package: str, where: object, extra: str) -> InputError:
+    """Return the refusal of what needs a package that only an extra of tkamb brings."""
+    return InputError(f"{package} is not installed", where, f"pip install 'tkamb[{extra}]'")
+
+
 def names_near(name: str, names: Iterable[str], title: str = "there are") -> str:
     """Return "did you mean ..." with the names that resemble one, and the first of all names."""
     there = list(names)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.columns import KINDS, RENAMED, in_a_family, ordered_names
-from tkamb.errors import InputError, names_near
+from tkamb.errors import InputError, names_near, not_installed
 from tkamb.files import TABLE_LIMIT, read_text
 from tkamb.geometry.frames import Array
 
@@ -95,8 +95,7 @@ class Results:
         try:
             from pandas import DataFrame
         except ImportError:
-            mend = "pip install 'tkamb[notebook]'"
-            raise InputError("pandas is not installed", "to_dataframe", mend) from None
+            raise not_installed("pandas", "to_dataframe", "notebook") from None
         return DataFrame(self.columns)
 
     def plot(self, *names: str, axis: str | None = None) -> "Figure":

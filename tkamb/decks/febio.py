@@ -75,7 +75,7 @@ def contact_quads(lattice: Lattice) -> Index:
 def _control(root: Element) -> None:
     control = _filled(root, "Control", analysis="STATIC", time_steps=STEPS, step_size=1 / STEPS)
     solver = SubElement(control, "solver", type="solid")
-    for name, value in (("symmetric_stiffness", 0), ("max_refs", 25), ("etol", 0.001)):
+    for name, value in (("symmetric_stiffness", "non-symmetric"), ("max_refs", 25), ("etol", 0.001)):
         SubElement(solver, name).text = str(value)
     stepper = SubElement(control, "time_stepper", type="default")
     for name, value in (("max_retries", 10), ("dtmin", 0.001), ("dtmax", 1 / STEPS)):

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tkamb.atomic import replaced_file
-from tkamb.errors import InputError
+from tkamb.errors import InputError, not_installed
 from tkamb.geometry.frames import Array
 
 if TYPE_CHECKING:
@@ -232,8 +232,7 @@ class ContactMaps:
         try:
             from pyvista import MultiBlock, PolyData
         except ImportError:
-            mend = "pip install 'tkamb[notebook]'"
-            raise InputError("PyVista is not installed", "to_pyvista", mend) from None
+            raise not_installed("PyVista", "to_pyvista", "notebook") from None
         faces = np.insert(self.triangles, 0, 3, axis=1)
         blocks = MultiBlock()
         for k, time in enumerate(self.time_s):
