@@ -6,25 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kept_runs import keep
 from synthetic_run import make_run
-from tkamb.atomic import replaced_together
-from tkamb.claim import claimed_directory
 from tkamb.cli import main
 from tkamb.compare import page
 from tkamb.compare.comparison import compare_folders
-from tkamb.output.maps import write_maps
 from tkamb.results import Results
-from tkamb.results_folder import put_numbers
 
 
 def written(folder, results, **summary):
     """Write results, no report, with keys of the summary changed; return the folder."""
-    results = replace(results, summary=results.summary | summary)
-    with claimed_directory(folder) as place, replaced_together(place) as files:
-        if results.maps is not None:
-            write_maps(results.maps, files.path("contact.h5"))
-        put_numbers(results, files)
-    return folder
+    return keep(replace(results, summary=results.summary | summary), folder)
 
 
 def chosen(results, frames):

@@ -7,12 +7,14 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from kept_runs import keep
 from scenes import write_scene
 from tkamb.cli import main
 from tkamb.contact.materials import material
 from tkamb.decks.febio import contact_quads
 from tkamb.decks.frame import frame_press
 from tkamb.errors import InputError
+from tkamb.simulation import simulate
 from tkamb.starter import lay_out
 from tkamb.studies.calculix import run_calculix
 from tkamb.studies.peer import peer_result
@@ -29,9 +31,8 @@ def folder(tmp_path_factory):
     text = scene.read_text().replace('model = "lattice"', 'model = "fe"')
     text = text.replace('material = "polyethylene"', 'material = "polyethylene-linear"')
     scene.write_text(text)
-    run = ["run", str(scene), "--frames", "2:3", "--resolution", str(COARSE_MM)]
-    assert main([*run, "--out", str(root / "run")]) == 0
-    return root / "run"
+    results = simulate(scene, frames=slice(2, 3), resolution_mm=COARSE_MM)
+    return keep(results, root / "run")
 
 
 @pytest.fixture(scope="module")

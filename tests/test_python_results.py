@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 
 import tkamb
+from kept_runs import keep
 from synthetic_run import make_run
-from tkamb.atomic import replaced_together
-from tkamb.claim import claimed_directory
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.inputs.meshes import read_triangles
-from tkamb.output.maps import write_maps
-from tkamb.results_folder import put_numbers
 
 RUN = make_run("gait", frames=11)
 
@@ -63,11 +60,9 @@ def test_pyvista_gets_one_block_a_frame_with_the_load():
 
 
 def test_the_time_series_for_paraview_names_a_file_for_each_map(tmp_path, capsys):
-    with claimed_directory(tmp_path / "run") as place, replaced_together(place) as files:
-        maps = make_run("gait", frames=11).maps
-        maps.pressure_Pa[3] = np.nan  # as a failed frame's
-        write_maps(maps, files.path("contact.h5"))
-        put_numbers(RUN, files)
+    maps = make_run("gait", frames=11).maps
+    maps.pressure_Pa[3] = np.nan  # as a failed frame's
+    keep(RUN, tmp_path / "run", maps)
     out = tmp_path / "vtk"
     assert main(["export", str(tmp_path / "run"), "--vtp", "--out", str(out)]) == 0
     assert "10 of 11 frames" in capsys.readouterr().out

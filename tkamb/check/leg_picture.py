@@ -224,7 +224,7 @@ def _draw_surface(axes: Axes, surface: Surface, view: View, colour: str) -> None
     faces = (0.45 + 0.55 * lean[facing[order]])[:, None] * np.array(to_rgb(colour))
     axes.add_collection(
         PolyCollection(
-            view.page(corners[order]), facecolors=faces, linewidths=0, antialiaseds=False,
+            list(view.page(corners[order])), facecolors=faces, linewidths=0, antialiaseds=False,
             rasterized=True,
         ),
         autolim=False,

@@ -63,7 +63,7 @@ def contact_quads(lattice: Lattice) -> Index:
     _, first, count = np.unique(
         np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
     )
-    touches = np.isin(faces, np.unique(lattice.contact_triangles)).all(axis=1)
+    touches = np.isin(faces, np.unique(lattice.contact_triangles)).sum(axis=1) == 4
     chosen = first[(count == 1) & touches[first]]
     quads = faces[chosen]
     corners = lattice.nodes[quads]
@@ -75,7 +75,11 @@ def contact_quads(lattice: Lattice) -> Index:
 def _control(root: Element) -> None:
     control = _filled(root, "Control", analysis="STATIC", time_steps=STEPS, step_size=1 / STEPS)
     solver = SubElement(control, "solver", type="solid")
-    for name, value in (("symmetric_stiffness", "non-symmetric"), ("max_refs", 25), ("etol", 0.001)):
+    for name, value in (
+        ("symmetric_stiffness", "non-symmetric"),
+        ("max_refs", 25),
+        ("etol", 0.001),
+    ):
         SubElement(solver, name).text = str(value)
     stepper = SubElement(control, "time_stepper", type="default")
     for name, value in (("max_retries", 10), ("dtmin", 0.001), ("dtmax", 1 / STEPS)):
