@@ -190,7 +190,7 @@ def _frames(results: "Results") -> Card:
     if failed or flagged:
         words = [f"{failed} failed (no numbers)"] if failed else []
         words += [f"{flagged} to be read with care"] if flagged else []
-        detail = "; ".join(words) + ": see the table below"
+        detail = "; ".join(words) + ": why is in the report's table and in column status"
     else:
         detail = "none failed, none flagged"
     return Card("Frames computed", value, detail, bool(failed or flagged))
