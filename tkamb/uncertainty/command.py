@@ -26,6 +26,7 @@ def add_uncertainty(commands: Any, frames: Any, setting: Any) -> None:
     command.add_argument("scene", type=Path, help="scene.toml; its [uncertainty] says what varies")
     command.add_argument("--samples", type=int, default=256, metavar="N", help="default 256")
     command.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default 1")
+    command.add_argument("--dask", metavar="ADDRESS|local", help="have a Dask cluster compute")
     command.add_argument("--method", default="lhs", metavar="lhs|sobol", help="default lhs")
     command.add_argument("--contact", metavar="NAME", help="contact model (`tkamb contact list`)")
     command.add_argument("--resolution", type=float, metavar="MM", help="spacing of the map points")
@@ -62,6 +63,7 @@ def _uncertainty(options: argparse.Namespace) -> int:
         load_scene(options.scene, overrides),
         samples=options.samples,
         workers=options.workers,
+        dask=options.dask,
         method=options.method,
         frames=options.frames,
         directory=directory,

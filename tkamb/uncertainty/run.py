@@ -1,7 +1,7 @@
 """All samples of a scene: over worker processes, kept as they are finished, then made bands."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +13,18 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.results import Results
 from tkamb.run.shards import Shard, Shards
+from tkamb.run.workers import Crew, Progress, Task
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.case import Case, load_case
 from tkamb.simulation import chosen_frames, simulate
 from tkamb.uncertainty.bands import FEWEST, Influence, band_columns, influences
 from tkamb.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
 from tkamb.uncertainty.kept import write_uncertainty
-from tkamb.uncertainty.sample import Sample
+from tkamb.uncertainty.sample import Sample, Sampler
 from tkamb.uncertainty.sampling import normal_samples
-from tkamb.uncertainty.workers import Progress, finished_samples
 
 SAMPLES = 256
-MOST_SAMPLES, MOST_WORKERS = 100_000, 256
+MOST_SAMPLES = 100_000
 TORNADO_RESULTS = (
     *("force_total_N", "medial_force_N", "lateral_force_N", "medial_share_equilibrium"),
     *("medial_peak_pressure_MPa", "lateral_peak_pressure_MPa", "quadriceps_N"),
@@ -65,6 +65,7 @@ def estimate_uncertainty(
     *,
     samples: int = SAMPLES,
     workers: int = 1,
+    dask: str | None = None,
     method: str = "lhs",
     frames: slice | None = None,
     directory: str | Path | None = None,
@@ -81,6 +82,8 @@ def estimate_uncertainty(
         scene: a scene, or the path of its file.
         samples: how many, at least 20.
         workers: processes; 1 computes in this one.
+        dask: address of a Dask scheduler that has the samples computed, or "local" for one with
+            so many workers.
         method: "lhs" or "sobol", see `tkamb.uncertainty.sampling`.
         frames: which frames; default all.
         directory: folder for all results; None keeps them in memory.
@@ -96,7 +99,9 @@ def estimate_uncertainty(
     """
     if isinstance(scene, str | Path):
         scene_path, scene = scene, load_scene(scene)
-    _check_numbers(samples, workers)
+    crew = Crew(workers, dask)
+    if not FEWEST <= samples <= MOST_SAMPLES:
+        raise InputError(f"{samples} is not within {FEWEST} to {MOST_SAMPLES}", "--samples")
     if directory is None and resume:
         raise InputError("there is no folder to go on in", "resume", "give a directory")
     case = load_case(scene)
@@ -104,7 +109,7 @@ def estimate_uncertainty(
     inputs = varied_inputs(case)
     normal = normal_samples(method, samples, len(inputs), uncertainty_of(case).seed)
     nominal = simulate(scene, frames=frames, scene_path=scene_path)
-    job = _Job(case, chosen, nominal, inputs, normal, method, workers, progress)
+    job = _Job(case, chosen, nominal, inputs, normal, method, crew, progress)
     if directory is None:
         return job.run(None)
     with claimed_directory(directory, force) as folder:
@@ -126,7 +131,7 @@ class _Job:
     inputs: tuple[VariedInput, ...]
     normal: Array
     method: str
-    workers: int
+    crew: Crew
     progress: Progress
 
     def run(self, shards: Shards | None) -> Uncertainty:
@@ -135,8 +140,8 @@ class _Job:
         count = len(self.normal)
         done = _kept(shards, count)
         left = [n for n in range(count) if n not in done]
-        arguments = (self.case.scene, self.frames, names)
-        new = finished_samples(arguments, [(n, self.normal[n]) for n in left], self.workers)
+        task = Task(Sampler, (self.case.scene, self.frames, names))
+        new = self.crew.answers(task, [(n, self.normal[n]) for n in left])
         try:
             for number, sample in self.progress(new, len(left)):
                 done[number] = sample
@@ -158,10 +163,11 @@ class _Job:
         rows = [names.index(name) for name in wanted]
         input_names = [one.name for one in self.inputs]
         tornado = influences(wanted, input_names, values[:, rows], errors)
-        self.nominal.summary["uncertainty"] = self._summary(failed)
-        return Uncertainty(self.nominal, bands, tornado, names, self.inputs, samples)
+        self.nominal.summary["uncertainty"] = self._summary(failed, tornado)
+        results = replace(self.nominal, bands=bands)
+        return Uncertainty(results, bands, tornado, names, self.inputs, samples)
 
-    def _summary(self, failed: np.ndarray) -> dict[str, Any]:
+    def _summary(self, failed: np.ndarray, tornado: list[Influence]) -> dict[str, Any]:
         return {
             "samples": len(failed),
             "method": self.method,
@@ -170,7 +176,16 @@ class _Job:
             "not_varied": held_inputs(self.case),
             "failed_share": float(failed.mean()),
             "largest_failed_share": float(failed.mean(axis=0).max()),
+            "shares_of_variance": shares_of_variance(tornado),
         }
+
+
+def shares_of_variance(tornado: Sequence[Influence]) -> dict[str, dict[str, float]]:
+    """Return result -> input -> its share of the result's variance, largest first."""
+    found: dict[str, dict[str, float]] = {}
+    for one in tornado:
+        found.setdefault(one.result, {})[one.name] = one.share
+    return found
 
 
 def banded_names(results: Results) -> list[str]:
@@ -192,14 +207,3 @@ def _kept(shards: Shards | None, count: int) -> dict[int, Sample]:
         if shard is not None and shard.contact is not None:
             found[number] = Sample(**shard.contact)
     return found
-
-
-def _check_numbers(samples: int, workers: int) -> None:
-    """Raise where there are too few or too many of either."""
-    wanted: Mapping[str, tuple[int, int, int]] = {
-        "--samples": (samples, FEWEST, MOST_SAMPLES),
-        "--workers": (workers, 1, MOST_WORKERS),
-    }
-    for option, (given, least, most) in wanted.items():
-        if not least <= given <= most:
-            raise InputError(f"{given} is not within {least} to {most}", option)

@@ -79,6 +79,10 @@ class Sampler:
     def _side(self) -> ContactSide | None:
         return ContactSide(self.case, self._mechanics) if self.case.scene.contact else None
 
+    def __call__(self, number: int, normal: Array) -> Sample:
+        """Return the sample: what a worker does, see `tkamb.run.workers`."""
+        return self.sample(number, normal)
+
     def draw(self, number: int, normal: Array) -> Draw:
         """Return what the sample of a number makes of the inputs.
 
