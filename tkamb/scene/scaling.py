@@ -6,7 +6,7 @@ per length E A / L grows with s, force per strain E A with s². Angles and time 
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tkamb.body.load import LinkPoint
 from tkamb.errors import InputError
@@ -62,7 +62,9 @@ def _columns(values: Array, columns: list[int], s: float) -> Array:
 
 def _motion(motion: "KneeMotion", s: float) -> "KneeMotion":
     names = ("coordinates", "velocity", "acceleration", "raw_coordinates")
-    changes = {name: _columns(getattr(motion, name), TRANSLATIONS, s) for name in names}
+    changes: dict[str, Any] = {
+        name: _columns(getattr(motion, name), TRANSLATIONS, s) for name in names
+    }
     changes["deviation_translation"] = motion.deviation_translation * s
     for name in ("patella", "patella_velocity", "patella_acceleration"):
         if getattr(motion, name) is not None:
