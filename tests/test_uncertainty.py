@@ -14,7 +14,7 @@ from tkamb.uncertainty.bands import band_columns, influences, percentiles
 from tkamb.uncertainty.inputs import Draw
 from tkamb.uncertainty.run import estimate_uncertainty
 from tkamb.uncertainty.sample import Sampler
-from tkamb.uncertainty.sampling import noise, normal_samples
+from tkamb.uncertainty.sampling import Point, noise, normal_samples
 
 SCENE = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
 SLOPES = np.array([3.0, -2.0, 1.0, 0.5])
@@ -115,8 +115,8 @@ def draw_of(sampler, **normal):
 
 def sampled(sampler, monkeypatch, **normal):
     """Return the values of the sample that moves these inputs."""
-    monkeypatch.setattr(sampler, "draw", lambda number, z: draw_of(sampler, **normal))
-    return sampler.sample(0, np.zeros(0)).values
+    monkeypatch.setattr(sampler, "draw", lambda point: draw_of(sampler, **normal))
+    return sampler(0, Point.of(0, np.zeros(0))).values
 
 
 def test_a_sample_is_the_run_of_the_scene_with_its_inputs_moved(monkeypatch):

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 CSV_NAME, SUMMARY_NAME, REPORT_NAME = "results.csv", "summary.json", "report.html"
 MAPS_NAME = "contact.h5"
 BANDS_NAME, TORNADO_NAME, SAMPLES_NAME = "bands.csv", "tornado.csv", "samples.h5"
-UNCERTAINTY_NAMES = (BANDS_NAME, TORNADO_NAME, SAMPLES_NAME)
+INDICES_NAME = "indices.csv"
+UNCERTAINTY_NAMES = (BANDS_NAME, TORNADO_NAME, SAMPLES_NAME, INDICES_NAME)
 """Stand beside the results that they belong to, and go with them."""
 SUMMARY_LIMIT = 256 * MEGABYTE
 """Bytes of a summary: a line for every failed frame."""
