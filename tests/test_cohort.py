@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import threading
 from contextlib import suppress
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from faults import Faults
+from interrupted_runs import broken_off, held_elsewhere
 from synthetic_run import make_run
 from tkamb.claim import claimed_directory, settle
 from tkamb.cli import main
@@ -91,14 +91,8 @@ def test_a_cohort_is_its_runs_one_by_one_and_lists_what_failed(file, tmp_path, c
 def test_parts_and_workers_and_an_interrupt_change_nothing(file, tmp_path):
     whole, parted = tmp_path / "whole", tmp_path / "parted"
 
-    def break_off(runs, count):
-        for index, one in enumerate(runs):
-            if index == 1:
-                raise KeyboardInterrupt
-            yield one
-
     with pytest.raises(KeyboardInterrupt, match="1 of 6 runs are kept"):
-        run_cohort(file, whole, progress=break_off)
+        run_cohort(file, whole, progress=broken_off(1))
     assert not (whole / "cohort.parquet").exists()
     computed = []
 
@@ -214,21 +208,8 @@ def test_two_into_one_folder_and_another_cohort_to_resume_are_refused(file, tmp_
     capsys.readouterr()
     assert main(["cohort", str(file), "--out", str(folder), "--resume", "--shard", "3/6"]) == 2
     assert "cannot resume" in capsys.readouterr().err
-    held, done = threading.Event(), threading.Event()
-
-    def hold():
-        with claimed_directory(folder / "shard-3-of-6"):
-            held.set()
-            done.wait()
-
-    other = threading.Thread(target=hold)
-    other.start()
-    held.wait()
-    try:
+    with held_elsewhere(folder / "shard-3-of-6"):
         assert main(["cohort", str(file), "--out", str(folder), "--shard", "3/6"]) == 2
-    finally:
-        done.set()
-        other.join()
     said = capsys.readouterr().err.strip()
     assert "another tkamb is writing" in said and "\n" not in said
 

@@ -87,6 +87,8 @@ def run_cohort(
         KeyboardInterrupt: what is finished is kept in the folder.
     """
     cohort = cohort if isinstance(cohort, Cohort) else load_cohort(cohort)
+    crew = crew or Crew()
+    crew.check()
     identity = _identity(cohort)
     directory = Path(directory)
     folder = directory if part is None else directory / part.folder
@@ -98,7 +100,7 @@ def run_cohort(
         done = _kept([shards, *others], wanted)
         left = [(n, cohort.runs[n]) for n in wanted if n not in done]
         task = Task(CohortWorker, (cohort.frames, cohort.table.map_flexion_deg))
-        answers = (crew or Crew()).answers(task, left)
+        answers = crew.answers(task, left)
         try:
             for number, outcome in progress(answers, len(left)):
                 shards.put(number, outcome.shard())

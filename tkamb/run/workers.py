@@ -62,6 +62,13 @@ class Crew:
         if not 1 <= self.workers <= MOST_WORKERS:
             raise InputError(f"{self.workers} is not within 1 to {MOST_WORKERS}", "--workers")
 
+    def check(self) -> None:
+        """Raise an InputError where a cluster that is asked for is not there."""
+        if self.dask is not None:
+            from tkamb.run.cluster import check_cluster
+
+            check_cluster(self.dask)
+
     def answers(self, task: Task, wanted: Sequence[Numbered]) -> Iterator[Numbered]:
         """Yield answers with their numbers as they are finished, in any order.
 
@@ -72,7 +79,7 @@ class Crew:
         Raises:
             ComputationError: a worker was killed, or the scheduler is gone.
         """
-        if self.dask is not None:
+        if self.dask is not None and wanted:
             from tkamb.run.cluster import answers_of_cluster
 
             return answers_of_cluster(task, wanted, self.dask, self.workers)

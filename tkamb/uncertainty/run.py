@@ -1,6 +1,7 @@
 """All samples of a scene: over worker processes, kept as they are finished, then made bands."""
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -110,16 +111,20 @@ def estimate_uncertainty(
         raise InputError(f"{samples} is not within {FEWEST} to {MOST_SAMPLES}", "--samples")
     if directory is None and resume:
         raise InputError("there is no folder to go on in", "resume", "give a directory")
+    crew.check()
     case = load_case(scene)
     chosen = chosen_frames(frames, len(case.motion.time))
     inputs = varied_inputs(case)
     points = _points(method, samples, len(inputs), uncertainty_of(case).seed, indices)
-    nominal = simulate(scene, frames=frames, scene_path=scene_path)
     crossed = samples if indices else 0
-    job = _Job(case, chosen, nominal, inputs, points, crossed, method, crew, progress)
-    if directory is None:
-        return job.run(None)
-    with claimed_directory(directory, force) as folder:
+    with ExitStack() as stack:
+        folder = None
+        if directory is not None:
+            folder = stack.enter_context(claimed_directory(directory, force))
+        nominal = simulate(scene, frames=frames, scene_path=scene_path)
+        job = _Job(case, chosen, nominal, inputs, points, crossed, method, crew, progress)
+        if folder is None:
+            return job.run(None)
         identity = nominal.summary["identity"] | {"method of sampling": job.design}
         found = job.run(Shards(folder, identity, resume))
         write_uncertainty(found, folder)
@@ -167,7 +172,7 @@ class _Job:
             for number, sample in self.progress(new, len(left)):
                 done[number] = sample
                 if shards is not None:
-                    shards.put(number, Shard({}, vars(sample)))
+                    shards.put(number, Shard({}, dict(vars(sample))))
         except KeyboardInterrupt:
             if shards is None or not done:
                 raise

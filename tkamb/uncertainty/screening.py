@@ -72,12 +72,14 @@ def screen(
         InputError: bad input.
         ComputationError: a worker ended before its sample.
     """
+    crew = crew or Crew()
+    crew.check()
     case = load_case(scene)
     chosen = chosen_frames(frames, len(case.motion.time))
     inputs = varied_inputs(case)
     task = Task(Sampler, (scene, chosen, ("flexion_deg", *SCREENED)))
     points = list(enumerate(one_at_a_time(len(inputs))))
-    answers = (crew or Crew()).answers(task, points)
+    answers = crew.answers(task, points)
     samples: dict[int, Sample] = dict(progress(answers, len(points)))
     values = np.array([samples[n].values for n in range(len(points))])
     found: list[Screened] = []
