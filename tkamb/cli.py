@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from tkamb.cohort.command import add_cohort
 from tkamb.datasets.command import add_data
 from tkamb.export_command import add_export
 from tkamb.guard import guarded
@@ -76,6 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     add_stability(commands)
     add_wear(commands)
     add_uncertainty(commands, _slice, _setting)
+    add_cohort(commands)
     return parser
 
 

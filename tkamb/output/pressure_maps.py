@@ -114,7 +114,7 @@ def draw_maps(
         grid = figure.subplots(down, across, squeeze=False).ravel()
         for axes, frame in zip(grid, frames, strict=False):
             view.draw_insert(axes)
-            _draw_pressure(axes, view, pressure[rows[frame]], scale)
+            draw_pressure(axes, view, pressure[rows[frame]], scale)
             _draw_centres(axes, view, results, frame)
             view.draw_labels(axes)
             axes.set_title(_caption(results, axis, frame), fontsize=8.5)
@@ -170,7 +170,8 @@ def _shade(points: Array, triangles: NDArray[np.int64]) -> Array:
     return 0.55 + 0.4 * np.clip(normal @ (light / np.linalg.norm(light)), 0.0, 1.0)
 
 
-def _draw_pressure(axes: Axes, view: TopView, pressure: Array, scale: Normalize) -> None:
+def draw_pressure(axes: Axes, view: TopView, pressure: Array, scale: Normalize) -> None:
+    """Colour the insert with a pressure (n,), in the scale's unit."""
     loaded = (pressure[view.triangles] > TOUCHED * float(scale.vmax or 1.0)).any(axis=1)
     if not loaded.any():
         return
