@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from scenes import write_scene
 from tkamb.cli import main
 from tkamb.contact.materials import material
 from tkamb.decks.febio import contact_quads
@@ -17,6 +18,7 @@ from tkamb.studies.calculix import run_calculix
 from tkamb.studies.peer import peer_result
 
 COARSE_MM = 4.0
+WITH_CALCULIX = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
 
 
 @pytest.fixture(scope="module")
@@ -37,13 +39,29 @@ def pressed(folder):
     return frame_press(folder, 0)
 
 
-@pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
-def test_calculix_runs_the_deck_and_agrees_with_the_frame(pressed):
-    """The trade-off's numbers of `fe`: approach 1.5 %, peak pressure 2 %; forces 2 %."""
+@WITH_CALCULIX
+def test_calculix_runs_the_deck_and_carries_the_load(pressed):
     result, balance = peer_result(pressed.problem, run_calculix(pressed.deck("ccx")))
     assert balance == pytest.approx(1.0, abs=2e-3)
-    assert result.approach == pytest.approx(pressed.approach, rel=0.015)
-    assert result.pressure.max() == pytest.approx(pressed.peak_pressure, rel=0.02)
+    assert -result.wrench_on_insert[1] == pytest.approx(pressed.problem.load, rel=2e-3)
+    # CalculiX keeps the starter's femoral facets: their middles lie 10 µm off the surface (median).
+    assert result.approach == pytest.approx(pressed.approach, abs=1e-5)
+
+
+@pytest.mark.slow
+@WITH_CALCULIX
+def test_calculix_agrees_with_a_frame_of_the_shipped_knee(tmp_path):
+    """Within what the trade-off finds of lattice and CalculiX at 2 mm: 0.6 % in approach, 4.7 % in
+    peak pressure; measured 0.25 % and 4.3 %."""
+    settings = {"contact__model": "fe", "contact__material": "polyethylene-linear"}
+    scene = write_scene(tmp_path / "knee", **settings)
+    out = tmp_path / "run"
+    run = ["run", str(scene), "--frames", "50:51", "--resolution", "3", "--out", str(out)]
+    assert main(run) == 0
+    pressed = frame_press(out, 0)
+    result, _ = peer_result(pressed.problem, run_calculix(pressed.deck("ccx")))
+    assert result.approach == pytest.approx(pressed.approach, rel=0.006)
+    assert result.pressure.max() == pytest.approx(pressed.peak_pressure, rel=0.047)
 
 
 def test_the_command_writes_a_deck_that_says_what_to_compare(folder, pressed, tmp_path, capsys):

@@ -28,7 +28,7 @@ def test_every_message_of_the_page_is_one_of_the_program_s():
     assert not missing
 
 
-@pytest.mark.parametrize("page", ["your_own_patient.md", "../README.md"])
+@pytest.mark.parametrize("page", ["your_own_patient.md", "commands.md", "../README.md"])
 def test_every_command_line_of_the_page_is_understood(page):
     lines = COMMAND.findall((DOCS / page).read_text(encoding="utf-8"))
     assert len(lines) > 5
@@ -42,3 +42,12 @@ def test_every_link_between_the_pages_leads_somewhere():
         for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
             if not target.startswith("http"):
                 assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_the_paper_s_numbers_stand_in_the_pages_that_they_link():
+    text = (DOCS / "paper.md").read_text(encoding="utf-8")
+    quoted = re.findall(r"\[([\d.]+(?: of \d+)?)\]\(([a-z_]+\.md)\)", text)
+    assert len(quoted) >= 5
+    for number, page in quoted:
+        there = (DOCS / page).read_text(encoding="utf-8")
+        assert re.search(rf"(?<![\d.]){re.escape(number)}(?![\d.]*\d)", there), (number, page)

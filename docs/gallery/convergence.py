@@ -1,6 +1,6 @@
 """Does it converge?
 
-A result that moves with the spacing of the map's points is not yet one. Here the contact area by
+A result that moves with the spacing of the map's points is not yet one. Here the approach by
 `foundation` at four spacings, against the finest: ask this of your own bodies before you publish.
 """
 
@@ -33,6 +33,9 @@ error = np.abs(approach[:-1] / approach[-1] - 1.0)
 figure, axes = plt.subplots(figsize=(5, 3.4), layout="constrained")
 axes.loglog(SPACINGS[:-1], 100 * error, "o-", color="#0072B2")
 axes.set(xlabel="spacing (mm)", ylabel="approach, off the finest by (%)")
+axes.set_xticks(SPACINGS[:-1], [f"{spacing:g}" for spacing in SPACINGS[:-1]], minor=False)
+axes.set_yticks([0.5, 1, 2, 4], ["0.5", "1", "2", "4"])
+axes.minorticks_off()
 figure.savefig("convergence.png", dpi=100)
 
 assert error[2] < 0.01, error

@@ -14,7 +14,7 @@ import tkamb
 from tkamb.press import press_meshes
 
 MESHES = Path(tkamb.__file__).parent / "starter" / "files"
-ADDUCTIONS = np.array([-0.5, -0.25, 0.0, 0.25, 0.5])  # deg
+ADDUCTIONS = np.array([-0.3, -0.15, 0.0, 0.15, 0.3])  # deg
 
 
 def force(side):

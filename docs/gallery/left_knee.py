@@ -44,6 +44,7 @@ for name, cops, colour in zip(
     axes.plot(cops[:, 2], cops[:, 0], "o", color=colour, label=f"{name} knee")
     axes.annotate(" medial", (cops[0, 2], cops[0, 0]), fontsize=8)
 axes.set(xlabel="to the subject's right (mm)", ylabel="anterior (mm)")
+axes.margins(x=0.25)
 axes.legend()
 figure.savefig("left_knee.png", dpi=100)
 

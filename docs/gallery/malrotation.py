@@ -1,8 +1,8 @@
 """A component five degrees malrotated.
 
-The femoral component is turned about the long axis, five degrees either way. This knee is
-symmetric: what one condyle carries when the component is turned out, the other carries when it is
-turned in. What differs from that is the faceting of the meshes.
+The femoral component is turned about the long axis, five degrees either way, and held there: one
+condyle then takes nearly all of the load, and the peak rises by a fifth. This knee is symmetric:
+turned in or turned out, the peak is the same but for the faceting of the meshes.
 """
 
 from pathlib import Path
@@ -36,5 +36,6 @@ axes.set(xlabel="rotation of the femoral component (deg)", ylabel="peak pressure
 axes.legend()
 figure.savefig("malrotation.png", dpi=100)
 
-off = np.abs(np.array(sides["medial"]) / np.array(sides["lateral"][::-1]) - 1.0).max()
-assert off < 0.05, off
+worst = np.max(list(sides.values()), axis=0)
+off = abs(worst[0] / worst[-1] - 1.0)
+assert off < 0.03, off

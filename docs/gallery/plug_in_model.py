@@ -50,6 +50,9 @@ for modulus in (0.5e11, 1e11, 2e11):
 figure, axes = plt.subplots(figsize=(5, 3.4), layout="constrained")
 axes.loglog(approach.keys(), approach.values(), "o-", color="#009E73")
 axes.set(xlabel="modulus (Pa/m)", ylabel="approach (mm)")
+axes.set_xticks(list(approach), [f"{modulus:.0e}" for modulus in approach])
+axes.set_yticks([0.1, 0.15, 0.2], ["0.10", "0.15", "0.20"])
+axes.minorticks_off()
 figure.savefig("plug_in_model.png", dpi=100)
 
 # On paraboloids the load is pi sqrt(R1 R2) modulus approach²: twice the modulus, 1/sqrt(2).

@@ -27,10 +27,10 @@ found = {
     for name in MODELS
 }
 
-figure, grid = plt.subplots(1, 3, figsize=(9, 3), layout="constrained")
+figure, grid = plt.subplots(1, 3, figsize=(9, 2.4), layout="constrained")
 for axes, quantity in zip(grid, ("approach_mm", "peak_pressure_MPa", "area_mm2"), strict=True):
     values = [one.get(quantity) or one["medial"][quantity] for one in found.values()]
-    axes.bar(found.keys(), values, color="#0072B2")
+    axes.barh(list(found), values, color="#0072B2")
     axes.set_title(quantity + ("" if quantity == "approach_mm" else ", medial"), fontsize=9)
 figure.savefig("swap_models.png", dpi=100)
 

@@ -5,7 +5,7 @@ The laboratory's y is up; ahead is where the insert's x points, on the mean over
 A left knee is mirrored at input and drawn mirrored back.
 """
 
-import contextlib
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,10 +121,8 @@ def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str]]:
         poses = {link: state.pose(link) for link in (bundle.proximal.link, bundle.distal.link)}
         found.append((np.stack(bundle.ends(poses)), PURPLE))
     if mechanics.extensor is not None:
-        # A patella that is lost there has no lines; the run says so of its frame.
-        with contextlib.suppress(ComputationError):
-            paths = mechanics.extensor.paths(state)
-            found += [(path.points, VERMILLION) for path in paths]
+        with suppress(ComputationError):  # a patella that is lost there: the run says so
+            found += [(path.points, VERMILLION) for path in mechanics.extensor.paths(state)]
     return found
 
 
@@ -202,8 +200,8 @@ def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
     if one.force is not None and one.loaded:
         tip = one.point + one.force / weight * METRES_PER_BW
         arrow = {"arrowstyle": "-|>", "color": BLUE, "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0}
-        ends = [(float(x), float(y)) for x, y in (view.page(tip), view.page(one.point))]
-        axes.annotate("", ends[0], ends[1], arrowprops=arrow)
+        head, tail = (tuple(view.page(end).tolist()) for end in (tip, one.point))
+        axes.annotate("", head, tail, arrowprops=arrow)
         shown += [tip[None], one.point[None]]
     if one.force is not None:
         axes.axhline(one.point[1], color=GREY, linewidth=1)

@@ -100,10 +100,8 @@ def draw_quantity(comparison: Comparison, quantity: Quantity) -> Figure | None:
 def _draw_curve(axes: Axes, number: int, run: Run, values: Array) -> None:
     x, y = run.axis.broken(values)
     colour, dashes = run_colour(number), DASHES[number % len(DASHES)]
-    marker = "o" if len(values) == 1 else None
-    axes.plot(
-        x, y, color=colour, linestyle=dashes, marker=marker, markersize=4, gid=f"run-{number}"
-    )
+    marker = "o" if len(values) == 1 else ""  # a line of one point would not be seen
+    axes.plot(x, y, color=colour, linestyle=dashes, gid=f"run-{number}", marker=marker)
     lost = failed(run.results)
     height = np.full(int(lost.sum()), FAILED_ROW * (1 + number))
     axes.plot(

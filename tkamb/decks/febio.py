@@ -68,8 +68,8 @@ def contact_quads(lattice: Lattice) -> Index:
     quads = faces[chosen]
     corners = lattice.nodes[quads]
     normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    inward = np.einsum("ij,ij->i", normal, corners.mean(axis=1) - inside[chosen]) < 0
-    return np.where(inward[:, None], quads[:, ::-1], quads)
+    outward = np.einsum("ij,ij->i", normal, corners.mean(axis=1) - inside[chosen])
+    return np.where(outward[:, None] < 0, quads[:, ::-1], quads)
 
 
 def _control(root: Element) -> None:
