@@ -35,6 +35,7 @@ _MUSCLES = "[muscles]"
 _RECORDED = "[contact] with adduction not released"
 _MARKERS = "[motion.markers]"
 _ADJUST = "[contact] with adjust = true"
+_MEASURED = "[measured]"
 
 LIGAMENT = "ligament_<name>_N"
 """Stands for one column per [[ligament]], in the scene's order."""
@@ -199,6 +200,9 @@ COLUMNS: tuple[Column, ...] = (
         "axis on which contact and patella leave it",
         _MUSCLES,
     ),
+    Column("measured_total_N", "axial force that was measured, as force_si_N", _MEASURED),
+    Column("measured_medial_N", "the same of the medial condyle", _MEASURED),
+    Column("measured_lateral_N", "the same of the lateral condyle", _MEASURED),
 )
 
 RENAMED = {"softest_N_per_mm": "smallest_stiffness_N_per_mm"}

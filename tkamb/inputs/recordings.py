@@ -186,3 +186,22 @@ class ForceRecording:
     laboratory_axes: str
     unloaded: float
     surface: float
+
+
+@dataclass(frozen=True, eq=False)
+class ForceMeasurement:
+    """What an instrumented implant measured.
+
+    Args:
+        file: the file.
+        columns: time, total, medial, lateral -> column name, or column -> factor of a sum.
+        unit: of the forces.
+        offset: s, added to the file's clock it is the motion's.
+        format: a name of `tkamb.inputs.tables.READERS`; None: the suffix.
+    """
+
+    file: Path
+    columns: dict[str, str | dict[str, float]]
+    unit: str
+    offset: float
+    format: str | None

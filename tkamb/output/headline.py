@@ -54,6 +54,7 @@ def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
     found = (
         _questions(results),
         _peak_force(results, axis),
+        _measured(results),
         _shares(results),
         _peak_pressure(results, axis),
         _extensor(results, axis),
@@ -89,6 +90,16 @@ def _peak_force(results: "Results", axis: HorizontalAxis) -> Card | None:
         f"{100 * share:.1f} % of it superior–inferior"
     )
     return Card("Peak contact force", f"{found.value:.2f} BW", detail)
+
+
+def _measured(results: "Results") -> Card | None:
+    """Return how far the run is from what an instrumented implant measured, with [measured]."""
+    if not results.summary.get("measured"):
+        return None
+    from tkamb.output.comparison import comparison_words
+
+    value, detail, incomplete = comparison_words(results.summary["measured"])
+    return Card("Against what was measured", value, detail, incomplete)
 
 
 def _shares(results: "Results") -> Card | None:

@@ -60,6 +60,10 @@ def summary_of(
         summary["first_wrapping_flexion_deg"] = _first_wrapping(columns)
     if scene.muscles:
         summary["reserves"] = reserves(columns)
+    if scene.measured:
+        from tkamb.run.measured import compare_measured
+
+        summary["measured"] = compare_measured(columns, case.body_weight)
     if scene.contact:
         table = scene.contact
         error = known_error(table.model, table.resolution_mm, table.material, table.options)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from tkamb.body.muscles import Muscle, PatellarLigament
     from tkamb.geometry.surface import Surface
     from tkamb.inputs.ground_reaction import GroundReaction
+    from tkamb.inputs.measured_force import MeasuredForce
     from tkamb.inputs.tibia import BodyMotion
 
 logger = logging.getLogger("tkamb")
@@ -43,6 +44,7 @@ class Case:
         ligaments: the bundles, generic ones among them; slack lengths where the scene has them.
         muscles: the muscles.
         patellar_ligament: the patellar ligament.
+        measured: what an instrumented implant measured.
     """
 
     scene: Scene
@@ -56,6 +58,7 @@ class Case:
     ligaments: "tuple[Ligament, ...]" = ()
     muscles: "tuple[Muscle, ...]" = ()
     patellar_ligament: "PatellarLigament | None" = None
+    measured: "MeasuredForce | None" = None
 
     @cached_property
     def split(self) -> float | None:
@@ -147,7 +150,16 @@ def load_case(scene: Scene) -> Case:
         _ligaments(scene, parts, chain),
         muscles,
         patellar_ligament,
+        _measured(scene, motion),
     )
+
+
+def _measured(scene: Scene, motion: KneeMotion) -> "MeasuredForce | None":
+    if scene.measured is None:
+        return None
+    from tkamb.inputs.measured_force import load_measured_force
+
+    return load_measured_force(in_si(scene.measured), motion.time)
 
 
 def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, ...]":
