@@ -43,7 +43,8 @@ MUSCLE_FORCE = "muscle_<name>_N"
 ACTIVATION = "activation_<name>"
 RESERVE = "reserve_<coordinate>_Nm"
 JOINT_MOMENT = "joint_moment_<coordinate>_Nm"
-FAMILIES = (LIGAMENT, MUSCLE_FORCE, ACTIVATION, RESERVE, JOINT_MOMENT)
+ENVELOPE = "envelope_<name>"
+FAMILIES = (LIGAMENT, MUSCLE_FORCE, ACTIVATION, RESERVE, JOINT_MOMENT, ENVELOPE)
 """Each stands for one column per ligament, muscle or coordinate."""
 
 COLUMNS: tuple[Column, ...] = (
@@ -200,6 +201,7 @@ COLUMNS: tuple[Column, ...] = (
         "axis on which contact and patella leave it",
         _MUSCLES,
     ),
+    Column(ENVELOPE, "normalised EMG envelope of the muscle <name>", "[muscles.emg]"),
     Column("measured_total_N", "axial force that was measured, as force_si_N", _MEASURED),
     Column("measured_medial_N", "the same of the medial condyle", _MEASURED),
     Column("measured_lateral_N", "the same of the lateral condyle", _MEASURED),

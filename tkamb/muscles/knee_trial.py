@@ -63,8 +63,14 @@ class KneeTrial:
         # a muscle without a taut path keeps its NaN, so that the frame fails by its name
         lost = np.isnan(table[0]).any(axis=1)
         table[0, :, self.flexion] = np.where(lost, np.nan, row)
+        guide = None if whole.guide is None else whole.guide.only(k)
         frame = replace(
-            whole, moment=moments, arms=table, active=whole.active[own], passive=whole.passive[own]
+            whole,
+            moment=moments,
+            arms=table,
+            active=whole.active[own],
+            passive=whole.passive[own],
+            guide=guide,
         )
         return frame, frame.solved(0)
 

@@ -19,9 +19,9 @@ def comparison_words(found: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, 
     first, *others = found.items()
     name, one = first
     counts = [_count_words(one)]
-    counts += [
-        f"{other}: {words}" for other, o in others if (words := _count_words(o)) != counts[0]
-    ]
+    counts += [f"{n}: {words}" for n, o in others if (words := _count_words(o)) != counts[0]]
+    if low_high := one["measured_where_not_compared_N"]:
+        counts[0] += f", where {low_high[0]:.0f} to {low_high[1]:.0f} N were measured"
     details = "; ".join([*(error_words(n, o) for n, o in found.items()), *counts])
     incomplete = any(o[key] for o in found.values() for key in WHY_NOT)
     if not one["frames_compared"]:
@@ -49,7 +49,4 @@ def error_words(name: str, one: Mapping[str, Any]) -> str:
 def _count_words(one: Mapping[str, Any]) -> str:
     total = one["frames_compared"] + sum(one[key] for key in WHY_NOT)
     why = [f"{one[key]} {words}" for key, words in WHY_NOT.items() if one[key]]
-    low_high = one["measured_where_not_compared_N"]
-    if low_high:
-        why.append(f"where {low_high[0]:.0f} to {low_high[1]:.0f} N were measured")
     return ", ".join([f"{one['frames_compared']} of {total} frames compared", *why])

@@ -90,11 +90,10 @@ def _motion_row(case: Case, k: int) -> dict[str, Any]:
         row[f"{name}_deg"] = coordinates[name] / DEGREE
     if motion.markers is not None:
         row |= _marker_row(motion.markers, motion.time[k : k + 1])
-    if case.measured is not None:
-        from tkamb.run.measured import measured_column
+    if case.measured is not None or case.emg is not None:
+        from tkamb.run.recorded import recorded_row
 
-        forces = case.measured.at(motion.time[k : k + 1])
-        row |= {measured_column(name): force[0] for name, force in forces.items()}
+        row |= recorded_row(case, k)
     return row
 
 

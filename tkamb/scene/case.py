@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from tkamb.body.ligaments import Ligament
     from tkamb.body.muscles import Muscle, PatellarLigament
     from tkamb.geometry.surface import Surface
+    from tkamb.inputs.emg import Envelopes
     from tkamb.inputs.ground_reaction import GroundReaction
     from tkamb.inputs.measured_force import MeasuredForce
     from tkamb.inputs.tibia import BodyMotion
@@ -45,6 +46,7 @@ class Case:
         muscles: the muscles.
         patellar_ligament: the patellar ligament.
         measured: what an instrumented implant measured.
+        emg: envelopes of the muscles' surface EMG.
     """
 
     scene: Scene
@@ -59,6 +61,7 @@ class Case:
     muscles: "tuple[Muscle, ...]" = ()
     patellar_ligament: "PatellarLigament | None" = None
     measured: "MeasuredForce | None" = None
+    emg: "Envelopes | None" = None
 
     @cached_property
     def split(self) -> float | None:
@@ -151,6 +154,7 @@ def load_case(scene: Scene) -> Case:
         muscles,
         patellar_ligament,
         _measured(scene, motion),
+        _emg(scene),
     )
 
 
@@ -160,6 +164,14 @@ def _measured(scene: Scene, motion: KneeMotion) -> "MeasuredForce | None":
     from tkamb.inputs.measured_force import load_measured_force
 
     return load_measured_force(in_si(scene.measured), motion.time)
+
+
+def _emg(scene: Scene) -> "Envelopes | None":
+    if scene.muscles is None or scene.muscles.emg is None:
+        return None
+    from tkamb.inputs.emg import load_envelopes
+
+    return load_envelopes(in_si(scene.muscles.emg))
 
 
 def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, ...]":
