@@ -44,7 +44,11 @@ ACTIVATION = "activation_<name>"
 RESERVE = "reserve_<coordinate>_Nm"
 JOINT_MOMENT = "joint_moment_<coordinate>_Nm"
 ENVELOPE = "envelope_<name>"
-FAMILIES = (LIGAMENT, MUSCLE_FORCE, ACTIVATION, RESERVE, JOINT_MOMENT, ENVELOPE)
+CONTRIBUTIONS = {side: f"{side}_from_<name>_N" for side in ("medial", "lateral")}
+FAMILIES = (
+    *(LIGAMENT, MUSCLE_FORCE, ACTIVATION, RESERVE, JOINT_MOMENT, ENVELOPE),
+    *CONTRIBUTIONS.values(),
+)
 """Each stands for one column per ligament, muscle or coordinate."""
 
 COLUMNS: tuple[Column, ...] = (
@@ -200,6 +204,16 @@ COLUMNS: tuple[Column, ...] = (
         "moment about <coordinate> that muscles and reserve carry together; the knee's about the "
         "axis on which contact and patella leave it",
         _MUSCLES,
+    ),
+    *(
+        Column(
+            family,
+            f"what the muscle <name> adds to {side}_force_equilibrium_N with pose, contact points "
+            "and lines held; also of quadriceps, ligaments, external (weight, inertia, ground): "
+            "they sum up to it",
+            _MUSCLES,
+        )
+        for side, family in CONTRIBUTIONS.items()
     ),
     Column(ENVELOPE, "normalised EMG envelope of the muscle <name>", "[muscles.emg]"),
     Column("measured_total_N", "axial force that was measured, as force_si_N", _MEASURED),

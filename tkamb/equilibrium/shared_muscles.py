@@ -40,6 +40,11 @@ class SharedMuscles:
         self._trial, self._names = trial, trial.muscles
         self._shank, self._thigh = trial.shank @ flip, trial.thigh @ flip
 
+    @property
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """Group of muscles -> their names (`tkamb.muscles.leg.muscle_groups`)."""
+        return dict(self._trial.groups)
+
     def share(
         self, k: int, geometry: KneeGeometry, friction: float, lifted: frozenset[str]
     ) -> MuscleShare:

@@ -102,7 +102,7 @@ def _draw_lines(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:
         x, y = axis.broken(line.values)
         dashes = DASHES if line.dashed else "-"
         gid = f"line-{line.name}"
-        broad = {"linewidth": 5.0, "alpha": 0.28, "zorder": 1.5} if line.behind else {}
+        broad: Any = {"linewidth": 5.0, "alpha": 0.28, "zorder": 1.5} if line.behind else {}
         axes.plot(x, y, color=line.colour, linestyle=dashes, label=line.label, gid=gid, **broad)
 
 

@@ -5,9 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tkamb.body.contributions import condyle_contributions
 from tkamb.body.knee import dome_sensitivity
 from tkamb.columns import (
     ACTIVATION,
+    CONTRIBUTIONS,
     JOINT_MOMENT,
     MUSCLE_FORCE,
     RESERVE,
@@ -151,6 +153,9 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
         }
     if frame.geometry.share is not None and not loads.problems:
         row |= _muscle_row(frame.geometry.share)
+        parts = condyle_contributions(frame.geometry, loads, friction)
+        for side, causes in parts.items():
+            row |= {family_column(CONTRIBUTIONS[side], name): n for name, n in causes.items()}
     return row | {
         ligament_column(name): tension for name, tension in frame.geometry.tensions.items()
     }
