@@ -69,7 +69,7 @@ def on_link(loads, link):
 
 
 def test_the_quadriceps_presses_by_the_patellar_ligament_alone():
-    """The patella's balance in the femur's sagittal plane gives the ligament, the shank the rest."""
+    """The patella's balance in the sagittal plane gives the ligament, the shank the rest."""
     geometry, loads = solved("taut")
     parts = condyle_contributions(geometry, loads, FRICTION)
     extensor, femur = geometry.extensor, geometry.state.pose("femur")

@@ -9,7 +9,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.importing.anatomy import Leg, find_leg
 from tkamb.inputs.ground_reaction import GroundReaction
-from tkamb.opensim.lines import Muscle, PathPoint
+from tkamb.opensim.lines import AnyPathPoint, Muscle, PathPoint
 from tkamb.opensim.model import Joint, OpenSimModel
 
 EXTENSORS = "knee extensors"
@@ -75,7 +75,7 @@ def muscle_groups(leg: Leg, muscles: Sequence[Muscle]) -> dict[str, tuple[str, .
     """
     bones = leg_bones(leg)
 
-    def region(point: PathPoint) -> str:
+    def region(point: AnyPathPoint) -> str:
         return next((name for name in ("tibia", "foot") if point.body in bones[name]), "thigh")
 
     groups: dict[str, tuple[str, ...]] = dict.fromkeys(GROUPS.values(), ())

@@ -62,6 +62,7 @@ def report_html(results: "Results") -> str:
         maps=_maps(results, axis),
         legend=_legend(results),
         plots=[_plot(panel, results, axis) for panel in panels(results)],
+        muscles=_muscles(results, axis),
         motion=motion_table(results, axis),
         strain=strain_table(results.summary),
         flags=flag_rows(results, axis),
@@ -120,6 +121,21 @@ def _maps(results: "Results", axis: HorizontalAxis) -> dict[str, Any] | None:
     }
 
 
+def _muscles(results: "Results", axis: HorizontalAxis) -> dict[str, Any] | None:
+    """Return the section on muscles; None without [muscles]."""
+    if not results.summary.get("muscle_groups"):
+        return None
+    from tkamb.output.muscles import draw_activations, muscle_panels, reserve_words
+
+    figure = draw_activations(results, axis)
+    return {
+        "activations": None if figure is None else svg_text(figure, "activations"),
+        "emg": bool(results.summary.get("emg")),
+        "plots": [_plot(panel, results, axis) for panel in muscle_panels(results)],
+        "reserves": reserve_words(results.summary),
+    }
+
+
 def _plot(panel: Panel, results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
     return {"panel": panel, "svg": svg_text(draw_panel(panel, results, axis), panel.name)}
 
@@ -169,6 +185,10 @@ def _text(value: Any) -> str:
 def _cursor_data(results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
     """Return what the slider shows of each frame: position, status, the lines of every plot."""
     drawn = (*panels(results), centre_panel(results))
+    if results.summary.get("muscle_groups"):
+        from tkamb.output.muscles import muscle_panels
+
+        drawn += muscle_panels(results)
     name = axis.label.split(" (")[0]
     return {
         "x": _round(axis.values),

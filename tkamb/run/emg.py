@@ -1,13 +1,15 @@
 """How recorded EMG and predicted activations agree, muscle by muscle."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tkamb.columns import ACTIVATION, family_column
 from tkamb.geometry.frames import Array
-from tkamb.inputs.emg import Envelopes
+
+if TYPE_CHECKING:
+    from tkamb.inputs.emg import Envelopes
 
 LAGS = np.arange(-40, 41) * 0.005
 """s: where the largest cross-correlation is sought, 0.2 s to either side."""
@@ -17,7 +19,7 @@ FEWEST = 8
 """Frames below which nothing is said of correlation and lag."""
 
 
-def compare_emg(envelopes: Envelopes, columns: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def compare_emg(envelopes: "Envelopes", columns: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return how each muscle's activation a and envelope e agree over the computed frames.
 
     Pearson's r and RMSE of a(t) and e(t), and the lag L of the largest r of a(t) and e(t - L):
@@ -55,7 +57,7 @@ def _pearson(a: Array, b: Array) -> float:
     return float(np.corrcoef(a, b)[0, 1])
 
 
-def _lag(envelopes: Envelopes, muscle: str, time: Array, activation: Array) -> float:
+def _lag(envelopes: "Envelopes", muscle: str, time: Array, activation: Array) -> float:
     """Return the lag (s) of the largest correlation; NaN where it has no maximum inside."""
     shifted = np.array([envelopes.at(muscle, time - lag) for lag in LAGS])
     known = np.isfinite(shifted).all(axis=0)
