@@ -13,7 +13,10 @@ from tkamb.columns import (
     CONTRIBUTIONS,
     ENVELOPE,
     MUSCLE_FORCE,
+    RESERVE,
+    belongs,
     family_column,
+    name_in,
 )
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis
@@ -22,6 +25,7 @@ from tkamb.output.panels import Line, Panel
 from tkamb.output.style import (
     BLACK,
     BLUE,
+    CYCLE,
     GREEN,
     GREY,
     ORANGE,
@@ -35,7 +39,7 @@ from tkamb.output.style import (
 if TYPE_CHECKING:
     from tkamb.results import Results
 
-GROUP_COLOURS = (VERMILLION, BLUE, GREEN, ORANGE, PURPLE, SKY, GREY)
+GROUP_COLOURS = (VERMILLION, BLUE, GREEN, ORANGE, PURPLE, BLACK, GREY)
 EXTERNAL, LIGAMENTS, EXTENSORS = "external", "ligaments", "quadriceps"
 """Contributions beside those of single muscles."""
 CELL, CELLS_ACROSS, MARGIN = (2.16, 1.12), 5, 0.3
@@ -59,8 +63,12 @@ class Cell:
 
 
 def muscle_panels(results: "Results") -> tuple[Panel, ...]:
-    """Return the plots of forces by group, and of the contributions to either condyle."""
-    made = (_forces(results), *(_contributions(results, side) for side in CONTRIBUTIONS))
+    """Return the plots of what makes either condyle's force, of forces by group and of reserves."""
+    made = (
+        *(_contributions(results, side) for side in CONTRIBUTIONS),
+        _forces(results),
+        _reserves(results),
+    )
     return tuple(panel for panel in made if panel.lines)
 
 
@@ -84,13 +92,29 @@ def _forces(results: "Results") -> Panel:
     return Panel("muscle_forces", "Muscle forces by group", "BW", lines, note)
 
 
+def _reserves(results: "Results") -> Panel:
+    columns = [name for name in results.columns if belongs(name, RESERVE)]
+    lines = tuple(
+        Line(
+            column,
+            name_in(column, RESERVE).replace("_", " "),
+            results[column],
+            CYCLE[k % len(CYCLE)],
+            k >= len(CYCLE),
+        )
+        for k, column in enumerate(columns)
+        if np.isfinite(results[column]).any()
+    )
+    return Panel("reserves", "Reserve moments", "N·m", lines, "What no muscle carries.")
+
+
 def _contributions(results: "Results", side: str) -> Panel:
     family, scale, colours = CONTRIBUTIONS[side], 1 / body_weight(results), _colours(results)
     total = results[f"{side}_force_equilibrium_N"]
     parts = {EXTERNAL: (EXTERNAL,), LIGAMENTS: (LIGAMENTS,)} | _groups(results)
     labels = {EXTERNAL: "weight, inertia, ground"}
-    shades = {EXTERNAL: GREY, LIGAMENTS: PURPLE} | colours
-    lines = [Line("all", "all", scale * total, BLACK)]
+    shades = {EXTERNAL: GREY, LIGAMENTS: SKY} | colours
+    lines = [Line("all", "all, by equilibrium", scale * total, BLACK)]
     for k, (part, names) in enumerate(parts.items()):
         own = (EXTENSORS,) if part == "knee extensors" else names
         values = _sum(results, family, own)
@@ -151,11 +175,10 @@ def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
                 axes.set_visible(False)
                 continue
             _draw_cell(axes, cells[k], results, axis)
-            if k + CELLS_ACROSS >= len(cells):
-                axes.tick_params(labelbottom=True)
-                axes.set_xlabel(axis.label)
+            axes.tick_params(labelbottom=k + CELLS_ACROSS >= len(cells))
         grid[0, 0].set_ylim(0, 1.02)
         grid[0, 0].set_yticks([0, 0.5, 1])
+        figure.supxlabel(axis.label, fontsize=9)
     return figure
 
 
