@@ -19,13 +19,21 @@ CHANNELS = {"vaslat": "VL", "semimem": "SM", "gasmed": "MG", "glmed1": "GM", "gl
 CHANNELS |= {"soleus": "SOL", "tibant": "TA"}
 ACROSS = (*GROUPS["thigh to shank"], *GROUPS["thigh to foot"])
 STRENGTH_N = 900.0
+KEPT = ["time_s", "flexion_deg", "status", "force_si_N", "force_total_N", "force_total_BW"]
+KEPT += ["quadriceps_N", "patellar_ligament_N", "patellofemoral_N"]
+KEPT += [
+    f"{side}_{kind}"
+    for side in ("medial", "lateral")
+    for kind in ("force_N", "force_equilibrium_N")
+]
+"""Columns of the plain run; few, so that the page is soon made."""
 
 
 def muscle_run(frames: int = 56) -> Results:
     """Return the run; one frame failed, the measured force lacks the last two."""
     plain = make_run("gait", frames, maps=False)
     s = np.linspace(0, 1, frames)
-    columns = {k: v for k, v in plain.columns.items() if k == "status" or np.isfinite(v).any()}
+    columns = {name: plain.columns[name] for name in KEPT}
     failed = np.array([status == "singular" for status in columns["status"]])
     columns["status"] = ["failed: singular" if bad else "ok" for bad in failed]
     names = [name for group in GROUPS.values() for name in group]

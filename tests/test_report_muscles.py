@@ -28,7 +28,7 @@ def test_what_makes_a_force_sums_up_to_it(run, side):
     panel = next(panel for panel in muscle_panels(run) if panel.name == f"from_{side}")
     whole, *parts = panel.lines
     assert {part.label for part in parts} == {
-        "weight, inertia, ground", "ligaments", "knee extensors", "thigh to shank", "thigh to foot",
+        "external loads", "ligaments", "knee extensors", "thigh to shank", "thigh to foot",
     }  # fmt: skip
     np.testing.assert_allclose(sum(part.values for part in parts), whole.values, atol=1e-9)
 
@@ -56,7 +56,7 @@ def test_the_plots_hold_activation_and_envelope(run):
     assert len(medial.collections) == 1
     assert medial.get_title("right") == "r 0.81"
     assert len(titles["gaslat"].collections) == 0
-    assert titles["glmed1 … glmed2"].get_title("right") == "r −0.20 to 0.81"
+    assert titles["GM (2)"].get_title("right") == "r −0.20 to 0.81"
 
 
 def test_reserves_stand_in_words(run):

@@ -16,8 +16,7 @@ def comparison_words(found: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, 
     Args:
         found: force -> what `compare_measured` returns, as in the summary.
     """
-    first, *others = found.items()
-    name, one = first
+    (_, one), *others = found.items()
     counts = [_count_words(one)]
     counts += [f"{n}: {words}" for n, o in others if (words := _count_words(o)) != counts[0]]
     if low_high := one["measured_where_not_compared_N"]:
@@ -26,7 +25,7 @@ def comparison_words(found: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, 
     incomplete = any(o[key] for o in found.values() for key in WHY_NOT)
     if not one["frames_compared"]:
         return "no frame to compare", details, True
-    return f"{name} RMSE {one['rmse_BW']:.2f} BW", details, incomplete
+    return f"RMSE {one['rmse_BW']:.2f} BW", details, incomplete
 
 
 def error_words(name: str, one: Mapping[str, Any]) -> str:

@@ -13,10 +13,7 @@ from tkamb.columns import (
     CONTRIBUTIONS,
     ENVELOPE,
     MUSCLE_FORCE,
-    RESERVE,
-    belongs,
     family_column,
-    name_in,
 )
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis
@@ -25,7 +22,6 @@ from tkamb.output.panels import Line, Panel
 from tkamb.output.style import (
     BLACK,
     BLUE,
-    CYCLE,
     GREEN,
     GREY,
     ORANGE,
@@ -42,6 +38,12 @@ if TYPE_CHECKING:
 GROUP_COLOURS = (VERMILLION, BLUE, GREEN, ORANGE, PURPLE, BLACK, GREY)
 EXTERNAL, LIGAMENTS, EXTENSORS = "external", "ligaments", "quadriceps"
 """Contributions beside those of single muscles."""
+HELD = (
+    "What makes a force: each load alone in the frame's equations, with pose, contact points and "
+    "normals, friction's direction and all lines of action held; they sum up to the force by "
+    "equilibrium. What a muscle alone leaves unbalanced in flexion is carried by a moment. "
+    "External loads: weight, inertia and ground. Muscles are grouped by the bones that they end on."
+)
 CELL, CELLS_ACROSS, MARGIN = (2.16, 1.12), 5, 0.3
 """Inches: width and height of a small plot; how many stand beside each other; for the labels."""
 SHADE = "#c4c4c4"
@@ -52,7 +54,7 @@ class Cell:
     """One small plot of activations.
 
     Args:
-        title: the muscle, or the channel of several.
+        title: the muscle, or the channel of several and how many they are.
         muscles: whose activations are drawn.
         envelope: the muscle whose EMG stands behind; None: there is none.
     """
@@ -63,11 +65,10 @@ class Cell:
 
 
 def muscle_panels(results: "Results") -> tuple[Panel, ...]:
-    """Return the plots of what makes either condyle's force, of forces by group and of reserves."""
+    """Return the plots of what makes either condyle's force, and of the forces by group."""
     made = (
         *(_contributions(results, side) for side in CONTRIBUTIONS),
         _forces(results),
-        _reserves(results),
     )
     return tuple(panel for panel in made if panel.lines)
 
@@ -88,33 +89,16 @@ def _forces(results: "Results") -> Panel:
         for k, (group, names) in enumerate(_groups(results).items())
         if np.isfinite(total := _sum(results, MUSCLE_FORCE, names)).any()
     )
-    note = "Sums of the muscles' forces, by the bones that they end on."
-    return Panel("muscle_forces", "Muscle forces by group", "BW", lines, note)
-
-
-def _reserves(results: "Results") -> Panel:
-    columns = [name for name in results.columns if belongs(name, RESERVE)]
-    lines = tuple(
-        Line(
-            column,
-            name_in(column, RESERVE).replace("_", " "),
-            results[column],
-            CYCLE[k % len(CYCLE)],
-            k >= len(CYCLE),
-        )
-        for k, column in enumerate(columns)
-        if np.isfinite(results[column]).any()
-    )
-    return Panel("reserves", "Reserve moments", "N·m", lines, "What no muscle carries.")
+    return Panel("muscle_forces", "Muscle forces by group", "BW", lines)
 
 
 def _contributions(results: "Results", side: str) -> Panel:
     family, scale, colours = CONTRIBUTIONS[side], 1 / body_weight(results), _colours(results)
     total = results[f"{side}_force_equilibrium_N"]
     parts = {EXTERNAL: (EXTERNAL,), LIGAMENTS: (LIGAMENTS,)} | _groups(results)
-    labels = {EXTERNAL: "weight, inertia, ground"}
+    labels = {EXTERNAL: "external loads"}
     shades = {EXTERNAL: GREY, LIGAMENTS: SKY} | colours
-    lines = [Line("all", "all, by equilibrium", scale * total, BLACK)]
+    lines = [Line("all", "all", scale * total, BLACK)]
     for k, (part, names) in enumerate(parts.items()):
         own = (EXTENSORS,) if part == "knee extensors" else names
         values = _sum(results, family, own)
@@ -122,12 +106,7 @@ def _contributions(results: "Results", side: str) -> Panel:
             dashed = part in (EXTERNAL, LIGAMENTS)
             label = labels.get(part, part)
             lines.append(Line(f"part-{k}", label, scale * values, shades[part], dashed))
-    note = (
-        "Each load by itself in the frame's equations, with pose, contact points and normals, "
-        "friction's direction and all lines held; they sum up to the force by equilibrium. What a "
-        "muscle alone leaves unbalanced in flexion is carried by a moment."
-    )
-    panel = Panel(f"from_{side}", f"What makes the {side} force", "BW", tuple(lines), note)
+    panel = Panel(f"from_{side}", f"What makes the {side} force", "BW", tuple(lines))
     return panel if len(lines) > 1 else Panel(panel.name, panel.title, "BW", ())
 
 
@@ -155,8 +134,8 @@ def activation_cells(results: "Results") -> list[Cell]:
                 channel = emg[name]["channel"]
                 channels[channel] = (*channels.get(channel, ()), name)
         cells += [
-            Cell(own[0] if len(own) == 1 else f"{own[0]} … {own[-1]}", own, own[0])
-            for own in channels.values()
+            Cell(own[0] if len(own) == 1 else f"{channel} ({len(own)})", own, own[0])
+            for channel, own in channels.items()
         ]
     return cells
 

@@ -27,13 +27,15 @@ DEFAULT = ("forces", "condyles", "ratios", "pressures")
 DASHES = (0, (4, 2))
 
 
-def draw_panel(panel: Panel, results: "Results", axis: HorizontalAxis) -> Figure:
+def draw_panel(
+    panel: Panel, results: "Results", axis: HorizontalAxis, width: float = WIDTH
+) -> Figure:
     """Return one plot with its flagged and failed frames marked along the bottom.
 
-    Each curve's id in the picture is its line's name.
+    Each curve's id in the picture is its line's name; the width is in inches.
     """
     with settings():
-        figure = new_figure(WIDTH, HEIGHT)
+        figure = new_figure(width, HEIGHT)
         axes = figure.add_subplot()
         _draw_lines(axes, panel, axis)
         _label_axes(axes, panel, axis)

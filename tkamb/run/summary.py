@@ -174,7 +174,7 @@ def not_modelled(case: Case) -> list[str]:
     scene = case.scene
     parts = {
         "ground reaction": scene.ground_reaction,
-        "ligaments": scene.ligament,
+        "ligaments": scene.ligament or scene.generic_ligaments,
         "quadriceps, patella and patellar ligament": scene.patella,
         "femorotibial contact": scene.contact,
     }
