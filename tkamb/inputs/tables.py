@@ -142,7 +142,10 @@ def read_lines(path: Path) -> list[str]:
 
 
 def read_csv(path: Path) -> Table:
-    """Comma-separated: one header row; empty lines and lines that begin with # are skipped."""
+    """Comma-separated: one header row; empty lines and lines that begin with # are skipped.
+
+    Empty cells behind the last name are left out: some programs end every line with a comma.
+    """
     lines = read_lines(path)
     rows = [
         (number, line.split(","))
@@ -156,7 +159,11 @@ def read_csv(path: Path) -> Table:
         if len(names) == 1 and sign in names[0]:
             mend = "save it with commas between the cells and points in the numbers"
             raise InputError(f"has {word} between its cells, not commas", path, mend)
-    return Table(path, _columns(path, names, rows[1:]))
+    body = [
+        (number, cells if any(map(str.strip, cells[len(names) :])) else cells[: len(names)])
+        for number, cells in rows[1:]
+    ]
+    return Table(path, _columns(path, names, body))
 
 
 def read_storage(path: Path) -> Table:
