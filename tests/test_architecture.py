@@ -38,6 +38,7 @@ DRAWING = {
     "wear": {"contact", "geometry", "inputs", "output", "results_folder", "run", "scene"}
     | {"simulation"},
     "uncertainty": {*KNEE, "columns", "results", "results_folder", "run", "simulation"},
+    "cohort": {"columns", "geometry", "output", "results", "run", "scene", "simulation"},
     "validation": {"contact", "designs", "geometry", "simulation", "studies"},
 }
 """Which folder knows which folders and which modules beside them: inputs → body → (equilibrium ⇄

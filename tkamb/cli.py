@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from tkamb.check.command import add_check
+from tkamb.cohort.command import add_cohort
 from tkamb.compare.command import add_compare
 from tkamb.datasets.command import add_data
 from tkamb.export_command import add_export
@@ -80,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     add_stability(commands)
     add_wear(commands)
     add_uncertainty(commands, _slice, _setting)
+    add_cohort(commands)
     return parser
 
 

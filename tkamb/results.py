@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
     from tkamb.output.maps import ContactMaps
 
+PERCENTILES = {"p05": 5.0, "p50": 50.0, "p95": 95.0}
+"""Ending of a column of bands.csv -> per cent of the samples below it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Results:
@@ -34,6 +37,7 @@ class Results:
             in docs/results.md.
         maps: pressure maps per frame; None without contact.
         directory: where it was written to or read from.
+        bands: columns of bands.csv, where inputs were varied; else empty.
 
     Raises:
         InputError: an unknown column, columns of different lengths, or no time or status.
@@ -43,6 +47,7 @@ class Results:
     summary: dict[str, Any] = field(default_factory=dict)
     maps: "ContactMaps | None" = None
     directory: Path | None = None
+    bands: dict[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "columns", _complete_columns(self.columns))
@@ -85,6 +90,12 @@ class Results:
             for name, values in self.columns.items()
             if KINDS.get(name) != "text" and bool(np.isnan(values).all())
         )
+
+    def band(self, name: str) -> Array | None:
+        """Return p05, p50 and p95 (3, f) of a column; None where it has no band."""
+        ends = [self.bands.get(f"{name}_{end}") for end in PERCENTILES]
+        found = [end for end in ends if end is not None]
+        return np.array(found) if len(found) == len(ends) else None
 
     def to_dataframe(self) -> "DataFrame":
         """Return the columns as a pandas DataFrame, frames as rows; NaN where there is no number.
@@ -148,6 +159,22 @@ def read_csv(path: str | Path) -> dict[str, Any]:
         InputError: no such file, an unknown column, a row of another length, not a number.
     """
     path = Path(path)
+    cells = _cells_of(path)
+    return {name: _parse(name, values, path) for name, values in cells.items()}
+
+
+def read_bands(path: str | Path) -> dict[str, Array]:
+    """Read the columns of a bands.csv.
+
+    Raises:
+        InputError: no such file, a row of another length, not a number.
+    """
+    path = Path(path)
+    return {name: _numbers(name, cells, path) for name, cells in _cells_of(path).items()}
+
+
+def _cells_of(path: Path) -> dict[str, tuple[str, ...]]:
+    """Return the cells of a table, column by column, with names of earlier releases made ours."""
     try:
         rows = list(csv.reader(io.StringIO(read_text(path, TABLE_LIMIT))))
     except csv.Error as error:
@@ -159,7 +186,7 @@ def read_csv(path: str | Path) -> dict[str, Any]:
         if len(row) != len(header):
             raise InputError(f"line {number} has {len(row)} cells, not {len(header)}", path)
     cells = list(zip(*body, strict=True)) or [() for _ in header]
-    return {name: _parse(name, values, path) for name, values in zip(header, cells, strict=True)}
+    return dict(zip(header, cells, strict=True))
 
 
 def csv_text(columns: Mapping[str, Any]) -> str:
@@ -188,6 +215,10 @@ def _parse(name: str, cells: tuple[str, ...], path: Path) -> Any:
         return list(cells)
     if name not in KINDS and not in_a_family(name):
         raise InputError(f"unknown column '{name}'", path, names_near(name, KINDS))
+    return _numbers(name, cells, path)
+
+
+def _numbers(name: str, cells: tuple[str, ...], path: Path) -> Array:
     try:
         return np.array([float(cell) if cell else math.nan for cell in cells])
     except ValueError as error:

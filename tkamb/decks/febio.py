@@ -63,7 +63,7 @@ def contact_quads(lattice: Lattice) -> Index:
     _, first, count = np.unique(
         np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
     )
-    touches = np.isin(faces, np.unique(lattice.contact_triangles)).sum(axis=1) == 4
+    touches = np.asarray(np.isin(faces, np.unique(lattice.contact_triangles)).all(axis=1))
     chosen = first[(count == 1) & touches[first]]
     quads = faces[chosen]
     corners = lattice.nodes[quads]

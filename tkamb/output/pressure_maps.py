@@ -136,7 +136,7 @@ def draw_map(
 ) -> None:
     """Draw one frame's pressure (n,) MPa on the insert, with its centres."""
     view.draw_insert(axes)
-    _draw_pressure(axes, view, pressure, scale)
+    draw_pressure(axes, view, pressure, scale)
     _draw_centres(axes, view, results, frame)
     view.draw_labels(axes)
 
@@ -189,7 +189,8 @@ def _shade(points: Array, triangles: NDArray[np.int64]) -> Array:
     return 0.55 + 0.4 * np.clip(normal @ (light / np.linalg.norm(light)), 0.0, 1.0)
 
 
-def _draw_pressure(axes: Axes, view: TopView, pressure: Array, scale: Normalize) -> None:
+def draw_pressure(axes: Axes, view: TopView, pressure: Array, scale: Normalize) -> None:
+    """Colour the insert with a pressure (n,), in the scale's unit."""
     loaded = (pressure[view.triangles] > TOUCHED * float(scale.vmax or 1.0)).any(axis=1)
     if not loaded.any():
         return
