@@ -35,26 +35,43 @@ def on_files(files, config):
     return files
 
 
+def on_page_markdown(markdown, page, config, files):
+    """Lead the links of a page of docs/ that leave it to the pages made here."""
+    source = ROOT / "docs" / page.file.src_uri
+    return _led(markdown, source.parent, page.file.src_uri) if source.is_file() else markdown
+
+
 def _page(page: str, source: str) -> str:
-    """Return the text of a file with its links led to pages; other links become plain names."""
-    folder, here = (ROOT / source).parent, Path(page).parent
-    known = {(ROOT / file).resolve(): made for made, file in COPIED.items()}
-    up = "../" * (len(here.parts))
+    """Return the text of a file with its links led to pages."""
+    return _led((ROOT / source).read_text(encoding="utf-8"), (ROOT / source).parent, page)
+
+
+def _led(text: str, folder: Path, page: str) -> str:
+    """Return a text with its links led to pages; those to other files become plain names.
+
+    Args:
+        text: Markdown.
+        folder: to which its links are relative.
+        page: what it becomes.
+    """
+    made = {(ROOT / file).resolve(): name for name, file in COPIED.items()}
+    made[ROOT / "docs" / "gallery"] = "gallery.md"
+    up = "../" * len(Path(page).parent.parts)
 
     def led(match):
         picture, words, target, anchor = match.groups()
+        path = (folder / target).resolve()
         if target.startswith(("http:", "https:")):
             return match[0]
-        path = (folder / target).resolve()
-        if path.is_dir() and (path / "README.md").is_file():
+        if (path / "README.md").is_file():
             path /= "README.md"
-        if path in known:
-            return f"[{words}]({up}{known[path]}{anchor or ''})"
+        if path in made:
+            return f"[{words}]({up}{made[path]}{anchor or ''})"
         if path.is_relative_to(ROOT / "docs") and path.is_file():
             return f"{picture}[{words}]({up}{path.relative_to(ROOT / 'docs')}{anchor or ''})"
         return f"`{words}`"
 
-    return LINK.sub(led, (ROOT / source).read_text(encoding="utf-8"))
+    return LINK.sub(led, text)
 
 
 def _api() -> str:

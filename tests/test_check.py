@@ -15,7 +15,14 @@ from tkamb.starter import lay_out
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    return lay_out(tmp_path_factory.mktemp("check") / "knee")
+    """Return the starter scene with a measured force beside it."""
+    path = lay_out(tmp_path_factory.mktemp("check") / "knee")
+    (path.parent / "implant.csv").write_text("time,F\n1.0,367.75\n2.0,1471\n3.3,735.5\n")
+    table = (
+        '[measured]\nfile = "implant.csv"\ncolumns = {total = "F"}\nunit = "N"\noffset_s = 0.0\n'
+    )
+    path.write_text(f"{path.read_text()}\n{table}")
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +37,7 @@ def test_it_says_what_each_file_gave_and_writes_the_picture_alone(scene, capfd):
     said = capfd.readouterr().out
     assert "motion (motion.csv): 6 frames" in said
     assert "flexion 28.0 to 107.9 deg" in said
+    assert "measured force (implant.csv): total 0.50 to 2.00 BW, 3 samples" in said
     assert "question: none" in said and "not modelled: " in said
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert sorted(scene.parent.iterdir()) == sorted([*before, picture])

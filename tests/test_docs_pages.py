@@ -51,3 +51,11 @@ def test_the_paper_s_numbers_stand_in_the_pages_that_they_link():
     for number, page in quoted:
         there = (DOCS / page).read_text(encoding="utf-8")
         assert re.search(rf"(?<![\d.]){re.escape(number)}(?![\d.]*\d)", there), (number, page)
+
+
+def test_every_page_is_on_the_site_and_in_the_list():
+    site = (ROOT / "scripts" / "mkdocs.yml").read_text(encoding="utf-8")
+    listed = (DOCS / "pages.md").read_text(encoding="utf-8")
+    for page in DOCS.glob("*.md"):
+        assert f"- {page.name}\n" in site, f"add {page.name} to nav of scripts/mkdocs.yml"
+        assert page.name == "pages.md" or f"({page.name})" in listed, f"add {page.name} to pages.md"

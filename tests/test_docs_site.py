@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 def test_the_site_is_built_without_a_warning_and_stands_by_itself(tmp_path):
     pytest.importorskip("material", reason="mkdocs-material is not installed")
     pytest.importorskip("mkdocstrings", reason="mkdocstrings is not installed")
-    build = ["mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
+    build = ["mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
     config = ["--config-file", str(ROOT / "scripts" / "mkdocs.yml")]
     done = subprocess.run(
         [sys.executable, "-m", *build, *config], cwd=ROOT, capture_output=True, text=True

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from tkamb.geometry.frames import KNEE_COORDINATES, Array
 from tkamb.geometry.surface import Surface
 from tkamb.scene.case import Case
 from tkamb.units import DEGREE, MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.inputs.measured_force import MeasuredForce
 
 ANGLES = ("flexion", "adduction", "axial_rotation")
 TORN = 0.1
@@ -52,8 +56,13 @@ def inventory(mechanics: Mechanics) -> tuple[Entry, ...]:
     if case.scene.muscles:
         file = case.scene.muscles.model
         found.append(Entry("muscles", file, "all of the leg, by static optimisation"))
+    if case.emg is not None:
+        text = f"channels {', '.join(case.emg.values)}, {_span(case.emg.time)}"
+        found.append(Entry("EMG", case.emg.path, text))
     if case.scene.contact:
         found.append(_contact(case))
+    if case.measured is not None:
+        found.append(_measured(case.measured, case.body_weight))
     return tuple(found)
 
 
@@ -159,6 +168,21 @@ def _contact(case: Case) -> Entry:
     if table.released:
         text += f"; solved for: {', '.join(sorted({*table.released, 'si'}))}"
     return Entry("contact", None, text)
+
+
+def _measured(measured: "MeasuredForce", weight: float) -> Entry:
+    """Return what an instrumented implant measured: held against a run, never used in it."""
+    forces = [
+        _range(name, values[np.isfinite(values)] / weight, "BW", 2)
+        for name, values in measured.force.items()
+        if np.isfinite(values).any()
+    ]
+    text = f"{', '.join(forces)}, {_span(measured.time)}; only compared, never used"
+    return Entry("measured force", measured.path, text)
+
+
+def _span(time: Array) -> str:
+    return f"{len(time)} samples, {time[0]:.3g} to {time[-1]:.3g} s"
 
 
 def _range(name: str, values: Array, unit: str, digits: int) -> str:
