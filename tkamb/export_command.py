@@ -26,6 +26,7 @@ def add_export(commands: Any) -> None:
     export.add_argument(
         "--resolution", type=float, metavar="MM", help="of --deck: edge of its hexahedra"
     )
+    export.add_argument("--force", action="store_true", help="--out may be a folder not tkamb's")
     export.set_defaults(command=_export)
 
 
@@ -75,7 +76,7 @@ def _export_maps(options: argparse.Namespace) -> int:
     results = read_results(options.folder)
     if results.maps is None:
         raise InputError("holds no contact.h5", options.folder, "run the scene with [contact]")
-    with claimed_directory(options.out) as folder:
+    with claimed_directory(options.out, options.force) as folder:
         names = write_map_series(results.maps, folder)
     left = "; a left knee's mirror image" if results.summary.get("side") == "left" else ""
     frames = f"{len(names) - 1} of {len(results)} frames"
