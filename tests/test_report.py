@@ -80,6 +80,7 @@ def test_page_stands_by_itself(kind, request):
     assert found.outside == []
     assert found.twice == []
     assert "http" not in text.replace("http-equiv", "")
+    assert "<h2>Muscles</h2>" not in text
     assert "@import" not in text
     assert all(r.startswith("#") for r in re.findall(r"url\(([^)]*)\)", text))
     assert len(text.encode()) < 5e6

@@ -17,6 +17,7 @@ from tkamb.geometry.frames import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
     from tkamb.output.maps import ContactMaps
 
@@ -54,6 +55,18 @@ class Results:
     def __len__(self) -> int:
         return len(self.columns["status"])
 
+    def __repr__(self) -> str:
+        """Return in a line how much there is, of what."""
+        lost = sum(status.startswith("failed") for status in self.status)
+        contact = self.summary.get("contact") or {}
+        parts = [
+            f"{len(self)} frames" + (f" ({lost} failed)" if lost else ""),
+            contact.get("model", "no contact"),
+            f"{len(self.columns)} columns, {len(self.not_modelled)} of them not modelled",
+            "no maps" if self.maps is None else f"maps of {len(self.maps.points_m)} points",
+        ]
+        return f"<tkamb.Results: {', '.join(parts)}>"
+
     def __getitem__(self, name: str) -> Array:
         """Return a numeric column (f,).
 
@@ -83,6 +96,19 @@ class Results:
         ends = [self.bands.get(f"{name}_{end}") for end in PERCENTILES]
         found = [end for end in ends if end is not None]
         return np.array(found) if len(found) == len(ends) else None
+
+    def to_dataframe(self) -> "DataFrame":
+        """Return the columns as a pandas DataFrame, frames as rows; NaN where there is no number.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        try:
+            from pandas import DataFrame
+        except ImportError:
+            mend = "pip install 'tkamb[notebook]'"
+            raise InputError("pandas is not installed", "to_dataframe", mend) from None
+        return DataFrame(self.columns)
 
     def plot(self, *names: str, axis: str | None = None) -> "Figure":
         """Return plots of the run in one matplotlib figure, which notebooks show.

@@ -61,6 +61,7 @@ def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
         _questions(results),
         _peak_force(results, axis),
         _band(results, axis),
+        _measured(results),
         _shares(results),
         _peak_pressure(results, axis),
         _extensor(results, axis),
@@ -132,6 +133,16 @@ def _largest(table: Mapping[str, Any], result: str) -> str:
 
 def _plain(name: str) -> str:
     return AXIS_NAMES.get(name, name.replace("_", " ").replace(".", " "))
+
+
+def _measured(results: "Results") -> Card | None:
+    """Return how far the run is from what an instrumented implant measured, with [measured]."""
+    if not results.summary.get("measured"):
+        return None
+    from tkamb.output.comparison import comparison_words
+
+    value, detail, incomplete = comparison_words(results.summary["measured"])
+    return Card("Against what was measured", value, detail, incomplete)
 
 
 def _shares(results: "Results") -> Card | None:
@@ -233,7 +244,7 @@ def _frames(results: "Results") -> Card:
     if failed or flagged:
         words = [f"{failed} failed (no numbers)"] if failed else []
         words += [f"{flagged} to be read with care"] if flagged else []
-        detail = "; ".join(words) + ": see the table below"
+        detail = "; ".join(words) + ": why is in the report's table and in column status"
     else:
         detail = "none failed, none flagged"
     return Card("Frames computed", value, detail, bool(failed or flagged))

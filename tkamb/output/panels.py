@@ -35,6 +35,7 @@ class Line:
         dashed: drawn dashed.
         band: (3, f) p05, p50 and p95 over samples with varied inputs, in the panel's unit; None:
             there are none.
+        behind: drawn broad and pale behind the others: what they are held against.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Line:
     colour: str
     dashed: bool = False
     band: Array | None = None
+    behind: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +138,7 @@ def _total(results: "Results") -> Panel:
     total = _line(results, "force_total_BW", "total", BLACK)
     parts = _components(results, "force", "N", scale)
     lines = (total, replace(parts[0], label="superior–inferior", dashed=True), *parts[1:])
+    lines += (_measured(results, "total", "measured, axial", BLACK),)
     note = "On the insert; SI positive in compression. Residuals are not included."
     return Panel("forces", "Tibiofemoral contact force", "BW", lines, note)
 
@@ -145,12 +148,18 @@ def _condyles(results: "Results") -> Panel:
     lines = (
         *_both_sides(results, "force_N", ", deformation", scale=scale),
         *_both_sides(results, "force_equilibrium_N", ", equilibrium", dashed=True, scale=scale),
+        *(_measured(results, s, f"{s}, measured", colour) for s, colour in SIDE_COLOURS.items()),
     )
     note = (
         "Deformation: the total load is pressed in at the measured rotation. "
         "Equilibrium: balance of coronal moments."
     )
     return Panel("condyles", "Medial and lateral force, two estimates", "BW", lines, note)
+
+
+def _measured(results: "Results", name: str, label: str, colour: str) -> Line:
+    line = _line(results, f"measured_{name}_N", label, colour, scale=1 / body_weight(results))
+    return replace(line, behind=True)
 
 
 def _share(results: "Results") -> Panel:

@@ -28,13 +28,15 @@ DASHES = (0, (4, 2))
 BAND_OPACITY = 0.16
 
 
-def draw_panel(panel: Panel, results: "Results", axis: HorizontalAxis) -> Figure:
+def draw_panel(
+    panel: Panel, results: "Results", axis: HorizontalAxis, width: float = WIDTH
+) -> Figure:
     """Return one plot with its flagged and failed frames marked along the bottom.
 
-    Each curve's id in the picture is its line's name.
+    Each curve's id in the picture is its line's name; the width is in inches.
     """
     with settings():
-        figure = new_figure(WIDTH, HEIGHT)
+        figure = new_figure(width, HEIGHT)
         axes = figure.add_subplot()
         _draw_lines(axes, panel, axis)
         _label_axes(axes, panel, axis)
@@ -103,7 +105,8 @@ def _draw_lines(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:
         x, y = axis.broken(line.values)
         dashes = DASHES if line.dashed else "-"
         gid = f"line-{line.name}"
-        axes.plot(x, y, color=line.colour, linestyle=dashes, label=line.label, gid=gid)
+        broad: Any = {"linewidth": 5.0, "alpha": 0.28, "zorder": 1.5} if line.behind else {}
+        axes.plot(x, y, color=line.colour, linestyle=dashes, label=line.label, gid=gid, **broad)
         if line.band is not None and not line.dashed:
             _draw_band(axes, line, axis)
 

@@ -60,6 +60,10 @@ def summary_of(
         summary["first_wrapping_flexion_deg"] = _first_wrapping(columns)
     if scene.muscles:
         summary["reserves"] = reserves(columns)
+    if case.measured is not None or case.emg is not None:
+        from tkamb.run.recorded import compare_recorded
+
+        summary |= compare_recorded(case, columns)
     if scene.contact:
         table = scene.contact
         error = known_error(table.model, table.resolution_mm, table.material, table.options)
@@ -171,7 +175,7 @@ def not_modelled(case: Case) -> list[str]:
     scene = case.scene
     parts = {
         "ground reaction": scene.ground_reaction,
-        "ligaments": scene.ligament,
+        "ligaments": scene.ligament or scene.generic_ligaments,
         "quadriceps, patella and patellar ligament": scene.patella,
         "femorotibial contact": scene.contact,
     }
@@ -217,6 +221,8 @@ def assumptions(case: Case) -> list[str]:
         )
     if scene.muscles:
         sentences.append(_sharing(scene.muscles))
+        if scene.muscles.emg:
+            sentences.append(scene.muscles.emg.sentence)
     if scene.contact:
         sentences.append(_agreement(scene.contact))
     if scene.patient.side == "left":

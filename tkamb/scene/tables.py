@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from tkamb.defaults import CONTACT_MODEL
+from tkamb.scene.emg import EmgTable
 from tkamb.scene.table import (
     Axes,
     KneeFreedom,
@@ -237,6 +238,7 @@ class MusclesTable(SceneTable):
     law: Literal["isometric", "hill"] = Field(
         "isometric", description="strength: the maximal isometric force, or force-length-velocity"
     )
+    emg: EmgTable | None = Field(None, description="recorded activity of the muscles")
 
 
 class PatellarLigamentTable(SceneTable):
