@@ -142,6 +142,11 @@ def headline(found: "Uncertainty") -> list[str]:
         parts = ", ".join(f"{row.name} {row.share:.0%}" for row in rows if row.share >= 0.01)
         if parts:
             lines.append(f"{result} varies by {parts} (shares of variance, by regression)")
+    for name, one in found.results.summary["uncertainty"].get("measured_inside", {}).items():
+        lines.append(
+            f"the measured {name} force lies within 5 to 95 % in {one['share']:.0%} of "
+            f"{one['frames']} frames"
+        )
     for result in ("force_total_N", "medial_force_N"):
         parts = ", ".join(
             f"{one.name} {one.first:.2f} alone, {one.total:.2f} in all"
