@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import tomllib
 from contextlib import suppress
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from tkamb.claim import claimed_directory, settle
 from tkamb.cli import main
 from tkamb.cohort.kept import frame_table, write_cohort
 from tkamb.cohort.outcome import Outcome, chosen_map
-from tkamb.cohort.plan import load_cohort
+from tkamb.cohort.plan import CohortTable, load_cohort
 from tkamb.cohort.report import cohort_html
 from tkamb.cohort.run import run_cohort
 from tkamb.cohort.statistics import groups_of, spread
@@ -88,7 +89,8 @@ def test_a_cohort_is_its_runs_one_by_one_and_lists_what_failed(file, tmp_path, c
     assert "Three legs" in page and "nowhere.csv" in page
 
 
-def test_parts_and_workers_and_an_interrupt_change_nothing(file, tmp_path):
+def test_parts_and_workers_and_an_interrupt_change_nothing(file, tmp_path, monkeypatch):
+    monkeypatch.setattr("tkamb.cohort.kept.cohort_html", lambda *_: "page")
     whole, parted = tmp_path / "whole", tmp_path / "parted"
 
     with pytest.raises(KeyboardInterrupt, match="1 of 6 runs are kept"):
@@ -151,6 +153,15 @@ def test_the_map_is_that_of_the_frame_asked_for_and_the_page_shows_one_per_group
     assert "http" not in page.replace("http-equiv", "")
     table = frame_table(cohort, outcomes, {})
     assert table.num_rows == 4 * 21
+
+
+def test_the_example_is_six_designs_that_exist_on_seventeen_legs_by_two_models():
+    folder = KNEE.parent / "designs"
+    table = CohortTable.model_validate(tomllib.loads((folder / "cohort.toml").read_text()))
+    assert len(table.subject) * len(table.trial) * len(table.contact) == 17 * 2
+    assert {path.parent.name for path in folder.glob("*/design.toml")} == {
+        design.name for design in table.design
+    }
 
 
 @pytest.mark.parametrize(

@@ -191,6 +191,19 @@ def test_gap_is_the_distance_of_the_closest_points() -> None:
             assert contact.at(at).normal[:2] == pytest.approx(out, abs=5e-3)
 
 
+def test_a_prepared_contact_that_is_used_again_remembers_nothing() -> None:
+    first, places = (
+        PatellofemoralContact(cylinder(), dome()),
+        ([0.046, 0.0, 0.1], [0.04, 0.02, 0.0]),
+    )
+    first.at(places[0])
+    again, new = first.unused().at(places[1]), PatellofemoralContact(cylinder(), dome())
+    fresh = new.at(places[1])
+    assert again.gap == fresh.gap
+    np.testing.assert_array_equal(again.point, fresh.point)
+    np.testing.assert_array_equal(again.normal, fresh.normal)
+
+
 def test_gap_is_smooth_through_touch() -> None:
     contact = PatellofemoralContact(cylinder(), dome())
     x = TROCHLEA + DOME - 0.004 + np.linspace(-5e-4, 5e-4, 21)

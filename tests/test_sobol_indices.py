@@ -88,7 +88,8 @@ def stiff_knee():
     return bodies_alone(**still, uncertainty__segment_mass=0.1, uncertainty__ground_reaction=0.1)
 
 
-def test_indices_of_a_scene_add_up_where_loads_add_up(tmp_path):
+def test_indices_of_a_scene_add_up_where_loads_add_up(tmp_path, monkeypatch):
+    monkeypatch.setattr("tkamb.output.report.report_html", lambda results: "page")
     folder = tmp_path / "out"
     found = estimate_uncertainty(
         stiff_knee(),

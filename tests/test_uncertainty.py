@@ -15,7 +15,7 @@ from tkamb.results_folder import BANDS_NAME, UNCERTAINTY_NAMES, write_results
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
 from tkamb.simulation import simulate
-from tkamb.uncertainty.bands import band_columns, influences, percentiles
+from tkamb.uncertainty.bands import band_columns, influences, measured_inside, percentiles
 from tkamb.uncertainty.inputs import Draw
 from tkamb.uncertainty.kept import write_uncertainty
 from tkamb.uncertainty.run import estimate_uncertainty
@@ -107,6 +107,19 @@ def test_a_frame_that_failed_in_most_samples_has_no_band_and_others_say_how_many
     np.testing.assert_allclose(found["failed_share"], [0.6, 0.1])
     assert np.isnan(found["force_total_N_p50"][0])
     assert found["force_total_N_p50"][1] == pytest.approx(54.5)  # of 10 to 99
+
+
+def test_the_share_of_measured_frames_inside_the_band_counts_those_that_have_both():
+    nan = float("nan")
+    columns = {"measured_total_N": np.array([100.0, 300.0, nan, 120.0, 90.0])}
+    bands = {
+        "force_si_N_p05": np.array([90.0, 100.0, 90.0, nan, 90.0]),
+        "force_si_N_p95": np.array([110.0, 200.0, 110.0, nan, 110.0]),
+    }
+    found = measured_inside(columns, bands, {"total": {"predicted": "force_si_N"}})
+    assert found == {"total": {"frames": 3, "share": pytest.approx(2 / 3)}}
+    none = measured_inside(columns, {}, {"total": {"predicted": "force_si_N"}})
+    assert none["total"]["frames"] == 0 and np.isnan(none["total"]["share"])
 
 
 def draw_of(sampler, **normal):

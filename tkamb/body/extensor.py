@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -177,7 +178,7 @@ class ExtensorFrames:
         origin, insertion = self.muscle.points[stretch : stretch + 2]
         joint, (proximal, distal) = chain.patella_joint_in_femur, self.ligament.points
         return ExtensorMechanism(
-            PatellofemoralContact(parts.femoral.moved(inverse(joint)), parts.button),
+            _patellar_contact(parts.femoral, parts.button, joint.tobytes()).unused(),
             joint,
             transform(chain.link_in(origin.link, "femur"), origin.position),
             transform(chain.link_in(insertion.link, "patella"), insertion.position),
@@ -210,6 +211,19 @@ class ExtensorFrames:
         result[part] = np.stack(rates(time[part], bridged), axis=1)
         result[np.isnan(places).any(axis=1)] = np.nan
         return result
+
+
+@lru_cache(maxsize=1)
+def _patellar_contact(femoral: Surface, button: Surface, joint: bytes) -> PatellofemoralContact:
+    """Return the contact of two surfaces, prepared once for the many samples of a scene.
+
+    Args:
+        femoral: femoral component, femur link's frame; told from others by its identity.
+        button: patellar button, likewise.
+        joint: (4, 4) pose_joint_in_femur, its bytes.
+    """
+    joint_in_femur = np.frombuffer(joint).reshape(4, 4)
+    return PatellofemoralContact(femoral.moved(inverse(joint_in_femur)), button)
 
 
 def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]:

@@ -25,6 +25,7 @@ the direction of the patellofemoral force. Shift and tilt are estimated to first
 reported, not carried out.
 """
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,11 +111,21 @@ class PatellofemoralContact:
         self._corner_normals, self._sharp = femoral.corner_normals, sharp_edges(femoral)
         self._samples = _joint_side(patellar)
         self._left: NDArray[np.bool_] = np.asarray(self._samples[:, 2] < 0.0)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Have no distance carried over."""
         count = len(self._samples)
         self._seen_at = np.full((count, 3), np.inf)
         self._distance = np.zeros(count)
         self._foot, self._normal = np.zeros((count, 3)), np.zeros((count, 3))
         self._on_edge = np.zeros(count)
+
+    def unused(self) -> "PatellofemoralContact":
+        """Return the same contact as it was before any position was looked at."""
+        other = copy.copy(self)
+        other._forget()
+        return other
 
     def pose(self, coordinates: Array) -> Array:
         """Return pose_patella_in_joint (4, 4) at (ap, si, rotation), m and rad."""

@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from tkamb.atomic import replaced_together, write_synced
 from tkamb.cohort.outcome import Outcome
@@ -19,7 +17,14 @@ from tkamb.cohort.plan import GROUP_AXES, Cohort, CohortRun
 from tkamb.cohort.report import cohort_html
 from tkamb.cohort.statistics import group_rows, groups_of
 from tkamb.columns import ordered_names
+from tkamb.errors import not_installed
 from tkamb.files import sha256_of
+
+try:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+except ImportError:
+    raise not_installed("pyarrow", "the table of a cohort", "cohort") from None
 
 TABLE_NAME, RUNS_NAME, GROUPS_NAME = "cohort.parquet", "runs.csv", "groups.csv"
 SUMMARY_NAME, REPORT_NAME = "cohort.json", "cohort.html"

@@ -19,8 +19,11 @@ NEAR = 1e-3
 """m; columns nearer than this take part in the search for a load."""
 THINNEST = 1e-6
 """m; a layer thinner than this, at the insert's rim, counts as this thick."""
-NARROW = 1e-12
-"""m; with a stiffness of some 1e8 N/m a reaction rises by 1e-4 N between approaches this near."""
+NARROW = 1e-9
+"""m; with a stiffness of some 1e8 N/m a reaction rises by 0.1 N between approaches this near."""
+WELL_BELOW = 0.99
+SMALL_LOAD = 1.0
+"""N; a reaction below that share of a load, less this, does not reach the load within `NARROW`."""
 NEARBY = 1.5e-3
 """m; the columns nearer than this are looked at while the femur moves by less."""
 
@@ -116,7 +119,7 @@ class ElasticFoundation(ContactModel):
         pose = nearby.state.pair.pose_at_approach(nearby.pose, nearby.within)
         found = self.evaluate(nearby.state, pose)
         reaction = -float(found.wrench_on_insert[1])
-        return found.status is ContactStatus.OK and reaction < (1.0 - 2.0 * LOAD_TOLERANCE) * load
+        return found.status is ContactStatus.OK and reaction < WELL_BELOW * load - SMALL_LOAD
 
     def probe(self, state: SampledContact, guess: ContactResult | None = None) -> Any:
         """Return the probe with near columns and exact stiffness; see `ContactModel`."""
@@ -144,10 +147,16 @@ class _NearColumns:
     def __init__(self, law: Law, state: SampledContact, pose: Array) -> None:
         self._law, self.state, self.pose = law, state, pose
         self._reach, self._near = -np.inf, state.surface
-        self.within, self.beyond = -np.inf, np.inf
+        self.within, self.beyond, self._last = -np.inf, np.inf, 0.0
 
     def reaction(self, approach: float) -> float:
-        """Return the reaction (N) at an approach (m); inf where it is out of range."""
+        """Return the reaction (N) at an approach (m); inf where it is out of range.
+
+        Where the range ends it is known to `NARROW`: between the two sides of the end it is the
+        reaction before it.
+        """
+        if self.within < approach < self.beyond <= self.within + NARROW:
+            return self._last
         samples, pair = self.state.surface, self.state.pair
         pose = pair.pose_at_approach(self.pose, approach)
         if approach > self._reach:
@@ -159,9 +168,11 @@ class _NearColumns:
         if (strain >= DEEPEST).any():
             self.beyond = min(self.beyond, approach)
             return np.inf
-        self.within = max(self.within, approach)
         pressure = layer_pressure(self._law, pair.material, strain)
-        return float((pressure * near.area) @ near.normals[:, 1])
+        reaction = float((pressure * near.area) @ near.normals[:, 1])
+        if approach > self.within:
+            self.within, self._last = approach, reaction
+        return reaction
 
 
 def layer_pressure(law: Law, material: Material, strain: Array) -> Array:

@@ -97,8 +97,12 @@ class Mechanics:
         if self.query is None or contact is None or contact.released:
             return
         middle, last = len(self.poses) // 2, len(self.poses) - 1
-        nearest = [nearest_gap(self.query.at(self.poses[k])) for k in (0, middle, last)]
-        if all(abs(gap) > FARTHEST_GAP for gap in nearest):
+        nearest: list[float] = []
+        for k in (middle, 0, last):
+            nearest.append(nearest_gap(self.query.at(self.poses[k])))
+            if abs(nearest[-1]) <= FARTHEST_GAP:
+                break
+        else:
             gap = min(nearest, key=abs)
             raise InputError(
                 f"neither condyle is near the insert (nearest {abs(gap) / MILLIMETRE:.0f} mm "

@@ -114,6 +114,12 @@ def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
         for name, words in BANDED.items()
         if _largest(table, name)
     ]
+    for name, inside in table.get("measured_inside", {}).items():
+        if inside["frames"]:
+            parts.append(
+                f"the measured {name} force lies within its band in {inside['share']:.0%} of "
+                f"{inside['frames']} frames"
+            )
     worst, held = table["largest_failed_share"], table["not_varied"]
     if worst > NOTABLE_FAILED:
         parts.append(f"in up to {worst:.0%} of the samples a frame failed")

@@ -1,7 +1,7 @@
 """From samples to bands and to which input moves what."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.results import PERCENTILES
 
+ENDS = ("p05", "p95")
 FEWEST = 20
 """Numbers below which a 5th percentile is not even between the two smallest of them."""
 MOST_FAILED = 0.5
@@ -59,6 +60,30 @@ def band_columns(
         for ending, found in percentiles(values[:, index], failed).items():
             columns[f"{name}_{ending}"] = found
     return columns
+
+
+def measured_inside(
+    columns: Mapping[str, Any], bands: Mapping[str, Array], compared: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """Return of each force that was measured in how many frames it lies from p05 to p95.
+
+    Args:
+        columns: of results.csv, `measured_<name>_N` among them.
+        bands: of bands.csv.
+        compared: force -> what it is held against, as in the summary's `measured`.
+
+    Returns:
+        Force -> frames that have both, and the share of them inside; NaN of none.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for name, one in compared.items():
+        measured, column = columns[f"measured_{name}_N"], one["predicted"]
+        low, high = (bands.get(f"{column}_{end}", np.full(len(measured), np.nan)) for end in ENDS)
+        both = np.isfinite(measured) & np.isfinite(low)
+        inside = (low <= measured) & (measured <= high)
+        share = float(inside[both].mean()) if both.any() else float("nan")
+        found[name] = {"frames": int(both.sum()), "share": share}
+    return found
 
 
 @dataclass(frozen=True)

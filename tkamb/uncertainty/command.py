@@ -111,7 +111,7 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     if frames is None:
         step = -(-len(load_case(scene).motion.time) // QUICK_FRAMES)
         frames = slice(None, None, step)
-        said.append(f"every {step}th frame; --frames chooses others")
+        said.append(f"frames ::{step}; --frames chooses others")
     rows = screen(
         scene,
         frames=frames,
@@ -142,6 +142,11 @@ def headline(found: "Uncertainty") -> list[str]:
         parts = ", ".join(f"{row.name} {row.share:.0%}" for row in rows if row.share >= 0.01)
         if parts:
             lines.append(f"{result} varies by {parts} (shares of variance, by regression)")
+    for name, one in found.results.summary["uncertainty"].get("measured_inside", {}).items():
+        lines.append(
+            f"the measured {name} force lies within 5 to 95 % in {one['share']:.0%} of "
+            f"{one['frames']} frames"
+        )
     for result in ("force_total_N", "medial_force_N"):
         parts = ", ".join(
             f"{one.name} {one.first:.2f} alone, {one.total:.2f} in all"

@@ -18,7 +18,13 @@ from tkamb.run.workers import Crew, Progress, Task
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.case import Case, load_case
 from tkamb.simulation import chosen_frames, simulate
-from tkamb.uncertainty.bands import FEWEST, Influence, band_columns, influences
+from tkamb.uncertainty.bands import (
+    FEWEST,
+    Influence,
+    band_columns,
+    influences,
+    measured_inside,
+)
 from tkamb.uncertainty.indices import SobolIndex, sobol_indices
 from tkamb.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
 from tkamb.uncertainty.kept import write_uncertainty
@@ -39,6 +45,8 @@ NO_BAND = (
 """What is no result of the knee, or is not computed for a sample."""
 NOT_SAMPLED = ("_seconds", "_slip_mm", "_velocity_mm_per_s")
 """Endings: computing time, and what adds up over frames that a sample does not compute."""
+RECORDED = ("measured_", "envelope_")
+"""Beginnings: what was recorded beside the run."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +203,11 @@ class _Job:
         errors = np.array([one.errors for one in plain])
         bands = band_columns(self.nominal["time_s"], names, values, failed)
         tornado = influences(wanted, input_names, values[:, rows], errors)
-        self.nominal.summary["uncertainty"] = self._summary(failed, tornado)
+        summary = self.nominal.summary
+        summary["uncertainty"] = self._summary(failed, tornado)
+        if summary.get("measured"):
+            inside = measured_inside(self.nominal.columns, bands, summary["measured"])
+            summary["uncertainty"]["measured_inside"] = inside
         results = replace(self.nominal, bands=bands)
         return Uncertainty(results, bands, tornado, names, self.inputs, samples, found)
 
@@ -228,6 +240,7 @@ def banded_names(results: Results) -> list[str]:
         if KINDS.get(name) != "text"
         and name not in (*NO_BAND, *results.not_modelled)
         and not name.endswith(NOT_SAMPLED)
+        and not name.startswith(RECORDED)
     ]
 
 
