@@ -33,6 +33,8 @@ class Line:
         values: (f,) in the panel's unit.
         colour: of the line.
         dashed: drawn dashed.
+        band: (3, f) p05, p50 and p95 over samples with varied inputs, in the panel's unit; None:
+            there are none.
         behind: drawn broad and pale behind the others: what they are held against.
     """
 
@@ -41,6 +43,7 @@ class Line:
     values: Array
     colour: str
     dashed: bool = False
+    band: Array | None = None
     behind: bool = False
 
 
@@ -106,7 +109,10 @@ def _line(
     scale: float = 1.0,
 ) -> Line:
     values = results.columns.get(column, np.full(len(results), np.nan))
-    return Line(column, label, values * scale, colour, dashed)
+    band = results.band(column)
+    return Line(
+        column, label, values * scale, colour, dashed, None if band is None else band * scale
+    )
 
 
 def _components(results: "Results", stem: str, unit: str, scale: float = 1.0) -> tuple[Line, ...]:
@@ -129,7 +135,7 @@ def _both_sides(
 
 def _total(results: "Results") -> Panel:
     scale = 1 / body_weight(results)
-    total = Line("force_total_BW", "total", results["force_total_BW"], BLACK)
+    total = _line(results, "force_total_BW", "total", BLACK)
     parts = _components(results, "force", "N", scale)
     lines = (total, replace(parts[0], label="superior–inferior", dashed=True), *parts[1:])
     lines += (_measured(results, "total", "measured, axial", BLACK),)

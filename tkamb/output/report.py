@@ -148,6 +148,11 @@ def _plot(
 def _legend(results: "Results") -> list[str]:
     """Return what the marks in the plots mean."""
     sentences = ["Lines run in time order."]
+    if results.bands:
+        sentences.append(
+            "Shaded: 5 to 95 % of the samples with varied inputs, dotted: their median; "
+            "full lines: the scene as it stands."
+        )
     if flagged(results).any():
         sentences.append("Orange ticks at the bottom: frames to be read with care.")
     if failed(results).any():

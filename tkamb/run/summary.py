@@ -98,8 +98,8 @@ def _subject(case: Case) -> dict[str, Any]:
     return {
         "side": patient.side,
         "frame": f"insert frame: x anterior, y superior, z {lateral}",
-        "body_mass_kg": patient.mass_kg,
-        "height_mm": patient.height_mm,
+        "body_mass_kg": case.body_mass,
+        "height_mm": case.height_mm,
         "yield_stress_MPa": output.yield_stress_MPa,
         "axis": output.axis,
     }
@@ -158,15 +158,16 @@ def input_hashes(case: Case, scene: Path | None) -> dict[str, str]:
 
 def _files_read(case: Case) -> list[Path]:
     unread = {"output"} | ({"implant"} if case.femoral is None else set())
-    return _paths(case.scene.model_dump(exclude=unread))
+    return files_in(case.scene.model_dump(exclude=unread))
 
 
-def _paths(value: Any) -> list[Path]:
+def files_in(value: Any) -> list[Path]:
+    """Return the paths of files that are there, in nested dictionaries and lists."""
     if isinstance(value, Path):
         return [value] if value.is_file() else []
     if isinstance(value, dict):
         value = list(value.values())
-    return [p for item in value for p in _paths(item)] if isinstance(value, list | tuple) else []
+    return [p for item in value for p in files_in(item)] if isinstance(value, list | tuple) else []
 
 
 def not_modelled(case: Case) -> list[str]:

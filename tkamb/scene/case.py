@@ -83,9 +83,20 @@ class Case:
         return next((m.wrap.bone for m in self.muscles if m.wrap and m.wrap.bone), None)
 
     @property
+    def body_mass(self) -> float:
+        """kg, of the patient at the scene's scale."""
+        return self.scene.patient.mass_kg * self.scene.patient.scale**3
+
+    @property
+    def height_mm(self) -> float | None:
+        """Body height at the scene's scale, if the scene has one."""
+        patient = self.scene.patient
+        return None if patient.height_mm is None else patient.height_mm * patient.scale
+
+    @property
     def body_weight(self) -> float:
         """N."""
-        return self.scene.patient.mass_kg * -float(self.chain.model.gravity.linear[1])
+        return self.body_mass * -float(self.chain.model.gravity.linear[1])
 
 
 def load_case(scene: Scene) -> Case:
@@ -141,7 +152,7 @@ def load_case(scene: Scene) -> Case:
         from tkamb.scene import lines
 
         muscles, patellar_ligament = lines.muscles(scene, chain), lines.patellar_ligament(scene)
-    return Case(
+    case = Case(
         scene,
         chain,
         motion,
@@ -156,6 +167,11 @@ def load_case(scene: Scene) -> Case:
         _measured(scene, motion),
         _emg(scene),
     )
+    if scene.patient.scale == 1.0:
+        return case
+    from tkamb.scene.scaling import scaled_case
+
+    return scaled_case(case)
 
 
 def _measured(scene: Scene, motion: KneeMotion) -> "MeasuredForce | None":

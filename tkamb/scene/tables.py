@@ -41,6 +41,14 @@ class PatientTable(SceneTable):
     height_mm: Annotated[Number | None, within(1000, 2300, "is it in millimetres, standing?")] = (
         Field(None, description="body height, 1000 to 2300")
     )
+    scale: Annotated[Number, within(0.7, 1.4, "1 is the patient as recorded")] = Field(
+        1.0,
+        description=(
+            "makes of the patient a synthetic one of the same shape: lengths, implants and knee "
+            "translations times this, masses and ground reaction times its cube; mass_kg and "
+            "height_mm stay those of the patient as recorded"
+        ),
+    )
 
 
 class FemoralImplantTable(SceneTable):
