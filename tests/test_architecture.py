@@ -29,7 +29,7 @@ DRAWING = {
     "compare": {*SHOWN, "geometry"},
     "decks": {"contact", "geometry", "output", "results", "results_folder", "run"},
     "importing": {"geometry", "inputs", "opensim", "scene"},
-    "run": {*KNEE, *SHOWN} - {"results"},
+    "run": {*KNEE, *SHOWN, "plausibility"} - {"results"},
     "output": {"columns", "contact", "geometry", "run"},
     "view": {*KNEE, *SHOWN, "run", "simulation"} - {"columns"},
     "studies": {*KNEE, "decks", "inputs", "output", "run", "simulation"} - {"body"},

@@ -103,6 +103,7 @@ def _add_run(commands: Any) -> None:
     add_no_cache(run)
     run.add_argument("--force", action="store_true", help="write into a folder that is not tkamb's")
     run.add_argument("--resume", action="store_true", help="go on with an interrupted run")
+    run.add_argument("--workers", type=int, default=1, metavar="N", help="processes for the frames")
     run.add_argument("--profile", action="store_true", help="what was touched, and time per part")
     run.add_argument("--strict", action="store_true", help="exit 1 when a frame failed")
     run.add_argument("--json", action="store_true", help="print summary.json")
@@ -169,6 +170,7 @@ def _run(options: argparse.Namespace) -> int:
             scene_path=options.scene,
             progress=lambda frames: tqdm(frames, unit="frame", disable=None),
             resume=options.resume,
+            workers=options.workers,
         )
         if profile:
             results.summary["profile"] = profile.report(results, options.scene)

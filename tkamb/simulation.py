@@ -1,32 +1,27 @@
 """The whole pipeline on one page: scene, body, contact, results."""
 
 import time as clock
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tkamb.claim import claimed_directory
-from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
-from tkamb.plausibility.plausibility import Plausibility
 from tkamb.results import Results
+from tkamb.run.frames import LAST_FRAMES, Finished, FrameSolver, finished_in_order
 from tkamb.run.recorder import FolderRecorder, Recorder, finished_results
-from tkamb.run.status import frame_status
 from tkamb.run.summary import input_hashes, run_identity, scene_hash, summary_of
-from tkamb.run.tabulate import frame_row, join_rows
+from tkamb.run.tabulate import join_rows
+from tkamb.run.workers import Crew
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.case import Case, load_case
 
 if TYPE_CHECKING:
     from tkamb.equilibrium.contact_side import ContactSide
-    from tkamb.equilibrium.frame_contact import FrameContact
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
-
-LAST_FRAMES = 20
-"""How many contacts are kept as guesses for the next."""
 
 
 def simulate(
@@ -40,6 +35,7 @@ def simulate(
     progress: Progress = lambda frames: frames,
     resume: bool = False,
     force: bool = False,
+    workers: int = 1,
 ) -> Results:
     """Run a scene and return its results.
 
@@ -55,12 +51,17 @@ def simulate(
         resume: go on with what an earlier, interrupted run of the same scene and frames left
             in the folder; needs one.
         force: write into the folder even if it holds things that are not tkamb's.
+        workers: processes that share the frames; more than one start every tenth frame without
+            a guess from the one before, which moves answers within the solver's tolerance.
 
     Raises:
         InputError: the scene or a file that it names cannot be used, the run to resume is
-            another one, or the folder cannot be claimed (`tkamb.claim`).
+            another one, the folder cannot be claimed (`tkamb.claim`), or no such number of
+            workers.
+        ComputationError: a worker was killed.
         KeyboardInterrupt: with a folder, what was finished is written there first.
     """
+    crew = Crew(workers)
     if isinstance(scene, str | Path):
         scene_path, scene = scene, load_scene(scene)
     start = clock.perf_counter()
@@ -82,7 +83,7 @@ def simulate(
             folder = stack.enter_context(claimed_directory(directory, force))
             recorder = FolderRecorder(folder, identity, resume)
         stack.callback(recorder.close)
-        return run.compute(recorder, progress)
+        return run.compute(recorder, progress, crew.workers)
 
 
 @dataclass(eq=False)
@@ -98,23 +99,23 @@ class _Run:
 
     def prepare(self) -> None:
         """Build both sides of the equilibrium; whatever is wrong with the input shows here."""
-        self.mechanics = Mechanics(self.case)
-        self.plausibility = Plausibility(self.mechanics)
-        self.slips = self.mechanics.slips()
+        self.solver = FrameSolver(self.case)
         self.seconds = {"read": clock.perf_counter() - self.start}
-        self.side = self._contact_side() if self.case.scene.contact else None
+        if self.solver.side is not None:
+            self.seconds["prepare contact"] = self.solver.side.prepare_seconds
+            self.seconds["read"] -= self.solver.side.prepare_seconds
 
-    def compute(self, recorder: Recorder, progress: Progress) -> Results:
+    def compute(self, recorder: Recorder, progress: Progress, workers: int) -> Results:
         """Compute every frame that is not there yet and return the results."""
-        self.recorder, side = recorder, self.side
-        if side is not None:
-            self._begin_maps(side)
-        before = self._earlier(side)
+        self.recorder = recorder
+        if self.solver.side is not None:
+            self._begin_maps(self.solver.side)
+        self._take_earlier()
         self.resumed = len(self.recorder.rows)
         left = [k for k in self.indices if k not in self.recorder.rows]
         try:
-            for k in progress(left):
-                self._frame(k, side, before)
+            for frame in self._finished(left, progress, workers):
+                self.recorder.record(*frame)
                 if self.recorder.due() and len(self.recorder.rows) < len(self.indices):
                     self.recorder.publish(self.results())
         except KeyboardInterrupt:
@@ -132,37 +133,24 @@ class _Run:
         """Return the results so far; frames that are still to do are failed ones."""
         columns = join_rows(self.case, self.indices, self.recorder.rows)
         self.seconds["all"] = clock.perf_counter() - self.start
-        summary = summary_of(self.case, columns, self.seconds, self.path, self.mechanics.strains)
-        summary["questions"] = [question.text for question in self.plausibility.questions]
-        if self.mechanics.muscles is not None:
-            summary["muscle_groups"] = self.mechanics.muscles.groups
+        strains = self.solver.mechanics.strains
+        summary = summary_of(self.case, columns, self.seconds, self.path, strains)
+        summary["questions"] = [question.text for question in self.solver.plausibility.questions]
         summary["identity"] = self.identity
         summary["inputs"] = self.inputs
         summary["resumed_frames"] = self.resumed
         summary["unfinished_frames"] = len(self.indices) - len(self.recorder.rows)
         return Results(columns, summary, self.recorder.maps)
 
-    def _frame(self, k: int, side: "ContactSide | None", before: "list[FrameContact]") -> None:
-        contact = arrays = None
-        if side is None:
-            body = self.mechanics.frame(k)
-        else:
-            from tkamb.run.recall import contact_arrays
-
-            body, contact = side.frame(k, before)
-            before.append(contact)
-            del before[:-LAST_FRAMES]
-            arrays = contact_arrays(contact)
-        doubts = self.plausibility.flags(k, body)
-        status = frame_status(self.case, k, body, contact, doubts)
-        self.recorder.record(k, frame_row(self.case, k, body, contact, self.slips, status), arrays)
-
-    def _contact_side(self) -> "ContactSide":
-        from tkamb.equilibrium.contact_side import ContactSide
-
-        side = ContactSide(self.case, self.mechanics)
-        self.seconds["prepare contact"] = side.prepare_seconds
-        return side
+    def _finished(
+        self, left: Sequence[int], progress: Progress, workers: int
+    ) -> Iterator[Finished]:
+        """Yield the frames that are left, in order, as they are finished."""
+        if workers == 1:
+            yield from (self.solver.solve(k) for k in progress(left))
+            return
+        frames = finished_in_order(self.case.scene, self.indices, left, workers)
+        yield from (frame for _, frame in zip(progress(left), frames, strict=True))
 
     def _begin_maps(self, side: "ContactSide") -> None:
         labels = {
@@ -172,15 +160,15 @@ class _Run:
         }
         self.recorder.begin_maps(side.state.points, side.state.triangles, labels)
 
-    def _earlier(self, side: "ContactSide | None") -> "list[FrameContact]":
-        """Return the last contacts of the run that is resumed."""
-        earlier = self.recorder.take_earlier(self.indices)
+    def _take_earlier(self) -> None:
+        """Take over the frames of the run that is resumed, the last contacts as guesses."""
+        earlier, side = self.recorder.take_earlier(self.indices), self.solver.side
         if side is None or not earlier:
-            return []
+            return
         from tkamb.run.recall import recalled
 
-        last = list(earlier.items())[-LAST_FRAMES:]
-        return [recalled(side, self.mechanics, k, arrays) for k, arrays in last]
+        mechanics, last = self.solver.mechanics, list(earlier.items())[-LAST_FRAMES:]
+        self.solver.before = [recalled(side, mechanics, k, arrays) for k, arrays in last]
 
 
 def _with_contact(scene: Scene, model: str | None, resolution_mm: float | None) -> Scene:

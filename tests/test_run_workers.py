@@ -1,0 +1,59 @@
+"""`tkamb run --workers`: the frames over processes, and the answers of one."""
+
+import numpy as np
+import pytest
+
+from scenes import fast_scene
+from tkamb.cli import main
+from tkamb.columns import KINDS
+from tkamb.results_folder import read_results
+from tkamb.simulation import simulate
+
+SCENE = fast_scene()
+EFFORT = ("body_seconds", "query_seconds", "contact_seconds", "iterations")
+
+
+@pytest.fixture(scope="module")
+def serial():
+    return simulate(SCENE, frames=slice(0, 101, 8))
+
+
+def numbers(results):
+    return {name: results[name] for name in results.columns if KINDS.get(name) != "text"}
+
+
+def test_answers_are_those_of_one_process(serial, tmp_path):
+    shared = simulate(SCENE, frames=slice(0, 101, 8), directory=tmp_path / "out", workers=2)
+    assert list(shared["status"]) == list(serial["status"])
+    for name, values in numbers(shared).items():
+        if name not in EFFORT:
+            scale = np.nanmax(np.abs(serial[name]), initial=1e-12)
+            np.testing.assert_allclose(
+                values, serial[name], rtol=0, atol=1e-5 * scale, err_msg=name
+            )
+    largest = np.nanmax(serial.maps.pressure_Pa)
+    assert np.nanmax(np.abs(shared.maps.pressure_Pa - serial.maps.pressure_Pa)) < 1e-5 * largest
+
+
+def test_workers_are_counted_before_anything_is_touched(tmp_path, capsys):
+    assert main(["run", str(SCENE), "--workers", "0", "--out", str(tmp_path / "out")]) == 2
+    assert "--workers" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_of_two_is_resumed_by_one(tmp_path, monkeypatch):
+    stopped = []
+
+    def stop_after(frames):
+        for k in frames:
+            if len(stopped) == 11:
+                raise KeyboardInterrupt
+            stopped.append(k)
+            yield k
+
+    out, frames = tmp_path / "out", slice(0, 101, 4)
+    with pytest.raises(KeyboardInterrupt, match="11 of 26 frames are kept"):
+        simulate(SCENE, frames=frames, directory=out, workers=2, progress=stop_after)
+    whole = simulate(SCENE, frames=frames, directory=out, resume=True)
+    assert whole.summary["resumed_frames"] == 11 and whole.summary["unfinished_frames"] == 0
+    assert np.isfinite(read_results(out)["force_total_BW"]).all()

@@ -1,0 +1,116 @@
+"""Frames of a case, one by one: both sides of the equilibrium in, a row of the results out."""
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from tkamb.equilibrium.mechanics import Mechanics
+from tkamb.geometry.frames import Array
+from tkamb.plausibility.plausibility import Plausibility
+from tkamb.run.shards import Row
+from tkamb.run.status import frame_status
+from tkamb.run.tabulate import frame_row
+from tkamb.run.workers import Crew, Task
+from tkamb.scene import Scene
+from tkamb.scene.case import Case, load_case
+
+if TYPE_CHECKING:
+    from tkamb.equilibrium.contact_side import ContactSide
+    from tkamb.equilibrium.frame_contact import FrameContact
+
+LAST_FRAMES = 20
+"""How many contacts are kept as guesses for the next."""
+
+CHUNK = 10
+"""Frames that a worker computes in a row: the first of them has no guess from the one before.
+
+The same for any number of workers, so that their number changes no answer.
+"""
+
+Finished = tuple[int, Row, dict[str, Array] | None]
+"""Number, row and the contact's arrays (`tkamb.run.recall`; None if it failed or is not there)."""
+
+
+class FrameSolver:
+    """Computes the frames of a case.
+
+    Args:
+        case: the scene with its files read.
+
+    Attributes:
+        mechanics: the body side.
+        side: the contact side; None without [contact].
+        prepare_seconds: what preparing the contact took, s; None without.
+        before: contacts of the last frames, guesses for the next.
+
+    Raises:
+        InputError: whatever is wrong with the input.
+    """
+
+    def __init__(self, case: Case) -> None:
+        self._case = case
+        self.mechanics = Mechanics(case)
+        self.plausibility = Plausibility(self.mechanics)
+        self._slips = self.mechanics.slips()
+        self.side = self._contact_side() if case.scene.contact else None
+        self.before: list[FrameContact] = []
+
+    def solve(self, k: int) -> Finished:
+        """Return frame k."""
+        contact = arrays = None
+        if self.side is None:
+            body = self.mechanics.frame(k)
+        else:
+            from tkamb.run.recall import contact_arrays
+
+            body, contact = self.side.frame(k, self.before)
+            self.before.append(contact)
+            del self.before[:-LAST_FRAMES]
+            arrays = contact_arrays(contact)
+        doubts = self.plausibility.flags(k, body)
+        status = frame_status(self._case, k, body, contact, doubts)
+        return k, frame_row(self._case, k, body, contact, self._slips, status), arrays
+
+    def _contact_side(self) -> "ContactSide":
+        from tkamb.equilibrium.contact_side import ContactSide
+
+        return ContactSide(self._case, self.mechanics)
+
+
+class ChunkSolver:
+    """What a worker does: reads the scene once, and computes chunk after chunk."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._solver = FrameSolver(load_case(scene))
+
+    def __call__(self, number: int, frames: Sequence[int]) -> list[Finished]:
+        """Return the frames of a chunk."""
+        self._solver.before.clear()
+        return [self._solver.solve(k) for k in frames]
+
+
+def finished_in_order(
+    scene: Scene, indices: range, left: Sequence[int], workers: int
+) -> Iterator[Finished]:
+    """Yield frames over worker processes, in order.
+
+    Args:
+        scene: for each worker to read.
+        indices: all frames of the run, which make its chunks.
+        left: those that are still to do.
+        workers: processes.
+
+    Raises:
+        ComputationError: a worker was killed.
+    """
+    chunks: dict[int, list[int]] = {}
+    for k in left:
+        chunks.setdefault(indices.index(k) // CHUNK, []).append(k)
+    early: dict[int, list[Finished]] = {}
+    turn = iter(chunks)
+    answers = Crew(workers).answers(Task(ChunkSolver, (scene,)), list(chunks.items()))
+    expected: Any = next(turn, None)
+    for number, frames in answers:
+        early[number] = frames
+        while expected in early:
+            yield from early.pop(expected)
+            expected = next(turn, None)
