@@ -71,6 +71,6 @@ def _summary(plain: dict, columns: dict) -> dict:
         "muscle_groups": {group: list(names) for group, names in GROUPS.items()},
         "emg": {"settings": {"use": "report"}, "muscles": emg},
         "reserves": reserves,
-        "measured": compare_measured(columns, WEIGHT_N),
+        "measured": compare_measured(columns, ("total", "medial", "lateral"), WEIGHT_N),
         "body_mass_kg": MASS_KG,
     }

@@ -8,6 +8,7 @@ from synthetic_run import make_run
 from tkamb.errors import InputError
 from tkamb.inputs.measured_force import load_measured_force
 from tkamb.output.axis import horizontal_axis
+from tkamb.output.comparison import comparison_words
 from tkamb.output.headline import cards
 from tkamb.output.panels import panels
 from tkamb.results import Results
@@ -82,7 +83,7 @@ def run_with_measurement(frames=40):
 def test_errors_of_a_straight_line_are_its_own():
     columns, summary = run_with_measurement()
     weight = summary["body_mass_kg"] * 9.80665
-    found = compare_measured(columns, weight)
+    found = compare_measured(columns, ["total"], weight)
     assert set(found) == {"total"}
     one, m = found["total"], columns[measured_column("total")]
     m = m[np.isfinite(m) & np.isfinite(columns["force_si_N"])]
@@ -95,9 +96,18 @@ def test_errors_of_a_straight_line_are_its_own():
     assert one["peak_predicted_time_s"] == one["peak_measured_time_s"]
 
 
+def test_without_contact_the_condyles_are_those_of_equilibrium():
+    columns, _ = run_with_measurement()
+    del columns["medial_force_N"]
+    columns[measured_column("medial")] = columns["medial_force_equilibrium_N"] - 50.0
+    one = compare_measured(columns, ["medial"], 700.0)["medial"]
+    assert one["predicted"] == "medial_force_equilibrium_N"
+    assert one["bias_N"] == pytest.approx(50.0)
+
+
 def test_every_frame_is_counted():
     columns, _ = run_with_measurement()
-    one = compare_measured(columns, 700.0)["total"]
+    one = compare_measured(columns, ["total"], 700.0)["total"]
     counts = {key: value for key, value in one.items() if key.startswith("frames_")}
     assert counts == {
         "frames_compared": 34,
@@ -109,17 +119,23 @@ def test_every_frame_is_counted():
     assert one["measured_where_not_compared_N"] == [left_out.min(), left_out.max()]
 
 
-def test_a_run_without_a_number_is_compared_with_nothing():
+@pytest.mark.parametrize("lost", ["force_si_N", measured_column("total")])
+def test_a_run_without_a_pair_says_that_nothing_is_compared(lost):
+    """Nothing predicted, or frames that lie outside the measurement."""
     columns, _ = run_with_measurement()
-    columns["force_si_N"][:] = np.nan
-    one = compare_measured(columns, 700.0)["total"]
+    columns[lost][:] = np.nan
+    one = compare_measured(columns, ["total"], 700.0)["total"]
     assert one["frames_compared"] == 0
     assert "rmse_N" not in one
+    value, words, incomplete = comparison_words({"total": one})
+    assert value == "no frame to compare"
+    assert "0 of 40 frames compared" in words
+    assert incomplete
 
 
 def test_the_report_shows_what_was_measured_behind_what_is_predicted():
     columns, summary = run_with_measurement()
-    summary = summary | {"measured": compare_measured(columns, 700.0)}
+    summary = summary | {"measured": compare_measured(columns, ["total"], 700.0)}
     results = Results(columns, summary)
     found = {panel.name: panel for panel in panels(results)}["forces"].lines
     behind = [line for line in found if line.behind]

@@ -146,12 +146,19 @@ def test_a_scene_with_muscles_needs_its_own_patella(tmp_path):
         load_scene(scene)
 
 
-def test_without_the_table_no_muscles_are_imported():
+def test_without_the_tables_neither_muscles_nor_emg_nor_measurements_are_imported():
+    own = (
+        "tkamb.muscles",
+        "tkamb.opensim",
+        "tkamb.inputs.emg",
+        "tkamb.inputs.measured",
+        "tkamb.run.",
+    )
     code = (
         "import sys; from tkamb.scene import load_scene; from tkamb.scene.case import load_case; "
         "from tkamb.equilibrium.mechanics import Mechanics; "
         f"m = Mechanics(load_case(load_scene({str(SHIPPED)!r}))); assert m.muscles is None; "
-        "print([n for n in sys.modules if n.startswith(('tkamb.muscles', 'tkamb.opensim'))])"
+        f"print([n for n in sys.modules if n.startswith({own})])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -135,6 +135,9 @@ class _Run:
         self.seconds["all"] = clock.perf_counter() - self.start
         strains = self.solver.mechanics.strains
         summary = summary_of(self.case, columns, self.seconds, self.path, strains)
+        muscles = self.solver.mechanics.muscles
+        if muscles is not None:
+            summary["muscle_groups"] = muscles.groups
         summary["questions"] = [question.text for question in self.solver.plausibility.questions]
         summary["identity"] = self.identity
         summary["inputs"] = self.inputs

@@ -241,8 +241,9 @@ def _notes(
     request: ImportRequest, scale: float, found: Trial, own_ligaments: bool
 ) -> tuple[str, ...]:
     notes = [
-        "Only the quadriceps acts: where hamstrings and gastrocnemius act too, the contact force "
-        "is too low and the quadriceps force is what the joint moment needs at least.",
+        "Without [muscles] only the quadriceps acts: where hamstrings and gastrocnemius act too, "
+        "the contact force is too low and the quadriceps force is what the joint moment needs at "
+        "least.",
         *_motion_notes(request, found),
         "Foot and shank are one body with the ankle at its neutral angle.",
     ]

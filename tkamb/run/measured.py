@@ -1,6 +1,6 @@
 """What was measured in a knee held against what a run predicts."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,9 @@ def measured_column(name: str) -> str:
     return f"measured_{name}_N"
 
 
-def compare_measured(columns: Mapping[str, Any], body_weight: float) -> dict[str, dict[str, Any]]:
+def compare_measured(
+    columns: Mapping[str, Any], names: Iterable[str], body_weight: float
+) -> dict[str, dict[str, Any]]:
     """Return how far a run is from what was measured, of each force that was.
 
     Over the n frames that have both, with predicted p and measured m,
@@ -34,17 +36,19 @@ def compare_measured(columns: Mapping[str, Any], body_weight: float) -> dict[str
 
     Args:
         columns: of results.csv, `measured_<name>_N` among them.
+        names: of the forces that were measured: total, medial, lateral.
         body_weight: N.
     """
     failed = np.array([status.startswith(FAILED) for status in columns["status"]], bool)
+    missing = np.full(len(failed), np.nan)
     found = {}
-    for name, candidates in PREDICTED.items():
-        measured = columns.get(measured_column(name))
-        if measured is None or not np.isfinite(measured).any():
-            continue
-        column = next((c for c in candidates if np.isfinite(columns[c]).any()), candidates[0])
-        counted = _counts(columns[column], measured, failed)
-        error = _errors(columns["time_s"], columns[column], measured, body_weight)
+    for name in names:
+        predicted = {column: columns.get(column, missing) for column in PREDICTED[name]}
+        known = [column for column, values in predicted.items() if np.isfinite(values).any()]
+        column = next(iter(known or predicted))
+        measured = columns[measured_column(name)]
+        counted = _counts(predicted[column], measured, failed)
+        error = _errors(columns["time_s"], predicted[column], measured, body_weight)
         found[name] = {"predicted": column} | counted | error
     return found
 

@@ -29,7 +29,7 @@ def compare_recorded(case: Case, columns: Mapping[str, Any]) -> dict[str, Any]:
     """Return the summary's keys `measured` and `emg`, as far as the scene has them."""
     found: dict[str, Any] = {}
     if case.measured is not None:
-        found["measured"] = compare_measured(columns, case.body_weight)
+        found["measured"] = compare_measured(columns, case.measured.force, case.body_weight)
     if case.emg is not None:
         assert case.scene.muscles is not None and case.scene.muscles.emg is not None
         settings = case.scene.muscles.emg.model_dump(mode="json", exclude_none=True)
