@@ -24,7 +24,7 @@ from tkamb.contact.foundation import LinearFoundation
 from tkamb.contact.probe import Probe
 from tkamb.contact.registry import contact_model
 from tkamb.equilibrium.balance import BalanceStatus, Trial, find_balance
-from tkamb.equilibrium.released import SCALE, ReleasedForces
+from tkamb.equilibrium.released_forces import SCALE, ReleasedForces
 from tkamb.geometry.frames import knee_axes, knee_pose, knee_twist
 
 LOAD = 1000.0

@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from tkamb.body.chain import ChainState
 
 
-AGREED = 1.0
-"""N: muscle forces that change by less from one sharing to the next agree with the knee."""
-
-
 @dataclass(frozen=True, eq=False)
 class CrossingLines:
     """Lines from the shank to the thigh at one frame.
@@ -75,10 +71,6 @@ class MuscleShare:
     crossing: np.ndarray
     lines: CrossingLines
     status: str = "ok"
-
-    def agrees(self, other: "MuscleShare") -> bool:
-        """Return whether two shares of a frame are the same to `AGREED`."""
-        return bool(np.abs(self.force - other.force).max() < AGREED)
 
     def loads(self, state: "ChainState") -> tuple[PointForces, ...]:
         """Return what the crossing muscles and the knee's reserve do to tibia and femur."""

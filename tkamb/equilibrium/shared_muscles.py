@@ -74,6 +74,10 @@ class SharedMuscles:
             lines,
         )
 
+    def tension(self, share: MuscleShare) -> float:
+        """Return what the extensor group pulls with, N."""
+        return float(share.force[self._trial.extensor].sum())
+
     def solve(
         self, k: int, geometry: KneeGeometry, friction: float
     ) -> tuple[KneeGeometry, KneeLoads]:
