@@ -32,6 +32,19 @@ class CrossingLines:
     shank: Array
     thigh: Array
 
+    def unit_wrenches(self, tibia: Array, femur: Array) -> Array:
+        """Return the wrench (..., c, 6) of one newton of each on the insert, about its origin.
+
+        Args:
+            tibia: (4, 4) pose of the tibia link in the insert frame.
+            femur: (..., 4, 4) poses of the femur link in it.
+        """
+        start = transform(tibia, self.shank)
+        along = np.einsum("...ij,cj->...ci", femur[..., :3, :3], self.thigh)
+        along = along + femur[..., None, :3, 3] - start
+        along = along / np.linalg.norm(along, axis=-1, keepdims=True)
+        return wrench_of(np.broadcast_to(start, along.shape), along)
+
     def unit_loads(self, state: "ChainState") -> list[tuple[PointForces, ...]]:
         """Return what one newton of each does to tibia and femur, insert frame."""
         start = transform(state.pose("tibia"), self.shank)
@@ -90,12 +103,8 @@ class MuscleShare:
             tibia: (4, 4) pose of the tibia link in the insert frame.
             femur: (..., 4, 4) poses of the femur link in it.
         """
-        start = transform(tibia, self.lines.shank)
-        total = np.zeros((*femur.shape[:-2], 6))
-        for p, q, force in zip(start, self.lines.thigh, self.force[self.crossing], strict=True):
-            along = transform(femur, q) - p
-            along = along / np.linalg.norm(along, axis=-1, keepdims=True)
-            total = total + force * wrench_of(p, along)
+        units = self.lines.unit_wrenches(tibia, femur)
+        total = np.einsum("i,...ij->...j", self.force[self.crossing], units)
         total[..., 3:] += self._knee_reserve
         return np.asarray(total)
 

@@ -250,23 +250,24 @@ class _Frame:
         Raises:
             ComputationError: there is none within `WIDEST_TURN`.
         """
-        here = self.at_rotation(guess, float(guess[2]))
-        step = FIRST_STEP
+        here, step = self.at_rotation(guess, float(guess[2])), FIRST_STEP
+        before = here
         while abs(here.coordinates[2] - guess[2]) < WIDEST_TURN:
-            turn = here.coordinates[2] + np.sign(here.moment) * step
-            there = self.at_rotation(here.coordinates, float(turn))
+            turn = float(here.coordinates[2] + np.sign(here.moment) * step)
+            there = self.at_rotation(_on_line(before, here, turn), turn)
             if there.moment * here.moment <= 0.0:
                 return self.between(here, there)
-            here, step = there, 1.6 * step
+            before, here, step = here, there, 1.6 * step
         raise _Lost(PatellaStatus.MOMENT)
 
     def between(self, here: _Balance, there: _Balance) -> _Balance:
         """Return the balance at the zero of the moment between two rotations."""
-        last = here
+        before, last = there, here
 
         def moment(rotation: float) -> float:
-            nonlocal last
-            last = self.at_rotation(last.coordinates, rotation)
+            nonlocal before, last
+            start = _on_line(before, last, rotation)
+            before, last = last, self.at_rotation(start, rotation)
             return last.moment
 
         ends = (here.coordinates[2], there.coordinates[2])
@@ -360,6 +361,14 @@ _CONDITIONS = (
 def _condition(error: ComputationError) -> PatellaStatus:
     """Return the condition that a search missed; errors of the lines have no status."""
     return error.status if isinstance(error, _Lost) else PatellaStatus.LINE
+
+
+def _on_line(before: _Balance, last: _Balance, rotation: float) -> Array:
+    """Return coordinates (3,) at a rotation on the line through those of two balances."""
+    change = last.coordinates - before.coordinates
+    if change[2] == 0.0:
+        return last.coordinates
+    return np.asarray(last.coordinates + (rotation - last.coordinates[2]) / change[2] * change)
 
 
 def _cross(a: Array, b: Array) -> float:

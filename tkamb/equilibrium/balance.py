@@ -8,7 +8,9 @@ by the trapezoidal rule, against what K predicts,
     W = (r(q) + r(q + d)) . d / 2          W_K = r(q) . d - d . K d / 2 :
 
 forces that have a potential lower it by W, so that with W > 0 in every step the energy falls.
-A trial that overshoots into a stiff contact costs work and is taken back.
+A trial that overshoots into a stiff contact costs work and is taken back. Where loads that follow
+the motion leave K unsymmetric, stable but not positive definite, work is no measure; a step then
+goes along Newton's direction, in which |r| falls, and is judged by that.
 
 Everything is in metres and newtons: rotations are scaled by a lever arm.
 
@@ -36,7 +38,7 @@ LONGEST_TRAVEL = 20e-3
 """m: a coordinate this far from its start is held by nothing."""
 PROBE_STEP = 2e-6
 """m: of the finite differences where the stiffness is not known."""
-MOST_STEPS = 60
+MOST_STEPS = 200
 
 
 class BalanceStatus(Enum):
@@ -138,7 +140,7 @@ class _Search:
         return self._end(BalanceStatus.OUT_OF_RANGE if lost else BalanceStatus.NOT_CONVERGED)
 
     def _step(self) -> None:
-        step = bounded_step(self.stiffness, self.force, self._radius)
+        step, part = self._next()
         trial = self._at(self.x + step)
         self._steps, self._since = self._steps + 1, self._since + 1
         length = float(np.linalg.norm(step))
@@ -148,7 +150,8 @@ class _Search:
         if self._unknown:
             self._radius = 0.25 * length
             return
-        helps = self._halves(step, trial.force)
+        fall = 1.0 - float(np.linalg.norm(trial.force) / np.linalg.norm(self.force))
+        helps = part > 0 and fall > 0.5 * part
         ratio = 1.0 if helps else work / predicted if predicted > 0 else -1.0
         taken = ratio > 0.05
         if trial.stiffness is None:
@@ -166,17 +169,14 @@ class _Search:
             if trial.stiffness is not None:
                 self.stiffness = trial.stiffness
 
-    def _halves(self, step: Array, force: Array) -> bool:
-        """Return whether a full Newton step with a stable but indefinite stiffness helps.
-
-        Follower loads and friction make it unsymmetric; their work is no measure then.
-        """
+    def _next(self) -> tuple[Array, float]:
+        """Return the next step, and what part it is of Newton's where |r| judges it; else 0."""
         symmetric, smallest_stiffness = smallest_eigenvalues(self.stiffness)
         if symmetric > 0 or smallest_stiffness <= 0:
-            return False
+            return bounded_step(self.stiffness, self.force, self._radius), 0.0
         newton = np.linalg.solve(self.stiffness, self.force)
-        full = np.allclose(step, newton, rtol=1e-9, atol=0)
-        return bool(full and np.linalg.norm(force) < 0.5 * np.linalg.norm(self.force))
+        part = min(1.0, self._radius / float(np.linalg.norm(newton)))
+        return np.asarray(part * newton), part
 
     def _at(self, x: Array) -> Trial:
         self._trials += 1

@@ -156,7 +156,8 @@ class ReleasedKnee:
         geometry = self._mechanics.geometry(k, place, patella)
         muscles = self._mechanics.muscles
         if muscles is not None and not geometry.problems:
-            share = mixing.mixed(self._share(k, geometry, touch))
+            held = None if touch is None or before is None else before.geometry.share
+            share = mixing.mixed(self._share(k, geometry, middle, touch, held))
             geometry, slack = replace(geometry, share=share), muscles.tension(share) < SLACK
         forces = self._forces(k, geometry, middle, slack)
         balance = forces.balance(before.balance.stiffness if before else None)
@@ -180,16 +181,24 @@ class ReleasedKnee:
         return knee, not muscles and contact.known and forces.pushes(balance)
 
     def _share(
-        self, k: int, geometry: KneeGeometry, touch: "ProbedContact | None"
+        self,
+        k: int,
+        geometry: KneeGeometry,
+        middle: Array,
+        touch: "ProbedContact | None",
+        held: "MuscleShare | None",
     ) -> "MuscleShare":
-        """Return what each muscle carries while the contact is as it is.
+        """Return what each muscle carries, the released coordinates yielding to it.
+
+        Where the search begins, or the contact model has no tangent, contact points stay; where
+        these make the first equations singular the knee's forces pass through the femoral origin.
 
         Args:
             k: frame.
             geometry: the frame without its contact.
-            touch: the contact there; None where the search begins. It is then that of the
-                place, and where this makes the equations singular the knee's forces pass
-                through the femoral origin.
+            middle: (3,) m, where residual forces act.
+            touch: the contact there; None where the search begins.
+            held: what was held when the knee came to rest there.
 
         Raises:
             ComputationError: no muscle forces carry the frame.
@@ -198,11 +207,19 @@ class ReleasedKnee:
         muscles, friction = mechanics.muscles, mechanics.friction
         assert muscles is not None
         here = self._probe.at(knee_pose(place)) if touch is None else touch
-        points = mechanics.resultants(k, place, here.condyles)
-        off = frozenset(mechanics.sides - set(points)) if points else frozenset[str]()
-        share = muscles.share(k, replace(geometry, condyles=points), friction, off)
-        if touch is None and share.status != "ok":
-            share = muscles.share(k, geometry, friction, frozenset())
+        gain = None
+        if held is not None:
+            forces = self._forces(k, replace(geometry, share=held), middle, False)
+            gain = forces.tension_per_wrench(here)
+        if gain is not None:
+            base = float(gain @ forces.without_muscles(here))
+            share = muscles.share_of_yielding_knee(k, geometry, friction, base, gain)
+        else:
+            points = mechanics.resultants(k, place, here.condyles)
+            off = frozenset(mechanics.sides - set(points)) if points else frozenset[str]()
+            share = muscles.share(k, replace(geometry, condyles=points), friction, off)
+            if touch is None and share.status != "ok":
+                share = muscles.share(k, geometry, friction, frozenset())
         if share.status != "ok":
             raise ComputationError(f"muscles: {share.status.removeprefix('failed: ')}")
         return share

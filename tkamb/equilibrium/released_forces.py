@@ -1,6 +1,7 @@
 """What drives the released knee coordinates at trial places, the patella held on the femur."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,6 +80,40 @@ class ReleasedForces:
         twists = knee_axes(place)[self._rows] / self._scale[:, None]
         gain = self._joint.contact_gain(place) / self._scale[:, None]
         return Trial(forces[-1], -(change + gain @ stiffness @ twists.T))
+
+    def tension_per_wrench(self, contact: "ProbedContact") -> Array | None:
+        """Return v (6,): the patellar ligament's tension is v . w, the knee at rest.
+
+        w is all else that acts on the insert: loads from outside, ligaments, muscles, and the
+        contact at the place where the search begins. About there, with f = -J w the
+        generalised forces and K = -df/dq of contact, ligaments and muscles, one Newton step
+
+            -J w - K dq - J B y = 0
+
+        for the released dq and what keeps the others y, the tension among it. None where the
+        contact model does not know its tangent.
+
+        Args:
+            contact: at that place.
+        """
+        place = self._place
+        wrench, stiffness = self._with_friction(place, contact)
+        if stiffness is None:
+            return None
+        kept = self._joint.kept(place, wrench)
+        steps = np.zeros((len(self._rows) + 1, 6))
+        steps[np.arange(len(self._rows)), self._rows] = TINY / self._scale
+        forces = self._joint.whole(place + steps, wrench, kept)
+        axes = knee_axes(place)
+        twists = axes[self._rows] / self._scale[:, None]
+        change = (forces[:-1] - forces[-1]).T / TINY - axes @ stiffness @ twists.T
+        matrix = np.hstack([-change, axes @ self._joint.columns(place)])
+        return np.asarray(-np.linalg.solve(matrix, axes)[-1])
+
+    def without_muscles(self, contact: "ProbedContact") -> Array:
+        """Return the wrench (6,) on the insert of all but muscles and what keeps coordinates."""
+        wrench, _ = self._with_friction(self._place, contact)
+        return replace(self._joint, share=None).sum_of(self._place, wrench)
 
     def at(self, balance: Balance) -> Array:
         """Return the knee coordinates (6,) of a balance."""

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from tkamb.body.crossing import CrossingLines, MuscleShare
-from tkamb.body.extensor_response import flexion_row
+from tkamb.body.extensor_response import FlexionRow, flexion_row, yielding_flexion_row
 from tkamb.body.knee import KneeGeometry, KneeLoads, solve_knee, unsolved
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose
@@ -50,23 +50,46 @@ class SharedMuscles:
             friction: Coulomb coefficient.
             lifted: sides that carry nothing.
         """
-        trial, lines = self._trial, CrossingLines(self._shank[k], self._thigh[k])
-        names = trial.problems.coordinates
+        lines = self._lines(k)
         try:
-            row = flexion_row(geometry, lines, friction, lifted)
+            return self._shared(k, lines, flexion_row(geometry, lines, friction, lifted))
         except ComputationError as error:
             return self._failed(lines, f"failed: {error.what}")
+
+    def share_of_yielding_knee(
+        self, k: int, geometry: KneeGeometry, friction: float, base: float, per_wrench: Array
+    ) -> MuscleShare:
+        """Return what each muscle carries in frame k while released coordinates yield to it.
+
+        Args:
+            k: frame.
+            geometry: the knee; its contact is not looked at.
+            friction: Coulomb coefficient.
+            base: N, see `yielding_flexion_row`.
+            per_wrench: (6,), likewise.
+        """
+        lines = self._lines(k)
+        try:
+            row = yielding_flexion_row(geometry, lines, friction, base, per_wrench)
+        except ComputationError as error:
+            return self._failed(lines, f"failed: {error.what}")
+        return self._shared(k, lines, row)
+
+    def _lines(self, k: int) -> CrossingLines:
+        return CrossingLines(self._shank[k], self._thigh[k])
+
+    def _shared(self, k: int, lines: CrossingLines, row: FlexionRow) -> MuscleShare:
+        trial = self._trial
         problem, (activation, reserve, _, status) = trial.solved(
             k, row.moment, row.extensor_arm, row.arms
         )
         if status != "ok":
             return self._failed(lines, status)
-        force = trial.force(k, activation)
         return MuscleShare(
             self._names,
             activation,
-            force,
-            names,
+            trial.force(k, activation),
+            trial.problems.coordinates,
             problem.moment[0],
             reserve,
             trial.flexion,
