@@ -107,10 +107,6 @@ class JointEquilibrium:
         axes, columns, wrench = self._sum_loads(coordinates, contact)
         return -np.einsum("...ij,...j->...i", axes, wrench + columns @ kept)
 
-    def sum_of(self, coordinates: Array, contact: Array) -> Array:
-        """Return the wrench (6,) of all but what keeps coordinates, at coordinates (6,)."""
-        return self._sum_loads(coordinates, contact)[2]
-
     def columns(self, coordinates: Array) -> Array:
         """Return B (6, 6 - n) at coordinates (6,)."""
         return self._sum_loads(coordinates, np.zeros(6))[1]

@@ -110,7 +110,7 @@ class _Search:
         self._forces, self._start = forces, start
         self._trials, self._steps = 0, 0
         self._fresh, self._since, self._unknown = False, 0, False
-        self._radius = FIRST_RADIUS
+        self._radius, self._refused = FIRST_RADIUS, False
         self._work: list[float] = []
         self.x = start
         first = self._at(start)
@@ -154,6 +154,7 @@ class _Search:
         helps = part > 0 and fall > 0.5 * part
         ratio = 1.0 if helps else work / predicted if predicted > 0 else -1.0
         taken = ratio > 0.05
+        self._refused = part > 0 and not taken  # across a kink |r| may rise: the other step next
         if trial.stiffness is None:
             self._learn(step, trial.force)
         if ratio < 0.25:
@@ -172,7 +173,7 @@ class _Search:
     def _next(self) -> tuple[Array, float]:
         """Return the next step, and what part it is of Newton's where |r| judges it; else 0."""
         symmetric, smallest_stiffness = smallest_eigenvalues(self.stiffness)
-        if symmetric > 0 or smallest_stiffness <= 0:
+        if symmetric > 0 or smallest_stiffness <= 0 or self._refused:
             return bounded_step(self.stiffness, self.force, self._radius), 0.0
         newton = np.linalg.solve(self.stiffness, self.force)
         part = min(1.0, self._radius / float(np.linalg.norm(newton)))

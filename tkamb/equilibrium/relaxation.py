@@ -8,10 +8,15 @@ circle. So the forces go only a part omega of the way from those held, f, to tho
 
 d and d' the last two f' - f: Aitken's secant for a vector. At the end f' itself is held.
 
+How the knee yields to the muscles, which decides their arms, is found anew in the first passes
+only: the contact's stiffness jumps from facet to facet, and forces that follow every jump would
+never settle. What it is by then belongs to a pose some micrometres away.
+
 References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.1620010306;
 Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -28,6 +33,10 @@ LEAST, MOST = 0.05, 1.0
 """The limits of omega."""
 
 
+FRESH = 3
+"""In so many passes it is found anew how the knee yields."""
+
+
 class Relaxation:
     """The muscles' forces over the passes of one search.
 
@@ -39,6 +48,15 @@ class Relaxation:
         self._held: MuscleShare | None = None
         self._last: Array | None = None
         self._part, self.settled = MOST, True
+        self._yields: Array | None = None
+        self._passes = 0
+
+    def kept(self, found: Callable[[], Array | None]) -> Array | None:
+        """Return how the knee yields, from `found` in the first passes."""
+        if self._passes < FRESH:
+            self._yields = found()
+        self._passes += 1
+        return self._yields
 
     def mixed(self, asked: "MuscleShare") -> "MuscleShare":
         """Return the forces to hold next.

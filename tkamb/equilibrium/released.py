@@ -157,7 +157,7 @@ class ReleasedKnee:
         muscles = self._mechanics.muscles
         if muscles is not None and not geometry.problems:
             held = None if touch is None or before is None else before.geometry.share
-            share = mixing.mixed(self._share(k, geometry, middle, touch, held))
+            share = mixing.mixed(self._share(k, geometry, middle, touch, held, mixing))
             geometry, slack = replace(geometry, share=share), muscles.tension(share) < SLACK
         forces = self._forces(k, geometry, middle, slack)
         balance = forces.balance(before.balance.stiffness if before else None)
@@ -187,6 +187,7 @@ class ReleasedKnee:
         middle: Array,
         touch: "ProbedContact | None",
         held: "MuscleShare | None",
+        mixing: Relaxation,
     ) -> "MuscleShare":
         """Return what each muscle carries, the released coordinates yielding to it.
 
@@ -199,6 +200,7 @@ class ReleasedKnee:
             middle: (3,) m, where residual forces act.
             touch: the contact there; None where the search begins.
             held: what was held when the knee came to rest there.
+            mixing: keeps how the knee yields.
 
         Raises:
             ComputationError: no muscle forces carry the frame.
@@ -210,9 +212,10 @@ class ReleasedKnee:
         gain = None
         if held is not None:
             forces = self._forces(k, replace(geometry, share=held), middle, False)
-            gain = forces.tension_per_wrench(here)
-        if gain is not None:
-            base = float(gain @ forces.without_muscles(here))
+            gain = mixing.kept(lambda: forces.tension_per_wrench(here))
+        if held is not None and gain is not None:
+            pull = held.wrench(geometry.state.pose("tibia"), geometry.state.pose("femur"))
+            base = forces.tension(here) - float(gain @ pull)
             share = muscles.share_of_yielding_knee(k, geometry, friction, base, gain)
         else:
             points = mechanics.resultants(k, place, here.condyles)

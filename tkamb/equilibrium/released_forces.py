@@ -1,7 +1,6 @@
 """What drives the released knee coordinates at trial places, the patella held on the femur."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -82,19 +81,18 @@ class ReleasedForces:
         return Trial(forces[-1], -(change + gain @ stiffness @ twists.T))
 
     def tension_per_wrench(self, contact: "ProbedContact") -> Array | None:
-        """Return v (6,): the patellar ligament's tension is v . w, the knee at rest.
+        """Return v (6,): a further wrench dw on the insert adds v . dw to the ligament's tension.
 
-        w is all else that acts on the insert: loads from outside, ligaments, muscles, and the
-        contact at the place where the search begins. About there, with f = -J w the
-        generalised forces and K = -df/dq of contact, ligaments and muscles, one Newton step
+        The released coordinates yield to it by dq and stay at rest: with K = -df/dq of the
+        generalised forces f = -J w of contact, ligaments and muscles,
 
-            -J w - K dq - J B y = 0
+            -J dw - K dq - J B dy = 0
 
-        for the released dq and what keeps the others y, the tension among it. None where the
-        contact model does not know its tangent.
+        for dq and what keeps the other coordinates dy, the tension of the patellar ligament
+        among it. None where the contact model does not know its tangent.
 
         Args:
-            contact: at that place.
+            contact: at the place where the search begins, the knee at rest.
         """
         place = self._place
         wrench, stiffness = self._with_friction(place, contact)
@@ -110,10 +108,10 @@ class ReleasedForces:
         matrix = np.hstack([-change, axes @ self._joint.columns(place)])
         return np.asarray(-np.linalg.solve(matrix, axes)[-1])
 
-    def without_muscles(self, contact: "ProbedContact") -> Array:
-        """Return the wrench (6,) on the insert of all but muscles and what keeps coordinates."""
+    def tension(self, contact: "ProbedContact") -> float:
+        """Return the tension (N) by which the patellar ligament balances flexion there."""
         wrench, _ = self._with_friction(self._place, contact)
-        return replace(self._joint, share=None).sum_of(self._place, wrench)
+        return float(self._joint.kept(self._place, wrench)[-1])
 
     def at(self, balance: Balance) -> Array:
         """Return the knee coordinates (6,) of a balance."""

@@ -169,6 +169,7 @@ def load_muscles(case: Case) -> SharedMuscles:
             reserve=table.reserve_Nm,
             exponent=table.exponent,
             weights=table.weights,
+            lowest=table.least_activation,
             law=table.law,
         ),
     )
