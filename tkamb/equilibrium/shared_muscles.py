@@ -19,6 +19,7 @@ from tkamb.muscles.recording import LegRecording, load_knee_trial
 from tkamb.muscles.sharing import Sharing
 from tkamb.scene.case import Case
 from tkamb.scene.si import in_si
+from tkamb.scene.tables import MusclesTable
 from tkamb.units import MILLIMETRE
 
 SAME_PLACE = 0.5 * MILLIMETRE
@@ -32,11 +33,14 @@ class SharedMuscles:
     Args:
         trial: the muscles over the frames.
         left: a left leg's, whose knee is computed as its mirror image.
+
+    Attributes:
+        trial: as given.
     """
 
     def __init__(self, trial: KneeTrial, left: bool = False) -> None:
         flip = MIRROR if left else np.eye(3)
-        self._trial, self._names = trial, trial.muscles
+        self.trial, self._names = trial, trial.muscles
         self._shank, self._thigh = trial.shank @ flip, trial.thigh @ flip
 
     def share(
@@ -79,7 +83,7 @@ class SharedMuscles:
         return CrossingLines(self._shank[k], self._thigh[k])
 
     def _shared(self, k: int, lines: CrossingLines, row: FlexionRow) -> MuscleShare:
-        trial = self._trial
+        trial = self.trial
         problem, (activation, reserve, _, status) = trial.solved(
             k, row.moment, row.extensor_arm, row.arms
         )
@@ -99,7 +103,7 @@ class SharedMuscles:
 
     def tension(self, share: MuscleShare) -> float:
         """Return what the extensor group pulls with, N."""
-        return float(share.force[self._trial.extensor].sum())
+        return float(share.force[self.trial.extensor].sum())
 
     def solve(
         self, k: int, geometry: KneeGeometry, friction: float
@@ -123,7 +127,7 @@ class SharedMuscles:
 
     def _failed(self, lines: CrossingLines, status: str) -> MuscleShare:
         nothing = np.full(len(self._names), np.nan)
-        names = self._trial.problems.coordinates
+        names = self.trial.problems.coordinates
         rest = np.full(len(names), np.nan)
         return MuscleShare(
             self._names,
@@ -132,11 +136,22 @@ class SharedMuscles:
             names,
             rest,
             rest,
-            self._trial.flexion,
-            self._trial.crossing,
+            self.trial.flexion,
+            self.trial.crossing,
             lines,
             status,
         )
+
+
+def sharing_of(table: MusclesTable) -> Sharing:
+    """Return the options of a scene's [muscles]."""
+    return Sharing(
+        reserve=table.reserve_Nm,
+        exponent=table.exponent,
+        weights=table.weights,
+        lowest=table.least_activation,
+        law=table.law,
+    )
 
 
 def load_muscles(case: Case) -> SharedMuscles:
@@ -165,13 +180,7 @@ def load_muscles(case: Case) -> SharedMuscles:
         insert=None if insert is None else insert.mesh,
         mesh_unit="m" if insert is None else insert.unit,
         mesh_axes="+x,+y,+z" if insert is None else insert.axes,
-        sharing=Sharing(
-            reserve=table.reserve_Nm,
-            exponent=table.exponent,
-            weights=table.weights,
-            lowest=table.least_activation,
-            law=table.law,
-        ),
+        sharing=sharing_of(table),
     )
     links, trial = load_knee_trial(source, case.motion.time)
     _check_links(case, links.insert_in_tibia, links.hip)
