@@ -25,16 +25,20 @@ DRAWING = {
     "scene": {"body", "geometry", "inputs"},
     "equilibrium": {"body", "contact", "geometry", "muscles", "scene"},
     "plausibility": {"geometry", "inputs", "scene"},
+    "check": {*KNEE, "output", "plausibility", "run"},
+    "compare": {*SHOWN, "geometry"},
+    "decks": {"contact", "geometry", "output", "results", "results_folder", "run"},
     "importing": {"geometry", "inputs", "opensim", "scene"},
     "run": {*KNEE, *SHOWN} - {"results"},
     "output": {"columns", "contact", "geometry", "run"},
     "view": {*KNEE, *SHOWN, "run", "simulation"} - {"columns"},
-    "studies": {*KNEE, "inputs", "output", "run", "simulation"} - {"body"},
+    "studies": {*KNEE, "decks", "inputs", "output", "run", "simulation"} - {"body"},
     "muscles": {"geometry", "importing", "inputs", "opensim"},
     "designs": {"contact", "geometry"},
     "wear": {"contact", "geometry", "inputs", "output", "results_folder", "run", "scene"}
     | {"simulation"},
     "uncertainty": {*KNEE, "columns", "results", "results_folder", "run", "simulation"},
+    "cohort": {"columns", "geometry", "output", "results", "run", "scene", "simulation"},
     "validation": {"contact", "designs", "geometry", "simulation", "studies"},
 }
 """Which folder knows which folders and which modules beside them: inputs → body → (equilibrium ⇄

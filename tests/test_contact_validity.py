@@ -99,8 +99,9 @@ def test_a_peak_above_100_megapascal_is_flagged(name, insert):
     words = "peak above 100 MPa: polyethylene's law is not known there; is this the lip or an edge?"
     assert any(words in flag for flag in result.flags)
     report = PressReport(
-        name, 1.0, state.node_count, 2500.0, result, None, state.pair, "right", 0.0, 0.0, 0.0
-    )
+        name, 1.0, state.node_count, 2500.0, result, None, state.triangles, state.pair, "right",
+        0.0, 0.0, 0.0,
+    )  # fmt: skip
     assert any(words in line for line in report.lines() if line.startswith("note: "))
     assert any(words in flag for flag in report.as_dict()["flags"])
 

@@ -2,7 +2,6 @@
 
 import re
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -162,17 +161,16 @@ def test_stride_is_the_most_representative_one():
     plate = read_table(scene.ground_reaction.file)
     vertical = plate.column("ground_force_2_vy")
     strikes = plate.time()[1:][(vertical[1:] >= 20) & (vertical[:-1] < 20)]
-    forces, leans = [], []
-    for start, end in pairwise(strikes):
-        at = np.linspace(start, end, 51)
-        forces.append(load_ground_reaction(in_si(scene.ground_reaction), at, "right").force)
-        up = load_tibia(in_si(scene.tibia), at, "right", 6.0).pose[:, :3, 1]
-        leans.append(np.arctan2(up[:, [0, 2]], up[:, [1]]))
+    at = np.linspace(strikes[:-1], strikes[1:], 50, endpoint=False, axis=1).ravel()
+    force = load_ground_reaction(in_si(scene.ground_reaction), at, "right").force
+    up = load_tibia(in_si(scene.tibia), at, "right", 6.0).pose[:, :3, 1]
+    lean = np.arctan2(up[:, [0, 2]], up[:, [1]])
+    strides = len(strikes) - 1
+    forces, leans = force.reshape(strides, 50, 3), lean.reshape(strides, 50, 2)
     score = sum(
         distance / distance.mean()
         for distance in (
-            np.sqrt(np.mean((np.array(v) - np.mean(v, axis=0)) ** 2, axis=(1, 2)))
-            for v in (forces, leans)
+            np.sqrt(np.mean((v - np.mean(v, axis=0)) ** 2, axis=(1, 2))) for v in (forces, leans)
         )
     )
     best = int(np.argmin(score))

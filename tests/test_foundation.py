@@ -14,6 +14,7 @@ from tkamb.contact.foundation import (
 )
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
+from tkamb.contact.pressing import press_by_search
 from tkamb.contact.result import ContactStatus
 from tkamb.contact.samples import sample_surface
 from tkamb.errors import InputError
@@ -215,6 +216,28 @@ def test_out_of_range_is_nan_and_says_why():
     assert beside.status is ContactStatus.OUT_OF_RANGE
     assert "does not lie over the insert" in beside.flags[0]
     assert beside.medial is None
+
+
+@pytest.mark.parametrize("share", [0.5, 0.999, 1.05, 3.0])
+def test_where_the_range_ends_the_near_columns_say_what_the_whole_bed_does(share, monkeypatch):
+    model = ElasticFoundation(1e-3)
+    state = model.prepare(sphere_on_block(material("polyethylene")))
+    most = -model.evaluate(state, lowered(0.4999 * HEIGHT)).wrench_on_insert[1]
+    looked, evaluate = [], ElasticFoundation.evaluate
+
+    def counted(self, *arguments):
+        looked.append(1)
+        return evaluate(self, *arguments)
+
+    monkeypatch.setattr(ElasticFoundation, "evaluate", counted)
+    found = model.press(state, share * most, lowered(0))
+    few = len(looked)
+    whole = press_by_search(model, state, share * most, lowered(0))
+    assert found.status is whole.status
+    assert (found.status is ContactStatus.OK) == (share < 1.0)
+    assert found.flags == whole.flags
+    np.testing.assert_allclose(found.approach, whole.approach, rtol=1e-6)
+    assert few <= 2 < len(looked) - few  # the bed at the end, and once where the range ends
 
 
 def test_first_touch_of_crossed_cylinders_is_found_on_their_edges():

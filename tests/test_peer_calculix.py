@@ -13,12 +13,14 @@ from tkamb.contact.lattice.meshing.grid import build_grid
 from tkamb.contact.materials import material, tabulated_material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
+from tkamb.decks.calculix import Deck
+from tkamb.decks.problem import press_problem
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.surface import Surface
 from tkamb.studies import peer
 from tkamb.studies.bodies import balls, block, dishes
-from tkamb.studies.calculix import Deck, PeerRun, run_calculix
+from tkamb.studies.calculix import PeerRun, run_calculix
 from tkamb.studies.cases import study_case
 from tkamb.studies.peer import measure_by_calculix, press_by_calculix
 from tkamb.studies.references import read_references
@@ -47,7 +49,7 @@ def test_an_undeformed_insert_has_the_gaps_of_its_smooth_surface():
     """Facets of 2 mm in a dish: the lift is in the nodes already, the gap must not count it."""
     insert = block(lambda x, z: 8e-3 + (x**2 + z**2) / 120e-3, (16e-3, 16e-3), 2e-3)
     bodies = ContactPair(balls(22e-3, 0.0), insert, material(LINEAR))
-    problem = peer._problem(bodies, 500.0, knee_pose(np.zeros(6)), 1.0)
+    problem = press_problem(bodies, 500.0, knee_pose(np.zeros(6)), 1.0)
     still = np.zeros((len(problem.lattice.nodes), 4))
     still[:, 0] = np.arange(1, len(still) + 1)
     bent = peer._bent(problem, PeerRun({"NINSERT": still}, 0.0, 0.0, 0))

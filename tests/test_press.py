@@ -1,8 +1,10 @@
 """`tkamb press` on mesh files: what it prints, and that units, axes and side only relabel."""
 
+import base64
 import json
 from functools import partial
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -104,9 +106,15 @@ def test_report_has_the_interface_s_keys(meshes, capsys):
     assert 0 < found["approach_mm"] < 1
 
 
-def test_text_names_both_condyles(meshes, capsys):
+def test_text_names_both_condyles_and_the_map_is_written(meshes, capsys, tmp_path):
     femoral, insert = meshes()
-    assert main(["press", str(femoral), str(insert), "--load", "900", *FOUNDATION]) == 0
+    pressing = ["press", str(femoral), str(insert), "--load", "900", *FOUNDATION]
+    assert main([*pressing, "--out", str(tmp_path / "map.vtp")]) == 0
+    arrays = ElementTree.parse(tmp_path / "map.vtp").getroot().iter("DataArray")
+    (text,) = (one.text for one in arrays if one.get("Name") == "nodal_force_N")
+    force = np.frombuffer(base64.b64decode(text)[8:]).reshape(-1, 3)
+    assert force[:, 1].sum() == pytest.approx(-900, rel=1e-6)
+    assert main([*pressing, "--out", str(tmp_path / "map.stl")]) == 2
     text = capsys.readouterr().out
     assert "medial" in text
     assert "lateral" in text

@@ -7,18 +7,17 @@ from tkamb.cli import main
 from tkamb.run.profiling import Profile
 
 
-def profiled(folder, drop, capsys):
+def profiled(folder, drop, capsys, *options):
     scene = write_scene(folder / "scene", drop)
     out = folder / "out"
-    status = main(
-        ["run", str(scene), "--out", str(out), "--frames", "0:101:50", "--profile", "--json"]
-    )
+    run = ["run", str(scene), "--out", str(out), "--frames", "0:101:50", "--profile", "--json"]
+    status = main([*run, *options])
     assert status == 0
     return json.loads(capsys.readouterr().out)["profile"]
 
 
 def test_a_run_says_what_it_touched(tmp_path, capsys):
-    found = profiled(tmp_path, (), capsys)
+    found = profiled(tmp_path, (), capsys, "--contact", "foundation")
     names = {path.rsplit("/", 1)[-1] for path in found["files"]}
     assert {"scene.toml", "patient.urdf", "motion.csv", "insert.stl"} <= names
     assert found["frames"] == 3 and found["not_modelled"] == []

@@ -78,6 +78,7 @@ def test_page_stands_by_itself(kind, request):
     assert found.outside == []
     assert found.twice == []
     assert "http" not in text.replace("http-equiv", "")
+    assert "<h2>Muscles</h2>" not in text
     assert "@import" not in text
     assert all(r.startswith("#") for r in re.findall(r"url\(([^)]*)\)", text))
     assert len(text.encode()) < 5e6
@@ -390,3 +391,45 @@ def test_a_script_that_is_not_the_report_s_own_does_not_run(page, tmp_path, chro
     assert browser.evaluate("document.title") != "foreign"
     refused = [told for told in browser.problems if "Content Security Policy" in told]
     assert len(refused) >= 3
+
+
+def with_bands(run):
+    """Return a run with a band of 80 to 130 % around two of its columns, median 110 %."""
+    bands = {
+        f"{name}_{end}": factor * run[name]
+        for name in ("force_total_BW", "medial_peak_pressure_MPa")
+        for end, factor in (("p05", 0.8), ("p50", 1.1), ("p95", 1.3))
+    }
+    table = {
+        "samples": 256,
+        "largest_failed_share": 0.125,
+        "not_varied": ["segment_mass"],
+        "shares_of_variance": {"force_total_N": {"ml": 0.61, "adduction": 0.2, "rest": 0.19}},
+    }
+    summary = run.summary | {"uncertainty": table}
+    return Results(run.columns, summary, run.maps, bands=bands)
+
+
+def test_bands_are_drawn_at_their_percentiles_and_told_in_words(bend, page):
+    run = with_bands(bend)
+    found = report_html(run)
+    forces = re.search(r'id="figure-forces">.*?</svg>', found, re.DOTALL).group()
+    values, heights = bend["force_total_BW"], curve(found, "forces", "force_total_BW")[0][:, 1]
+    slope, offset = np.polyfit(values, heights, 1)
+    median = re.search(r'id="forces-median-force_total_BW">\s*<path d="([^"]+)"', forces).group(1)
+    drawn = np.array(re.findall(r"[ML] (\S+) (\S+)", median), float)[:, 1]
+    assert np.allclose(drawn, 1.1 * slope * values + offset, atol=0.01)
+    shade = re.search(
+        r'id="forces-band-force_total_BW">.*? d="([^"]+)".*? y="([^"]+)"', forces, re.DOTALL
+    )
+    y = np.array(re.findall(r"[ML] \S+ (\S+)", shade.group(1)), float) + float(shade.group(2))
+    assert y.min() == pytest.approx(slope * 1.3 * values.max() + offset, abs=0.01)
+    assert y.max() == pytest.approx(slope * 0.8 * values.min() + offset, abs=0.01)
+    assert "-band-" in re.search(r'id="figure-pressures">.*?</svg>', found, re.DOTALL).group()
+    assert "-band-" not in page
+    card = next(one for one in cards(run, horizontal_axis(run)) if one.title.startswith("How sure"))
+    peak = values.max()
+    assert card.value == f"{0.8 * peak:.2f}–{1.3 * peak:.2f} BW"
+    for words in ("5 to 95 % of 256", "ML (61%)", "up to 12% of the samples", "segment mass"):
+        assert words in card.detail
+    assert card.warning

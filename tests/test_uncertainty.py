@@ -1,20 +1,26 @@
 """Bands: known propagation, samples by number alone, and the case with its inputs moved."""
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from faults import Faults
+from interrupted_runs import broken_off, held_elsewhere
+from tkamb.claim import settle
 from tkamb.cli import main
+from tkamb.errors import InputError
 from tkamb.results_folder import BANDS_NAME, UNCERTAINTY_NAMES, write_results
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
 from tkamb.simulation import simulate
 from tkamb.uncertainty.bands import band_columns, influences, percentiles
 from tkamb.uncertainty.inputs import Draw
+from tkamb.uncertainty.kept import write_uncertainty
 from tkamb.uncertainty.run import estimate_uncertainty
 from tkamb.uncertainty.sample import Sampler
-from tkamb.uncertainty.sampling import noise, normal_samples
+from tkamb.uncertainty.sampling import Point, noise, normal_samples
 
 SCENE = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
 SLOPES = np.array([3.0, -2.0, 1.0, 0.5])
@@ -115,8 +121,8 @@ def draw_of(sampler, **normal):
 
 def sampled(sampler, monkeypatch, **normal):
     """Return the values of the sample that moves these inputs."""
-    monkeypatch.setattr(sampler, "draw", lambda number, z: draw_of(sampler, **normal))
-    return sampler.sample(0, np.zeros(0)).values
+    monkeypatch.setattr(sampler, "draw", lambda point: draw_of(sampler, **normal))
+    return sampler(0, Point.of(0, np.zeros(0))).values
 
 
 def test_a_sample_is_the_run_of_the_scene_with_its_inputs_moved(monkeypatch):
@@ -169,14 +175,8 @@ def test_interrupted_and_resumed_by_two_workers_it_is_what_one_worker_finds(tmp_
     scene = bodies_alone(uncertainty__ligament_strain=0.02, uncertainty__segment_mass=0.1)
     folder, options = tmp_path / "out", {"samples": 40, "frames": slice(0, 101, 25)}
 
-    def break_off(samples, count):
-        for index, one in enumerate(samples):
-            if index == 4:
-                raise KeyboardInterrupt
-            yield one
-
     with pytest.raises(KeyboardInterrupt, match="4 of 40 samples are kept"):
-        estimate_uncertainty(scene, **options, directory=folder, progress=break_off)
+        estimate_uncertainty(scene, **options, directory=folder, progress=broken_off(4))
     assert not (folder / BANDS_NAME).exists()
     one = estimate_uncertainty(scene, **options)
     two = estimate_uncertainty(scene, **options, directory=folder, resume=True, workers=2)
@@ -215,3 +215,29 @@ def test_a_scene_in_which_nothing_varies_is_refused():
     none += [f"uncertainty__centre_of_pressure_{axis}_mm" for axis in ("ap", "ml")]
     with pytest.raises(Exception, match="no input varies"):
         estimate_uncertainty(bodies_alone(**dict.fromkeys(none, 0.0)), samples=20)
+
+
+def test_two_runs_into_one_folder_are_refused_before_anything_is_computed(tmp_path):
+    folder, message = tmp_path / "out", "another tkamb is writing into this folder"
+    with held_elsewhere(folder), pytest.raises(InputError, match=message):
+        estimate_uncertainty(bodies_alone(), samples=20, directory=folder)
+    assert [path.name for path in folder.iterdir()] == [".tkamb"]
+
+
+def test_a_full_disk_leaves_no_bands_or_all_of_them(tmp_path, monkeypatch):
+    found = estimate_uncertainty(bodies_alone(), samples=20, frames=slice(0, 1))
+    monkeypatch.setattr("tkamb.output.report.report_html", lambda results: "page")
+
+    def write(folder, number=None):
+        folder.mkdir()
+        injected = Faults(folder, number).injected(monkeypatch)
+        with injected as faults, suppress(InputError):
+            write_uncertainty(found, folder)
+        settle(folder)
+        wanted = {"bands.csv", "tornado.csv", "samples.h5", "results.csv", "summary.json"}
+        return faults.calls, wanted, wanted & {path.name for path in folder.iterdir()}
+
+    calls, wanted, written = write(tmp_path / "whole")
+    assert written == wanted
+    for number in range(len(calls)):
+        assert write(tmp_path / f"full{number}", number)[2] in (set(), wanted)

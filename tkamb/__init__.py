@@ -9,6 +9,7 @@ Each name is imported when it is first used.
 """
 
 from importlib import import_module
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -19,7 +20,16 @@ if TYPE_CHECKING:
     from tkamb.simulation import simulate
     from tkamb.view.show import show
 
-__all__ = ["Results", "Scene", "contact_model", "load_scene", "read_results", "show", "simulate"]
+__all__ = [
+    "Results",
+    "Scene",
+    "__version__",
+    "contact_model",
+    "load_scene",
+    "read_results",
+    "show",
+    "simulate",
+]
 
 _HOMES = {
     "Results": "tkamb.results",
@@ -31,9 +41,19 @@ _HOMES = {
     "simulate": "tkamb.simulation",
 }
 
+__version__: str
+
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name == "__version__":
+        value: Any = version("tkamb")
+    elif name in _HOMES:
+        value = getattr(import_module(_HOMES[name]), name)
+    else:
         raise AttributeError(f"module 'tkamb' has no attribute '{name}'")
-    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
     return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

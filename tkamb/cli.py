@@ -11,6 +11,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from tkamb.check.command import add_check
+from tkamb.cohort.command import add_cohort
+from tkamb.compare.command import add_compare
 from tkamb.datasets.command import add_data
 from tkamb.export_command import add_export
 from tkamb.guard import guarded
@@ -62,8 +65,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"tkamb {version('tkamb')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     add_new(commands)
+    add_check(commands, _setting)
     _add_run(commands)
     _add_folder_commands(commands)
+    add_compare(commands)
     add_press(commands)
     add_contact(commands)
     add_mesh(commands)
@@ -76,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     add_stability(commands)
     add_wear(commands)
     add_uncertainty(commands, _slice, _setting)
+    add_cohort(commands)
     return parser
 
 

@@ -35,6 +35,7 @@ _MUSCLES = "[muscles]"
 _RECORDED = "[contact] with adduction not released"
 _MARKERS = "[motion.markers]"
 _ADJUST = "[contact] with adjust = true"
+_MEASURED = "[measured]"
 
 LIGAMENT = "ligament_<name>_N"
 """Stands for one column per [[ligament]], in the scene's order."""
@@ -42,7 +43,12 @@ MUSCLE_FORCE = "muscle_<name>_N"
 ACTIVATION = "activation_<name>"
 RESERVE = "reserve_<coordinate>_Nm"
 JOINT_MOMENT = "joint_moment_<coordinate>_Nm"
-FAMILIES = (LIGAMENT, MUSCLE_FORCE, ACTIVATION, RESERVE, JOINT_MOMENT)
+ENVELOPE = "envelope_<name>"
+CONTRIBUTIONS = {side: f"{side}_from_<name>_N" for side in ("medial", "lateral")}
+FAMILIES = (
+    *(LIGAMENT, MUSCLE_FORCE, ACTIVATION, RESERVE, JOINT_MOMENT, ENVELOPE),
+    *CONTRIBUTIONS.values(),
+)
 """Each stands for one column per ligament, muscle or coordinate."""
 
 COLUMNS: tuple[Column, ...] = (
@@ -199,6 +205,20 @@ COLUMNS: tuple[Column, ...] = (
         "axis on which contact and patella leave it",
         _MUSCLES,
     ),
+    *(
+        Column(
+            family,
+            f"what the muscle <name> adds to {side}_force_equilibrium_N with pose, contact points "
+            "and lines held; also of quadriceps, ligaments, external (weight, inertia, ground): "
+            "they sum up to it",
+            _MUSCLES,
+        )
+        for side, family in CONTRIBUTIONS.items()
+    ),
+    Column(ENVELOPE, "normalised EMG envelope of the muscle <name>", "[muscles.emg]"),
+    Column("measured_total_N", "axial force that was measured, as force_si_N", _MEASURED),
+    Column("measured_medial_N", "the same of the medial condyle", _MEASURED),
+    Column("measured_lateral_N", "the same of the lateral condyle", _MEASURED),
 )
 
 RENAMED = {"softest_N_per_mm": "smallest_stiffness_N_per_mm"}

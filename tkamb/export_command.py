@@ -4,6 +4,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from tkamb.errors import InputError
+
 
 def add_export(commands: Any) -> None:
     """Add the command `export` to the parser's commands."""
@@ -11,13 +13,71 @@ def add_export(commands: Any) -> None:
     export.add_argument("folder", type=Path, metavar="DIR")
     kind = export.add_mutually_exclusive_group(required=True)
     kind.add_argument("--sto", type=Path, metavar="F.sto", help="all columns, for OpenSim")
+    kind.add_argument(
+        "--vtp", action="store_true", help="pressure maps over time, for ParaView; needs --out"
+    )
+    kind.add_argument(
+        "--deck", choices=("ccx", "feb"), help="one frame's contact, for CalculiX or FEBio 4"
+    )
+    export.add_argument(
+        "--out", type=Path, metavar="DIR2", help="folder of --vtp; file of --deck (.inp, .feb)"
+    )
+    export.add_argument("--frame", type=int, metavar="K", help="of --deck: row of results.csv")
+    export.add_argument(
+        "--resolution", type=float, metavar="MM", help="of --deck: edge of its hexahedra"
+    )
     export.set_defaults(command=_export)
 
 
 def _export(options: argparse.Namespace) -> int:
+    if bool(options.vtp or options.deck) != bool(options.out):
+        mend = "--vtp --out DIR2, --deck ccx --frame K --out F.inp, or --sto F.sto alone"
+        raise InputError("--out belongs to --vtp and --deck, which need it", "export", mend)
+    if bool(options.deck) != (options.frame is not None):
+        raise InputError("--deck and --frame go together", "export", "--deck ccx --frame K")
+    if options.resolution is not None and not options.deck:
+        raise InputError("--resolution belongs to --deck", "export", "leave it out")
+    if options.deck:
+        return _export_deck(options)
+    return _export_maps(options) if options.vtp else _export_storage(options)
+
+
+def _export_deck(options: argparse.Namespace) -> int:
+    from tkamb.atomic import write_text
+    from tkamb.contact.registry import COARSEST_MM
+    from tkamb.decks.frame import SUFFIX, frame_press
+
+    if options.out.suffix.lower() != SUFFIX[options.deck]:
+        raise InputError(f"is no {SUFFIX[options.deck]} file", options.out, "name it so")
+    if options.resolution is not None and not 0 < options.resolution <= COARSEST_MM:
+        mend = f"give more than 0, at most {COARSEST_MM:g} mm"
+        raise InputError(f"resolution {options.resolution} mm", "--resolution", mend)
+    found = frame_press(options.folder, options.frame, options.resolution)
+    write_text(options.out, found.deck(options.deck))
+    print("\n".join([f"{options.out}: {found.comments()[0]}", *found.comments()[2:]]))
+    return 0
+
+
+def _export_storage(options: argparse.Namespace) -> int:
     from tkamb.output.storage import write_results_storage
     from tkamb.results_folder import read_results
 
     results = read_results(options.folder)
     print(f"{options.sto}: {write_results_storage(results, options.sto)}")
+    return 0
+
+
+def _export_maps(options: argparse.Namespace) -> int:
+    from tkamb.claim import claimed_directory
+    from tkamb.output.vtk import write_map_series
+    from tkamb.results_folder import read_results
+
+    results = read_results(options.folder)
+    if results.maps is None:
+        raise InputError("holds no contact.h5", options.folder, "run the scene with [contact]")
+    with claimed_directory(options.out) as folder:
+        names = write_map_series(results.maps, folder)
+    left = "; a left knee's mirror image" if results.summary.get("side") == "left" else ""
+    frames = f"{len(names) - 1} of {len(results)} frames"
+    print(f"{options.out / names[0]}: {frames}, m and Pa in the insert frame{left}")
     return 0

@@ -34,6 +34,7 @@ def add_press(commands: Any) -> None:
     press.add_argument("--material", default="polyethylene", metavar="NAME")
     _add_side(press)
     press.add_argument("--adjust", action=argparse.BooleanOptionalAction, default=False)
+    press.add_argument("--out", type=Path, metavar="F.vtp", help="the pressure map, for ParaView")
     press.add_argument("--json", action="store_true")
     press.set_defaults(command=_press)
 
@@ -41,6 +42,8 @@ def add_press(commands: Any) -> None:
 def _press(options: argparse.Namespace) -> int:
     from tkamb.press import press_meshes, read_pose
 
+    if options.out and options.out.suffix.lower() != ".vtp":
+        raise InputError("is no .vtp file", options.out, "name it like map.vtp")
     pose = read_pose(options.pose_file) if options.pose_file else options.pose
     report = press_meshes(
         options.femoral,
@@ -57,6 +60,8 @@ def _press(options: argparse.Namespace) -> int:
         adjust=options.adjust,
         options=without_cache(options.contact) if options.no_cache else None,
     )
+    if options.out:
+        report.write_map(options.out)
     print(json.dumps(report.as_dict(), indent=2) if options.json else "\n".join(report.lines()))
     return 0 if report.carried else 1
 

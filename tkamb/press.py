@@ -25,7 +25,7 @@ from tkamb.geometry.adjustment import adjust as adjusted
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.flat_bottom import insert_placement
-from tkamb.geometry.frames import Array, mirrored_pose
+from tkamb.geometry.frames import Array, Index, mirrored_pose
 from tkamb.geometry.frames import pose as pose_matrix
 from tkamb.inputs.meshes import axes_rotation, load_surface, mirrored
 from tkamb.known_errors import KnownError, as_json, known_error, known_error_words
@@ -54,6 +54,7 @@ class PressReport:
         load: N.
         result: the contact, in the insert frame (mirrored for a left knee).
         adjustment: what was done to the pose before contact, if anything.
+        triangles: (k, 3) of neighbouring map points.
         pair: the two bodies.
         side: of the knee.
         prepare_seconds: for the geometry.
@@ -68,6 +69,7 @@ class PressReport:
     load: float
     result: ContactResult
     adjustment: Adjustment | None
+    triangles: Index
     pair: ContactPair
     side: Side
     prepare_seconds: float
@@ -79,6 +81,19 @@ class PressReport:
     def carried(self) -> bool:
         """Whether the load was reached."""
         return self.result.status is ContactStatus.OK
+
+    def write_map(self, path: Path) -> None:
+        """Write the pressure map as .vtp (metres, insert frame; a left knee's mirror image).
+
+        Raises:
+            InputError: another format, or a place that cannot be written.
+        """
+        from tkamb.output.vtk import write_triangles
+
+        result = self.result
+        data = {"pressure_Pa": result.pressure, "gap_m": result.gap}
+        data |= {"nodal_force_N": result.nodal_force}
+        write_triangles(path, result.points, self.triangles, data)
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
@@ -213,6 +228,7 @@ def press_meshes(
         load=load,
         result=result,
         adjustment=adjustment,
+        triangles=state.triangles,
         pair=pair,
         side=side,
         prepare_seconds=prepared - started,

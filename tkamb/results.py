@@ -17,8 +17,12 @@ from tkamb.geometry.frames import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
     from tkamb.output.maps import ContactMaps
+
+PERCENTILES = {"p05": 5.0, "p50": 50.0, "p95": 95.0}
+"""Ending of a column of bands.csv -> per cent of the samples below it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +37,7 @@ class Results:
             in docs/results.md.
         maps: pressure maps per frame; None without contact.
         directory: where it was written to or read from.
+        bands: columns of bands.csv, where inputs were varied; else empty.
 
     Raises:
         InputError: an unknown column, columns of different lengths, or no time or status.
@@ -42,12 +47,25 @@ class Results:
     summary: dict[str, Any] = field(default_factory=dict)
     maps: "ContactMaps | None" = None
     directory: Path | None = None
+    bands: dict[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "columns", _complete_columns(self.columns))
 
     def __len__(self) -> int:
         return len(self.columns["status"])
+
+    def __repr__(self) -> str:
+        """Return in a line how much there is, of what."""
+        lost = sum(status.startswith("failed") for status in self.status)
+        contact = self.summary.get("contact") or {}
+        parts = [
+            f"{len(self)} frames" + (f" ({lost} failed)" if lost else ""),
+            contact.get("model", "no contact"),
+            f"{len(self.columns)} columns, {len(self.not_modelled)} of them not modelled",
+            "no maps" if self.maps is None else f"maps of {len(self.maps.points_m)} points",
+        ]
+        return f"<tkamb.Results: {', '.join(parts)}>"
 
     def __getitem__(self, name: str) -> Array:
         """Return a numeric column (f,).
@@ -72,6 +90,25 @@ class Results:
             for name, values in self.columns.items()
             if KINDS.get(name) != "text" and bool(np.isnan(values).all())
         )
+
+    def band(self, name: str) -> Array | None:
+        """Return p05, p50 and p95 (3, f) of a column; None where it has no band."""
+        ends = [self.bands.get(f"{name}_{end}") for end in PERCENTILES]
+        found = [end for end in ends if end is not None]
+        return np.array(found) if len(found) == len(ends) else None
+
+    def to_dataframe(self) -> "DataFrame":
+        """Return the columns as a pandas DataFrame, frames as rows; NaN where there is no number.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        try:
+            from pandas import DataFrame
+        except ImportError:
+            mend = "pip install 'tkamb[notebook]'"
+            raise InputError("pandas is not installed", "to_dataframe", mend) from None
+        return DataFrame(self.columns)
 
     def plot(self, *names: str, axis: str | None = None) -> "Figure":
         """Return plots of the run in one matplotlib figure, which notebooks show.
@@ -123,6 +160,22 @@ def read_csv(path: str | Path) -> dict[str, Any]:
         InputError: no such file, an unknown column, a row of another length, not a number.
     """
     path = Path(path)
+    cells = _cells_of(path)
+    return {name: _parse(name, values, path) for name, values in cells.items()}
+
+
+def read_bands(path: str | Path) -> dict[str, Array]:
+    """Read the columns of a bands.csv.
+
+    Raises:
+        InputError: no such file, a row of another length, not a number.
+    """
+    path = Path(path)
+    return {name: _numbers(name, cells, path) for name, cells in _cells_of(path).items()}
+
+
+def _cells_of(path: Path) -> dict[str, tuple[str, ...]]:
+    """Return the cells of a table, column by column, with names of earlier releases made ours."""
     try:
         rows = list(csv.reader(io.StringIO(read_text(path, TABLE_LIMIT))))
     except csv.Error as error:
@@ -134,7 +187,7 @@ def read_csv(path: str | Path) -> dict[str, Any]:
         if len(row) != len(header):
             raise InputError(f"line {number} has {len(row)} cells, not {len(header)}", path)
     cells = list(zip(*body, strict=True)) or [() for _ in header]
-    return {name: _parse(name, values, path) for name, values in zip(header, cells, strict=True)}
+    return dict(zip(header, cells, strict=True))
 
 
 def csv_text(columns: Mapping[str, Any]) -> str:
@@ -163,6 +216,10 @@ def _parse(name: str, cells: tuple[str, ...], path: Path) -> Any:
         return list(cells)
     if name not in KINDS and not in_a_family(name):
         raise InputError(f"unknown column '{name}'", path, names_near(name, KINDS))
+    return _numbers(name, cells, path)
+
+
+def _numbers(name: str, cells: tuple[str, ...], path: Path) -> Array:
     try:
         return np.array([float(cell) if cell else math.nan for cell in cells])
     except ValueError as error:

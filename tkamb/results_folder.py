@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from tkamb.claim import claimed_directory, settle
 from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
 from tkamb.files import MEGABYTE, read_json, sha256_of
-from tkamb.results import Results, csv_text, read_csv
+from tkamb.results import Results, csv_text, read_bands, read_csv
 
 if TYPE_CHECKING:
     from tkamb.output.maps import ContactMaps
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 CSV_NAME, SUMMARY_NAME, REPORT_NAME = "results.csv", "summary.json", "report.html"
 MAPS_NAME = "contact.h5"
 BANDS_NAME, TORNADO_NAME, SAMPLES_NAME = "bands.csv", "tornado.csv", "samples.h5"
-UNCERTAINTY_NAMES = (BANDS_NAME, TORNADO_NAME, SAMPLES_NAME)
+INDICES_NAME = "indices.csv"
+UNCERTAINTY_NAMES = (BANDS_NAME, TORNADO_NAME, SAMPLES_NAME, INDICES_NAME)
 """Stand beside the results that they belong to, and go with them."""
 SUMMARY_LIMIT = 256 * MEGABYTE
 """Bytes of a summary: a line for every failed frame."""
@@ -53,7 +54,9 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
         maps = read_maps(directory / MAPS_NAME)
     if check and (found := differences(directory, summary)):
         raise InputError(found[0], directory, "`tkamb verify` tells all; run it again")
-    return Results(columns, summary, maps, directory)
+    there = (directory / BANDS_NAME).exists()
+    bands = read_bands(directory / BANDS_NAME) if there else {}
+    return Results(columns, summary, maps, directory, bands)
 
 
 def read_summary(directory: Path) -> dict[str, Any]:
@@ -114,6 +117,8 @@ def write_results(
     from tkamb.output.report import report_html
     from tkamb.run.shards import remove_shards
 
+    if BANDS_NAME not in (more or {}):
+        results = replace(results, bands={})  # the page shows none that stand beside it nowhere
     with claimed_directory(directory, force) as folder:
         with replaced_together(folder) as files:
             _put_maps(results.maps, files)

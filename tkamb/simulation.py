@@ -134,6 +134,8 @@ class _Run:
         self.seconds["all"] = clock.perf_counter() - self.start
         summary = summary_of(self.case, columns, self.seconds, self.path, self.mechanics.strains)
         summary["questions"] = [question.text for question in self.plausibility.questions]
+        if self.mechanics.muscles is not None:
+            summary["muscle_groups"] = self.mechanics.muscles.groups
         summary["identity"] = self.identity
         summary["inputs"] = self.inputs
         summary["resumed_frames"] = self.resumed

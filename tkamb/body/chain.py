@@ -61,11 +61,8 @@ class Chain:
         lock = [full.getJointId(name) for name in full.names if name not in keep]
         model = pin.buildReducedModel(full, lock, pin.neutral(full)) if lock else full
         model.gravity = pin.Motion(np.array([0.0, -gravity, 0.0]), np.zeros(3))
-        self.model = model
         self._columns = [model.joints[model.getJointId(name)].idx_v for name in self.joints]
-        base = model.getJointId(KNEE_JOINT_NAMES[0])
-        self._insert_in_root = model.jointPlacements[base].homogeneous
-        self._tibia_in_root = model.frames[self.frame_id("tibia")].placement.homogeneous
+        self._take(model)
 
     def changed(self, mass_factor: float, insert_shift: Array) -> "Chain":
         """Return the chain with other masses, and the insert elsewhere on the tibia.
@@ -83,9 +80,33 @@ class Chain:
         base = model.getJointId(KNEE_JOINT_NAMES[0])
         placement = model.jointPlacements[base]
         model.jointPlacements[base] = placement * pin.SE3(np.eye(3), insert_shift)
-        other.model = model
-        other._insert_in_root = model.jointPlacements[base].homogeneous
+        other._take(model)
         return other
+
+    def scaled(self, length: float) -> "Chain":
+        """Return the chain of a body of the same shape and density, `length` times as large."""
+        other, model = copy.copy(self), pin.Model(self.model)
+        for joint in range(1, model.njoints):
+            inertia, placement = model.inertias[joint], model.jointPlacements[joint]
+            model.inertias[joint] = pin.Inertia(
+                length**3 * inertia.mass, length * inertia.lever, length**5 * inertia.inertia
+            )
+            model.jointPlacements[joint] = pin.SE3(
+                placement.rotation, length * placement.translation
+            )
+        for frame in model.frames:
+            frame.placement = pin.SE3(
+                frame.placement.rotation, length * frame.placement.translation
+            )
+        other._take(model)
+        return other
+
+    def _take(self, model: pin.Model) -> None:
+        """Make another model this chain's, and remember where the insert and the tibia are."""
+        self.model = model
+        base = model.getJointId(KNEE_JOINT_NAMES[0])
+        self._insert_in_root = model.jointPlacements[base].homogeneous
+        self._tibia_in_root = model.frames[self.frame_id("tibia")].placement.homogeneous
 
     def frame_id(self, link: str) -> int:
         """Return Pinocchio's id of a link's frame, or raise InputError naming the links."""

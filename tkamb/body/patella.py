@@ -30,6 +30,13 @@ TOLERANCE = 1e-8
 TURN_TOLERANCE = 1e-7
 """rad, of the rotation at which the moment vanishes."""
 
+FARTHEST_AHEAD = 8.0
+"""Lengths of a chord that a search looks ahead along it."""
+
+MOST_CHORDS = 10
+LEAST_TURN = 1e-5
+"""rad: a smaller turn says nothing of the moment's slope."""
+
 FIRST_STEP = np.deg2rad(0.5)
 WIDEST_TURN = np.deg2rad(40.0)
 """rad: first step and end of the search about the guess."""
@@ -181,6 +188,39 @@ def patella_at(
     return frame.state(balance, PatellaStatus.EDGE if edge else PatellaStatus.OK)
 
 
+class _Closing:
+    """Newton's steps that close gap and ligament length in the plane, with Broyden's slopes.
+
+    The contact's unit normal and the ligament's direction are the slopes to begin with. The
+    groove's flanks make the gap's up to a fifth less steep, which Broyden's updates learn.
+    """
+
+    def __init__(self, ligament_length: float) -> None:
+        self._length = ligament_length
+        self._slopes: Array = np.eye(2)
+        self._step: Array = np.zeros(2)
+        self.errors: Array = np.full(2, np.inf)
+
+    @property
+    def closed(self) -> bool:
+        return bool(np.abs(self.errors).max() < TOLERANCE)
+
+    def step(self, balance: _Balance) -> Array:
+        """Return the step (2,) in ap and si from a balance, 5 mm at most."""
+        before, stretch = self.errors, balance.ligament.length - self._length
+        self.errors = np.array([balance.contact.gap, stretch])
+        largest, last = float(np.abs(self.errors).max()), float(np.abs(before).max())
+        if largest < 0.5 * last < np.inf:
+            missed = self.errors - before - self._slopes @ self._step
+            self._slopes += np.outer(missed, self._step) / (self._step @ self._step)
+        else:
+            normal, direction = balance.contact.normal, balance.ligament.start_direction
+            self._slopes = np.stack([normal[:2], -direction[:2]])
+        step = np.linalg.solve(self._slopes, -self.errors)
+        self._step = np.asarray(step * min(1.0, 5e-3 / max(float(np.linalg.norm(step)), 1e-12)))
+        return self._step
+
+
 class _Frame:
     """The mechanism at one frame, in the patellar joint's frame."""
 
@@ -224,24 +264,20 @@ class _Frame:
         )
 
     def at_rotation(self, start: Array, rotation: float) -> _Balance:
-        """Return the balance where gap and ligament length hold at a rotation (Newton).
+        """Return the balance where gap and ligament length hold at a rotation (Newton, Broyden).
 
         Raises:
             ComputationError: they do not, or a line cannot run there.
         """
+        closing = _Closing(self.mechanism.ligament_length)
         coordinates = np.array([start[0], start[1], rotation])
         for _ in range(40):
             balance = self.balance(coordinates)
-            errors = np.array(
-                [balance.contact.gap, balance.ligament.length - self.mechanism.ligament_length]
-            )
-            if np.abs(errors).max() < TOLERANCE:
+            step = closing.step(balance)
+            if closing.closed:
                 return balance
-            slopes = np.stack([balance.contact.normal[:2], -balance.ligament.start_direction[:2]])
-            step = np.linalg.solve(slopes, -errors)
-            step *= min(1.0, 5e-3 / np.linalg.norm(step))
             coordinates = coordinates + np.append(step, 0.0)
-        worst = np.argmax(np.abs(errors))
+        worst = np.argmax(np.abs(closing.errors))
         raise _Lost((PatellaStatus.GAP, PatellaStatus.LIGAMENT)[worst])
 
     def follow(self, guess: Array) -> _Balance:
@@ -250,29 +286,61 @@ class _Frame:
         Raises:
             ComputationError: there is none within `WIDEST_TURN`.
         """
-        here, step = self.at_rotation(guess, float(guess[2])), FIRST_STEP
-        before = here
+        here = self.at_rotation(guess, float(guess[2]))
+        step = FIRST_STEP
         while abs(here.coordinates[2] - guess[2]) < WIDEST_TURN:
-            turn = float(here.coordinates[2] + np.sign(here.moment) * step)
-            there = self.at_rotation(_on_line(before, here, turn), turn)
+            turn = here.coordinates[2] + np.sign(here.moment) * step
+            there = self.at_rotation(here.coordinates, float(turn))
             if there.moment * here.moment <= 0.0:
                 return self.between(here, there)
-            before, here, step = here, there, 1.6 * step
+            ahead = self._chord(here, there, FARTHEST_AHEAD)
+            if ahead is not None:
+                return ahead
+            here, step = there, 1.6 * step
         raise _Lost(PatellaStatus.MOMENT)
 
     def between(self, here: _Balance, there: _Balance) -> _Balance:
         """Return the balance at the zero of the moment between two rotations."""
-        before, last = there, here
+        found = self._chord(here, there)
+        if found is not None:
+            return found
+        last = here
 
         def moment(rotation: float) -> float:
-            nonlocal before, last
-            start = _on_line(before, last, rotation)
-            before, last = last, self.at_rotation(start, rotation)
+            nonlocal last
+            last = self.at_rotation(last.coordinates, rotation)
             return last.moment
 
         ends = (here.coordinates[2], there.coordinates[2])
         brentq(moment, *ends, xtol=TURN_TOLERANCE, rtol=1e-12)
         return last
+
+    def _chord(self, here: _Balance, there: _Balance, reach: float = 1.0) -> _Balance | None:
+        """Return the stable balance on the chord of two by mending all three conditions at once.
+
+        Each step closes gap and ligament and turns along the chord from `here` to `there` as
+        far as the moment's slope asks. None where that leads beyond `reach` times the chord, to
+        an unstable place, or does not end.
+        """
+        way = there.coordinates - here.coordinates
+        slope = (there.moment - here.moment) / way[2]
+        closing, turned = _Closing(self.mechanism.ligament_length), 0.0
+        coordinates, before = here.coordinates - here.moment / slope * way / way[2], here.moment
+        for _ in range(MOST_CHORDS):
+            balance = self.balance(coordinates)
+            if abs(turned) > LEAST_TURN:
+                slope = (balance.moment - before) / turned
+            before, turned = balance.moment, -balance.moment / slope
+            along = turned * way / way[2]
+            step = closing.step(balance)
+            if slope >= 0.0:
+                return None
+            if closing.closed and abs(turned) < TURN_TOLERANCE:
+                return balance
+            coordinates = coordinates + along + np.append(step, 0.0)
+            if not 0.0 <= (coordinates[2] - here.coordinates[2]) / way[2] <= reach:
+                return None
+        return None
 
     def scan(self) -> tuple[_Balance, bool]:
         """Return the stable balance with the shortest muscle, and whether there are more.
@@ -361,14 +429,6 @@ _CONDITIONS = (
 def _condition(error: ComputationError) -> PatellaStatus:
     """Return the condition that a search missed; errors of the lines have no status."""
     return error.status if isinstance(error, _Lost) else PatellaStatus.LINE
-
-
-def _on_line(before: _Balance, last: _Balance, rotation: float) -> Array:
-    """Return coordinates (3,) at a rotation on the line through those of two balances."""
-    change = last.coordinates - before.coordinates
-    if change[2] == 0.0:
-        return last.coordinates
-    return np.asarray(last.coordinates + (rotation - last.coordinates[2]) / change[2] * change)
 
 
 def _cross(a: Array, b: Array) -> float:

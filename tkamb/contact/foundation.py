@@ -19,6 +19,8 @@ NEAR = 1e-3
 """m; columns nearer than this take part in the search for a load."""
 THINNEST = 1e-6
 """m; a layer thinner than this, at the insert's rim, counts as this thick."""
+NARROW = 1e-12
+"""m; with a stiffness of some 1e8 N/m a reaction rises by 1e-4 N between approaches this near."""
 NEARBY = 1.5e-3
 """m; the columns nearer than this are looked at while the femur moves by less."""
 
@@ -98,7 +100,23 @@ class ElasticFoundation(ContactModel):
         result = press_by_search(self, state, load, pose, guess, nearby.reaction)
         if result.status is ContactStatus.OK and result.residual <= LOAD_TOLERANCE:
             return result
+        if result.status is ContactStatus.OUT_OF_RANGE and self._holds(nearby, load):
+            return result
         return press_by_search(self, state, load, pose, guess)
+
+    def _holds(self, nearby: "_NearColumns", load: float) -> bool:
+        """Say whether the whole bed is out of range where the near columns are.
+
+        Their reaction is a part of the whole bed's, so that this is out of range too where they
+        are; and it carries less than the load up to there if it does just before, since it rises
+        with the approach. One evaluation there thus says what a search over the bed would.
+        """
+        if nearby.beyond - nearby.within > NARROW:
+            return False
+        pose = nearby.state.pair.pose_at_approach(nearby.pose, nearby.within)
+        found = self.evaluate(nearby.state, pose)
+        reaction = -float(found.wrench_on_insert[1])
+        return found.status is ContactStatus.OK and reaction < (1.0 - 2.0 * LOAD_TOLERANCE) * load
 
     def probe(self, state: SampledContact, guess: ContactResult | None = None) -> Any:
         """Return the probe with near columns and exact stiffness; see `ContactModel`."""
@@ -116,24 +134,32 @@ class LinearFoundation(ElasticFoundation):
 
 
 class _NearColumns:
-    """The reaction of the columns that lie near the femoral component."""
+    """The reaction of the columns that lie near the femoral component.
+
+    Attributes:
+        within: m, the greatest approach so far that is in their range; -inf: none.
+        beyond: m, the smallest that is not; inf: none.
+    """
 
     def __init__(self, law: Law, state: SampledContact, pose: Array) -> None:
-        self._law, self._state, self._pose = law, state, pose
+        self._law, self.state, self.pose = law, state, pose
         self._reach, self._near = -np.inf, state.surface
+        self.within, self.beyond = -np.inf, np.inf
 
     def reaction(self, approach: float) -> float:
         """Return the reaction (N) at an approach (m); inf where it is out of range."""
-        samples, pair = self._state.surface, self._state.pair
-        pose = pair.pose_at_approach(self._pose, approach)
+        samples, pair = self.state.surface, self.state.pair
+        pose = pair.pose_at_approach(self.pose, approach)
         if approach > self._reach:
-            gap = gaps_along_normals(samples, self._state.pair.femoral, pose)
+            gap = gaps_along_normals(samples, pair.femoral, pose)
             self._near, self._reach = samples.part(gap < NEAR), approach + NEAR / 2
         near = self._near
-        gap = gaps_along_normals(near, self._state.pair.femoral, pose)
+        gap = gaps_along_normals(near, pair.femoral, pose)
         strain = np.maximum(-gap, 0.0) / np.maximum(near.thickness, THINNEST)
         if (strain >= DEEPEST).any():
+            self.beyond = min(self.beyond, approach)
             return np.inf
+        self.within = max(self.within, approach)
         pressure = layer_pressure(self._law, pair.material, strain)
         return float((pressure * near.area) @ near.normals[:, 1])
 

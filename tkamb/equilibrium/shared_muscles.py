@@ -12,8 +12,9 @@ import numpy as np
 from tkamb.body.crossing import CrossingLines, MuscleShare
 from tkamb.body.extensor_response import FlexionRow, flexion_row, yielding_flexion_row
 from tkamb.body.knee import KneeGeometry, KneeLoads, solve_knee, unsolved
-from tkamb.errors import ComputationError, InputError
+from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose
+from tkamb.muscles.emg import EmgGuide
 from tkamb.muscles.knee_trial import KneeTrial
 from tkamb.muscles.recording import LegRecording, load_knee_trial
 from tkamb.muscles.sharing import Sharing
@@ -42,6 +43,11 @@ class SharedMuscles:
         flip = MIRROR if left else np.eye(3)
         self.trial, self._names = trial, trial.muscles
         self._shank, self._thigh = trial.shank @ flip, trial.thigh @ flip
+
+    @property
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """Group of muscles -> their names (`tkamb.muscles.leg.muscle_groups`)."""
+        return dict(self.trial.groups)
 
     def share(
         self, k: int, geometry: KneeGeometry, friction: float, lifted: frozenset[str]
@@ -184,7 +190,39 @@ def load_muscles(case: Case) -> SharedMuscles:
     )
     links, trial = load_knee_trial(source, case.motion.time)
     _check_links(case, links.insert_in_tibia, links.hip)
+    if table.emg is not None:
+        trial = _guided(case, trial)
     return SharedMuscles(trial, scene.patient.side == "left")
+
+
+def _guided(case: Case, trial: KneeTrial) -> KneeTrial:
+    """Return the trial with the scene's EMG in it, where it is more than reported.
+
+    Raises:
+        InputError: a muscle that the model does not have, or frames without EMG.
+    """
+    table, envelopes, time = case.scene.muscles, case.emg, case.motion.time
+    assert table is not None and table.emg is not None and envelopes is not None
+    for name in envelopes.channel_of:
+        if name not in trial.muscles:
+            mend = names_near(name, trial.muscles, "the leg's muscles")
+            raise InputError(f"no muscle '{name}'", "[muscles.emg] channels", mend)
+    if table.emg.use == "report":
+        return trial
+    values = np.full((len(time), len(trial.muscles)), np.nan)
+    for name in envelopes.channel_of:
+        values[:, trial.muscles.index(name)] = envelopes.at(name, time)
+        if np.isnan(values[:, trial.muscles.index(name)]).any():
+            raise InputError(
+                f"covers {envelopes.time[0]:g} to {envelopes.time[-1]:g} s, the frames "
+                f"{time[0]:g} to {time[-1]:g} s",
+                envelopes.path,
+                "EMG that guides the muscles is needed in every frame",
+            )
+    size = table.emg.weight if table.emg.use == "target" else table.emg.width
+    assert size is not None
+    guide = EmgGuide(values, table.emg.use, size)
+    return replace(trial, problems=replace(trial.problems, guide=guide))
 
 
 def _check_links(case: Case, insert_in_tibia: Array, hip: Array) -> None:

@@ -186,3 +186,45 @@ class ForceRecording:
     laboratory_axes: str
     unloaded: float
     surface: float
+
+
+@dataclass(frozen=True, eq=False)
+class ForceMeasurement:
+    """What an instrumented implant measured.
+
+    Args:
+        file: the file.
+        columns: time, total, medial, lateral -> column name, or column -> factor of a sum.
+        unit: of the forces.
+        offset: s, added to the file's clock it is the motion's.
+        format: a name of `tkamb.inputs.tables.READERS`; None: the suffix.
+    """
+
+    file: Path
+    columns: dict[str, str | dict[str, float]]
+    unit: str
+    offset: float
+    format: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class EmgRecording:
+    """Surface EMG and what its envelopes are made by.
+
+    Args:
+        file: a C3D file or a table.
+        time: of a table: its column of times.
+        offset: s, added to the file's clock it is the motion's.
+        channels: channel -> muscles.
+        high_pass: Hz, before rectifying.
+        cutoff: Hz, low-pass after it.
+        normalised_by: "recording", or channel -> value in its unit.
+    """
+
+    file: Path
+    time: str
+    offset: float
+    channels: dict[str, tuple[str, ...]]
+    high_pass: Cutoff
+    cutoff: float
+    normalised_by: Literal["recording"] | dict[str, float]

@@ -1,5 +1,6 @@
 """Read recorded tables: `.csv`, OpenSim `.sto` and `.mot`, and markers of `.trc` and `.c3d`."""
 
+import contextlib
 import math
 import re
 from collections import Counter
@@ -20,6 +21,8 @@ TRC_ROUNDING_S = 1e-3
 _NOT_A_NUMBER = re.compile(r"[+-]?(nan(\(\w*\))?|1\.#(ind|qnan)0*)")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
 """Plain decimal: Python alone also reads 1_000 and the digits of other scripts."""
+_OF_NUMBERS = "0123456789+-.eE "
+"""What plain decimals are written with."""
 _INFINITE = re.compile(r"[+-]?inf(inity)?")
 _LARGEST = 1e12
 """Beyond any measurement and any clock: the square of a larger number may overflow."""
@@ -139,7 +142,10 @@ def read_lines(path: Path) -> list[str]:
 
 
 def read_csv(path: Path) -> Table:
-    """Comma-separated: one header row; empty lines and lines that begin with # are skipped."""
+    """Comma-separated: one header row; empty lines and lines that begin with # are skipped.
+
+    Empty cells behind the last name are left out: some programs end every line with a comma.
+    """
     lines = read_lines(path)
     rows = [
         (number, line.split(","))
@@ -153,7 +159,11 @@ def read_csv(path: Path) -> Table:
         if len(names) == 1 and sign in names[0]:
             mend = "save it with commas between the cells and points in the numbers"
             raise InputError(f"has {word} between its cells, not commas", path, mend)
-    return Table(path, _columns(path, names, rows[1:]))
+    body = [
+        (number, cells if any(map(str.strip, cells[len(names) :])) else cells[: len(names)])
+        for number, cells in rows[1:]
+    ]
+    return Table(path, _columns(path, names, body))
 
 
 def read_storage(path: Path) -> Table:
@@ -239,8 +249,18 @@ def _columns(path: Path, names: list[str], rows: list[tuple[int, list[str]]]) ->
         if len(cells) != len(names):
             wrong = f"line {number} has {len(cells)} cells, the header {len(names)}"
             raise InputError(wrong, path, _why_uneven(len(cells), len(names)))
-        values[k] = [_number(cell, path, number) for cell in cells]
+        values[k] = _row(cells, path, number)
     return {name: values[:, k].copy() for k, name in enumerate(names)}
+
+
+def _row(cells: list[str], path: Path, line: int) -> list[float]:
+    if not "".join(cells).strip(_OF_NUMBERS):
+        # The whole row at once is quicker; what is no number after all gets its message below.
+        with contextlib.suppress(ValueError):
+            numbers = [float(cell) for cell in cells]
+            if max(numbers) <= _LARGEST and min(numbers) >= -_LARGEST:
+                return numbers
+    return [_number(cell, path, line) for cell in cells]
 
 
 def _number(cell: str, path: Path, line: int) -> float:

@@ -6,7 +6,7 @@ the arms of the muscles that cross the knee (`tkamb.body.extensor_response`).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.importing.links import Links
 from tkamb.muscles.bones import Bones
+from tkamb.muscles.leg import muscle_groups
 from tkamb.muscles.sharing import FrameProblems, Sharing
 from tkamb.muscles.trial import trial_problems
 from tkamb.opensim.motion import CoordinateMotion
@@ -30,6 +31,7 @@ class KneeTrial:
         crossing: (c,) places of the other muscles that cross the knee.
         shank: (f, c, 3) m, where these leave shank or foot, tibia link.
         thigh: (f, c, 3) m, where they reach thigh or pelvis, femur link.
+        groups: name of a group -> its muscles, see `muscle_groups`.
     """
 
     problems: FrameProblems
@@ -38,6 +40,7 @@ class KneeTrial:
     crossing: np.ndarray
     shank: Array
     thigh: Array
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def muscles(self) -> tuple[str, ...]:
@@ -63,8 +66,14 @@ class KneeTrial:
         # a muscle without a taut path keeps its NaN, so that the frame fails by its name
         lost = np.isnan(table[0]).any(axis=1)
         table[0, :, self.flexion] = np.where(lost, np.nan, row)
+        guide = None if whole.guide is None else whole.guide.only(k)
         frame = replace(
-            whole, moment=moments, arms=table, active=whole.active[own], passive=whole.passive[own]
+            whole,
+            moment=moments,
+            arms=table,
+            active=whole.active[own],
+            passive=whole.passive[own],
+            guide=guide,
         )
         return frame, frame.solved(0)
 
@@ -98,7 +107,8 @@ def knee_trial(
         raise InputError("no muscle leads to or past a patella", leg.model.name)
     crossing, shank, thigh = _crossing_lines(links, bones, extensor)
     flexion = problems.coordinates.index(leg.flexion)
-    return KneeTrial(problems, flexion, extensor, crossing, shank, thigh)
+    groups = muscle_groups(leg, problems.muscles)
+    return KneeTrial(problems, flexion, extensor, crossing, shank, thigh, groups)
 
 
 def _crossing_lines(

@@ -1,6 +1,6 @@
 """Which coordinates and muscles of a model belong to a leg, and what loads its foot."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -9,9 +9,20 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.importing.anatomy import Leg, find_leg
 from tkamb.inputs.ground_reaction import GroundReaction
-from tkamb.opensim.lines import Muscle, PathPoint
+from tkamb.opensim.lines import AnyPathPoint, Muscle, PathPoint
 from tkamb.opensim.model import Joint, OpenSimModel
 
+EXTENSORS = "knee extensors"
+GROUPS = {
+    frozenset(["patella"]): EXTENSORS,
+    frozenset(["thigh", "tibia"]): "thigh to shank",
+    frozenset(["thigh", "foot"]): "thigh to foot",
+    frozenset(["thigh"]): "across the hip",
+    frozenset(["tibia", "foot"]): "shank to foot",
+    frozenset(["tibia"]): "within the shank",
+    frozenset(["foot"]): "within the foot",
+}
+"""Where a muscle's ends lie -> its group's name."""
 SAME = 1e-6
 """Relative or m: strengths, lengths and points that differ by less are the same."""
 
@@ -54,6 +65,27 @@ def leg_muscles(leg: Leg) -> tuple[str, ...]:
     ]
     twins = set(length_twins(leg.model).values())
     return tuple(name for name in names if name not in twins)
+
+
+def muscle_groups(leg: Leg, muscles: Sequence[Muscle]) -> dict[str, tuple[str, ...]]:
+    """Return group -> names of its muscles, by the bones that a muscle's path ends on.
+
+    The extensors of the knee end on the patella or lead past it; whatever lies above the thigh
+    counts as thigh.
+    """
+    bones = leg_bones(leg)
+
+    def region(point: AnyPathPoint) -> str:
+        return next((name for name in ("tibia", "foot") if point.body in bones[name]), "thigh")
+
+    groups: dict[str, tuple[str, ...]] = dict.fromkeys(GROUPS.values(), ())
+    for muscle in muscles:
+        points = muscle.path.points
+        group = GROUPS[frozenset([region(points[0]), region(points[-1])])]
+        if leg.patella is not None and leg.patella in [point.body for point in points]:
+            group = EXTENSORS
+        groups[group] = (*groups[group], muscle.name)
+    return {group: names for group, names in groups.items() if names}
 
 
 def length_twins(model: OpenSimModel) -> dict[str, str]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
+from tkamb.muscles.emg import EmgGuide
 from tkamb.muscles.hill import LONGEST
 from tkamb.muscles.static_optimisation import LoadSharing, share_load
 from tkamb.opensim.lines import Muscle
@@ -65,7 +66,10 @@ class Sharing:
 
 @dataclass(frozen=True, eq=False)
 class FrameProblems:
-    """All frames' problems; arrays as in `MuscleTrial`, forces as in `rigid_tendon_strength`."""
+    """All frames' problems; arrays as in `MuscleTrial`, forces as in `rigid_tendon_strength`.
+
+    `guide`: what EMG asks of the activations, if anything.
+    """
 
     muscles: list[Muscle]
     coordinates: tuple[str, ...]
@@ -74,6 +78,7 @@ class FrameProblems:
     arms: Array
     active: Array
     passive: Array
+    guide: EmgGuide | None = None
 
     def solved(self, k: int) -> tuple[Array, Array, float, str]:
         """Return activations (m,), reserves (c,), KKT residual and status of frame k."""
@@ -108,7 +113,7 @@ class FrameProblems:
         count, reserve = len(self.muscles), self.sharing.reserves(self.coordinates)
         none = reserve == 0.0
         turned = self.arms[k].T
-        return LoadSharing(
+        problem = LoadSharing(
             weight=_weights(self.muscles, self.sharing),
             lowest=np.full(count, self.sharing.lowest),
             highest=np.full(count, self.sharing.highest),
@@ -119,6 +124,7 @@ class FrameProblems:
             reserve=np.where(none, np.inf, reserve),
             exponent=self.sharing.exponent,
         )
+        return problem if self.guide is None else self.guide.applied(problem, k)
 
 
 def _weights(muscles: Sequence[Muscle], sharing: Sharing) -> Array:

@@ -16,6 +16,12 @@ from tkamb.run.agreement import LARGE_RESIDUAL, SHARES_APART
 if TYPE_CHECKING:
     from tkamb.results import Results
 
+BANDED = {"force_total_N": "the total", "medial_force_N": "the medial force"}
+AXIS_NAMES = {"ap": "AP", "si": "SI", "ml": "ML"}
+MOST_INPUTS = 2
+"""How many inputs a sentence names."""
+NOTABLE_FAILED = 0.05
+"""Share of samples: where more fail, the bands leave out a whole tail."""
 PRESSURE_AND_AREA = ("peak_pressure", "mean_pressure", "area")
 
 
@@ -54,6 +60,8 @@ def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
     found = (
         _questions(results),
         _peak_force(results, axis),
+        _band(results, axis),
+        _measured(results),
         _shares(results),
         _peak_pressure(results, axis),
         _extensor(results, axis),
@@ -89,6 +97,52 @@ def _peak_force(results: "Results", axis: HorizontalAxis) -> Card | None:
         f"{100 * share:.1f} % of it superior–inferior"
     )
     return Card("Peak contact force", f"{found.value:.2f} BW", detail)
+
+
+def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
+    """Return how sure the peak force is, what moves it, and what the band leaves out."""
+    table, peak = results.summary.get("uncertainty"), metrics.peak(results, "force_total_BW")
+    band = results.band("force_total_BW")
+    if not table or peak is None or band is None:
+        return None
+    low, middle, high = band[:, peak.frame]
+    parts = [f"5 to 95 % of {table['samples']} samples, median {middle:.2f} BW"]
+    if not np.isfinite(low):
+        parts = [f"no band {_where(results, axis, peak.frame)}: too many samples failed"]
+    parts += [
+        f"{words} varies most with {_largest(table, name)}"
+        for name, words in BANDED.items()
+        if _largest(table, name)
+    ]
+    worst, held = table["largest_failed_share"], table["not_varied"]
+    if worst > NOTABLE_FAILED:
+        parts.append(f"in up to {worst:.0%} of the samples a frame failed")
+    if held:
+        names = ", ".join(name.replace("_", " ") for name in held)
+        parts.append(f"not varied, and so not in the band: {names}")
+    value = f"{low:.2f}–{high:.2f} BW" if np.isfinite(low) else "–"
+    return Card("How sure the peak is", value, "; ".join(parts), bool(held))
+
+
+def _largest(table: Mapping[str, Any], result: str) -> str:
+    """Return the inputs with the largest shares in a result's variance, in words."""
+    shares = (table.get("shares_of_variance") or {}).get(result) or {}
+    first = [(name, share) for name, share in shares.items() if name != "rest"][:MOST_INPUTS]
+    return ", ".join(f"{_plain(name)} ({share:.0%})" for name, share in first if share >= 0.01)
+
+
+def _plain(name: str) -> str:
+    return AXIS_NAMES.get(name, name.replace("_", " ").replace(".", " "))
+
+
+def _measured(results: "Results") -> Card | None:
+    """Return how far the run is from what an instrumented implant measured, with [measured]."""
+    if not results.summary.get("measured"):
+        return None
+    from tkamb.output.comparison import comparison_words
+
+    value, detail, incomplete = comparison_words(results.summary["measured"])
+    return Card("Against what was measured", value, detail, incomplete)
 
 
 def _shares(results: "Results") -> Card | None:
@@ -190,7 +244,7 @@ def _frames(results: "Results") -> Card:
     if failed or flagged:
         words = [f"{failed} failed (no numbers)"] if failed else []
         words += [f"{flagged} to be read with care"] if flagged else []
-        detail = "; ".join(words) + ": see the table below"
+        detail = "; ".join(words) + ": why is in the report's table and in column status"
     else:
         detail = "none failed, none flagged"
     return Card("Frames computed", value, detail, bool(failed or flagged))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import h5py
 import numpy as np
@@ -20,6 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from tkamb.atomic import replaced_file
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
+
+if TYPE_CHECKING:
+    from pyvista import MultiBlock
 
 UNITS = "SI: m, s, Pa, N; poses 4x4"
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
@@ -216,6 +219,34 @@ class ContactMaps:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def to_pyvista(self) -> "MultiBlock":
+        """Return the maps for PyVista: one block a frame, "frame 0" first.
+
+        Each is the insert's articular surface (m, insert frame) with pressure_Pa, gap_m,
+        nodal_force_N at its points, and time_s as field data; a failed frame holds NaN.
+
+        Raises:
+            InputError: PyVista is not installed.
+        """
+        try:
+            from pyvista import MultiBlock, PolyData
+        except ImportError:
+            mend = "pip install 'tkamb[notebook]'"
+            raise InputError("PyVista is not installed", "to_pyvista", mend) from None
+        faces = np.insert(self.triangles, 0, 3, axis=1)
+        blocks = MultiBlock()
+        for k, time in enumerate(self.time_s):
+            block = PolyData(self.points_m, faces)
+            for name, values in self.frame_data(k).items():
+                block.point_data[name] = values
+            block.field_data["time_s"] = [time]
+            blocks.append(block, f"frame {k}")
+        return blocks
+
+    def frame_data(self, k: int) -> dict[str, Array]:
+        """Return pressure_Pa (n,), gap_m (n,) and nodal_force_N (n, 3) of frame k by name."""
+        return {name: getattr(self, name)[k] for name in ("pressure_Pa", "gap_m", "nodal_force_N")}
 
     def _array(self, name: str, frames: int | None = None) -> Any:
         if not isinstance(self.source, Path):

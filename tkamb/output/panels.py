@@ -33,6 +33,9 @@ class Line:
         values: (f,) in the panel's unit.
         colour: of the line.
         dashed: drawn dashed.
+        band: (3, f) p05, p50 and p95 over samples with varied inputs, in the panel's unit; None:
+            there are none.
+        behind: drawn broad and pale behind the others: what they are held against.
     """
 
     name: str
@@ -40,6 +43,8 @@ class Line:
     values: Array
     colour: str
     dashed: bool = False
+    band: Array | None = None
+    behind: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +109,10 @@ def _line(
     scale: float = 1.0,
 ) -> Line:
     values = results.columns.get(column, np.full(len(results), np.nan))
-    return Line(column, label, values * scale, colour, dashed)
+    band = results.band(column)
+    return Line(
+        column, label, values * scale, colour, dashed, None if band is None else band * scale
+    )
 
 
 def _components(results: "Results", stem: str, unit: str, scale: float = 1.0) -> tuple[Line, ...]:
@@ -127,9 +135,10 @@ def _both_sides(
 
 def _total(results: "Results") -> Panel:
     scale = 1 / body_weight(results)
-    total = Line("force_total_BW", "total", results["force_total_BW"], BLACK)
+    total = _line(results, "force_total_BW", "total", BLACK)
     parts = _components(results, "force", "N", scale)
     lines = (total, replace(parts[0], label="superior–inferior", dashed=True), *parts[1:])
+    lines += (_measured(results, "total", "measured, axial", BLACK),)
     note = "On the insert; SI positive in compression. Residuals are not included."
     return Panel("forces", "Tibiofemoral contact force", "BW", lines, note)
 
@@ -139,12 +148,18 @@ def _condyles(results: "Results") -> Panel:
     lines = (
         *_both_sides(results, "force_N", ", deformation", scale=scale),
         *_both_sides(results, "force_equilibrium_N", ", equilibrium", dashed=True, scale=scale),
+        *(_measured(results, s, f"{s}, measured", colour) for s, colour in SIDE_COLOURS.items()),
     )
     note = (
         "Deformation: the total load is pressed in at the measured rotation. "
         "Equilibrium: balance of coronal moments."
     )
     return Panel("condyles", "Medial and lateral force, two estimates", "BW", lines, note)
+
+
+def _measured(results: "Results", name: str, label: str, colour: str) -> Line:
+    line = _line(results, f"measured_{name}_N", label, colour, scale=1 / body_weight(results))
+    return replace(line, behind=True)
 
 
 def _share(results: "Results") -> Panel:

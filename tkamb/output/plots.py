@@ -16,7 +16,7 @@ from matplotlib.ticker import (
 from tkamb.errors import InputError
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
 from tkamb.output.metrics import failed, flagged
-from tkamb.output.panels import Panel, centre_panel, panels
+from tkamb.output.panels import Line, Panel, centre_panel, panels
 from tkamb.output.style import BLACK, GREY, ORANGE, legend_above, new_figure, settings
 
 if TYPE_CHECKING:
@@ -25,15 +25,18 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT = 5.4, 3.1
 DEFAULT = ("forces", "condyles", "ratios", "pressures")
 DASHES = (0, (4, 2))
+BAND_OPACITY = 0.16
 
 
-def draw_panel(panel: Panel, results: "Results", axis: HorizontalAxis) -> Figure:
+def draw_panel(
+    panel: Panel, results: "Results", axis: HorizontalAxis, width: float = WIDTH
+) -> Figure:
     """Return one plot with its flagged and failed frames marked along the bottom.
 
-    Each curve's id in the picture is its line's name.
+    Each curve's id in the picture is its line's name; the width is in inches.
     """
     with settings():
-        figure = new_figure(WIDTH, HEIGHT)
+        figure = new_figure(width, HEIGHT)
         axes = figure.add_subplot()
         _draw_lines(axes, panel, axis)
         _label_axes(axes, panel, axis)
@@ -102,7 +105,19 @@ def _draw_lines(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:
         x, y = axis.broken(line.values)
         dashes = DASHES if line.dashed else "-"
         gid = f"line-{line.name}"
-        axes.plot(x, y, color=line.colour, linestyle=dashes, label=line.label, gid=gid)
+        broad: Any = {"linewidth": 5.0, "alpha": 0.28, "zorder": 1.5} if line.behind else {}
+        axes.plot(x, y, color=line.colour, linestyle=dashes, label=line.label, gid=gid, **broad)
+        if line.band is not None and not line.dashed:
+            _draw_band(axes, line, axis)
+
+
+def _draw_band(axes: Axes, line: Line, axis: HorizontalAxis) -> None:
+    """Shade a line's 5 to 95 % and dot its median."""
+    assert line.band is not None
+    (x, low), (_, middle), (_, high) = (axis.broken(one) for one in line.band)
+    opacity, name = BAND_OPACITY, f"band-{line.name}"
+    axes.fill_between(x, low, high, color=line.colour, alpha=opacity, linewidth=0, gid=name)
+    axes.plot(x, middle, color=line.colour, linestyle=":", linewidth=1, gid=f"median-{line.name}")
 
 
 def _legend_columns(panel: Panel) -> int:
@@ -133,7 +148,9 @@ def _scale_vertically(axes: Axes, panel: Panel) -> None:
         axes.yaxis.set_minor_formatter(NullFormatter())
         return
     axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
-    values = [line.values[np.isfinite(line.values)] for line in panel.lines]
+    drawn = [line.values for line in panel.lines]
+    drawn += [one.band.ravel() for one in panel.lines if one.band is not None and not one.dashed]
+    values = [one[np.isfinite(one)] for one in drawn]
     values.append(np.zeros(int(panel.from_zero)))
     values.append(np.array(panel.level[:1] if panel.level else ()))
     low, high = (float(f(np.concatenate(values))) for f in (np.min, np.max))

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
+from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
@@ -113,21 +114,39 @@ def draw_maps(
         figure = new_figure(11.0, down * (10.0 / 4 * ratio + 0.75))
         grid = figure.subplots(down, across, squeeze=False).ravel()
         for axes, frame in zip(grid, frames, strict=False):
-            view.draw_insert(axes)
-            _draw_pressure(axes, view, pressure[rows[frame]], scale)
-            _draw_centres(axes, view, results, frame)
-            view.draw_labels(axes)
+            draw_map(axes, view, results, frame, pressure[rows[frame]], scale)
             axes.set_title(_caption(results, axis, frame), fontsize=8.5)
         for axes in grid[len(frames) :]:
             axes.set_axis_off()
-        mappable = ScalarMappable(scale, PRESSURE_MAP)
-        bar = figure.colorbar(mappable, ax=list(grid), fraction=0.02, pad=0.01, aspect=30)
-        bar.set_label("contact pressure (MPa)")
+        bar = pressure_bar(figure, list(grid), scale)
         stress = results.summary.get("yield_stress_MPa")
         if stress is not None and stress < float(scale.vmax or 1.0):
             bar.ax.axhline(stress, color="white", linewidth=1.5)
             bar.ax.text(-0.25, stress, "yield", ha="right", va="center", fontsize=7.5)
     return figure
+
+
+def draw_map(
+    axes: Axes,
+    view: TopView,
+    results: "Results",
+    frame: int,
+    pressure: Array,
+    scale: Normalize,
+) -> None:
+    """Draw one frame's pressure (n,) MPa on the insert, with its centres."""
+    view.draw_insert(axes)
+    draw_pressure(axes, view, pressure, scale)
+    _draw_centres(axes, view, results, frame)
+    view.draw_labels(axes)
+
+
+def pressure_bar(figure: Figure, axes: Sequence[Axes], scale: Normalize) -> Colorbar:
+    """Return the colour bar of pressure maps on one scale (MPa)."""
+    mappable = ScalarMappable(scale, PRESSURE_MAP)
+    bar = figure.colorbar(mappable, ax=list(axes), fraction=0.02, pad=0.01, aspect=30)
+    bar.set_label("contact pressure (MPa)")
+    return bar
 
 
 def draw_paths(
@@ -170,7 +189,8 @@ def _shade(points: Array, triangles: NDArray[np.int64]) -> Array:
     return 0.55 + 0.4 * np.clip(normal @ (light / np.linalg.norm(light)), 0.0, 1.0)
 
 
-def _draw_pressure(axes: Axes, view: TopView, pressure: Array, scale: Normalize) -> None:
+def draw_pressure(axes: Axes, view: TopView, pressure: Array, scale: Normalize) -> None:
+    """Colour the insert with a pressure (n,), in the scale's unit."""
     loaded = (pressure[view.triangles] > TOUCHED * float(scale.vmax or 1.0)).any(axis=1)
     if not loaded.any():
         return

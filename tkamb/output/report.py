@@ -16,7 +16,7 @@ from tkamb.output.headline import cards, run_title
 from tkamb.output.metrics import body_weight, failed, flagged
 from tkamb.output.pages import asset, policy_sources, render
 from tkamb.output.panels import Panel, centre_panel, panels
-from tkamb.output.plots import draw_panel
+from tkamb.output.plots import WIDTH, draw_panel
 from tkamb.output.pressure_maps import draw_maps, draw_paths, mapped_frames, top_view
 from tkamb.output.style import svg_text
 from tkamb.output.tables import flag_rows, motion_table, strain_table
@@ -30,6 +30,8 @@ POLICY = (
     "style-src-attr 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
 )
 """The page runs its own script and loads nothing; the plots set their colours in attributes."""
+THIRD = 2 / 3 * WIDTH
+"""Inches: width of a plot of which three stand beside each other, at the same size of letters."""
 PROVENANCE = (
     "scene", "scene_sha256", "started", "command", "versions", "seconds", "contact", "frame",
 )  # fmt: skip
@@ -62,6 +64,7 @@ def report_html(results: "Results") -> str:
         maps=_maps(results, axis),
         legend=_legend(results),
         plots=[_plot(panel, results, axis) for panel in panels(results)],
+        muscles=_muscles(results, axis),
         motion=motion_table(results, axis),
         strain=strain_table(results.summary),
         flags=flag_rows(results, axis),
@@ -120,13 +123,36 @@ def _maps(results: "Results", axis: HorizontalAxis) -> dict[str, Any] | None:
     }
 
 
-def _plot(panel: Panel, results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
-    return {"panel": panel, "svg": svg_text(draw_panel(panel, results, axis), panel.name)}
+def _muscles(results: "Results", axis: HorizontalAxis) -> dict[str, Any] | None:
+    """Return the section on muscles; None without [muscles]."""
+    if not results.summary.get("muscle_groups"):
+        return None
+    from tkamb.output.muscles import HELD, draw_activations, muscle_panels, reserve_words
+
+    figure = draw_activations(results, axis)
+    return {
+        "activations": None if figure is None else svg_text(figure, "activations"),
+        "emg": bool(results.summary.get("emg")),
+        "plots": [_plot(panel, results, axis, THIRD) for panel in muscle_panels(results)],
+        "held": HELD,
+        "reserves": reserve_words(results.summary),
+    }
+
+
+def _plot(
+    panel: Panel, results: "Results", axis: HorizontalAxis, width: float = WIDTH
+) -> dict[str, Any]:
+    return {"panel": panel, "svg": svg_text(draw_panel(panel, results, axis, width), panel.name)}
 
 
 def _legend(results: "Results") -> list[str]:
     """Return what the marks in the plots mean."""
     sentences = ["Lines run in time order."]
+    if results.bands:
+        sentences.append(
+            "Shaded: 5 to 95 % of the samples with varied inputs, dotted: their median; "
+            "full lines: the scene as it stands."
+        )
     if flagged(results).any():
         sentences.append("Orange ticks at the bottom: frames to be read with care.")
     if failed(results).any():
@@ -169,6 +195,10 @@ def _text(value: Any) -> str:
 def _cursor_data(results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
     """Return what the slider shows of each frame: position, status, the lines of every plot."""
     drawn = (*panels(results), centre_panel(results))
+    if results.summary.get("muscle_groups"):
+        from tkamb.output.muscles import muscle_panels
+
+        drawn += muscle_panels(results)
     name = axis.label.split(" (")[0]
     return {
         "x": _round(axis.values),

@@ -7,6 +7,7 @@ length in bytes (UInt64), little-endian, uncompressed. Coordinates are written i
 import base64
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
 
 import numpy as np
@@ -15,8 +16,13 @@ from numpy.typing import NDArray
 from tkamb.atomic import replaced_file
 from tkamb.contact.lattice.meshing.cells import scaled_jacobians
 from tkamb.contact.lattice.meshing.grid import Lattice
+from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 
+if TYPE_CHECKING:
+    from tkamb.output.maps import ContactMaps
+
+SERIES_NAME = "contact.pvd"
 HEXAHEDRON = 12
 """VTK's number for a cell of eight nodes."""
 TYPES = {"f8": "Float64", "i8": "Int64", "u1": "UInt8", "i1": "Int8"}
@@ -67,6 +73,34 @@ def write_triangles(
     _append(block, "offsets", (3 * np.arange(1, len(triangles) + 1)).astype("<i8"))
     _append_data(piece, point_data, {})
     _write(root, path)
+
+
+def write_map_series(maps: "ContactMaps", folder: Path) -> list[str]:
+    """Write the maps of a run for ParaView: one .vtp a frame, and a .pvd that gives their times.
+
+    Frames without a map (failed ones hold NaN) have no file; ParaView shows nothing there.
+
+    Args:
+        maps: of the run.
+        folder: where to.
+
+    Returns:
+        The names of the files, the .pvd first.
+
+    Raises:
+        InputError: no frame has a map, or the folder cannot be written.
+    """
+    whole = np.flatnonzero(np.isfinite(maps.pressure_Pa).all(axis=1))
+    if not len(whole):
+        raise InputError("no frame has a pressure map", "export --vtp")
+    root = Element("VTKFile", type="Collection", version="1.0", byte_order="LittleEndian")
+    collection, names = SubElement(root, "Collection"), []
+    for k in map(int, whole):
+        names.append(f"contact_{k:04d}.vtp")
+        write_triangles(folder / names[-1], maps.points_m, maps.triangles, maps.frame_data(k))
+        SubElement(collection, "DataSet", timestep=repr(float(maps.time_s[k])), file=names[-1])
+    _write(root, folder / SERIES_NAME)
+    return [SERIES_NAME, *names]
 
 
 def _document(kind: str, points: Array, **counts: int) -> tuple[Element, Element]:

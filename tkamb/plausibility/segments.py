@@ -44,12 +44,12 @@ def segment_questions(case: Case) -> Iterator[Question]:
         "femur": np.mean([t["thigh"].mass for t in tables]),
     }
     masses = {link: chain.segment(link)[0] for link in shares}
-    ratios = {link: masses[link] / (share * patient.mass_kg) for link, share in shares.items()}
+    ratios = {link: masses[link] / (share * case.body_mass) for link, share in shares.items()}
     if wrong := [s for s, r in ratios.items() if not 1 / SEGMENT_MASS <= r <= SEGMENT_MASS]:
         link = wrong[0]
         yield Question(
             f"'{link}' of the URDF weighs {masses[link]:.3g} kg, {ratios[link]:.2g} times what it "
-            f"does in a body of {patient.mass_kg:g} kg: is mass_kg, or the URDF's, in pounds?",
+            f"does in a body of {case.body_mass:g} kg: is mass_kg, or the URDF's, in pounds?",
             "masses of URDF and [patient] disagree",
         )
     if case.scene.patella:
@@ -60,8 +60,8 @@ def segment_questions(case: Case) -> Iterator[Question]:
     ):
         length = float(np.linalg.norm(end))
         yield from _of_inertia(case, link, end)
-        if patient.height_mm is not None:
-            share = length / (patient.height_mm * MILLIMETRE)
+        if case.height_mm is not None:
+            share = length / (case.height_mm * MILLIMETRE)
             if not shares_of_height[0] <= share <= shares_of_height[1]:
                 yield Question(
                     f"'{link}' is {length / MILLIMETRE:.0f} mm long, {share:.2f} of the body "

@@ -60,6 +60,10 @@ def summary_of(
         summary["first_wrapping_flexion_deg"] = _first_wrapping(columns)
     if scene.muscles:
         summary["reserves"] = reserves(columns)
+    if case.measured is not None or case.emg is not None:
+        from tkamb.run.recorded import compare_recorded
+
+        summary |= compare_recorded(case, columns)
     if scene.contact:
         table = scene.contact
         error = known_error(table.model, table.resolution_mm, table.material, table.options)
@@ -94,8 +98,8 @@ def _subject(case: Case) -> dict[str, Any]:
     return {
         "side": patient.side,
         "frame": f"insert frame: x anterior, y superior, z {lateral}",
-        "body_mass_kg": patient.mass_kg,
-        "height_mm": patient.height_mm,
+        "body_mass_kg": case.body_mass,
+        "height_mm": case.height_mm,
         "yield_stress_MPa": output.yield_stress_MPa,
         "axis": output.axis,
     }
@@ -154,15 +158,16 @@ def input_hashes(case: Case, scene: Path | None) -> dict[str, str]:
 
 def _files_read(case: Case) -> list[Path]:
     unread = {"output"} | ({"implant"} if case.femoral is None else set())
-    return _paths(case.scene.model_dump(exclude=unread))
+    return files_in(case.scene.model_dump(exclude=unread))
 
 
-def _paths(value: Any) -> list[Path]:
+def files_in(value: Any) -> list[Path]:
+    """Return the paths of files that are there, in nested dictionaries and lists."""
     if isinstance(value, Path):
         return [value] if value.is_file() else []
     if isinstance(value, dict):
         value = list(value.values())
-    return [p for item in value for p in _paths(item)] if isinstance(value, list | tuple) else []
+    return [p for item in value for p in files_in(item)] if isinstance(value, list | tuple) else []
 
 
 def not_modelled(case: Case) -> list[str]:
@@ -170,7 +175,7 @@ def not_modelled(case: Case) -> list[str]:
     scene = case.scene
     parts = {
         "ground reaction": scene.ground_reaction,
-        "ligaments": scene.ligament,
+        "ligaments": scene.ligament or scene.generic_ligaments,
         "quadriceps, patella and patellar ligament": scene.patella,
         "femorotibial contact": scene.contact,
     }
@@ -216,6 +221,8 @@ def assumptions(case: Case) -> list[str]:
         )
     if scene.muscles:
         sentences.append(_sharing(scene.muscles))
+        if scene.muscles.emg:
+            sentences.append(scene.muscles.emg.sentence)
     if scene.contact:
         sentences.append(_agreement(scene.contact))
     if scene.patient.side == "left":

@@ -5,9 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tkamb.body.contributions import condyle_contributions
 from tkamb.body.knee import dome_sensitivity
 from tkamb.columns import (
     ACTIVATION,
+    CONTRIBUTIONS,
     JOINT_MOMENT,
     MUSCLE_FORCE,
     RESERVE,
@@ -90,6 +92,10 @@ def _motion_row(case: Case, k: int) -> dict[str, Any]:
         row[f"{name}_deg"] = coordinates[name] / DEGREE
     if motion.markers is not None:
         row |= _marker_row(motion.markers, motion.time[k : k + 1])
+    if case.measured is not None or case.emg is not None:
+        from tkamb.run.recorded import recorded_row
+
+        row |= recorded_row(case, k)
     return row
 
 
@@ -147,6 +153,9 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
         }
     if frame.geometry.share is not None and not loads.problems:
         row |= _muscle_row(frame.geometry.share)
+        parts = condyle_contributions(frame.geometry, loads, friction)
+        for side, causes in parts.items():
+            row |= {family_column(CONTRIBUTIONS[side], name): n for name, n in causes.items()}
     return row | {
         ligament_column(name): tension for name, tension in frame.geometry.tensions.items()
     }

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from tkamb.body.ligaments import Ligament
     from tkamb.body.muscles import Muscle, PatellarLigament
     from tkamb.geometry.surface import Surface
+    from tkamb.inputs.emg import Envelopes
     from tkamb.inputs.ground_reaction import GroundReaction
+    from tkamb.inputs.measured_force import MeasuredForce
     from tkamb.inputs.tibia import BodyMotion
 
 logger = logging.getLogger("tkamb")
@@ -43,6 +45,8 @@ class Case:
         ligaments: the bundles, generic ones among them; slack lengths where the scene has them.
         muscles: the muscles.
         patellar_ligament: the patellar ligament.
+        measured: what an instrumented implant measured.
+        emg: envelopes of the muscles' surface EMG.
     """
 
     scene: Scene
@@ -56,6 +60,8 @@ class Case:
     ligaments: "tuple[Ligament, ...]" = ()
     muscles: "tuple[Muscle, ...]" = ()
     patellar_ligament: "PatellarLigament | None" = None
+    measured: "MeasuredForce | None" = None
+    emg: "Envelopes | None" = None
 
     @cached_property
     def split(self) -> float | None:
@@ -77,9 +83,20 @@ class Case:
         return next((m.wrap.bone for m in self.muscles if m.wrap and m.wrap.bone), None)
 
     @property
+    def body_mass(self) -> float:
+        """kg, of the patient at the scene's scale."""
+        return self.scene.patient.mass_kg * self.scene.patient.scale**3
+
+    @property
+    def height_mm(self) -> float | None:
+        """Body height at the scene's scale, if the scene has one."""
+        patient = self.scene.patient
+        return None if patient.height_mm is None else patient.height_mm * patient.scale
+
+    @property
     def body_weight(self) -> float:
         """N."""
-        return self.scene.patient.mass_kg * -float(self.chain.model.gravity.linear[1])
+        return self.body_mass * -float(self.chain.model.gravity.linear[1])
 
 
 def load_case(scene: Scene) -> Case:
@@ -135,7 +152,7 @@ def load_case(scene: Scene) -> Case:
         from tkamb.scene import lines
 
         muscles, patellar_ligament = lines.muscles(scene, chain), lines.patellar_ligament(scene)
-    return Case(
+    case = Case(
         scene,
         chain,
         motion,
@@ -147,7 +164,30 @@ def load_case(scene: Scene) -> Case:
         _ligaments(scene, parts, chain),
         muscles,
         patellar_ligament,
+        _measured(scene, motion),
+        _emg(scene),
     )
+    if scene.patient.scale == 1.0:
+        return case
+    from tkamb.scene.scaling import scaled_case
+
+    return scaled_case(case)
+
+
+def _measured(scene: Scene, motion: KneeMotion) -> "MeasuredForce | None":
+    if scene.measured is None:
+        return None
+    from tkamb.inputs.measured_force import load_measured_force
+
+    return load_measured_force(in_si(scene.measured), motion.time)
+
+
+def _emg(scene: Scene) -> "Envelopes | None":
+    if scene.muscles is None or scene.muscles.emg is None:
+        return None
+    from tkamb.inputs.emg import load_envelopes
+
+    return load_envelopes(in_si(scene.muscles.emg))
 
 
 def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, ...]":

@@ -14,6 +14,7 @@ from pydantic_core import ErrorDetails
 
 from tkamb.errors import InputError, names_near
 from tkamb.files import read_text
+from tkamb.scene.measured import MeasuredTable
 from tkamb.scene.recording_tables import GroundReactionTable, MotionTable, TibiaTable
 from tkamb.scene.table import SceneTable
 from tkamb.scene.tables import (
@@ -55,6 +56,7 @@ class Scene(SceneTable):
     patellar_ligament: PatellarLigamentTable | None = None
     patella: PatellaTable | None = None
     contact: ContactTable | None = None
+    measured: MeasuredTable | None = None
     output: OutputTable = OutputTable()
     uncertainty: UncertaintyTable | None = None
 

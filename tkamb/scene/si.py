@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from tkamb.inputs import recordings
-from tkamb.scene import recording_tables, tables
+from tkamb.scene import emg, measured, recording_tables, tables
 from tkamb.scene.table import SceneTable
 from tkamb.units import DEGREE, MILLIMETRE
 
@@ -22,6 +22,8 @@ CLASSES: dict[type[SceneTable], type] = {
     recording_tables.TibiaTable: recordings.ShankRecording,
     recording_tables.JointCentreTable: recordings.JointCentre,
     recording_tables.GroundReactionTable: recordings.ForceRecording,
+    measured.MeasuredTable: recordings.ForceMeasurement,
+    emg.EmgTable: recordings.EmgRecording,
 }
 
 NAMES = {"neutral_mm": "neutral_translation", "neutral_deg": "neutral_rotation"}

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from tkamb.defaults import CONTACT_MODEL
+from tkamb.scene.emg import EmgTable
 from tkamb.scene.table import (
     Axes,
     KneeFreedom,
@@ -39,6 +40,14 @@ class PatientTable(SceneTable):
     # The same child to the tallest adults but a few.
     height_mm: Annotated[Number | None, within(1000, 2300, "is it in millimetres, standing?")] = (
         Field(None, description="body height, 1000 to 2300")
+    )
+    scale: Annotated[Number, within(0.7, 1.4, "1 is the patient as recorded")] = Field(
+        1.0,
+        description=(
+            "makes of the patient a synthetic one of the same shape: lengths, implants and knee "
+            "translations times this, masses and ground reaction times its cube; mass_kg and "
+            "height_mm stay those of the patient as recorded"
+        ),
     )
 
 
@@ -235,6 +244,7 @@ class MusclesTable(SceneTable):
     law: Literal["isometric", "hill"] = Field(
         "isometric", description="strength: the maximal isometric force, or force-length-velocity"
     )
+    emg: EmgTable | None = Field(None, description="recorded activity of the muscles")
 
 
 class PatellarLigamentTable(SceneTable):

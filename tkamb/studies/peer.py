@@ -16,29 +16,21 @@ import time as clock
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from tkamb.contact.area import covered_areas
 from tkamb.contact.lattice.meshing.contact_map import ContactMap, contact_map
-from tkamb.contact.lattice.meshing.grid import Lattice, build_grid
-from tkamb.contact.lattice.problem import SurfaceFromBelow
 from tkamb.contact.pair import ContactPair, PreparedContact
-from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult
+from tkamb.decks.calculix import ELEMENT, Deck
+from tkamb.decks.problem import PressProblem, press_problem
 from tkamb.errors import ComputationError
-from tkamb.geometry.frames import Array, Index, Mask
-from tkamb.geometry.surface import Surface
-from tkamb.studies.calculix import LONGEST_SECONDS, Deck, PeerRun, run_calculix
+from tkamb.geometry.frames import Array
+from tkamb.studies.calculix import LONGEST_SECONDS, PeerRun, run_calculix
 from tkamb.studies.cases import StudyCase
 from tkamb.studies.measures import Measure
 from tkamb.studies.quantities import quantities, raster_map
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
-ELEMENT = "C3D8I"
-TOUCHABLE_WITHIN = 2.0
-"""Nodes whose gap at first touch is within this many times the guessed depth can be touched."""
-LARGEST_NORMAL_Y = -0.3
-"""Largest y of a femoral normal that takes part."""
 LARGEST_IMBALANCE = 0.01
 """Largest difference of the summed contact forces from the load, over the load."""
 
@@ -113,78 +105,28 @@ def press_by_calculix(
         ComputationError: it failed, or what it found does not carry the load.
     """
     start = clock.perf_counter()
-    problem = _problem(pair, load, pose, grid_mm)
+    problem = press_problem(pair, load, pose, grid_mm)
     deck = Deck(problem.lattice, problem.patch, pair.material, pair.bearing, load, element)
     text = deck.text
     prepared = clock.perf_counter() - start
     run = run_calculix(text, longest)
-    result, balance = _result(problem, load, run)
+    result, balance = peer_result(problem, run)
     return PeerAnswer(result, run, prepared, len(problem.lattice.nodes), balance)
 
 
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """The grid, and the femoral component where CalculiX begins.
+def peer_result(problem: PressProblem, run: PeerRun) -> tuple[ContactResult, float]:
+    """Return what CalculiX found by the contract's definitions, and its forces over the load.
 
-    Args:
-        pair: the two bodies.
-        lattice: grid of the insert, its contact nodes on the smooth surface.
-        nodes: (c,) contact nodes.
-        map: contact surface.
-        floor: femoral component from below.
-        pose: (4, 4) at the guessed depth.
-        depth: m, guessed.
-        touchable: (c,) contact nodes over which `patch` lies.
-        patch: femoral triangles, insert frame.
+    Raises:
+        ComputationError: it touched beyond its femoral patch, or does not carry the load.
     """
-
-    pair: ContactPair
-    lattice: Lattice
-    nodes: Index
-    map: ContactMap
-    floor: SurfaceFromBelow
-    pose: Array
-    depth: float
-    touchable: Mask
-    patch: Surface
-
-
-def _problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -> _Problem:
-    lattice = build_grid(pair.insert, grid_mm * MILLIMETRE)
-    nodes, surface = contact_map(lattice, pair.insert)
-    smooth = lattice.nodes.copy()
-    smooth[nodes, 1] += surface.lift
-    floor = SurfaceFromBelow(pair.femoral, pair.femoral.rays)
-    guess = contact_model("foundation", grid_mm)
-    depth = guess.press(guess.prepare(pair), load, pose).approach
-    if not depth > 0:
-        raise ComputationError("needs a load that presses the bodies together", "CalculiX")
-    places, _ = floor.over(surface.points, pair.pose_at_approach(pose, 0.0))
-    near = places[:, 1] - surface.points[:, 1] < TOUCHABLE_WITHIN * depth
-    placed = pair.pose_at_approach(pose, depth)
-    patch = _patch(pair.femoral.moved(placed), surface.points[near], grid_mm * MILLIMETRE)
-    lattice = replace(lattice, nodes=smooth)
-    return _Problem(pair, lattice, nodes, surface, floor, placed, depth, near, patch)
-
-
-def _patch(femoral: Surface, points: Array, spacing: float) -> Surface:
-    """Return the downward triangles that lie within a cell of points, seen from above."""
-    down = np.flatnonzero(femoral.face_normals[:, 1] < LARGEST_NORMAL_Y)
-    middle = femoral.triangles[down].mean(axis=1)[:, ::2]
-    away, _ = cKDTree(points[:, ::2]).query(middle, distance_upper_bound=spacing)
-    used, faces = np.unique(femoral.faces[down[np.isfinite(away)]], return_inverse=True)
-    return Surface(femoral.vertices[used], faces.reshape(-1, 3).astype(np.int64), "patch")
-
-
-def _result(problem: _Problem, load: float, run: PeerRun) -> tuple[ContactResult, float]:
-    """Return what CalculiX found by the contract's definitions, and its forces over the load."""
     if not {"NREF", "NINSERT", "contact"} <= run.blocks.keys():
         raise ComputationError("gave no contact stress", "CalculiX")
     approach = problem.depth - float(run.blocks["NREF"][-1, 2]) * MILLIMETRE
     pose = problem.pair.pose_at_approach(problem.pose, approach)
     bent = _bent(problem, run)
     force = _nodal_forces(problem, pose, run, bent)
-    balance = -float(force[:, 1].sum()) / load
+    balance = -float(force[:, 1].sum()) / problem.load
     if not abs(balance - 1) <= LARGEST_IMBALANCE:
         raise ComputationError(f"gave pressures that sum to {balance:.4f} of the load", "CalculiX")
     surface = problem.map
@@ -201,7 +143,7 @@ def _result(problem: _Problem, load: float, run: PeerRun) -> tuple[ContactResult
     return result, balance
 
 
-def _bent(problem: _Problem, run: PeerRun) -> ContactMap:
+def _bent(problem: PressProblem, run: PeerRun) -> ContactMap:
     """Return the deformed contact surface."""
     moved = run.blocks["NINSERT"]
     moved = moved[np.argsort(moved[:, 0]), 1:] * MILLIMETRE
@@ -209,13 +151,13 @@ def _bent(problem: _Problem, run: PeerRun) -> ContactMap:
     return contact_map(deformed, problem.pair.insert)[1]
 
 
-def _gaps(problem: _Problem, pose: Array, bent: ContactMap) -> Array:
+def _gaps(problem: PressProblem, pose: Array, bent: ContactMap) -> Array:
     """Return the vertical gaps (c,) above the deformed nodes, m, inf where nothing is above."""
     above, _ = problem.floor.over(bent.points, pose)
     return np.nan_to_num(above[:, 1] - bent.points[:, 1], nan=np.inf)
 
 
-def _nodal_forces(problem: _Problem, pose: Array, run: PeerRun, bent: ContactMap) -> Array:
+def _nodal_forces(problem: PressProblem, pose: Array, run: PeerRun, bent: ContactMap) -> Array:
     """Return the forces (c, 3) on the contact nodes, N: pressure times deformed area."""
     stress = run.blocks["contact"]
     pressure = np.zeros(len(bent.points))

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from tkamb.contact.registry import contact_names
+from tkamb.decks.calculix import ELEMENT
 from tkamb.studies.calculix import find_program
 from tkamb.studies.cases import StudyCase, case_names, study_case
 from tkamb.studies.kept_rows import KeptRows, row_key
 from tkamb.studies.measures import Job, Measure, measure_apart
-from tkamb.studies.peer import ELEMENT, measure_by_calculix
+from tkamb.studies.peer import measure_by_calculix
 from tkamb.studies.references import (
     STORED,
     Reference,

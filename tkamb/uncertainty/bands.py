@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from tkamb.geometry.frames import SIDES, Array
+from tkamb.results import PERCENTILES
 
-PERCENTILES = {"p05": 5.0, "p50": 50.0, "p95": 95.0}
 FEWEST = 20
 """Numbers below which a 5th percentile is not even between the two smallest of them."""
 MOST_FAILED = 0.5

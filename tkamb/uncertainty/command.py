@@ -10,6 +10,9 @@ if TYPE_CHECKING:
 
 SHOWN = 5
 """Inputs of the tornado table that are printed."""
+QUICK_CONTACT = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
+QUICK_FRAMES = 11
+"""What a screening takes where nothing else is asked for."""
 NOTABLE_FAILED = 0.05
 """Share of samples: where more fail, the bands leave out a whole tail."""
 
@@ -26,7 +29,14 @@ def add_uncertainty(commands: Any, frames: Any, setting: Any) -> None:
     command.add_argument("scene", type=Path, help="scene.toml; its [uncertainty] says what varies")
     command.add_argument("--samples", type=int, default=256, metavar="N", help="default 256")
     command.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default 1")
+    command.add_argument("--dask", metavar="ADDRESS|local", help="have a Dask cluster compute")
     command.add_argument("--method", default="lhs", metavar="lhs|sobol", help="default lhs")
+    command.add_argument(
+        "--indices", action="store_true", help="Sobol' indices too: N (d + 2) samples of d inputs"
+    )
+    command.add_argument(
+        "--screen", action="store_true", help="one input at a time, seconds; nothing is written"
+    )
     command.add_argument("--contact", metavar="NAME", help="contact model (`tkamb contact list`)")
     command.add_argument("--resolution", type=float, metavar="MM", help="spacing of the map points")
     command.add_argument("--out", type=Path, metavar="DIR", help="output folder")
@@ -57,12 +67,16 @@ def _uncertainty(options: argparse.Namespace) -> int:
         overrides["contact.model"] = options.contact
     if options.resolution is not None:
         overrides["contact.resolution_mm"] = options.resolution
+    if options.screen:
+        return _screen(options, overrides)
     directory = options.out or Path("out") / f"{options.scene.resolve().parent.name}_uncertainty"
     found = estimate_uncertainty(
         load_scene(options.scene, overrides),
         samples=options.samples,
         workers=options.workers,
+        dask=options.dask,
         method=options.method,
+        indices=options.indices,
         frames=options.frames,
         directory=directory,
         scene_path=options.scene,
@@ -74,6 +88,39 @@ def _uncertainty(options: argparse.Namespace) -> int:
         print(f"tkamb: {line}", file=sys.stderr)
     print("\n".join([*headline(found), f"bands: {directory / 'bands.csv'}"]))
     return 1 if all(one.failed.all() for one in found.samples) else 0
+
+
+def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
+    """Print the tornado of one input at a time; quick unless the command line says otherwise."""
+    from tqdm import tqdm
+
+    from tkamb.errors import InputError
+    from tkamb.run.workers import Crew
+    from tkamb.scene import load_scene
+    from tkamb.scene.case import load_case
+    from tkamb.uncertainty.screening import screen, screen_lines
+
+    for name in ("out", "indices", "resume"):
+        if getattr(options, name):
+            raise InputError("does not go with --screen, which writes nothing", f"--{name}")
+    scene, said = load_scene(options.scene, overrides), []
+    if scene.contact and not {"contact.model", "contact.resolution_mm"} & set(overrides):
+        scene = load_scene(options.scene, overrides | QUICK_CONTACT)
+        said.append("contact by foundation at 2 mm; --contact and --resolution choose another")
+    frames = options.frames
+    if frames is None:
+        step = -(-len(load_case(scene).motion.time) // QUICK_FRAMES)
+        frames = slice(None, None, step)
+        said.append(f"every {step}th frame; --frames chooses others")
+    rows = screen(
+        scene,
+        frames=frames,
+        crew=Crew(options.workers, options.dask),
+        progress=lambda samples, count: tqdm(samples, total=count, unit="sample", disable=None),
+    )
+    said.append("one input at a time by one standard deviation: minus, plus; no interactions")
+    print("\n".join([*screen_lines(rows), *(f"({line})" for line in said)]))
+    return 0 if rows else 1
 
 
 def headline(found: "Uncertainty") -> list[str]:
@@ -95,18 +142,23 @@ def headline(found: "Uncertainty") -> list[str]:
         parts = ", ".join(f"{row.name} {row.share:.0%}" for row in rows if row.share >= 0.01)
         if parts:
             lines.append(f"{result} varies by {parts} (shares of variance, by regression)")
+    for result in ("force_total_N", "medial_force_N"):
+        parts = ", ".join(
+            f"{one.name} {one.first:.2f} alone, {one.total:.2f} in all"
+            for one in [row for row in found.indices if row.result == result][:SHOWN]
+        )
+        if parts:
+            lines.append(f"{result}, Sobol' indices: {parts}")
     return lines
 
 
 def warnings_of(found: "Uncertainty") -> list[str]:
     """Return what the bands leave out."""
-    from numpy import mean
-
     lines, summary = [], found.results.summary["uncertainty"]
     if summary["not_varied"]:
         names = ", ".join(summary["not_varied"])
         lines.append(f"not varied, so the bands are too narrow for them: {names}")
-    share = mean([one.failed for one in found.samples], axis=0)
+    share = found.bands["failed_share"]
     if (share > NOTABLE_FAILED).any():
         lines.append(
             f"in {(share > NOTABLE_FAILED).sum()} of {len(share)} frames more than "

@@ -4,28 +4,26 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
 
-from tkamb.results import Results
-from tkamb.results_folder import BANDS_NAME, SAMPLES_NAME, TORNADO_NAME, write_results
-from tkamb.uncertainty.bands import Influence
-from tkamb.uncertainty.inputs import VariedInput
-from tkamb.uncertainty.sample import Sample
+from tkamb.results_folder import (
+    BANDS_NAME,
+    INDICES_NAME,
+    SAMPLES_NAME,
+    TORNADO_NAME,
+    write_results,
+)
+
+if TYPE_CHECKING:
+    from tkamb.uncertainty.indices import SobolIndex
+    from tkamb.uncertainty.run import Uncertainty
 
 
-def write_uncertainty(
-    results: Results,
-    bands: Mapping[str, Any],
-    tornado: Sequence[Influence],
-    names: Sequence[str],
-    inputs: Sequence[VariedInput],
-    samples: Sequence[Sample],
-    folder: Path,
-) -> None:
-    """Write the nominal results, bands.csv, tornado.csv and samples.h5 together.
+def write_uncertainty(found: "Uncertainty", folder: Path) -> None:
+    """Write the nominal results and, beside them, bands, tornado, samples and indices together.
 
     Raises:
         InputError: the folder cannot be written.
@@ -33,21 +31,23 @@ def write_uncertainty(
 
     def write_samples(path: Path) -> None:
         with h5py.File(path, "w") as file:
-            file["result_names"] = list(names)
-            file["input_names"] = [one.name for one in inputs]
-            file["input_units"] = [one.unit for one in inputs]
-            file["input_standard_deviations"] = [one.deviation for one in inputs]
-            file["time_s"] = results["time_s"]
+            file["result_names"] = found.names
+            file["input_names"] = [one.name for one in found.inputs]
+            file["input_units"] = [one.unit for one in found.inputs]
+            file["input_standard_deviations"] = [one.deviation for one in found.inputs]
+            file["time_s"] = found.results["time_s"]
             for name, dtype in (("values", float), ("failed", bool), ("errors", float)):
-                content = np.array([getattr(one, name) for one in samples], dtype)
+                content = np.array([getattr(one, name) for one in found.samples], dtype)
                 file.create_dataset(name, data=content, compression="gzip")
 
     more = {
-        BANDS_NAME: lambda path: path.write_text(_table_text(bands), encoding="utf-8"),
-        TORNADO_NAME: lambda path: path.write_text(_tornado_text(tornado, inputs), "utf-8"),
+        BANDS_NAME: lambda path: path.write_text(_table_text(found.bands), encoding="utf-8"),
+        TORNADO_NAME: lambda path: path.write_text(_tornado_text(found), "utf-8"),
         SAMPLES_NAME: write_samples,
     }
-    write_results(results, folder, more=more)
+    if found.indices:
+        more[INDICES_NAME] = lambda path: path.write_text(_indices_text(found.indices), "utf-8")
+    write_results(found.results, folder, more=more)
 
 
 def _table_text(columns: Mapping[str, Any]) -> str:
@@ -55,15 +55,24 @@ def _table_text(columns: Mapping[str, Any]) -> str:
     return _csv([list(columns), *rows])
 
 
-def _tornado_text(tornado: Sequence[Influence], inputs: Sequence[VariedInput]) -> str:
-    known = {one.name: one for one in inputs}
+def _tornado_text(found: "Uncertainty") -> str:
+    known = {one.name: one for one in found.inputs}
     rows: list[Sequence[str]] = [
         ("result", "input", "standard_deviation", "unit", "variance_share", "change_per_sd")
     ]
-    for one in tornado:
+    for one in found.tornado:
         given = known.get(one.name)
         deviation, unit = (_cell(given.deviation), given.unit) if given else ("", "")
         rows.append((one.result, one.name, deviation, unit, _cell(one.share), _cell(one.change)))
+    return _csv(rows)
+
+
+def _indices_text(indices: "Sequence[SobolIndex]") -> str:
+    head = ("result", "input", "first_order", "first_order_se", "total", "total_se", "rows")
+    rows: list[Sequence[str]] = [head]
+    for one in indices:
+        numbers = (one.first, one.first_error, one.total, one.total_error)
+        rows.append((one.result, one.name, *map(_cell, numbers), str(one.rows)))
     return _csv(rows)
 
 

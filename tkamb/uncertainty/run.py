@@ -1,7 +1,8 @@
 """All samples of a scene: over worker processes, kept as they are finished, then made bands."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +14,19 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.results import Results
 from tkamb.run.shards import Shard, Shards
+from tkamb.run.workers import Crew, Progress, Task
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.case import Case, load_case
 from tkamb.simulation import chosen_frames, simulate
 from tkamb.uncertainty.bands import FEWEST, Influence, band_columns, influences
+from tkamb.uncertainty.indices import SobolIndex, sobol_indices
 from tkamb.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
 from tkamb.uncertainty.kept import write_uncertainty
-from tkamb.uncertainty.sample import Sample
-from tkamb.uncertainty.sampling import normal_samples
-from tkamb.uncertainty.workers import Progress, finished_samples
+from tkamb.uncertainty.sample import Sample, Sampler
+from tkamb.uncertainty.sampling import Point, crossed_points, normal_samples
 
 SAMPLES = 256
-MOST_SAMPLES, MOST_WORKERS = 100_000, 256
+MOST_SAMPLES = 100_000
 TORNADO_RESULTS = (
     *("force_total_N", "medial_force_N", "lateral_force_N", "medial_share_equilibrium"),
     *("medial_peak_pressure_MPa", "lateral_peak_pressure_MPa", "quadriceps_N"),
@@ -49,7 +51,8 @@ class Uncertainty:
         tornado: which input moves what.
         names: columns of results.csv that have a band.
         inputs: those that varied.
-        samples: in the order of their numbers.
+        samples: in the order of their numbers; those of Saltelli's design after the others.
+        indices: Sobol' indices, where they were asked for.
     """
 
     results: Results
@@ -58,6 +61,7 @@ class Uncertainty:
     names: list[str]
     inputs: tuple[VariedInput, ...]
     samples: list[Sample]
+    indices: list[SobolIndex] = field(default_factory=list)
 
 
 def estimate_uncertainty(
@@ -65,7 +69,9 @@ def estimate_uncertainty(
     *,
     samples: int = SAMPLES,
     workers: int = 1,
+    dask: str | None = None,
     method: str = "lhs",
+    indices: bool = False,
     frames: slice | None = None,
     directory: str | Path | None = None,
     scene_path: str | Path | None = None,
@@ -81,7 +87,11 @@ def estimate_uncertainty(
         scene: a scene, or the path of its file.
         samples: how many, at least 20.
         workers: processes; 1 computes in this one.
+        dask: address of a Dask scheduler that has the samples computed, or "local" for one with
+            so many workers.
         method: "lhs" or "sobol", see `tkamb.uncertainty.sampling`.
+        indices: find Sobol' indices too, by Saltelli's design: `samples` (d + 2) are computed
+            with d inputs, and the bands are those of twice `samples`.
         frames: which frames; default all.
         directory: folder for all results; None keeps them in memory.
         scene_path: where the scene came from, for the summary.
@@ -96,52 +106,73 @@ def estimate_uncertainty(
     """
     if isinstance(scene, str | Path):
         scene_path, scene = scene, load_scene(scene)
-    _check_numbers(samples, workers)
+    crew = Crew(workers, dask)
+    if not FEWEST <= samples <= MOST_SAMPLES:
+        raise InputError(f"{samples} is not within {FEWEST} to {MOST_SAMPLES}", "--samples")
     if directory is None and resume:
         raise InputError("there is no folder to go on in", "resume", "give a directory")
+    crew.check()
     case = load_case(scene)
     chosen = chosen_frames(frames, len(case.motion.time))
     inputs = varied_inputs(case)
-    normal = normal_samples(method, samples, len(inputs), uncertainty_of(case).seed)
-    nominal = simulate(scene, frames=frames, scene_path=scene_path)
-    job = _Job(case, chosen, nominal, inputs, normal, method, workers, progress)
-    if directory is None:
-        return job.run(None)
-    with claimed_directory(directory, force) as folder:
-        identity = nominal.summary["identity"] | {"method of sampling": method}
+    points = _points(method, samples, len(inputs), uncertainty_of(case).seed, indices)
+    crossed = samples if indices else 0
+    with ExitStack() as stack:
+        folder = None
+        if directory is not None:
+            folder = stack.enter_context(claimed_directory(directory, force))
+        nominal = simulate(scene, frames=frames, scene_path=scene_path)
+        job = _Job(case, chosen, nominal, inputs, points, crossed, method, crew, progress)
+        if folder is None:
+            return job.run(None)
+        identity = nominal.summary["identity"] | {"method of sampling": job.design}
         found = job.run(Shards(folder, identity, resume))
-        write_uncertainty(
-            found.results, found.bands, found.tornado, found.names, inputs, found.samples, folder
-        )
+        write_uncertainty(found, folder)
     return found
+
+
+def _points(method: str, samples: int, dimensions: int, seed: int, crossed: bool) -> list[Point]:
+    if not crossed:
+        normal = normal_samples(method, samples, dimensions, seed)
+        return [Point.of(number, one) for number, one in enumerate(normal)]
+    both = normal_samples(method, samples, 2 * dimensions, seed)
+    return crossed_points(both[:, :dimensions], both[:, dimensions:])
 
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """The samples of one scene."""
+    """The samples of one scene; with `crossed` rows of Saltelli's design, if that is not 0."""
 
     case: Case
     frames: range
     nominal: Results
     inputs: tuple[VariedInput, ...]
-    normal: Array
+    points: list[Point]
+    crossed: int
     method: str
-    workers: int
+    crew: Crew
     progress: Progress
+
+    @property
+    def design(self) -> str:
+        """Return what makes sample n the same: not how many there are, but for a design."""
+        return (
+            f"{self.method}, Saltelli's design of {self.crossed}" if self.crossed else self.method
+        )
 
     def run(self, shards: Shards | None) -> Uncertainty:
         """Compute the samples that are not there yet and return all with their bands."""
         names = banded_names(self.nominal)
-        count = len(self.normal)
+        count = len(self.points)
         done = _kept(shards, count)
         left = [n for n in range(count) if n not in done]
-        arguments = (self.case.scene, self.frames, names)
-        new = finished_samples(arguments, [(n, self.normal[n]) for n in left], self.workers)
+        task = Task(Sampler, (self.case.scene, self.frames, names))
+        new = self.crew.answers(task, [(n, self.points[n]) for n in left])
         try:
             for number, sample in self.progress(new, len(left)):
                 done[number] = sample
                 if shards is not None:
-                    shards.put(number, Shard({}, vars(sample)))
+                    shards.put(number, Shard({}, dict(vars(sample))))
         except KeyboardInterrupt:
             if shards is None or not done:
                 raise
@@ -150,18 +181,25 @@ class _Job:
         return self._found(names, [done[n] for n in range(count)])
 
     def _found(self, names: list[str], samples: list[Sample]) -> Uncertainty:
-        values = np.array([one.values for one in samples])
-        failed = np.array([one.failed for one in samples])
-        errors = np.array([one.errors for one in samples])
-        bands = band_columns(self.nominal["time_s"], names, values, failed)
         wanted = [name for name in TORNADO_RESULTS if name in names]
         rows = [names.index(name) for name in wanted]
         input_names = [one.name for one in self.inputs]
+        found: list[SobolIndex] = []
+        if self.crossed:
+            every = np.array([one.values[rows] for one in samples])
+            seed = uncertainty_of(self.case).seed
+            found = sobol_indices(wanted, input_names, every, self.crossed, seed)
+        plain = samples[: 2 * self.crossed or len(samples)]  # those that are independent
+        values = np.array([one.values for one in plain])
+        failed = np.array([one.failed for one in plain])
+        errors = np.array([one.errors for one in plain])
+        bands = band_columns(self.nominal["time_s"], names, values, failed)
         tornado = influences(wanted, input_names, values[:, rows], errors)
-        self.nominal.summary["uncertainty"] = self._summary(failed)
-        return Uncertainty(self.nominal, bands, tornado, names, self.inputs, samples)
+        self.nominal.summary["uncertainty"] = self._summary(failed, tornado)
+        results = replace(self.nominal, bands=bands)
+        return Uncertainty(results, bands, tornado, names, self.inputs, samples, found)
 
-    def _summary(self, failed: np.ndarray) -> dict[str, Any]:
+    def _summary(self, failed: np.ndarray, tornado: list[Influence]) -> dict[str, Any]:
         return {
             "samples": len(failed),
             "method": self.method,
@@ -170,7 +208,16 @@ class _Job:
             "not_varied": held_inputs(self.case),
             "failed_share": float(failed.mean()),
             "largest_failed_share": float(failed.mean(axis=0).max()),
+            "shares_of_variance": shares_of_variance(tornado),
         }
+
+
+def shares_of_variance(tornado: Sequence[Influence]) -> dict[str, dict[str, float]]:
+    """Return result -> input -> its share of the result's variance, largest first."""
+    found: dict[str, dict[str, float]] = {}
+    for one in tornado:
+        found.setdefault(one.result, {})[one.name] = one.share
+    return found
 
 
 def banded_names(results: Results) -> list[str]:
@@ -192,14 +239,3 @@ def _kept(shards: Shards | None, count: int) -> dict[int, Sample]:
         if shard is not None and shard.contact is not None:
             found[number] = Sample(**shard.contact)
     return found
-
-
-def _check_numbers(samples: int, workers: int) -> None:
-    """Raise where there are too few or too many of either."""
-    wanted: Mapping[str, tuple[int, int, int]] = {
-        "--samples": (samples, FEWEST, MOST_SAMPLES),
-        "--workers": (workers, 1, MOST_WORKERS),
-    }
-    for option, (given, least, most) in wanted.items():
-        if not least <= given <= most:
-            raise InputError(f"{given} is not within {least} to {most}", option)

@@ -30,7 +30,7 @@ from tkamb.uncertainty.inputs import (
     varied_case,
     varied_inputs,
 )
-from tkamb.uncertainty.sampling import noise
+from tkamb.uncertainty.sampling import Point, noise_of_point
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,29 +79,25 @@ class Sampler:
     def _side(self) -> ContactSide | None:
         return ContactSide(self.case, self._mechanics) if self.case.scene.contact else None
 
-    def draw(self, number: int, normal: Array) -> Draw:
-        """Return what the sample of a number makes of the inputs.
-
-        Args:
-            number: of the sample.
-            normal: (d,) its standard normal inputs.
-        """
+    def draw(self, point: Point) -> Draw:
+        """Return what the sample at a point makes of the inputs."""
         table = uncertainty_of(self.case)
-        count = len(pose_names(self.inputs))
+        count = len(pose_names(self.inputs))  # they come first
         # on the whole recording's clock: the same whichever frames are asked for
-        per_frame = noise(number, self._time, count, table.correlation_s, table.seed)
+        per_frame = noise_of_point(point, range(count), self._time, table.correlation_s, table.seed)
         if len(self.case.motion.time) < len(self._time):
             per_frame = per_frame[list(self._chosen)]
-        return Draw(self.inputs, normal, per_frame, table.constant_share)
+        share = 1.0 if point.noise_of is None else table.constant_share
+        return Draw(self.inputs, point.normal, per_frame, share)
 
-    def sample(self, number: int, normal: Array) -> Sample:
-        """Return the sample; a frame begins its search at the frame before of the same sample.
+    def __call__(self, number: int, point: Point) -> Sample:
+        """Return the sample at a point; a frame begins its search at the one before.
 
         Args:
-            number: of the sample.
-            normal: (d,) its standard normal inputs.
+            number: of the sample; what workers tell samples by, it changes nothing.
+            point: where it lies.
         """
-        draw = self.draw(number, normal)
+        draw = self.draw(point)
         errors = draw.standardised()[list(self._frames)]
         values = np.full((len(self._names), len(self._frames)), np.nan)
         failed = np.ones(len(self._frames), bool)

@@ -4,6 +4,8 @@ Sample number n is the same whatever the count of samples and whoever asks for i
 samples keeps the old ones and the order in which workers finish does not matter.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -20,6 +22,54 @@ SMALLEST_TAIL = 1e-9
 """Of a normal distribution: Sobol' points may be 0, whose quantile is not finite."""
 NOISE = 1
 """Tells the seeds of the noise from those of the hypercubes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """Where in the space of inputs a sample lies.
+
+    Args:
+        normal: (d,) standard normal, one per input.
+        noise_of: (d,) numbers of the samples whose noise per frame each input has; None: no
+            noise, the whole deviation of a pose is the same in all frames.
+    """
+
+    normal: Array
+    noise_of: tuple[int, ...] | None
+
+    @classmethod
+    def of(cls, number: int, normal: Array) -> "Point":
+        """Return the point of a sample with its own noise."""
+        return cls(normal, (number,) * len(normal))
+
+
+def crossed_points(first: Array, second: Array) -> list[Point]:
+    """Return the points of Saltelli's design: A, B, and A with each column from B.
+
+    A point's noise goes with its column. Order: n of A, n of B, then n per input.
+
+    Args:
+        first: (n, d) standard normal, A.
+        second: (n, d) of B.
+
+    Reference: Saltelli et al., Comput Phys Commun 181:259 (2010),
+    doi:10.1016/j.cpc.2009.09.018.
+    """
+    count, dimensions = first.shape
+    points = [Point.of(n, one) for n, one in enumerate(np.concatenate([first, second]))]
+    for i in range(dimensions):
+        for n in range(count):
+            normal, own = first[n].copy(), [n] * dimensions
+            normal[i], own[i] = second[n, i], count + n
+            points.append(Point(normal, tuple(own)))
+    return points
+
+
+def one_at_a_time(dimensions: int) -> list[Point]:
+    """Return the points of a screening: none moved, then each input by -1 and +1 deviation."""
+    steps = np.repeat(np.eye(dimensions), 2, axis=0)
+    steps[::2] *= -1.0
+    return [Point(one, None) for one in np.concatenate([np.zeros((1, dimensions)), steps])]
 
 
 def normal_samples(method: str, count: int, dimensions: int, seed: int) -> Array:
@@ -56,6 +106,27 @@ def normal_samples(method: str, count: int, dimensions: int, seed: int) -> Array
             f"unknown method '{method}'", "--method", names_near(method, get_args(Method))
         )
     return ndtri(np.clip(uniform[:count], SMALLEST_TAIL, 1.0 - SMALLEST_TAIL))
+
+
+def noise_of_point(
+    point: Point, columns: Sequence[int], time: Array, correlation_time: float, seed: int
+) -> Array:
+    """Return the noise (f, p) of the inputs in these columns at a point.
+
+    Args:
+        point: the sample's point.
+        columns: (p,) of the inputs that have noise.
+        time: (f,) s, rising.
+        correlation_time: s.
+        seed: of all draws.
+    """
+    found = np.zeros((len(time), len(columns)))
+    for number in dict.fromkeys(point.noise_of or ()):
+        draws = noise(number, time, len(columns), correlation_time, seed)
+        for place, column in enumerate(columns):
+            if point.noise_of is not None and point.noise_of[column] == number:
+                found[:, place] = draws[:, place]
+    return found
 
 
 def noise(number: int, time: Array, dimensions: int, correlation_time: float, seed: int) -> Array:

@@ -49,11 +49,25 @@ def strain_scale() -> Colours:
     return _sample("YlOrRd", np.linspace(0.15, 1.0, 256))
 
 
+def activation_scale() -> Colours:
+    """Return the 256 colours (256, 3) from no activation to the limit."""
+    return _sample("BuPu", np.linspace(0.35, 1.0, 256))
+
+
 def strain_colours(strain: ArrayLike, limit: float) -> Colours:
     """Return colours (..., 3) of ligament strains; slack (strain <= 0) is grey."""
-    strain = np.asarray(strain, float)
-    level = np.clip(np.nan_to_num(strain) / (limit or 1.0) * 255.0, 0.0, 255.0).astype(int)
-    return np.where((strain > 0)[..., None], strain_scale()[level], rgb(SLACK)).astype(np.uint8)
+    return _on_scale(strain, limit, strain_scale())
+
+
+def activation_colours(activation: ArrayLike, limit: float) -> Colours:
+    """Return colours (..., 3) of activations; none (<= 0) is grey."""
+    return _on_scale(activation, limit, activation_scale())
+
+
+def _on_scale(values: ArrayLike, limit: float, scale: Colours) -> Colours:
+    values = np.asarray(values, float)
+    level = np.clip(np.nan_to_num(values) / (limit or 1.0) * 255.0, 0.0, 255.0).astype(int)
+    return np.where((values > 0)[..., None], scale[level], rgb(SLACK)).astype(np.uint8)
 
 
 def _sample(name: str, at: NDArray[np.float64]) -> Colours:

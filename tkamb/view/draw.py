@@ -22,6 +22,7 @@ from tkamb.view.strands import (
     centres_of_pressure,
     extensor_strands,
     ligament_strands,
+    muscle_strands,
     path_strands,
 )
 
@@ -50,7 +51,8 @@ def draw(
     contact = case.scene.contact
     floor, centre = floor_and_foot(case, geometries, run.frames)
     bundles, limit = ligament_strands(mechanics, states)
-    strands = [*bundles, *extensor_strands(mechanics, states)]
+    muscles, most_active = muscle_strands(geometries)
+    strands = [*bundles, *extensor_strands(mechanics, states), *muscles]
     markers = [*contact_markers(geometries), *centre]
     if maps is not None and found:
         assert case.insert is not None
@@ -73,6 +75,7 @@ def draw(
         markers=tuple(markers),
         map=_pressure_map(results, rows),
         strain_limit=limit,
+        activation_limit=most_active,
         lattice=lattice_lines(case) if lattice else np.empty((0, 2, 3)),
         notes=(*_stand_ins(case, bool(floor)), *case.scene.output.notes),
     )

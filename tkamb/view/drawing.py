@@ -20,6 +20,7 @@ LAYERS = (
     "floor",
     "ligaments",
     "extensor lines",
+    "muscles",
     "forces",
     "pressure map",
     "contact points",
@@ -166,6 +167,7 @@ class Drawing:
         markers: contact points and centres of pressure.
         map: pressure; None without contact.
         strain_limit: upper end of the ligaments' colour scale; 0 without ligaments.
+        activation_limit: upper end of the muscles' colour scale; 0 without muscles.
         lattice: (s, 2, 3) m, lines of the contact model's grid; empty unless asked for.
         notes: what a viewer must know, plain sentences.
     """
@@ -184,6 +186,7 @@ class Drawing:
     markers: tuple[Marker, ...]
     map: PressureMap | None
     strain_limit: float
+    activation_limit: float = 0.0
     lattice: Array = field(default_factory=lambda: np.empty((0, 2, 3)))
     notes: tuple[str, ...] = ()
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array
 from tkamb.units import MILLIMETRE
-from tkamb.view.colours import pressure_scale, strain_scale
+from tkamb.view.colours import activation_scale, pressure_scale, strain_scale
 from tkamb.view.drawing import (
     HIDDEN_AT_FIRST,
     LAYERS,
@@ -90,8 +90,10 @@ def pack(drawings: Sequence[Drawing]) -> bytes:
             "metres_per_body_weight": METRES_PER_BODY_WEIGHT,
             "peak_MPa": peak,
             "strain_limit": limit,
+            "activation_limit": max(one.activation_limit for one in drawings),
             "pressure_scale": block.put(pressure_scale(), "uint8"),
             "strain_scale": block.put(strain_scale(), "uint8"),
+            "activation_scale": block.put(activation_scale(), "uint8"),
             "views": [_view(block, k, one, peak) for k, one in enumerate(drawings)],
         }
     )

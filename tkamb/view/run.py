@@ -8,13 +8,13 @@ from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.errors import InputError
 from tkamb.results import Results
 from tkamb.results_folder import SUMMARY_NAME, read_results
-from tkamb.run.summary import files_hash, scene_hash
-from tkamb.scene import Scene, load_scene
+from tkamb.run.rerun import RUN_AGAIN, case_of_results, same_files
+from tkamb.run.summary import scene_hash
+from tkamb.scene import load_scene
 from tkamb.scene.case import Case, load_case
 from tkamb.simulation import simulate
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
-RUN_AGAIN = "run it again: tkamb run"
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ def open_run(
     if (folder / SUMMARY_NAME).exists():
         results = read_results(folder)
         same = results.summary.get("scene_sha256") == scene_hash(case)
-        same = same and _same_files(case, results)
+        same = same and same_files(case, results.summary)
         if same and len(results) and not results.summary.get("unfinished_frames"):
             announce(f"results of this scene found in {folder}")
             return match_frames(case, results)
@@ -143,22 +143,7 @@ def run_of_results(results: Results) -> CaseResults:
     Raises:
         InputError: the scene is not there, or no longer what was run.
     """
-    case = load_case(_scene_of(results))
-    scene = results.summary.get("scene")
-    if scene_hash(case) != results.summary.get("scene_sha256"):
-        what = "has changed since these results were computed, or was run with --set"
-        raise InputError(what, scene, f"{RUN_AGAIN} {scene}")
-    if not _same_files(case, results):
-        what = "a mesh or table that it names has changed since these results were computed"
-        raise InputError(what, scene, f"{RUN_AGAIN} {scene}")
-    return match_frames(case, results)
-
-
-def _same_files(case: Case, results: Results) -> bool:
-    """Say whether meshes and tables hold what the run read; a run without a record counts."""
-    identity = results.summary.get("identity") or {}
-    found = identity.get("content of a file")
-    return found is None or found == files_hash(case)
+    return match_frames(case_of_results(results), results)
 
 
 def _from_folder(folder: Path) -> CaseResults:
@@ -166,20 +151,3 @@ def _from_folder(folder: Path) -> CaseResults:
     if not len(results):
         raise InputError("holds no frame", folder, RUN_AGAIN)
     return run_of_results(results)
-
-
-def _scene_of(results: Results) -> Scene:
-    """Return the scene of results, with the contact model they were run with."""
-    name = results.summary.get("scene")
-    if not name:
-        raise InputError("names no scene file", "summary", "give the scene itself to tkamb view")
-    path = Path(name)
-    if not path.exists():
-        raise InputError(
-            "the scene of these results is not there",
-            path,
-            "put it back, or run it again",
-        )
-    contact = results.summary.get("contact") or {}
-    overrides = {f"contact.{key}": value for key, value in contact.items() if value is not None}
-    return load_scene(path, overrides)

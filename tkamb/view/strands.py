@@ -1,4 +1,4 @@
-"""The lines of a drawing: ligament bundles, tendons, and the paths of the centres of pressure."""
+"""The lines of a drawing: ligaments, tendons, muscles, and paths of the centres of pressure."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -6,15 +6,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tkamb.body.chain import ChainState
+from tkamb.body.knee import KneeGeometry
 from tkamb.body.wrapping import TautPath
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import ComputationError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, transform
 from tkamb.geometry.surface import Surface
 from tkamb.output.metrics import stretches
 from tkamb.output.style import SIDE_COLOURS
 from tkamb.units import MILLIMETRE
-from tkamb.view.colours import TENDON, WRAPPED, Colours, rgb, strain_colours
+from tkamb.view.colours import (
+    TENDON,
+    WRAPPED,
+    Colours,
+    activation_colours,
+    rgb,
+    strain_colours,
+)
 from tkamb.view.drawing import Marker, Strand
 
 if TYPE_CHECKING:
@@ -22,6 +30,12 @@ if TYPE_CHECKING:
 
 BUNDLE, TENDON_RADIUS, PATH = 1.0 * MILLIMETRE, 1.5 * MILLIMETRE, 0.35 * MILLIMETRE
 """m, radii; bundles are thinner where a ligament has many."""
+
+MUSCLE_RADIUS = 2.0 * MILLIMETRE
+SLACK_FORCE = 1.0
+"""N."""
+LEAST_ACTIVATION = 0.1
+"""Upper end of the colour scale, where no muscle is more active."""
 
 MANY_BUNDLES = 20
 
@@ -60,6 +74,39 @@ def extensor_strands(mechanics: Mechanics, states: Sequence[ChainState]) -> tupl
     muscle, ligament = (list(found) for found in zip(*paths, strict=True))
     name = extensor.muscle.name.replace("_", " ")
     return _tendon(name, muscle), _tendon("patellar ligament", ligament)
+
+
+def muscle_strands(geometries: Sequence[KneeGeometry]) -> tuple[tuple[Strand, ...], float]:
+    """Return the muscles across the knee coloured by activation, and the scale's upper limit.
+
+    From where a line leaves the shank or foot to where it reaches thigh or pelvis; those that
+    carry less than a newton are grey, and frames without a solution have none.
+    """
+    shares = [one.share if one.share and one.share.status == "ok" else None for one in geometries]
+    first = next((share for share in shares if share), None)
+    if first is None:
+        return (), 0.0
+    count = len(first.crossing)
+    ends = np.full((len(shares), count, 2, 3), np.nan)
+    activation, force = np.zeros((2, len(shares), count))
+    for k, (one, share) in enumerate(zip(geometries, shares, strict=True)):
+        if share is not None:
+            ends[k, :, 0] = transform(one.state.pose("tibia"), share.lines.shank)
+            ends[k, :, 1] = transform(one.state.pose("femur"), share.lines.thigh)
+            activation[k], force[k] = share.activation[share.crossing], share.force[share.crossing]
+    limit = max(float(activation.max()), LEAST_ACTIVATION)
+    colours = activation_colours(np.where(force < SLACK_FORCE, 0.0, activation), limit)
+    strands = tuple(
+        Strand(
+            first.muscles[muscle],
+            "muscles",
+            ends[:, i],
+            np.repeat(colours[:, i, None], 2, axis=1),
+            MUSCLE_RADIUS,
+        )
+        for i, muscle in enumerate(first.crossing)
+    )
+    return strands, limit
 
 
 def _tendon(name: str, paths: list[TautPath | None]) -> Strand:

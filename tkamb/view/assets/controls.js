@@ -85,8 +85,10 @@ function addLegends() {
   const peak = data.peak_MPa;
   element("pressure-bar").hidden = !(peak > 0);
   element("strain-bar").hidden = !(data.strain_limit > 0);
+  element("activation-bar").hidden = !(data.activation_limit > 0);
   colourBar("pressure-bar", data.pressure_scale, peak, 1);
   colourBar("strain-bar", data.strain_scale, 100 * data.strain_limit, 1);
+  colourBar("activation-bar", data.activation_scale, 100 * data.activation_limit, 1);
   const known = new Set();
   for (const view of views) {
     for (const arrow of view.arrows) {

@@ -1,0 +1,75 @@
+"""Pages of the docs site that are made from other files: README, changelog, models, gallery."""
+
+import re
+from pathlib import Path
+
+from mkdocs.structure.files import File
+
+ROOT = Path(__file__).parents[1]
+COPIED = {
+    "index.md": "README.md",
+    "contributing.md": "CONTRIBUTING.md",
+    "changelog.md": "CHANGELOG.md",
+    **{f"models/{p.parent.name}.md": f"models/{p.parent.name}/README.md"
+       for p in sorted(ROOT.glob("models/*/README.md"))},
+}  # fmt: skip
+"""Page -> the file that it is made from."""
+API = (
+    "simulation.simulate", "scene.scene.load_scene", "scene.scene.Scene", "results.Results",
+    "results_folder.read_results", "output.maps.ContactMaps", "press.press_meshes",
+    "press.PressReport", "check.scene_check", "compare.comparison",
+    "contact.registry.contact_model", "contact.model", "contact.result.ContactResult",
+    "contact.pair", "testing", "errors",
+)  # fmt: skip
+"""What others program against."""
+LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
+
+
+def on_files(files, config):
+    """Add the pages that are made from other files."""
+    pages = {page: _page(page, source) for page, source in COPIED.items()}
+    pages["api.md"] = _api()
+    pages["gallery.md"] = _gallery()
+    for page, text in pages.items():
+        files.append(File.generated(config, page, content=text))
+    return files
+
+
+def _page(page: str, source: str) -> str:
+    """Return the text of a file with its links led to pages; other links become plain names."""
+    folder, here = (ROOT / source).parent, Path(page).parent
+    known = {(ROOT / file).resolve(): made for made, file in COPIED.items()}
+    up = "../" * (len(here.parts))
+
+    def led(match):
+        picture, words, target, anchor = match.groups()
+        if target.startswith(("http:", "https:")):
+            return match[0]
+        path = (folder / target).resolve()
+        if path.is_dir() and (path / "README.md").is_file():
+            path /= "README.md"
+        if path in known:
+            return f"[{words}]({up}{known[path]}{anchor or ''})"
+        if path.is_relative_to(ROOT / "docs") and path.is_file():
+            return f"{picture}[{words}]({up}{path.relative_to(ROOT / 'docs')}{anchor or ''})"
+        return f"`{words}`"
+
+    return LINK.sub(led, (ROOT / source).read_text(encoding="utf-8"))
+
+
+def _api() -> str:
+    heads = "# Python\n\nWhat others program against; `dir(tkamb)` lists the shortest names.\n\n"
+    return heads + "\n".join(f"::: tkamb.{name}\n" for name in API)
+
+
+def _gallery() -> str:
+    """Return the gallery's page: of each example its picture, first words and code."""
+    parts = ["# Gallery\n\nEach example runs in the tests and is held to the number it asserts.\n"]
+    for path in sorted((ROOT / "docs" / "gallery").glob("*.py")):
+        _, words, code = path.read_text(encoding="utf-8").split('"""', 2)
+        title, _, rest = words.partition("\n")
+        picture = f"gallery/{path.stem}.png"
+        shown = f"![{title}]({picture})\n" if (ROOT / "docs" / picture).is_file() else ""
+        parts.append(f"## {title.rstrip('.')}\n\n{rest.strip()}\n\n{shown}")
+        parts.append(f'```python title="docs/gallery/{path.name}"\n{code.strip()}\n```\n')
+    return "\n".join(parts)

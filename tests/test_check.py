@@ -1,0 +1,90 @@
+"""`tkamb check`: what a scene gives and what it asks, without a run."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tkamb.check.leg_picture import leg_frame, shown_frames
+from tkamb.check.scene_check import check_scene
+from tkamb.cli import main
+from tkamb.starter import lay_out
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return lay_out(tmp_path_factory.mktemp("check") / "knee")
+
+
+@pytest.fixture(scope="module")
+def checked(scene):
+    return check_scene(scene)
+
+
+def test_it_says_what_each_file_gave_and_writes_the_picture_alone(scene, capfd):
+    before = sorted(scene.parent.iterdir())
+    picture = scene.parent / "leg.png"
+    assert main(["check", str(scene), "--out", str(picture)]) == 0
+    said = capfd.readouterr().out
+    assert "motion (motion.csv): 6 frames" in said
+    assert "flexion 28.0 to 107.9 deg" in said
+    assert "question: none" in said and "not modelled: " in said
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert sorted(scene.parent.iterdir()) == sorted([*before, picture])
+    picture.unlink()
+
+
+def test_a_ground_reaction_in_the_wrong_unit_is_asked_about(scene, checked):
+    assert checked.questions == ()
+    table = scene.parent / "ground_reaction.csv"
+    text = table.read_text()
+    header, *rows = text.splitlines()
+    cells = [row.split(",") for row in rows]
+    forces = [k for k, name in enumerate(header.split(",")) if name.endswith("_N")]
+    for row in cells:
+        for k in forces:
+            row[k] = str(9.80665 * float(row[k]))
+    table.write_text("\n".join([header, *(",".join(row) for row in cells)]) + "\n")
+    asked = check_scene(scene).as_dict()
+    table.write_text(text)
+    assert any("ground reaction" in question for question in asked["questions"])
+    assert json.loads(json.dumps(asked)) == asked
+
+
+def test_the_leg_is_drawn_where_the_chain_and_the_plate_are(checked):
+    """Segments keep their lengths, the hip is above the ankle, the force acts on the plate."""
+    case = checked.mechanics.case
+    frames = [leg_frame(checked.mechanics, k) for k in shown_frames(checked.mechanics)]
+    assert len(frames) == 3
+    shank = [np.linalg.norm(one.joints[1] - one.joints[2]) for one in frames]
+    np.testing.assert_allclose(shank, shank[0], rtol=1e-12)
+    for one in frames:
+        np.testing.assert_allclose(one.joints[2], case.tibia.pose[one.frame, :3, 3], atol=1e-12)
+        np.testing.assert_array_equal(one.force, case.ground.force[one.frame])
+        np.testing.assert_array_equal(one.point, case.ground.point[one.frame])
+        assert one.joints[0, 1] > one.joints[1, 1] > one.joints[2, 1] > one.point[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--out", "leg.jpg"], "none of .png, .html"),
+        (["--set", "contact.model=magic"], "magic"),
+        (["--set", "contact.material=cheese"], "polyethylene"),
+        (["--set", "motion.file=no.csv"], "no.csv"),
+    ],
+)
+def test_bad_input_is_one_line(scene, tmp_path, monkeypatch, capfd, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    assert main(["check", str(scene), *arguments]) == 2
+    said = capfd.readouterr().err
+    assert words in said and said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_page_holds_questions_picture_and_files(scene, tmp_path):
+    page = tmp_path / "check.html"
+    assert main(["check", str(scene), "--out", str(page)]) == 0
+    text = page.read_text(encoding="utf-8")
+    assert "ground_reaction.csv" in text and "<svg" in text
+    assert "http://" not in text.replace("http://www.w3.org", "")

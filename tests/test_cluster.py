@@ -1,0 +1,147 @@
+"""Jobs over a Dask cluster: the same answers as here, whatever dies."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from test_uncertainty import SCENE, bodies_alone
+from tkamb.cli import main
+from tkamb.errors import ComputationError, InputError
+from tkamb.run import cluster
+from tkamb.run.workers import Crew, Task
+from tkamb.uncertainty.run import estimate_uncertainty
+
+
+class Adder:
+    """Adds its base to what it is given, after a while."""
+
+    made = 0
+
+    def __init__(self, base, seconds=0.0):
+        type(self).made += 1
+        self.base, self.seconds = base, seconds
+
+    def __call__(self, number, job):
+        time.sleep(self.seconds)
+        return number, self.base + job, os.getpid()
+
+
+def distributed():
+    return pytest.importorskip("distributed", reason="Dask is not installed")
+
+
+def test_answers_of_a_cluster_are_those_of_this_process_and_preparation_is_done_once():
+    with distributed().LocalCluster(
+        n_workers=1, threads_per_worker=4, processes=False, dashboard_address=None
+    ) as place:
+        Adder.made = 0
+        task, wanted = Task(Adder, (10,)), [(n, n**2) for n in range(20)]
+        there = dict(Crew(1, place.scheduler_address).answers(task, wanted))
+        assert Adder.made == 1
+        assert there == dict(Crew(1).answers(task, wanted))
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense"])
+def test_a_scheduler_that_is_not_there_is_one_line(address, tmp_path, monkeypatch, capsys):
+    distributed()
+    monkeypatch.setattr(cluster, "PATIENCE", 0.5)
+    folder = tmp_path / "out"
+    assert main(["uncertainty", str(SCENE), "--dask", address, "--out", str(folder)]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "no Dask scheduler answers" in said and "\n" not in said
+    assert not folder.exists()
+
+
+def test_without_dask_the_install_line_is_given(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"pip install 'tkamb\[cluster\]'"):
+        Crew(1, "local").check()
+
+
+def test_workers_are_counted():
+    for wrong in (0, 1000):
+        with pytest.raises(InputError, match="--workers"):
+            Crew(wrong)
+
+
+@pytest.mark.slow
+def test_a_worker_killed_in_the_middle_changes_nothing():
+    module = distributed()
+    with module.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as place:
+        scene = bodies_alone(uncertainty__ligament_strain=0.02)
+        options = {"samples": 40, "frames": slice(0, 101, 25)}
+        seen = []
+
+        def kill_one(samples, count):
+            for index, one in enumerate(samples):
+                if index == 5:
+                    with module.Client(place.scheduler_address, set_as_default=False) as client:
+                        os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
+                seen.append(one[0])
+                yield one
+
+        there = estimate_uncertainty(
+            scene, **options, dask=place.scheduler_address, progress=kill_one
+        )
+    assert sorted(seen) == list(range(40))
+    here = estimate_uncertainty(scene, **options)
+    for name, band in here.bands.items():
+        np.testing.assert_array_equal(band, there.bands[name])
+
+
+@pytest.fixture
+def place(tmp_path):
+    """Give a scheduler with one worker, processes of their own, and its address."""
+    distributed()
+    file = tmp_path / "scheduler.json"
+    python, quiet = [sys.executable, "-m"], ["--no-dashboard"]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+    command = ["distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", str(file)]
+    scheduler = subprocess.Popen([*python, *command, *quiet])
+    while not file.exists() and scheduler.poll() is None:
+        time.sleep(0.1)
+    address = json.loads(file.read_text())["address"]
+    command = ["distributed.cli.dask_worker", address, "--nthreads", "1"]
+    worker = subprocess.Popen([*python, *command, *quiet], env=environment)
+    yield scheduler, address
+    for process in (worker, scheduler):
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.slow
+def test_a_scheduler_killed_in_the_middle_is_said_in_one_line(place):
+    scheduler, address = place
+    found = []
+
+    def killing(answers):
+        for one in answers:
+            found.append(one)
+            if len(found) == 5:
+                scheduler.kill()
+            yield one
+
+    answers = Crew(1, address).answers(Task(Adder, (1, 0.1)), [(n, n) for n in range(400)])
+    with pytest.raises(ComputationError, match="scheduler is gone"):
+        list(killing(answers))
+    assert 5 <= len(found) < 400
+
+
+@pytest.mark.slow
+def test_a_local_cluster_of_processes_gives_the_same_tables():
+    distributed()
+    scene = bodies_alone(uncertainty__segment_mass=0.1)
+    options = {"samples": 24, "frames": slice(0, 101, 50)}
+    one = estimate_uncertainty(scene, **options)
+    two = estimate_uncertainty(scene, **options, dask="local", workers=2)
+    for name, band in one.bands.items():
+        np.testing.assert_array_equal(band, two.bands[name])

@@ -1,0 +1,232 @@
+"""Cohorts: the runs that a file makes, one table, groups, parts, resuming, and what fails."""
+
+import json
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from faults import Faults
+from interrupted_runs import broken_off, held_elsewhere
+from synthetic_run import make_run
+from tkamb.claim import claimed_directory, settle
+from tkamb.cli import main
+from tkamb.cohort.kept import frame_table, write_cohort
+from tkamb.cohort.outcome import Outcome, chosen_map
+from tkamb.cohort.plan import load_cohort
+from tkamb.cohort.report import cohort_html
+from tkamb.cohort.run import run_cohort
+from tkamb.cohort.statistics import groups_of, spread
+from tkamb.errors import InputError
+from tkamb.run.workers import Crew
+from tkamb.simulation import simulate
+
+KNEE = Path(__file__).parents[1] / "models" / "deep_knee_bend"
+WRITTEN = {"cohort.parquet", "runs.csv", "groups.csv", "cohort.json", "cohort.html"}
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Write a cohort of two subjects and a lost one, of a leg without implants."""
+    for name in ("patient.urdf", "motion.csv", "tibia.csv", "ground_reaction.csv"):
+        shutil.copy(KNEE / name, tmp_path)
+    whole = (KNEE / "scene.toml").read_text()
+    (tmp_path / "scene.toml").write_text(whole[: whole.index("[implant.femoral]")])
+    path = tmp_path / "legs.toml"
+    path.write_text(
+        """
+        title = "Three legs"
+        frames = "0:101:20"
+        [[subject]]
+        name = "small"
+        scale = 0.9
+        [[subject]]
+        name = "large"
+        scale = 1.1
+        [[subject]]
+        name = "lost"
+        set = { "motion.file" = "nowhere.csv" }
+        [[trial]]
+        name = "bend"
+        scene = "scene.toml"
+        [[design]]
+        name = "plain"
+        [[design]]
+        name = "heavy"
+        set = { "patient.mass_kg" = 100.0 }
+        """
+    )
+    return path
+
+
+def test_a_cohort_is_its_runs_one_by_one_and_lists_what_failed(file, tmp_path, capsys):
+    folder = tmp_path / "out"
+    assert main(["cohort", str(file), "--out", str(folder)]) == 0
+    said = capsys.readouterr()
+    assert "4 of 6 runs computed" in said.out
+    assert "lost" in said.err and "nowhere.csv" in said.err
+    assert {path.name for path in folder.iterdir()} == {*WRITTEN, ".tkamb"}
+    table = pq.read_table(folder / "cohort.parquet").to_pydict()
+    cohort = load_cohort(file)
+    for run in (cohort.runs[1], cohort.runs[2]):
+        alone = simulate(run.scene, frames=cohort.frames)
+        rows = [k for k, number in enumerate(table["run"]) if number == run.number]
+        for name in ("time_s", "force_total_BW", "hip_moment_si_Nm"):
+            assert [table[name][k] for k in rows] == list(alone[name])
+        assert {table["scene_sha256"][k] for k in rows} == {alone.summary["scene_sha256"]}
+        assert {table["subject"][k] for k in rows} == {run.labels["subject"]}
+    runs = (folder / "runs.csv").read_text().splitlines()
+    assert len(runs) == 7
+    assert sum("nowhere.csv" in line for line in runs) == 2
+    summary = json.loads((folder / "cohort.json").read_text())
+    assert [one["run"] for one in summary["failed_runs"]] == [4, 5]
+    assert summary["identity"]["code of tkamb"]
+    page = (folder / "cohort.html").read_text()
+    assert "Three legs" in page and "nowhere.csv" in page
+
+
+def test_parts_and_workers_and_an_interrupt_change_nothing(file, tmp_path):
+    whole, parted = tmp_path / "whole", tmp_path / "parted"
+
+    with pytest.raises(KeyboardInterrupt, match="1 of 6 runs are kept"):
+        run_cohort(file, whole, progress=broken_off(1))
+    assert not (whole / "cohort.parquet").exists()
+    computed = []
+
+    def counted(runs, count):
+        computed.append(count)
+        return runs
+
+    run_cohort(file, whole, crew=Crew(2), resume=True, progress=counted)
+    assert computed == [5]
+    for part in ("1/2", "2/2"):
+        assert main(["cohort", str(file), "--out", str(parted), "--shard", part]) in (0, 1)
+    run_cohort(file, parted, resume=True, progress=counted)
+    assert computed == [5, 0]
+    for name in ("cohort.parquet", "runs.csv", "groups.csv"):
+        assert (whole / name).read_bytes() == (parted / name).read_bytes()
+    assert not list(whole.rglob("*.frame")) and not list(parted.rglob("*.frame"))
+
+
+def outcome(scale, frames=41, kind="bend"):
+    """Return an outcome made of the synthetic run with its numbers scaled."""
+    run = make_run(kind, frames)
+    columns = {
+        name: values * (scale if name.endswith(("_BW", "_N", "_MPa", "_mm2")) else 1.0)
+        for name, values in run.columns.items()
+        if name != "status" and name not in run.not_modelled
+    }
+    return Outcome("", columns, run.status, chosen_map(run, 60.0))
+
+
+def test_group_statistics_count_each_run_once(file):
+    cohort = load_cohort(file)
+    outcomes = {0: outcome(0.8, 41), 2: outcome(1.2, 201), 4: Outcome("gone", {}, [])}
+    (group,) = groups_of(cohort, outcomes)
+    assert (group.labels, group.numbers, group.failed) == ({"design": "plain"}, (0, 2), 1)
+    peak = spread(group.peaks["force_total_BW"])
+    original = make_run("bend", 201)["force_total_BW"].max()
+    assert peak.mean == pytest.approx(original, rel=2e-3)  # 41 and 201 frames alike
+    assert peak.sd == pytest.approx(0.4 * original / np.sqrt(2), rel=0.02)
+    assert (peak.low, peak.high) == pytest.approx((0.8 * original, 1.2 * original), rel=0.01)
+    flexion = make_run("bend", 201)["flexion_deg"]
+    chosen = (flexion >= 30.0) & (flexion < 40.0)
+    mean = 1.2 * make_run("bend", 201)["force_total_BW"][chosen].mean()
+    assert group.edges[3] == 30.0
+    assert group.bins["force_total_BW"][1, 3] == pytest.approx(mean, rel=1e-12)
+
+
+def test_the_map_is_that_of_the_frame_asked_for_and_the_page_shows_one_per_group(file):
+    one = outcome(1.0)
+    assert one.columns["flexion_deg"][one.chosen.frame] == pytest.approx(60.0, abs=1.5)
+    whole = Outcome.of(one.shard())
+    np.testing.assert_array_equal(whole.chosen.pressure, one.chosen.pressure)
+    cohort = load_cohort(file)
+    outcomes = {n: outcome(1.0 + 0.05 * n, 21) for n in range(4)}
+    page = cohort_html(cohort, outcomes, groups_of(cohort, outcomes))
+    assert page.count("anterior ↑") == 2  # plain and heavy
+    assert "http" not in page.replace("http-equiv", "")
+    table = frame_table(cohort, outcomes, {})
+    assert table.num_rows == 4 * 21
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("scale = 0.9", "scale = 5.0", "less than or equal to 1.4"),
+        ("scale = 0.9", "size = 0.9", "unknown key 'subject.0.size'"),
+        ('"small"', '"large"', "two entries called 'large'"),
+        ('"scene.toml"', '"scenes.toml"', "scenes.toml"),
+        ("patient.mass_kg", "patient.mas_kg", "unknown key 'patient.mas_kg'"),
+        ('"0:101:20"', '"0-101"', "is not A:B or A:B:STEP"),
+        ("[[trial]]", "[[trials]]", "unknown key 'trials'"),
+        ("[[trial]]", "[[trial]", "is not TOML"),
+        ('name = "bend"', 'name = "bend"\nsubjects = ["nobody"]', "no subject 'nobody'"),
+    ],
+)
+def test_a_bad_file_is_one_line_and_nothing_is_written(file, tmp_path, capsys, old, new, words):
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+    folder = tmp_path / "out"
+    assert main(["cohort", str(file), "--out", str(folder)]) == 2
+    said = capsys.readouterr().err.strip()
+    assert words in said and "\n" not in said
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--workers", "0"], "0 is not within 1"),
+        (["--shard", "3/2"], "3/2 is no part"),
+        (["--shard", "1"], "'1' is not I/N"),
+        (["--frames", "500:600"], "not in the motion"),
+    ],
+)
+def test_bad_options_are_one_line(file, tmp_path, capsys, options, words):
+    folder = tmp_path / "out"
+    try:
+        status = main(["cohort", str(file), "--out", str(folder), *options])
+    except SystemExit as stop:
+        status = stop.code
+    said = capsys.readouterr().err.strip()
+    assert words in said
+    if "--frames" in options:  # known when a trial is read: every run fails by name
+        assert status == 1
+    else:
+        assert status == 2 and "\n" not in said and not folder.exists()
+
+
+def test_two_into_one_folder_and_another_cohort_to_resume_are_refused(file, tmp_path, capsys):
+    folder = tmp_path / "out"
+    assert main(["cohort", str(file), "--out", str(folder), "--shard", "3/6"]) == 0
+    file.write_text(file.read_text().replace("scale = 1.1", "scale = 1.2"))
+    capsys.readouterr()
+    assert main(["cohort", str(file), "--out", str(folder), "--resume", "--shard", "3/6"]) == 2
+    assert "cannot resume" in capsys.readouterr().err
+    with held_elsewhere(folder / "shard-3-of-6"):
+        assert main(["cohort", str(file), "--out", str(folder), "--shard", "3/6"]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "another tkamb is writing" in said and "\n" not in said
+
+
+def test_a_full_disk_leaves_no_table_or_the_whole_of_it(file, tmp_path, monkeypatch):
+    cohort, outcomes = load_cohort(file), {n: outcome(1.0, 5) for n in range(4)}
+    monkeypatch.setattr("tkamb.cohort.kept.cohort_html", lambda *_: "page")
+
+    def write(place, number=None):
+        place.mkdir()
+        injected = Faults(place, number).injected(monkeypatch)
+        with claimed_directory(place), injected as faults, suppress(InputError):
+            write_cohort(cohort, outcomes, {}, place)
+        settle(place)
+        return faults.calls, WRITTEN & {path.name for path in place.iterdir()}
+
+    calls, written = write(tmp_path / "whole")
+    assert written == WRITTEN
+    for number in range(len(calls)):
+        assert write(tmp_path / f"full{number}", number)[1] in (set(), WRITTEN)

@@ -1,0 +1,141 @@
+"""`tkamb compare`: known differences come out, and what is not the same is said."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from synthetic_run import make_run
+from tkamb.atomic import replaced_together
+from tkamb.claim import claimed_directory
+from tkamb.cli import main
+from tkamb.compare.comparison import compare_folders
+from tkamb.output.maps import write_maps
+from tkamb.results import Results
+from tkamb.results_folder import put_numbers
+
+
+def written(folder, results, **summary):
+    """Write results, no report, with keys of the summary changed; return the folder."""
+    results = replace(results, summary=results.summary | summary)
+    with claimed_directory(folder) as place, replaced_together(place) as files:
+        if results.maps is not None:
+            write_maps(results.maps, files.path("contact.h5"))
+        put_numbers(results, files)
+    return folder
+
+
+def chosen(results, frames):
+    """Return results with these frames alone, without maps."""
+    columns = {
+        name: [values[k] for k in frames] if name == "status" else values[frames]
+        for name, values in results.columns.items()
+    }
+    return Results(columns, results.summary)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """A bend, and the same with 7 N more at 60 deg, a failed frame and another model."""
+    root = tmp_path_factory.mktemp("runs")
+    bend = make_run("bend", frames=21)
+    other = make_run("bend", frames=21)
+    other.columns["force_total_N"][10] += 7.0
+    other.columns["status"][3] = "failed: no balance"
+    for name, values in other.columns.items():
+        if name not in ("time_s", "flexion_deg", "status"):
+            values[3] = np.nan
+    contact = {"model": "hertz", "resolution_mm": 1.5, "material": "none"}
+    return written(root / "a", bend), written(root / "b", other, contact=contact)
+
+
+def of(found, column):
+    (one,) = [one for one in found.differences if one.column == column]
+    return one
+
+
+def test_a_known_difference_is_found_at_its_frame(folders):
+    found = compare_folders(folders)
+    assert found.runs[1].pairing.exact
+    one = of(found, "force_total_N")
+    assert (one.max_abs, one.at_frame, one.frames) == (pytest.approx(7.0), 10, 20)
+    assert one.at == pytest.approx(60.0)
+    assert one.rms == pytest.approx(7.0 / np.sqrt(20)) and one.mean == pytest.approx(7.0 / 20)
+    assert of(found, "medial_area_mm2").max_abs == 0.0
+
+
+def test_what_is_not_the_same_is_said(folders):
+    notes = " ".join(compare_folders(folders).notes)
+    assert "contact, model. a: synthetic; b: hertz" in notes
+    assert "b: 1 of 21 frames failed" in notes
+    assert "body mass" not in notes
+
+
+def test_fewer_frames_of_one_recording_pair_without_interpolation(folders, tmp_path):
+    some = chosen(make_run("bend", frames=21, maps=False), list(range(0, 21, 4)))
+    found = compare_folders([folders[0], written(tmp_path / "some", some)])
+    assert found.runs[1].pairing.exact
+    assert of(found, "force_total_N").frames == 6
+    assert of(found, "force_total_N").max_abs == 0.0
+    assert any("15 frames of a have no partner" in note for note in found.notes)
+
+
+def test_other_frames_are_interpolated_to_second_order(folders, tmp_path):
+    """The error of linear interpolation falls by four when the frames are twice as many."""
+    errors = []
+    for frames in (38, 75):  # none of their times are those of 21 frames, but the ends
+        other = make_run("bend", frames=frames, maps=False)
+        other.columns["time_s"] += 1.0
+        found = compare_folders([folders[0], written(tmp_path / str(frames), other)])
+        assert not found.runs[1].pairing.exact
+        errors.append(of(found, "quadriceps_N").rms)
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.25)
+
+
+def test_a_place_with_two_answers_is_not_compared(folders, tmp_path):
+    there_and_back = make_run("bend", frames=30, maps=False)
+    there_and_back.columns["time_s"] += 1.0
+    there_and_back.columns["flexion_deg"][20:] = there_and_back["flexion_deg"][19:9:-1] - 0.5
+    found = compare_folders([folders[0], written(tmp_path / "back", there_and_back)])
+    assert found.differences == ()
+    assert any("two answers" in note for note in found.notes)
+
+
+def test_a_mix_of_axes_is_refused_unless_one_is_chosen(folders, tmp_path, capfd):
+    gait = written(tmp_path / "gait", make_run("gait", frames=21, maps=False))
+    out = tmp_path / "out"
+    assert main(["compare", str(folders[0]), str(gait), "--out", str(out)]) == 2
+    said = capfd.readouterr().err
+    assert "over cycle" in said and "--axis" in said and said.count("\n") == 1
+    assert not out.exists()
+    assert main(["compare", str(folders[0]), str(gait), "--axis", "cycle", "--out", str(out)]) == 0
+    assert "Not the same side. a: right; gait: left" in capfd.readouterr().out
+
+
+def test_the_page_stands_by_itself_and_holds_both_maps(folders, tmp_path, capfd):
+    out = tmp_path / "out"
+    both = [str(folder) for folder in folders]
+    assert main(["compare", *both, "--frame", "10", "--out", str(out), "--json"]) == 0
+    printed = json.loads(capfd.readouterr().out)
+    assert printed["runs"][1]["failed_frames"] == 1
+    text = (out / "compare.html").read_text(encoding="utf-8")
+    assert "frame 10, flexion 60°" in text.replace("\n", " ")
+    assert "http://" not in text and "https://" not in text
+    assert text.count("<figure") > 8
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["{a}"], "two to 8"),
+        (["{a}", "nowhere"], "nowhere"),
+        (["{a}", "{a}", "--frame", "99"], "99"),
+    ],
+)
+def test_bad_input_is_one_line(folders, tmp_path, monkeypatch, capfd, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    assert main(["compare", *(word.format(a=folders[0]) for word in arguments)]) == 2
+    said = capfd.readouterr().err
+    assert words in said and said.count("\n") == 1
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,183 @@
+"""EMG: envelopes of known value, targets and bounds in the sharing, agreement with activations."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from scipy.integrate import quad
+
+from recordings import write_c3d
+from shared_trials import STRENGTHS, two_flexors
+from tkamb.errors import InputError
+from tkamb.inputs.emg import Envelopes, envelope, load_envelopes
+from tkamb.muscles.emg import EmgGuide
+from tkamb.muscles.sharing import KKT_LIMIT
+from tkamb.run.emg import compare_emg
+from tkamb.scene.emg import EmgTable
+from tkamb.scene.si import in_si
+
+RATE = 1200.0
+TIME = np.arange(int(4 * RATE)) / RATE
+INSIDE = slice(600, -600)
+
+
+def test_the_envelope_of_a_sine_is_its_rectified_mean():
+    signal = 0.3 + 2.0 * np.sin(2 * np.pi * 97.3 * TIME)
+    for high_pass in (20.0, "none"):
+        found = envelope(signal, RATE, 6.0, high_pass)[INSIDE]
+        np.testing.assert_allclose(found, 2 * 2.0 / np.pi, rtol=5e-3)
+
+
+def test_the_envelope_has_no_phase_and_half_the_amplitude_at_the_cutoff():
+    """A carrier at 150 Hz whose amplitude swings at the low-pass cut-off."""
+    swing = 1 + 0.5 * np.sin(2 * np.pi * 5.0 * TIME)
+    found = envelope(swing * np.sin(2 * np.pi * 151.7 * TIME), RATE, 5.0, 30.0)[INSIDE]
+    expected = 2 / np.pi * (1 + 0.25 * np.sin(2 * np.pi * 5.0 * TIME[INSIDE]))
+    np.testing.assert_allclose(found, expected, atol=0.01)
+
+
+def test_the_high_pass_takes_slow_movement_away():
+    slow = 3.0 * np.sin(2 * np.pi * 1.5 * TIME)
+    assert envelope(slow, RATE, 6.0, 30.0)[INSIDE].max() < 0.01
+    mean, _ = quad(lambda phase: 3.0 * abs(np.sin(phase)) / np.pi, 0, np.pi)
+    assert envelope(slow, RATE, 6.0, "none")[INSIDE].mean() == pytest.approx(mean, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("signal", "cutoff", "words"),
+    [
+        (np.full(500, np.nan), 6.0, "gap"),
+        (np.ones(5000), 700.0, "700 Hz is not below half of 1200 Hz"),
+        (np.ones(100), 6.0, "shorter than a period of the cut-off 6 Hz"),
+    ],
+)
+def test_signals_that_carry_no_envelope_are_refused(signal, cutoff, words):
+    with pytest.raises(InputError, match=words):
+        envelope(signal, RATE, cutoff, "none")
+
+
+def table(file, **changes):
+    given = {"channels": {"VL": ("vaslat",)}, "high_pass_Hz": 20.0, "cutoff_Hz": 6.0}
+    return EmgTable(**({"file": file} | given | changes))
+
+
+def burst(centre):
+    return np.exp(-(((TIME - centre) / 0.2) ** 2)) * np.sin(2 * np.pi * 97.3 * TIME)
+
+
+def test_channels_of_a_c3d_stand_on_its_clock_over_their_largest_value(tmp_path):
+    markers = {"heel": np.ones((400, 3))}
+    path = write_c3d(
+        tmp_path / "a.c3d", markers, first_frame=50, ratio=12, analog={"VL": 3e-4 * burst(1.5)}
+    )
+    found = load_envelopes(in_si(table(path, offset_s=0.04)))
+    values = found.values["VL"]
+    assert values.max() == pytest.approx(1.0)
+    assert found.time[values.argmax()] == pytest.approx(0.5 + 0.04 + 1.5, abs=0.01)
+    assert np.isnan(found.at("vaslat", np.array([0.5, 4.6]))).all()
+    given = load_envelopes(in_si(table(path, normalised_by={"VL": 3e-4})))
+    assert given.values["VL"].max() < 2 / np.pi
+
+
+def test_a_table_serves_as_well(tmp_path):
+    path = tmp_path / "emg.csv"
+    rows = [f"{t:.6f},{v:.9f}," for t, v in zip(TIME, burst(2.0), strict=True)]
+    path.write_text("\n".join(["clock,VL,", *rows]).replace("VL,", "VL"), encoding="utf-8")
+    found = load_envelopes(in_si(table(path, time="clock")))
+    assert found.time[found.values["VL"].argmax()] == pytest.approx(2.0, abs=0.01)
+    with pytest.raises(InputError, match="no column 'VM'"):
+        load_envelopes(in_si(table(path, time="clock", channels={"VM": ("vasmed",)})))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"use": "target"},
+        {"use": "bounds", "weight": 1.0},
+        {"weight": 1.0},
+        {"channels": {"VL": ("vaslat",), "VM": ("vaslat",)}},
+        {"channels": {"VL": ()}},
+        {"normalised_by": {"VM": 1.0}},
+    ],
+)
+def test_tables_that_contradict_themselves_are_refused(tmp_path, changes):
+    with pytest.raises(ValidationError):
+        table(tmp_path, **changes)
+
+
+WEIGHT, ENVELOPE, MOMENT = 3.0, 0.4, 70.0
+ARMS = np.array([0.0, 0.05, 0.04])
+
+
+def sharing(guide, lowest=0.0):
+    """Return the frame of two flexors that carry 70 N·m without reserve."""
+    problems = two_flexors(1, reserve=0.0, least=lowest).problems
+    arms = np.zeros((1, 3, 1))
+    arms[0, :, 0] = ARMS
+    return replace(problems, moment=np.full((1, 1), MOMENT), arms=arms, guide=guide)
+
+
+def test_a_target_has_the_optimum_of_its_closed_form():
+    """min Σ a² + W (a_2 - e)² with d.a = M: a = (W e - λ d)/(1 + W) and -λ d by Lagrange."""
+    guide = EmgGuide(np.array([[np.nan, ENVELOPE, np.nan]]), "target", WEIGHT)
+    activation, _, residual, status = sharing(guide).solved(0)
+    d = (ARMS * STRENGTHS)[1:]
+    stiff, pull = np.array([1 + WEIGHT, 1.0]), np.array([WEIGHT * ENVELOPE, 0.0])
+    multiplier = (MOMENT - d @ (pull / stiff)) / (d @ (d / stiff))
+    np.testing.assert_allclose(activation[1:], (pull + multiplier * d) / stiff, rtol=1e-9)
+    assert status == "ok"
+    assert residual < KKT_LIMIT
+
+
+def test_bounds_hold_the_activation_near_the_envelope():
+    guide = EmgGuide(np.array([[np.nan, 0.4, np.nan]]), "bounds", 0.05)
+    activation, _, residual, status = sharing(guide).solved(0)
+    assert activation[1] == pytest.approx(0.45)  # without EMG it is 0.61
+    assert activation[2] == pytest.approx((MOMENT - 0.45 * 0.05 * 1800) / (0.04 * 1200))
+    assert status == "ok"
+    assert residual < KKT_LIMIT
+
+
+def test_bounds_never_leave_those_of_every_muscle():
+    guide = EmgGuide(np.array([[np.nan, 1.7, 0.0]]), "bounds", 0.2)
+    problem = guide.applied(sharing(None, lowest=0.05)._frame(0), 0)
+    np.testing.assert_allclose(problem.lowest, [0.05, 1.0, 0.05])
+    np.testing.assert_allclose(problem.highest, [1.0, 1.0, 0.2])
+
+
+def test_each_frame_of_a_knee_has_its_own_envelope():
+    trial = two_flexors(2, reserve=0.0, least=0.0)
+    values = np.array([[np.nan, 0.5, np.nan], [np.nan, 0.6, np.nan]])
+    guide = EmgGuide(values, "target", 1e6)
+    trial = replace(trial, problems=replace(trial.problems, guide=guide))
+    for k in range(2):
+        _, (activation, *_, status) = trial.solved(k, MOMENT, 0.0, ARMS[1:])
+        assert status == "ok"
+        assert activation[1] == pytest.approx(values[k, 1], abs=1e-4)
+
+
+def test_agreement_finds_correlation_error_and_lag():
+    """Frames at 30 Hz of an activation that is half the envelope, 60 ms later."""
+    own = np.exp(-(((TIME - 2.0) / 0.3) ** 2))
+    envelopes = Envelopes(None, TIME, {"VL": own}, {"vaslat": "VL"})
+    time = np.arange(0.5, 3.5, 1 / 30)
+    activation = 0.5 * envelopes.at("vaslat", time - 0.06)
+    activation[[3, 40]] = np.nan
+    columns = {"time_s": time, "activation_vaslat": activation}
+    found = compare_emg(envelopes, columns)["vaslat"]
+    both, there = np.isfinite(activation), envelopes.at("vaslat", time)
+    assert found["lag_s"] == pytest.approx(0.06, abs=0.0026)
+    assert found["pearson_r"] == pytest.approx(np.corrcoef(activation[both], there[both])[0, 1])
+    assert found["rmse"] == pytest.approx(np.std(activation[both] - there[both], mean=0.0))
+    assert (found["frames_compared"], found["frames_left_out"]) == (len(time) - 2, 2)
+
+
+@pytest.mark.parametrize("shape", [lambda t: np.exp(-((t - 2.5) ** 2)), lambda t: 3 * t])
+def test_a_lag_beyond_the_window_is_none(shape):
+    """An activation half a second late, and a ramp, which correlates alike at every lag."""
+    own = {"VL": TIME if shape(1.0) == 3.0 else np.exp(-((TIME - 2.0) ** 2))}
+    envelopes = Envelopes(None, TIME, own, {"vaslat": "VL"})
+    time = np.arange(1.0, 3.0, 1 / 30)
+    columns = {"time_s": time, "activation_vaslat": shape(time)}
+    assert np.isnan(compare_emg(envelopes, columns)["vaslat"]["lag_s"])

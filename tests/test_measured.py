@@ -1,0 +1,130 @@
+"""What was measured against what a run predicts: clock, sums, gaps, errors, every frame counted."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from synthetic_run import make_run
+from tkamb.errors import InputError
+from tkamb.inputs.measured_force import load_measured_force
+from tkamb.output.axis import horizontal_axis
+from tkamb.output.headline import cards
+from tkamb.output.panels import panels
+from tkamb.results import Results
+from tkamb.run.measured import compare_measured, measured_column
+from tkamb.scene.measured import MeasuredTable
+from tkamb.scene.si import in_si
+
+POUND = 0.45359237 * 9.80665
+
+
+def read(path, at, content="time,a,b\n0,10,1\n1,20,2\n2,30,3\n3,40,4\n4,50,5\n", **changes):
+    path.write_text(content, encoding="utf-8")
+    table = {"file": path, "unit": "N", "offset_s": 0.0, "columns": {"total": "a"}} | changes
+    at = np.asarray(at, float)
+    return load_measured_force(in_si(MeasuredTable(**table)), at).at(at)
+
+
+def test_forces_are_sums_in_newton_on_the_motions_clock(tmp_path):
+    columns = {"total": {"a": 1.0, "b": 2.0}, "medial": {"b": 3.0}}
+    found = read(tmp_path / "m.csv", [1.0, 1.75], unit="lbf", offset_s=0.5, columns=columns)
+    clock = np.array([0.5, 1.25])
+    total, medial = (12 + 12 * clock) * POUND, 3 * (1 + clock) * POUND
+    np.testing.assert_allclose(found["total"], total)
+    np.testing.assert_allclose(found["medial"], medial)
+    np.testing.assert_allclose(found["lateral"], total - medial)
+
+
+def test_nothing_is_invented_outside_and_across_gaps(tmp_path):
+    content = "time,a,\n0,1,\n1,2,\n2,,\n3,4,\n4,5,\n10,11,\n11,12,\n"
+    at = [-0.1, 0.5, 1.5, 2.5, 3.5, 4.0, 7.0, 10.5, 11.1]
+    found = read(tmp_path / "m.csv", at, content)["total"]
+    known = [0.5, 3.5, 4.0, 10.5]
+    np.testing.assert_array_equal(np.isfinite(found), np.isin(at, known))
+    np.testing.assert_allclose(found[np.isfinite(found)], np.array(known) + 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"offset_s": 100.0}, "measured from 100 to 104 s, the motion lasts from 0 to 1 s"),
+        ({"columns": {"total": "A"}}, "no column 'A'"),
+    ],
+)
+def test_what_cannot_be_used_is_refused(tmp_path, changes, words):
+    with pytest.raises(InputError, match=words):
+        read(tmp_path / "m.csv", [0.0, 1.0], **changes)
+
+
+@pytest.mark.parametrize("columns", [{"time": "t"}, {"time": {"t": 1.0}, "total": "a"}])
+def test_columns_that_name_no_force_are_refused(tmp_path, columns):
+    with pytest.raises(ValidationError, match="'columns'"):
+        MeasuredTable(file=tmp_path, unit="N", offset_s=0.0, columns=columns)
+
+
+def run_with_measurement(frames=40):
+    """Return a run whose prediction is 1.5 measured + 30 N; two frames failed, three unmeasured."""
+    run = make_run("gait", frames, maps=False)
+    columns = {k: v for k, v in run.columns.items() if k == "status" or np.isfinite(v).any()}
+    measured = 800 + 300 * np.sin(np.arange(frames) / 5)
+    columns["force_si_N"] = 1.5 * measured + 30
+    columns["status"] = ["ok"] * frames
+    for k in (4, 20):
+        columns["status"][k] = "failed: for a test"
+        columns["force_si_N"][k] = np.nan
+    columns["force_si_N"][7] = np.nan
+    measured = measured.copy()
+    measured[-3:] = np.nan
+    columns[measured_column("total")] = measured
+    return columns, run.summary
+
+
+def test_errors_of_a_straight_line_are_its_own():
+    columns, summary = run_with_measurement()
+    weight = summary["body_mass_kg"] * 9.80665
+    found = compare_measured(columns, weight)
+    assert set(found) == {"total"}
+    one, m = found["total"], columns[measured_column("total")]
+    m = m[np.isfinite(m) & np.isfinite(columns["force_si_N"])]
+    assert one["bias_N"] == pytest.approx(0.5 * m.mean() + 30)
+    assert one["rmse_N"] ** 2 == pytest.approx(one["bias_N"] ** 2 + 0.25 * m.var())
+    assert one["rmse_BW"] * weight == pytest.approx(one["rmse_N"])
+    assert one["pearson_r"] == pytest.approx(1.0)
+    assert one["r_squared"] == pytest.approx(1 - one["rmse_N"] ** 2 / m.var())
+    assert one["peak_predicted_N"] == pytest.approx(1.5 * one["peak_measured_N"] + 30)
+    assert one["peak_predicted_time_s"] == one["peak_measured_time_s"]
+
+
+def test_every_frame_is_counted():
+    columns, _ = run_with_measurement()
+    one = compare_measured(columns, 700.0)["total"]
+    counts = {key: value for key, value in one.items() if key.startswith("frames_")}
+    assert counts == {
+        "frames_compared": 34,
+        "frames_failed": 2,
+        "frames_without_measurement": 3,
+        "frames_without_prediction": 1,
+    }
+    left_out = columns[measured_column("total")][[4, 7, 20]]
+    assert one["measured_where_not_compared_N"] == [left_out.min(), left_out.max()]
+
+
+def test_a_run_without_a_number_is_compared_with_nothing():
+    columns, _ = run_with_measurement()
+    columns["force_si_N"][:] = np.nan
+    one = compare_measured(columns, 700.0)["total"]
+    assert one["frames_compared"] == 0
+    assert "rmse_N" not in one
+
+
+def test_the_report_shows_what_was_measured_behind_what_is_predicted():
+    columns, summary = run_with_measurement()
+    summary = summary | {"measured": compare_measured(columns, 700.0)}
+    results = Results(columns, summary)
+    found = {panel.name: panel for panel in panels(results)}["forces"].lines
+    behind = [line for line in found if line.behind]
+    assert [line.name for line in behind] == ["measured_total_N"]
+    card = next(c for c in cards(results, horizontal_axis(results)) if "measured" in c.title)
+    assert card.warning
+    for words in ("34 of 40 frames compared", "2 failed", "3 without measurement", "r 1.00"):
+        assert words in card.detail

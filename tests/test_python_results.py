@@ -1,0 +1,94 @@
+"""Results in Python: what a reader of a notebook sees, data frames, PyVista and ParaView."""
+
+import importlib
+import sys
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+import tkamb
+from synthetic_run import make_run
+from tkamb.atomic import replaced_together
+from tkamb.claim import claimed_directory
+from tkamb.cli import main
+from tkamb.errors import InputError
+from tkamb.inputs.meshes import read_triangles
+from tkamb.output.maps import write_maps
+from tkamb.results_folder import put_numbers
+
+RUN = make_run("gait", frames=11)
+
+
+def test_the_package_lists_its_public_names_and_its_version():
+    assert dir(tkamb) == sorted(tkamb.__all__)
+    assert tkamb.__version__ == importlib.metadata.version("tkamb")
+    with pytest.raises(AttributeError, match="simulat"):
+        _ = tkamb.simulat
+
+
+def test_a_run_is_one_line():
+    text = repr(make_run("bend", frames=5, maps=False))
+    assert "5 frames, synthetic" in text and "no maps" in text and "\n" not in text
+    assert f"maps of {len(RUN.maps.points_m)} points" in repr(RUN)
+
+
+def test_the_data_frame_holds_the_columns():
+    pandas = pytest.importorskip("pandas", reason="pandas is not installed")
+    frame = RUN.to_dataframe()
+    assert isinstance(frame, pandas.DataFrame)
+    assert list(frame.columns) == list(RUN.columns) and len(frame) == 11
+    np.testing.assert_array_equal(frame["force_total_N"], RUN["force_total_N"])
+    assert list(frame["status"]) == RUN.status
+
+
+@pytest.mark.parametrize(
+    ("package", "call"),
+    [("pandas", RUN.to_dataframe), ("pyvista", RUN.maps.to_pyvista)],
+)
+def test_an_extra_that_is_absent_is_one_line(monkeypatch, package, call):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=r"not installed; pip install 'tkamb\[notebook\]'"):
+        call()
+
+
+def test_pyvista_gets_one_block_a_frame_with_the_load():
+    pytest.importorskip("pyvista", reason="PyVista is not installed")
+    blocks = RUN.maps.to_pyvista()
+    assert len(blocks) == 11
+    block = blocks["frame 4"]
+    np.testing.assert_array_equal(block.point_data["pressure_Pa"], RUN.maps.pressure_Pa[4])
+    assert block.n_cells == len(RUN.maps.triangles)
+    assert block.field_data["time_s"][0] == RUN["time_s"][4]
+
+
+def test_the_time_series_for_paraview_names_a_file_for_each_map(tmp_path, capsys):
+    with claimed_directory(tmp_path / "run") as place, replaced_together(place) as files:
+        maps = make_run("gait", frames=11).maps
+        maps.pressure_Pa[3] = np.nan  # as a failed frame's
+        write_maps(maps, files.path("contact.h5"))
+        put_numbers(RUN, files)
+    out = tmp_path / "vtk"
+    assert main(["export", str(tmp_path / "run"), "--vtp", "--out", str(out)]) == 0
+    assert "10 of 11 frames" in capsys.readouterr().out
+    sets = ElementTree.parse(out / "contact.pvd").getroot().findall("Collection/DataSet")
+    times = [float(one.get("timestep")) for one in sets]
+    assert times == [t for k, t in enumerate(RUN["time_s"]) if k != 3]
+    for one in sets:
+        _, faces = read_triangles(out / one.get("file"))
+        np.testing.assert_array_equal(faces, maps.triangles)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--vtp"], "--out belongs to"),
+        (["--sto", "a.sto", "--out", "b"], "--out belongs to"),
+        (["--deck", "ccx", "--out", "a.inp"], "--frame go together"),
+        (["--deck", "ccx", "--frame", "0", "--out", "a.feb"], "no .inp file"),
+    ],
+)
+def test_options_that_do_not_belong_together_are_refused(tmp_path, capsys, arguments, words):
+    assert main(["export", str(tmp_path), *arguments]) == 2
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1

@@ -1,0 +1,72 @@
+"""The report's section on muscles: what is drawn where, and that its parts sum up."""
+
+import numpy as np
+import pytest
+
+from muscle_run import ACROSS, CHANNELS, GROUPS, muscle_run
+from synthetic_run import WEIGHT_N
+from tkamb.output.axis import horizontal_axis
+from tkamb.output.muscles import activation_cells, draw_activations, muscle_panels, reserve_words
+from tkamb.output.report import report_html
+
+
+@pytest.fixture(scope="module")
+def run():
+    return muscle_run()
+
+
+def test_forces_of_the_groups_are_the_sums_of_their_muscles(run):
+    panel = next(panel for panel in muscle_panels(run) if panel.name == "muscle_forces")
+    assert [line.label for line in panel.lines] == list(GROUPS)
+    for line in panel.lines:
+        total = sum(run[f"muscle_{name}_N"] for name in GROUPS[line.label])
+        np.testing.assert_allclose(WEIGHT_N * line.values, total)
+
+
+@pytest.mark.parametrize("side", ["medial", "lateral"])
+def test_what_makes_a_force_sums_up_to_it(run, side):
+    panel = next(panel for panel in muscle_panels(run) if panel.name == f"from_{side}")
+    whole, *parts = panel.lines
+    assert {part.label for part in parts} == {
+        "external loads", "ligaments", "knee extensors", "thigh to shank", "thigh to foot",
+    }  # fmt: skip
+    np.testing.assert_allclose(sum(part.values for part in parts), whole.values, atol=1e-9)
+
+
+def test_no_two_curves_of_a_plot_look_alike(run):
+    for panel in muscle_panels(run):
+        looks = [(line.colour, line.dashed) for line in panel.lines]
+        assert len(set(looks)) == len(looks), panel.name
+
+
+def test_every_muscle_across_the_knee_and_every_other_channel_has_its_plot(run):
+    cells = activation_cells(run)
+    drawn = [name for cell in cells for name in cell.muscles]
+    assert len(drawn) == len(set(drawn))
+    assert set(drawn) == {*GROUPS["knee extensors"], *ACROSS, *CHANNELS}
+    both = next(cell for cell in cells if "glmed1" in cell.muscles)
+    assert both.muscles == ("glmed1", "glmed2")
+
+
+def test_the_plots_hold_activation_and_envelope(run):
+    figure = draw_activations(run, horizontal_axis(run))
+    titles = {axes.get_title("left"): axes for axes in figure.axes if axes.get_visible()}
+    medial = titles["gasmed"]
+    np.testing.assert_allclose(medial.lines[0].get_ydata(), run["activation_gasmed"])
+    assert len(medial.collections) == 1
+    assert medial.get_title("right") == "r 0.81"
+    assert len(titles["gaslat"].collections) == 0
+    assert titles["GM (2)"].get_title("right") == "r −0.20 to 0.81"
+
+
+def test_reserves_stand_in_words(run):
+    words = reserve_words(run.summary)
+    assert "hip rotation 7.2 N·m (55 %, above 5 % in 31 frames)" in words
+    assert "knee flexion 1.4 N·m (4 %)" in words
+
+
+def test_the_section_is_in_the_page(run):
+    page = report_html(run)
+    assert "<h2>Muscles</h2>" in page
+    assert "figure-from_medial" in page
+    assert "line-measured_medial_N" in page

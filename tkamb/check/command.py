@@ -1,0 +1,65 @@
+"""`tkamb check`: arguments in, exit status out."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tkamb.errors import InputError
+
+if TYPE_CHECKING:
+    from tkamb.check.scene_check import SceneCheck
+
+PICTURES = (".png", ".html")
+
+
+def add_check(commands: Any, setting: Any) -> None:
+    """Add `check` to the command line.
+
+    Args:
+        commands: the parser's subcommands.
+        setting: what reads TABLE.KEY=VALUE.
+    """
+    check = commands.add_parser("check", help="read a scene's files and look at them; no run")
+    check.add_argument("scene", type=Path, help="scene.toml")
+    check.add_argument(
+        "--out", type=Path, metavar="F", help="the leg at three frames: .png, or .html with it all"
+    )
+    check.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        type=setting,
+        metavar="TABLE.KEY=VALUE",
+        help="override a key of the scene",
+    )
+    check.add_argument("--json", action="store_true")
+    check.set_defaults(command=_check)
+
+
+def _check(options: argparse.Namespace) -> int:
+    from tkamb.check.scene_check import check_scene
+
+    if options.out and options.out.suffix.lower() not in PICTURES:
+        mend = f"name it like check{PICTURES[0]}"
+        raise InputError(f"is none of {', '.join(PICTURES)}", options.out, mend)
+    found = check_scene(options.scene, dict(options.set))
+    if options.out:
+        _write_picture(found, options.out)
+    written = [f"picture: {options.out}"] if options.out else []
+    lines = [*found.lines(), *written, f"next: tkamb run {options.scene}"]
+    print(json.dumps(found.as_dict(), indent=2) if options.json else "\n".join(lines))
+    return 0
+
+
+def _write_picture(found: "SceneCheck", path: Path) -> None:
+    from tkamb.atomic import replaced_file, write_text
+    from tkamb.check.leg_picture import draw_leg
+    from tkamb.check.page import check_html
+
+    figure = draw_leg(found.mechanics)
+    if path.suffix.lower() == ".html":
+        write_text(path, check_html(found, figure))
+        return
+    with replaced_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=130)

@@ -1,0 +1,97 @@
+"""A scene read whole and looked at, before anything is run."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tkamb.check.inventory import Entry, inventory
+from tkamb.contact.materials import material
+from tkamb.contact.registry import contact_model
+from tkamb.equilibrium.mechanics import Mechanics
+from tkamb.plausibility.plausibility import Plausibility
+from tkamb.run.summary import assumptions, not_modelled
+from tkamb.scene import load_scene
+from tkamb.scene.case import Case, load_case
+
+
+@dataclass(frozen=True, eq=False)
+class SceneCheck:
+    """What a scene gives, leaves out and makes one ask.
+
+    Args:
+        scene: its file.
+        mechanics: the case, prepared.
+        entries: what each file and table gave.
+        not_modelled: what the scene leaves out.
+        assumptions: what the numbers would rest on.
+        questions: what is unlikely about it, with the likely mistake.
+    """
+
+    scene: Path
+    mechanics: Mechanics
+    entries: tuple[Entry, ...]
+    not_modelled: tuple[str, ...]
+    assumptions: tuple[str, ...]
+    questions: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """Return the check as lines of text."""
+        nothing = ["none: nothing unlikely was found; that is no proof"]
+        return [
+            f"{self.scene}: can be run",
+            *(entry.line() for entry in self.entries),
+            f"not modelled: {', '.join(self.not_modelled)}",
+            *(f"assumed: {sentence}" for sentence in self.assumptions),
+            *(f"question: {question}" for question in self.questions or nothing),
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `tkamb check --json` prints."""
+        motion = self.mechanics.case.motion
+        return {
+            "scene": str(self.scene),
+            "frames": len(motion.time),
+            "duration_s": float(motion.time[-1] - motion.time[0]),
+            "inputs": [
+                {"part": e.part, "file": e.file and str(e.file), "found": e.found}
+                for e in self.entries
+            ],
+            "not_modelled": list(self.not_modelled),
+            "assumptions": list(self.assumptions),
+            "questions": list(self.questions),
+        }
+
+
+def check_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> SceneCheck:
+    """Read every file of a scene and ask what is unlikely about it; nothing is run.
+
+    The contact model is made, but not prepared: a mesh that it cannot use is found by a run.
+
+    Args:
+        path: of the scene.
+        overrides: dotted key -> value, as `tkamb.load_scene` takes them.
+
+    Raises:
+        InputError: what `tkamb run` would refuse of the scene and its files.
+    """
+    scene = load_scene(path, overrides)
+    if scene.contact:
+        contact_model(scene.contact.model, scene.contact.resolution_mm, **scene.contact.options)
+        material(scene.contact.material)
+    case = load_case(scene)
+    mechanics = Mechanics(case)
+    return SceneCheck(
+        Path(path),
+        mechanics,
+        inventory(mechanics),
+        (*not_modelled(case), *_beyond(case)),
+        tuple(assumptions(case)),
+        tuple(question.text for question in Plausibility(mechanics).questions),
+    )
+
+
+def _beyond(case: Case) -> list[str]:
+    """Return what tkamb has no table for, as far as it matters to this scene."""
+    others = [] if case.scene.muscles else ["muscles other than the quadriceps"]
+    patella = ["out-of-plane motion of the patella"] if case.scene.patella else []
+    return [*others, *patella, "cam–post contact", "wear and creep (`tkamb wear`)"]

@@ -1,0 +1,152 @@
+"""One run of a cohort: through the whole pipeline, and what of it is kept."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.cohort.plan import CohortRun
+from tkamb.columns import KINDS
+from tkamb.errors import TkambError
+from tkamb.geometry.frames import Array
+from tkamb.output.metrics import map_rows
+from tkamb.output.panels import lateral_axis_name
+from tkamb.results import Results
+from tkamb.run.shards import Shard
+from tkamb.run.status import FAILED
+from tkamb.simulation import simulate
+
+TIMES = "_seconds"
+"""Ending of computing times: the only columns that another computer finds otherwise."""
+
+
+@dataclass(frozen=True, eq=False)
+class PressureMap:
+    """The pressure on the insert at one frame.
+
+    Args:
+        frame: of the run's rows.
+        points: (n, 3) m.
+        triangles: (k, 3).
+        pressure: (n,) Pa.
+        side: "right" or "left".
+        lateral: what insert z points to, "lateral" or "medial".
+    """
+
+    frame: int
+    points: Array
+    triangles: NDArray[np.int64]
+    pressure: Array
+    side: str
+    lateral: str
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What one run gave.
+
+    Args:
+        reason: why the run failed as a whole; "" if it did not.
+        columns: name -> (f,) numbers of results.csv that the run has, without computing times.
+        status: of each frame.
+        chosen: its pressure map; None without contact.
+    """
+
+    reason: str
+    columns: dict[str, Array]
+    status: list[str]
+    chosen: PressureMap | None = None
+
+    @property
+    def failed_frames(self) -> int:
+        """Return how many frames failed."""
+        return sum(status.startswith(FAILED) for status in self.status)
+
+    def shard(self) -> Shard:
+        """Return it as what is kept in a folder."""
+        row: dict[str, Any] = {"reason": self.reason, "status": self.status}
+        arrays: dict[str, Any] = {f"column {name}": values for name, values in self.columns.items()}
+        if self.chosen is not None:
+            one = self.chosen
+            row |= {"frame": one.frame, "side": one.side, "lateral": one.lateral}
+            arrays |= {"points": one.points, "triangles": one.triangles, "pressure": one.pressure}
+        return Shard(row, arrays or None)
+
+    @classmethod
+    def of(cls, shard: Shard) -> "Outcome":
+        """Return what a shard holds."""
+        row, arrays = shard.row, shard.contact or {}
+        columns = {
+            name.removeprefix("column "): values
+            for name, values in arrays.items()
+            if name.startswith("column ")
+        }
+        chosen = None
+        if "points" in arrays:
+            triangles = np.asarray(arrays["triangles"], np.int64)
+            chosen = PressureMap(
+                row["frame"],
+                arrays["points"],
+                triangles,
+                arrays["pressure"],
+                row["side"],
+                row["lateral"],
+            )
+        return cls(row["reason"], columns, row["status"], chosen)
+
+
+class CohortWorker:
+    """Computes runs of a cohort.
+
+    Args:
+        frames: of every trial.
+        map_flexion: deg, which frame's map is kept; None: that of the largest force.
+    """
+
+    def __init__(self, frames: slice, map_flexion: float | None) -> None:
+        self._frames, self._map_flexion = frames, map_flexion
+
+    def __call__(self, number: int, run: CohortRun) -> Outcome:
+        """Return what a run gives: what `tkamb run` would, or why it cannot."""
+        try:
+            results = simulate(run.scene, frames=self._frames, scene_path=run.scene_path)
+        except TkambError as error:
+            return Outcome(str(error), {}, [])
+        if all(status.startswith(FAILED) for status in results.status):
+            return Outcome(f"every frame failed, the first: {results.status[0]}", {}, [])
+        columns = {
+            name: values
+            for name, values in results.columns.items()
+            if KINDS.get(name) != "text"
+            and not name.endswith(TIMES)
+            and name not in results.not_modelled
+        }
+        return Outcome("", columns, results.status, chosen_map(results, self._map_flexion))
+
+
+def chosen_map(results: Results, flexion: float | None) -> PressureMap | None:
+    """Return the map of the frame nearest to a flexion (deg), or of the largest force."""
+    if results.maps is None:
+        return None
+    rows = {k: row for k, row in map_rows(results).items() if not _failed(results, k)}
+    if not rows:
+        return None
+    frames = np.array(sorted(rows))
+    if flexion is None:
+        best = int(np.nanargmax(results["force_total_BW"][frames]))
+    else:
+        best = int(np.argmin(np.abs(results["flexion_deg"][frames] - flexion)))
+    frame = int(frames[best])
+    return PressureMap(
+        frame,
+        results.maps.points_m,
+        results.maps.triangles,
+        results.maps.pressure_Pa[rows[frame]],
+        str(results.summary.get("side", "right")),
+        lateral_axis_name(results),
+    )
+
+
+def _failed(results: Results, frame: int) -> bool:
+    return results.status[frame].startswith(FAILED)

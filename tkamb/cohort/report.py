@@ -1,0 +1,228 @@
+"""The cohort's report: one page that stands by itself, groups side by side."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from tkamb.cohort.outcome import Outcome
+from tkamb.cohort.plan import Cohort
+from tkamb.cohort.statistics import CYCLE, Group, spread
+from tkamb.geometry.frames import Array
+from tkamb.output.headline import Card
+from tkamb.output.maps import ContactMaps
+from tkamb.output.pages import asset, policy_sources, render
+from tkamb.output.pressure_maps import TopView, draw_pressure
+from tkamb.output.style import CYCLE as COLOURS
+from tkamb.output.style import PRESSURE_MAP, legend_above, new_figure, settings, svg_text
+from tkamb.units import MEGAPASCAL
+
+PACKAGE = "tkamb.cohort"
+POLICY = (
+    "default-src 'none'; style-src-elem {style}; style-src-attr 'unsafe-inline'; img-src data:; "
+    "base-uri 'none'; form-action 'none'"
+)
+SHOWN = {
+    "force_total_BW": ("Tibiofemoral contact force", "BW", 2),
+    "medial_peak_pressure_MPa": ("Peak pressure, medial", "MPa", 1),
+    "lateral_peak_pressure_MPa": ("Peak pressure, lateral", "MPa", 1),
+    "medial_area_mm2": ("Contact area, medial", "mm²", 0),
+    "lateral_area_mm2": ("Contact area, lateral", "mm²", 0),
+    "quadriceps_N": ("Quadriceps tension", "N", 0),
+}
+"""Column -> title, unit and digits."""
+AT_ONCE = len(COLOURS)
+"""Groups in one plot."""
+MOST_MAPS = 24
+MOST_FAILED = 100
+
+
+def cohort_html(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> str:
+    """Return the report as HTML."""
+    style = asset("tkamb.output", "report.css")
+    return render(
+        PACKAGE,
+        "cohort.html",
+        policy=POLICY.format(style=policy_sources(style)),
+        style=style,
+        title=cohort.table.title,
+        subtitle=_subtitle(cohort, outcomes),
+        cards=_cards(cohort, outcomes, groups),
+        headings=[SHOWN[name][:2] for name in _there(groups)],
+        rows=[_row(group, _there(groups)) for group in groups],
+        plots=list(_plots(groups)),
+        maps=_maps(cohort, outcomes, groups),
+        failed=_failed(cohort, outcomes)[:MOST_FAILED],
+        failed_count=sum(bool(one.reason) for one in outcomes.values()),
+    )
+
+
+def _there(groups: Sequence[Group]) -> list[str]:
+    return [name for name in SHOWN if any(name in group.peaks for group in groups)]
+
+
+def _subtitle(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> str:
+    parts = []
+    for axis in ("subject", "trial", "design", "contact"):
+        count = len({cohort.runs[n].labels[axis] for n in outcomes} - {""})
+        if count:
+            parts.append(f"{count} {axis}{'s' if count > 1 else ''}")
+    groups = ", ".join(cohort.group_by) or "nothing: one group"
+    return f"{' × '.join(parts)}; grouped by {groups}"
+
+
+def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> list[Card]:
+    failed = sum(bool(one.reason) for one in outcomes.values())
+    frames = sum(len(one.status) for one in outcomes.values())
+    lost = sum(one.failed_frames for one in outcomes.values())
+    detail = f"{failed} failed: listed at the end" if failed else "none failed"
+    found = [
+        Card("Runs computed", f"{len(outcomes) - failed} of {len(outcomes)}", detail, failed > 0)
+    ]
+    words = "no numbers in those that failed" if lost else "none failed"
+    found.append(Card("Frames computed", f"{frames - lost} of {frames}", words, lost > 0))
+    name = "force_total_BW"
+    means = {
+        group.name: float(np.nanmean(group.peaks[name])) for group in groups if name in group.peaks
+    }
+    if not means:
+        return found
+    low, high = (f(means, key=lambda group: means[group]) for f in (min, max))
+    value, detail = f"{means[low]:.2f}–{means[high]:.2f} BW", f"least {low}, most {high}"
+    if f"{means[low]:.2f}" == f"{means[high]:.2f}":
+        value, detail = f"{means[low]:.2f} BW", "alike in all groups"
+    found.append(Card("Peak contact force", value, f"mean of the runs' peaks: {detail}"))
+    return found
+
+
+def _row(group: Group, names: Sequence[str]) -> list[str]:
+    """Return a group's line of the table: how many runs, and the peaks."""
+    cells = [group.name, str(len(group.numbers)), str(group.failed or "")]
+    for name in names:
+        over = spread(group.peaks.get(name, np.array([np.nan]))[:, None])
+        digits = SHOWN[name][2]
+        if not over.runs.sum():
+            cells.append("–")
+            continue
+        text = f"{over.mean[0]:.{digits}f}"
+        if over.runs[0] > 1:
+            text += (
+                f" ± {over.sd[0]:.{digits}f} ({over.low[0]:.{digits}f}–{over.high[0]:.{digits}f})"
+            )
+        cells.append(text)
+    return cells
+
+
+def _plots(groups: Sequence[Group]) -> Any:
+    """Yield a plot per quantity and axis, of so many groups as one can tell apart."""
+    for name in _there(groups):
+        for axis in dict.fromkeys(group.axis for group in groups):
+            own = [group for group in groups if group.axis == axis and name in group.bins]
+            for first in range(0, len(own), AT_ONCE):
+                part, title = own[first : first + AT_ONCE], SHOWN[name][0]
+                svg = svg_text(draw_groups(part, name), f"{name}-{axis}-{first}")
+                yield {"title": title, "unit": SHOWN[name][1], "svg": svg}
+
+
+def draw_groups(groups: Sequence[Group], name: str) -> Figure:
+    """Return the groups' means of a column over the motion, with one standard deviation."""
+    with settings():
+        figure = new_figure(5.4, 3.1)
+        axes = figure.add_subplot()
+        for group, colour in zip(groups, COLOURS, strict=False):
+            _draw_group(axes, group, name, colour)
+        cycle = groups[0].axis == CYCLE
+        axes.set_xlabel("cycle (%)" if cycle else "flexion (deg)")
+        axes.set_ylabel(SHOWN[name][1])
+        axes.set_ylim(bottom=0.0)
+        legend_above(axes, 2 if sum(len(group.name) + 6 for group in groups) > 72 else 4)
+    return figure
+
+
+def _draw_group(axes: Axes, group: Group, name: str, colour: str) -> None:
+    over, middle = spread(group.bins[name]), 0.5 * (group.edges[:-1] + group.edges[1:])
+    there = over.runs > 0  # lines run on over bins that no frame falls into
+    middle, mean, sd = middle[there], over.mean[there], over.sd[there]
+    axes.plot(middle, mean, "o-", color=colour, markersize=3, label=group.name)
+    axes.fill_between(middle, mean - sd, mean + sd, color=colour, alpha=0.13, linewidth=0)
+
+
+def _maps(
+    cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]
+) -> dict[str, Any] | None:
+    """Return one map of each group side by side on one scale; None without contact."""
+    shown = [(group, _typical(group, outcomes)) for group in groups]
+    with_map = [(group, n) for group, n in shown if n is not None][:MOST_MAPS]
+    if not with_map:
+        return None
+    flexion = cohort.table.map_flexion_deg
+    frame = "The largest force" if flexion is None else f"The frame nearest to {flexion:g}°"
+    return {
+        "svg": svg_text(draw_group_maps(cohort, outcomes, with_map), "maps"),
+        "frame": frame,
+        "more": len(groups) - len(with_map),
+    }
+
+
+def _typical(group: Group, outcomes: Mapping[int, Outcome]) -> int | None:
+    """Return the run whose peak force is the group's median, of those with a map."""
+    peaks = {
+        n: float(np.nanmax(outcomes[n].columns["force_total_BW"]))
+        for n in group.numbers
+        if outcomes[n].chosen is not None
+    }
+    ordered = sorted(peaks, key=lambda n: peaks[n])
+    return ordered[(len(ordered) - 1) // 2] if ordered else None
+
+
+def draw_group_maps(
+    cohort: Cohort, outcomes: Mapping[int, Outcome], shown: Sequence[tuple[Group, int]]
+) -> Figure:
+    """Return the chosen pressure maps on one colour scale."""
+    largest = max(_pressure(outcomes[n]).max() for _, n in shown)
+    scale = Normalize(0.0, float(largest) or 1.0)
+    across = min(4, len(shown))
+    down = -(-len(shown) // across)
+    with settings():
+        figure = new_figure(11.0, down * 2.6)
+        grid = figure.subplots(down, across, squeeze=False).ravel()
+        for axes in grid:
+            axes.set_axis_off()
+        for axes, (group, n) in zip(grid, shown, strict=False):
+            chosen = outcomes[n].chosen
+            assert chosen is not None
+            maps = ContactMaps({"points_m": chosen.points, "triangles": chosen.triangles})
+            view = TopView(maps, chosen.side, chosen.lateral)
+            view.draw_insert(axes)
+            draw_pressure(axes, view, _pressure(outcomes[n]), scale)
+            view.draw_labels(axes)
+            axes.set_title(_caption(cohort, outcomes[n], group, n), fontsize=8.5)
+        bar = figure.colorbar(
+            ScalarMappable(scale, PRESSURE_MAP), ax=list(grid), fraction=0.02, pad=0.01, aspect=30
+        )
+        bar.set_label("contact pressure (MPa)")
+    return figure
+
+
+def _pressure(outcome: Outcome) -> Array:
+    assert outcome.chosen is not None
+    return outcome.chosen.pressure / MEGAPASCAL
+
+
+def _caption(cohort: Cohort, outcome: Outcome, group: Group, number: int) -> str:
+    assert outcome.chosen is not None
+    k = outcome.chosen.frame
+    flexion, force = outcome.columns["flexion_deg"][k], outcome.columns["force_total_BW"][k]
+    who = cohort.runs[number].labels["subject"]
+    return f"{group.name}\n{who + ', ' if who else ''}{flexion:.0f}°, {force:.2f} BW"
+
+
+def _failed(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> list[tuple[str, str, str]]:
+    """Return number, labels and reason of the runs that failed."""
+    return [
+        (str(n), cohort.runs[n].words(), one.reason) for n, one in outcomes.items() if one.reason
+    ]

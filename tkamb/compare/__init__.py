@@ -1,0 +1,1 @@
+"""`tkamb compare`: folders of results beside each other on one axis."""

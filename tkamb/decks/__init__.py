@@ -1,0 +1,1 @@
+"""One frame as a contact problem for other programs: CalculiX and FEBio."""

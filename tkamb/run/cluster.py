@@ -1,0 +1,126 @@
+"""Jobs over a Dask cluster: the same answers as those of worker processes.
+
+Dask is an extra (`pip install 'tkamb[cluster]'`) and imported only when asked for. Each process
+of the cluster prepares once what the jobs share. A job whose worker dies is done again by
+another one; a job is a function of its number and content alone, so that changes no answer.
+"""
+
+import pickle
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+from tkamb.errors import ComputationError, InputError
+
+if TYPE_CHECKING:
+    from tkamb.run.workers import Numbered, Task
+
+LOCAL = "local"
+PATIENCE = 10.0
+"""s that a scheduler may take to answer."""
+MOST_DEATHS = 5
+"""Workers that may die under one job before it is taken to be what kills them."""
+LOST = "what is finished is kept: go on with --resume"
+
+
+def answers_of_cluster(
+    task: "Task", wanted: Sequence["Numbered"], address: str, workers: int
+) -> Iterator["Numbered"]:
+    """Yield answers with their numbers as they are finished, in any order.
+
+    Args:
+        task: what each process of the cluster prepares.
+        wanted: numbers and contents of the jobs.
+        address: of the scheduler, "tcp://host:8786"; "local": one on this machine.
+        workers: processes of a local one.
+
+    Raises:
+        InputError: Dask is not installed, or no scheduler answers there.
+        ComputationError: the scheduler is gone, or a job killed one worker after the other.
+    """
+    distributed = _library()
+    with ExitStack() as stack:
+        place = address
+        if address == LOCAL:
+            place = stack.enter_context(
+                distributed.LocalCluster(
+                    n_workers=workers, threads_per_worker=1, dashboard_address=None
+                )
+            )
+        client = stack.enter_context(_connected(distributed, place, address))
+        yield from _answers(distributed, client, task, wanted)
+
+
+def check_cluster(address: str) -> None:
+    """Raise an InputError where Dask is not installed, or no scheduler answers."""
+    distributed = _library()
+    if address != LOCAL:
+        _connected(distributed, address, address).close()
+
+
+def _library() -> Any:
+    """Return Dask's `distributed`, set up for us."""
+    try:
+        import dask
+        import distributed
+    except ImportError:
+        mend = "pip install 'tkamb[cluster]'"
+        raise InputError("Dask is not installed", "--dask", mend) from None
+    dask.config.set({"distributed.scheduler.allowed-failures": MOST_DEATHS})
+    return distributed
+
+
+def _connected(distributed: Any, place: Any, address: str) -> Any:
+    """Return a client of the scheduler."""
+    try:
+        return distributed.Client(place, timeout=PATIENCE)
+    except (OSError, ValueError, TypeError) as error:  # no answer; no address
+        raise InputError(
+            f"no Dask scheduler answers at '{address}' ({type(error).__name__})",
+            "--dask",
+            "start one (`dask scheduler`), or give --dask local",
+        ) from None
+
+
+def _answers(
+    distributed: Any, client: Any, task: "Task", wanted: Sequence["Numbered"]
+) -> Iterator["Numbered"]:
+    packed = pickle.dumps((task.make, task.arguments))
+    try:
+        futures = {
+            client.submit(answer, packed, number, job, pure=False): number for number, job in wanted
+        }
+        for future in distributed.as_completed(futures):
+            if future.cancelled():
+                raise ComputationError("the Dask scheduler is gone", "--dask", LOST)
+            yield futures.pop(future), future.result()
+    except distributed.KilledWorker:
+        what = f"a job killed {MOST_DEATHS} workers"
+        raise ComputationError(what, "--dask", f"is there memory for it? {LOST}") from None
+    except OSError as error:  # dask's CommClosedError among them
+        raise ComputationError(f"the Dask scheduler is gone ({error})", "--dask", LOST) from None
+
+
+_one_at_a_time = threading.Lock()
+"""A worker of many threads does one job at a time: what they share is not made for threads."""
+
+
+def answer(packed: bytes, number: int, job: Any) -> Any:
+    """Do one job on a worker of the cluster.
+
+    Args:
+        packed: pickled `make` and `arguments` of a `tkamb.run.workers.Task`.
+        number: of the job.
+        job: its content.
+    """
+    with _one_at_a_time:
+        return _prepared(packed)(number, job)
+
+
+@lru_cache(maxsize=1)
+def _prepared(packed: bytes) -> Callable[[int, Any], Any]:
+    make, arguments = pickle.loads(packed)
+    prepared: Callable[[int, Any], Any] = make(*arguments)
+    return prepared

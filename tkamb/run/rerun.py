@@ -1,0 +1,52 @@
+"""The case that results came from: their scene read anew, if it is still what was run."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tkamb.errors import InputError
+from tkamb.run.summary import files_hash, scene_hash
+from tkamb.scene import Scene, load_scene
+from tkamb.scene.case import Case, load_case
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
+
+RUN_AGAIN = "run it again: tkamb run"
+
+
+def case_of_results(results: "Results") -> Case:
+    """Return the case of results, whose summary names the scene.
+
+    Raises:
+        InputError: the scene is not there, or no longer what was run.
+    """
+    summary = results.summary
+    case, scene = load_case(_scene_of(summary)), summary.get("scene")
+    if scene_hash(case) != summary.get("scene_sha256"):
+        what = "has changed since these results were computed, or was run with --set"
+        raise InputError(what, scene, f"{RUN_AGAIN} {scene}")
+    if not same_files(case, summary):
+        what = "a mesh or table that it names has changed since these results were computed"
+        raise InputError(what, scene, f"{RUN_AGAIN} {scene}")
+    return case
+
+
+def same_files(case: Case, summary: Mapping[str, Any]) -> bool:
+    """Say whether meshes and tables hold what the run read; a run without a record counts."""
+    found = (summary.get("identity") or {}).get("content of a file")
+    return found is None or found == files_hash(case)
+
+
+def _scene_of(summary: Mapping[str, Any]) -> Scene:
+    """Return the scene of results, with the contact model they were run with."""
+    name = summary.get("scene")
+    if not name:
+        raise InputError("names no scene file", "summary", "give the scene itself to tkamb view")
+    path = Path(name)
+    if not path.exists():
+        what = "the scene of these results is not there"
+        raise InputError(what, path, "put it back, or run it again")
+    contact = summary.get("contact") or {}
+    overrides = {f"contact.{key}": value for key, value in contact.items() if value is not None}
+    return load_scene(path, overrides)
