@@ -127,6 +127,8 @@ class _Search:
         if not self.known:
             return self._end(BalanceStatus.OUT_OF_RANGE)
         while self._steps < MOST_STEPS:
+            if not np.isfinite(self.stiffness).all():  # a neighbour of this place is out of range
+                return self._end(BalanceStatus.OUT_OF_RANGE)
             if self._converged():
                 return self._end(self._kind())
             if np.abs(self.x - self._start).max() > LONGEST_TRAVEL:
@@ -223,7 +225,8 @@ class _Search:
         )
 
     def _smallest_stiffness(self) -> float:
-        return smallest_eigenvalues(self.stiffness)[1] if self.known else np.nan
+        finite = np.isfinite(self.stiffness).all()
+        return smallest_eigenvalues(self.stiffness)[1] if finite else np.nan
 
     def _end(self, status: BalanceStatus) -> Balance:
         return Balance(
