@@ -173,4 +173,4 @@ def test_activations_in_gait_are_continuous_at_100_Hz():
     assert np.abs(np.diff(activations, axis=1)).max() < 0.2
     assert np.median(columns["coupling_iterations"]) <= 5
     heads = sum(columns[f"muscle_{name}_N"] for name in ("recfem", "vasint", "vaslat", "vasmed"))
-    np.testing.assert_allclose(heads, columns["quadriceps_N"], atol=1.0)
+    np.testing.assert_allclose(heads, columns["quadriceps_N"], atol=2.0)
