@@ -137,7 +137,8 @@ class _Search:
                 break
             if not self._own and self._since > len(self.x):
                 self._refresh()
-            self._step()
+            else:
+                self._step()
         lost = self._radius < NARROWEST_RADIUS and self._unknown
         return self._end(BalanceStatus.OUT_OF_RANGE if lost else BalanceStatus.NOT_CONVERGED)
 
@@ -216,6 +217,8 @@ class _Search:
         if not (self._own or self._fresh) and self._smallest_stiffness() <= SMALLEST_STIFFNESS:
             self._refresh()
         smallest_stiffness = self._smallest_stiffness()
+        if np.isnan(smallest_stiffness):
+            return BalanceStatus.OUT_OF_RANGE
         if smallest_stiffness < -SMALLEST_STIFFNESS:
             return BalanceStatus.UNSTABLE
         return (
