@@ -7,7 +7,8 @@ from tkamb.body.joint_equilibrium import JointEquilibrium, unit_keeper
 from tkamb.body.ligaments import BundleArrays
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
-from tkamb.equilibrium.released import SCALE, ReleasedForces, released_indices
+from tkamb.equilibrium.released import released_indices
+from tkamb.equilibrium.released_forces import SCALE, ReleasedForces
 from tkamb.geometry.frames import KNEE_COORDINATES
 
 BALL, HALF, HEIGHT = 25e-3, 20e-3, 10e-3

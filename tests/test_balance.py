@@ -24,7 +24,7 @@ from tkamb.contact.foundation import LinearFoundation
 from tkamb.contact.probe import Probe
 from tkamb.contact.registry import contact_model
 from tkamb.equilibrium.balance import BalanceStatus, Trial, find_balance
-from tkamb.equilibrium.released import SCALE, ReleasedForces
+from tkamb.equilibrium.released_forces import SCALE, ReleasedForces
 from tkamb.geometry.frames import knee_axes, knee_pose, knee_twist
 
 LOAD = 1000.0
@@ -65,6 +65,26 @@ def test_springs_come_to_rest_where_their_matrix_says():
         assert end.status is BalanceStatus.OK
         assert np.allclose(end.coordinates, np.linalg.solve(stiffness, load), atol=2e-6)
         assert end.smallest_stiffness == pytest.approx(np.linalg.eigvalsh(stiffness)[0], rel=1e-3)
+
+
+def test_loads_that_follow_the_motion_do_not_hold_up_the_search():
+    """A stable stiffness whose symmetric part is indefinite: no potential, work is no measure."""
+    stiffness = np.array([[1e4, 8e4, 0.0], [0.0, 2e4, 3e4], [0.0, 0.0, 1e4]])
+    assert np.linalg.eigvalsh(0.5 * (stiffness + stiffness.T))[0] < -1e4
+    end = find_balance(lambda x: Trial(-stiffness @ x, stiffness), np.array([5e-3, -3e-3, 2e-3]))
+    assert end.status is BalanceStatus.OK
+    assert end.steps < 20
+    np.testing.assert_allclose(end.coordinates, 0.0, atol=2e-6)
+
+
+def test_a_start_at_the_rim_of_what_is_known_is_out_of_range():
+    """Forces at the start, none beside it: no stiffness by differences."""
+    start = np.array([1e-3, 0.0])
+    end = find_balance(
+        lambda x: Trial(np.array([5.0, -3.0]) if x[0] <= start[0] else np.full(2, np.nan)), start
+    )
+    assert end.status is BalanceStatus.OUT_OF_RANGE
+    assert np.isnan(end.smallest_stiffness)
 
 
 def test_energy_falls_in_every_step_through_a_stiffening_contact():

@@ -141,7 +141,7 @@ def test_bounds_hold_the_activation_near_the_envelope():
 
 def test_bounds_never_leave_those_of_every_muscle():
     guide = EmgGuide(np.array([[np.nan, 1.7, 0.0]]), "bounds", 0.2)
-    problem = guide.applied(sharing(None, lowest=0.05)._frame(0), 0)
+    problem = guide.applied(sharing(None, lowest=0.05).frame(0), 0)
     np.testing.assert_allclose(problem.lowest, [0.05, 1.0, 0.05])
     np.testing.assert_allclose(problem.highest, [1.0, 1.0, 0.2])
 

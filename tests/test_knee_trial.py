@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from jw_gait import JW, gait, needs_jw
 from tkamb.geometry.frames import inverse, transform
@@ -58,3 +59,24 @@ def test_their_lines_have_the_wrench_of_the_paths_on_shank_and_foot(jw):
     apart = np.abs(np.concatenate([moment, along], axis=-1) - pulls).max(axis=(0, 2))
     names = np.array(trial.muscles)[trial.crossing]
     assert {n for n, d in zip(names, apart, strict=True) if d > 1e-9} == set()
+
+
+@needs_jw
+def test_slsqp_finds_the_same_forces_in_gait(jw):
+    """The quadratic programme of whole legs, hip to subtalar joint, by another solver."""
+    problems = jw[1].problems
+    for k in range(0, len(problems.moment), 3):
+        problem = problems.frame(k)
+        activation, reserve, _, status = problems.solved(k)
+        assert status == "ok"
+        other = minimize(
+            problem.cost,
+            np.full(len(activation), 0.1),
+            jac=problem.gradient,
+            bounds=list(zip(problem.lowest, problem.highest, strict=True)),
+            method="SLSQP",
+            options={"ftol": 1e-13, "maxiter": 300},
+        )
+        assert problem.cost(activation) <= problem.cost(other.x) * (1 + 1e-9)
+        np.testing.assert_allclose(activation, other.x, atol=2e-4)
+        np.testing.assert_allclose(problem.others(other.x), reserve, atol=0.02)

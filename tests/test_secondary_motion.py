@@ -12,7 +12,7 @@ from tkamb.contact.probe import condyle_wrenches
 from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.equilibrium.mechanics import Mechanics
-from tkamb.equilibrium.released import SCALE
+from tkamb.equilibrium.released_forces import SCALE
 from tkamb.geometry.frames import knee_pose
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case

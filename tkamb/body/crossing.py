@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from tkamb.body.chain import ChainState
 
 
-AGREED = 1.0
-"""N: muscle forces that change by less from one sharing to the next agree with the knee."""
-
-
 @dataclass(frozen=True, eq=False)
 class CrossingLines:
     """Lines from the shank to the thigh at one frame.
@@ -35,6 +31,19 @@ class CrossingLines:
 
     shank: Array
     thigh: Array
+
+    def unit_wrenches(self, tibia: Array, femur: Array) -> Array:
+        """Return the wrench (..., c, 6) of one newton of each on the insert, about its origin.
+
+        Args:
+            tibia: (4, 4) pose of the tibia link in the insert frame.
+            femur: (..., 4, 4) poses of the femur link in it.
+        """
+        start = transform(tibia, self.shank)
+        along = np.einsum("...ij,cj->...ci", femur[..., :3, :3], self.thigh)
+        along = along + femur[..., None, :3, 3] - start
+        along = along / np.linalg.norm(along, axis=-1, keepdims=True)
+        return wrench_of(np.broadcast_to(start, along.shape), along)
 
     def unit_loads(self, state: "ChainState") -> list[tuple[PointForces, ...]]:
         """Return what one newton of each does to tibia and femur, insert frame."""
@@ -76,10 +85,6 @@ class MuscleShare:
     lines: CrossingLines
     status: str = "ok"
 
-    def agrees(self, other: "MuscleShare") -> bool:
-        """Return whether two shares of a frame are the same to `AGREED`."""
-        return bool(np.abs(self.force - other.force).max() < AGREED)
-
     def loads(self, state: "ChainState") -> tuple[PointForces, ...]:
         """Return what the crossing muscles and the knee's reserve do to tibia and femur."""
         scaled = [
@@ -98,12 +103,8 @@ class MuscleShare:
             tibia: (4, 4) pose of the tibia link in the insert frame.
             femur: (..., 4, 4) poses of the femur link in it.
         """
-        start = transform(tibia, self.lines.shank)
-        total = np.zeros((*femur.shape[:-2], 6))
-        for p, q, force in zip(start, self.lines.thigh, self.force[self.crossing], strict=True):
-            along = transform(femur, q) - p
-            along = along / np.linalg.norm(along, axis=-1, keepdims=True)
-            total = total + force * wrench_of(p, along)
+        units = self.lines.unit_wrenches(tibia, femur)
+        total = np.einsum("i,...ij->...j", self.force[self.crossing], units)
         total[..., 3:] += self._knee_reserve
         return np.asarray(total)
 

@@ -96,6 +96,21 @@ class JointEquilibrium:
         through = np.eye(6) - columns @ np.linalg.solve(rows @ columns, rows)
         return np.asarray(-axes[list(self.released)] @ through)
 
+    def whole(self, coordinates: Array, contact: Array, kept: Array) -> Array:
+        """Return (..., 6): generalised forces on all coordinates, with what keeps some of them.
+
+        Args:
+            coordinates: (..., 6) knee coordinates.
+            contact: (6,) w_contact on the insert.
+            kept: (6 - n,) y.
+        """
+        axes, columns, wrench = self._sum_loads(coordinates, contact)
+        return -np.einsum("...ij,...j->...i", axes, wrench + columns @ kept)
+
+    def columns(self, coordinates: Array) -> Array:
+        """Return B (6, 6 - n) at coordinates (6,)."""
+        return self._sum_loads(coordinates, np.zeros(6))[1]
+
     @property
     def _prescribed(self) -> list[int]:
         return [i for i in range(6) if i not in self.released]

@@ -8,7 +8,9 @@ by the trapezoidal rule, against what K predicts,
     W = (r(q) + r(q + d)) . d / 2          W_K = r(q) . d - d . K d / 2 :
 
 forces that have a potential lower it by W, so that with W > 0 in every step the energy falls.
-A trial that overshoots into a stiff contact costs work and is taken back.
+A trial that overshoots into a stiff contact costs work and is taken back. Where loads that follow
+the motion leave K unsymmetric, stable but not positive definite, work is no measure; a step then
+goes along Newton's direction, in which |r| falls, and is judged by that.
 
 Everything is in metres and newtons: rotations are scaled by a lever arm.
 
@@ -36,7 +38,7 @@ LONGEST_TRAVEL = 20e-3
 """m: a coordinate this far from its start is held by nothing."""
 PROBE_STEP = 2e-6
 """m: of the finite differences where the stiffness is not known."""
-MOST_STEPS = 150
+MOST_STEPS = 200
 """A lightly loaded knee that slides 16 mm over lattice cells of 2 mm needs 80."""
 
 
@@ -109,7 +111,7 @@ class _Search:
         self._forces, self._start = forces, start
         self._trials, self._steps = 0, 0
         self._fresh, self._since, self._unknown = False, 0, False
-        self._radius = FIRST_RADIUS
+        self._radius, self._refused = FIRST_RADIUS, False
         self._work: list[float] = []
         self.x = start
         first = self._at(start)
@@ -126,6 +128,8 @@ class _Search:
         if not self.known:
             return self._end(BalanceStatus.OUT_OF_RANGE)
         while self._steps < MOST_STEPS:
+            if not np.isfinite(self.stiffness).all():  # a neighbour of this place is out of range
+                return self._end(BalanceStatus.OUT_OF_RANGE)
             if self._converged():
                 return self._end(self._kind())
             if np.abs(self.x - self._start).max() > LONGEST_TRAVEL:
@@ -134,12 +138,13 @@ class _Search:
                 break
             if not self._own and self._since > len(self.x):
                 self._refresh()
-            self._step()
+            else:
+                self._step()
         lost = self._radius < NARROWEST_RADIUS and self._unknown
         return self._end(BalanceStatus.OUT_OF_RANGE if lost else BalanceStatus.NOT_CONVERGED)
 
     def _step(self) -> None:
-        step = bounded_step(self.stiffness, self.force, self._radius)
+        step, part = self._next()
         trial = self._at(self.x + step)
         self._steps, self._since = self._steps + 1, self._since + 1
         length = float(np.linalg.norm(step))
@@ -149,9 +154,11 @@ class _Search:
         if self._unknown:
             self._radius = 0.25 * length
             return
-        helps = self._halves(step, trial.force)
+        fall = 1.0 - float(np.linalg.norm(trial.force) / np.linalg.norm(self.force))
+        helps = part > 0 and fall > 0.5 * part
         ratio = 1.0 if helps else work / predicted if predicted > 0 else -1.0
         taken = ratio > 0.05
+        self._refused = part > 0 and not taken  # across a kink |r| may rise: the other step next
         if trial.stiffness is None:
             self._learn(step, trial.force)
         if ratio < 0.25:
@@ -167,17 +174,14 @@ class _Search:
             if trial.stiffness is not None:
                 self.stiffness = trial.stiffness
 
-    def _halves(self, step: Array, force: Array) -> bool:
-        """Return whether a full Newton step with a stable but indefinite stiffness helps.
-
-        Follower loads and friction make it unsymmetric; their work is no measure then.
-        """
+    def _next(self) -> tuple[Array, float]:
+        """Return the next step, and what part it is of Newton's where |r| judges it; else 0."""
         symmetric, smallest_stiffness = smallest_eigenvalues(self.stiffness)
-        if symmetric > 0 or smallest_stiffness <= 0:
-            return False
+        if symmetric > 0 or smallest_stiffness <= 0 or self._refused:
+            return bounded_step(self.stiffness, self.force, self._radius), 0.0
         newton = np.linalg.solve(self.stiffness, self.force)
-        full = np.allclose(step, newton, rtol=1e-9, atol=0)
-        return bool(full and np.linalg.norm(force) < 0.5 * np.linalg.norm(self.force))
+        part = min(1.0, self._radius / float(np.linalg.norm(newton)))
+        return np.asarray(part * newton), part
 
     def _at(self, x: Array) -> Trial:
         self._trials += 1
@@ -214,6 +218,8 @@ class _Search:
         if not (self._own or self._fresh) and self._smallest_stiffness() <= SMALLEST_STIFFNESS:
             self._refresh()
         smallest_stiffness = self._smallest_stiffness()
+        if np.isnan(smallest_stiffness):
+            return BalanceStatus.OUT_OF_RANGE
         if smallest_stiffness < -SMALLEST_STIFFNESS:
             return BalanceStatus.UNSTABLE
         return (
@@ -223,7 +229,8 @@ class _Search:
         )
 
     def _smallest_stiffness(self) -> float:
-        return smallest_eigenvalues(self.stiffness)[1] if self.known else np.nan
+        finite = np.isfinite(self.stiffness).all()
+        return smallest_eigenvalues(self.stiffness)[1] if finite else np.nan
 
     def _end(self, status: BalanceStatus) -> Balance:
         return Balance(

@@ -29,13 +29,13 @@ from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.frame_contact import FrameContact
 from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
+from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates, knee_pose
 from tkamb.scene.case import Case
 from tkamb.units import DEGREE
 
 if TYPE_CHECKING:
-    from tkamb.body.crossing import MuscleShare
     from tkamb.equilibrium.released import KneeEquilibrium
 
 NAN = float("nan")
@@ -179,36 +179,22 @@ class ContactSide:
         )
 
     def _release(self, k: int, before: Sequence[FrameContact]) -> tuple[FrameLoads, FrameContact]:
-        """Return body and contact with the released coordinates at rest."""
-        good = [contact for contact in before if contact.equilibrium and contact.result][-2:]
-        if self.mechanics.muscles is None:
-            return self.rest(k, good)
-        from tkamb.equilibrium.muscles_at_rest import rest_with_muscles
-
-        return rest_with_muscles(self, self.mechanics.muscles, k, good)
-
-    def rest(
-        self, k: int, good: Sequence[FrameContact], share: "MuscleShare | None" = None
-    ) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact with the released coordinates at rest.
 
         Args:
             k: frame.
-            good: the last two contacts that were found, where the search begins.
-            share: the other muscles' forces.
+            before: the contacts of the frames before; the last two that were found are where
+                the search begins.
         """
         released, start = self.released, clock.perf_counter()
         assert released is not None
-        earlier, guess = (good[-1].equilibrium, good[-1].result) if good else (None, None)
+        good = [contact for contact in before if contact.equilibrium and contact.result][-2:]
+        guess = good[-1].result if good else None
         points = {} if len(released.released) == 5 else self._nearest_points(k)
-        knee = None
-        for place in self._starts(k, [c.equilibrium.coordinates for c in good if c.equilibrium]):
-            if np.isfinite(place).all():
-                knee = released.find(k, place, points, earlier, share)
-                if knee.balance.status not in ASTRAY:
-                    break
-        if knee is None:
-            contact = self.nothing("the femoral component does not lie over the insert")
+        try:
+            knee = self._rest(k, [c.equilibrium for c in good if c.equilibrium], points)
+        except ComputationError as error:
+            contact = self.nothing(error.what)
             body = self.mechanics.frame(k)
             return replace(body, loads=unsolved([contact.problem])), contact
         result, contact = None, self.nothing(knee.problem)
@@ -224,6 +210,35 @@ class ContactSide:
             equilibrium=knee,
         )
         return self._equilibrium_loads(k, knee, contact, points), contact
+
+    def _rest(
+        self, k: int, found: "Sequence[KneeEquilibrium]", points: dict[str, Array]
+    ) -> "KneeEquilibrium":
+        """Return the knee at rest, from the first start that leads there.
+
+        Args:
+            k: frame.
+            found: the last two frames that were found.
+            points: side -> where a condyle that carries nothing is nearest to the insert.
+
+        Raises:
+            ComputationError: no start lies over the insert, or no muscle forces carry the frame.
+        """
+        assert self.released is not None
+        knee, failure = None, "the femoral component does not lie over the insert"
+        for place in self._starts(k, [knee.coordinates for knee in found]):
+            if not np.isfinite(place).all():
+                continue
+            try:
+                knee = self.released.find(k, place, points, found[-1] if found else None)
+            except ComputationError as error:
+                failure = error.what
+                continue
+            if knee.balance.status not in ASTRAY and not (knee.problem and self.mechanics.muscles):
+                break
+        if knee is None:
+            raise ComputationError(failure)
+        return knee
 
     def _starts(self, k: int, found: list[Array]) -> Iterator[Array]:
         """Yield where a search may begin: as the last frames went on, as the last, as recorded.
@@ -255,22 +270,15 @@ class ContactSide:
                 side: CondylePoint(point, up, still, NAN) for side, point in points.items()
             }
             touching = self.resultants(k, knee.coordinates, contact.result)
-            sides = {"medial"} if self.case.split is None else {"medial", "lateral"}
-            geometry = replace(
-                geometry, condyles=separated | touching, lifted=frozenset(sides - set(touching))
-            )
+            lifted = frozenset(self.mechanics.sides - set(touching))
+            geometry = replace(geometry, condyles=separated | touching, lifted=lifted)
             loads = solve_knee(geometry, self.mechanics.friction)
         seconds = clock.perf_counter() - start
         return FrameLoads(geometry, loads, None, 0.0, seconds)
 
     def resultants(self, k: int, place: Array, result: ContactResult) -> dict[str, CondylePoint]:
         """Return the contact's resultants as the contact points of the equations."""
-        return {
-            side: CondylePoint(
-                condyle.point, condyle.normal, self.mechanics.sliding(k, place, condyle.point), 0.0
-            )
-            for side, condyle in condyle_wrenches(result, self.case.split).items()
-        }
+        return self.mechanics.resultants(k, place, condyle_wrenches(result, self.case.split))
 
     def _nearest_points(self, k: int) -> dict[str, Array]:
         query = self.mechanics.query

@@ -1,6 +1,7 @@
 """The body side of a case: geometry of each frame in, loads of each frame out."""
 
 import time as clock
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ from tkamb.body.chain import ChainMotion, ChainState
 from tkamb.body.contact_points import (
     FARTHEST_GAP,
     NO_CONTACT,
+    CondylePoint,
     ContactPoints,
     contact_points,
     nearest_gap,
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from tkamb.body.ligaments import Ligament
     from tkamb.body.patella import PatellaState
     from tkamb.body.slip import CondyleSlip
+    from tkamb.contact.probe import CondyleWrench
     from tkamb.equilibrium.shared_muscles import SharedMuscles
     from tkamb.geometry.adjustment import Adjustment
     from tkamb.geometry.closest import ClosestPointQuery
@@ -188,6 +191,28 @@ class Mechanics:
         """
         velocity, spin = knee_twist(coordinates, self.case.motion.velocity[k])
         return np.asarray(velocity + np.cross(spin, point - coordinates[:3]))
+
+    @property
+    def sides(self) -> set[str]:
+        """Names of the condyles that may carry load."""
+        return {"medial"} if self.case.split is None else set(SIDES)
+
+    def resultants(
+        self, k: int, coordinates: Array, condyles: "Mapping[str, CondyleWrench]"
+    ) -> dict[str, CondylePoint]:
+        """Return the resultants of a contact as the contact points of the equations.
+
+        Args:
+            k: frame; the rates are the recorded ones.
+            coordinates: (6,) where the knee is.
+            condyles: side -> what it does to the insert there.
+        """
+        return {
+            side: CondylePoint(
+                condyle.point, condyle.normal, self.sliding(k, coordinates, condyle.point), 0.0
+            )
+            for side, condyle in condyles.items()
+        }
 
     def slips(self) -> "dict[str, CondyleSlip]":
         """Return side -> rolling and slipping of all frames; empty without the two surfaces."""

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from tkamb.body.crossing import CrossingLines, MuscleShare
-from tkamb.body.extensor_response import flexion_row
+from tkamb.body.extensor_response import FlexionRow, flexion_row, yielding_flexion_row
 from tkamb.body.knee import KneeGeometry, KneeLoads, solve_knee, unsolved
 from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose
@@ -20,6 +20,7 @@ from tkamb.muscles.recording import LegRecording, load_knee_trial
 from tkamb.muscles.sharing import Sharing
 from tkamb.scene.case import Case
 from tkamb.scene.si import in_si
+from tkamb.scene.tables import MusclesTable
 from tkamb.units import MILLIMETRE
 
 SAME_PLACE = 0.5 * MILLIMETRE
@@ -33,17 +34,20 @@ class SharedMuscles:
     Args:
         trial: the muscles over the frames.
         left: a left leg's, whose knee is computed as its mirror image.
+
+    Attributes:
+        trial: as given.
     """
 
     def __init__(self, trial: KneeTrial, left: bool = False) -> None:
         flip = MIRROR if left else np.eye(3)
-        self._trial, self._names = trial, trial.muscles
+        self.trial, self._names = trial, trial.muscles
         self._shank, self._thigh = trial.shank @ flip, trial.thigh @ flip
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
         """Group of muscles -> their names (`tkamb.muscles.leg.muscle_groups`)."""
-        return dict(self._trial.groups)
+        return dict(self.trial.groups)
 
     def share(
         self, k: int, geometry: KneeGeometry, friction: float, lifted: frozenset[str]
@@ -56,29 +60,56 @@ class SharedMuscles:
             friction: Coulomb coefficient.
             lifted: sides that carry nothing.
         """
-        trial, lines = self._trial, CrossingLines(self._shank[k], self._thigh[k])
-        names = trial.problems.coordinates
+        lines = self._lines(k)
         try:
-            row = flexion_row(geometry, lines, friction, lifted)
+            return self._shared(k, lines, flexion_row(geometry, lines, friction, lifted))
         except ComputationError as error:
             return self._failed(lines, f"failed: {error.what}")
+
+    def share_of_yielding_knee(
+        self, k: int, geometry: KneeGeometry, friction: float, base: float, per_wrench: Array
+    ) -> MuscleShare:
+        """Return what each muscle carries in frame k while released coordinates yield to it.
+
+        Args:
+            k: frame.
+            geometry: the knee; its contact is not looked at.
+            friction: Coulomb coefficient.
+            base: N, see `yielding_flexion_row`.
+            per_wrench: (6,), likewise.
+        """
+        lines = self._lines(k)
+        try:
+            row = yielding_flexion_row(geometry, lines, friction, base, per_wrench)
+        except ComputationError as error:
+            return self._failed(lines, f"failed: {error.what}")
+        return self._shared(k, lines, row)
+
+    def _lines(self, k: int) -> CrossingLines:
+        return CrossingLines(self._shank[k], self._thigh[k])
+
+    def _shared(self, k: int, lines: CrossingLines, row: FlexionRow) -> MuscleShare:
+        trial = self.trial
         problem, (activation, reserve, _, status) = trial.solved(
             k, row.moment, row.extensor_arm, row.arms
         )
         if status != "ok":
             return self._failed(lines, status)
-        force = trial.force(k, activation)
         return MuscleShare(
             self._names,
             activation,
-            force,
-            names,
+            trial.force(k, activation),
+            trial.problems.coordinates,
             problem.moment[0],
             reserve,
             trial.flexion,
             trial.crossing,
             lines,
         )
+
+    def tension(self, share: MuscleShare) -> float:
+        """Return what the extensor group pulls with, N."""
+        return float(share.force[self.trial.extensor].sum())
 
     def solve(
         self, k: int, geometry: KneeGeometry, friction: float
@@ -102,7 +133,7 @@ class SharedMuscles:
 
     def _failed(self, lines: CrossingLines, status: str) -> MuscleShare:
         nothing = np.full(len(self._names), np.nan)
-        names = self._trial.problems.coordinates
+        names = self.trial.problems.coordinates
         rest = np.full(len(names), np.nan)
         return MuscleShare(
             self._names,
@@ -111,11 +142,22 @@ class SharedMuscles:
             names,
             rest,
             rest,
-            self._trial.flexion,
-            self._trial.crossing,
+            self.trial.flexion,
+            self.trial.crossing,
             lines,
             status,
         )
+
+
+def sharing_of(table: MusclesTable) -> Sharing:
+    """Return the options of a scene's [muscles]."""
+    return Sharing(
+        reserve=table.reserve_Nm,
+        exponent=table.exponent,
+        weights=table.weights,
+        lowest=table.least_activation,
+        law=table.law,
+    )
 
 
 def load_muscles(case: Case) -> SharedMuscles:
@@ -144,12 +186,7 @@ def load_muscles(case: Case) -> SharedMuscles:
         insert=None if insert is None else insert.mesh,
         mesh_unit="m" if insert is None else insert.unit,
         mesh_axes="+x,+y,+z" if insert is None else insert.axes,
-        sharing=Sharing(
-            reserve=table.reserve_Nm,
-            exponent=table.exponent,
-            weights=table.weights,
-            law=table.law,
-        ),
+        sharing=sharing_of(table),
     )
     links, trial = load_knee_trial(source, case.motion.time)
     _check_links(case, links.insert_in_tibia, links.hip)

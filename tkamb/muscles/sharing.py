@@ -85,7 +85,7 @@ class FrameProblems:
         reason = self._unknown(k)
         if reason is None:
             try:
-                shared = share_load(self._frame(k))
+                shared = share_load(self.frame(k))
             except ComputationError as error:
                 reason = error.what
             else:
@@ -108,7 +108,7 @@ class FrameProblems:
                 return f"{why} {', '.join(names)}"
         return None
 
-    def _frame(self, k: int) -> LoadSharing:
+    def frame(self, k: int) -> LoadSharing:
         """Return the problem of frame k."""
         count, reserve = len(self.muscles), self.sharing.reserves(self.coordinates)
         none = reserve == 0.0

@@ -235,6 +235,12 @@ class MusclesTable(SceneTable):
         description="the reserve moment that costs as much as one fully active muscle of weight "
         "1, of every balanced coordinate or of each by name; 0 forbids it",
     )
+    least_activation: Number = Field(
+        0.0,
+        ge=0,
+        le=0.2,
+        description="of every muscle: its resting tone, which presses the knee where no load does",
+    )
     law: Literal["isometric", "hill"] = Field(
         "isometric", description="strength: the maximal isometric force, or force-length-velocity"
     )

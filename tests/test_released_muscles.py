@@ -1,0 +1,176 @@
+"""Released coordinates and muscles that share the load: one search, one answer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from joints import demand, dished_joint, push
+from jw_gait import JW, needs_jw
+from mirrored_patient import write_mirrored_patient
+from scenes import MODEL
+from shared_trials import two_flexors
+from tkamb.body.crossing import CrossingLines, MuscleShare
+from tkamb.body.joint_equilibrium import external_wrench
+from tkamb.body.load import total_wrench
+from tkamb.contact.foundation import ElasticFoundation
+from tkamb.equilibrium.contact_side import ContactSide
+from tkamb.equilibrium.mechanics import Mechanics
+from tkamb.equilibrium.relaxation import Relaxation
+from tkamb.equilibrium.released_forces import ReleasedForces
+from tkamb.equilibrium.shared_muscles import SharedMuscles
+from tkamb.geometry.frames import MIRROR
+from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
+from tkamb.simulation import simulate
+
+OG3 = MODEL.parent / "jw" / "ngait_og3.toml"
+CONTACT = {
+    "contact.model": "foundation",
+    "contact.resolution_mm": 2.0,
+    "contact.released": ["ap", "ml", "axial_rotation", "adduction"],
+}
+FRAMES = (40, 41, 42)
+
+
+def side_with_flexors(scene, left=False):
+    """Return the shipped knee with quadriceps, hamstring and gastrocnemius."""
+    case = load_case(load_scene(scene, CONTACT))
+    mechanics = Mechanics(case)
+    trial = two_flexors(len(case.motion.time), least=0.02)
+    if left:
+        trial = replace(trial, shank=trial.shank @ MIRROR, thigh=trial.thigh @ MIRROR)
+    mechanics.muscles = SharedMuscles(trial, left=left)
+    return ContactSide(case, mechanics)
+
+
+def computed(side):
+    """Return body and contact of a few frames, each from the one before."""
+    found = []
+    for k in FRAMES:
+        found.append(side.frame(k, [contact for _, contact in found]))
+    return found
+
+
+@pytest.fixture(scope="module")
+def side():
+    return side_with_flexors(MODEL / "scene.toml")
+
+
+@pytest.fixture(scope="module")
+def resting(side):
+    return computed(side)
+
+
+def test_the_shank_is_in_equilibrium_with_muscles(side, resting):
+    """Ground, weight, inertia, ligaments, muscles, patellar ligament, contact and residuals."""
+    for body, _ in resting:
+        geometry, values = body.geometry, body.loads.values
+        assert geometry.share.force[1:].min() > 15.0
+        loads = [*geometry.ligaments, *geometry.share.loads(geometry.state)]
+        total = external_wrench(geometry, geometry.coordinates)
+        total = total + total_wrench([a for a in loads if a.link == "tibia"], np.zeros(3))
+        pull = [p for p in geometry.extensor.patellar_ligament if p.link == "tibia"]
+        total = total + values["patellar_ligament"] * total_wrench(pull, np.zeros(3))
+        points = []
+        for name, condyle in geometry.condyles.items():
+            force = -values[f"{name}_normal"] * condyle.direction(side.mechanics.friction)
+            total = total + push(force, condyle.point)
+            points.append(condyle.point)
+        left = np.array([values["residual_ap"], 0.0, values["residual_ml"]])
+        total = total + push(left, np.mean(points, axis=0))
+        total[4] += values["residual_axial"]
+        scale = np.linalg.norm(body.loads.contact_force)
+        np.testing.assert_allclose(total, 0.0, atol=1e-8 * scale)
+
+
+def test_the_sharing_is_that_of_the_released_knee(resting):
+    """The quadriceps of sharing and equations to 1 N, and nothing that rest should make zero."""
+    for body, contact in resting:
+        quadriceps = body.geometry.extensor.tension(body.loads.values)
+        assert quadriceps == pytest.approx(body.geometry.share.force[0], abs=1.0)
+        assert quadriceps > 500.0
+        assert contact.iterations <= 6
+        for name in ("residual_ap", "residual_ml"):
+            assert abs(body.loads.values[name]) < 0.2
+
+
+def test_activations_are_continuous(resting):
+    activations = np.array([body.geometry.share.activation for body, _ in resting])
+    assert np.abs(np.diff(activations, axis=0)).max() < 0.05
+
+
+def test_a_left_leg_with_muscles_gives_the_mirrored_answer(tmp_path, resting):
+    mirrored = side_with_flexors(write_mirrored_patient(tmp_path), left=True)
+    body, contact = mirrored.frame(FRAMES[0])
+    same, there = resting[0]
+    np.testing.assert_allclose(body.geometry.share.force, same.geometry.share.force, atol=1e-5)
+    np.testing.assert_allclose(body.loads.contact_force, same.loads.contact_force, atol=1e-4)
+    here = contact.equilibrium.coordinates
+    np.testing.assert_allclose(here, there.equilibrium.coordinates, atol=1e-9)
+
+
+def test_what_keeps_flexion_answers_to_a_wrench_as_the_yielding_knee_does():
+    """The tangent against a second search under a little more load."""
+    state = ElasticFoundation(resolution=1e-3, law="linear").prepare(dished_joint())
+    model, start = ElasticFoundation(resolution=1e-3, law="linear"), np.zeros(6)
+    start[1] = state.pair.first_touch_height(np.eye(4)) - 5e-5
+    load = push((20.0, 900.0, 5.0), (0.003, 0.0, 0.004))
+
+    def rest(external, place):
+        joint = demand(external)
+        forces = ReleasedForces(joint, model.probe(state), place)
+        balance = forces.balance()
+        contact = forces.contact(balance)
+        place = forces.at(balance)
+        return place, contact, float(joint.kept(place, contact.wrench)[-1])
+
+    place, contact, kept = rest(load, start)
+    forces = ReleasedForces(demand(load), model.probe(state), place)
+    assert forces.tension(contact) == pytest.approx(kept, abs=1e-9)
+    more = push((1.0, 20.0, 0.5), (0.004, 0.01, -0.01))
+    change = rest(load + more, place)[2] - kept
+    rigid = demand(more).kept(place, np.zeros(6))[-1]
+    assert forces.tension_per_wrench(contact) @ more == pytest.approx(change, rel=0.01)
+    assert abs(rigid - change) > 0.05 * abs(change)
+
+
+def share_of(force):
+    one, none = np.array([force]), np.zeros((0, 3))
+    return MuscleShare(
+        ("a",), one, one, ("knee",), one, one, 0, np.zeros(0, int), CrossingLines(none, none)
+    )
+
+
+@pytest.mark.parametrize("slope", [0.2, -0.3, -1.0, -4.0])
+def test_relaxation_settles_what_would_go_round_in_a_circle(slope):
+    """f' = 100 + slope f: with a slope below -1 taking turns would never end."""
+    mixing = Relaxation()
+    held = mixing.mixed(share_of(0.0))
+    for _ in range(6):
+        held = mixing.mixed(share_of(100.0 + slope * held.force[0]))
+        if mixing.settled:
+            break
+    assert mixing.settled
+    assert held.force[0] == pytest.approx(100.0 / (1.0 - slope), abs=4.0)
+
+
+@pytest.mark.slow
+@needs_jw
+def test_activations_in_gait_are_continuous_at_100_Hz():
+    """Mid-stance of og3: no jump without a condyle that lands or lifts off."""
+    changes = {
+        "muscles.model": str(JW / "JW.osim"),
+        "contact.resolution_mm": 1.5,
+        "motion.interval_s": [2.30, 2.40],
+        "motion.frames": 11,
+    }
+    results = simulate(load_scene(OG3, changes))
+    columns = results.columns
+    assert not any(status.startswith("failed") for status in columns["status"])
+    activations = np.array([v for name, v in columns.items() if name.startswith("activation_")])
+    assert len(activations) > 40
+    assert np.abs(np.diff(activations, axis=1)).max() < 0.2
+    assert np.median(columns["coupling_iterations"]) <= 5
+    heads = sum(columns[f"muscle_{name}_N"] for name in ("recfem", "vasint", "vaslat", "vasmed"))
+    np.testing.assert_allclose(heads, columns["quadriceps_N"], atol=2.0)

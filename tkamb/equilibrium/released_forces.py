@@ -1,0 +1,145 @@
+"""What drives the released knee coordinates at trial places, the patella held on the femur."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.body.contact_points import CondylePoint
+from tkamb.body.joint_equilibrium import JointEquilibrium
+from tkamb.body.load import wrench_of
+from tkamb.equilibrium.balance import Balance, Trial, find_balance
+from tkamb.geometry.frames import Array, knee_axes, knee_pose
+
+if TYPE_CHECKING:
+    from tkamb.contact.probe import Probe, ProbedContact
+
+LEVER = 0.025
+"""m: half the usual distance of the condyles; makes rotations comparable to translations."""
+SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
+TINY = 1e-7
+"""m: step of the finite differences of axes and ligaments."""
+
+Sliding = Callable[[Array, Array], Array]
+
+
+def _no_sliding(place: Array, point: Array) -> Array:
+    return np.zeros(3)
+
+
+class ReleasedForces:
+    """What drives the released coordinates at trial places, the patella held on the femur.
+
+    Args:
+        joint: of the body.
+        probe: of the contact model.
+        place: (6,) knee coordinates; those not released stay.
+        friction: Coulomb coefficient.
+        sliding: from coordinates (6,) and point (3,) to the femur's velocity there (3,), m/s.
+
+    Attributes:
+        seen: scaled coordinates as bytes -> contact there.
+    """
+
+    def __init__(
+        self,
+        joint: JointEquilibrium,
+        probe: "Probe",
+        place: Array,
+        friction: float = 0.0,
+        sliding: Sliding = _no_sliding,
+    ) -> None:
+        self._joint, self._probe, self._place = joint, probe, np.array(place, float)
+        self._friction, self._sliding = friction, sliding
+        self._rows = list(joint.released)
+        self._scale = SCALE[self._rows]
+        self.seen: dict[bytes, ProbedContact] = {}
+
+    def balance(self, stiffness: Array | None = None) -> Balance:
+        """Return where the released coordinates come to rest, from the given place."""
+        return find_balance(self.trial, self._place[self._rows] * self._scale, stiffness)
+
+    def contact(self, balance: Balance) -> "ProbedContact":
+        """Return the contact of a balance."""
+        return self.seen[balance.coordinates.tobytes()]
+
+    def trial(self, x: Array) -> Trial:
+        """Return scaled forces and stiffness at scaled coordinates (n,), m."""
+        place = self._with(x)
+        contact = self.seen[x.tobytes()] = self._probe.at(knee_pose(place))
+        if not contact.known:
+            return Trial(np.full(len(x), np.nan))
+        wrench, stiffness = self._with_friction(place, contact)
+        if stiffness is None:
+            return Trial(self._joint.imbalance(place, wrench) / self._scale)
+        steps = np.zeros((len(x) + 1, 6))
+        steps[np.arange(len(x)), self._rows] = TINY / self._scale
+        forces = self._joint.imbalance(place + steps, wrench) / self._scale
+        change = (forces[:-1] - forces[-1]).T / TINY
+        twists = knee_axes(place)[self._rows] / self._scale[:, None]
+        gain = self._joint.contact_gain(place) / self._scale[:, None]
+        return Trial(forces[-1], -(change + gain @ stiffness @ twists.T))
+
+    def tension_per_wrench(self, contact: "ProbedContact") -> Array | None:
+        """Return v (6,): a further wrench dw on the insert adds v . dw to the ligament's tension.
+
+        The released coordinates yield to it by dq and stay at rest: with K = -df/dq of the
+        generalised forces f = -J w of contact, ligaments and muscles,
+
+            -J dw - K dq - J B dy = 0
+
+        for dq and what keeps the other coordinates dy, the tension of the patellar ligament
+        among it. None where the contact model does not know its tangent.
+
+        Args:
+            contact: at the place where the search begins, the knee at rest.
+        """
+        place = self._place
+        wrench, stiffness = self._with_friction(place, contact)
+        if stiffness is None:
+            return None
+        kept = self._joint.kept(place, wrench)
+        steps = np.zeros((len(self._rows) + 1, 6))
+        steps[np.arange(len(self._rows)), self._rows] = TINY / self._scale
+        forces = self._joint.whole(place + steps, wrench, kept)
+        axes = knee_axes(place)
+        twists = axes[self._rows] / self._scale[:, None]
+        change = (forces[:-1] - forces[-1]).T / TINY - axes @ stiffness @ twists.T
+        matrix = np.hstack([-change, axes @ self._joint.columns(place)])
+        return np.asarray(-np.linalg.solve(matrix, axes)[-1])
+
+    def tension(self, contact: "ProbedContact") -> float:
+        """Return the tension (N) by which the patellar ligament balances flexion there."""
+        wrench, _ = self._with_friction(self._place, contact)
+        return float(self._joint.kept(self._place, wrench)[-1])
+
+    def at(self, balance: Balance) -> Array:
+        """Return the knee coordinates (6,) of a balance."""
+        return self._with(balance.coordinates)
+
+    def pushes(self, balance: Balance) -> bool:
+        """Return whether the patellar ligament, where it is taut, would have to push."""
+        if self._joint.line is None:
+            return False
+        place = self.at(balance)
+        wrench, _ = self._with_friction(place, self.contact(balance))
+        return bool(self._joint.kept(place, wrench)[-1] < 0)
+
+    def _with(self, x: Array) -> Array:
+        place = self._place.copy()
+        place[self._rows] = x / self._scale
+        return place
+
+    def _with_friction(self, place: Array, contact: "ProbedContact") -> tuple[Array, Array | None]:
+        """Return wrench (6,) on the insert with friction, and its stiffness (6, 6) if known."""
+        wrench, stiffness = np.zeros(6), np.zeros((6, 6))
+        for condyle in contact.condyles.values():
+            sliding = self._sliding(place, condyle.point)
+            touch = CondylePoint(condyle.point, condyle.normal, sliding, 0.0)
+            drag = touch.normal - touch.direction(self._friction)
+            rubbing = wrench_of(touch.point, drag)
+            wrench += condyle.wrench + condyle.force * rubbing
+            if condyle.stiffness is not None:
+                pressed = -touch.normal @ condyle.stiffness[:3]
+                stiffness += condyle.stiffness + np.outer(rubbing, pressed)
+        return wrench, stiffness if contact.tangent else None
