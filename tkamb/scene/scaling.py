@@ -29,16 +29,18 @@ def scaled_case(case: "Case") -> "Case":
     """Return the case with its scene's `[patient] scale`.
 
     Raises:
-        InputError: the scene has [muscles] or markers, which have models of their own size.
+        InputError: the scene has [muscles] or markers, which have models of their own size, or
+            [measured], which is another subject's.
     """
     s = case.scene.patient.scale
     for there, table in (
         (case.scene.muscles, "[muscles]"),
         (case.motion.markers, "[motion.markers]"),
+        (case.scene.measured, "[measured]"),
     ):
         if there is not None:
-            what = f"cannot scale a scene with {table}"
-            raise InputError(what, "[patient] scale", "scale the model that it names instead")
+            what, mend = f"cannot scale a scene with {table}", "scale its models, or leave it out"
+            raise InputError(what, "[patient] scale", mend)
     return replace(
         case,
         chain=case.chain.scaled(s),
