@@ -29,7 +29,7 @@ def pytest_runtest_protocol(item):
     def trace(frame, event, argument):
         codes.add(frame.f_code)
 
-    start = time.perf_counter()
+    start = time.process_time()
     threading.settrace(trace)
     sys.settrace(trace)
     yield
@@ -40,7 +40,7 @@ def pytest_runtest_protocol(item):
         for code in codes
         if code.co_filename.startswith(PACKAGE)
     )
-    row = {"test": item.nodeid, "seconds": time.perf_counter() - start, "called": names}
+    row = {"test": item.nodeid, "seconds": time.process_time() - start, "called": names}
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(row) + "\n")
 
