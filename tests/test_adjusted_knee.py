@@ -45,7 +45,7 @@ def test_the_adjustment_leaves_the_shipped_total_alone(tmp_path):
     np.testing.assert_allclose(split(adjusted), split(recorded), atol=1e-4)
 
 
-@pytest.mark.parametrize("degrees", [0.4, -0.4])
+@pytest.mark.parametrize("degrees", [0.4, pytest.param(-0.4, marks=pytest.mark.slow)])
 def test_the_adjustment_mends_the_split_of_a_coronal_error(tmp_path, degrees):
     """0.4 deg and 0.4 mm of error: the split is mended, the total changes by 0.006 BW."""
     right = next(with_and_without(wrong_scene(tmp_path / "right", 0.0, 0.0)))

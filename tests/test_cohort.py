@@ -225,6 +225,7 @@ def test_two_into_one_folder_and_another_cohort_to_resume_are_refused(file, tmp_
     assert "another tkamb is writing" in said and "\n" not in said
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_no_table_or_the_whole_of_it(file, tmp_path, monkeypatch):
     cohort, outcomes = load_cohort(file), {n: outcome(1.0, 5) for n in range(4)}
     monkeypatch.setattr("tkamb.cohort.kept.cohort_html", lambda *_: "page")

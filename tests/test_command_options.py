@@ -12,6 +12,7 @@ from tkamb.cli import main
 SCENE = fast_scene()
 
 
+@pytest.mark.slow
 def test_no_cache_reaches_the_model(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("TKAMB_CACHE_DIR", str(tmp_path / "kept"))
     run = ["run", str(SCENE), "--frames", "50:51", "--resolution", "1.5", "--contact"]

@@ -28,12 +28,14 @@ def plain_report(monkeypatch):
 @pytest.fixture
 def quick_case(monkeypatch):
     """Scenes are read, and their bodies built, once."""
-    import tkamb.simulation as simulation
+    from tkamb import simulation
+    from tkamb.run import frames
 
-    for name, key_of in (("load_case", Scene.model_dump_json), ("Mechanics", id)):
+    parts = ((simulation, "load_case", Scene.model_dump_json), (frames, "Mechanics", id))
+    for module, name, key_of in parts:
         kept = {}
 
-        make = getattr(simulation, name)
+        make = getattr(module, name)
 
         def known(given, make=make, key_of=key_of, kept=kept):
             key = key_of(given)
@@ -41,7 +43,7 @@ def quick_case(monkeypatch):
                 kept[key] = make(given)
             return kept[key]
 
-        monkeypatch.setattr(simulation, name, known)
+        monkeypatch.setattr(module, name, known)
 
 
 def snapshot(out):

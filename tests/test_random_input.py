@@ -113,7 +113,7 @@ def test_any_text_is_read_or_refused_as_a_scene(content):
         assert "\n" not in str(caught.value)
 
 
-@settings(GENTLE, max_examples=12)
+@settings(GENTLE, max_examples=6)
 @given(st.sampled_from(PATHS), st.none() | NUMBERS)
 def test_a_run_of_a_scene_with_a_random_number(capsys, path, value):
     with tempfile.TemporaryDirectory() as name:
@@ -126,7 +126,7 @@ def test_a_run_of_a_scene_with_a_random_number(capsys, path, value):
 CELLS = st.sampled_from(["", "nan", "inf", "-1e300", "1e9", "0", "abc", "1,2", '"', "\x00", "é"])
 
 
-@settings(GENTLE, max_examples=15)
+@settings(GENTLE, max_examples=8)
 @given(
     st.sampled_from(["motion.csv", "tibia.csv", "ground_reaction.csv"]),
     st.integers(0, 101),
@@ -145,7 +145,7 @@ def test_a_run_with_a_random_cell_in_its_tables(capsys, name, row, column, cell)
         run_cleanly(folder, capsys, "--contact", "foundation", "--resolution", "3")
 
 
-@settings(GENTLE, max_examples=15)
+@settings(GENTLE, max_examples=8)
 @given(
     st.sampled_from(["femoral_component.stl", "insert.stl"]),
     st.sampled_from(["cut", "noise", "scale", "drop", "bytes", "turn"]),

@@ -96,6 +96,7 @@ def kill_and_resume(out, waits):
     return read_results(out)
 
 
+@pytest.mark.slow
 def test_killed_again_and_again_the_run_ends_as_the_undisturbed_one(tmp_path, undisturbed):
     """While it starts, at its first frames, in between and at the end; see scripts/study_kills."""
     waits = [(0, 0.5), (1, 0.0), (3, 0.01), (8, 0.03), (14, 0.0), (TOTAL, 0.02)]

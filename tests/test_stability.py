@@ -137,8 +137,8 @@ def test_counts_add_up_and_failures_are_listed():
     assert picture(verdicts).axes
 
 
-def test_a_tenth_of_the_matrix_has_no_failure():
-    verdicts = list(run_stability(stability_cases(quick=True)))
+def test_a_twentieth_of_the_matrix_has_no_failure():
+    verdicts = list(run_stability(stability_cases(quick=True)[::2]))
     assert not [v for v in verdicts if v.failed]
     assert all(v.reason for v in verdicts if v.kind == "flagged")
     assert Counter(v.kind for v in verdicts)["converged"] > 0.7 * len(verdicts)
@@ -183,6 +183,7 @@ def test_ctrl_c_leaves_a_readable_part(tmp_path):
     assert (tmp_path / "stability.png").exists()
 
 
+@pytest.mark.slow
 def test_a_run_in_slow_motion_obeys_the_law_of_inertia():
     assert judge_scene(SceneExtreme("time", 3.0)).kind == "converged"
 

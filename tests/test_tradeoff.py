@@ -208,6 +208,7 @@ def test_the_default_matrix_leaves_out_only_repeats():
     assert len(seconds) == len(wanted) and sum(seconds) < 900
 
 
+@pytest.mark.slow
 def test_the_quick_study_is_stopped_and_goes_on(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(tradeoff, "QUICK_MODELS", ("foundation", "lattice", "fe"))
     asked = []

@@ -222,6 +222,7 @@ def test_another_contact_model_on_the_frame(live):
     assert browser.problems == []
 
 
+@pytest.mark.slow
 def test_two_contact_models_side_by_side_on_one_scale(folder, chromium, tmp_path):
     other = tmp_path / "hertz"
     other.mkdir()
