@@ -30,6 +30,7 @@ from tkamb.contact.lattice.meshing.grid import (
     build_grid,
     grid_spacing,
 )
+from tkamb.contact.lattice.meshing.levels import Levels
 from tkamb.contact.lattice.meshing.quality import measure_quality
 from tkamb.contact.lattice.meshing.walls import inside
 from tkamb.errors import InputError
@@ -253,6 +254,16 @@ def test_layers_have_no_step_in_a_dish(name, size):
     inner = ~rim[:, [0, 2]].any(axis=1) & (np.abs(top[1][:, 2]) > 11e-3)
     deep = inner & (top[1][:, 1] < np.quantile(top[1][inner, 1], 0.3))
     assert np.ptp(top[0][deep, 1]) == 0
+
+
+def test_a_height_s_position_is_the_layer_that_stands_there():
+    """Nodes of every column, pegs and posts included: `position` is the inverse of `heights`."""
+    reference = 1e-3 * np.array([[8.0, 9.5, 12.0], [7.3, 10.0, 11.1]])
+    levels = Levels(reference, layers=10, below=2, spacing=1e-3, count=16)
+    heights = levels.heights()
+    i, j, k = np.indices(heights.shape)
+    found = levels.position(heights.ravel(), i.ravel(), k.ravel())
+    np.testing.assert_allclose(found, j.ravel(), atol=1e-9)
 
 
 @pytest.mark.parametrize("name", INSERTS)

@@ -7,6 +7,7 @@ import pytest
 
 from lattice_bodies import condyles, dished_insert, pair
 from tkamb.contact.lattice.initial_guess import WarmStart, initial_guess
+from tkamb.contact.lattice.linear import compliance
 from tkamb.contact.lattice.linear.compliance import ComplianceCache
 from tkamb.contact.lattice.model import warm_start_of
 from tkamb.contact.lattice.problem import Region, undeformed
@@ -111,6 +112,17 @@ def test_compliance_at_hand_changes_no_answer(state):
     used, fresh = model.press(state, LOAD, POSE), model.press(bare, LOAD, POSE)
     assert used.approach == pytest.approx(fresh.approach, rel=1e-9)
     assert used.pressure == pytest.approx(fresh.pressure, rel=1e-6, abs=1.0)
+
+
+def test_the_compliance_at_hand_stays_within_its_bound(state, monkeypatch):
+    """Spare nodes are worked out along with those wanted, unless there are too many."""
+    wanted, spare = np.array([3, 5]), np.arange(2, 9)
+    for most, kept in ((7, spare), (6, wanted)):
+        monkeypatch.setattr(compliance, "MOST_STORED", most)
+        cache = ComplianceCache(state.problem.operator.half)
+        cache.among(wanted, spare)
+        assert cache.nodes.tolist() == kept.tolist()
+        assert cache.compliance.shape == (3, len(kept), 3, len(kept))
 
 
 def test_a_warm_start_of_another_insert_is_not_used(state):

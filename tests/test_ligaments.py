@@ -163,6 +163,18 @@ def test_generic_set_scales_with_the_implant() -> None:
         generic_ligaments(cylinder(0.02, 0.07), slab(0.075), np.eye(4), ("ITB",))
 
 
+def test_generic_ends_stand_in_half_widths_of_their_part() -> None:
+    """The deep MCL ends at the insert's medial edge, the LCL beyond the lateral one."""
+    found = {
+        bundle.name.removeprefix("generic_"): bundle
+        for bundle in generic_ligaments(cylinder(0.02, 0.07), slab(0.075), np.eye(4))
+    }
+    assert found["MCL_deep"].distal.position[2] == pytest.approx(-0.0375)
+    assert found["LCL"].distal.position[2] == pytest.approx(1.10 * 0.0375)
+    middle = 0.001  # of the component's width
+    assert found["MCL_anterior"].proximal.position[2] - middle == pytest.approx(-1.20 * 0.035)
+
+
 def test_generic_set_is_plausible_on_the_shipped_knee() -> None:
     """Collaterals within 12 % of slack over 0-90 deg; the PCL tightens with flexion."""
     case = load_case(
