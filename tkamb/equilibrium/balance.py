@@ -10,7 +10,8 @@ by the trapezoidal rule, against what K predicts,
 forces that have a potential lower it by W, so that with W > 0 in every step the energy falls.
 A trial that overshoots into a stiff contact costs work and is taken back. Where loads that follow
 the motion leave K unsymmetric, stable but not positive definite, work is no measure; a step then
-goes along Newton's direction, in which |r| falls, and is judged by that.
+goes along Newton's direction, in which |r| falls, and is judged by that; a search that ends nowhere
+so is tried once more by work alone.
 
 Everything is in metres and newtons: rotations are scaled by a lever arm.
 
@@ -19,7 +20,7 @@ doi:10.1007/978-0-387-40065-5.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -103,12 +104,21 @@ def find_balance(forces: Forces, start: Array, stiffness: Array | None = None) -
         stiffness: (n, n) N/m of an earlier search near by, a guess that saves trials where
             `forces` does not bring its own.
     """
-    return _Search(forces, np.array(start, float), stiffness).run()
+    found = _Search(forces, np.array(start, float), stiffness).run()
+    if found.status not in (BalanceStatus.RUNS_AWAY, BalanceStatus.NOT_CONVERGED):
+        return found
+    # Newton's direction may lead off over the facets of a contact; the way downhill may not.
+    again = _Search(forces, np.array(start, float), stiffness, downhill=True).run()
+    if again.status is not BalanceStatus.OK:
+        return found
+    return replace(again, trials=found.trials + again.trials, steps=found.steps + again.steps)
 
 
 class _Search:
-    def __init__(self, forces: Forces, start: Array, stiffness: Array | None) -> None:
-        self._forces, self._start = forces, start
+    def __init__(
+        self, forces: Forces, start: Array, stiffness: Array | None, downhill: bool = False
+    ) -> None:
+        self._forces, self._start, self._downhill = forces, start, downhill
         self._trials, self._steps = 0, 0
         self._fresh, self._since, self._unknown = False, 0, False
         self._radius, self._refused = FIRST_RADIUS, False
@@ -181,6 +191,8 @@ class _Search:
             return bounded_step(self.stiffness, self.force, self._radius), 0.0
         newton = np.linalg.solve(self.stiffness, self.force)
         part = min(1.0, self._radius / float(np.linalg.norm(newton)))
+        if self._downhill and part < 1.0:
+            return bounded_step(self.stiffness, self.force, self._radius), 0.0
         return np.asarray(part * newton), part
 
     def _at(self, x: Array) -> Trial:
