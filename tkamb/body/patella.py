@@ -37,6 +37,9 @@ MOST_CHORDS = 10
 LEAST_TURN = 1e-5
 """rad: a smaller turn says nothing of the moment's slope."""
 
+FLATTEST = 1e-6
+"""Determinant of the contact normal and the ligament's direction: less is one line."""
+
 FIRST_STEP = np.deg2rad(0.5)
 WIDEST_TURN = np.deg2rad(40.0)
 """rad: first step and end of the search about the guess."""
@@ -210,10 +213,11 @@ class _Closing:
         before, stretch = self.errors, balance.ligament.length - self._length
         self.errors = np.array([balance.contact.gap, stretch])
         largest, last = float(np.abs(self.errors).max()), float(np.abs(before).max())
-        if largest < 0.5 * last < np.inf:
+        learns = largest < 0.5 * last < np.inf
+        if learns:
             missed = self.errors - before - self._slopes @ self._step
             self._slopes += np.outer(missed, self._step) / (self._step @ self._step)
-        else:
+        if not learns or abs(np.linalg.det(self._slopes)) < FLATTEST:
             normal, direction = balance.contact.normal, balance.ligament.start_direction
             self._slopes = np.stack([normal[:2], -direction[:2]])
         step = np.linalg.solve(self._slopes, -self.errors)
@@ -245,7 +249,7 @@ class _Frame:
         )
         pull, hold = -muscle.end_direction[:2], ligament.start_direction[:2]
         sides = np.column_stack([hold, contact.normal[:2]])
-        if abs(np.linalg.det(sides)) < 1e-6:
+        if abs(np.linalg.det(sides)) < FLATTEST:
             raise ComputationError("the patellar ligament runs along the contact normal")
         ligament_force, normal_force = np.linalg.solve(sides, -pull)
         moment = (
@@ -324,17 +328,19 @@ class _Frame:
         """
         way = there.coordinates - here.coordinates
         slope = (there.moment - here.moment) / way[2]
+        if slope >= 0.0:
+            return None
         closing, turned = _Closing(self.mechanism.ligament_length), 0.0
         coordinates, before = here.coordinates - here.moment / slope * way / way[2], here.moment
         for _ in range(MOST_CHORDS):
             balance = self.balance(coordinates)
             if abs(turned) > LEAST_TURN:
                 slope = (balance.moment - before) / turned
+            if slope >= 0.0:
+                return None
             before, turned = balance.moment, -balance.moment / slope
             along = turned * way / way[2]
             step = closing.step(balance)
-            if slope >= 0.0:
-                return None
             if closing.closed and abs(turned) < TURN_TOLERANCE:
                 return balance
             coordinates = coordinates + along + np.append(step, 0.0)

@@ -10,8 +10,8 @@ by the trapezoidal rule, against what K predicts,
 forces that have a potential lower it by W, so that with W > 0 in every step the energy falls.
 A trial that overshoots into a stiff contact costs work and is taken back. Where loads that follow
 the motion leave K unsymmetric, stable but not positive definite, work is no measure; a step then
-goes along Newton's direction, in which |r| falls, and is judged by that; a search that ends nowhere
-so is tried once more by work alone.
+goes along Newton's direction, in which |r| falls, and is judged by that. A search that ends nowhere
+so is tried once more with none but whole Newton steps judged by |r|, all shorter ones by work.
 
 Everything is in metres and newtons: rotations are scaled by a lever arm.
 

@@ -39,7 +39,6 @@ class FrameSolver:
     Attributes:
         mechanics: the body side.
         side: the contact side; None without [contact].
-        prepare_seconds: what preparing the contact took, s; None without.
         before: contacts of the last frames, guesses for the next.
 
     Raises:
