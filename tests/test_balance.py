@@ -314,3 +314,20 @@ def test_every_model_comes_to_rest_through_the_same_contract(name, resolution_mm
     assert np.allclose(contact.wrench[:3], [-20, -LOAD, 0], atol=0.2)
     assert contact.condyles["lateral"].force > contact.condyles["medial"].force
     assert abs(place[2]) < 0.5e-3
+
+
+def test_over_facets_a_search_that_ran_away_comes_to_rest_downhill():
+    """An unsymmetric spring (as friction makes it) with ripples: facets of a contact surface."""
+    stiffness = np.array([[30e3, 257e3], [-3.83e3, 18.6e3]])
+    amplitude, wave = 61.4, 2 * np.pi / 0.919e-3
+
+    def forces(x):
+        slopes = stiffness + amplitude * wave * np.diag(np.cos(wave * x))
+        return Trial(-stiffness @ x - amplitude * np.sin(wave * x), slopes)
+
+    start = np.array([1.556e-3, -6.235e-3])
+    found = find_balance(forces, start)
+    assert found.status is BalanceStatus.OK
+    assert np.abs(forces(found.coordinates).force).max() < 0.05
+    assert np.linalg.eigvals(forces(found.coordinates).stiffness).real.min() > 0
+    assert np.abs(found.coordinates - start).max() < 20e-3
