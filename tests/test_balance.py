@@ -318,14 +318,16 @@ def test_every_model_comes_to_rest_through_the_same_contract(name, resolution_mm
 
 def test_over_facets_a_search_that_ran_away_comes_to_rest_downhill():
     """An unsymmetric spring (as friction makes it) with ripples: facets of a contact surface."""
-    stiffness = np.array([[30e3, 257e3], [-3.83e3, 18.6e3]])
-    amplitude, wave = 61.4, 2 * np.pi / 0.919e-3
+    drawn = np.random.default_rng(236)  # one of five in 400 that need the second search
+    coupling = drawn.uniform(5e4, 3e5), -drawn.uniform(1e3, 1e4)
+    stiffness = np.array([[3e4, coupling[0]], [coupling[1], drawn.uniform(2e3, 2e4)]])
+    amplitude, wave = drawn.uniform(10, 80), 2 * np.pi / drawn.uniform(2e-4, 2e-3)
+    start = drawn.uniform(-8e-3, 8e-3, 2)
 
     def forces(x):
         slopes = stiffness + amplitude * wave * np.diag(np.cos(wave * x))
         return Trial(-stiffness @ x - amplitude * np.sin(wave * x), slopes)
 
-    start = np.array([1.556e-3, -6.235e-3])
     found = find_balance(forces, start)
     assert found.status is BalanceStatus.OK
     assert np.abs(forces(found.coordinates).force).max() < 0.05
