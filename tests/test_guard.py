@@ -91,11 +91,12 @@ def test_large_files_are_not_read(tmp_path, capfd):
     """Two gigabytes of nothing: the size is looked at before a byte is read."""
     for name in ("scene.toml", "motion.csv", "mesh.stl", "leg.urdf"):
         os.truncate(os.open(tmp_path / name, os.O_CREAT | os.O_WRONLY), 2_000_000_000)
-    assert "MB large" in refused(capfd, "run", tmp_path / "scene.toml")
+    out = ("--out", tmp_path / "o")  # no other process writes there
+    assert "MB large" in refused(capfd, "run", tmp_path / "scene.toml", *out)
     assert "MB large" in refused(capfd, "press", tmp_path / "mesh.stl", MESHES[1], "--load", 1)
     for key, name in (("motion.file", "motion.csv"), ("patient.urdf", "leg.urdf")):
         setting = f"{key}='{tmp_path / name}'"
-        assert "MB large" in refused(capfd, "run", MODEL / "scene.toml", "--set", setting)
+        assert "MB large" in refused(capfd, "run", MODEL / "scene.toml", "--set", setting, *out)
 
 
 def test_a_hundred_thousand_columns(tmp_path):

@@ -5,7 +5,6 @@ import json
 import logging
 import os
 import sys
-import tomllib
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -19,6 +18,7 @@ from tkamb.export_command import add_export
 from tkamb.guard import guarded
 from tkamb.importing.command import add_import
 from tkamb.mesh_command import add_contact, add_mesh, add_no_cache, add_press, without_cache
+from tkamb.scene_options import add_scene_options, overrides_of
 from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
 from tkamb.uncertainty.command import add_uncertainty
@@ -65,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"tkamb {version('tkamb')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     add_new(commands)
-    add_check(commands, _setting)
+    add_check(commands)
     _add_run(commands)
     _add_folder_commands(commands)
     add_compare(commands)
@@ -80,26 +80,14 @@ def _parser() -> argparse.ArgumentParser:
     add_tradeoff(commands)
     add_stability(commands)
     add_wear(commands)
-    add_uncertainty(commands, _slice, _setting)
+    add_uncertainty(commands)
     add_cohort(commands)
     return parser
 
 
 def _add_run(commands: Any) -> None:
     run = commands.add_parser("run", help="motion in, condyle forces and report out")
-    run.add_argument("scene", type=Path, help="scene.toml")
-    run.add_argument("--contact", metavar="NAME", help="contact model (`tkamb contact list`)")
-    run.add_argument("--resolution", type=float, metavar="MM", help="spacing of the map points")
-    run.add_argument("--out", type=Path, metavar="DIR", help="output folder")
-    run.add_argument("--frames", type=_slice, metavar="A:B:STEP", help="frames, as in Python")
-    run.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        type=_setting,
-        metavar="TABLE.KEY=VALUE",
-        help="override a key of the scene",
-    )
+    add_scene_options(run)
     add_no_cache(run)
     run.add_argument("--force", action="store_true", help="write into a folder that is not tkamb's")
     run.add_argument("--resume", action="store_true", help="go on with an interrupted run")
@@ -123,28 +111,6 @@ def _add_scene(commands: Any) -> None:
     scene = commands.add_parser("scene", help="the scene file")
     scene.add_argument("--schema", action="store_true", required=True, help="print its JSON schema")
     scene.set_defaults(command=_scene)
-
-
-def _slice(text: str) -> slice:
-    parts = text.split(":")
-    if not 2 <= len(parts) <= 3:
-        raise argparse.ArgumentTypeError(f"'{text}' is not A:B or A:B:STEP")
-    try:
-        return slice(*(int(part) if part else None for part in parts))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' holds something else than integers") from None
-
-
-def _setting(text: str) -> tuple[str, Any]:
-    key, equals, value = text.partition("=")
-    if not equals or not key.strip():
-        raise argparse.ArgumentTypeError(f"'{text}' is not TABLE.KEY=VALUE")
-    if "\n" in text.strip():
-        raise argparse.ArgumentTypeError("is more than one line; give --set for each key")
-    try:
-        return key.strip(), tomllib.loads(f"value = {value.strip()}")["value"]
-    except tomllib.TOMLDecodeError:
-        return key.strip(), value.strip()
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -194,11 +160,7 @@ def _scene_of(options: argparse.Namespace) -> "Scene":
     """Return the scene of `run` with what the command line overrides."""
     from tkamb.scene import load_scene
 
-    overrides = dict(options.set)
-    if options.contact:
-        overrides["contact.model"] = options.contact
-    if options.resolution is not None:
-        overrides["contact.resolution_mm"] = options.resolution
+    overrides = overrides_of(options)
     scene = load_scene(options.scene, overrides)
     if not options.no_cache:
         return scene

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tkamb.errors import InputError
+from tkamb.scene_options import add_set
 
 if TYPE_CHECKING:
     from tkamb.check.scene_check import SceneCheck
@@ -13,26 +14,14 @@ if TYPE_CHECKING:
 PICTURES = (".png", ".html")
 
 
-def add_check(commands: Any, setting: Any) -> None:
-    """Add `check` to the command line.
-
-    Args:
-        commands: the parser's subcommands.
-        setting: what reads TABLE.KEY=VALUE.
-    """
+def add_check(commands: Any) -> None:
+    """Add `check` to the command line."""
     check = commands.add_parser("check", help="read a scene's files and look at them; no run")
     check.add_argument("scene", type=Path, help="scene.toml")
     check.add_argument(
         "--out", type=Path, metavar="F", help="the leg at three frames: .png, or .html with it all"
     )
-    check.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        type=setting,
-        metavar="TABLE.KEY=VALUE",
-        help="override a key of the scene",
-    )
+    add_set(check)
     check.add_argument("--json", action="store_true")
     check.set_defaults(command=_check)
 

@@ -21,6 +21,7 @@ from tkamb.files import read_text, sha256_of
 from tkamb.run.summary import files_in
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.table import Number, SceneTable
+from tkamb.scene_options import frames_slice
 
 AXES = ("subject", "trial", "design", "contact")
 GROUP_AXES = ("activity", *AXES[1:])
@@ -273,13 +274,10 @@ def _overrides(entry: Any, folder: Path) -> dict[str, Any]:
 
 
 def _slice(text: str, path: Path) -> slice:
-    parts = text.split(":")
     try:
-        if not 2 <= len(parts) <= 3:
-            raise ValueError
-        return slice(*(int(part) if part else None for part in parts))
-    except ValueError:
-        raise InputError(f"'frames': '{text}' is not A:B or A:B:STEP", path) from None
+        return frames_slice(text)
+    except ValueError as error:
+        raise InputError(f"'frames': {error}", path) from None
 
 
 def _complaint(error: ValidationError, path: Path) -> InputError:

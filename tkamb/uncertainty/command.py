@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tkamb.scene_options import add_scene_options, overrides_of
+
 if TYPE_CHECKING:
     from tkamb.uncertainty.run import Uncertainty
 
@@ -17,16 +19,10 @@ NOTABLE_FAILED = 0.05
 """Share of samples: where more fail, the bands leave out a whole tail."""
 
 
-def add_uncertainty(commands: Any, frames: Any, setting: Any) -> None:
-    """Add `uncertainty` to the command line.
-
-    Args:
-        commands: the parser's subcommands.
-        frames: what reads A:B:STEP, as in `run`.
-        setting: what reads TABLE.KEY=VALUE.
-    """
+def add_uncertainty(commands: Any) -> None:
+    """Add `uncertainty` to the command line."""
     command = commands.add_parser("uncertainty", help="bands beside every result of a scene")
-    command.add_argument("scene", type=Path, help="scene.toml; its [uncertainty] says what varies")
+    add_scene_options(command)
     command.add_argument("--samples", type=int, default=256, metavar="N", help="default 256")
     command.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default 1")
     command.add_argument("--dask", metavar="ADDRESS|local", help="have a Dask cluster compute")
@@ -36,18 +32,6 @@ def add_uncertainty(commands: Any, frames: Any, setting: Any) -> None:
     )
     command.add_argument(
         "--screen", action="store_true", help="one input at a time, seconds; nothing is written"
-    )
-    command.add_argument("--contact", metavar="NAME", help="contact model (`tkamb contact list`)")
-    command.add_argument("--resolution", type=float, metavar="MM", help="spacing of the map points")
-    command.add_argument("--out", type=Path, metavar="DIR", help="output folder")
-    command.add_argument("--frames", type=frames, metavar="A:B:STEP", help="frames, as in Python")
-    command.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        type=setting,
-        metavar="TABLE.KEY=VALUE",
-        help="override a key of the scene",
     )
     command.add_argument(
         "--force", action="store_true", help="write into a folder that is not tkamb's"
@@ -62,11 +46,7 @@ def _uncertainty(options: argparse.Namespace) -> int:
     from tkamb.scene import load_scene
     from tkamb.uncertainty.run import estimate_uncertainty
 
-    overrides = dict(options.set)
-    if options.contact:
-        overrides["contact.model"] = options.contact
-    if options.resolution is not None:
-        overrides["contact.resolution_mm"] = options.resolution
+    overrides = overrides_of(options)
     if options.screen:
         return _screen(options, overrides)
     directory = options.out or Path("out") / f"{options.scene.resolve().parent.name}_uncertainty"

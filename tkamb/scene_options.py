@@ -1,0 +1,72 @@
+"""What commands on a scene are told alike: contact model, frames, keys to override."""
+
+import argparse
+import tomllib
+from pathlib import Path
+from typing import Any
+
+
+def add_scene_options(command: Any) -> None:
+    """Add scene, --contact, --resolution, --out, --frames and --set to a command."""
+    command.add_argument("scene", type=Path, help="scene.toml")
+    command.add_argument("--contact", metavar="NAME", help="contact model (`tkamb contact list`)")
+    command.add_argument("--resolution", type=float, metavar="MM", help="spacing of the map points")
+    command.add_argument("--out", type=Path, metavar="DIR", help="output folder")
+    command.add_argument("--frames", type=_frames, metavar="A:B:STEP", help="frames, as in Python")
+    add_set(command)
+
+
+def add_set(command: Any) -> None:
+    """Add --set to a command."""
+    command.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        type=_setting,
+        metavar="TABLE.KEY=VALUE",
+        help="override a key of the scene",
+    )
+
+
+def overrides_of(options: argparse.Namespace) -> dict[str, Any]:
+    """Return dotted key -> value of what `add_scene_options` was given."""
+    overrides = dict(options.set)
+    if options.contact:
+        overrides["contact.model"] = options.contact
+    if options.resolution is not None:
+        overrides["contact.resolution_mm"] = options.resolution
+    return overrides
+
+
+def frames_slice(text: str) -> slice:
+    """Return the slice that A:B or A:B:STEP says.
+
+    Raises:
+        ValueError: it says none.
+    """
+    parts = text.split(":")
+    if not 2 <= len(parts) <= 3:
+        raise ValueError(f"'{text}' is not A:B or A:B:STEP")
+    try:
+        return slice(*(int(part) if part else None for part in parts))
+    except ValueError:
+        raise ValueError(f"'{text}' holds something else than integers") from None
+
+
+def _frames(text: str) -> slice:
+    try:
+        return frames_slice(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise argparse.ArgumentTypeError(f"'{text}' is not TABLE.KEY=VALUE")
+    if "\n" in text.strip():
+        raise argparse.ArgumentTypeError("is more than one line; give --set for each key")
+    try:
+        return key.strip(), tomllib.loads(f"value = {value.strip()}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key.strip(), value.strip()
