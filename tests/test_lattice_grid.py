@@ -108,6 +108,17 @@ def test_half_cell_rule_and_thin_intervals():
     np.testing.assert_array_equal(ends.single, single)
 
 
+@pytest.mark.parametrize("noise", [-1e-9, 1e-9])
+def test_rounding_does_not_move_an_interval_on_a_tie(noise):
+    """Ends half-way between nodes, on nodes, and as thick as half a cell."""
+    low = np.array([0.5, 1.5, 2.0, 3.35, 4.0])
+    high = np.array([4.5, 3.0, 2.5, 3.85, 6.5])
+    plain = interval_ends(low, high, 9)
+    for ends in (interval_ends(low + noise, high, 9), interval_ends(low, high + noise, 9)):
+        for name, value in vars(plain).items():
+            np.testing.assert_array_equal(getattr(ends, name), value, name)
+
+
 def test_one_node_inside_a_very_thin_interval_is_left_alone():
     ends = interval_ends(np.array([2.8]), np.array([3.1]), 9)
     assert ends.first[0] == ends.last[0] == 3
