@@ -47,15 +47,15 @@ class Page:
     def open(self, url, ready=READY):
         """Open an address and wait until a JavaScript expression holds."""
         self._page.goto(url)
-        self.evaluate(
-            "new Promise((done) => { const t = setInterval(() => {"
-            f"if ({ready}) {{ clearInterval(t); done(true); }} }}, 20); }})"
-        )
+        self.wait(ready)
         return self
 
     def wait(self, ready):
         """Wait until a JavaScript expression holds."""
-        self._page.wait_for_function(ready)
+        self.evaluate(
+            "new Promise((done) => { const t = setInterval(() => {"
+            f"if ({ready}) {{ clearInterval(t); done(true); }} }}, 20); }})"
+        )
 
     def saved(self, selector):
         """Click on something and return the bytes of the file that it saves."""
