@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 5.4, 3.1
 DEFAULT = ("forces", "condyles", "ratios", "pressures")
+TITLE_PAD, LEGEND_ROW = 8.0, 14.0
+"""Points between a plot and its title, for each row of the legend between them."""
 DASHES = (0, (4, 2))
 BAND_OPACITY = 0.16
 SPAN = "#e2e2e2"
@@ -74,8 +76,10 @@ def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = Non
             _draw_lines(axes, panel, horizontal)
             _label_axes(axes, panel, horizontal)
             mark_frames(axes, results, horizontal)
-            axes.set_title(panel.title, loc="left", pad=28, fontweight="bold")
-            legend_above(axes, _legend_columns(panel))
+            columns = _legend_columns(panel)
+            above = TITLE_PAD + LEGEND_ROW * -(-len(panel.lines) // columns)
+            axes.set_title(panel.title, loc="left", pad=above, fontweight="bold")
+            legend_above(axes, columns)
     return figure
 
 
