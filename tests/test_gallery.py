@@ -10,19 +10,21 @@ EXAMPLES = sorted(GALLERY.glob("*.py"))
 
 
 RECORDED = {"dm_gait": "dm", "jw_squat": "jw"}
-"""Example -> the subject whose recordings it needs; a minute of reading and motion each."""
+"""Example -> the subject whose recordings it needs."""
+SLOW = {"cohort", *RECORDED}
 
 
 def marked(example):
     """The example as a parameter: slow and skipped without data where it is on recordings."""
-    if example.stem not in RECORDED:
-        return pytest.param(example, id=example.stem)
-    folder = Path(__file__).parents[2] / "shared" / "data" / RECORDED[example.stem]
-    there = pytest.mark.skipif(not folder.is_dir(), reason="the subject's recordings are not here")
-    return pytest.param(example, id=example.stem, marks=(pytest.mark.slow, there))
+    marks = [pytest.mark.slow] if example.stem in SLOW else []
+    if example.stem in RECORDED:
+        folder = Path(__file__).parents[2] / "shared" / "data" / RECORDED[example.stem]
+        reason = "the subject's recordings are not here"
+        marks.append(pytest.mark.skipif(not folder.is_dir(), reason=reason))
+    return pytest.param(example, id=example.stem, marks=marks)
 
 
-@pytest.mark.parametrize("example", map(marked, EXAMPLES))
+@pytest.mark.parametrize("example", [marked(example) for example in EXAMPLES])
 def test_the_example_holds_its_number(example, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")

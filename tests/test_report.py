@@ -340,7 +340,9 @@ def test_missing_mass_and_unwritable_folder_are_one_line(bend, tmp_path):
     with pytest.raises(InputError, match="body_mass_kg"):
         report_html(run)
     with pytest.raises(InputError, match="cannot be written"):
-        write_report(bend, tmp_path / "missing" / "report.html")
+        write_report(
+            Results(bend.columns, bend.summary, None), tmp_path / "missing" / "report.html"
+        )
 
 
 def test_notebooks_show_headline_and_plots(bend):
