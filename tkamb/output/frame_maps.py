@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.colors import to_hex
+from matplotlib.colors import Normalize, to_hex
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
@@ -18,7 +18,7 @@ from PIL import Image
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.output.levels import pressure_levels
 from tkamb.output.metrics import map_rows
-from tkamb.output.pressure_maps import TopView
+from tkamb.output.pressure_maps import TopView, pressure_bar
 from tkamb.output.style import PRESSURE_MAP, new_figure, settings
 from tkamb.units import MEGAPASCAL
 
@@ -34,14 +34,21 @@ MARGIN = 2
 """Grid points kept around all contacts of the run."""
 
 
-def draw_insert(view: TopView) -> Figure:
-    """Return the bare insert, over which the page draws."""
+def draw_insert(view: TopView, largest: float) -> Figure:
+    """Return the bare insert, over which the page draws, and the colours up to `largest`, MPa."""
     with settings():
         figure = new_figure(5.4, 3.7)
         axes = figure.add_subplot()
         view.draw_insert(axes)
         view.draw_labels(axes)
+        pressure_bar(figure, [axes], Normalize(0.0, largest))
     return figure
+
+
+def largest_pressure(results: "Results") -> float:
+    """Return the top of the colour scale, MPa: the largest pressure, 1 where there is none."""
+    assert results.maps is not None
+    return float(np.nanmax(results.maps.pressure_Pa)) / MEGAPASCAL or 1.0
 
 
 def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
@@ -56,7 +63,7 @@ def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
     rows = map_rows(results)
     frames = np.array(sorted(rows))
     kept = frames[np.unique(np.linspace(0, len(frames) - 1, MOST_FRAMES).round().astype(int))]
-    largest = float(np.nanmax(results.maps.pressure_Pa)) or 1.0
+    largest = largest_pressure(results) * MEGAPASCAL
     tiles, edges = _tiles(results, view, [rows[k] for k in kept], largest)
     across = int(np.ceil(np.sqrt(len(kept))))
     nearest = [int(np.argmin(np.abs(kept - k))) for k in range(len(results))]

@@ -12,7 +12,7 @@ import numpy as np
 from tkamb.atomic import write_text
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import LABELS, HorizontalAxis, horizontal_axis
-from tkamb.output.frame_maps import draw_insert, frame_maps
+from tkamb.output.frame_maps import draw_insert, frame_maps, largest_pressure
 from tkamb.output.headline import cards, run_title
 from tkamb.output.metrics import body_weight, failed, flagged
 from tkamb.output.pages import asset, policy_sources, render
@@ -130,7 +130,7 @@ def _maps(results: "Results", axis: HorizontalAxis) -> dict[str, Any] | None:
     if view is None or not frames:
         return None
     return {
-        "insert": svg_text(draw_insert(view), "map"),
+        "insert": svg_text(draw_insert(view, largest_pressure(results)), "map"),
         "frames": frame_maps(results, view),
         "pictures": svg_text(draw_maps(results, view, axis, frames), "maps"),
         "paths": svg_text(draw_paths(results, view, axis, frames), "paths"),

@@ -51,8 +51,9 @@ function savePng(name, figure) {
 function addTools(figure) {
   const plot = plots.find(one => one.figure === figure);
   const name = `${data.name} ${figure.id.slice("figure-".length)}`.replace(/[^\w-]+/g, "_");
-  const kinds = {PNG: () => savePng(name, figure)};
-  if (!figure.querySelector("canvas")) {  // a canvas is no part of the SVG
+  const moving = figure.querySelector("canvas");
+  const kinds = {PNG: () => savePng(moving ? `${name}_${slider.value}` : name, figure)};
+  if (!moving) {  // a canvas is no part of the SVG
     kinds.SVG = () => save(`${name}.svg`, new Blob([svgOf(figure).text], {type: "image/svg+xml"}));
   }
   if (plot) kinds.CSV = () => save(`${name}.csv`, new Blob([csvText(plot)], {type: "text/csv"}));
