@@ -1,8 +1,8 @@
 """Activities in which instrumented knees were measured, and the peak forces found in them.
 
-Each number is a source's mean of the subjects' peaks, as its abstract states it: of the resultant
-force in five subjects (Kutzner et al. 2010), of the axial force (D'Lima et al. 2007). Single
-subjects and trials lie outside them.
+Each number is a source's mean of the subjects' peaks: of the resultant force in five subjects
+(Kutzner et al. 2010, from its abstract), of the axial force (D'Lima et al. 2007, as it is quoted
+since). Single subjects and trials lie outside them.
 
 References: Kutzner et al. (2010), J Biomech 43:2164, doi:10.1016/j.jbiomech.2010.03.046; D'Lima et
 al. (2007), J Biomech 40 Suppl 1:S11, doi:10.1016/j.jbiomech.2007.03.004.
