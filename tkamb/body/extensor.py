@@ -12,7 +12,7 @@ from tkamb.body.knee import Extensor
 from tkamb.body.load import PointForces
 from tkamb.body.muscles import Line, Muscle, PatellarLigament, Wrap, muscle_line, off_femur
 from tkamb.body.patella import ExtensorMechanism, PatellaState, patella_at, solve_patella
-from tkamb.body.patellofemoral import PatellofemoralContact
+from tkamb.body.patellofemoral import PatellarContact, PatellofemoralContact
 from tkamb.body.unknowns import Unknown, muscle_load
 from tkamb.body.wrapping import TautPath, is_inside
 from tkamb.errors import ComputationError, InputError
@@ -71,13 +71,16 @@ class ExtensorFrames:
         self.muscle = muscle_line(parts.muscle, parts.chain, parts.femoral)
         self.ligament = self._ligament_line()
         self._check_fixed_ends()
-        self._mechanism = self._build_mechanism()
-        self._recorded = recorded is not None
+        self._mechanism, prepared = self._build_mechanism()
+        self._contacts: tuple[PatellarContact, ...] | None = None
         if recorded is not None:
             self._joints = recorded
+            self._contacts = _recorded_contacts(prepared, recorded[:, 0].tobytes())
             self.states = [
-                patella_at(self._mechanism, pose, coordinates)
-                for pose, coordinates in zip(poses, recorded[:, 0], strict=True)
+                patella_at(self._mechanism, pose, coordinates, contact)
+                for pose, coordinates, contact in zip(
+                    poses, recorded[:, 0], self._contacts, strict=True
+                )
             ]
         else:
             self.states = _solve_all(self._mechanism, poses)
@@ -94,8 +97,9 @@ class ExtensorFrames:
         from where it was at the recorded pose.
         """
         found = self.states[k].coordinates if guess is None else guess
-        if self._recorded:
-            return patella_at(self._mechanism, pose, self.states[k].coordinates)
+        if self._contacts is not None:
+            recorded = self.states[k].coordinates
+            return patella_at(self._mechanism, pose, recorded, self._contacts[k])
         return solve_patella(self._mechanism, pose, found)
 
     def at(
@@ -172,13 +176,15 @@ class ExtensorFrames:
                     "move the point, or set wrap = false",
                 )
 
-    def _build_mechanism(self) -> ExtensorMechanism:
+    def _build_mechanism(self) -> tuple[ExtensorMechanism, PatellofemoralContact]:
+        """Return the mechanism, and its contact as it was prepared."""
         parts, chain = self._parts, self._chain
         stretch = off_femur(self.muscle.points, chain)
         origin, insertion = self.muscle.points[stretch : stretch + 2]
         joint, (proximal, distal) = chain.patella_joint_in_femur, self.ligament.points
-        return ExtensorMechanism(
-            _patellar_contact(parts.femoral, parts.button, joint.tobytes()).unused(),
+        prepared = _patellar_contact(parts.femoral, parts.button, joint.tobytes())
+        mechanism = ExtensorMechanism(
+            prepared.unused(),
             joint,
             transform(chain.link_in(origin.link, "femur"), origin.position),
             transform(chain.link_in(insertion.link, "patella"), insertion.position),
@@ -188,6 +194,7 @@ class ExtensorFrames:
             None if self.muscle.wrap is None else self.muscle.wrap.outline,
             None if self.ligament.wrap is None else self.ligament.wrap.outline,
         )
+        return mechanism, prepared
 
     def _differentiate(self, time: Array, rates: Rates) -> Array:
         """Return the solved coordinates with their rates (f, 3, 3); NaN where it is lost.
@@ -224,6 +231,20 @@ def _patellar_contact(femoral: Surface, button: Surface, joint: bytes) -> Patell
     """
     joint_in_femur = np.frombuffer(joint).reshape(4, 4)
     return PatellofemoralContact(femoral.moved(inverse(joint_in_femur)), button)
+
+
+@lru_cache(maxsize=1)
+def _recorded_contacts(
+    prepared: PatellofemoralContact, coordinates: bytes
+) -> tuple[PatellarContact, ...]:
+    """Return the contact at each recorded place: where the knee is does not change it.
+
+    Args:
+        prepared: the contact; told from others by its identity.
+        coordinates: (f, 3) m and rad, their bytes.
+    """
+    contact = prepared.unused()
+    return tuple(contact.at(place) for place in np.frombuffer(coordinates).reshape(-1, 3))
 
 
 def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]:

@@ -67,7 +67,8 @@ class Mechanics:
 
     Args:
         case: the scene with its files read.
-        query: of closest points between the case's two surfaces, if there is one already.
+        query: of closest points between the case's two surfaces, if there is one already; the
+            condyles have then been seen to be near the insert.
 
     Attributes:
         poses: (f, 4, 4) recorded pose_femur_in_insert.
@@ -83,7 +84,8 @@ class Mechanics:
         self.poses = knee_pose(case.motion.coordinates)
         self.friction = case.scene.contact.friction if case.scene.contact else 0.0
         self.query = query or _contact_query(case)
-        self._check_near()
+        if query is None:
+            self._check_near()
         self.extensor = None
         if case.scene.patella:
             self.extensor = extensor_frames(case, self.poses)
