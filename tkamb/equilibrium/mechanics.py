@@ -69,6 +69,7 @@ class Mechanics:
         case: the scene with its files read.
         query: of closest points between the case's two surfaces, if there is one already; the
             condyles have then been seen to be near the insert.
+        shared: the muscles of [muscles], if they are prepared already.
 
     Attributes:
         poses: (f, 4, 4) recorded pose_femur_in_insert.
@@ -79,7 +80,12 @@ class Mechanics:
         muscles: those that share the load; None if the quadriceps alone acts.
     """
 
-    def __init__(self, case: Case, query: "ClosestPointQuery | None" = None) -> None:
+    def __init__(
+        self,
+        case: Case,
+        query: "ClosestPointQuery | None" = None,
+        shared: "SharedMuscles | None" = None,
+    ) -> None:
         self.case = case
         self.poses = knee_pose(case.motion.coordinates)
         self.friction = case.scene.contact.friction if case.scene.contact else 0.0
@@ -90,8 +96,8 @@ class Mechanics:
         if case.scene.patella:
             self.extensor = extensor_frames(case, self.poses)
         self.ligaments, self.strains = self._build_ligaments()
-        self.muscles: SharedMuscles | None = None
-        if case.scene.muscles:
+        self.muscles = shared
+        if case.scene.muscles and shared is None:
             from tkamb.equilibrium.shared_muscles import load_muscles
 
             self.muscles = load_muscles(case)

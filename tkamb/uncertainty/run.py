@@ -25,6 +25,7 @@ from tkamb.uncertainty.bands import (
     influences,
     measured_inside,
 )
+from tkamb.uncertainty.correlation import correlation_root
 from tkamb.uncertainty.indices import SobolIndex, sobol_indices
 from tkamb.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
 from tkamb.uncertainty.kept import write_uncertainty
@@ -123,6 +124,7 @@ def estimate_uncertainty(
     case = load_case(scene)
     chosen = chosen_frames(frames, len(case.motion.time))
     inputs = varied_inputs(case)
+    _check_correlation(case, inputs, indices)
     points = _points(method, samples, len(inputs), uncertainty_of(case).seed, indices)
     crossed = samples if indices else 0
     with ExitStack() as stack:
@@ -137,6 +139,18 @@ def estimate_uncertainty(
         found = job.run(Shards(folder, identity, resume))
         write_uncertainty(found, folder)
     return found
+
+
+def _check_correlation(case: Case, inputs: Sequence[VariedInput], indices: bool) -> None:
+    """Raise where inputs cannot err together so, or indices are asked of such inputs."""
+    tables = uncertainty_of(case).correlation
+    correlation_root(tables, [one.name for one in inputs])
+    if tables and indices:
+        raise InputError(
+            "Sobol' indices are those of independent inputs",
+            "--indices with [[uncertainty.correlation]]",
+            "leave out one of them; tornado.csv has shares of correlated inputs",
+        )
 
 
 def _points(method: str, samples: int, dimensions: int, seed: int, crossed: bool) -> list[Point]:

@@ -20,17 +20,16 @@ from tkamb.run.status import FAILED, frame_status
 from tkamb.run.tabulate import frame_row
 from tkamb.scene import Scene
 from tkamb.scene.case import Case, load_case
+from tkamb.uncertainty.correlation import correlation_root
 from tkamb.uncertainty.inputs import (
     Draw,
     VariedInput,
     pose_names,
-    thinnable,
-    thinned,
     uncertainty_of,
-    varied_case,
     varied_inputs,
 )
 from tkamb.uncertainty.sampling import Point, noise_of_point
+from tkamb.uncertainty.varied_case import thinnable, thinned, varied_case, varied_muscles
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +68,9 @@ class Sampler:
             (thinned(whole, frames), range(len(frames))) if thinnable(whole) else (whole, frames)
         )
         self.inputs: tuple[VariedInput, ...] = varied_inputs(self.case)
+        self._root = correlation_root(
+            uncertainty_of(self.case).correlation, [one.name for one in self.inputs]
+        )
         self._split = self.case.split
 
     @cached_property
@@ -87,8 +89,10 @@ class Sampler:
         per_frame = noise_of_point(point, range(count), self._time, table.correlation_s, table.seed)
         if len(self.case.motion.time) < len(self._time):
             per_frame = per_frame[list(self._chosen)]
-        share = 1.0 if point.noise_of is None else table.constant_share
-        return Draw(self.inputs, point.normal, per_frame, share)
+        if point.noise_of is None:  # one input at a time: whatever errs with it stays
+            return Draw(self.inputs, point.normal, per_frame, 1.0)
+        noise = per_frame @ self._root[:count, :count].T
+        return Draw(self.inputs, self._root @ point.normal, noise, table.constant_share)
 
     def __call__(self, number: int, point: Point) -> Sample:
         """Return the sample at a point; a frame begins its search at the one before.
@@ -103,7 +107,8 @@ class Sampler:
         failed = np.ones(len(self._frames), bool)
         try:
             case = self._varied(draw)
-            mechanics = Mechanics(case, self._mechanics.query)
+            muscles = varied_muscles(self._mechanics.muscles, draw)
+            mechanics = Mechanics(case, self._mechanics.query, muscles)
             side = self._contact(case, mechanics, draw)
         except TkambError:  # the moved inputs cannot be used: no frame has a number
             return Sample(values, failed, errors)
