@@ -16,7 +16,7 @@ from tkamb.body.patella import (
     solve_patella,
 )
 from tkamb.body.patellofemoral import PatellofemoralContact
-from tkamb.equilibrium.mechanics import extensor_frames
+from tkamb.equilibrium.known import extensor_frames
 from tkamb.geometry.frames import Array, inverse, knee_pose, transform
 from tkamb.geometry.surface import Surface
 from tkamb.scene import load_scene

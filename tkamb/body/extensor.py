@@ -1,6 +1,7 @@
 """The extensor mechanism over all frames: where the patella is, and its lines of action."""
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -67,11 +68,7 @@ class ExtensorFrames:
     def __init__(
         self, parts: ExtensorParts, time: Array, poses: Array, recorded: Array | None, rates: Rates
     ) -> None:
-        self._parts, self._chain = parts, parts.chain
-        self.muscle = muscle_line(parts.muscle, parts.chain, parts.femoral)
-        self.ligament = self._ligament_line()
-        self._check_fixed_ends()
-        self._mechanism, prepared = self._build_mechanism()
+        prepared = self._take(parts)
         self._contacts: tuple[PatellarContact, ...] | None = None
         if recorded is not None:
             self._joints = recorded
@@ -85,6 +82,38 @@ class ExtensorFrames:
         else:
             self.states = _solve_all(self._mechanism, poses)
             self._joints = self._differentiate(time, rates)
+
+    def _take(self, parts: ExtensorParts) -> PatellofemoralContact:
+        """Build the lines and the mechanism of parts; return its contact as it was prepared."""
+        self._parts, self._chain = parts, parts.chain
+        self.muscle = muscle_line(parts.muscle, parts.chain, parts.femoral)
+        self.ligament = self._ligament_line()
+        self._check_fixed_ends()
+        self._mechanism, prepared = self._build_mechanism()
+        return prepared
+
+    def moved(self, parts: ExtensorParts, poses: Array, frames: Sequence[int]) -> "ExtensorFrames":
+        """Return the mechanism of a solved patella with its parts or the femur a little elsewhere.
+
+        In the frames asked for the patella is found anew, from where it is here; its joint moves
+        by as much. Rates, and the patella in the other frames, stay.
+
+        Args:
+            parts: the mechanism.
+            poses: (f, 4, 4) pose_femur_in_insert.
+            frames: in which the patella is found anew.
+
+        Raises:
+            InputError: a line starts inside what it wraps.
+        """
+        other = copy.copy(self)
+        other._take(parts)
+        other.states, other._joints = list(self.states), self._joints.copy()
+        for k in frames:
+            before = self.states[k].coordinates
+            other.states[k] = solve_patella(other._mechanism, poses[k], before)
+            other._joints[k, 0] += other.states[k].coordinates - before
+        return other
 
     def joints(self, k: int) -> Array:
         """Return patella coordinates, rates and accelerations (3, 3) of frame k; NaN if lost."""

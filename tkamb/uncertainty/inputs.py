@@ -84,7 +84,7 @@ def pose_names(inputs: tuple[VariedInput, ...]) -> list[str]:
 
 def _pose_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
     contact = case.scene.contact
-    free = contact.released if contact else ()
+    free = (*contact.released, "si") if contact and contact.released else ()  # found with them
     found = []
     for name in KNEE_COORDINATES:
         unit = "mm" if name in AXES else "deg"

@@ -13,6 +13,7 @@ import numpy as np
 
 from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.equilibrium.frame_contact import FrameContact
+from tkamb.equilibrium.known import Known
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array
@@ -107,8 +108,7 @@ class Sampler:
         failed = np.ones(len(self._frames), bool)
         try:
             case = self._varied(draw)
-            muscles = varied_muscles(self._mechanics.muscles, draw)
-            mechanics = Mechanics(case, self._mechanics.query, muscles)
+            mechanics = Mechanics(case, self._known(draw))
             side = self._contact(case, mechanics, draw)
         except TkambError:  # the moved inputs cannot be used: no frame has a number
             return Sample(values, failed, errors)
@@ -119,6 +119,11 @@ class Sampler:
             if not failed[column]:
                 values[:, column] = [row.get(name, np.nan) for name in self._names]
         return Sample(values, failed, errors)
+
+    def _known(self, draw: Draw) -> Known:
+        nominal = self._mechanics
+        muscles = varied_muscles(nominal.muscles, draw)
+        return Known(nominal.query, muscles, nominal.extensor, self._frames)
 
     def _varied(self, draw: Draw) -> Case:
         case = varied_case(self.case, draw)
