@@ -5,8 +5,8 @@ input that varies changes them, but the insert's modulus, for which the contact 
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -57,14 +57,18 @@ class Sampler:
         names: columns of results.csv that are wanted.
 
     Attributes:
+        names: as given.
         case: as it stands.
         inputs: that vary.
+
+    Raises:
+        TkambError: whatever is wrong with the scene.
     """
 
     def __init__(self, scene: Scene, frames: range, names: Sequence[str]) -> None:
         whole = load_case(scene)
         self._time = whole.motion.time
-        self._chosen, self._names = frames, list(names)
+        self._chosen, self.names = frames, list(names)
         self.case, self._frames = (
             (thinned(whole, frames), range(len(frames))) if thinnable(whole) else (whole, frames)
         )
@@ -73,14 +77,9 @@ class Sampler:
             uncertainty_of(self.case).correlation, [one.name for one in self.inputs]
         )
         self._split = self.case.split
-
-    @cached_property
-    def _mechanics(self) -> Mechanics:
-        return Mechanics(self.case)
-
-    @cached_property
-    def _side(self) -> ContactSide | None:
-        return ContactSide(self.case, self._mechanics) if self.case.scene.contact else None
+        self._mechanics = Mechanics(self.case)
+        contact = self.case.scene.contact
+        self._side = ContactSide(self.case, self._mechanics) if contact else None
 
     def draw(self, point: Point) -> Draw:
         """Return what the sample at a point makes of the inputs."""
@@ -104,7 +103,7 @@ class Sampler:
         """
         draw = self.draw(point)
         errors = draw.standardised()[list(self._frames)]
-        values = np.full((len(self._names), len(self._frames)), np.nan)
+        values = np.full((len(self.names), len(self._frames)), np.nan)
         failed = np.ones(len(self._frames), bool)
         try:
             case = self._varied(draw)
@@ -117,7 +116,7 @@ class Sampler:
             row = _frame(case, mechanics, side, k, before)
             failed[column] = row["status"].startswith(FAILED)
             if not failed[column]:
-                values[:, column] = [row.get(name, np.nan) for name in self._names]
+                values[:, column] = [row.get(name, np.nan) for name in self.names]
         return Sample(values, failed, errors)
 
     def _known(self, draw: Draw) -> Known:
@@ -141,6 +140,28 @@ class Sampler:
             stiffer = replace(material, young_modulus=material.young_modulus * factor)
             state = self._side.model.prepare(replace(state.pair, material=stiffer))
         return ContactSide(case, mechanics, state, sensitivity=False)
+
+
+class BandWorker:
+    """Computes samples; prepared before it is known which columns have a band.
+
+    Args:
+        scene: the scene.
+        frames: of the motion.
+    """
+
+    def __init__(self, scene: Scene, frames: range) -> None:
+        self._scene, self._frames = scene, frames
+        self._sampler: Sampler | None = None
+        with suppress(TkambError):  # the run of the scene as it stands says what is wrong
+            self._sampler = Sampler(scene, frames, ())
+
+    def __call__(self, number: int, job: tuple[Point, list[str]]) -> Sample:
+        """Return the sample at a point, with the columns of these names."""
+        point, names = job
+        sampler = self._sampler or Sampler(self._scene, self._frames, names)
+        sampler.names = names
+        return sampler(number, point)
 
 
 def _frame(
