@@ -57,7 +57,8 @@ def varied_inputs(case: Case) -> tuple[VariedInput, ...]:
 
 def held_inputs(case: Case) -> tuple[str, ...]:
     """Return the names of inputs that the case has and that do not vary: deviation 0."""
-    names = (one.name.partition(".")[0] for one in _all_inputs(case) if one.deviation == 0)
+    held = [one for one in _all_inputs(case) if one.deviation == 0]
+    names = (f"{one.name.partition('.')[0]}{'_angles' * ('.about_' in one.name)}" for one in held)
     return tuple(dict.fromkeys(names))
 
 
