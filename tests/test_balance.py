@@ -67,6 +67,47 @@ def test_springs_come_to_rest_where_their_matrix_says():
         assert end.smallest_stiffness == pytest.approx(np.linalg.eigvalsh(stiffness)[0], rel=1e-3)
 
 
+def hardening(guide=None):
+    """Return forces of springs that harden, with a guide to their stiffness; and where they rest.
+
+    f = load - K x - c x³, unit by unit; `guide` makes of the tangent what the trial brings.
+    """
+    rng = np.random.default_rng(7)
+    root = rng.normal(size=(4, 4))
+    linear, cubic = 1e6 * (root @ root.T + np.eye(4)), 1e14
+    rest = np.array([3e-4, -2e-4, 1e-4, 2e-4])
+    load = linear @ rest + cubic * rest**3
+
+    def trial(x):
+        tangent = linear + np.diag(3 * cubic * x**2)
+        force = load - linear @ x - cubic * x**3
+        return Trial(force) if guide is None else Trial(force, guide(tangent), exact=False)
+
+    return trial, rest
+
+
+@pytest.mark.parametrize(
+    ("guide", "most"),
+    [
+        (lambda tangent: 1.3 * tangent, 14),
+        (lambda tangent: tangent + 1e6, 14),
+        (lambda tangent: 1e6 * np.eye(4), 100),
+        (lambda tangent: -tangent, 100),
+    ],
+)
+def test_a_guide_to_the_stiffness_leads_to_the_same_rest(guide, most):
+    """One that is off by a third in fewer looks than differences take; a wrong one as well."""
+    plain, rest = hardening()
+    alone = find_balance(plain, np.zeros(4))
+    trial, _ = hardening(guide)
+    led = find_balance(trial, np.zeros(4))
+    for found in (alone, led):
+        assert found.status is BalanceStatus.OK
+        assert found.coordinates == pytest.approx(rest, abs=5e-8)
+    assert led.trials <= most
+    assert most > 20 or led.trials < alone.trials
+
+
 def test_loads_that_follow_the_motion_do_not_hold_up_the_search():
     """A stable stiffness whose symmetric part is indefinite: no potential, work is no measure."""
     stiffness = np.array([[1e4, 8e4, 0.0], [0.0, 2e4, 3e4], [0.0, 0.0, 1e4]])

@@ -61,6 +61,27 @@ def test_attachments_on_a_link_that_is_turned_on_the_patella_stay_where_they_are
             assert other.values[name] == pytest.approx(value, rel=1e-6, abs=1e-5)
 
 
+@pytest.mark.parametrize("move", [0.02, 0.3, 3.0, 40.0])
+def test_what_is_known_of_a_place_near_by_shortens_the_search_alone(mechanism, move):  # noqa: F811
+    """The same place by fewer looks, a degree on or 40: there the quick look gives up."""
+    near = solve_patella(
+        mechanism, knee_at(20.0), solve_patella(mechanism, knee_at(19.0)).coordinates
+    )
+    assert near.turning is not None
+    pose, looks = knee_at(20.0 + move), []
+    counted = ExtensorMechanism(**vars(mechanism))
+    look = counted.contact.at
+    object.__setattr__(counted, "contact", counted.contact.unused())
+    counted.contact.at = lambda place: looks.append(place) or look(place)
+    slow = solve_patella(counted, pose, near.coordinates)
+    asked = len(looks)
+    quick = solve_patella(counted, pose, near.coordinates, near.turning)
+    assert quick.coordinates == pytest.approx(slow.coordinates, abs=2e-7)
+    assert quick.patellofemoral_ratio == pytest.approx(slow.patellofemoral_ratio, abs=1e-6)
+    if move < 1.0:
+        assert len(looks) - asked <= 0.6 * asked
+
+
 @pytest.mark.parametrize("wild", [[0.0, 0.0, 2.5], [0.045, 0.3, -3.0]])
 def test_a_guess_that_leads_nowhere_does_not_lose_the_patella(mechanism, wild):  # noqa: F811
     """All rotations are searched then: the place is that of a search without a guess."""
@@ -100,9 +121,9 @@ def test_a_frame_that_loses_the_patella_fails_and_the_run_goes_on(plain, monkeyp
     scene = load_scene(MODEL / "scene.toml", FEW | {"contact.model": "foundation"})
     seen = []
 
-    def losing(parts, pose, guess=None):
+    def losing(parts, pose, *near):
         seen.append(pose)
-        found = solve_patella(parts, pose, guess)
+        found = solve_patella(parts, pose, *near)
         if len(seen) != 6:
             return found
         return replace(found, coordinates=np.full(3, np.nan), status=PatellaStatus.MOMENT)

@@ -110,26 +110,27 @@ class ExtensorFrames:
         other._take(parts)
         other.states, other._joints = list(self.states), self._joints.copy()
         for k in frames:
-            before = self.states[k].coordinates
-            other.states[k] = solve_patella(other._mechanism, poses[k], before)
-            other._joints[k, 0] += other.states[k].coordinates - before
+            near = self.states[k]
+            found = solve_patella(other._mechanism, poses[k], near.coordinates, near.turning)
+            other.states[k] = found
+            other._joints[k, 0] += found.coordinates - near.coordinates
         return other
 
     def joints(self, k: int) -> Array:
         """Return patella coordinates, rates and accelerations (3, 3) of frame k; NaN if lost."""
         return np.asarray(self._joints[k])
 
-    def patella(self, k: int, pose: Array, guess: Array | None = None) -> PatellaState:
+    def patella(self, k: int, pose: Array, guess: PatellaState | None = None) -> PatellaState:
         """Return the patella of frame k with the femur at another pose (4, 4).
 
-        Recorded coordinates are kept; a solved patella is found anew, from `guess` (3,) or
-        from where it was at the recorded pose.
+        Recorded coordinates are kept; a solved patella is found anew, from `guess` or from
+        where it was at the recorded pose.
         """
-        found = self.states[k].coordinates if guess is None else guess
         if self._contacts is not None:
             recorded = self.states[k].coordinates
             return patella_at(self._mechanism, pose, recorded, self._contacts[k])
-        return solve_patella(self._mechanism, pose, found)
+        near = self.states[k] if guess is None else guess
+        return solve_patella(self._mechanism, pose, near.coordinates, near.turning)
 
     def at(
         self, k: int, flexion: float, state: ChainState, patella: PatellaState | None = None
@@ -280,8 +281,8 @@ def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]
     """Solve frame after frame, each from the one before."""
     states: list[PatellaState] = []
     for pose in poses:
-        guess = states[-1].coordinates if states else None
-        states.append(solve_patella(mechanism, pose, guess))
+        near = (states[-1].coordinates, states[-1].turning) if states else ()
+        states.append(solve_patella(mechanism, pose, *near))
     return states
 
 

@@ -12,7 +12,7 @@ that satisfy the first two; a stable patella sits at a minimum of it. So the sea
 the patella in the direction of the unbalanced moment until that changes sign.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import pairwise
 
@@ -41,9 +41,9 @@ FLATTEST = 1e-6
 """Determinant of the contact normal and the ligament's direction: less is one line."""
 
 FIRST_STEP = np.deg2rad(0.5)
+NEAR_TURN = np.deg2rad(5.0)
 WIDEST_TURN = np.deg2rad(40.0)
-"""rad: first step and end of the search about the guess."""
-
+"""rad: first step, reach of a quick look, and end of the search about the guess."""
 
 NEAR = 5e-3
 """m: a place found farther from where the button first touched lies behind the femur."""
@@ -84,6 +84,8 @@ class PatellaState:
         shift: m along z, the mediolateral shift that is left out of the motion; first order.
         tilt: rad about y, likewise.
         status: how the search ended.
+        turning: (3,) change of ap and si (m) and of the moment (m, per unit tension) per rad of
+            rotation there, which shortens a search near by; None if not known.
     """
 
     coordinates: Array
@@ -96,6 +98,7 @@ class PatellaState:
     shift: float
     tilt: float
     status: PatellaStatus
+    turning: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,12 +147,14 @@ class _Balance:
     ligament_force: float
     normal_force: float
     moment: float
+    turning: Array | None = None
 
 
 def solve_patella(
     mechanism: ExtensorMechanism,
     pose_femur_in_insert: Array,
     guess: Array | None = None,
+    turning: Array | None = None,
 ) -> PatellaState:
     """Return the patella's place at one frame.
 
@@ -157,6 +162,7 @@ def solve_patella(
         mechanism: points, lengths, outlines and surfaces.
         pose_femur_in_insert: (4, 4) of the femur link.
         guess: (3,) coordinates of the previous frame; None searches all rotations.
+        turning: its `turning`, if it has one.
 
     Returns:
         The state; coordinates and forces are NaN unless status is OK, SEVERAL or EDGE.
@@ -165,7 +171,7 @@ def solve_patella(
     found, several = None, False
     if guess is not None and np.isfinite(guess).all():
         try:
-            found = frame.follow(guess)
+            found = frame.follow(guess, turning)
         except ComputationError:
             found = None  # a guess that leads nowhere says nothing: all rotations are searched
     if found is None:
@@ -297,12 +303,21 @@ class _Frame:
         worst = np.argmax(np.abs(closing.errors))
         raise _Lost((PatellaStatus.GAP, PatellaStatus.LIGAMENT)[worst])
 
-    def follow(self, guess: Array) -> _Balance:
+    def follow(self, guess: Array, turning: Array | None = None) -> _Balance:
         """Return the stable balance next to a guess: turn with the moment to its zero.
+
+        Args:
+            guess: (3,) coordinates.
+            turning: of a place near by; with it the zero is looked for at once.
 
         Raises:
             ComputationError: there is none within `WIDEST_TURN`.
         """
+        if turning is not None:
+            way = np.append(turning[:2], 1.0)
+            found = self._mended(guess, 0.0, float(turning[2]), way, (-NEAR_TURN, NEAR_TURN))
+            if found is not None:
+                return found
         here = self.at_rotation(guess, float(guess[2]))
         step = FIRST_STEP
         while abs(here.coordinates[2] - guess[2]) < WIDEST_TURN:
@@ -333,18 +348,32 @@ class _Frame:
         return last
 
     def _chord(self, here: _Balance, there: _Balance, reach: float = 1.0) -> _Balance | None:
-        """Return the stable balance on the chord of two by mending all three conditions at once.
-
-        Each step closes gap and ligament and turns along the chord from `here` to `there` as
-        far as the moment's slope asks. None where that leads beyond `reach` times the chord, to
-        an unstable place, or does not end.
-        """
-        way = there.coordinates - here.coordinates
-        slope = (there.moment - here.moment) / way[2]
+        """Return the stable balance on the chord of two, at most `reach` times its length away."""
+        turn = float(there.coordinates[2] - here.coordinates[2])
+        way = (there.coordinates - here.coordinates) / turn
+        slope = (there.moment - here.moment) / turn
         if slope >= 0.0:
             return None
+        span = (min(0.0, reach * turn), max(0.0, reach * turn))
+        return self._mended(here.coordinates, here.moment, slope, way, span)
+
+    def _mended(
+        self, start: Array, moment: float, slope: float, way: Array, span: tuple[float, float]
+    ) -> _Balance | None:
+        """Return the stable balance near a place by mending all three conditions at once.
+
+        Each step closes gap and ligament and turns along a way as far as the moment's slope asks.
+        None where that leads out of a span, to an unstable place, or does not end.
+
+        Args:
+            start: (3,) coordinates.
+            moment: m, the moment there.
+            slope: m per rad, of the moment along the way, negative.
+            way: (3,) change of the coordinates per rad.
+            span: rad, least and greatest rotation from the start.
+        """
         closing, turned = _Closing(self.mechanism.ligament_length), 0.0
-        coordinates, before = here.coordinates - here.moment / slope * way / way[2], here.moment
+        coordinates, before = start - moment / slope * way, moment
         for _ in range(MOST_CHORDS):
             balance = self.balance(coordinates)
             if abs(turned) > LEAST_TURN:
@@ -352,12 +381,11 @@ class _Frame:
             if slope >= 0.0:
                 return None
             before, turned = balance.moment, -balance.moment / slope
-            along = turned * way / way[2]
             step = closing.step(balance)
             if closing.closed and abs(turned) < TURN_TOLERANCE:
-                return balance
-            coordinates = coordinates + along + np.append(step, 0.0)
-            if not 0.0 <= (coordinates[2] - here.coordinates[2]) / way[2] <= reach:
+                return replace(balance, turning=np.append(way[:2], slope))
+            coordinates = coordinates + turned * way + np.append(step, 0.0)
+            if not span[0] <= coordinates[2] - start[2] <= span[1]:
                 return None
         return None
 
@@ -432,6 +460,7 @@ class _Frame:
             contact.shift,
             contact.tilt,
             status,
+            balance.turning,
         )
 
 

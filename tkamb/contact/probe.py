@@ -59,12 +59,14 @@ class ProbedContact:
     Args:
         condyles: side -> wrench.
         known: False where the model is out of range or has not converged.
-        tangent: the condyles' stiffness is known.
+        tangent: the condyles' stiffness is known,
+        exact: and is the tangent, no guide to it.
     """
 
     condyles: dict[str, CondyleWrench]
     known: bool = True
     tangent: bool = False
+    exact: bool = True
 
     @property
     def wrench(self) -> Array:
@@ -90,6 +92,10 @@ class Probe:
         if result.status is not ContactStatus.OK:
             return ProbedContact({}, known=False)
         self._guess = result
+        return self.seen(result)
+
+    def seen(self, result: ContactResult) -> ProbedContact:
+        """Return what a result says of the condyles."""
         return ProbedContact(condyle_wrenches(result, self._state.pair.split))
 
 

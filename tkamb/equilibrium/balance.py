@@ -35,10 +35,14 @@ SMALLEST_STIFFNESS = 100.0
 """N/m: a state that gives way by more than 10 mm per newton is indeterminate."""
 FIRST_RADIUS, WIDEST_RADIUS, NARROWEST_RADIUS = 0.5e-3, 3e-3, 1e-9
 """m: the trust region at the start, and its limits."""
+NARROW_RADIUS = 1e-6
+"""m: where guides to the stiffness still do not help, it is looked at by differences."""
 LONGEST_TRAVEL = 20e-3
 """m: a coordinate this far from its start is held by nothing."""
 PROBE_STEP = 2e-6
 """m: of the finite differences where the stiffness is not known."""
+KNOWN = 0.5
+"""A guide that misses more than this part of what it expects along a step says nothing of it."""
 MOST_STEPS = 200
 """A lightly loaded knee that slides 16 mm over lattice cells of 2 mm needs 80."""
 
@@ -61,10 +65,12 @@ class Trial:
     Args:
         force: (n,) N, drives each coordinate along its positive direction; NaN if unknown.
         stiffness: (n, n) N/m, -d force / d coordinates; None: by finite differences.
+        exact: it is that; else a guide, and what it misses is learnt from step to step.
     """
 
     force: Array
     stiffness: Array | None = None
+    exact: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +134,8 @@ class _Search:
         self.force = first.force
         self.known = bool(np.isfinite(first.force).all())
         if self.known:
-            self._own = first.stiffness is not None
+            self._own, self._guide = first.stiffness is not None and first.exact, first.stiffness
+            self._missing = np.zeros((len(start), len(start)))
             self.stiffness = self._first_stiffness(first, stiffness)
         else:
             self.stiffness = np.full((len(start), len(start)), np.nan)
@@ -146,7 +153,7 @@ class _Search:
                 return self._end(BalanceStatus.RUNS_AWAY)
             if self._radius < NARROWEST_RADIUS and (self._own or self._fresh):
                 break
-            if not self._own and self._since > len(self.x):
+            if self._guide is None and self._since > len(self.x):
                 self._refresh()
             else:
                 self._step()
@@ -169,11 +176,12 @@ class _Search:
         ratio = 1.0 if helps else work / predicted if predicted > 0 else -1.0
         taken = ratio > 0.05
         self._refused = part > 0 and not taken  # across a kink |r| may rise: the other step next
-        if trial.stiffness is None:
-            self._learn(step, trial.force)
+        if not self._own:
+            self._learn(step, trial)
         if ratio < 0.25:
             self._radius = 0.25 * length
-            if not (self._own or self._fresh) and ratio < 0.05:
+            lost = self._guide is None or self._radius < NARROW_RADIUS
+            if not (self._own or self._fresh) and lost and ratio < 0.05:
                 self._refresh()
         elif ratio > 0.7 and length > 0.8 * self._radius:
             self._radius = min(2.0 * self._radius, WIDEST_RADIUS)
@@ -182,7 +190,7 @@ class _Search:
             self.x, self.force = self.x + step, trial.force
             self._fresh = False
             if trial.stiffness is not None:
-                self.stiffness = trial.stiffness
+                self._guide, self.stiffness = trial.stiffness, trial.stiffness + self._missing
 
     def _next(self) -> tuple[Array, float]:
         """Return the next step, and what part it is of Newton's where |r| judges it; else 0."""
@@ -211,12 +219,23 @@ class _Search:
 
     def _refresh(self) -> None:
         self.stiffness = self._differences()
+        self._missing = self.stiffness - (0.0 if self._guide is None else self._guide)
         self._radius = max(self._radius, 1e-2 * FIRST_RADIUS)
 
-    def _learn(self, step: Array, force: Array) -> None:
-        """Correct the stiffness along a step (Broyden 1965, doi:10.2307/2003941)."""
-        missing = (self.force - force) - self.stiffness @ step
-        self.stiffness = self.stiffness + np.outer(missing, step) / (step @ step)
+    def _learn(self, step: Array, trial: Trial) -> None:
+        """Correct the stiffness along a step (Broyden 1965, doi:10.2307/2003941).
+
+        With guides at both ends it is what their mean misses that is learnt; a step that they do
+        not describe at all (contact was made or lost on the way) teaches nothing: all is forgotten.
+        """
+        expected = self.stiffness @ step
+        if self._guide is not None and trial.stiffness is not None:
+            expected = expected + 0.5 * (trial.stiffness - self._guide) @ step
+        missing = (self.force - trial.force) - expected
+        learnt = np.outer(missing, step) / (step @ step)
+        if self._guide is not None and np.linalg.norm(missing) > KNOWN * np.linalg.norm(expected):
+            learnt = -self._missing
+        self._missing, self.stiffness = self._missing + learnt, self.stiffness + learnt
 
     def _converged(self) -> bool:
         if np.abs(self.force).max() > FORCE_TOLERANCE:

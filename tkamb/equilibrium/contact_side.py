@@ -45,7 +45,11 @@ LOAD_CHANGE = 0.1
 POINT_CHANGE = 1e-6
 """m, of the centres of pressure between them."""
 MOST_ITERATIONS = 20
-ASTRAY = (BalanceStatus.OUT_OF_RANGE, BalanceStatus.NOT_CONVERGED)
+ASTRAY = (
+    BalanceStatus.OUT_OF_RANGE,
+    BalanceStatus.NOT_CONVERGED,
+    BalanceStatus.RUNS_AWAY,  # as far from a bad start as from a good one
+)
 """Ends of a search that another start may mend."""
 FIRST_DEPTH = 5e-5
 """m: how deep the search for released coordinates begins."""

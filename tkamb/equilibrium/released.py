@@ -236,7 +236,7 @@ class ReleasedKnee:
         extensor = self._mechanics.extensor
         if extensor is None:
             return None
-        return extensor.patella(k, knee_pose(place), guess.coordinates if guess else None)
+        return extensor.patella(k, knee_pose(place), guess)
 
     def _forces(
         self, k: int, geometry: KneeGeometry, middle: Array, slack: bool

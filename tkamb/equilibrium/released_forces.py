@@ -78,7 +78,7 @@ class ReleasedForces:
         change = (forces[:-1] - forces[-1]).T / TINY
         twists = knee_axes(place)[self._rows] / self._scale[:, None]
         gain = self._joint.contact_gain(place) / self._scale[:, None]
-        return Trial(forces[-1], -(change + gain @ stiffness @ twists.T))
+        return Trial(forces[-1], -(change + gain @ stiffness @ twists.T), contact.exact)
 
     def tension_per_wrench(self, contact: "ProbedContact") -> Array | None:
         """Return v (6,): a further wrench dw on the insert adds v . dw to the ligament's tension.

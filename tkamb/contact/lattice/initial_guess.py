@@ -60,6 +60,11 @@ class InitialGuess:
     reach: float = np.inf
     region: Region | None = None
 
+    @property
+    def cold(self) -> "InitialGuess":
+        """The same without what an earlier solution left."""
+        return replace(self, nonlinear_residual=None, moved=None, region=None)
+
 
 def initial_guess(
     cache: ComplianceCache,

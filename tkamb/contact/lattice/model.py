@@ -21,6 +21,7 @@ from tkamb.contact.lattice.linear.response import SINGLE
 from tkamb.contact.lattice.meshing.contact_map import contact_map
 from tkamb.contact.lattice.meshing.grid import Lattice, build_grid
 from tkamb.contact.lattice.newton import solve_by_newton
+from tkamb.contact.lattice.probe import LatticeProbe
 from tkamb.contact.lattice.problem import (
     ContactProblem,
     Direction,
@@ -38,6 +39,7 @@ from tkamb.contact.materials import LinearElastic, Material
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import check_load, within_insert
+from tkamb.contact.probe import Probe
 from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, Index, Mask
@@ -45,6 +47,8 @@ from tkamb.units import MILLIMETRE
 
 MOST_GROWTHS = 8
 """How often the candidate set may grow before it counts as saturated."""
+TOUCHING = 1e-13
+"""m; bodies that overlap by less carry nothing: 1e-6 N at 1e7 N/m."""
 REACH = 1.08
 """Candidates must cover this many times the approach that was found."""
 
@@ -132,7 +136,7 @@ class CellContact(ContactModel):
             return ContactResult.failed(state, pose, "the pose is not finite")
         gaps, planes = undeformed(state.problem, pose)
         deepest = -float(gaps.min())
-        if deepest <= 0:
+        if deepest <= TOUCHING:
             return ContactResult.of(state, pose, np.zeros(len(gaps)), gaps)
         return self._solved(state, pose, None, (gaps, planes), deepest, guess)
 
@@ -164,6 +168,11 @@ class CellContact(ContactModel):
         else:
             depth = guessed_depth(state.problem, gaps, state.surface.area, load)
         return self._solved(state, pose, load, (gaps, planes), depth, guess)
+
+    def probe(self, state: LatticeState, guess: ContactResult | None = None) -> Probe:
+        """Return the probe with stiffness; see `ContactModel`."""
+        kind = LatticeProbe if self.direction == "normal" else Probe
+        return kind(self, state, guess)
 
     def _solved(
         self,

@@ -95,24 +95,30 @@ def solve(
     first = balance.offset if guess.moved is None else guess.moved
     sliding = SlidingNodes(problem, points, first, pose, guess.planes)
     best: Solution | None = None
+    warm = guess.nonlinear_residual is not None
     while True:
         passes += 1
         planes = sliding.planes
         forces, moved = solve_pass(guess.response, balance.offset, points, planes, load, active)
+        if warm and not forces.active.any():
+            # What a heavier contact left behind holds the nodes down: begin without it.
+            warm, balance = False, NonlinearBalance(problem, guess.cold, tolerance.force)
+            sliding = SlidingNodes(problem, points, balance.offset, pose, guess.planes)
+            continue
         active = forces.active
         balance.respond(forces.force[:, None] * planes.normals)
         missed = sliding.follow(moved, forces)
-        if not active.any() or max(balance.residual, missed) <= tolerance.force:
+        if max(balance.residual, missed) <= tolerance.force:
             balance.look_everywhere()
         residual = max(balance.residual, missed)
-        done = not active.any() or residual <= tolerance.force
+        done = residual <= tolerance.force
         forces = replace(forces, converged=done and forces.converged)
         field, h, region = balance.field, balance.h, balance.region
         now = Solution(chosen, forces, planes, moved, field, h, passes, residual, region)
         if done:
             return now
         best = now if best is None or residual < best.residual else best
-        if passes == tolerance.passes or not residual < DIVERGED * best.residual:
+        if passes >= tolerance.passes or not residual < DIVERGED * best.residual:
             return _given_up(problem, best, passes)
         balance.advance()
 
@@ -305,16 +311,15 @@ class SlidingNodes:
         Returns:
             The largest distance of an active node from the femoral surface where it now is
             (overlap of the others counts too), relative to the largest displacement of an
-            active node.
+            active node; inf where no node is active, for bodies that overlap touch.
         """
-        if not forces.active.any():
-            return 0.0
         positions = self._points + moved
         there = tangent_planes(self._problem, positions, self._pose, self.planes)
         gap = there.gap(positions) + forces.approach * there.normal_y
         miss = np.where(forces.active, np.abs(gap), np.maximum(-gap, 0))
-        size = float(np.abs(moved[forces.active]).max())
+        size = float(np.abs(moved[forces.active]).max(initial=0.0))
         missed = float(np.nan_to_num(miss, nan=0.0).max()) / max(size, 1e-300)
+        missed = missed if forces.active.any() else np.inf
         if missed > SLOW * self._last:
             self._share = max(self._share / 2, SMALLEST_SHARE)
         self._last = missed

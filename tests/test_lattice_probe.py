@@ -1,0 +1,77 @@
+"""What a search for equilibrium asks of the lattice: its stiffness, and nothing of other loads."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lattice_bodies import above, condyles, dished_insert, pair
+from tkamb.contact.materials import material
+from tkamb.contact.registry import contact_model
+
+LEVER = 0.02
+"""m: half the distance of the condyles; makes rotations comparable to translations."""
+
+
+@lru_cache
+def prepared(name):
+    """Return a model of 2 mm cells, solved tightly, on two balls in a dish."""
+    model = replace(contact_model(name, 2.0), tolerance=1e-6)
+    bodies = pair(condyles(), dished_insert(), material("polyethylene"))
+    return model, model.prepare(bodies)
+
+
+def moved(pose, twist):
+    """Return a pose after a small displacement (6,) of the point at the insert's origin."""
+    turn = Rotation.from_rotvec(twist[3:]).as_matrix()
+    result = pose.copy()
+    result[:3] = turn @ pose[:3]
+    result[:3, 3] += twist[:3]
+    return result
+
+
+def stiffness_by_differences(model, state, result):
+    """Return the central differences (6, 6) of the wrench on the insert."""
+    found = np.zeros((6, 6))
+    for column, step in enumerate([2e-6] * 3 + [1e-4] * 3):
+        twist = step * np.eye(6)[column]
+        ahead, behind = (
+            model.evaluate(state, moved(result.pose, sign * twist), result).wrench_on_insert
+            for sign in (1, -1)
+        )
+        found[:, column] = (ahead - behind) / (2 * step)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "load", "within"),
+    [("lattice-linear", 1500.0, 0.01), ("lattice", 300.0, 0.03), ("lattice", 3000.0, 0.35)],
+)
+def test_the_stiffness_is_the_slope_of_the_wrench(name, load, within):
+    """Hooke's law: the tangent. Yielding polyethylene: stiffer, by as much as it has softened."""
+    model, state = prepared(name)
+    result = model.press(state, load, above(x=0.5e-3, y=0.03))
+    found = model.probe(state, result).at(result.pose)
+    assert found.tangent
+    assert found.exact == (name == "lattice-linear")
+    scale = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
+    scale = np.outer(scale, scale)
+    given = sum(condyle.stiffness for condyle in found.condyles.values()) / scale
+    wanted = stiffness_by_differences(model, state, result) / scale
+    assert np.linalg.norm(given - wanted) < within * np.linalg.norm(wanted)
+    assert given[1, 1] > 0.99 * wanted[1, 1]
+
+
+@pytest.mark.parametrize("name", ["lattice", "lattice-linear", "fe"])
+@pytest.mark.parametrize("depth", [0.02, 0.5])
+def test_a_light_contact_carries_the_same_after_a_heavy_one(name, depth):
+    """The heavy one's yielding lifts every node off the femur of the light one, at first."""
+    model, state = prepared(name)
+    heavy = model.press(state, 15_000.0, above(y=0.03))
+    pose = state.pair.pose_at_approach(heavy.pose, depth * 2e-4)
+    cold, warm = model.evaluate(state, pose), model.evaluate(state, pose, heavy)
+    force = np.linalg.norm(cold.nodal_force, axis=1).sum()
+    assert force > 5.0
+    assert warm.nodal_force == pytest.approx(cold.nodal_force, abs=1e-3 * force)

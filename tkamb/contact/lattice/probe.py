@@ -1,0 +1,98 @@
+"""The lattice's contact at neighbouring poses, with its stiffness while the nodes stay in contact.
+
+A femoral displacement v(x) = t + r cross x moves the contact's planes. Nodes in contact stay on
+them; with n the femoral normals, lambda the forces along them and C the compliance of the nodes,
+
+    dF = n dlambda + lambda dn,    n . (C dF - v) = 0,    dn = r cross n - G (v - n (n . v)),
+
+G the change of the femoral normal along the surface: the femur slides over the nodes, which are
+taken to move along the normal only. C is that of the linear operator. A material that has
+softened is softer than this stiffness says, and nodes come into contact or leave it: the forces
+are those of `evaluate`, the stiffness is a guide to where they vanish.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from tkamb.contact.lattice.problem import ContactProblem, LatticeState
+from tkamb.contact.probe import Probe, ProbedContact, condyle_wrenches
+from tkamb.contact.result import ContactResult, medial_points
+from tkamb.geometry.frames import Array, Index
+
+TURN_STEP = 5e-5
+"""m: between the places where femoral normals are compared; well below a cell."""
+
+
+class LatticeProbe(Probe):
+    """`evaluate` with the stiffness of what it found; see `tkamb.contact.probe.Probe`.
+
+    Args:
+        model: of the lattice family, nodes pressed along the femoral normal.
+        state: what its `prepare` returned.
+        guess: an earlier result.
+    """
+
+    def seen(self, result: ContactResult) -> ProbedContact:
+        """Return what a result says of the condyles, with their stiffness."""
+        condyles = condyle_wrenches(result, self._state.pair.split)
+        exact = self._state.problem.solid.material.is_linear
+        nodes = np.flatnonzero(result.nodal_force.any(axis=1))
+        if not len(nodes):
+            return ProbedContact(condyles, tangent=True, exact=exact)
+        change = force_changes(self._state, result, nodes)
+        points = result.points[nodes]
+        medial = medial_points(points, result.pose, self._state.pair.split)
+        for side, own in (("medial", medial), ("lateral", ~medial)):
+            if side in condyles:
+                part = change[own]
+                moment = np.cross(points[own, :, None], part, axis=1)
+                stiffness = np.vstack([part.sum(axis=0), moment.sum(axis=0)])
+                condyles[side] = replace(condyles[side], stiffness=stiffness)
+        return ProbedContact(condyles, tangent=True, exact=exact)
+
+
+def force_changes(state: LatticeState, result: ContactResult, nodes: Index) -> Array:
+    """Return the change (m, 3, 6) of nodal forces per small displacement of the femur.
+
+    Args:
+        state: prepared contact.
+        result: a contact that converged.
+        nodes: (m,) the contact nodes that carry.
+
+    Returns:
+        N per m of its point at the insert's origin, then N per rad.
+    """
+    problem = state.problem
+    force = result.nodal_force[nodes]
+    size = np.linalg.norm(force, axis=1)
+    normals = force / size[:, None]
+    where = problem.surface_points[nodes] + result.warm_start.moved[nodes]
+    response = state.compliance.among(nodes, nodes)
+    femoral = np.zeros((len(nodes), 3, 6))
+    femoral[:, :, :3] = np.eye(3)
+    femoral[:, :, 3:] = np.cross(np.eye(3)[None], where[:, None, :]).transpose(0, 2, 1)
+    towards = np.einsum("ij,ijk->ik", normals, femoral)
+    turned = np.zeros_like(femoral)
+    turned[:, :, 3:] = np.cross(np.eye(3)[None], normals[:, None, :]).transpose(0, 2, 1)
+    sliding = femoral - normals[:, :, None] * towards[:, None, :]
+    turned -= _normal_gradient(problem, where, result.pose) @ sliding
+    swung = size[:, None, None] * turned
+    moved = np.einsum("aibj,jbk->iak", response.compliance, swung, optimize=True)
+    along, _ = response.along(normals)
+    right = towards - np.einsum("ij,ijk->ik", normals, moved)
+    return normals[:, :, None] * np.linalg.solve(along, right)[:, None, :] + swung
+
+
+def _normal_gradient(problem: ContactProblem, where: Array, pose: Array) -> Array:
+    """Return the change (m, 3, 3) of the femoral normal per m along x, y and z; 0 along y.
+
+    Where a place lies beside the femoral component the normal is taken not to change.
+    """
+    gradient = np.zeros((len(where), 3, 3))
+    for axis in (0, 2):
+        step = TURN_STEP * np.eye(3)[axis]
+        ahead, behind = (problem.femoral.over(where + s, pose)[1] for s in (step, -step))
+        gradient[:, :, axis] = (ahead - behind) / (2 * TURN_STEP)
+    gradient[~np.isfinite(gradient).all(axis=(1, 2))] = 0.0
+    return gradient
