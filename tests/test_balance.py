@@ -103,6 +103,7 @@ def test_a_guide_to_the_stiffness_leads_to_the_same_rest(guide, most):
     led = find_balance(trial, np.zeros(4))
     for found in (alone, led):
         assert found.status is BalanceStatus.OK
+        assert len(found.work) <= found.steps < found.trials
         assert found.coordinates == pytest.approx(rest, abs=5e-8)
     assert led.trials <= most
     assert most > 20 or led.trials < alone.trials

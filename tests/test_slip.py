@@ -13,6 +13,7 @@ from tkamb.body.slip import (
     InsertProfile,
     arc,
     condyle_slip,
+    forward_sliding,
     roll_slip_motion,
     sliding_velocity,
 )
@@ -196,3 +197,17 @@ def test_arcs_agree_with_the_exact_sections() -> None:
     behind = points[1:] * [1.0, 1.0, 0.0] + points[0] * [0.0, 0.0, 1.0]
     travelled = arc_lengths(case.insert, ahead, behind).sum()
     assert np.abs(np.diff(side.insert_arc)).sum() == pytest.approx(travelled, rel=5e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_forward_sliding_is_that_of_the_femoral_point_in_the_plane_of_the_centre(seed):
+    """The femur's point beside the contact, as far out as the centre: no spin about y in it."""
+    rng = np.random.default_rng(seed)
+    place, rates = rng.normal(size=6) * [0.01, 0.01, 0.01, 0.3, 0.3, 0.3], rng.normal(size=6)
+    centre, contact = rng.normal(size=3) * 0.02, rng.normal(size=3) * 0.03
+    beside = np.append(contact[:2], transform(knee_pose(place), centre)[2])
+    on_femur = transform(inverse(knee_pose(place)), beside)
+    step = 1e-6
+    ahead, behind = (transform(knee_pose(place + s * rates), on_femur) for s in (step, -step))
+    wanted = (ahead - behind)[0] / (2 * step)
+    assert forward_sliding(place, rates, centre, contact) == pytest.approx(wanted, abs=1e-8)
