@@ -28,11 +28,17 @@ class Fault:
     end: int
     before: str
     after: str
+    text: str
+
+    @property
+    def change(self) -> str:
+        """Return where it is and what it changes, wherever in the function."""
+        return f"{self.file}:{self.function}:{self.kind}:{self.before}->{self.after}"
 
     @property
     def name(self) -> str:
         """Return a name that stays while the line does."""
-        return f"{self.file}:{self.function}:{self.kind}:{self.before}->{self.after}"
+        return f"{self.change} in {self.text}"
 
     def applied(self, text: str) -> str:
         """Return the source with the fault."""
@@ -125,8 +131,8 @@ class _Finder(ast.NodeVisitor):
             return
         before = self._source(node)
         spot = (node.lineno, node.col_offset, node.end_col_offset)
-        function = ".".join(self._inside)
-        self.faults.append(Fault(self.file, function, kind, *spot, before, after))
+        function, text = ".".join(self._inside), self.lines[node.lineno - 1].decode().strip()
+        self.faults.append(Fault(self.file, function, kind, *spot, before, after, text))
 
 
 def all_faults(root: Path, folders: tuple[str, ...]) -> list[Fault]:
@@ -144,11 +150,11 @@ def all_faults(root: Path, folders: tuple[str, ...]) -> list[Fault]:
 def drawn(root: Path, faults: list[Fault], count: int, seed: int) -> list[Fault]:
     """Return some of the faults: kinds in turn, at most one a line, all of them Python.
 
-    Their order hangs on their names alone, so that a change elsewhere draws few others.
+    Their order hangs on what they change alone, so that a change elsewhere draws few others.
     """
     heaps = {kind: [f for f in faults if f.kind == kind] for kind in KINDS}
     for heap in heaps.values():
-        heap.sort(key=lambda fault: sha256(f"{seed} {fault.name}".encode()).hexdigest())
+        heap.sort(key=lambda fault: sha256(f"{seed} {fault.change}".encode()).hexdigest())
     chosen, lines = [], set()
     while len(chosen) < count and any(heaps.values()):
         for heap in heaps.values():

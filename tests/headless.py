@@ -1,6 +1,7 @@
 """Pages in a headless browser: playwright drives the chromium that is installed."""
 
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -46,11 +47,25 @@ class Page:
     def open(self, url, ready=READY):
         """Open an address and wait until a JavaScript expression holds."""
         self._page.goto(url)
+        self.wait(ready)
+        return self
+
+    def wait(self, ready):
+        """Wait until a JavaScript expression holds."""
         self.evaluate(
             "new Promise((done) => { const t = setInterval(() => {"
             f"if ({ready}) {{ clearInterval(t); done(true); }} }}, 20); }})"
         )
-        return self
+
+    def saved(self, selector):
+        """Click on something and return the bytes of the file that it saves."""
+        with self._page.expect_download() as found:
+            self._page.click(selector)
+        return Path(found.value.path()).read_bytes()
+
+    def pdf(self):
+        """Return the page as it is printed."""
+        return self._page.pdf(prefer_css_page_size=True)
 
     def _console(self, message):
         if message.type in ("error", "assert"):

@@ -2,6 +2,7 @@
 
 import base64
 import logging
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from inserts import dished, raised, real_insert, shipped_insert, volume
+from lattice_bodies import box_insert
 from tkamb.contact.lattice.meshing.cells import (
     DIRECTIONS,
     FAMILY_SHARE,
@@ -106,6 +108,17 @@ def test_half_cell_rule_and_thin_intervals():
     single = np.zeros(8, bool)
     single[4] = True
     np.testing.assert_array_equal(ends.single, single)
+
+
+@pytest.mark.parametrize("noise", [-1e-9, 1e-9])
+def test_rounding_does_not_move_an_interval_on_a_tie(noise):
+    """Ends half-way between nodes, on nodes, and as thick as half a cell."""
+    low = np.array([0.5, 1.5, 2.0, 3.35, 4.0])
+    high = np.array([4.5, 3.0, 2.5, 3.85, 6.5])
+    plain = interval_ends(low, high, 9)
+    for ends in (interval_ends(low + noise, high, 9), interval_ends(low, high + noise, 9)):
+        for name, value in vars(plain).items():
+            np.testing.assert_array_equal(getattr(ends, name), value, name)
 
 
 def test_one_node_inside_a_very_thin_interval_is_left_alone():
@@ -212,6 +225,16 @@ def test_a_hole_is_empty_and_its_walls_are_smooth():
     within = (x > -0.004 + 1e-6) & (x < 0.003 - 1e-6) & (z > -0.005 + 1e-6) & (z < 0.0045 - 1e-6)
     assert not within.any()
     assert lattice_volume(lattice) == pytest.approx(volume(surface), rel=0.01)
+
+
+def test_shear_is_the_angle_by_which_a_lattice_was_sheared():
+    surface = box_insert(0.03, 0.01, 0.05)
+    lattice = build_grid(surface, 3e-3)
+    for axis in (0, 2):
+        nodes = lattice.nodes.copy()
+        nodes[:, axis] += np.tan(0.2) * nodes[:, 1]
+        sheared = measure_quality(replace(lattice, nodes=nodes), surface).shear
+        assert sheared == pytest.approx((0.2, 0.2, 0.2))
 
 
 def test_a_post_is_filled_recognised_and_flagged():

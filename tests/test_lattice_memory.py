@@ -5,11 +5,13 @@ import tracemalloc
 
 import numpy as np
 import pytest
+import scipy.sparse as sparse
 
 from lattice_blocks import block
 from lattice_bodies import box_insert, pair, sphere_cap
 from tkamb import memory
 from tkamb.contact.lattice.linear import memory_need, operator
+from tkamb.contact.lattice.linear.multifrontal import Dissection
 from tkamb.contact.lattice.linear.operator import fixed_unknowns, prepare_operator
 from tkamb.contact.lattice.linear.response import SINGLE
 from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
@@ -34,6 +36,15 @@ def test_the_count_bounds_what_is_taken(counts, monkeypatch):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < memory_need.SPARE * needs[0] < 3 * peak
+
+
+def test_a_single_front_takes_its_matrix_twice():
+    """30 nodes joined to each other: 90 unknowns in 8 bytes, twice, more than what is kept."""
+    nodes = np.arange(30)
+    joined = sparse.csr_matrix(np.ones((30, 30)))
+    tree = Dissection([nodes], [-1])
+    found = memory_need.factor_memory(tree, joined, np.zeros(30, bool), 4)
+    assert found == memory_need.MATRIX_BYTES * 90**2 + 8 * 2 * 90**2
 
 
 @pytest.mark.parametrize("left", [2e8, 6e7, 1.5e7])

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 from knees import HALF, UP, bent_knee
 from tkamb.body.knee import solve_knee
 from tkamb.body.load import PointForces
+from tkamb.body.load_state import LoadState, wrong_signs
+from tkamb.body.unknowns import Solution
 
 FRICTION = 0.05
 CARRIED = (
@@ -89,6 +91,18 @@ def test_a_patella_that_would_have_to_pull_fails_the_frame(knee):
     (problem,) = solve_knee(geometry, FRICTION).problems
     assert "patellofemoral" in problem
     assert "extension moment" in problem
+
+
+def test_a_knee_without_contact_that_must_be_extended_is_no_slack_one():
+    """Without contact the flexion left over is given on the femur: the other way round."""
+    slack = LoadState(frozenset(), frozenset({"quadriceps"}))
+
+    def wrong(name, moment):
+        return wrong_signs(slack, Solution({name: moment}, 1.0, True))
+
+    for name, extending in (("residual_flexion", 5.0), ("knee_moment_flexion", -5.0)):
+        assert wrong(name, extending) == ["extension moment 5 N·m needed"]
+        assert wrong(name, -extending) == []
 
 
 @settings(max_examples=150, deadline=None)

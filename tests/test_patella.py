@@ -41,6 +41,12 @@ def dome() -> Surface:
     return surface(trimesh.Trimesh(vertices + CENTRE, mesh.faces, process=False), "button")
 
 
+def translation(x: float, y: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:2, 3] = x, y
+    return pose
+
+
 def cylinder() -> Surface:
     return surface(trimesh.creation.cylinder(TROCHLEA, 0.08, sections=360), "trochlea")
 
@@ -168,6 +174,17 @@ def test_quadriceps_is_shortest_there(mechanism: ExtensorMechanism) -> None:
     slope = (lengths[2] - lengths[0]) / (2 * turn)
     curvature = (lengths[2] - 2 * lengths[1] + lengths[0]) / turn**2
     assert abs(slope / curvature) < np.deg2rad(0.3)
+
+
+@pytest.mark.parametrize("aside", [-0.05, 0.05])
+def test_a_button_may_lie_anywhere_on_its_patella(aside: float) -> None:
+    """Moved along y in its own frame, and the patella back by as much: the same contact."""
+    plain = PatellofemoralContact(cylinder(), dome())
+    moved = PatellofemoralContact(cylinder(), dome().moved(translation(0.0, aside)))
+    at = np.array([TROCHLEA + DOME - 0.004, 0.0, 0.0])
+    here, there = plain.at(at), moved.at(at - [0.0, aside, 0.0])
+    assert there.gap == pytest.approx(here.gap, abs=1e-6)
+    assert there.normal == pytest.approx(here.normal, abs=1e-3)
 
 
 def test_gap_is_the_distance_of_the_closest_points() -> None:

@@ -1,5 +1,6 @@
 """`tkamb press` on mesh files: what it prints, and that units, axes and side only relabel."""
 
+import argparse
 import base64
 import json
 from functools import partial
@@ -15,7 +16,9 @@ from tkamb import press
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.surface import Surface
+from tkamb.mesh_command import add_mesh, add_press
 from tkamb.press import read_pose
+from tkamb.units import LENGTH
 
 FOUNDATION = ["--contact", "foundation"]
 press_meshes = partial(press.press_meshes, contact="foundation")
@@ -282,3 +285,14 @@ def test_subject_dm_in_stance_has_both_condyles_in_their_dishes():
         assert found[side]["force_N"] > 600.0
         assert 18.0 < sign * found[side]["cop_mm"][2] < 32.0
         assert abs(found[side]["cop_mm"][0]) < 8.0
+
+
+def test_every_unit_that_mesh_check_names_is_one_that_the_commands_take():
+    parser = argparse.ArgumentParser()
+    commands = parser.add_subparsers()
+    add_press(commands)
+    add_mesh(commands)
+    for unit in LENGTH:
+        press = ["press", "a.stl", "b.stl", "--load", "1", "--units", unit]
+        assert parser.parse_args(press).units == unit
+        assert parser.parse_args(["mesh", "lattice", "b.stl", "--units", unit]).units == unit

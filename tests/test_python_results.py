@@ -2,6 +2,7 @@
 
 import importlib
 import sys
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -87,3 +88,44 @@ def test_options_that_do_not_belong_together_are_refused(tmp_path, capsys, argum
     assert main(["export", str(tmp_path), *arguments]) == 2
     said = capsys.readouterr().err
     assert words in said and said.count("\n") == 1
+
+
+def test_titles_legends_and_plots_do_not_overlap():
+    """However many rows a legend has: the forces have two, beside what was measured."""
+    measured = {
+        f"measured_{name}_N": RUN["force_total_N"] for name in ("total", "medial", "lateral")
+    }
+    figure = type(RUN)(RUN.columns | measured, RUN.summary).plot()
+    figure.draw_without_rendering()
+    boxes = [
+        part.get_window_extent()
+        for axes in figure.axes
+        if axes.get_legend()
+        for part in (axes._left_title, axes.get_legend(), axes.patch)
+    ]
+    for k, one in enumerate(boxes):
+        assert not any(one.overlaps(other) for other in boxes[k + 1 :] if not touches(one, other))
+    assert len(boxes) >= 9
+
+
+def touches(one, other):
+    """Whether two boxes share no more than an edge."""
+    return min(one.y1, other.y1) - max(one.y0, other.y0) < 0.5
+
+
+def test_what_one_meets_first_says_itself_in_a_line():
+    from tkamb.press import press_meshes
+
+    files = Path(tkamb.__file__).parent / "starter" / "files"
+    report = press_meshes(
+        files / "femoral_component.stl",
+        files / "insert.stl",
+        1500.0,
+        pose=(-6.9, 30.7, 0, 0, 0, 0),
+        contact="foundation",
+        resolution_mm=4.0,
+    )
+    for one in (report, report.result, RUN.maps, tkamb.load_scene(files / "scene.toml")):
+        assert repr(one).startswith(f"<tkamb.{type(one).__name__}: ")
+        assert len(repr(one)) < 250
+    assert f"medial {report.result.medial.force:.0f} N" in repr(report)

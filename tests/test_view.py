@@ -9,15 +9,18 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
+from tkamb.body.wrapping import TautPath
 from tkamb.cli import main
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.surface import Surface
 from tkamb.view import CAMERAS
+from tkamb.view.colours import SLACK, TENDON, rgb
 from tkamb.view.drawing import PressureMap
-from tkamb.view.payload import LEVELS, Block, _insert_transform, pressure_levels
+from tkamb.view.payload import LEVELS, Block, _insert_transform, map_levels
 from tkamb.view.run import open_run
 from tkamb.view.shading import shade
 from tkamb.view.show import Show, serve_in_background
+from tkamb.view.strands import _tendon
 from viewed import copied_scene, shipped_run, short_results
 
 
@@ -86,15 +89,22 @@ def test_levels_are_the_pressures_and_change_sign_at_the_rim():
     triangles = np.array([[0, 1, 4], [1, 2, 5], [1, 5, 4]])
     pressure = np.array([[4.0, 2.0, 0, 0, 0, 0]])
     gap = np.array([[0.0, 0, 3e-5, 1e-4, 1e-5, 2e-5]])
-    found = pressure_levels(PressureMap(points, triangles, pressure, gap), 4.0)[0]
+    found = map_levels(PressureMap(points, triangles, pressure, gap), 4.0)[0]
     assert list(found[:2]) == [LEVELS, round(LEVELS / 2)]
     assert (found[2:] < 0).all()
     assert found[2] < found[5] < found[4]
 
 
+def test_a_slack_tendon_is_grey_and_a_taut_one_red_where_it_is_free():
+    path = TautPath(np.array([[0.0, 0, 0], [1, 0, 0]]), 1.0, 0.0)
+    strand = _tendon("quadriceps", [path, path], np.array([True, False]))
+    assert (strand.colours[0] == rgb(SLACK)).all()
+    assert (strand.colours[1] == rgb(TENDON)).all()
+
+
 def test_a_failed_frame_shows_no_pressure():
     nothing = np.full((1, 3), np.nan)
-    found = pressure_levels(PressureMap(np.eye(3), np.array([[0, 1, 2]]), nothing, nothing), 10.0)
+    found = map_levels(PressureMap(np.eye(3), np.array([[0, 1, 2]]), nothing, nothing), 10.0)
     assert (found < 0).all()
 
 

@@ -222,6 +222,28 @@ def test_another_contact_model_on_the_frame(live):
     assert browser.problems == []
 
 
+def test_a_model_switch_shows_its_progress_and_can_be_cancelled(live):
+    server, browser = live
+    switch = server.switch
+    move_slider(browser, 2)
+    before = levels(browser)
+    answer = "document.getElementById('answer').textContent"
+    with switch._lock:  # as if another frame were being computed
+        browser.evaluate(
+            "(() => { const s = document.getElementById('contact'); s.value = 'hertz';"
+            "s.dispatchEvent(new Event('change')); })()"
+        )
+        browser.wait(f"{answer}.startsWith('asking hertz … 1 s')")
+        browser.evaluate("document.getElementById('cancel').click()")
+        browser.wait(f"{answer} === 'cancelled'")
+    assert browser.evaluate("document.getElementById('cancel').hidden")
+    assert browser.evaluate("document.getElementById('contact').value") == "foundation"
+    assert np.array_equal(levels(browser), before)
+    number = switch.cancel()
+    assert number == switch._latest
+    browser.problems.clear()  # the answer of what was cancelled is an error, and says so
+
+
 @pytest.mark.slow
 def test_two_contact_models_side_by_side_on_one_scale(folder, chromium, tmp_path):
     other = tmp_path / "hertz"

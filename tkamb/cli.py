@@ -114,8 +114,6 @@ def _add_scene(commands: Any) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from tqdm import tqdm
-
     from tkamb.run.profiling import Profile, profile_lines
 
     profile = Profile() if options.profile else None
@@ -123,23 +121,26 @@ def _run(options: argparse.Namespace) -> int:
     from tkamb.output.axis import horizontal_axis
     from tkamb.output.headline import cards
     from tkamb.results_folder import write_results
+    from tkamb.run.stages import Stages
     from tkamb.run.status import FAILED
     from tkamb.simulation import simulate
 
     scene = _scene_of(options)
     directory = options.out or scene.output.directory or _default_directory(options.scene)
-    with claimed_directory(directory, options.force):
+    with Stages(4) as stages, claimed_directory(directory, options.force):
         results = simulate(
             scene,
             frames=options.frames,
             directory=directory,
             scene_path=options.scene,
-            progress=lambda frames: tqdm(frames, unit="frame", disable=None),
+            progress=stages.frames,
+            stage=stages.begin,
             resume=options.resume,
             workers=options.workers,
         )
         if profile:
             results.summary["profile"] = profile.report(results, options.scene)
+        stages.begin("writing results and report")
         write_results(results, directory)
     failed = [k for k, status in enumerate(results.status) if status.startswith(FAILED)]
     for k in failed:

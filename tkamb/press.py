@@ -77,6 +77,13 @@ class PressReport:
     peak_rss_MB: float
     known_error: KnownError | None = None
 
+    def __repr__(self) -> str:
+        """Return in a line what was pressed and what was found."""
+        return (
+            f"<tkamb.PressReport: {self.contact} at {self.resolution_mm:g} mm, "
+            f"{self.load:g} N; {self.result!r}>"
+        )
+
     @property
     def carried(self) -> bool:
         """Whether the load was reached."""

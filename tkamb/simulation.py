@@ -33,6 +33,7 @@ def simulate(
     directory: str | Path | None = None,
     scene_path: str | Path | None = None,
     progress: Progress = lambda frames: frames,
+    stage: Callable[[str], None] = lambda name: None,
     resume: bool = False,
     force: bool = False,
     workers: int = 1,
@@ -48,6 +49,7 @@ def simulate(
             keeps them in memory.
         scene_path: where the scene came from, for the summary.
         progress: wraps the frame indices, a progress bar for example.
+        stage: is told what begins before the frames, by name.
         resume: go on with what an earlier, interrupted run of the same scene and frames left
             in the folder; needs one.
         force: write into the folder even if it holds things that are not tkamb's.
@@ -65,6 +67,7 @@ def simulate(
     if isinstance(scene, str | Path):
         scene_path, scene = scene, load_scene(scene)
     start = clock.perf_counter()
+    stage("reading scene and recordings")
     case = load_case(_with_contact(scene, contact, resolution_mm))
     indices = chosen_frames(frames, len(case.motion.time))
     identity = run_identity(case, indices)
@@ -76,6 +79,7 @@ def simulate(
             return done
     path = None if scene_path is None else Path(scene_path)
     run = _Run(case, indices, identity, input_hashes(case, path), path, start)
+    stage("preparing body and contact")
     run.prepare()  # before the folder is touched: bad input leaves it as it was
     with ExitStack() as stack:
         recorder = Recorder()

@@ -91,6 +91,7 @@ friction = 0.05
 [output]
 yield_stress_MPa = 21.0
 axis = "flexion"
+activity = "squat"  # of instrumented knees, for the report
 notes = [
   "Nobody was measured: geometry, motion and ground reaction are made to fit each other.",
   "First and last frame stand still: without sliding there is no friction, so the residuals jump.",

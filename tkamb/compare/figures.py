@@ -162,7 +162,7 @@ def _map_figure(
                 axes.set_axis_off()
                 axes.set_title(f"{run.label}: no map here", fontsize=8.5)
                 continue
-            draw_map(axes, view, run.results, frame, pressure, scale)
+            draw_map(axes, view, run.results, frame, scale)
             words = f"{run.label}\nframe {frame}, {run.axis.label.split(' (')[0]} "
             axes.set_title(f"{words}{run.axis.at(frame)}", fontsize=8.5)
         for axes in grid[len(comparison.runs) :]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from tkamb.contact.pair import ContactPair, PreparedContact
 from tkamb.geometry.frames import Array, Mask, inverse, transform
-from tkamb.units import MEGAPASCAL
+from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 HIGHEST_KNOWN = 100.0 * MEGAPASCAL
 """Peak pressure beyond which polyethylene's curves are extrapolated (they end at 40 to 60 MPa)."""
@@ -89,6 +89,17 @@ class ContactResult:
     residual: float = 0.0
     flags: tuple[str, ...] = ()
     warm_start: Any = None
+
+    def __repr__(self) -> str:
+        """Return in a line what each condyle carries."""
+        sides = [
+            f"{name} {one.force:.0f} N on {one.area / MILLIMETRE**2:.0f} mm², "
+            f"peak {one.peak_pressure / MEGAPASCAL:.1f} MPa"
+            for name, one in (("medial", self.medial), ("lateral", self.lateral))
+            if one is not None
+        ]
+        parts = [self.status.value, *(sides or ["nothing touches"]), f"{len(self.points)} points"]
+        return f"<tkamb.ContactResult: {'; '.join(parts)}>"
 
     @cached_property
     def approach(self) -> float:

@@ -3,8 +3,9 @@
 import argparse
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
+from tkamb.activities import Activity
 from tkamb.errors import InputError
 from tkamb.units import ANGLE, LENGTH
 
@@ -42,6 +43,7 @@ def add_import(commands: Any) -> None:
     p.add_argument("--out", type=Path, required=True, metavar="DIR")
     p.add_argument("--scene", default="scene.toml", metavar="NAME", help="name of the scene file")
     p.add_argument("--contact", choices=("foundation", "lattice"), default="foundation")
+    p.add_argument("--activity", choices=get_args(Activity), help="what the report compares with")
     p.add_argument("--note", action="append", default=[], metavar="TEXT", help="for the report")
     scale = p.add_mutually_exclusive_group()
     scale.add_argument("--scale-mass", dest="scale", action="store_true", default=None)
@@ -153,6 +155,7 @@ def import_request(options: argparse.Namespace) -> "ImportRequest":
         method=options.method,
         cutoff_Hz=options.cutoff_hz,
         contact=options.contact,
+        activity=options.activity,
         notes=tuple(options.note),
     )
 

@@ -90,6 +90,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         meshes,
         tissue,
         request.contact,
+        request.activity,
         (*_notes(request, scale, found, bool(tissue.bundles)), *request.notes),
     )
     report = [*_leg_lines(leg), weighed, *links.said, *_patella_line(links)]

@@ -32,6 +32,7 @@ class ImportRequest:
         method: reading of the markers that is used.
         cutoff_Hz: of markers and plates.
         contact: the scene's contact model.
+        activity: what the report compares with; None: with nothing.
         notes: of the user, for the report.
     """
 
@@ -54,4 +55,5 @@ class ImportRequest:
     method: str = "segments"
     cutoff_Hz: float = 6.0
     contact: str = "foundation"
+    activity: str | None = None
     notes: tuple[str, ...] = ()

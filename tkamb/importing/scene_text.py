@@ -77,6 +77,7 @@ class SceneText:
         meshes: the implant; None without.
         tissue: muscles and ligaments.
         contact: the contact model.
+        activity: what the report compares with; None: with nothing.
         notes: for the report.
     """
 
@@ -94,6 +95,7 @@ class SceneText:
     meshes: Meshes | None
     tissue: SoftTissue
     contact: str
+    activity: str | None
     notes: tuple[str, ...]
 
     def text(self) -> str:
@@ -270,8 +272,9 @@ class SceneText:
 
     def _output(self) -> list[str]:
         cycle = self.poses is not None and self.poses.given.stride is not None
-        lines = ["[output]", f'axis = "{"cycle" if cycle else "time"}"', "notes = ["]
-        return [*lines, *(f"    {toml_text(note)}," for note in self.notes), "]"]
+        lines = ["[output]", f'axis = "{"cycle" if cycle else "time"}"']
+        lines += [f"activity = {toml_text(self.activity)}"] if self.activity else []
+        return [*lines, "notes = [", *(f"    {toml_text(note)}," for note in self.notes), "]"]
 
 
 _ALL = ["flexion", "adduction", "axial_rotation", "ap", "si", "ml"]

@@ -72,7 +72,7 @@ def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
 
 
 def _where(results: "Results", axis: HorizontalAxis, frame: int) -> str:
-    flexion = f"{results['flexion_deg'][frame]:.0f}° of flexion"
+    flexion = f"{round(results['flexion_deg'][frame]) + 0}° of flexion"
     if axis.kind == "flexion":
         return f"at {flexion}"
     name = f"{axis.at(frame)} of the cycle" if axis.kind == "cycle" else axis.at(frame)

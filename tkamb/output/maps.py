@@ -174,6 +174,10 @@ class ContactMaps:
     source: Path | Mapping[str, ArrayLike]
     given_attributes: Mapping[str, Any] | None = None
 
+    def __repr__(self) -> str:
+        """Return in a line how much there is."""
+        return f"<tkamb.ContactMaps: {len(self)} frames of {len(self.points_m)} points>"
+
     @cached_property
     def points_m(self) -> Array:
         """(n, 3) map points."""

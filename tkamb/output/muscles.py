@@ -21,13 +21,9 @@ from tkamb.output.metrics import body_weight
 from tkamb.output.panels import Line, Panel
 from tkamb.output.style import (
     BLACK,
-    BLUE,
-    GREEN,
     GREY,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILLION,
+    LIST,
+    QUADRICEPS,
     new_figure,
     settings,
 )
@@ -35,7 +31,7 @@ from tkamb.output.style import (
 if TYPE_CHECKING:
     from tkamb.results import Results
 
-GROUP_COLOURS = (VERMILLION, BLUE, GREEN, ORANGE, PURPLE, BLACK, GREY)
+GROUP_COLOURS = (QUADRICEPS, *LIST, GREY, GREY)
 EXTERNAL, LIGAMENTS, EXTENSORS = "external", "ligaments", "quadriceps"
 """Contributions beside those of single muscles."""
 HELD = (
@@ -97,7 +93,7 @@ def _contributions(results: "Results", side: str) -> Panel:
     total = results[f"{side}_force_equilibrium_N"]
     parts = {EXTERNAL: (EXTERNAL,), LIGAMENTS: (LIGAMENTS,)} | _groups(results)
     labels = {EXTERNAL: "external loads"}
-    shades = {EXTERNAL: GREY, LIGAMENTS: SKY} | colours
+    shades = {EXTERNAL: GREY, LIGAMENTS: LIST[3]} | colours
     lines = [Line("all", "all", scale * total, BLACK)]
     for k, (part, names) in enumerate(parts.items()):
         own = (EXTENSORS,) if part == "knee extensors" else names
@@ -167,7 +163,7 @@ def _draw_cell(axes: Axes, cell: Cell, results: "Results", axis: HorizontalAxis)
         axes.fill_between(x, envelope, color=SHADE, linewidth=0)
     for name in cell.muscles:
         x, activation = axis.broken(results[family_column(ACTIVATION, name)])
-        axes.plot(x, activation, color=BLUE, linewidth=1.3)
+        axes.plot(x, activation, color=BLACK, linewidth=1.3)
     axes.set_title(cell.title, loc="left", fontsize=8.5, pad=2)
     r = _agreement(results, cell)
     if r:

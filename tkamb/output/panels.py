@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tkamb.activities import PEAKS_BW, peaks_words
 from tkamb.columns import is_ligament, ligament_of
 from tkamb.geometry.frames import Array
 from tkamb.known_errors import is_large, known_error_words
-from tkamb.output import style
 from tkamb.output.metrics import (
     body_weight,
     medial_share,
@@ -17,7 +17,18 @@ from tkamb.output.metrics import (
     split_undetermined,
     tension_ratio,
 )
-from tkamb.output.style import BLACK, BLUE, GREEN, GREY, PURPLE, SIDE_COLOURS, VERMILLION
+from tkamb.output.style import (
+    ANTERIOR,
+    BLACK,
+    GREY,
+    LIST,
+    PATELLAR_LIGAMENT,
+    PATELLOFEMORAL,
+    QUADRICEPS,
+    RIGHT,
+    SIDE_COLOURS,
+    SUPERIOR,
+)
 
 if TYPE_CHECKING:
     from tkamb.results import Results
@@ -58,6 +69,7 @@ class Panel:
         lines: its curves.
         note: a sentence under the plot.
         level: (value, label) of a horizontal reference line.
+        span: (low, high, label) of a shaded range behind the curves.
         second: (factor, unit) of a second vertical axis on the right.
         logarithmic: vertical axis.
         from_zero: the vertical axis holds zero.
@@ -71,6 +83,7 @@ class Panel:
     lines: tuple[Line, ...]
     note: str = ""
     level: tuple[float, str] | None = None
+    span: tuple[float, float, str] | None = None
     second: tuple[float, str] | None = None
     logarithmic: bool = False
     from_zero: bool = True
@@ -118,9 +131,9 @@ def _line(
 def _components(results: "Results", stem: str, unit: str, scale: float = 1.0) -> tuple[Line, ...]:
     right = lateral_axis_name(results)
     return (
-        _line(results, f"{stem}_si_{unit}", "superior", BLUE, scale=scale),
-        _line(results, f"{stem}_ap_{unit}", "anterior", VERMILLION, scale=scale),
-        _line(results, f"{stem}_ml_{unit}", right, GREEN, scale=scale),
+        _line(results, f"{stem}_si_{unit}", "superior", SUPERIOR, scale=scale),
+        _line(results, f"{stem}_ap_{unit}", "anterior", ANTERIOR, scale=scale),
+        _line(results, f"{stem}_ml_{unit}", right, RIGHT, scale=scale),
     )
 
 
@@ -140,7 +153,12 @@ def _total(results: "Results") -> Panel:
     lines = (total, replace(parts[0], label="superior–inferior", dashed=True), *parts[1:])
     lines += (_measured(results, "total", "measured, axial", BLACK),)
     note = "On the insert; SI positive in compression. Residuals are not included."
-    return Panel("forces", "Tibiofemoral contact force", "BW", lines, note)
+    activity, span = results.summary.get("activity"), None
+    if activity in PEAKS_BW:
+        found = PEAKS_BW[activity].values()
+        span = (min(found), max(found), "in vivo")
+        note += " " + peaks_words(activity)
+    return Panel("forces", "Tibiofemoral contact force", "BW", lines, note, span=span)
 
 
 def _condyles(results: "Results") -> Panel:
@@ -165,7 +183,7 @@ def _measured(results: "Results", name: str, label: str, colour: str) -> Line:
 def _share(results: "Results") -> Panel:
     lines = (
         Line("deformation", "by deformation", medial_share(results, "deformation"), BLACK),
-        Line("equilibrium", "by equilibrium", medial_share(results, "equilibrium"), PURPLE, True),
+        Line("equilibrium", "by equilibrium", medial_share(results, "equilibrium"), GREY, True),
     )
     title, unit = "Medial share of the load", "medial / (medial + lateral)"
     panel = Panel("share", title, unit, lines, level=(0.5, "even"), limits=(0.0, 1.0))
@@ -191,11 +209,11 @@ def _sensitivity(results: "Results") -> Panel:
 
 def _extensor(results: "Results") -> Panel:
     scale = 1 / body_weight(results)
-    tangential = ("patellofemoral_tangential_N", "patellofemoral, tangential", GREY, True)
+    tangential = ("patellofemoral_tangential_N", "patellofemoral, tangential", PATELLOFEMORAL, True)
     lines = (
-        _line(results, "quadriceps_N", "quadriceps", BLACK, scale=scale),
-        _line(results, "patellar_ligament_N", "patellar ligament", BLUE, scale=scale),
-        _line(results, "patellofemoral_N", "patellofemoral", VERMILLION, scale=scale),
+        _line(results, "quadriceps_N", "quadriceps", QUADRICEPS, scale=scale),
+        _line(results, "patellar_ligament_N", "patellar ligament", PATELLAR_LIGAMENT, scale=scale),
+        _line(results, "patellofemoral_N", "patellofemoral", PATELLOFEMORAL, scale=scale),
         _line(results, *tangential, scale=scale),
     )
     return Panel("extensor", "Extensor mechanism", "BW", lines)
@@ -205,8 +223,8 @@ def _ratios(results: "Results") -> Panel:
     ligament = tension_ratio(results, "patellar_ligament_N")
     patella = tension_ratio(results, "patellofemoral_N")
     lines = (
-        Line("PL/Q", "patellar ligament, PL/Q", ligament, BLUE),
-        Line("PF/Q", "patellofemoral, PF/Q", patella, VERMILLION),
+        Line("PL/Q", "patellar ligament, PL/Q", ligament, PATELLAR_LIGAMENT),
+        Line("PF/Q", "patellofemoral, PF/Q", patella, PATELLOFEMORAL),
     )
     return Panel("ratios", "Ratios to the quadriceps tension", "force / quadriceps", lines)
 
@@ -254,8 +272,8 @@ def _yield(results: "Results") -> Panel:
 
 def _external(results: "Results") -> Panel:
     lines = (
-        _line(results, "external_flexion_moment_Nm", "flexing", BLUE),
-        _line(results, "external_adduction_moment_Nm", "adducting", VERMILLION),
+        _line(results, "external_flexion_moment_Nm", "flexing", RIGHT),
+        _line(results, "external_adduction_moment_Nm", "adducting", ANTERIOR),
     )
     height = results.summary.get("height_mm")
     second = None
@@ -274,7 +292,7 @@ def _ligaments(results: "Results") -> Panel:
     bundles: dict[str, list[str]] = {}
     for name in names:
         own = ligament_of(name)
-        bundle = own.rstrip("0123456789").rstrip("_") if len(names) > len(style.CYCLE) else own
+        bundle = own.rstrip("0123456789").rstrip("_") if len(names) > len(LIST) else own
         bundles.setdefault(bundle or own, []).append(name)
     lines = tuple(
         _bundle(results, bundle, strands, k) for k, (bundle, strands) in enumerate(bundles.items())
@@ -289,22 +307,22 @@ def _bundle(results: "Results", bundle: str, strands: Sequence[str], position: i
     tension = np.array([results[name] for name in strands])
     missing = np.isnan(tension).all(axis=0)
     values = np.where(missing, np.nan, np.nansum(tension, axis=0))
-    colour = style.CYCLE[position % len(style.CYCLE)]
+    colour = LIST[position % len(LIST)]
     label = bundle.replace("_", " ") + (f" ({len(strands)})" if len(strands) > 1 else "")
     name = strands[0] if len(strands) == 1 else bundle
-    return Line(name, label, values, colour, position >= len(style.CYCLE))
+    return Line(name, label, values, colour, position >= len(LIST))
 
 
 def _residuals(results: "Results") -> Panel:
     with np.errstate(divide="ignore", invalid="ignore"):
         percent = 100 / np.abs(results["force_si_N"])
         sensitivity = _line(
-            results, "residual_sensitivity_N", "effect of ±10 mm on the total", PURPLE, True
+            results, "residual_sensitivity_N", "effect of ±10 mm on the total", GREY, True
         )
         lines = (
             Line("size", "magnitude", 100 * residual_share(results), BLACK),
-            Line("ap", "anterior", results["residual_ap_N"] * percent, VERMILLION),
-            Line("ml", lateral_axis_name(results), results["residual_ml_N"] * percent, GREEN),
+            Line("ap", "anterior", results["residual_ap_N"] * percent, ANTERIOR),
+            Line("ml", lateral_axis_name(results), results["residual_ml_N"] * percent, RIGHT),
             replace(sensitivity, values=sensitivity.values * percent),
         )
     note = (
@@ -316,9 +334,9 @@ def _residuals(results: "Results") -> Panel:
 
 def _residual_moment(results: "Results") -> Panel:
     lines = (
-        _line(results, "residual_axial_Nm", "axial", BLUE),
-        _line(results, "residual_coronal_Nm", "coronal, one condyle off", VERMILLION),
-        _line(results, "residual_flexion_Nm", "flexion, no quadriceps", GREEN),
+        _line(results, "residual_axial_Nm", "axial", SUPERIOR),
+        _line(results, "residual_coronal_Nm", "coronal, one condyle off", ANTERIOR),
+        _line(results, "residual_flexion_Nm", "flexion, no quadriceps", RIGHT),
     )
     return Panel("residual_moment", "Residual moments", "N·m", lines)
 
@@ -336,11 +354,11 @@ def _hip_moment(results: "Results") -> Panel:
 
 def _motion(results: "Results") -> Panel:
     lines = [
-        _line(results, "adduction_deg", "adduction", VERMILLION),
-        _line(results, "axial_rotation_deg", "axial rotation", GREEN),
+        _line(results, "adduction_deg", "adduction", ANTERIOR),
+        _line(results, "axial_rotation_deg", "axial rotation", SUPERIOR),
     ]
     if results.summary.get("axis", "flexion") != "flexion":
-        lines.insert(0, _line(results, "flexion_deg", "flexion", BLACK))
+        lines.insert(0, _line(results, "flexion_deg", "flexion", RIGHT))
     note = "Grood–Suntay; adduction positive in varus, axial rotation when the femur turns out."
     return Panel("motion", "Knee rotations", "deg", tuple(lines), note)
 
@@ -351,8 +369,8 @@ def _slip(results: "Results") -> Panel:
 
 def _adjustment(results: "Results") -> Panel:
     lines = (
-        _line(results, "adjust_translation_mm", "translation, mm", BLUE),
-        _line(results, "adjust_coronal_deg", "coronal angle, deg", VERMILLION),
+        _line(results, "adjust_translation_mm", "translation, mm", BLACK),
+        _line(results, "adjust_coronal_deg", "coronal angle, deg", ANTERIOR),
     )
     return Panel("adjustment", "Femoral adjustment before contact", "mm or deg", lines)
 
@@ -360,7 +378,7 @@ def _adjustment(results: "Results") -> Panel:
 def _adjustment_effect(results: "Results") -> Panel:
     lines = (
         _line(results, "adjust_force_change_BW", "total force, BW", BLACK),
-        _line(results, "adjust_share_change", "medial share (by equilibrium)", PURPLE, True),
+        _line(results, "adjust_share_change", "medial share (by equilibrium)", GREY, True),
     )
     note = "Adjusted less recorded pose. Frames whose total changes by over 0.01 BW are flagged."
     return Panel("adjustment_effect", "What the adjustment changes", "BW or share", lines, note)

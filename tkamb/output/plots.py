@@ -24,8 +24,11 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 5.4, 3.1
 DEFAULT = ("forces", "condyles", "ratios", "pressures")
+TITLE_PAD, LEGEND_ROW = 8.0, 14.0
+"""Points between a plot and its title, for each row of the legend between them."""
 DASHES = (0, (4, 2))
 BAND_OPACITY = 0.16
+SPAN = "#e2e2e2"
 
 
 def draw_panel(
@@ -73,8 +76,10 @@ def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = Non
             _draw_lines(axes, panel, horizontal)
             _label_axes(axes, panel, horizontal)
             mark_frames(axes, results, horizontal)
-            axes.set_title(panel.title, loc="left", pad=28, fontweight="bold")
-            legend_above(axes, _legend_columns(panel))
+            columns = _legend_columns(panel)
+            above = TITLE_PAD + LEGEND_ROW * -(-len(panel.lines) // columns)
+            axes.set_title(panel.title, loc="left", pad=above, fontweight="bold")
+            legend_above(axes, columns)
     return figure
 
 
@@ -136,6 +141,8 @@ def _label_axes(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:
     _scale_vertically(axes, panel)
     if panel.level:
         _draw_level(axes, *panel.level)
+    if panel.span:
+        _draw_span(axes, *panel.span)
     if panel.second:
         _draw_second(axes, *panel.second)
 
@@ -153,6 +160,7 @@ def _scale_vertically(axes: Axes, panel: Panel) -> None:
     values = [one[np.isfinite(one)] for one in drawn]
     values.append(np.zeros(int(panel.from_zero)))
     values.append(np.array(panel.level[:1] if panel.level else ()))
+    values.append(np.array(panel.span[:2] if panel.span else ()))
     low, high = (float(f(np.concatenate(values))) for f in (np.min, np.max))
     if panel.limits:
         low, high = panel.limits
@@ -167,6 +175,14 @@ def _draw_level(axes: Axes, value: float, label: str) -> None:
     transform = axes.get_yaxis_transform()
     words = label.replace(" ", "\n", 1)
     axes.text(1.01, value, words, transform=transform, va="center", fontsize=8, color=GREY)
+
+
+def _draw_span(axes: Axes, low: float, high: float, label: str) -> None:
+    """Shade a range, as a line where it is one value."""
+    axes.axhspan(low, high, facecolor=SPAN, edgecolor=SPAN, linewidth=2, zorder=0.5, gid="span")
+    middle, transform = 0.5 * (low + high), axes.get_yaxis_transform()
+    words = label.replace(" ", "\n", 1)
+    axes.text(1.01, middle, words, transform=transform, va="center", fontsize=8, color=GREY)
 
 
 def _draw_second(axes: Axes, factor: float, unit: str) -> None:

@@ -10,16 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import PolyCollection
 from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
-from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis
+from tkamb.output.levels import PageGrid, pressure_levels
 from tkamb.output.maps import ContactMaps
 from tkamb.output.metrics import map_rows, stretches
 from tkamb.output.panels import lateral_axis_name
@@ -29,8 +28,14 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 if TYPE_CHECKING:
     from tkamb.results import Results
 
-TOUCHED = 1e-3
-"""Share of the largest pressure from which a point is coloured."""
+MARGIN_MM = 2.0
+"""Around the insert in a picture."""
+STEP_MM = 0.3
+"""Between the points of the grid that pressures are drawn on."""
+LABEL_GAP_MM, LABEL_STEP_MM = 4.0, 2.6
+"""From a path to its labels, and between two of them."""
+RIM = 0.03
+"""Share of the scale over which a map fades at its rim, so that no steps are seen there."""
 
 
 class TopView:
@@ -48,26 +53,39 @@ class TopView:
         points = maps.points_m
         self.across = self.sign * points[:, 2] / MILLIMETRE
         self.up = points[:, 0] / MILLIMETRE
-        height = points[maps.triangles, 1].mean(axis=1)
-        self.triangles = maps.triangles[np.argsort(height)]
-        self.shade = _shade(points, self.triangles)
+        self.triangles = maps.triangles
+        self.grid = PageGrid(points, self.triangles, self.sign, STEP_MM)
+        self.grey = self.grid.sample(_shade(points, self.triangles))
 
     def page_coordinates(self, ap: Array, ml: Array) -> tuple[Array, Array]:
         """Return page coordinates (mm) of insert x and z (mm)."""
         return self.sign * ml, ap
 
+    @property
+    def across_limits(self) -> tuple[float, float]:
+        """Left and right end of the picture, mm."""
+        return float(self.across.min() - MARGIN_MM), float(self.across.max() + MARGIN_MM)
+
+    @property
+    def up_limits(self) -> tuple[float, float]:
+        """Lower and upper end of the picture, mm."""
+        return float(self.up.min() - MARGIN_MM), float(self.up.max() + MARGIN_MM)
+
     def draw_insert(self, axes: Axes) -> None:
         """Draw the insert in greys that show its dishes, and dress the axes."""
-        corners = np.stack([self.across, self.up], axis=1)[self.triangles]
-        greys = np.repeat(self.shade[:, None], 3, axis=1)
-        axes.add_collection(
-            PolyCollection(
-                list(corners), facecolors=greys, edgecolors=greys, linewidths=0.3, rasterized=True
-            )
+        over = self.grey >= 0
+        axes.imshow(
+            np.where(over, self.grey, self.grey.max()),
+            cmap="gray",
+            vmin=0,
+            vmax=1,
+            alpha=over.astype(float),
+            extent=self.grid.extent,
+            interpolation="bilinear",
+            zorder=1,
         )
-        margin = 2.0
-        axes.set_xlim(self.across.min() - margin, self.across.max() + margin)
-        axes.set_ylim(self.up.min() - margin, self.up.max() + margin)
+        axes.set_xlim(self.across_limits)
+        axes.set_ylim(self.up_limits)
         axes.set_aspect("equal")
         axes.set_axis_off()
 
@@ -104,8 +122,7 @@ def draw_maps(
     results: "Results", view: TopView, axis: HorizontalAxis, frames: Sequence[int]
 ) -> Figure:
     """Return pressure maps of these frames on one colour scale, 0 to the run's largest."""
-    pressure, rows = _pressure(results), map_rows(results)
-    largest = float(np.nanmax(pressure))
+    largest = float(np.nanmax(_pressure(results)))
     scale = Normalize(0.0, largest if largest > 0 else 1.0)
     across = min(4, len(frames))
     down = -(-len(frames) // across)
@@ -114,7 +131,7 @@ def draw_maps(
         figure = new_figure(11.0, down * (10.0 / 4 * ratio + 0.75))
         grid = figure.subplots(down, across, squeeze=False).ravel()
         for axes, frame in zip(grid, frames, strict=False):
-            draw_map(axes, view, results, frame, pressure[rows[frame]], scale)
+            draw_map(axes, view, results, frame, scale)
             axes.set_title(_caption(results, axis, frame), fontsize=8.5)
         for axes in grid[len(frames) :]:
             axes.set_axis_off()
@@ -131,12 +148,13 @@ def draw_map(
     view: TopView,
     results: "Results",
     frame: int,
-    pressure: Array,
     scale: Normalize,
 ) -> None:
-    """Draw one frame's pressure (n,) MPa on the insert, with its centres."""
+    """Draw the pressure of a frame that has a map on the insert, with its centres."""
+    assert results.maps is not None
+    row = map_rows(results)[frame]
     view.draw_insert(axes)
-    draw_pressure(axes, view, pressure, scale)
+    draw_pressure(axes, view, _pressure(results)[row], scale, results.maps.gap_m[row])
     _draw_centres(axes, view, results, frame)
     view.draw_labels(axes)
 
@@ -166,7 +184,6 @@ def draw_paths(
                 line[part] = x[part]
                 name = f"path-{side}" + (f"-{number}" if number else "")
                 axes.plot(line, y, color=colour, linewidth=1.6, gid=name)
-            axes.plot(x[list(frames)], y[list(frames)], "o", color=colour, ms=4, mec="white")
             _label_stops(axes, x, y, axis, frames, colour)
         view.draw_labels(axes)
     return figure
@@ -179,25 +196,45 @@ def _pressure(results: "Results") -> Array:
 
 
 def _shade(points: Array, triangles: NDArray[np.int64]) -> Array:
-    """Return a grey level (k,) per triangle, lit obliquely from above."""
+    """Return a grey level (n,) per point, lit obliquely from above."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
-    normal *= np.sign(normal[:, 1:2])
-    length = np.linalg.norm(normal, axis=1)
-    normal /= np.where(length > 0, length, 1.0)[:, None]
+    normal *= np.where(normal[:, 1:2] < 0, -1.0, 1.0)
+    summed = np.zeros_like(points)
+    for k in range(3):
+        np.add.at(summed, triangles[:, k], normal)
+    length = np.linalg.norm(summed, axis=1)
+    summed /= np.where(length > 0, length, 1.0)[:, None]
     light = np.array([0.5, 0.8, -0.33])
-    return 0.55 + 0.4 * np.clip(normal @ (light / np.linalg.norm(light)), 0.0, 1.0)
+    return 0.55 + 0.4 * np.clip(summed @ (light / np.linalg.norm(light)), 0.0, 1.0)
 
 
-def draw_pressure(axes: Axes, view: TopView, pressure: Array, scale: Normalize) -> None:
-    """Colour the insert with a pressure (n,), in the scale's unit."""
-    loaded = (pressure[view.triangles] > TOUCHED * float(scale.vmax or 1.0)).any(axis=1)
-    if not loaded.any():
-        return
-    mesh = Triangulation(view.across, view.up, view.triangles[loaded])
-    axes.tripcolor(
-        mesh, pressure, norm=scale, cmap=PRESSURE_MAP, shading="gouraud", rasterized=True
-    )
+def draw_pressure(
+    axes: Axes, view: TopView, pressure: Array, scale: Normalize, gap: Array | None = None
+) -> None:
+    """Colour the insert with a pressure (n,), in the scale's unit.
+
+    Args:
+        axes: with the insert.
+        view: of the insert.
+        pressure: (n,).
+        scale: from 0.
+        gap: (n,) m; says where between the points the contact ends.
+    """
+    peak = float(scale.vmax or 1.0)
+    apart = None if gap is None else gap[None]
+    level = view.grid.sample(pressure_levels(pressure[None], apart, view.triangles, peak)[0])
+    if (level > 0).any():
+        shown, opacity = peak * np.maximum(level, 0.0), np.clip(0.5 + level / RIM, 0.0, 1.0)
+        axes.imshow(
+            shown,
+            norm=scale,
+            cmap=PRESSURE_MAP,
+            alpha=opacity,
+            extent=view.grid.extent,
+            interpolation="bilinear",
+            zorder=1.5,
+        )
 
 
 def _draw_centres(axes: Axes, view: TopView, results: "Results", frame: int) -> None:
@@ -217,23 +254,33 @@ def _caption(results: "Results", axis: HorizontalAxis, frame: int) -> str:
 def _label_stops(
     axes: Axes, x: Array, y: Array, axis: HorizontalAxis, frames: Sequence[int], colour: str
 ) -> None:
-    """Write where the motion is beside the path's dots, as far as they have room."""
-    if not np.isfinite(x).any():
+    """Write beside a path where the motion is at its dots, its first and its last place."""
+    known = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    if not len(known):
         return
+    first, last = int(known[0]), int(known[-1])
+    chosen = sorted({first, last, *(k for k in frames if np.isfinite(x[k] + y[k]))})
     outward = 1.0 if np.nanmean(x) > 0 else -1.0
-    written: list[float] = []
-    for frame in frames:
-        if not np.isfinite(y[frame]) or any(abs(y[frame] - other) < 2.2 for other in written):
-            continue
-        written.append(float(y[frame]))
-        axes.annotate(
-            axis.at(frame),
-            (x[frame], y[frame]),
-            (7 * outward, 0),
-            textcoords="offset points",
+    column = outward * (np.nanmax(outward * x) + LABEL_GAP_MM)
+    words = {first: "start ", last: "end "} if last > first else {}
+    order = sorted(chosen, key=lambda k: y[k])
+    for frame, height in zip(order, _spread(y[order], LABEL_STEP_MM), strict=True):
+        axes.plot([x[frame], column], [y[frame], height], color=GREY, linewidth=0.5, zorder=2.5)
+        axes.plot(x[frame], y[frame], "o", color=colour, ms=4, mec="white", zorder=3)
+        axes.text(
+            column + 0.5 * outward,
+            height,
+            words.get(frame, "") + axis.at(frame),
             ha="left" if outward > 0 else "right",
             va="center",
             fontsize=8,
-            color=colour,
+            color=BLACK,
             path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )
+
+
+def _spread(heights: Array, step: float) -> Array:
+    """Return rising heights moved apart to at least a step, about where they were."""
+    count = np.arange(len(heights))
+    pressed = np.maximum.accumulate(heights - step * count) + step * count
+    return pressed - 0.5 * float(np.mean(pressed - heights))

@@ -12,12 +12,14 @@ import numpy as np
 from tkamb.atomic import write_text
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import LABELS, HorizontalAxis, horizontal_axis
+from tkamb.output.frame_maps import draw_insert, frame_maps, largest_pressure
 from tkamb.output.headline import cards, run_title
 from tkamb.output.metrics import body_weight, failed, flagged
 from tkamb.output.pages import asset, policy_sources, render
 from tkamb.output.panels import Panel, centre_panel, panels
 from tkamb.output.plots import WIDTH, draw_panel
 from tkamb.output.pressure_maps import draw_maps, draw_paths, mapped_frames, top_view
+from tkamb.output.reading import conclusions
 from tkamb.output.style import svg_text
 from tkamb.output.tables import flag_rows, motion_table, strain_table
 
@@ -32,6 +34,14 @@ POLICY = (
 """The page runs its own script and loads nothing; the plots set their colours in attributes."""
 THIRD = 2 / 3 * WIDTH
 """Inches: width of a plot of which three stand beside each other, at the same size of letters."""
+SCRIPTS = ("cursor.js", "units.js", "insert.js", "downloads.js", "start.js")
+"""In the order in which they stand in the page."""
+COLOURS = (
+    "Lines run in time order. In every plot blue is medial, red lateral, black the total; violet "
+    "is superior–inferior, teal anterior–posterior, olive medial–lateral, and moments and "
+    "rotations have the colour of the axis they turn about. Ligaments and muscles are told apart "
+    "within one plot."
+)
 PROVENANCE = (
     "scene", "scene_sha256", "started", "command", "versions", "seconds", "contact", "frame",
 )  # fmt: skip
@@ -50,7 +60,9 @@ def write_report(results: "Results", path: str | Path) -> None:
 def report_html(results: "Results") -> str:
     """Return the report as HTML: vector plots, pictures and style are inside the page."""
     axis = horizontal_axis(results)
-    style, script = asset(PACKAGE, "report.css"), asset(PACKAGE, "report.js")
+    style = asset(PACKAGE, "report.css")
+    script = "\n".join(asset(PACKAGE, name) for name in SCRIPTS)
+    maps, force = _maps(results, axis), results["force_total_N"]
     return render(
         PACKAGE,
         "report.html",
@@ -60,8 +72,9 @@ def report_html(results: "Results") -> str:
         title=run_title(results.summary),
         subtitle=_subtitle(results),
         cards=cards(results, axis),
+        conclusions=conclusions(results),
         sentences=_sentences(results.summary),
-        maps=_maps(results, axis),
+        maps=maps,
         legend=_legend(results),
         plots=[_plot(panel, results, axis) for panel in panels(results)],
         muscles=_muscles(results, axis),
@@ -71,7 +84,8 @@ def report_html(results: "Results") -> str:
         axis_name=LABELS[axis.kind].split(" (")[0],
         provenance=_provenance(results.summary),
         last_frame=len(results) - 1,
-        cursor=_cursor_data(results, axis),
+        first_frame=int(np.nanargmax(force)) if np.isfinite(force).any() else 0,
+        cursor=_cursor_data(results, axis) | {"maps": maps and maps["frames"]},
     )
 
 
@@ -116,6 +130,8 @@ def _maps(results: "Results", axis: HorizontalAxis) -> dict[str, Any] | None:
     if view is None or not frames:
         return None
     return {
+        "insert": svg_text(draw_insert(view, largest_pressure(results)), "map"),
+        "frames": frame_maps(results, view),
         "pictures": svg_text(draw_maps(results, view, axis, frames), "maps"),
         "paths": svg_text(draw_paths(results, view, axis, frames), "paths"),
         "centres": _plot(centre_panel(results), results, axis),
@@ -147,7 +163,7 @@ def _plot(
 
 def _legend(results: "Results") -> list[str]:
     """Return what the marks in the plots mean."""
-    sentences = ["Lines run in time order."]
+    sentences = [COLOURS]
     if results.bands:
         sentences.append(
             "Shaded: 5 to 95 % of the samples with varied inputs, dotted: their median; "
@@ -201,10 +217,17 @@ def _cursor_data(results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
         drawn += muscle_panels(results)
     name = axis.label.split(" (")[0]
     return {
+        "name": run_title(results.summary),
+        "axis": axis.label,
+        "bodyWeight": body_weight(results),
         "x": _round(axis.values),
         "place": [f"{name} {axis.at(k)}" for k in range(len(results))],
         "status": results.status,
-        "panels": {panel.name: _cursor_lines(panel) for panel in drawn if panel.lines},
+        "panels": {
+            panel.name: {"unit": panel.unit, "lines": _cursor_lines(panel)}
+            for panel in drawn
+            if panel.lines
+        },
     }
 
 

@@ -17,6 +17,11 @@ VERMILLION, ORANGE = "#D55E00", "#E69F00"
 GREEN, PURPLE = "#009E73", "#CC79A7"
 MEDIAL, LATERAL = BLUE, VERMILLION
 SIDE_COLOURS = {"medial": MEDIAL, "lateral": LATERAL}
+SUPERIOR, ANTERIOR, RIGHT = "#5D3A9B", "#2A9D8F", "#7B8B00"
+"""Of forces along the insert axes, and of moments and rotations about them."""
+QUADRICEPS, PATELLAR_LIGAMENT, PATELLOFEMORAL = "#882255", "#CC79A7", "#8C6D1F"
+LIST = ("#332288", "#A6761D", "#009E73", "#AA4499")
+"""Of ligaments and muscles, which are too many: they are told apart within one plot."""
 CYCLE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK, GREY)
 PRESSURE_MAP = "viridis"
 
@@ -69,7 +74,8 @@ def svg_text(figure: "Figure", name: str, dpi: int = 200) -> str:
     It has no style element: the page's own says how lines join.
     Every id is prefixed with `name`, so that many figures live in one page. `data-box` holds
     the left, right, top and bottom of the first axes in the picture's units and `data-range`
-    the values at its left and right end, for whoever draws over it.
+    the values at its left and right end, `data-heights` at its foot and head, for whoever draws
+    over it.
     """
     buffer = io.StringIO()
     with settings():
@@ -98,8 +104,10 @@ def _box(figure: "Figure") -> str:
         (1 - position.y0) * height,
     )
     box = " ".join(f"{edge:.2f}" for edge in edges)
-    low, high = axes.get_xlim()
-    return f'data-box="{box}" data-range="{low:.9g} {high:.9g}"'
+    (low, high), (foot, head) = axes.get_xlim(), axes.get_ylim()
+    return (
+        f'data-box="{box}" data-range="{low:.9g} {high:.9g}" data-heights="{foot:.9g} {head:.9g}"'
+    )
 
 
 def legend_above(axes: "Axes", columns: int = 4) -> None:

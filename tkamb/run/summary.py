@@ -102,6 +102,7 @@ def _subject(case: Case) -> dict[str, Any]:
         "height_mm": case.height_mm,
         "yield_stress_MPa": output.yield_stress_MPa,
         "axis": output.axis,
+        "activity": output.activity,
     }
 
 

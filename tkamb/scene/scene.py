@@ -60,6 +60,17 @@ class Scene(SceneTable):
     output: OutputTable = OutputTable()
     uncertainty: UncertaintyTable | None = None
 
+    def __repr__(self) -> str:
+        """Return in a line whose knee it is, what moves and what presses."""
+        contact = self.contact
+        parts = [
+            f"{self.patient.side} knee",
+            f"{self.patient.mass_kg:g} kg",
+            f"motion of {self.motion.file.name}",
+            f"{contact.model} at {contact.resolution_mm:g} mm" if contact else "no contact",
+        ]
+        return f"<tkamb.Scene: {', '.join(parts)}>"
+
     @model_validator(mode="after")
     def _belongs_together(self) -> Self:
         names = [ligament.name for ligament in self.ligament]

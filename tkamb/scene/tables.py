@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from tkamb.activities import Activity
 from tkamb.defaults import CONTACT_MODEL
 from tkamb.scene.emg import EmgTable
 from tkamb.scene.table import (
@@ -311,5 +312,8 @@ class OutputTable(SceneTable):
     yield_stress_MPa: Number = Field(21.0, ge=1, le=200)
     axis: Literal["flexion", "cycle", "time"] = Field(
         "flexion", description="the report's horizontal axis"
+    )
+    activity: Activity | None = Field(
+        None, description="the report draws what instrumented knees measured in it"
     )
     notes: list[str] = Field(default_factory=list, description="printed in the report")

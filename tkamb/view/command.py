@@ -34,6 +34,10 @@ def add_view(commands: Any) -> None:
     view.add_argument("--lattice", action="store_true", help="draw the lattice too")
     view.add_argument("--html", type=Path, metavar="F", help="write one file instead of a window")
     view.add_argument("--png", type=Path, metavar="F", help="write a picture of the frame")
+    for kind in ("gif", "mp4"):
+        view.add_argument(
+            f"--{kind}", type=Path, metavar="F", help="write all frames as a film (extra: film)"
+        )
     view.add_argument("--port", type=int, default=0, help="of the live window; default: any free")
     view.set_defaults(command=_view)
 
@@ -70,7 +74,12 @@ def _view(options: argparse.Namespace) -> int:
         show.write_html(options.html)
     if options.png:
         show.write_png(options.png)
-    if not (options.html or options.png):
+    films = [path for path in (options.gif, options.mp4) if path]
+    for path in films:
+        from tkamb.view.film import write_film
+
+        write_film(show, path, lambda frames: tqdm(frames, "filming", unit="frame", disable=None))
+    if not (options.html or options.png or films):
         show.open(announce, options.port)
     return 0
 
@@ -97,9 +106,14 @@ def _check(options: argparse.Namespace) -> None:
                 raise InputError(
                     "has its own contact model", path, "give the scene to choose another"
                 )
-    for path in (options.html, options.png):
+    for path in (options.html, options.png, options.gif, options.mp4):
         if path is not None and not os.access(path.absolute().parent, os.W_OK):
             raise InputError("cannot be written (no such folder, or not yours)", path)
+    for kind in ("gif", "mp4"):
+        if path := getattr(options, kind):
+            from tkamb.view.film import check_film
+
+            check_film(path, f"--{kind}")
     if options.png:
         from tkamb.view.page import find_browser
 

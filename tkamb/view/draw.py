@@ -52,7 +52,7 @@ def draw(
     floor, centre = floor_and_foot(case, geometries, run.frames)
     bundles, limit = ligament_strands(mechanics, states)
     muscles, most_active = muscle_strands(geometries)
-    strands = [*bundles, *extensor_strands(mechanics, states), *muscles]
+    strands = [*bundles, *extensor_strands(mechanics, states, results), *muscles]
     markers = [*contact_markers(geometries), *centre]
     if maps is not None and found:
         assert case.insert is not None

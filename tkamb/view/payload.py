@@ -20,6 +20,7 @@ from meshcat.path import Path as NodePath
 from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array
+from tkamb.output.levels import pressure_levels
 from tkamb.units import MILLIMETRE
 from tkamb.view.colours import activation_scale, pressure_scale, strain_scale
 from tkamb.view.drawing import (
@@ -189,44 +190,20 @@ def _map(block: Block, found: PressureMap, peak: float) -> dict[str, Any]:
         "count": len(found.points),
         "points": block.put(found.points, "float32"),
         "triangles": block.put(found.triangles, "uint32"),
-        "levels": block.put(pressure_levels(found, peak), "int16"),
+        "levels": block.put(map_levels(found, peak), "int16"),
     }
 
 
-def pressure_levels(found: PressureMap, peak: float) -> NDArray[np.int16]:
-    """Return pressure as levels (f, n): 1 to LEVELS where loaded, negative where not.
-
-    A loaded point holds its share of the page's largest pressure. Between a loaded and an
-    unloaded point the contact ends where the level, drawn linearly, is zero: an unloaded point at
-    the rim holds minus its gap, scaled so that on average the rim lies halfway. This is for the
-    eye; at the points themselves the levels are the data's.
+def map_levels(found: PressureMap, peak: float) -> NDArray[np.int16]:
+    """Return `pressure_levels` (f, n) of the map as integers: a loaded point's is at least 1.
 
     Args:
         found: the map.
         peak: MPa, top of the scale; a higher pressure has the top level.
     """
-    share = np.clip(np.nan_to_num(found.pressure) / (peak or 1.0), 0.0, 1.0)
-    return np.stack(
-        [
-            _frame_levels(one, gap, found.triangles)
-            for one, gap in zip(share, found.gap, strict=True)
-        ]
-    )
-
-
-def _frame_levels(share: Array, gap: Array, triangles: NDArray[np.int64]) -> NDArray[np.int16]:
-    loaded = share > 0
-    level = np.where(loaded, np.maximum(np.round(share * LEVELS), 1.0), -float(LEVELS))
-    corners = loaded[triangles]
-    rim = np.zeros(len(share), bool)
-    rim[triangles[corners.any(axis=1) & ~corners.all(axis=1)]] = True
-    outside, inside = rim & ~loaded, rim & loaded
-    if outside.any():
-        apart = np.maximum(np.nan_to_num(gap[outside]), 0.0)
-        mean = float(apart.mean())
-        relative = apart / mean if mean > 0 else np.ones(len(apart))
-        level[outside] = -np.clip(relative * level[inside].mean(), 1.0, LEVELS)
-    return level.astype(np.int16)
+    level = pressure_levels(found.pressure, found.gap, found.triangles, peak)
+    whole = np.maximum(np.round(np.abs(level) * LEVELS), 1.0)
+    return np.where(level > 0, whole, -whole).astype(np.int16)
 
 
 def _insert_transform(root: str, side: str) -> SetTransform:

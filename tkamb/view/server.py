@@ -45,15 +45,22 @@ frame it can only be said here."""
 class ContactSwitch:
     """Computes a frame of a run with any contact model; each model is prepared once.
 
+    Only the latest question is answered: a newer one, or `cancel`, ends those before it as soon as
+    the step that they are at is done.
+
     Args:
         run: with [contact].
         peak: MPa, top of the colour scale of the page.
+
+    Attributes:
+        stage: what is being done, in words; empty when nothing is.
     """
 
     def __init__(self, run: CaseResults, peak: float) -> None:
         self.run, self.peak = run, peak
+        self.stage = ""
         self._sides: dict[str, ContactSide] = {}
-        self._lock = Lock()
+        self._lock, self._counting, self._latest = Lock(), Lock(), 0
 
     def models(self) -> tuple[str, ...]:
         """Return the names that can be asked for; none without [contact]."""
@@ -67,12 +74,31 @@ class ContactSwitch:
             model: name of the contact model.
 
         Raises:
-            TkambError: no such model or frame, or the model cannot be prepared.
+            TkambError: no such model or frame, or the model cannot be prepared, or another
+                question came.
         """
         if not 0 <= row < len(self.run.frames):
             raise TkambError(f"there is no frame {row}")
+        number = self.cancel()
         with self._lock:
-            return self._compute(row, model)
+            try:
+                self._go_on(number, f"preparing {model}")
+                side = self._side(model)
+                self._go_on(number, f"computing frame {row} with {model}")
+                return self._compute(side, row, model)
+            finally:
+                self.stage = ""
+
+    def cancel(self) -> int:
+        """End what was asked before; return the number of the next question."""
+        with self._counting:
+            self._latest += 1
+            return self._latest
+
+    def _go_on(self, number: int, stage: str) -> None:
+        if number != self._latest:
+            raise TkambError("cancelled")
+        self.stage = stage
 
     def lattice(self) -> bytes:
         """Return the lines of the run's lattice, packed.
@@ -83,8 +109,7 @@ class ContactSwitch:
         with self._lock:
             return packed_lattice(lattice_lines(self.run.case))
 
-    def _compute(self, row: int, model: str) -> bytes:
-        side = self._side(model)
+    def _compute(self, side: ContactSide, row: int, model: str) -> bytes:
         _, contact = side.frame(self.run.frames[row])
         points, triangles = side.state.points, side.state.triangles
         result = contact.result
@@ -136,6 +161,7 @@ class ViewServer:
     def __init__(
         self, html: str, packed: bytes, switch: ContactSwitch | None, port: int = 0
     ) -> None:
+        self.switch = switch
         self._token = secrets.token_urlsafe(TOKEN_BYTES)
         content = {
             "": ("text/html; charset=utf-8", html.encode()),
@@ -209,6 +235,11 @@ class _Handler(BaseHTTPRequestHandler):
             return self.switch.answer(frame, model)
         if self.switch is not None and self._path_below_token == "lattice":
             return self.switch.lattice()
+        if self.switch is not None and self._path_below_token == "stage":
+            return self.switch.stage.encode()
+        if self.switch is not None and self._path_below_token == "cancel":
+            self.switch.cancel()
+            return b""
         raise TkambError("no such question")
 
     def log_message(self, format: str, *args: Any) -> None:

@@ -10,12 +10,13 @@ from tkamb.body.knee import KneeGeometry
 from tkamb.body.wrapping import TautPath
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import ComputationError
-from tkamb.geometry.frames import Array, transform
+from tkamb.geometry.frames import Array, Mask, transform
 from tkamb.geometry.surface import Surface
 from tkamb.output.metrics import stretches
 from tkamb.output.style import SIDE_COLOURS
 from tkamb.units import MILLIMETRE
 from tkamb.view.colours import (
+    SLACK,
     TENDON,
     WRAPPED,
     Colours,
@@ -60,8 +61,13 @@ def ligament_strands(
     return tuple(strands), limit
 
 
-def extensor_strands(mechanics: Mechanics, states: Sequence[ChainState]) -> tuple[Strand, ...]:
-    """Return muscle and patellar ligament, the part that lies on the bone in another colour."""
+def extensor_strands(
+    mechanics: Mechanics, states: Sequence[ChainState], results: "Results"
+) -> tuple[Strand, ...]:
+    """Return muscle and patellar ligament, the part that lies on the bone in another colour.
+
+    In frames where one carries less than a newton it is grey.
+    """
     extensor = mechanics.extensor
     if extensor is None:
         return ()
@@ -73,7 +79,11 @@ def extensor_strands(mechanics: Mechanics, states: Sequence[ChainState]) -> tupl
             paths.append((None, None))
     muscle, ligament = (list(found) for found in zip(*paths, strict=True))
     name = extensor.muscle.name.replace("_", " ")
-    return _tendon(name, muscle), _tendon("patellar ligament", ligament)
+    slack = [results[f"{one}_N"] < SLACK_FORCE for one in ("quadriceps", "patellar_ligament")]
+    return (
+        _tendon(name, muscle, slack[0]),
+        _tendon("patellar ligament", ligament, slack[1]),
+    )
 
 
 def muscle_strands(geometries: Sequence[KneeGeometry]) -> tuple[tuple[Strand, ...], float]:
@@ -109,12 +119,16 @@ def muscle_strands(geometries: Sequence[KneeGeometry]) -> tuple[tuple[Strand, ..
     return strands, limit
 
 
-def _tendon(name: str, paths: list[TautPath | None]) -> Strand:
-    """Return the strand of a taut path; its corners are doubled where the colour changes."""
+def _tendon(name: str, paths: list[TautPath | None], slack: Mask) -> Strand:
+    """Return the strand of a taut path (f), grey where it is slack (f,).
+
+    Its corners are doubled where the colour changes.
+    """
     lines = [_colour_path(path) for path in paths]
     most = max(len(points) for points, _ in lines)
     points = np.stack([np.pad(p, ((0, most - len(p)), (0, 0)), mode="edge") for p, _ in lines])
     colours = np.stack([np.pad(c, ((0, most - len(c)), (0, 0)), mode="edge") for _, c in lines])
+    colours[slack] = rgb(SLACK)
     return Strand(name, "extensor lines", points, colours, TENDON_RADIUS)
 
 

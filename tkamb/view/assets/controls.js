@@ -89,6 +89,11 @@ function addLegends() {
   colourBar("pressure-bar", data.pressure_scale, peak, 1);
   colourBar("strain-bar", data.strain_scale, 100 * data.strain_limit, 1);
   colourBar("activation-bar", data.activation_scale, 100 * data.activation_limit, 1);
+  if (views.length > 1) {
+    const head = made("tr", "", element("forces"));
+    made("th", "", head, {colspan: 2});
+    views.forEach((_, k) => made("th", runLetter(k), head, {class: "number"}));
+  }
   const known = new Set();
   for (const view of views) {
     for (const arrow of view.arrows) {
@@ -135,7 +140,7 @@ function addNumbers() {
   if (views.length > 1) {
     const head = made("tr", "", table);
     made("th", "", head);
-    views.forEach((view, k) => made("th", `${k ? "right" : "left"} picture`, head));
+    views.forEach((_, k) => made("th", runLetter(k), head));
   }
   const names = [...new Set(views.flatMap((view) => view.readings.map((row) => row.name)))];
   for (const name of names) {
@@ -150,6 +155,11 @@ function addNumbers() {
   for (const note of notes) made("li", note, element("notes"));
 }
 
+// What a run is called beside others.
+function runLetter(k) {
+  return String.fromCharCode(65 + k);
+}
+
 function showNumbers() {
   const frames = tkamb.views.map(tkamb.frameOf);
   for (const row of element("numbers").rows) {
@@ -158,13 +168,15 @@ function showNumbers() {
     });
   }
   for (const row of element("forces").rows) {
+    if (row.cells[0].tagName === "TH") continue;
     [...row.cells].slice(2).forEach((cell, k) => {
       cell.textContent = inBodyWeights(cell.arrow, frames[k], tkamb.views[k].body_weight);
     });
   }
   [...element("titles").children].forEach((title, k) => {
     const view = tkamb.views[k], place = tkamb.views.length > 1 ? ` · ${view.labels[frames[k]]}` : "";
-    title.textContent = `${view.title} · ${view.side} knee${place}`;
+    const letter = tkamb.views.length > 1 ? `${runLetter(k)}: ` : "";
+    title.textContent = `${letter}${view.title} · ${view.side} knee${place}`;
   });
   const words = tkamb.views.map((view, k) => view.statuses[frames[k]]);
   const plain = words.map((word) => (word === "ok" ? "" : word)).filter(Boolean);

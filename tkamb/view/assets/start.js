@@ -62,11 +62,14 @@ class Live {
     }
     document.getElementById("contact-choice").hidden = models.length === 0;
     this.choice.addEventListener("change", () => this.frameChanged());
+    this.button = document.getElementById("cancel");
+    this.button.addEventListener("click", () => this.cancel());
     this.latest = 0;
   }
 
   frameChanged() {
     const view = tkamb.views[0], number = ++this.latest;
+    this.rest();
     if (view.map !== view.runMap) {
       tkamb.showMap(view, view.runMap);
       tkamb.colourMap(view, tkamb.frameOf(view));
@@ -99,12 +102,45 @@ class Live {
     });
   }
 
+  // Says what the server is at, and since when, until `rest`.
+  watch(number, words) {
+    const answer = document.getElementById("answer"), began = performance.now();
+    this.rest();
+    this.button.hidden = false;
+    const tell = () => {
+      const seconds = Math.floor((performance.now() - began) / 1000);
+      answer.textContent = `${words} … ${seconds} s`;
+    };
+    tell();
+    this.clock = setInterval(async () => {
+      tell();
+      const response = await this.ask("stage", {});
+      const stage = response.ok ? await response.text() : "";
+      if (stage && number === this.latest) words = stage;
+    }, 500);
+  }
+
+  rest() {
+    clearInterval(this.clock);
+    this.button.hidden = true;
+  }
+
+  // The server ends the step that it is at and goes no further.
+  async cancel() {
+    clearTimeout(this.timer);
+    this.choice.value = tkamb.views[0].contact;
+    this.frameChanged();
+    await this.ask("cancel", {});
+    document.getElementById("answer").textContent = "cancelled";
+  }
+
   async compute(view, number, model) {
     const answer = document.getElementById("answer"), frame = tkamb.frameOf(view);
-    answer.textContent = `computing frame ${frame} with ${model} …`;
+    this.watch(number, `asking ${model}`);
     const response = await this.ask("contact", {frame, model});
     const packed = response.ok && new Uint8Array(await response.arrayBuffer());
     if (number !== this.latest) return;
+    this.rest();
     if (!packed) {
       answer.textContent = await response.text();
       return;

@@ -1,24 +1,32 @@
 "use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
 const slider = document.getElementById("frame");
+const watchers = [];  // what else follows the slider: functions of the frame
+
+function draw(parent, name, attributes) {  // an element of an SVG picture
+  const made = document.createElementNS(parent.namespaceURI, name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  parent.append(made);
+  return made;
+}
+
 const plots = [...document.querySelectorAll("figure.plot")].map(figure => {
-  const svg = figure.querySelector("svg");
+  const svg = figure.querySelector("svg"), name = figure.id.slice("figure-".length);
   const [left, right, top, bottom] = svg.dataset.box.split(" ").map(Number);
   const [low, high] = svg.dataset.range.split(" ").map(Number);
-  const line = document.createElementNS(svg.namespaceURI, "line");
-  line.setAttribute("class", "cursor");
-  line.setAttribute("y1", top);
-  line.setAttribute("y2", bottom);
-  svg.append(line);
-  const place = x => left + (x - low) / (high - low) * (right - left);
+  const line = draw(svg, "line", {class: "cursor", y1: top, y2: bottom});
   const value = at => low + (at - left) / (right - left) * (high - low);
   svg.addEventListener("pointermove", event => {
     const box = svg.getBoundingClientRect();
     show(nearest(value((event.clientX - box.left) / box.width * svg.viewBox.baseVal.width)));
   });
-  return {line, place, readout: figure.querySelector(".readout"),
-          lines: data.panels[figure.id.slice("figure-".length)]};
+  return {
+    figure, svg, name, line, left, right, top, bottom, scale: 1,
+    place: x => left + (x - low) / (high - low) * (right - left),
+    readout: figure.querySelector(".readout"), ...data.panels[name],
+  };
 });
+
 function nearest(x) {
   const now = Number(slider.value), range = Math.max(...data.x) - Math.min(...data.x) || 1;
   let best = now, least = Infinity;
@@ -28,10 +36,21 @@ function nearest(x) {
   });
   return best;
 }
+
 function written(value, digits) {
   const text = value.toFixed(digits);
   return Number(text) === 0 ? text.replace("-", "") : text.replace("-", "−");
 }
+
+function readoutSpan(plot, line, frame) {
+  const span = document.createElement("span"), swatch = document.createElement("i");
+  const value = line.values[frame], digits = plot.scale === 1 ? line.digits : 0;
+  swatch.style.background = line.colour;
+  const number = value === null ? "–" : written(value * plot.scale, digits);
+  span.append(swatch, `${line.label} ${number}`);
+  return span;
+}
+
 function show(frame) {
   slider.value = frame;
   const status = data.status[frame] === "ok" ? "" : ", " + data.status[frame].replaceAll("_", " ");
@@ -41,15 +60,7 @@ function show(frame) {
     const at = plot.place(data.x[frame]);
     plot.line.setAttribute("x1", at);
     plot.line.setAttribute("x2", at);
-    plot.readout.replaceChildren(...plot.lines.map(line => {
-      const span = document.createElement("span"), value = line.values[frame];
-      span.style.color = line.colour;
-      span.textContent = `${line.label} ${value === null ? "–" : written(value, line.digits)}`;
-      return span;
-    }));
+    plot.readout.replaceChildren(...plot.lines.map(line => readoutSpan(plot, line, frame)));
   }
+  for (const watcher of watchers) watcher(frame);
 }
-slider.addEventListener("input", () => show(Number(slider.value)));
-document.getElementById("bar").hidden = false;
-document.body.classList.add("live");
-show(Number(slider.value));

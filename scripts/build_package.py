@@ -1,0 +1,50 @@
+#!/usr/bin/env python3
+"""Build the sdist, and the wheel from it, out of the files that git knows.
+
+Usage: scripts/build_package.py FOLDER
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import tempfile
+from pathlib import Path
+
+from setuptools import build_meta
+
+ROOT = Path(__file__).parents[1]
+
+
+def build(folder: Path) -> tuple[Path, Path]:
+    """Return the sdist and the wheel, both in the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    before = Path.cwd()
+    with tempfile.TemporaryDirectory() as temporary:
+        source = Path(temporary) / "source"
+        for name in known_files():
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, source / name)
+        try:
+            os.chdir(source)
+            sdist = folder / build_meta.build_sdist(str(folder))
+            with tarfile.open(sdist) as archive:
+                archive.extractall(temporary, filter="data")
+            os.chdir(Path(temporary) / sdist.name.removesuffix(".tar.gz"))
+            wheel = folder / build_meta.build_wheel(str(folder))
+        finally:
+            os.chdir(before)
+    return sdist, wheel
+
+
+def known_files() -> list[str]:
+    """Return the paths that git knows and that are there."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True, text=True
+    ).stdout
+    return [name for name in listed.split("\0") if name and (ROOT / name).is_file()]
+
+
+if __name__ == "__main__":
+    print("\n".join(str(made) for made in build(Path(sys.argv[1]).resolve())))

@@ -1,0 +1,29 @@
+"""The wheel: built from the sdist, it holds every file of the package and nothing else."""
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_wheel_made_from_the_sdist_holds_the_whole_package(tmp_path):
+    done = subprocess.run(
+        [sys.executable, ROOT / "scripts" / "build_package.py", tmp_path],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    assert len(list(tmp_path.glob("*.tar.gz"))) == 1
+    listed = subprocess.run(
+        ["git", "ls-files", "tkamb"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split()
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        (entry,) = (name for name in names if name.endswith("entry_points.txt"))
+        assert "tkamb = tkamb.cli:main" in archive.read(entry).decode()
+        assert any(name.endswith("licenses/LICENSE") for name in names)
+    held = {name for name in names if ".dist-info/" not in name}
+    assert held == {name for name in listed if (ROOT / name).is_file()}

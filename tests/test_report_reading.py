@@ -1,0 +1,156 @@
+"""What a reader sees of a report: colours told apart, words that follow the run, smooth maps."""
+
+import re
+from itertools import combinations
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from synthetic_run import make_run
+from tkamb.activities import PEAKS_BW, Activity
+from tkamb.output import style
+from tkamb.output.axis import horizontal_axis
+from tkamb.output.levels import PageGrid, pressure_levels
+from tkamb.output.pages import asset
+from tkamb.output.panels import panels
+from tkamb.output.plots import draw_panel
+from tkamb.output.reading import conclusions
+from tkamb.results import Results
+
+
+@pytest.fixture(scope="module")
+def bend():
+    return make_run("bend", maps=False)
+
+
+@pytest.fixture(scope="module")
+def gait():
+    return make_run("gait", maps=False)
+
+
+def test_a_grid_over_the_insert_is_linear_between_its_points_and_ends_at_its_rim():
+    points = np.array([[0.0, 0, 0], [0.01, 0, 0], [0.01, 0, 0.01], [0, 0, 0.01]])
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    grid = PageGrid(points, triangles, -1.0, 1.0)
+    x, z = np.meshgrid(grid.up, grid.across, indexing="ij")
+    values = grid.sample(points @ [200.0, 0.0, -300.0])
+    over = values != -1.0
+    inside = (x > 0.1) & (x < 9.9) & (z < -0.1) & (z > -9.9)
+    assert over[inside].all()
+    np.testing.assert_allclose(values[over], (0.2 * x + 0.3 * z)[over], atol=1e-9)
+    outside = np.array([0.0, 0, np.inf, np.inf])  # nothing lies above: still one map
+    level = pressure_levels(np.array([[2.0, 2, 0, 0]]), outside[None], triangles, 4.0)[0]
+    assert list(level) == [0.5, 0.5, -0.5, -0.5]
+
+
+def test_the_in_vivo_peaks_of_the_activity_lie_behind_the_force(bend):
+    assert set(PEAKS_BW) == set(get_args(Activity))
+    (plain,) = (one for one in panels(bend) if one.name == "forces")
+    assert plain.span is None
+    run = Results(bend.columns, bend.summary | {"activity": "squat"}, None)
+    (panel,) = (one for one in panels(run) if one.name == "forces")
+    assert panel.span[:2] == (2.1, 2.53)
+    assert "Kutzner 2010" in panel.note and "D'Lima 2007" in panel.note
+    axes = draw_panel(panel, run, horizontal_axis(run)).axes[0]
+    (shade,) = [one for one in axes.patches if one.get_gid() == "span"]
+    assert (shade.get_y(), shade.get_y() + shade.get_height()) == pytest.approx((2.1, 2.53))
+
+
+def linear_rgb(colour):
+    rgb = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255
+    return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+
+
+def contrast(colour, ground="#ffffff"):
+    """WCAG 2.1's contrast ratio."""
+    low, high = sorted(float(linear_rgb(c) @ [0.2126, 0.7152, 0.0722]) for c in (colour, ground))
+    return (high + 0.05) / (low + 0.05)
+
+
+# Machado, Oliveira & Fernandes (2009), severity 1, in linear RGB
+VISIONS = {
+    "usual": np.eye(3),
+    "deuteranopia": [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881],
+    ],
+    "protanopia": [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+}
+
+
+def lab(rgb):
+    """CIELAB of linear sRGB."""
+    to_xyz = [
+        [0.4124564, 0.3575761, 0.1804375],
+        [0.2126729, 0.7151522, 0.0721750],
+        [0.0193339, 0.1191920, 0.9503041],
+    ]
+    x = to_xyz @ np.clip(rgb, 0, 1) / [0.95047, 1.0, 1.08883]
+    f = np.where(x > 0.008856, np.cbrt(x), 7.787 * x + 16 / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+@pytest.mark.parametrize("vision", VISIONS)
+def test_colours_that_meet_in_a_plot_are_told_apart(vision):
+    """Twenty units of CIELAB are as much as two greys of which one is half as bright."""
+    together = (
+        (style.MEDIAL, style.LATERAL, style.BLACK),
+        (style.SUPERIOR, style.ANTERIOR, style.RIGHT, style.BLACK),
+        (style.QUADRICEPS, style.PATELLAR_LIGAMENT, style.PATELLOFEMORAL),
+        style.LIST,
+    )
+    for group in together:
+        assert all(contrast(colour) >= 3.0 for colour in group)
+        seen = [lab(np.array(VISIONS[vision]) @ linear_rgb(colour)) for colour in group]
+        assert min(np.linalg.norm(a - b) for a, b in combinations(seen, 2)) > 20.0
+
+
+def test_text_stands_out_from_its_ground():
+    css = asset("tkamb.output", "report.css")
+    bright, dark = (
+        dict(re.findall(r"--(\w+): (#\w+)", block))
+        for block in re.findall(r":root \{(.*?)\}", css, re.DOTALL)
+    )
+    for colours in (bright, dark):
+        page = colours["page"] if len(colours["page"]) == 7 else "#ffffff"
+        assert all(contrast(colours[name], page) >= 4.5 for name in ("ink", "soft", "warn"))
+    assert contrast(style.GREY) >= 4.5
+
+
+def test_one_colour_has_one_meaning_over_all_plots(bend):
+    meanings = {}
+    for panel in panels(bend):
+        if panel.name != "ligaments":
+            for line in panel.lines:
+                meanings.setdefault(line.colour, set()).add(line.label.split(",")[0])
+    assert meanings[style.MEDIAL] == {"medial"}
+    assert meanings[style.LATERAL] == {"lateral"}
+    assert meanings[style.SUPERIOR] == {"superior", "superior–inferior", "axial", "axial rotation"}
+    assert not {style.MEDIAL, style.LATERAL, style.SUPERIOR} & {*style.LIST[1:], style.BLACK}
+
+
+def test_what_may_be_concluded_follows_the_run(bend, gait):
+    bears, bears_not = conclusions(bend)
+    assert any("quadriceps alone" in words for words in bears)
+    assert any("no input was varied" in words for words in bears_not)
+    assert any("1 of 101 frames: no numbers" in words for words in conclusions(gait)[1])
+    one = {"rmse_BW": 0.3, "r_squared": 0.8, "frames_compared": 9}
+    summary = bend.summary | {
+        "measured": {"total": one, "lateral": one | {"rmse_BW": 0.32, "r_squared": -0.84}},
+        "questions": ["is it?"],
+        "known_error": "not measured",
+        "uncertainty": {"samples": 9},
+    }
+    bears, bears_not = conclusions(Results(bend.columns, summary, None))
+    assert any("total 0.30 BW, lateral 0.32 BW" in words for words in bears)
+    assert not any("Which condyle" in words for words in bears)
+    assert bears_not[0].startswith("Anything, before the question")
+    assert any("lateral force: its mean would be nearer" in words for words in bears_not)
+    assert any("how far they are off is not measured" in words for words in bears_not)
+    assert not any("no input was varied" in words for words in bears_not)

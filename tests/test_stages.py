@@ -1,0 +1,30 @@
+"""Stages of a run: named on a terminal, silent in a pipe."""
+
+import io
+import re
+
+from tkamb.run.stages import Stages
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def run_through(stream):
+    with Stages(3, stream) as stages:
+        stages.begin("reading")
+        assert list(stages.frames(range(4))) == [0, 1, 2, 3]
+        stages.begin("writing")
+    return stream.getvalue()
+
+
+def test_a_terminal_sees_each_stage_once_with_its_time_and_the_frames_time_left():
+    told = run_through(Terminal())
+    assert re.search(r"1/3 reading … \d+\.\d s\n", told)
+    assert re.search(r"2/3 computing frames: 100%.*4/4 \[\d\d:\d\d<\d\d:\d\d", told)
+    assert re.search(r"3/3 writing … \d+\.\d s\n$", told)
+
+
+def test_a_pipe_sees_nothing():
+    assert run_through(io.StringIO()) == ""

@@ -1,0 +1,43 @@
+"""Activities in which instrumented knees were measured, and the peak forces found in them.
+
+Each number is a source's mean of the subjects' peaks, as its abstract states it: of the resultant
+force in five subjects (Kutzner et al. 2010), of the axial force (D'Lima et al. 2007). Single
+subjects and trials lie outside them.
+
+References: Kutzner et al. (2010), J Biomech 43:2164, doi:10.1016/j.jbiomech.2010.03.046; D'Lima et
+al. (2007), J Biomech 40 Suppl 1:S11, doi:10.1016/j.jbiomech.2007.03.004.
+"""
+
+from typing import Literal
+
+Activity = Literal[
+    "walking",
+    "squat",
+    "stair ascent",
+    "stair descent",
+    "standing up",
+    "sitting down",
+    "one-leg stance",
+]
+
+KUTZNER, DLIMA = "Kutzner 2010", "D'Lima 2007"
+PEAKS_BW: dict[str, dict[str, float]] = {
+    "walking": {KUTZNER: 2.61, DLIMA: 2.3},
+    "squat": {KUTZNER: 2.53, DLIMA: 2.1},
+    "stair ascent": {KUTZNER: 3.16, DLIMA: 3.0},
+    "stair descent": {KUTZNER: 3.46},
+    "standing up": {KUTZNER: 2.46, DLIMA: 2.5},
+    "sitting down": {KUTZNER: 2.25},
+    "one-leg stance": {KUTZNER: 2.59},
+}
+"""Activity -> source -> body weights."""
+
+
+def peaks_words(activity: str) -> str:
+    """Return the published mean peaks of an activity in two sentences."""
+    parts = [f"{force:.2f} BW ({source})" for source, force in PEAKS_BW[activity].items()]
+    plural = "peaks" if len(parts) > 1 else "peak"
+    return (
+        f"Grey: mean {plural} of instrumented knees in {activity}, {', '.join(parts)}. "
+        "People differ by more; a peak that lies there proves nothing."
+    )
