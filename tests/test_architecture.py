@@ -37,7 +37,7 @@ DRAWING = {
     "designs": {"contact", "geometry"},
     "wear": {"contact", "geometry", "inputs", "output", "results_folder", "run", "scene"}
     | {"simulation"},
-    "uncertainty": {*KNEE, "columns", "results", "results_folder", "run", "simulation"},
+    "uncertainty": {*KNEE, "columns", "inputs", "results", "results_folder", "run", "simulation"},
     "cohort": {"columns", "geometry", "output", "results", "run", "scene", "simulation"},
     "validation": {"contact", "designs", "geometry", "simulation", "studies"},
 }

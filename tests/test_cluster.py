@@ -98,29 +98,94 @@ def test_a_worker_killed_in_the_middle_changes_nothing():
         np.testing.assert_array_equal(band, there.bands[name])
 
 
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+
+
 @pytest.fixture
-def place(tmp_path):
-    """Give a scheduler with one worker, processes of their own, and its address."""
+def start(tmp_path):
+    """Give what starts a scheduler with one worker, processes of their own, and its address."""
     distributed()
-    file = tmp_path / "scheduler.json"
     python, quiet = [sys.executable, "-m"], ["--no-dashboard"]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
-    command = ["distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", str(file)]
-    scheduler = subprocess.Popen([*python, *command, *quiet])
-    while not file.exists() and scheduler.poll() is None:
-        time.sleep(0.1)
-    address = json.loads(file.read_text())["address"]
-    command = ["distributed.cli.dask_worker", address, "--nthreads", "1"]
-    worker = subprocess.Popen([*python, *command, *quiet], env=environment)
-    yield scheduler, address
-    for process in (worker, scheduler):
+    running = []
+
+    def started():
+        file = tmp_path / f"scheduler{len(running)}.json"
+        command = ["distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", str(file)]
+        scheduler = subprocess.Popen([*python, *command, *quiet])
+        running.append(scheduler)
+        while not file.exists() and scheduler.poll() is None:
+            time.sleep(0.1)
+        address = json.loads(file.read_text())["address"]
+        command = ["distributed.cli.dask_worker", address, "--nthreads", "1"]
+        running.append(subprocess.Popen([*python, *command, *quiet], env=ENVIRONMENT))
+        return scheduler, address
+
+    yield started
+    for process in reversed(running):
         process.kill()
         process.wait()
 
 
 @pytest.mark.slow
-def test_a_scheduler_killed_in_the_middle_is_said_in_one_line(place):
-    scheduler, address = place
+def test_a_scheduler_started_anew_and_a_client_gone_and_back_lose_and_double_nothing(
+    start, tmp_path
+):
+    scene, folder = bodies_alone(uncertainty__ligament_strain=0.02), tmp_path / "out"
+    options = {"samples": 120, "frames": slice(None)}
+    scheduler, address = start()
+
+    def killing(samples, count):
+        for index, one in enumerate(samples):
+            if index == 5:
+                scheduler.kill()
+            yield one
+
+    with pytest.raises(ComputationError, match="go on with --resume"):
+        estimate_uncertainty(scene, **options, dask=address, directory=folder, progress=killing)
+    first = _kept(folder)
+    assert 5 <= first < 120
+    _, address = start()
+    client = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            "from test_uncertainty import bodies_alone\n"
+            "from tkamb.uncertainty.run import estimate_uncertainty\n"
+            "estimate_uncertainty(bodies_alone(uncertainty__ligament_strain=0.02), samples=120, "
+            f"resume=True, directory={str(folder)!r}, dask={address!r})",
+        ],
+        env=ENVIRONMENT,
+    )
+    while _kept(folder) < first + 5 and client.poll() is None:
+        time.sleep(0.02)
+    client.kill()
+    client.wait()
+    second, counted = _kept(folder), []
+    assert first < second < 120
+
+    def counting(samples, count):
+        for one in samples:
+            counted.append(one[0])
+            yield one
+
+    there = estimate_uncertainty(
+        scene, **options, dask=address, directory=folder, resume=True, progress=counting
+    )
+    assert len(set(counted)) == len(counted) == 120 - second
+    here = estimate_uncertainty(scene, **options)
+    for name, band in here.bands.items():
+        np.testing.assert_array_equal(band, there.bands[name])
+    assert main(["verify", str(folder)]) == 0
+
+
+def _kept(folder):
+    """Return how many samples a folder holds."""
+    return len(list(folder.glob(".frames/*.frame")))
+
+
+@pytest.mark.slow
+def test_a_scheduler_killed_in_the_middle_is_said_in_one_line(start):
+    scheduler, address = start()
     found = []
 
     def killing(answers):

@@ -4,6 +4,7 @@ import json
 import shutil
 import tomllib
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,9 @@ from tkamb.cli import main
 from tkamb.cohort.kept import frame_table, write_cohort
 from tkamb.cohort.outcome import Outcome, chosen_map
 from tkamb.cohort.plan import CohortTable, load_cohort
-from tkamb.cohort.report import cohort_html
+from tkamb.cohort.report import _told_apart, cohort_html, draw_groups
 from tkamb.cohort.run import run_cohort
-from tkamb.cohort.statistics import groups_of, spread
+from tkamb.cohort.statistics import Group, groups_of, spread
 from tkamb.errors import InputError
 from tkamb.run.workers import Crew
 from tkamb.simulation import simulate
@@ -148,8 +149,11 @@ def test_the_map_is_that_of_the_frame_asked_for_and_the_page_shows_one_per_group
     np.testing.assert_array_equal(whole.chosen.pressure, one.chosen.pressure)
     cohort = load_cohort(file)
     outcomes = {n: outcome(1.0 + 0.05 * n, 21) for n in range(4)}
+    status = ["ok"] * 18 + ["failed: lost", "residual force is 13 %", "medial condyle lifted"]
+    outcomes[0] = replace(outcomes[0], status=status)
     page = cohort_html(cohort, outcomes, groups_of(cohort, outcomes))
     assert page.count("anterior ↑") == 2  # plain and heavy
+    assert "2 to be read with care" in page.replace("\xa0", " ")
     assert "http" not in page.replace("http-equiv", "")
     table = frame_table(cohort, outcomes, {})
     assert table.num_rows == 4 * 21
@@ -242,3 +246,23 @@ def test_a_full_disk_leaves_no_table_or_the_whole_of_it(file, tmp_path, monkeypa
     assert written == WRITTEN
     for number in range(len(calls)):
         assert write(tmp_path / f"full{number}", number)[1] in (set(), WRITTEN)
+
+
+def test_groups_too_many_for_one_plot_are_divided_by_a_label_and_keep_one_scale():
+    def group(design, contact, height):
+        labels = {"design": design, "contact": contact}
+        bins = {"force_total_BW": np.array([[0.0, height]])}
+        return Group(labels, (0,), 0, "flexion_deg", np.array([0.0, 10.0, 20.0]), bins, bins)
+
+    groups = [group(f"d{k}", model, k + 1.0) for k in range(6) for model in ("one", "two")]
+    plots = _told_apart(groups)
+    assert [words for words, _ in plots] == ["one", "two"]
+    for words, part in plots:
+        assert list(part) == [f"d{k}" for k in range(6)]
+        assert {one.labels["contact"] for one in part.values()} == {words}
+        figure = draw_groups(part, "force_total_BW", 6.0)
+        assert figure.axes[0].get_ylim() == pytest.approx((0.0, 6.3))
+    (whole,) = _told_apart(groups[:8])
+    assert whole[0] == "" and list(whole[1])[:2] == ["d0, one", "d0, two"]
+    lonely = [group(f"d{k}", "one", 1.0) for k in range(11)]  # no label divides them
+    assert [len(part) for _, part in _told_apart(lonely)] == [8, 3]

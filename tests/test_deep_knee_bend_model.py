@@ -248,7 +248,7 @@ def test_ground_reaction_fits_a_whole_body_in_balance(motion):
 
 
 def test_package_finds_the_patella_where_the_script_put_it(motion):
-    from tkamb.equilibrium.mechanics import extensor_frames
+    from tkamb.equilibrium.known import extensor_frames
     from tkamb.scene.case import load_case
 
     case = load_case(load_scene(MODEL / "scene.toml", {"patella.motion": "solved"}))

@@ -16,7 +16,7 @@ from tkamb.body.patella import (
     solve_patella,
 )
 from tkamb.body.patellofemoral import PatellofemoralContact
-from tkamb.equilibrium.mechanics import extensor_frames
+from tkamb.equilibrium.known import extensor_frames
 from tkamb.geometry.frames import Array, inverse, knee_pose, transform
 from tkamb.geometry.surface import Surface
 from tkamb.scene import load_scene
@@ -244,7 +244,7 @@ def test_groove_shares_the_force_and_never_jumps() -> None:
 
 def test_recorded_patella_keeps_its_gap(mechanism: ExtensorMechanism) -> None:
     place = np.array([TROCHLEA + DOME - 0.004 + 1e-3, 0.0, 0.0])
-    state = patella_at(mechanism, knee_at(0.0), place)
+    state = patella_at(mechanism, knee_at(0.0), place, mechanism.contact.at(place))
     assert state.gap == pytest.approx(1e-3, abs=1e-5)
     assert (state.coordinates == place).all()
 

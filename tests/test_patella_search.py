@@ -12,6 +12,7 @@ from tkamb import simulate
 from tkamb.body import extensor
 from tkamb.body.patella import ExtensorMechanism, PatellaStatus, solve_patella
 from tkamb.equilibrium.mechanics import Mechanics
+from tkamb.geometry.frames import knee_pose
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
 
@@ -137,3 +138,21 @@ def test_a_frame_that_loses_the_patella_fails_and_the_run_goes_on(plain, monkeyp
     assert not any(status[k].startswith("failed") for k in others)
     quadriceps = [plain.frame(k).loads.values["muscle_quadriceps"] for k in others]
     assert np.allclose(results["quadriceps_N"][others], quadriceps, atol=0.5)
+
+
+def test_a_sample_finds_the_patella_from_where_it_was_and_keeps_its_rates(plain):
+    """At the same poses the same; a little elsewhere what a search of all rotations finds."""
+    case, frames = plain.case, plain.extensor
+    same = frames.moved(frames._parts, plain.poses, range(2, 5))
+    for k in range(11):
+        np.testing.assert_allclose(same.joints(k), frames.joints(k), rtol=0, atol=1e-6)
+    bent = case.motion.coordinates + np.array([1e-3, 0.0, 0.0, 0.0, 0.0, 0.02])
+    moved = frames.moved(frames._parts, knee_pose(bent), range(2, 5))
+    for k in (2, 4):
+        alone = solve_patella(frames._mechanism, knee_pose(bent)[k])
+        np.testing.assert_allclose(moved.states[k].coordinates, alone.coordinates, atol=1e-6)
+        change = alone.coordinates - frames.states[k].coordinates
+        assert np.abs(change).max() > 1e-4
+        np.testing.assert_allclose(moved.joints(k)[0] - frames.joints(k)[0], change, atol=1e-6)
+        np.testing.assert_array_equal(moved.joints(k)[1:], frames.joints(k)[1:])
+    np.testing.assert_array_equal(moved.joints(6), frames.joints(6))

@@ -1,5 +1,8 @@
 """`tkamb run --workers`: the frames over processes, and the answers of one."""
 
+import functools
+from contextlib import suppress
+
 import numpy as np
 import pytest
 
@@ -7,6 +10,7 @@ from scenes import fast_scene
 from tkamb.cli import main
 from tkamb.columns import KINDS
 from tkamb.results_folder import read_results
+from tkamb.run.workers import Crew, Task
 from tkamb.simulation import simulate
 
 SCENE = fast_scene()
@@ -57,3 +61,16 @@ def test_a_run_of_two_is_resumed_by_one(tmp_path, monkeypatch):
     whole = simulate(SCENE, frames=frames, directory=out, resume=True)
     assert whole.summary["resumed_frames"] == 11 and whole.summary["unfinished_frames"] == 0
     assert np.isfinite(read_results(out)["force_total_BW"]).all()
+
+
+def test_a_team_prepares_before_it_is_asked_and_ends_with_its_block():
+    task, wanted = Task(functools.partial, (max,)), [(n, 10 - n) for n in range(10)]
+    with Crew(2).team(task, len(wanted)) as team:
+        found = dict(team.answers(wanted))
+    assert found == {n: max(n, 10 - n) for n in range(10)}
+    with suppress(RuntimeError), Crew(2).team(task, len(wanted)) as team:
+        assert [process.poll() for process in team.processes] == [None, None]
+        raise RuntimeError
+    assert all(process.poll() is not None for process in team.processes)
+    with Crew(1).team(task, len(wanted)) as team:
+        assert not team.processes and dict(team.answers(wanted)) == found

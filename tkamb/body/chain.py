@@ -64,12 +64,15 @@ class Chain:
         self._columns = [model.joints[model.getJointId(name)].idx_v for name in self.joints]
         self._take(model)
 
-    def changed(self, mass_factor: float, insert_shift: Array) -> "Chain":
+    def changed(
+        self, mass_factor: float, insert_shift: Array, insert_turn: Array | None = None
+    ) -> "Chain":
         """Return the chain with other masses, and the insert elsewhere on the tibia.
 
         Args:
             mass_factor: of every segment's mass; its inertia changes alike.
             insert_shift: (3,) m, in the insert's axes; the femur goes with the insert.
+            insert_turn: (3, 3) rotation about the insert's origin, in its axes; None: none.
         """
         other, model = copy.copy(self), pin.Model(self.model)
         for joint in range(1, model.njoints):
@@ -79,7 +82,8 @@ class Chain:
             )
         base = model.getJointId(KNEE_JOINT_NAMES[0])
         placement = model.jointPlacements[base]
-        model.jointPlacements[base] = placement * pin.SE3(np.eye(3), insert_shift)
+        turn = np.eye(3) if insert_turn is None else insert_turn
+        model.jointPlacements[base] = placement * pin.SE3(turn, insert_shift)
         other._take(model)
         return other
 

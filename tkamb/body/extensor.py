@@ -1,6 +1,7 @@
 """The extensor mechanism over all frames: where the patella is, and its lines of action."""
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -12,7 +13,7 @@ from tkamb.body.knee import Extensor
 from tkamb.body.load import PointForces
 from tkamb.body.muscles import Line, Muscle, PatellarLigament, Wrap, muscle_line, off_femur
 from tkamb.body.patella import ExtensorMechanism, PatellaState, patella_at, solve_patella
-from tkamb.body.patellofemoral import PatellofemoralContact
+from tkamb.body.patellofemoral import PatellarContact, PatellofemoralContact
 from tkamb.body.unknowns import Unknown, muscle_load
 from tkamb.body.wrapping import TautPath, is_inside
 from tkamb.errors import ComputationError, InputError
@@ -67,21 +68,53 @@ class ExtensorFrames:
     def __init__(
         self, parts: ExtensorParts, time: Array, poses: Array, recorded: Array | None, rates: Rates
     ) -> None:
-        self._parts, self._chain = parts, parts.chain
-        self.muscle = muscle_line(parts.muscle, parts.chain, parts.femoral)
-        self.ligament = self._ligament_line()
-        self._check_fixed_ends()
-        self._mechanism = self._build_mechanism()
-        self._recorded = recorded is not None
+        prepared = self._take(parts)
+        self._contacts: tuple[PatellarContact, ...] | None = None
         if recorded is not None:
             self._joints = recorded
+            self._contacts = _recorded_contacts(prepared, recorded[:, 0].tobytes())
             self.states = [
-                patella_at(self._mechanism, pose, coordinates)
-                for pose, coordinates in zip(poses, recorded[:, 0], strict=True)
+                patella_at(self._mechanism, pose, coordinates, contact)
+                for pose, coordinates, contact in zip(
+                    poses, recorded[:, 0], self._contacts, strict=True
+                )
             ]
         else:
             self.states = _solve_all(self._mechanism, poses)
             self._joints = self._differentiate(time, rates)
+
+    def _take(self, parts: ExtensorParts) -> PatellofemoralContact:
+        """Build the lines and the mechanism of parts; return its contact as it was prepared."""
+        self._parts, self._chain = parts, parts.chain
+        self.muscle = muscle_line(parts.muscle, parts.chain, parts.femoral)
+        self.ligament = self._ligament_line()
+        self._check_fixed_ends()
+        self._mechanism, prepared = self._build_mechanism()
+        return prepared
+
+    def moved(self, parts: ExtensorParts, poses: Array, frames: Sequence[int]) -> "ExtensorFrames":
+        """Return the mechanism of a solved patella with its parts or the femur a little elsewhere.
+
+        In the frames asked for the patella is found anew, from where it is here; its joint moves
+        by as much. Rates, and the patella in the other frames, stay.
+
+        Args:
+            parts: the mechanism.
+            poses: (f, 4, 4) pose_femur_in_insert.
+            frames: in which the patella is found anew.
+
+        Raises:
+            InputError: a line starts inside what it wraps.
+        """
+        other = copy.copy(self)
+        other._take(parts)
+        other.states, other._joints = list(self.states), self._joints.copy()
+        for k in frames:
+            near = self.states[k]
+            found = solve_patella(other._mechanism, poses[k], near.coordinates, near.turning)
+            other.states[k] = found
+            other._joints[k, 0] += found.coordinates - near.coordinates
+        return other
 
     def joints(self, k: int) -> Array:
         """Return patella coordinates, rates and accelerations (3, 3) of frame k; NaN if lost."""
@@ -93,8 +126,9 @@ class ExtensorFrames:
         Recorded coordinates are kept; a solved patella is found anew, from `guess` or from
         where it was at the recorded pose.
         """
-        if self._recorded:
-            return patella_at(self._mechanism, pose, self.states[k].coordinates)
+        if self._contacts is not None:
+            recorded = self.states[k].coordinates
+            return patella_at(self._mechanism, pose, recorded, self._contacts[k])
         near = self.states[k] if guess is None else guess
         return solve_patella(self._mechanism, pose, near.coordinates, near.turning)
 
@@ -172,13 +206,15 @@ class ExtensorFrames:
                     "move the point, or set wrap = false",
                 )
 
-    def _build_mechanism(self) -> ExtensorMechanism:
+    def _build_mechanism(self) -> tuple[ExtensorMechanism, PatellofemoralContact]:
+        """Return the mechanism, and its contact as it was prepared."""
         parts, chain = self._parts, self._chain
         stretch = off_femur(self.muscle.points, chain)
         origin, insertion = self.muscle.points[stretch : stretch + 2]
         joint, (proximal, distal) = chain.patella_joint_in_femur, self.ligament.points
-        return ExtensorMechanism(
-            _patellar_contact(parts.femoral, parts.button, joint.tobytes()).unused(),
+        prepared = _patellar_contact(parts.femoral, parts.button, joint.tobytes())
+        mechanism = ExtensorMechanism(
+            prepared.unused(),
             joint,
             transform(chain.link_in(origin.link, "femur"), origin.position),
             transform(chain.link_in(insertion.link, "patella"), insertion.position),
@@ -188,6 +224,7 @@ class ExtensorFrames:
             None if self.muscle.wrap is None else self.muscle.wrap.outline,
             None if self.ligament.wrap is None else self.ligament.wrap.outline,
         )
+        return mechanism, prepared
 
     def _differentiate(self, time: Array, rates: Rates) -> Array:
         """Return the solved coordinates with their rates (f, 3, 3); NaN where it is lost.
@@ -224,6 +261,20 @@ def _patellar_contact(femoral: Surface, button: Surface, joint: bytes) -> Patell
     """
     joint_in_femur = np.frombuffer(joint).reshape(4, 4)
     return PatellofemoralContact(femoral.moved(inverse(joint_in_femur)), button)
+
+
+@lru_cache(maxsize=1)
+def _recorded_contacts(
+    prepared: PatellofemoralContact, coordinates: bytes
+) -> tuple[PatellarContact, ...]:
+    """Return the contact at each recorded place: where the knee is does not change it.
+
+    Args:
+        prepared: the contact; told from others by its identity.
+        coordinates: (f, 3) m and rad, their bytes.
+    """
+    contact = prepared.unused()
+    return tuple(contact.at(place) for place in np.frombuffer(coordinates).reshape(-1, 3))
 
 
 def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]:

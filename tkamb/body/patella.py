@@ -188,11 +188,21 @@ def solve_patella(
 
 
 def patella_at(
-    mechanism: ExtensorMechanism, pose_femur_in_insert: Array, coordinates: Array
+    mechanism: ExtensorMechanism,
+    pose_femur_in_insert: Array,
+    coordinates: Array,
+    contact: PatellarContact,
 ) -> PatellaState:
-    """Return the contact of a patella whose place was recorded; its gap is as recorded."""
+    """Return the state of a patella whose place was recorded; its gap is as recorded.
+
+    Args:
+        mechanism: the extensor mechanism.
+        pose_femur_in_insert: (4, 4).
+        coordinates: (3,) of the patella, m and rad.
+        contact: of the button there.
+    """
     frame = _Frame(mechanism, pose_femur_in_insert)
-    balance = frame.balance(np.asarray(coordinates, float))
+    balance = frame.balance_at(np.asarray(coordinates, float), contact)
     edge = balance.contact.on_edge > 0.5
     return frame.state(balance, PatellaStatus.EDGE if edge else PatellaStatus.OK)
 
@@ -244,9 +254,12 @@ class _Frame:
 
     def balance(self, coordinates: Array) -> _Balance:
         """Return the forces with the force balance met and the moment left over (m)."""
+        return self.balance_at(coordinates, self.mechanism.contact.at(coordinates))
+
+    def balance_at(self, coordinates: Array, contact: PatellarContact) -> _Balance:
+        """Return what `balance` does, with the contact there known already."""
         m = self.mechanism
         here = m.contact.pose(coordinates)
-        contact = m.contact.at(coordinates)
         muscle = path_in_link(
             self.origin, transform(here, m.muscle_insertion), m.femoral_outline, self.femur
         )

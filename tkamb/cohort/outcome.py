@@ -63,6 +63,11 @@ class Outcome:
         """Return how many frames failed."""
         return sum(status.startswith(FAILED) for status in self.status)
 
+    @property
+    def flagged_frames(self) -> int:
+        """Return how many have numbers, and a status that says more than "ok"."""
+        return sum(status != "ok" for status in self.status) - self.failed_frames
+
     def shard(self) -> Shard:
         """Return it as what is kept in a folder."""
         row: dict[str, Any] = {"reason": self.reason, "status": self.status}

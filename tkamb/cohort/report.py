@@ -84,6 +84,8 @@ def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Gro
         Card("Runs computed", f"{len(outcomes) - failed} of {len(outcomes)}", detail, failed > 0)
     ]
     words = "no numbers in those that failed" if lost else "none failed"
+    if flagged := sum(one.flagged_frames for one in outcomes.values()):
+        words += f"; {flagged} to be read with care, see their status in cohort.parquet"
     found.append(Card("Frames computed", f"{frames - lost} of {frames}", words, lost > 0))
     name = "force_total_BW"
     means = {
@@ -118,36 +120,69 @@ def _row(group: Group, names: Sequence[str]) -> list[str]:
 
 
 def _plots(groups: Sequence[Group]) -> Any:
-    """Yield a plot per quantity and axis, of so many groups as one can tell apart."""
+    """Yield plots per quantity and axis, each of so many groups as one can tell apart."""
     for name in _there(groups):
         for axis in dict.fromkeys(group.axis for group in groups):
             own = [group for group in groups if group.axis == axis and name in group.bins]
-            for first in range(0, len(own), AT_ONCE):
-                part, title = own[first : first + AT_ONCE], SHOWN[name][0]
-                svg = svg_text(draw_groups(part, name), f"{name}-{axis}-{first}")
+            highest = max(_highest(group, name) for group in own) if own else 0.0
+            for place, (words, part) in enumerate(_told_apart(own)):
+                title = ", ".join(filter(None, (SHOWN[name][0], words)))
+                svg = svg_text(draw_groups(part, name, highest), f"{name}-{axis}-{place}")
                 yield {"title": title, "unit": SHOWN[name][1], "svg": svg}
 
 
-def draw_groups(groups: Sequence[Group], name: str) -> Figure:
-    """Return the groups' means of a column over the motion, with one standard deviation."""
+def _told_apart(groups: Sequence[Group]) -> list[tuple[str, dict[str, Group]]]:
+    """Return plots: what all groups of one have in common, and name -> group.
+
+    Too many for one plot are divided by the label with the fewest values that makes them few
+    enough, so that what differs in all else stands in one plot; else in their order.
+    """
+    if len(groups) > AT_ONCE:
+        values = {
+            axis: list(dict.fromkeys(group.labels[axis] for group in groups))
+            for axis in groups[0].labels
+        }
+        for axis in sorted(values, key=lambda axis: len(values[axis])):
+            parts = [[g for g in groups if g.labels[axis] == value] for value in values[axis]]
+            if 1 < max(map(len, parts)) <= AT_ONCE:
+                named = [{group.name_without(axis): group for group in part} for part in parts]
+                return list(zip(values[axis], named, strict=True))
+    starts = range(0, len(groups), AT_ONCE)
+    return [("", {group.name: group for group in groups[k : k + AT_ONCE]}) for k in starts]
+
+
+def _highest(group: Group, name: str) -> float:
+    """Return the top of a group's line and shade."""
+    over = spread(group.bins[name])
+    return float(np.nanmax(over.mean + np.nan_to_num(over.sd), initial=0.0))
+
+
+def draw_groups(groups: Mapping[str, Group], name: str, highest: float) -> Figure:
+    """Return the groups' means of a column over the motion, with one standard deviation.
+
+    Args:
+        groups: the legend's name -> group.
+        name: of the column.
+        highest: of all plots beside each other, so that they have one scale.
+    """
     with settings():
         figure = new_figure(5.4, 3.1)
         axes = figure.add_subplot()
-        for group, colour in zip(groups, COLOURS, strict=False):
-            _draw_group(axes, group, name, colour)
-        cycle = groups[0].axis == CYCLE
+        for (label, group), colour in zip(groups.items(), COLOURS, strict=False):
+            _draw_group(axes, group, label, name, colour)
+        cycle = next(iter(groups.values())).axis == CYCLE
         axes.set_xlabel("cycle (%)" if cycle else "flexion (deg)")
         axes.set_ylabel(SHOWN[name][1])
-        axes.set_ylim(bottom=0.0)
-        legend_above(axes, 2 if sum(len(group.name) + 6 for group in groups) > 72 else 4)
+        axes.set_ylim(0.0, 1.05 * highest or None)
+        legend_above(axes, 2 if sum(len(label) + 6 for label in groups) > 72 else 4)
     return figure
 
 
-def _draw_group(axes: Axes, group: Group, name: str, colour: str) -> None:
+def _draw_group(axes: Axes, group: Group, label: str, name: str, colour: str) -> None:
     over, middle = spread(group.bins[name]), 0.5 * (group.edges[:-1] + group.edges[1:])
     there = over.runs > 0  # lines run on over bins that no frame falls into
     middle, mean, sd = middle[there], over.mean[there], over.sd[there]
-    axes.plot(middle, mean, "o-", color=colour, markersize=3, label=group.name)
+    axes.plot(middle, mean, "o-", color=colour, markersize=3, label=label)
     axes.fill_between(middle, mean - sd, mean + sd, color=colour, alpha=0.13, linewidth=0)
 
 

@@ -48,7 +48,12 @@ class Group:
     @property
     def name(self) -> str:
         """Return the labels in one line."""
-        return ", ".join(filter(None, self.labels.values())) or "all runs"
+        return self.name_without("")
+
+    def name_without(self, axis: str) -> str:
+        """Return the labels but one in one line."""
+        named = (label for own, label in self.labels.items() if own != axis)
+        return ", ".join(filter(None, named)) or "all runs"
 
 
 @dataclass(frozen=True, eq=False)

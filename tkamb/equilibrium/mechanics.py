@@ -18,6 +18,7 @@ from tkamb.body.contact_points import (
 )
 from tkamb.body.knee import KneeGeometry, KneeLoads, solve_knee, unsolved
 from tkamb.body.load import PointForces
+from tkamb.equilibrium.known import Known, contact_query, extensor_frames
 from tkamb.errors import ComputationError, InputError, TkambError
 from tkamb.geometry.frames import SIDES, Array, knee_pose, knee_twist
 from tkamb.scene.case import Case
@@ -25,14 +26,11 @@ from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.body.adjustment_effect import AdjustmentEffect
-    from tkamb.body.extensor import ExtensorFrames
     from tkamb.body.ligaments import Ligament
     from tkamb.body.patella import PatellaState
     from tkamb.body.slip import CondyleSlip
     from tkamb.contact.probe import CondyleWrench
-    from tkamb.equilibrium.shared_muscles import SharedMuscles
     from tkamb.geometry.adjustment import Adjustment
-    from tkamb.geometry.closest import ClosestPointQuery
 
 STRAIN_FLEXIONS = (0.0, 60.0, 90.0)
 """deg: where the strains of the ligaments are shown."""
@@ -67,7 +65,7 @@ class Mechanics:
 
     Args:
         case: the scene with its files read.
-        query: of closest points between the case's two surfaces, if there is one already.
+        known: what is known already of a case that this one is a sample of.
 
     Attributes:
         poses: (f, 4, 4) recorded pose_femur_in_insert.
@@ -78,18 +76,19 @@ class Mechanics:
         muscles: those that share the load; None if the quadriceps alone acts.
     """
 
-    def __init__(self, case: Case, query: "ClosestPointQuery | None" = None) -> None:
+    def __init__(self, case: Case, known: Known | None = None) -> None:
         self.case = case
         self.poses = knee_pose(case.motion.coordinates)
         self.friction = case.scene.contact.friction if case.scene.contact else 0.0
-        self.query = query or _contact_query(case)
-        self._check_near()
+        self.query = known.query if known else contact_query(case)
+        if known is None:
+            self._check_near()
         self.extensor = None
         if case.scene.patella:
-            self.extensor = extensor_frames(case, self.poses)
+            self.extensor = extensor_frames(case, self.poses, known)
         self.ligaments, self.strains = self._build_ligaments()
-        self.muscles: SharedMuscles | None = None
-        if case.scene.muscles:
+        self.muscles = known.muscles if known else None
+        if case.scene.muscles and known is None:
             from tkamb.equilibrium.shared_muscles import load_muscles
 
             self.muscles = load_muscles(case)
@@ -317,41 +316,3 @@ class Mechanics:
     def _attachment_links(self) -> set[str]:
         bundles = self.case.ligaments
         return {end.link for bundle in bundles for end in (bundle.proximal, bundle.distal)}
-
-
-def extensor_frames(case: Case, poses: Array) -> "ExtensorFrames":
-    """Return the extensor mechanism of a case with [patella].
-
-    Raises:
-        InputError: no patella was recorded, or see `ExtensorFrames`.
-    """
-    from tkamb.body.extensor import ExtensorFrames, ExtensorParts
-
-    assert case.patellar_ligament is not None and case.scene.patella is not None
-    assert case.femoral is not None and case.patella is not None
-    (muscle,) = case.muscles
-    parts = ExtensorParts(
-        muscle, case.patellar_ligament, case.chain, case.femoral, case.patella, case.insert
-    )
-    motion, recorded = case.motion, None
-    if case.scene.patella.motion == "recorded":
-        if motion.patella is None:
-            raise InputError(
-                "has no patella columns",
-                case.scene.motion.file,
-                "record patella_ap, patella_si, patella_rotation or set [patella] motion = "
-                "'solved'",
-            )
-        assert motion.patella_velocity is not None and motion.patella_acceleration is not None
-        rates = (motion.patella_velocity, motion.patella_acceleration)
-        recorded = np.stack([motion.patella, *rates], axis=1)
-    return ExtensorFrames(parts, motion.time, poses, recorded, case.rates)
-
-
-def _contact_query(case: Case) -> "ClosestPointQuery | None":
-    if case.scene.contact is None:
-        return None
-    from tkamb.geometry.closest import ClosestPointQuery
-
-    assert case.femoral is not None and case.insert is not None
-    return ClosestPointQuery(case.femoral, case.insert, case.split)

@@ -16,7 +16,7 @@ from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose
 from tkamb.muscles.emg import EmgGuide
 from tkamb.muscles.knee_trial import KneeTrial
-from tkamb.muscles.recording import LegRecording, load_knee_trial
+from tkamb.muscles.recording import LegRecording, group_names, load_knee_trial
 from tkamb.muscles.sharing import Sharing
 from tkamb.scene.case import Case
 from tkamb.scene.si import in_si
@@ -41,13 +41,25 @@ class SharedMuscles:
 
     def __init__(self, trial: KneeTrial, left: bool = False) -> None:
         flip = MIRROR if left else np.eye(3)
-        self.trial, self._names = trial, trial.muscles
+        self.trial, self._left, self._names = trial, left, trial.muscles
         self._shank, self._thigh = trial.shank @ flip, trial.thigh @ flip
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
         """Group of muscles -> their names (`tkamb.muscles.leg.muscle_groups`)."""
         return dict(self.trial.groups)
+
+    def changed(self, strength: Array, shank: Array, thigh: Array) -> "SharedMuscles":
+        """Return the muscles with other strengths, and their lines across the knee elsewhere.
+
+        Args:
+            strength: (m,) factors of each muscle's strength.
+            shank: (m, 3) m, shifts of where its line leaves the shank, a right leg's tibia link.
+            thigh: (m, 3) m, of where it reaches the thigh, femur link.
+        """
+        flip = MIRROR if self._left else np.eye(3)
+        trial = self.trial.changed(strength, shank @ flip, thigh @ flip)
+        return SharedMuscles(trial, self._left)
 
     def share(
         self, k: int, geometry: KneeGeometry, friction: float, lifted: frozenset[str]
@@ -193,6 +205,17 @@ def load_muscles(case: Case) -> SharedMuscles:
     if table.emg is not None:
         trial = _guided(case, trial)
     return SharedMuscles(trial, scene.patient.side == "left")
+
+
+def groups_of(case: Case) -> tuple[str, ...]:
+    """Return the names of the groups of the muscles of a case with [muscles].
+
+    Raises:
+        InputError: a model that cannot be used.
+    """
+    table = case.scene.muscles
+    assert table is not None
+    return group_names(table.model, case.scene.patient.side)
 
 
 def _guided(case: Case, trial: KneeTrial) -> KneeTrial:

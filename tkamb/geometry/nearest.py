@@ -27,13 +27,18 @@ class Nearest:
         distance: (n,) m.
         points: (n, 3) m, on the surface.
         faces: (n,) triangle of each.
-        normals: (n, 3) unit normals there, interpolated from the vertices.
+        surface: whose points they are.
     """
 
     distance: Array
     points: Array
     faces: Index
-    normals: Array
+    surface: "NearestPoints"
+
+    @cached_property
+    def normals(self) -> Array:
+        """Unit normals (n, 3) there, interpolated from the vertices."""
+        return self.surface.normals_at(self.points, self.faces)
 
 
 class NearestPoints:
@@ -68,7 +73,7 @@ class NearestPoints:
         apart = np.linalg.norm(feet - points[:, None], axis=2)
         row, best = np.arange(len(points)), apart.argmin(axis=1)
         foot, face = feet[row, best], candidates[row, best]
-        return Nearest(apart[row, best], foot, face, self.normals_at(foot, face))
+        return Nearest(apart[row, best], foot, face, self)
 
     def heights(self, points: Array) -> Array:
         """Return the heights (n,) of points (n, 3) above the surface's nearest sample, m.

@@ -4,6 +4,7 @@ A sagittal section is the cut of a surface with a plane z = const of its frame.
 """
 
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -72,7 +73,14 @@ def sagittal_outline(
     Raises:
         InputError: no surface is cut, or the cuts span no area.
     """
-    z_values = list(z_values)
+    return _outline(tuple(surfaces), tuple(float(z) for z in z_values), offset, below)
+
+
+@lru_cache(maxsize=4)
+def _outline(
+    surfaces: tuple[Surface, ...], z_values: tuple[float, ...], offset: float, below: float
+) -> Array:
+    """Return what `sagittal_outline` does; the last few are kept, for a scene's many samples."""
     cuts = [sagittal_section(surface, z) for surface in surfaces for z in z_values]
     points = _points_below(np.concatenate([*cuts, np.empty((0, 2, 2))]), below - offset)
     if len(points) == 0:
@@ -82,7 +90,9 @@ def sagittal_outline(
             f"sagittal outline of {names}",
             "check the line's points and the mesh's unit and place",
         )
-    return convex_outline(points, offset)
+    outline = convex_outline(points, offset)
+    outline.flags.writeable = False  # shared by all who ask
+    return outline
 
 
 def _points_below(segments: Array, y: float) -> Array:

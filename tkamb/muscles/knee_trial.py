@@ -47,6 +47,31 @@ class KneeTrial:
         """Their names."""
         return tuple(muscle.name for muscle in self.problems.muscles)
 
+    def changed(self, strength: Array, shank: Array, thigh: Array) -> "KneeTrial":
+        """Return the trial with other strengths, and the lines across the knee elsewhere.
+
+        Args:
+            strength: (m,) factors of each muscle's strength, active and passive.
+            shank: (m, 3) m, shifts of where its line leaves the shank.
+            thigh: (m, 3) m, of where it reaches the thigh.
+        """
+        muscles = [
+            replace(muscle, max_isometric_force_N=float(factor) * muscle.max_isometric_force_N)
+            for muscle, factor in zip(self.problems.muscles, strength, strict=True)
+        ]
+        problems = replace(
+            self.problems,
+            muscles=muscles,
+            active=self.problems.active * strength,
+            passive=self.problems.passive * strength,
+        )
+        return replace(
+            self,
+            problems=problems,
+            shank=self.shank + shank[self.crossing],
+            thigh=self.thigh + thigh[self.crossing],
+        )
+
     def solved(
         self, k: int, moment: float, extensor_arm: float, arms: Array
     ) -> tuple[FrameProblems, tuple[Array, Array, float, str]]:

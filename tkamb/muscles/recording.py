@@ -16,7 +16,7 @@ from tkamb.inputs.meshes import load_surface
 from tkamb.inputs.recordings import ForceRecording, Side
 from tkamb.inputs.tables import read_table
 from tkamb.muscles.knee_trial import KneeTrial, knee_trial
-from tkamb.muscles.leg import foot_loads
+from tkamb.muscles.leg import foot_loads, leg_muscles, muscle_groups
 from tkamb.muscles.sharing import Sharing
 from tkamb.opensim.kinematics import Kinematics
 from tkamb.opensim.motion import CoordinateMotion, coordinate_motion, read_coordinates
@@ -79,6 +79,20 @@ def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial
         reaction = load_ground_reaction(source.ground, time, "right")
         loads = foot_loads(model, {source.side: reaction})
     return links, knee_trial(links, motion, loads, source.sharing)
+
+
+def group_names(model: Path, side: Side) -> tuple[str, ...]:
+    """Return the names of the groups of a leg's muscles, see `muscle_groups`.
+
+    Args:
+        model: the .osim file.
+        side: of the leg.
+
+    Raises:
+        InputError: whatever cannot be used.
+    """
+    leg = find_leg(read_osim(model), side)
+    return tuple(muscle_groups(leg, [leg.model.muscles[name] for name in leg_muscles(leg)]))
 
 
 def _motion(source: LegRecording, kinematics: Kinematics, time: Array) -> CoordinateMotion:

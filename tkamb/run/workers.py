@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import IO, Any
 
@@ -79,13 +80,23 @@ class Crew:
         Raises:
             ComputationError: a worker was killed, or the scheduler is gone.
         """
-        if self.dask is not None and wanted:
-            from tkamb.run.cluster import answers_of_cluster
+        with self.team(task, len(wanted)) as team:
+            yield from team.answers(wanted)
 
-            return answers_of_cluster(task, wanted, self.dask, self.workers)
-        if self.workers == 1 or len(wanted) < 2:
-            return _answers_here(task, wanted)
-        return _answers_of_processes(task, wanted, self.workers)
+    @contextmanager
+    def team(self, task: Task, count: int) -> Iterator["Team"]:
+        """Give who answers; processes begin to prepare at once, while the caller does other things.
+
+        Args:
+            task: what every worker prepares.
+            count: of the jobs, at most.
+        """
+        processes = self.dask is None and self.workers > 1 and count > 1
+        team = Team(self, task, min(self.workers, count) if processes else 0)
+        try:
+            yield team
+        finally:
+            team.stop()
 
 
 def _answers_here(task: Task, wanted: Sequence[Numbered]) -> Iterator[Numbered]:
@@ -95,26 +106,59 @@ def _answers_here(task: Task, wanted: Sequence[Numbered]) -> Iterator[Numbered]:
         yield number, work(number, job)
 
 
-def _answers_of_processes(
-    task: Task, wanted: Sequence[Numbered], workers: int
-) -> Iterator[Numbered]:
-    jobs: queue.SimpleQueue[Numbered] = queue.SimpleQueue()
-    answers: queue.SimpleQueue[Numbered | None] = queue.SimpleQueue()
-    for job in wanted:
-        jobs.put(job)
-    processes = [_start() for _ in range(min(workers, len(wanted)))]
-    for process in processes:
-        threading.Thread(target=_attend, args=(process, task, jobs, answers), daemon=True).start()
-    try:
+class Team:
+    """Those of a crew who do the jobs of one task.
+
+    Args:
+        crew: whose.
+        task: what every worker prepares.
+        count: of processes; 0: a cluster's, or this one.
+
+    Attributes:
+        processes: that were started.
+    """
+
+    def __init__(self, crew: Crew, task: Task, count: int) -> None:
+        self._crew, self._task = crew, task
+        self._jobs: queue.SimpleQueue[Numbered | None] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[Numbered | None] = queue.SimpleQueue()
+        self.processes = [_start() for _ in range(count)]
+        for process in self.processes:
+            threading.Thread(
+                target=_attend, args=(process, task, self._jobs, self._answers), daemon=True
+            ).start()
+
+    def answers(self, wanted: Sequence[Numbered]) -> Iterator[Numbered]:
+        """Yield answers with their numbers as they are finished, in any order; see `Crew.answers`.
+
+        Args:
+            wanted: numbers and contents of the jobs.
+
+        Raises:
+            ComputationError: a worker was killed, or the scheduler is gone.
+        """
+        if self._crew.dask is not None and wanted:
+            from tkamb.run.cluster import answers_of_cluster
+
+            yield from answers_of_cluster(self._task, wanted, self._crew.dask, self._crew.workers)
+            return
+        if not self.processes:
+            yield from _answers_here(self._task, wanted)
+            return
+        for job in wanted:
+            self._jobs.put(job)
         for _ in wanted:
-            answer = answers.get()
+            answer = self._answers.get()
             if answer is None:
                 raise ComputationError(
                     ENDED, "--workers", f"is there memory for so many? {KEPT.capitalize()}"
                 )
             yield answer
-    finally:
-        for process in processes:
+
+    def stop(self) -> None:
+        """End the processes."""
+        for process in self.processes:
+            self._jobs.put(None)
             process.kill()
             process.wait()
 
@@ -132,19 +176,15 @@ def _start() -> "subprocess.Popen[bytes]":
 def _attend(
     process: "subprocess.Popen[bytes]",
     task: Task,
-    jobs: "queue.SimpleQueue[Numbered]",
+    jobs: "queue.SimpleQueue[Numbered | None]",
     answers: "queue.SimpleQueue[Numbered | None]",
 ) -> None:
-    """Hand one worker its jobs; None among the answers says that it is gone."""
+    """Hand one worker its jobs until None comes; None among the answers says that it is gone."""
     assert process.stdin is not None and process.stdout is not None
     try:
         # as plain values: the worker's Task is that of the module it was started as
         _send(process.stdin, (task.make, task.arguments))
-        while True:
-            try:
-                job = jobs.get_nowait()
-            except queue.Empty:
-                return
+        while (job := jobs.get()) is not None:
             _send(process.stdin, job)
             answers.put(pickle.load(process.stdout))
     except (OSError, EOFError, ValueError, pickle.UnpicklingError):

@@ -111,8 +111,9 @@ def influences(
 
     Regression: at each frame y = a + sum_i (b_i x_i + c_i x_i²) + e by least squares, x_i the
     errors in standard deviations; the square is for what rises either way, as a force does up
-    either flank. x_i and x_i² of independent normal inputs are uncorrelated, so that
-    b_i² var(x_i) + c_i² var(x_i²) is the input's part of var(y); parts and variances are summed
+    either flank. An input's part of var(y) is cov(b_i x_i + c_i x_i², y), for independent inputs
+    b_i² var(x_i) + c_i² var(x_i²); that of an input which errs with others has what it does with
+    them in it, and may be negative (Li et al. 2010). Parts and variances are summed
     over the frames. What is left is the rest: kinks, interactions and chance. Empty with fewer
     than `SAMPLES_PER_INPUT` samples per input.
 
@@ -121,6 +122,8 @@ def influences(
         inputs: (d,) names.
         values: (n, m, f) NaN where a sample has no number.
         errors: (n, f, d) in standard deviations.
+
+    Reference: Li et al., J Phys Chem A 114:6022 (2010), doi:10.1021/jp9096919.
     """
     found: list[Influence] = []
     for index, result in enumerate(results):
@@ -151,5 +154,5 @@ def _regression(y: Array, errors: Array) -> tuple[Array, Array, float] | None:
     terms: Any = np.hstack([x, x**2])
     terms = terms - terms.mean(axis=0)
     slopes, *_ = np.linalg.lstsq(terms, y - y.mean(), rcond=None)
-    parts = slopes**2 * terms.var(axis=0)
+    parts = slopes * (terms.T @ (y - y.mean())) / len(y)
     return slopes[:count], parts[:count] + parts[count:], variance

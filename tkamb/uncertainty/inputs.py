@@ -1,16 +1,9 @@
-"""Which inputs of a case vary, by how much, and the case with its inputs moved.
+"""Which inputs of a case vary, by how much, and what one sample makes of them."""
 
-All of it happens on what was read, in SI and as a right knee's: no file is read again.
-"""
-
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from tkamb.body.ligaments import Ligament
-from tkamb.body.load import LinkPoint
-from tkamb.body.muscles import Muscle
 from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, Array
 from tkamb.scene.case import Case
@@ -20,6 +13,15 @@ from tkamb.units import DEGREE, MILLIMETRE
 AXES = ("ap", "si", "ml")
 COP_AXES = {"ap": 0, "ml": 2}
 """Of the laboratory."""
+UNITS = {"mm": MILLIMETRE, "deg": DEGREE}
+MARKED = ("shank", "thigh")
+"""Segments whose markers vary."""
+LINE_ENDS = ("origin", "insertion")
+"""Of a line that pulls the patella."""
+GROUP_ENDS = ("shank", "thigh")
+"""Where the lines of a group leave shank and thigh."""
+ACROSS_KNEE = ("thigh to shank", "thigh to foot")
+"""Groups of muscles with lines across the knee, see `tkamb.muscles.leg`."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +47,7 @@ def varied_inputs(case: Case) -> tuple[VariedInput, ...]:
     Raises:
         InputError: none is left.
     """
-    table = uncertainty_of(case)
-    found = [*_pose_inputs(case, table), *_load_inputs(case, table), *_tissue_inputs(case, table)]
-    inputs = tuple(one for one in found if one.deviation > 0)
+    inputs = tuple(one for one in _all_inputs(case) if one.deviation > 0)
     if not inputs:
         raise InputError(
             "no input varies", "[uncertainty]", "give a standard deviation above 0 to one"
@@ -57,10 +57,20 @@ def varied_inputs(case: Case) -> tuple[VariedInput, ...]:
 
 def held_inputs(case: Case) -> tuple[str, ...]:
     """Return the names of inputs that the case has and that do not vary: deviation 0."""
-    table = uncertainty_of(case)
-    found = [*_pose_inputs(case, table), *_load_inputs(case, table), *_tissue_inputs(case, table)]
-    names = (one.name.partition(".")[0] for one in found if one.deviation == 0)
+    held = [one for one in _all_inputs(case) if one.deviation == 0]
+    names = (f"{one.name.partition('.')[0]}{'_angles' * ('.about_' in one.name)}" for one in held)
     return tuple(dict.fromkeys(names))
+
+
+def _all_inputs(case: Case) -> list[VariedInput]:
+    table = uncertainty_of(case)
+    return [
+        *_pose_inputs(case, table),
+        *_marker_inputs(case, table),
+        *_load_inputs(case, table),
+        *_muscle_inputs(case, table),
+        *_tissue_inputs(case, table),
+    ]
 
 
 def uncertainty_of(case: Case) -> UncertaintyTable:
@@ -75,13 +85,25 @@ def pose_names(inputs: tuple[VariedInput, ...]) -> list[str]:
 
 def _pose_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
     contact = case.scene.contact
-    free = contact.released if contact else ()
+    free = (*contact.released, "si") if contact and contact.released else ()  # found with them
     found = []
     for name in KNEE_COORDINATES:
         unit = "mm" if name in AXES else "deg"
         if name not in free:
             found.append(VariedInput(name, getattr(table, f"{name}_{unit}"), unit))
     return found
+
+
+def _marker_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
+    """Return those of each marker on shank and thigh."""
+    markers = case.scene.motion.markers
+    labels = [
+        label
+        for segment in (markers.segment if markers else ())
+        if segment.name in MARKED
+        for label in segment.markers_mm
+    ]
+    return [one for label in labels for one in _places(f"marker.{label}", AXES, table.markers_mm)]
 
 
 def _load_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
@@ -92,9 +114,34 @@ def _load_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
             for axis in COP_AXES:
                 name = f"centre_of_pressure_{axis}"
                 found.append(VariedInput(name, getattr(table, f"{name}_mm"), "mm"))
+            if case.tibia is not None:
+                found += _places("knee_centre", AXES, table.knee_centre_mm)
     if case.scene.contact is not None:
         found.append(VariedInput("friction", table.friction, "1"))
         found.append(VariedInput("young_modulus", table.young_modulus, "relative"))
+        found.append(VariedInput("yield_stress", table.yield_stress, "relative"))
+    return found
+
+
+def _muscle_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
+    """Return strengths by group, and attachments by line or group."""
+    found: list[VariedInput] = []
+    groups: tuple[str, ...] = ()
+    if case.scene.muscles is not None:
+        groups = ("",)
+        if table.muscle_strength > 0 or table.muscle_attachment_mm > 0:
+            from tkamb.equilibrium.shared_muscles import groups_of
+
+            groups = groups_of(case)
+        found = [
+            VariedInput(f"muscle_strength.{group}", table.muscle_strength, "relative")
+            for group in groups
+        ]
+    ends = [(one.name, end) for one in case.muscles for end in LINE_ENDS]
+    ends += [(group, end) for group in groups if group in ACROSS_KNEE for end in GROUP_ENDS]
+    for name, end in ends:
+        place = f"muscle_attachment.{name}.{end}"
+        found += _places(place, AXES, table.muscle_attachment_mm)
     return found
 
 
@@ -106,6 +153,10 @@ def _tissue_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
         strain = f"ligament_strain.{bundle.name}"
         found.append(VariedInput(strain, table.ligament_strain, "1"))
     found += _places("insert_placement", AXES, table.insert_placement_mm)
+    found += [
+        VariedInput(f"insert_placement.about_{axis}", table.insert_placement_deg, "deg")
+        for axis in AXES
+    ]
     if case.ligaments or case.muscles:
         found += _places("femoral_placement", AXES, table.femoral_placement_mm)
     if case.patellar_ligament is not None:
@@ -149,7 +200,7 @@ class Draw:
         """Return an input's error in SI, or 0 if it does not vary; not for poses."""
         for one, value in zip(self.inputs, self.normal, strict=True):
             if one.name == name:
-                return float(value) * one.deviation * (MILLIMETRE if one.unit == "mm" else 1.0)
+                return float(value) * one.deviation * UNITS.get(one.unit, 1.0)
         return 0.0
 
     def factor(self, name: str) -> float:
@@ -164,105 +215,6 @@ class Draw:
         """Return the error (3,) m of a place: ap, si, ml."""
         return np.array([self.error(f"{name}.{axis}") for axis in AXES])
 
-
-def varied_case(case: Case, draw: Draw) -> Case:
-    """Return the case with its inputs moved; rates and accelerations stay as recorded.
-
-    The insert's modulus is not in a case: `tkamb.uncertainty.sample` varies it.
-    """
-    changes: dict[str, Any] = {"motion": _motion(case, draw)}
-    if case.scene.contact is not None:
-        friction = max(0.0, case.scene.contact.friction + draw.error("friction"))
-        contact = case.scene.contact.model_copy(update={"friction": friction})
-        changes["scene"] = case.scene.model_copy(update={"contact": contact})
-    if case.ground is not None:
-        shift = np.zeros(3)
-        for name, axis in COP_AXES.items():
-            shift[axis] = draw.error(f"centre_of_pressure_{name}")
-        factor, ground = draw.factor("ground_reaction"), case.ground
-        changes["ground"] = replace(
-            ground,
-            force=ground.force * factor,
-            moment=ground.moment * factor,
-            point=ground.point + shift,
-        )
-    changes["chain"] = case.chain.changed(
-        draw.factor("segment_mass"), draw.place("insert_placement")
-    )
-    changes["ligaments"] = tuple(_ligament(case, one, draw) for one in case.ligaments)
-    changes["muscles"] = tuple(_muscle(case, one, draw) for one in case.muscles)
-    if case.patellar_ligament is not None:
-        end = case.patellar_ligament.distal
-        moved = LinkPoint(end.link, end.position + draw.place("tuberosity"))
-        changes["patellar_ligament"] = replace(case.patellar_ligament, distal=moved)
-    return replace(case, **changes)
-
-
-def _motion(case: Case, draw: Draw) -> Any:
-    motion, errors = case.motion, draw.standardised()
-    coordinates = motion.coordinates.copy()
-    for i, one in enumerate(draw.inputs):
-        if one.name in KNEE_COORDINATES:
-            scale = one.deviation * (MILLIMETRE if one.unit == "mm" else DEGREE)
-            coordinates[:, KNEE_COORDINATES.index(one.name)] += scale * errors[:, i]
-    patella = motion.patella
-    if patella is not None:
-        patella = patella + np.array([draw.error("dome.ap"), draw.error("dome.si"), 0.0])
-    return replace(motion, coordinates=coordinates, patella=patella)
-
-
-def _ligament(case: Case, bundle: Ligament, draw: Draw) -> Ligament:
-    strain = draw.error(f"ligament_strain.{bundle.name}")
-    return replace(
-        bundle,
-        proximal=_on_femur(case, bundle.proximal, draw),
-        distal=_on_femur(case, bundle.distal, draw),
-        stiffness=bundle.stiffness * draw.factor(f"ligament_stiffness.{bundle.name}"),
-        slack_length=bundle.slack_length / (1.0 + strain),  # one of the two is NaN and stays so
-        reference_strain=bundle.reference_strain + strain,
-    )
-
-
-def _muscle(case: Case, muscle: Muscle, draw: Draw) -> Muscle:
-    return replace(muscle, points=tuple(_on_femur(case, point, draw) for point in muscle.points))
-
-
-def _on_femur(case: Case, end: LinkPoint, draw: Draw) -> LinkPoint:
-    """Return a point moved with the femur, if it is on it."""
-    shift = draw.place("femoral_placement")
-    if not shift.any() or case.chain.carrier(end.link) != "femur":
-        return end
-    turned = case.chain.link_in(end.link, "femur")[:3, :3].T @ shift
-    return LinkPoint(end.link, end.position + turned)
-
-
-def thinnable(case: Case) -> bool:
-    """Say whether a frame needs no other frame of the motion.
-
-    A solved patella is differentiated in time, and a reference strain looks for its pose.
-    """
-    solved = case.scene.patella is not None and case.scene.patella.motion == "solved"
-    return not solved and all(np.isfinite(one.slack_length) for one in case.ligaments)
-
-
-def thinned(case: Case, frames: range) -> Case:
-    """Return the case with these frames of its motion alone."""
-    count, chosen = len(case.motion.time), list(frames)
-
-    def at_frames(recording: Any) -> Any:
-        if recording is None:
-            return None
-        found = {one.name: getattr(recording, one.name) for one in fields(recording)}
-        series = {
-            name: value[chosen]
-            for name, value in found.items()
-            if isinstance(value, np.ndarray) and len(value) == count
-        }
-        return replace(recording, **series)
-
-    return replace(
-        case,
-        motion=at_frames(case.motion),
-        tibia=at_frames(case.tibia),
-        ground=at_frames(case.ground),
-    )
+    def turn(self, name: str) -> Array:
+        """Return the error of a direction as a rotation vector (3,) rad: about ap, si, ml."""
+        return np.array([self.error(f"{name}.about_{axis}") for axis in AXES])

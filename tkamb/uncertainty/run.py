@@ -14,7 +14,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.results import Results
 from tkamb.run.shards import Shard, Shards
-from tkamb.run.workers import Crew, Progress, Task
+from tkamb.run.workers import Crew, Progress, Task, Team
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.case import Case, load_case
 from tkamb.simulation import chosen_frames, simulate
@@ -25,10 +25,11 @@ from tkamb.uncertainty.bands import (
     influences,
     measured_inside,
 )
+from tkamb.uncertainty.correlation import correlation_root
 from tkamb.uncertainty.indices import SobolIndex, sobol_indices
 from tkamb.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
 from tkamb.uncertainty.kept import write_uncertainty
-from tkamb.uncertainty.sample import Sample, Sampler
+from tkamb.uncertainty.sample import BandWorker, Sample
 from tkamb.uncertainty.sampling import Point, crossed_points, normal_samples
 
 SAMPLES = 256
@@ -123,20 +124,35 @@ def estimate_uncertainty(
     case = load_case(scene)
     chosen = chosen_frames(frames, len(case.motion.time))
     inputs = varied_inputs(case)
+    _check_correlation(case, inputs, indices)
     points = _points(method, samples, len(inputs), uncertainty_of(case).seed, indices)
     crossed = samples if indices else 0
     with ExitStack() as stack:
         folder = None
         if directory is not None:
             folder = stack.enter_context(claimed_directory(directory, force))
+        task = Task(BandWorker, (case.scene, chosen))
+        team = stack.enter_context(crew.team(task, len(points)))  # prepares meanwhile
         nominal = simulate(scene, frames=frames, scene_path=scene_path)
-        job = _Job(case, chosen, nominal, inputs, points, crossed, method, crew, progress)
+        job = _Job(case, nominal, inputs, points, crossed, method, team, progress)
         if folder is None:
             return job.run(None)
         identity = nominal.summary["identity"] | {"method of sampling": job.design}
         found = job.run(Shards(folder, identity, resume))
         write_uncertainty(found, folder)
     return found
+
+
+def _check_correlation(case: Case, inputs: Sequence[VariedInput], indices: bool) -> None:
+    """Raise where inputs cannot err together so, or indices are asked of such inputs."""
+    tables = uncertainty_of(case).correlation
+    correlation_root(tables, [one.name for one in inputs])
+    if tables and indices:
+        raise InputError(
+            "Sobol' indices are those of independent inputs",
+            "--indices with [[uncertainty.correlation]]",
+            "leave out one of them; tornado.csv has shares of correlated inputs",
+        )
 
 
 def _points(method: str, samples: int, dimensions: int, seed: int, crossed: bool) -> list[Point]:
@@ -152,13 +168,12 @@ class _Job:
     """The samples of one scene; with `crossed` rows of Saltelli's design, if that is not 0."""
 
     case: Case
-    frames: range
     nominal: Results
     inputs: tuple[VariedInput, ...]
     points: list[Point]
     crossed: int
     method: str
-    crew: Crew
+    team: Team
     progress: Progress
 
     @property
@@ -174,8 +189,7 @@ class _Job:
         count = len(self.points)
         done = _kept(shards, count)
         left = [n for n in range(count) if n not in done]
-        task = Task(Sampler, (self.case.scene, self.frames, names))
-        new = self.crew.answers(task, [(n, self.points[n]) for n in left])
+        new = self.team.answers([(n, (self.points[n], names)) for n in left])
         try:
             for number, sample in self.progress(new, len(left)):
                 done[number] = sample

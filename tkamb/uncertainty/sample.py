@@ -5,14 +5,15 @@ input that varies changes them, but the insert's modulus, for which the contact 
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.equilibrium.frame_contact import FrameContact
+from tkamb.equilibrium.known import Known
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array
@@ -20,17 +21,16 @@ from tkamb.run.status import FAILED, frame_status
 from tkamb.run.tabulate import frame_row
 from tkamb.scene import Scene
 from tkamb.scene.case import Case, load_case
+from tkamb.uncertainty.correlation import correlation_root
 from tkamb.uncertainty.inputs import (
     Draw,
     VariedInput,
     pose_names,
-    thinnable,
-    thinned,
     uncertainty_of,
-    varied_case,
     varied_inputs,
 )
 from tkamb.uncertainty.sampling import Point, noise_of_point
+from tkamb.uncertainty.varied_case import thinnable, thinned, varied_case, varied_muscles
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,27 +57,29 @@ class Sampler:
         names: columns of results.csv that are wanted.
 
     Attributes:
+        names: as given.
         case: as it stands.
         inputs: that vary.
+
+    Raises:
+        TkambError: whatever is wrong with the scene.
     """
 
     def __init__(self, scene: Scene, frames: range, names: Sequence[str]) -> None:
         whole = load_case(scene)
         self._time = whole.motion.time
-        self._chosen, self._names = frames, list(names)
+        self._chosen, self.names = frames, list(names)
         self.case, self._frames = (
             (thinned(whole, frames), range(len(frames))) if thinnable(whole) else (whole, frames)
         )
         self.inputs: tuple[VariedInput, ...] = varied_inputs(self.case)
+        self._root = correlation_root(
+            uncertainty_of(self.case).correlation, [one.name for one in self.inputs]
+        )
         self._split = self.case.split
-
-    @cached_property
-    def _mechanics(self) -> Mechanics:
-        return Mechanics(self.case)
-
-    @cached_property
-    def _side(self) -> ContactSide | None:
-        return ContactSide(self.case, self._mechanics) if self.case.scene.contact else None
+        self._mechanics = Mechanics(self.case)
+        contact = self.case.scene.contact
+        self._side = ContactSide(self.case, self._mechanics) if contact else None
 
     def draw(self, point: Point) -> Draw:
         """Return what the sample at a point makes of the inputs."""
@@ -87,8 +89,10 @@ class Sampler:
         per_frame = noise_of_point(point, range(count), self._time, table.correlation_s, table.seed)
         if len(self.case.motion.time) < len(self._time):
             per_frame = per_frame[list(self._chosen)]
-        share = 1.0 if point.noise_of is None else table.constant_share
-        return Draw(self.inputs, point.normal, per_frame, share)
+        if point.noise_of is None:  # one input at a time: whatever errs with it stays
+            return Draw(self.inputs, point.normal, per_frame, 1.0)
+        noise = per_frame @ self._root[:count, :count].T
+        return Draw(self.inputs, self._root @ point.normal, noise, table.constant_share)
 
     def __call__(self, number: int, point: Point) -> Sample:
         """Return the sample at a point; a frame begins its search at the one before.
@@ -99,11 +103,11 @@ class Sampler:
         """
         draw = self.draw(point)
         errors = draw.standardised()[list(self._frames)]
-        values = np.full((len(self._names), len(self._frames)), np.nan)
+        values = np.full((len(self.names), len(self._frames)), np.nan)
         failed = np.ones(len(self._frames), bool)
         try:
             case = self._varied(draw)
-            mechanics = Mechanics(case, self._mechanics.query)
+            mechanics = Mechanics(case, self._known(draw))
             side = self._contact(case, mechanics, draw)
         except TkambError:  # the moved inputs cannot be used: no frame has a number
             return Sample(values, failed, errors)
@@ -112,8 +116,13 @@ class Sampler:
             row = _frame(case, mechanics, side, k, before)
             failed[column] = row["status"].startswith(FAILED)
             if not failed[column]:
-                values[:, column] = [row.get(name, np.nan) for name in self._names]
+                values[:, column] = [row.get(name, np.nan) for name in self.names]
         return Sample(values, failed, errors)
+
+    def _known(self, draw: Draw) -> Known:
+        nominal = self._mechanics
+        muscles = varied_muscles(nominal.muscles, draw)
+        return Known(nominal.query, muscles, nominal.extensor, self._frames)
 
     def _varied(self, draw: Draw) -> Case:
         case = varied_case(self.case, draw)
@@ -131,6 +140,28 @@ class Sampler:
             stiffer = replace(material, young_modulus=material.young_modulus * factor)
             state = self._side.model.prepare(replace(state.pair, material=stiffer))
         return ContactSide(case, mechanics, state, sensitivity=False)
+
+
+class BandWorker:
+    """Computes samples; prepared before it is known which columns have a band.
+
+    Args:
+        scene: the scene.
+        frames: of the motion.
+    """
+
+    def __init__(self, scene: Scene, frames: range) -> None:
+        self._scene, self._frames = scene, frames
+        self._sampler: Sampler | None = None
+        with suppress(TkambError):  # the run of the scene as it stands says what is wrong
+            self._sampler = Sampler(scene, frames, ())
+
+    def __call__(self, number: int, job: tuple[Point, list[str]]) -> Sample:
+        """Return the sample at a point, with the columns of these names."""
+        point, names = job
+        sampler = self._sampler or Sampler(self._scene, self._frames, names)
+        sampler.names = names
+        return sampler(number, point)
 
 
 def _frame(

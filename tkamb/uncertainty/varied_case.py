@@ -1,0 +1,172 @@
+"""A case with its inputs moved as one sample has them.
+
+All of it happens on what was read, in SI and as a right knee's: no file is read again.
+"""
+
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tkamb.body.ligaments import Ligament
+from tkamb.body.load import LinkPoint
+from tkamb.body.muscles import Muscle
+from tkamb.equilibrium.shared_muscles import SharedMuscles
+from tkamb.geometry.frames import KNEE_COORDINATES
+from tkamb.scene import Scene
+from tkamb.scene.case import Case
+from tkamb.uncertainty.inputs import COP_AXES, GROUP_ENDS, LINE_ENDS, UNITS, Draw
+from tkamb.uncertainty.marker_errors import displaced_by_markers
+
+if TYPE_CHECKING:
+    from tkamb.inputs.ground_reaction import GroundReaction
+    from tkamb.inputs.motion import KneeMotion
+
+
+def varied_case(case: Case, draw: Draw) -> Case:
+    """Return the case with its inputs moved; rates and accelerations stay as recorded.
+
+    The insert's modulus and the shared muscles are not in a case: `tkamb.uncertainty.sample`
+    varies them.
+    """
+    tibia, coordinates = displaced_by_markers(case, draw)
+    moved = replace(case, tibia=tibia, motion=replace(case.motion, coordinates=coordinates))
+    changes: dict[str, Any] = {"motion": _motion(moved, draw), "scene": _scene(case, draw)}
+    if tibia is not None:
+        place = tibia.pose.copy()
+        place[:, :3, 3] += tibia.pose[:, :3, :3] @ draw.place("knee_centre")
+        changes["tibia"] = replace(tibia, pose=place)
+    if case.ground is not None:
+        changes["ground"] = _ground(case.ground, draw)
+    changes["chain"] = case.chain.changed(
+        draw.factor("segment_mass"),
+        draw.place("insert_placement"),
+        Rotation.from_rotvec(draw.turn("insert_placement")).as_matrix(),
+    )
+    changes["ligaments"] = tuple(_ligament(case, one, draw) for one in case.ligaments)
+    changes["muscles"] = tuple(_muscle(case, one, draw) for one in case.muscles)
+    if case.patellar_ligament is not None:
+        end = case.patellar_ligament.distal
+        distal = LinkPoint(end.link, end.position + draw.place("tuberosity"))
+        changes["patellar_ligament"] = replace(case.patellar_ligament, distal=distal)
+    return replace(case, **changes)
+
+
+def _scene(case: Case, draw: Draw) -> Scene:
+    """Return the scene with the numbers that are read from it."""
+    scene = case.scene
+    if scene.contact is None:
+        return scene
+    friction = max(0.0, scene.contact.friction + draw.error("friction"))
+    limit = scene.output.yield_stress_MPa * draw.factor("yield_stress")
+    return scene.model_copy(
+        update={
+            "contact": scene.contact.model_copy(update={"friction": friction}),
+            "output": scene.output.model_copy(update={"yield_stress_MPa": limit}),
+        }
+    )
+
+
+def _ground(ground: "GroundReaction", draw: Draw) -> "GroundReaction":
+    shift = np.zeros(3)
+    for name, axis in COP_AXES.items():
+        shift[axis] = draw.error(f"centre_of_pressure_{name}")
+    factor = draw.factor("ground_reaction")
+    return replace(
+        ground,
+        force=ground.force * factor,
+        moment=ground.moment * factor,
+        point=ground.point + shift,
+    )
+
+
+def _motion(case: Case, draw: Draw) -> "KneeMotion":
+    motion, errors = case.motion, draw.standardised()
+    coordinates = motion.coordinates.copy()
+    for i, one in enumerate(draw.inputs):
+        if one.name in KNEE_COORDINATES:
+            scale = one.deviation * UNITS[one.unit]
+            coordinates[:, KNEE_COORDINATES.index(one.name)] += scale * errors[:, i]
+    patella = motion.patella
+    if patella is not None:
+        patella = patella + np.array([draw.error("dome.ap"), draw.error("dome.si"), 0.0])
+    return replace(motion, coordinates=coordinates, patella=patella)
+
+
+def _ligament(case: Case, bundle: Ligament, draw: Draw) -> Ligament:
+    strain = draw.error(f"ligament_strain.{bundle.name}")
+    return replace(
+        bundle,
+        proximal=_on_femur(case, bundle.proximal, draw),
+        distal=_on_femur(case, bundle.distal, draw),
+        stiffness=bundle.stiffness * draw.factor(f"ligament_stiffness.{bundle.name}"),
+        slack_length=bundle.slack_length / (1.0 + strain),  # one of the two is NaN and stays so
+        reference_strain=bundle.reference_strain + strain,
+    )
+
+
+def _muscle(case: Case, muscle: Muscle, draw: Draw) -> Muscle:
+    points = [_on_femur(case, point, draw) for point in muscle.points]
+    for k, end in zip((0, -1), LINE_ENDS, strict=True):
+        shift = draw.place(f"muscle_attachment.{muscle.name}.{end}")
+        points[k] = LinkPoint(points[k].link, points[k].position + shift)
+    return replace(muscle, points=tuple(points))
+
+
+def varied_muscles(muscles: SharedMuscles | None, draw: Draw) -> SharedMuscles | None:
+    """Return shared muscles with their groups' strengths and attachments moved.
+
+    Their motion and the rows of hip and ankle stay as recorded.
+    """
+    if muscles is None:
+        return None
+    names = muscles.trial.muscles
+    factors, shifts = np.ones(len(names)), np.zeros((len(GROUP_ENDS), len(names), 3))
+    for group, members in muscles.groups.items():
+        own = np.isin(names, members)
+        factors[own] = draw.factor(f"muscle_strength.{group}")
+        for shift, end in zip(shifts, GROUP_ENDS, strict=True):
+            shift[own] = draw.place(f"muscle_attachment.{group}.{end}")
+    return muscles.changed(factors, *shifts)
+
+
+def _on_femur(case: Case, end: LinkPoint, draw: Draw) -> LinkPoint:
+    """Return a point moved with the femur, if it is on it."""
+    shift = draw.place("femoral_placement")
+    if not shift.any() or case.chain.carrier(end.link) != "femur":
+        return end
+    turned = case.chain.link_in(end.link, "femur")[:3, :3].T @ shift
+    return LinkPoint(end.link, end.position + turned)
+
+
+def thinnable(case: Case) -> bool:
+    """Say whether a frame needs no other frame of the motion.
+
+    A solved patella is differentiated in time, and a reference strain looks for its pose.
+    """
+    solved = case.scene.patella is not None and case.scene.patella.motion == "solved"
+    return not solved and all(np.isfinite(one.slack_length) for one in case.ligaments)
+
+
+def thinned(case: Case, frames: range) -> Case:
+    """Return the case with these frames of its motion alone."""
+    count, chosen = len(case.motion.time), list(frames)
+
+    def at_frames(recording: Any) -> Any:
+        if recording is None:
+            return None
+        found = {one.name: getattr(recording, one.name) for one in fields(recording)}
+        series = {
+            name: value[chosen]
+            for name, value in found.items()
+            if isinstance(value, np.ndarray) and len(value) == count
+        }
+        return replace(recording, **series)
+
+    return replace(
+        case,
+        motion=at_frames(case.motion),
+        tibia=at_frames(case.tibia),
+        ground=at_frames(case.ground),
+    )
