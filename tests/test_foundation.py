@@ -14,7 +14,7 @@ from tkamb.contact.foundation import (
 )
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
-from tkamb.contact.pressing import press_by_search
+from tkamb.contact.pressing import LOAD_TOLERANCE, press_by_search, search_load
 from tkamb.contact.result import ContactStatus
 from tkamb.contact.samples import sample_surface
 from tkamb.errors import InputError
@@ -287,3 +287,18 @@ def test_the_slope_is_that_of_the_pressure(law, name):
     ends = [layer_pressure(law, chosen, strain + side * step) for side in (-1, 1)]
     slope = (ends[1] - ends[0]) / (2 * step)
     np.testing.assert_allclose(layer_slope(law, chosen, strain), slope, rtol=1e-5)
+
+
+@pytest.mark.parametrize("power", [1.0, 1.5, 2.0])
+@pytest.mark.parametrize("start", [1e-7, 1e-4, 5e-3])
+def test_the_search_for_a_load_says_how_near_it_came(power, start):
+    """Reactions c d^p: the approach in closed form, and the difference that is left there."""
+
+    def reaction(approach):
+        return 1e9 * approach**power
+
+    found = search_load(reaction, 800.0, start)
+    assert found.approach == pytest.approx((800.0 / 1e9) ** (1 / power), rel=1e-6)
+    assert found.residual == pytest.approx(abs(reaction(found.approach) / 800.0 - 1.0), abs=1e-15)
+    assert found.residual <= LOAD_TOLERANCE
+    assert found.deepest >= found.approach
