@@ -33,6 +33,7 @@ needs_dm = pytest.mark.skipif(
 )
 
 
+@pytest.mark.slow
 @needs_dm
 def test_mirrored_dm_is_the_same_knee(tmp_path):
     """To 0.1 % of each column's size, in stance and swing, muscles and pressure included."""
