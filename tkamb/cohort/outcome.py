@@ -10,6 +10,7 @@ from tkamb.cohort.plan import CohortRun
 from tkamb.columns import KINDS
 from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array
+from tkamb.memory import give_back
 from tkamb.output.metrics import map_rows
 from tkamb.output.panels import lateral_axis_name
 from tkamb.results import Results
@@ -114,6 +115,12 @@ class CohortWorker:
 
     def __call__(self, number: int, run: CohortRun) -> Outcome:
         """Return what a run gives: what `tkamb run` would, or why it cannot."""
+        try:
+            return self._outcome(run)
+        finally:
+            give_back()
+
+    def _outcome(self, run: CohortRun) -> Outcome:
         try:
             results = simulate(run.scene, frames=self._frames, scene_path=run.scene_path)
         except TkambError as error:
