@@ -85,7 +85,8 @@ def give_back() -> None:
     """Return freed memory to the system; nothing where the C library cannot.
 
     glibc keeps what was freed between what is in use: a process that computed one knee after
-    another, each with its own meshes, grew to 2.1 GB by its hundredth and stays at 0.3 GB so.
+    another, each with its own meshes, grew to 2.1 GB by its hundredth. Given back after each,
+    twelve such knees by two processes held 0.3 GB between knees and never more than 0.68 GB.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:

@@ -61,12 +61,14 @@ class ProbedContact:
         known: False where the model is out of range or has not converged.
         tangent: the condyles' stiffness is known,
         exact: and is the tangent, no guide to it.
+        accuracy: share of the contact force to which the model knows it.
     """
 
     condyles: dict[str, CondyleWrench]
     known: bool = True
     tangent: bool = False
     exact: bool = True
+    accuracy: float = 0.0
 
     @property
     def wrench(self) -> Array:

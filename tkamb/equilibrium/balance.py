@@ -28,7 +28,8 @@ import numpy as np
 from tkamb.geometry.frames import Array
 
 FORCE_TOLERANCE = 0.05
-"""N (moments over the lever arm): what may be left of a converged coordinate's force."""
+"""N (moments over the lever arm): what may be left of a converged coordinate's force, or as much
+as the forces are known to."""
 STEP_TOLERANCE = 2e-6
 """m: the Newton step that is left of a converged coordinate."""
 SMALLEST_STIFFNESS = 100.0
@@ -66,11 +67,13 @@ class Trial:
         force: (n,) N, drives each coordinate along its positive direction; NaN if unknown.
         stiffness: (n, n) N/m, -d force / d coordinates; None: by finite differences.
         exact: it is that; else a guide, and what it misses is learnt from step to step.
+        known_to: N, a smaller force is not told from none.
     """
 
     force: Array
     stiffness: Array | None = None
     exact: bool = True
+    known_to: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +134,7 @@ class _Search:
         self._work: list[float] = []
         self.x = start
         first = self._at(start)
-        self.force = first.force
+        self.force, self._known_to = first.force, first.known_to
         self.known = bool(np.isfinite(first.force).all())
         if self.known:
             self._own, self._guide = first.stiffness is not None and first.exact, first.stiffness
@@ -187,7 +190,7 @@ class _Search:
             self._radius = min(2.0 * self._radius, WIDEST_RADIUS)
         if taken:
             self._work.append(work)
-            self.x, self.force = self.x + step, trial.force
+            self.x, self.force, self._known_to = self.x + step, trial.force, trial.known_to
             self._fresh = False
             if trial.stiffness is not None:
                 self._guide, self.stiffness = trial.stiffness, trial.stiffness + self._missing
@@ -226,19 +229,21 @@ class _Search:
         """Correct the stiffness along a step (Broyden 1965, doi:10.2307/2003941).
 
         With guides at both ends it is what their mean misses that is learnt; a step that they do
-        not describe at all (contact was made or lost on the way) teaches nothing: all is forgotten.
+        not describe at all (contact was made or lost on the way) teaches nothing: all is forgotten,
+        unless it has just been looked at by differences.
         """
         expected = self.stiffness @ step
         if self._guide is not None and trial.stiffness is not None:
             expected = expected + 0.5 * (trial.stiffness - self._guide) @ step
         missing = (self.force - trial.force) - expected
         learnt = np.outer(missing, step) / (step @ step)
-        if self._guide is not None and np.linalg.norm(missing) > KNOWN * np.linalg.norm(expected):
+        strange = np.linalg.norm(missing) > KNOWN * np.linalg.norm(expected)
+        if self._guide is not None and strange and not self._fresh:
             learnt = -self._missing
         self._missing, self.stiffness = self._missing + learnt, self.stiffness + learnt
 
     def _converged(self) -> bool:
-        if np.abs(self.force).max() > FORCE_TOLERANCE:
+        if np.abs(self.force).max() > max(FORCE_TOLERANCE, self._known_to):
             return False
         left, values, right = np.linalg.svd(self.stiffness)
         held = values > SMALLEST_STIFFNESS

@@ -70,15 +70,18 @@ class ReleasedForces:
         if not contact.known:
             return Trial(np.full(len(x), np.nan))
         wrench, stiffness = self._with_friction(place, contact)
+        known_to = contact.accuracy * float(np.linalg.norm(wrench[:3]))
         if stiffness is None:
-            return Trial(self._joint.imbalance(place, wrench) / self._scale)
+            force = self._joint.imbalance(place, wrench) / self._scale
+            return Trial(force, known_to=known_to)
         steps = np.zeros((len(x) + 1, 6))
         steps[np.arange(len(x)), self._rows] = TINY / self._scale
         forces = self._joint.imbalance(place + steps, wrench) / self._scale
         change = (forces[:-1] - forces[-1]).T / TINY
         twists = knee_axes(place)[self._rows] / self._scale[:, None]
         gain = self._joint.contact_gain(place) / self._scale[:, None]
-        return Trial(forces[-1], -(change + gain @ stiffness @ twists.T), contact.exact)
+        tangent = -(change + gain @ stiffness @ twists.T)
+        return Trial(forces[-1], tangent, contact.exact, known_to)
 
     def tension_per_wrench(self, contact: "ProbedContact") -> Array | None:
         """Return v (6,): a further wrench dw on the insert adds v . dw to the ligament's tension.

@@ -171,8 +171,9 @@ class CellContact(ContactModel):
 
     def probe(self, state: LatticeState, guess: ContactResult | None = None) -> Probe:
         """Return the probe with stiffness; see `ContactModel`."""
-        kind = LatticeProbe if self.direction == "normal" else Probe
-        return kind(self, state, guess)
+        if self.direction == "vertical":
+            return Probe(self, state, guess)
+        return LatticeProbe(self, state, guess, self.tolerance)
 
     def _solved(
         self,

@@ -16,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from tkamb.contact.lattice.problem import ContactProblem, LatticeState
+from tkamb.contact.pressing import Evaluates
 from tkamb.contact.probe import Probe, ProbedContact, condyle_wrenches
 from tkamb.contact.result import ContactResult, medial_points
 from tkamb.geometry.frames import Array, Index
@@ -31,7 +32,18 @@ class LatticeProbe(Probe):
         model: of the lattice family, nodes pressed along the femoral normal.
         state: what its `prepare` returned.
         guess: an earlier result.
+        accuracy: the model's tolerance, share of the contact force.
     """
+
+    def __init__(
+        self,
+        model: Evaluates,
+        state: LatticeState,
+        guess: ContactResult | None,
+        accuracy: float,
+    ) -> None:
+        super().__init__(model, state, guess)
+        self._accuracy = accuracy
 
     def seen(self, result: ContactResult) -> ProbedContact:
         """Return what a result says of the condyles, with their stiffness."""
@@ -39,7 +51,7 @@ class LatticeProbe(Probe):
         exact = self._state.problem.solid.material.is_linear
         nodes = np.flatnonzero(result.nodal_force.any(axis=1))
         if not len(nodes):
-            return ProbedContact(condyles, tangent=True, exact=exact)
+            return ProbedContact(condyles, tangent=True, exact=exact, accuracy=self._accuracy)
         change = force_changes(self._state, result, nodes)
         points = result.points[nodes]
         medial = medial_points(points, result.pose, self._state.pair.split)
@@ -49,7 +61,7 @@ class LatticeProbe(Probe):
                 moment = np.cross(points[own, :, None], part, axis=1)
                 stiffness = np.vstack([part.sum(axis=0), moment.sum(axis=0)])
                 condyles[side] = replace(condyles[side], stiffness=stiffness)
-        return ProbedContact(condyles, tangent=True, exact=exact)
+        return ProbedContact(condyles, tangent=True, exact=exact, accuracy=self._accuracy)
 
 
 def force_changes(state: LatticeState, result: ContactResult, nodes: Index) -> Array:
