@@ -47,6 +47,20 @@ def test_a_single_front_takes_its_matrix_twice():
     assert found == memory_need.MATRIX_BYTES * 90**2 + 8 * 2 * 90**2
 
 
+def test_the_updates_of_two_fronts_wait_for_the_third():
+    """Two ends of 10 nodes each, apart, and 10 between: at the third front both updates lie."""
+    first, second, between = np.arange(10), np.arange(10, 20), np.arange(20, 30)
+    joined = np.ones((30, 30))
+    joined[:10, 10:20] = joined[10:20, :10] = 0.0
+    tree = Dissection([first, second, between], [2, 2, -1])
+    found = memory_need.factor_memory(tree, sparse.csr_matrix(joined), np.zeros(30, bool), 4)
+    own, update = 60 * 30, 30 * 30
+    last = 4 * 2 * own + 8 * (2 * update + 2 * 30**2)
+    at_second = 4 * own + 8 * (update + 2 * own + update)
+    assert at_second > last
+    assert found == memory_need.MATRIX_BYTES * 9 * joined.sum() + at_second
+
+
 @pytest.mark.parametrize("left", [2e8, 6e7, 1.5e7])
 def test_what_does_not_fit_is_refused_with_what_does(monkeypatch, left):
     bodies = pair(sphere_cap(22e-3), box_insert(0.04, 0.01, 0.06), LINEAR)
