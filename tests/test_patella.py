@@ -13,8 +13,8 @@ from tkamb.body.patella import (
     PatellaState,
     PatellaStatus,
     patella_at,
-    solve_patella,
 )
+from tkamb.body.patella_search import solve_patella
 from tkamb.body.patellofemoral import PatellofemoralContact
 from tkamb.equilibrium.known import extensor_frames
 from tkamb.geometry.frames import Array, inverse, knee_pose, transform
@@ -160,10 +160,10 @@ def test_conditions_hold_and_guess_does_not_matter(mechanism: ExtensorMechanism)
 
 def test_quadriceps_is_shortest_there(mechanism: ExtensorMechanism) -> None:
     """Virtual work: turning the patella with contact and ligament kept lengthens the muscle."""
-    from tkamb.body.patella import _Frame
+    from tkamb.body.patella_search import _Search
 
     state = solve_patella(mechanism, knee_at(25.0))
-    frame = _Frame(mechanism, knee_at(25.0))
+    frame = _Search(mechanism, knee_at(25.0))
     turn = np.deg2rad(4.0)
     lengths = []
     for step in (-turn, 0.0, turn):

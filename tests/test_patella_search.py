@@ -10,7 +10,8 @@ from scenes import MODEL, write_scene
 from test_patella import INSERTION, knee_at, mechanism  # noqa: F401
 from tkamb import simulate
 from tkamb.body import extensor
-from tkamb.body.patella import ExtensorMechanism, PatellaStatus, solve_patella
+from tkamb.body.patella import ExtensorMechanism, PatellaStatus
+from tkamb.body.patella_search import solve_patella
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.frames import knee_pose
 from tkamb.scene import load_scene
@@ -67,7 +68,7 @@ def test_what_is_known_of_a_place_near_by_shortens_the_search_alone(mechanism, m
     near = solve_patella(
         mechanism, knee_at(20.0), solve_patella(mechanism, knee_at(19.0)).coordinates
     )
-    assert near.turning is not None
+    assert near.slopes is not None
     pose, looks = knee_at(20.0 + move), []
     counted = ExtensorMechanism(**vars(mechanism))
     look = counted.contact.at
@@ -75,7 +76,7 @@ def test_what_is_known_of_a_place_near_by_shortens_the_search_alone(mechanism, m
     counted.contact.at = lambda place: looks.append(place) or look(place)
     slow = solve_patella(counted, pose, near.coordinates)
     asked = len(looks)
-    quick = solve_patella(counted, pose, near.coordinates, near.turning)
+    quick = solve_patella(counted, pose, near.coordinates, near.slopes)
     assert quick.coordinates == pytest.approx(slow.coordinates, abs=2e-7)
     assert quick.patellofemoral_ratio == pytest.approx(slow.patellofemoral_ratio, abs=1e-6)
     if move < 1.0:

@@ -12,7 +12,8 @@ from tkamb.body.chain import Chain, ChainState
 from tkamb.body.knee import Extensor
 from tkamb.body.load import PointForces
 from tkamb.body.muscles import Line, Muscle, PatellarLigament, Wrap, muscle_line, off_femur
-from tkamb.body.patella import ExtensorMechanism, PatellaState, patella_at, solve_patella
+from tkamb.body.patella import ExtensorMechanism, PatellaState, patella_at
+from tkamb.body.patella_search import solve_patella
 from tkamb.body.patellofemoral import PatellarContact, PatellofemoralContact
 from tkamb.body.unknowns import Unknown, muscle_load
 from tkamb.body.wrapping import TautPath, is_inside
@@ -111,7 +112,7 @@ class ExtensorFrames:
         other.states, other._joints = list(self.states), self._joints.copy()
         for k in frames:
             near = self.states[k]
-            found = solve_patella(other._mechanism, poses[k], near.coordinates, near.turning)
+            found = solve_patella(other._mechanism, poses[k], near.coordinates, near.slopes)
             other.states[k] = found
             other._joints[k, 0] += found.coordinates - near.coordinates
         return other
@@ -130,7 +131,7 @@ class ExtensorFrames:
             recorded = self.states[k].coordinates
             return patella_at(self._mechanism, pose, recorded, self._contacts[k])
         near = self.states[k] if guess is None else guess
-        return solve_patella(self._mechanism, pose, near.coordinates, near.turning)
+        return solve_patella(self._mechanism, pose, near.coordinates, near.slopes)
 
     def at(
         self, k: int, flexion: float, state: ChainState, patella: PatellaState | None = None
@@ -281,7 +282,7 @@ def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]
     """Solve frame after frame, each from the one before."""
     states: list[PatellaState] = []
     for pose in poses:
-        near = (states[-1].coordinates, states[-1].turning) if states else ()
+        near = (states[-1].coordinates, states[-1].slopes) if states else ()
         states.append(solve_patella(mechanism, pose, *near))
     return states
 
