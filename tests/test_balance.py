@@ -132,6 +132,23 @@ def test_forces_are_balanced_to_what_they_are_known_to(known_to):
     assert end.coordinates == pytest.approx([1e-4], abs=5e-6)
 
 
+def test_a_start_at_rest_with_a_wrong_guide_is_stable():
+    """What was learnt, here nothing, does not name a rest unstable: it is looked at anew."""
+    stiffness = np.diag([2e5, 1e5])
+    end = find_balance(lambda x: Trial(-stiffness @ x, -stiffness, exact=False), np.zeros(2))
+    assert end.status is BalanceStatus.OK
+    assert end.smallest_stiffness == pytest.approx(1e5, rel=1e-6)
+
+
+def test_what_keeps_the_prescribed_coordinates_leaves_no_force_on_them():
+    external = push([30.0, LOAD, -40.0], [2e-3, 0, 5e-3])
+    joint = demand(external, ("adduction", "ap"))
+    place, contact = np.array([1e-3, TOUCH, -0.5e-3, 0.03, 0.002, 0.4]), push([5.0, -800.0, 9.0])
+    left = joint.whole(place, contact, joint.kept(place, contact))
+    assert np.abs(np.delete(left, joint.released)).max() < 1e-10
+    assert left[list(joint.released)] == pytest.approx(joint.imbalance(place, contact), abs=1e-9)
+
+
 def test_a_start_at_the_rim_of_what_is_known_is_out_of_range():
     """Forces at the start, none beside it: no stiffness by differences."""
     start = np.array([1e-3, 0.0])
@@ -205,6 +222,8 @@ def test_the_foundation_probe_gives_the_wrench_of_evaluate_and_its_tangent(dishe
     assert here.tangent
     assert not slow.tangent
     assert np.allclose(here.wrench, slow.wrench, rtol=1e-12, atol=1e-12)
+    for side, condyle in here.condyles.items():
+        assert condyle.centre == pytest.approx(slow.condyles[side].centre, abs=1e-12)
     axes = knee_axes(place)
     tangent = sum(c.stiffness for c in here.condyles.values()) @ axes.T
     for i, size in enumerate(np.array([1, 1, 1, 40, 40, 40]) * 1e-6):

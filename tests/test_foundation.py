@@ -97,6 +97,11 @@ def test_the_bed_lies_on_the_mesh_with_true_areas_normals_and_thickness():
     outward /= distance[:, None]
     assert np.einsum("ij,ij->i", bed.normals, outward).min() > np.cos(np.radians(1.0))
     assert np.allclose(bed.thickness, bed.points[:, 1])
+    along = bed.points[:, 1] / bed.normals[:, 1]
+    foot = bed.points - along[:, None] * bed.normals
+    onto_bottom = (np.abs(foot[:, [0, 2]]) < 15e-3).all(axis=1)
+    assert onto_bottom.any()
+    assert np.allclose(bed.depth[onto_bottom], along[onto_bottom], atol=1e-9)
     x, z = (g.ravel() for g in np.meshgrid(*2 * [np.linspace(-15e-3, 15e-3, 601)]))
     true = (30e-3) ** 2 * np.mean(radius / np.sqrt(radius**2 - x**2 - z**2))
     assert bed.area.sum() == pytest.approx(true, rel=3e-3)

@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import coo_array
@@ -23,7 +24,7 @@ from tkamb.contact.lattice.meshing.cells import (
     join_springs,
     scaled_jacobians,
 )
-from tkamb.contact.lattice.meshing.columns import interval_ends
+from tkamb.contact.lattice.meshing.columns import _without_narrow_gaps, interval_ends
 from tkamb.contact.lattice.meshing.grid import (
     BOTTOM,
     CONTACT,
@@ -38,6 +39,7 @@ from tkamb.contact.lattice.meshing.walls import inside
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import pose
+from tkamb.geometry.height_field import Intervals
 from tkamb.geometry.nearest import nearest_on_triangles
 from tkamb.geometry.repair import repair
 from tkamb.geometry.surface import Surface
@@ -108,6 +110,16 @@ def test_half_cell_rule_and_thin_intervals():
     single = np.zeros(8, bool)
     single[4] = True
     np.testing.assert_array_equal(ends.single, single)
+
+
+@pytest.mark.parametrize(("begins", "joined"), [(2.4, 1), (2.6, 0), (2.8, 0), (3.4, 0)])
+def test_a_gap_is_closed_where_both_its_ends_fall_on_one_node(begins, joined):
+    """The interval below ends at 2.0, on node 2, the next one at the nearest to where it begins."""
+    low, high = np.array([0.0, begins]), np.array([2.0, 6.0])
+    line = np.zeros(2, int)
+    merged, *_, count = _without_narrow_gaps(Intervals(line, line, low, high, 0), low, high)
+    assert count == joined
+    assert merged.upper.tolist() == ([6.0] if joined else [2.0, 6.0])
 
 
 @pytest.mark.parametrize("noise", [-1e-9, 1e-9])
@@ -225,6 +237,32 @@ def test_a_hole_is_empty_and_its_walls_are_smooth():
     within = (x > -0.004 + 1e-6) & (x < 0.003 - 1e-6) & (z > -0.005 + 1e-6) & (z < 0.0045 - 1e-6)
     assert not within.any()
     assert lattice_volume(lattice) == pytest.approx(volume(surface), rel=0.01)
+
+
+def test_walls_between_the_planes_of_the_grid_have_a_node_in_every_row():
+    """A hole from -4 to 3 and -5.5 to 4.5 mm, of which only one lies on a plane of the grid."""
+    lattice = build_grid(held(solid_hole=(-0.0042, 0.0031, -0.0053, 0.0046)), 1.3e-3)
+    x, z = lattice.nodes[:, 0], lattice.nodes[:, 2]
+    layers = len(np.unique(lattice.index[:, 1]))
+    grid_x, grid_z = np.linspace(-0.02, 0.02, 32), np.linspace(-0.03, 0.03, 47)
+    rows = (
+        ((grid_x > -0.004) & (grid_x < 0.003)).sum(),
+        ((grid_z > -0.0055) & (grid_z < 0.0045)).sum(),
+    )
+    beside = (z > -0.0055) & (z < 0.0045), (x > -0.004) & (x < 0.003)
+    for wall in (-0.004, 0.003):
+        assert ((np.abs(x - wall) < 2e-9) & beside[0]).sum() == rows[1] * layers
+    for wall in (-0.0055, 0.0045):
+        assert ((np.abs(z - wall) < 2e-9) & beside[1]).sum() == rows[0] * layers
+
+
+def test_a_round_wall_keeps_its_volume():
+    """A standing cylinder, of 17 cells across."""
+    mesh = trimesh.creation.cylinder(0.0083, 0.01, sections=256)
+    vertices = np.asarray(mesh.vertices)[:, [1, 2, 0]] + [0.0, 0.005, 0.0]
+    surface = Surface(vertices, np.asarray(mesh.faces), "cylinder")
+    lattice = build_grid(surface, 1e-3)
+    assert lattice_volume(lattice) == pytest.approx(volume(surface), rel=2e-4)
 
 
 def test_shear_is_the_angle_by_which_a_lattice_was_sheared():

@@ -187,6 +187,18 @@ def test_a_button_may_lie_anywhere_on_its_patella(aside: float) -> None:
     assert there.normal == pytest.approx(here.normal, abs=1e-3)
 
 
+def test_the_shift_on_a_slope_is_the_yield_times_its_sine() -> None:
+    """A plane that faces forward and 20 deg to the right: n_z = sin 20 deg everywhere."""
+    slope = np.deg2rad(20.0)
+    wall = trimesh.creation.box([0.02, 0.2, 0.2])
+    wall.apply_translation([-0.01, 0.0, 0.0])
+    wall.apply_transform(trimesh.transformations.rotation_matrix(-slope, [0, 1, 0]))
+    contact = PatellofemoralContact(surface(wall, "wall"), dome(), lateral_yield=0.01)
+    found = contact.at(np.array([DOME / np.cos(slope) - CENTRE[0], 0.0, 0.0]))
+    assert found.shift == pytest.approx(0.01 * np.sin(slope), rel=1e-9)
+    assert found.normal == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)
+
+
 def test_gap_is_the_distance_of_the_closest_points() -> None:
     """Against python-fcl, apart by 0.2-2 mm, dome on cylinder."""
     contact = PatellofemoralContact(cylinder(), dome())
