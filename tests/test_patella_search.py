@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from tkamb import simulate
 from tkamb.body import extensor
 from tkamb.body.patella import ExtensorMechanism, PatellaStatus
 from tkamb.body.patella_search import solve_patella
+from tkamb.equilibrium.known import Known, extensor_frames
 from tkamb.equilibrium.mechanics import Mechanics
+from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_pose
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
@@ -157,3 +160,14 @@ def test_a_sample_finds_the_patella_from_where_it_was_and_keeps_its_rates(plain)
         np.testing.assert_allclose(moved.joints(k)[0] - frames.joints(k)[0], change, atol=1e-6)
         np.testing.assert_array_equal(moved.joints(k)[1:], frames.joints(k)[1:])
     np.testing.assert_array_equal(moved.joints(6), frames.joints(6))
+
+
+def test_a_sample_looks_for_a_solved_patella_from_where_it_is_known(plain):
+    """A recorded one stays as recorded."""
+    known = Known(None, None, SimpleNamespace(moved=lambda *_: "moved"), range(1))
+    poses = knee_pose(plain.case.motion.coordinates)
+    assert extensor_frames(plain.case, poses, known) == "moved"
+    patella = plain.case.scene.patella.model_copy(update={"motion": "recorded"})
+    scene = plain.case.scene.model_copy(update={"patella": patella})
+    with pytest.raises(InputError, match="has no patella columns"):
+        extensor_frames(replace(plain.case, scene=scene), poses, known)
