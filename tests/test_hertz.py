@@ -199,6 +199,23 @@ def test_a_tilted_block_pushes_along_its_normal():
     assert result.approach * np.cos(np.radians(10)) == pytest.approx(depth, rel=0.02)
 
 
+def test_cells_of_a_slope_carry_their_mean_of_the_semi_ellipsoid():
+    """At 25 deg and cells of half the patch; shares of the load against a quadrature in x and z."""
+    slope, size = np.tan(np.radians(25)), 2e-3
+    insert = dished_insert(lambda x, z: 20e-3 + slope * x, spacing=30e-3)
+    model = Hertz(size)
+    state = model.prepare(ContactPair(graded_sphere(RADIUS), insert, LINEAR))
+    result = model.press(state, 500.0, np.eye(4))
+    ticks = ((np.arange(100) + 0.5) / 100 - 0.5) * size
+    dx, dz = (grid.ravel() for grid in np.meshgrid(ticks, ticks))
+    away = result.points - result.medial.centre_of_pressure
+    x, z = away[:, :1] + dx, away[:, 2:] + dz
+    radius = np.sqrt(result.medial.area / np.pi)
+    height = np.sqrt(np.maximum(1 - (x**2 * (1 + slope**2) + z**2) / radius**2, 0)).mean(axis=1)
+    shares = result.pressure / result.pressure.sum()
+    assert shares == pytest.approx(height / height.sum(), abs=2e-3)
+
+
 def test_facets_average_out():
     """Noise of 2 µm on the insert's vertices, 0.5 mm apart, moves the force by under 5 %."""
     clean = dished_insert(lambda x, z: HEIGHT + (x**2 + z**2) / (2 * 60e-3))

@@ -192,14 +192,14 @@ def test_orphans_go_and_are_counted(folder, caplog):
     folder.mkdir(parents=True)
     orphan, young, held = (folder / f".tkamb-{name}.part" for name in ("old", "young", "held"))
     for path in (orphan, young, held):
-        path.write_bytes(bytes(1000))
+        path.write_bytes(bytes(3_000_000))
     for path in (orphan, held):
         os.utime(path, (1e9, 1e9))
     (folder / ".tkamb-link.part").symlink_to(orphan)
     with open(held) as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         cached()
-    assert "1 unfinished file(s) removed" in caplog.text
+    assert "1 unfinished file(s) removed, 3 MB" in caplog.text
     assert not orphan.exists() and young.exists() and held.exists()
 
 

@@ -263,6 +263,10 @@ def test_a_round_wall_keeps_its_volume():
     surface = Surface(vertices, np.asarray(mesh.faces), "cylinder")
     lattice = build_grid(surface, 1e-3)
     assert lattice_volume(lattice) == pytest.approx(volume(surface), rel=2e-4)
+    radius = np.hypot(lattice.nodes[:, 0], lattice.nodes[:, 2])
+    top = (lattice.nodes[:, 1] > 0.01 - 1e-9) & (radius < 0.0083 + 1e-9)
+    assert top.sum() > 200
+    assert (lattice.node_class[top] == CONTACT).all()
 
 
 def test_shear_is_the_angle_by_which_a_lattice_was_sheared():

@@ -13,6 +13,7 @@ from tkamb.body.slip import (
     InsertProfile,
     arc,
     condyle_slip,
+    femoral_arcs,
     forward_sliding,
     roll_slip_motion,
     sliding_velocity,
@@ -26,6 +27,16 @@ from tkamb.scene.case import load_case
 RADIUS, TROUGH, DEPTH = 0.02, 0.05, 0.012
 FRAMES = 61
 FLEXION = np.deg2rad(np.linspace(0.0, 60.0, FRAMES))
+
+
+def test_arcs_of_a_turned_femur_are_their_part_in_the_insert_s_sagittal_plane() -> None:
+    """A sphere flexed in steps of 20 deg, axially turned by 40 deg all the while: R dθ cos 40°."""
+    coordinates = np.zeros((5, 6))
+    coordinates[:, 1], coordinates[:, 3] = RADIUS, np.deg2rad(40.0)
+    coordinates[:, 5] = np.deg2rad(20.0) * np.arange(5)
+    arcs = femoral_arcs(np.zeros((5, 3)), knee_pose(coordinates))
+    assert np.abs(arcs) == pytest.approx(RADIUS * np.deg2rad(20.0) * np.cos(np.deg2rad(40.0)))
+    assert np.ptp(arcs) < 1e-12
 
 
 def cylinder() -> Surface:
