@@ -1,5 +1,7 @@
 """The pipeline on the shipped knee bend: what the numbers must obey, whoever made them."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -15,8 +17,15 @@ CLOCKS = {"body_seconds", "query_seconds", "contact_seconds"}
 
 
 @pytest.fixture(scope="module")
-def bend():
-    return simulate(fast_scene(), frames=EVERY_TENTH)
+def timed_bend():
+    start = time.perf_counter()
+    results = simulate(fast_scene(), frames=EVERY_TENTH)
+    return results, time.perf_counter() - start
+
+
+@pytest.fixture(scope="module")
+def bend(timed_bend):
+    return timed_bend[0]
 
 
 def test_every_frame_has_numbers(bend):
@@ -24,6 +33,13 @@ def test_every_frame_has_numbers(bend):
     assert not any(status.startswith("failed") for status in bend.status)
     for name in ("force_total_N", "quadriceps_N", "patellofemoral_N", "medial_area_mm2"):
         assert np.isfinite(bend[name]).all(), name
+
+
+def test_the_parts_of_the_time_are_parts_of_the_whole(timed_bend):
+    results, seconds = timed_bend
+    parts = np.stack([results[name] for name in sorted(CLOCKS)])
+    assert (parts > 0.0).all()
+    assert parts.sum() < seconds
 
 
 def test_forces_go_the_way_of_the_source(bend):
