@@ -162,6 +162,8 @@ def test_two_condyles_share_evenly_and_by_their_depths():
     model = LinearFoundation(1e-3)
     state = model.prepare(ContactPair(two_spheres(), flat_insert(HEIGHT, half_z=28e-3), LINEAR))
     level = model.press(state, 1500.0, np.eye(4))
+    missed = abs(1.0 + level.wrench_on_insert[1] / 1500.0)
+    assert 1e-12 < level.residual == pytest.approx(missed, rel=1e-3)
     assert level.medial.force == pytest.approx(750, rel=1e-6)
     assert level.lateral.force == pytest.approx(750, rel=1e-6)
     assert level.medial.centre_of_pressure == pytest.approx([0, HEIGHT, -12e-3], abs=1e-5)
