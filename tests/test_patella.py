@@ -199,6 +199,28 @@ def test_the_shift_on_a_slope_is_the_yield_times_its_sine() -> None:
     assert found.normal == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)
 
 
+def test_the_point_lies_on_the_line_of_action_of_both_facets() -> None:
+    """A wall across x and one turned by 30 deg, 6 mm higher: the moments about z add up."""
+    size, turns, rises = 0.008, np.deg2rad([0.0, 30.0]), np.array([0.0, 0.006])
+    walls, caps = [], []
+    for turn, rise, side in zip(turns, rises, (-0.01, 0.01), strict=True):
+        wall = trimesh.creation.box([0.02, 0.04, 0.016])
+        wall.apply_translation([-0.01 - size, 0.0, 0.0])
+        wall.apply_transform(trimesh.transformations.rotation_matrix(turn, [0, 0, 1]))
+        cap = trimesh.creation.icosphere(subdivisions=5, radius=size)
+        walls.append(wall.apply_translation([0.0, rise, side]))
+        caps.append(cap.apply_translation([0.0, rise, side]))
+    femoral, button = (surface(trimesh.util.concatenate(m), "pair") for m in (walls, caps))
+    found = PatellofemoralContact(femoral, button).at(np.zeros(3))
+    share = np.array([found.share_left, 1.0 - found.share_left])
+    assert share.min() > 0.05
+    force = share @ np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    moment = -share @ (rises * np.cos(turns))
+    assert found.normal[:2] == pytest.approx(force / np.linalg.norm(force), abs=1e-9)
+    arm = found.point[0] * found.normal[1] - found.point[1] * found.normal[0]
+    assert arm == pytest.approx(moment / np.linalg.norm(force), abs=3e-5)
+
+
 def test_gap_is_the_distance_of_the_closest_points() -> None:
     """Against python-fcl, apart by 0.2-2 mm, dome on cylinder."""
     contact = PatellofemoralContact(cylinder(), dome())
