@@ -149,6 +149,14 @@ def test_what_keeps_the_prescribed_coordinates_leaves_no_force_on_them():
     assert left[list(joint.released)] == pytest.approx(joint.imbalance(place, contact), abs=1e-9)
 
 
+def test_the_contact_s_gain_is_the_slope_of_the_imbalance():
+    joint = demand(push([30.0, LOAD, -40.0], [2e-3, 0, 5e-3]), ("adduction", "ap"))
+    place, contact = np.array([1e-3, TOUCH, -0.5e-3, 0.03, 0.002, 0.4]), push([5.0, -800.0, 9.0])
+    steps = np.stack([joint.imbalance(place, contact + unit) for unit in np.eye(6)], axis=1)
+    change = steps - joint.imbalance(place, contact)[:, None]
+    assert joint.contact_gain(place) == pytest.approx(change, abs=1e-9)
+
+
 def test_a_start_at_the_rim_of_what_is_known_is_out_of_range():
     """Forces at the start, none beside it: no stiffness by differences."""
     start = np.array([1e-3, 0.0])

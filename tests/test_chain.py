@@ -218,3 +218,13 @@ def test_insert_frame_is_the_origin_of_knee_ap():
     wanted = Rotation.from_euler("xyz", [0, 0.02, 0.05]).as_matrix()
     np.testing.assert_allclose(chain.insert_in_tibia[:3, :3], wanted, atol=1e-12)
     np.testing.assert_allclose(chain.insert_in_tibia[:3, 3], [-0.005, 0.39, 0.002], atol=1e-12)
+
+
+def test_the_patella_s_joint_is_where_it_stands_at_zero():
+    chain = leg()
+    motion = random_motion(chain, np.random.default_rng(3))
+    motion.joints[0, 6:] = 0.0
+    state = chain.at(motion)
+    stands = inverse(state.pose("femur")) @ state.pose("patella")
+    np.testing.assert_allclose(chain.patella_joint_in_femur, stands, atol=1e-12)
+    assert stands[2, 3] == pytest.approx(1e-3)

@@ -171,3 +171,17 @@ def test_a_sample_looks_for_a_solved_patella_from_where_it_is_known(plain):
     scene = plain.case.scene.model_copy(update={"patella": patella})
     with pytest.raises(InputError, match="has no patella columns"):
         extensor_frames(replace(plain.case, scene=scene), poses, known)
+
+
+def test_the_moments_of_three_lines_on_the_patella_add_up_to_nothing(plain):
+    """About the femur's z, per unit tension: quadriceps, patellar ligament, contact."""
+    for k in (3, 9):
+        state, patella = plain.geometry(k).state, plain.extensor.states[k]
+        muscle, ligament = plain.extensor.paths(state)
+        hold = patella.ligament_ratio * ligament.start_direction
+        press = patella.patellofemoral_ratio * patella.contact_normal
+        points = np.stack([muscle.points[-1], ligament.points[0], patella.contact_point])
+        forces = np.stack([-muscle.end_direction, hold, press])
+        moments = np.cross(points - state.pose("femur")[:3, 3], forces) @ state.pose("femur")[:3, 2]
+        assert np.abs(moments).min() > 1e-4
+        assert moments.sum() == pytest.approx(0.0, abs=1e-6)
