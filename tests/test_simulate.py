@@ -1,6 +1,7 @@
 """The pipeline on the shipped knee bend: what the numbers must obey, whoever made them."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import pytest
 from scenes import fast_scene, write_scene
 from tkamb import load_scene, simulate
 from tkamb.columns import COLUMNS
+from tkamb.contact.foundation import ElasticFoundation
+from tkamb.contact.result import ContactStatus
 from tkamb.errors import InputError
 
 EVERY_TENTH = slice(0, 101, 10)
@@ -123,3 +126,15 @@ def test_body_weight_scales_everything_but_geometry(tmp_path):
 def test_frames_outside_the_motion_are_refused(frames):
     with pytest.raises(InputError, match="not in the motion"):
         simulate(fast_scene(), frames=frames)
+
+
+def test_a_frame_whose_contact_is_out_of_range_fails_and_says_so(monkeypatch):
+    press = ElasticFoundation.press
+
+    def losing(self, *arguments):
+        return replace(press(self, *arguments), status=ContactStatus.OUT_OF_RANGE)
+
+    monkeypatch.setattr(ElasticFoundation, "press", losing)
+    results = simulate(fast_scene(), contact="foundation", frames=slice(40, 41))
+    assert results.status[0].startswith("failed: contact out of range")
+    assert np.isnan(results["medial_peak_pressure_MPa"]).all()
