@@ -36,6 +36,12 @@ def gait():
     return make_run("gait")
 
 
+@pytest.fixture
+def unwritten(monkeypatch):
+    """Pages whose plots are drawn but not written as SVG, which takes the time."""
+    monkeypatch.setattr("tkamb.output.report.svg_text", lambda *_: "<svg></svg>")
+
+
 @pytest.fixture(scope="module")
 def page(bend):
     return report_html(bend)
@@ -178,7 +184,9 @@ def test_residuals_are_relative_to_the_superior_inferior_force(bend):
     assert np.allclose(drawn["residual_sensitivity_N"].values, sensitivity)
 
 
-def test_the_known_error_stands_beside_pressure_and_area_in_colour_where_it_is_large(bend):
+def test_the_known_error_stands_beside_pressure_and_area_in_colour_where_it_is_large(
+    bend, unwritten
+):
     small = {"approach": 0.3, "force": 0.2, "mean_pressure": 0.02, "peak_pressure": 0.04}
     for area, coloured in ((0.03, False), (0.11, True), (None, False)):
         said = "not measured" if area is None else small | {"area": area, "cases": 4}
@@ -314,7 +322,7 @@ def test_single_frame_and_still_motion_are_drawn():
         assert Checker(report_html(Results(still, one.summary, one.maps))).open == []
 
 
-def test_words_of_the_user_cannot_break_the_page(bend):
+def test_words_of_the_user_cannot_break_the_page(bend, unwritten):
     summary = {**bend.summary, "title": "</script><b>", "notes": ["<img src=x>"]}
     run = Results({**bend.columns, "status": ["</script>"] * len(bend)}, summary, None)
     found = Checker(report_html(run))
@@ -335,7 +343,7 @@ def test_cursor_data_are_the_columns(bend, page):
     assert np.allclose(total["values"], bend["force_total_BW"], rtol=1e-4)
 
 
-def test_missing_mass_and_unwritable_folder_are_one_line(bend, tmp_path):
+def test_missing_mass_and_unwritable_folder_are_one_line(bend, unwritten, tmp_path):
     run = Results(bend.columns, {**bend.summary, "body_mass_kg": None}, None)
     with pytest.raises(InputError, match="body_mass_kg"):
         report_html(run)
