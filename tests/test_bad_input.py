@@ -224,3 +224,8 @@ def test_set_overrides_a_key_and_checks_it(tmp_path, capfd):
         "contact.fricton=0.1",
     )
     assert "unknown key 'contact.fricton'" in line
+
+
+@pytest.mark.parametrize("command", ["new", "wear"])
+def test_a_name_longer_than_a_folder_holds_is_one_line(capfd, command):
+    assert "File name too long" in refused(capfd, command, "n" * 300)

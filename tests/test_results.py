@@ -197,3 +197,18 @@ def test_documentation_lists_every_column():
     page = ROOT / "docs" / "results.md"
     advice = "run scripts/make_results_page"
     assert columns_as_markdown() in page.read_text(encoding="utf-8"), advice
+
+
+@pytest.mark.parametrize("error", [OSError, RuntimeError, KeyError])
+def test_whatever_h5py_says_of_a_damaged_file_is_one_line(tmp_path, monkeypatch, error):
+    """Its objects raise other errors than its files do: a flipped bit may hit either."""
+    write_maps(make_run("bend", frames=3).maps, tmp_path / "contact.h5")
+
+    def broken(*_):
+        raise error("bad object header")
+
+    monkeypatch.setattr(h5py.Group, "__contains__", broken)
+    with pytest.raises(
+        InputError, match=r"contact.h5: cannot be read as HDF5 \(bad object header\)"
+    ):
+        read_maps(tmp_path / "contact.h5")

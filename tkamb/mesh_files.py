@@ -1,5 +1,6 @@
 """Files made from a mesh: the lattice of an insert, and one of several bodies."""
 
+import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -107,7 +108,7 @@ def write_body(path: str | Path, number: int, out: str | Path) -> str:
     out = Path(out)
     if out.suffix.lower() not in BODY_FORMATS:
         raise InputError(f"is none of {', '.join(BODY_FORMATS)}", out, "name a file that ends so")
-    if out.exists():
+    if os.path.exists(out):
         raise InputError("is there already", out, "give a new file: nothing of yours is replaced")
     mended, scale = mended_mesh(path)
     bodies = separate_bodies(mended.vertices, mended.faces)

@@ -1,5 +1,6 @@
 """All runs of a cohort: over workers, kept as they are finished, then made one table."""
 
+import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -135,7 +136,7 @@ def _parts(directory: Path, part: Part | None, resume: bool) -> Iterator[list[Pa
 
 def _holds_parts_alone(directory: Path) -> bool:
     """Say whether a folder was made by parts of a cohort and holds nothing else."""
-    entries = list(directory.iterdir()) if directory.is_dir() else []
+    entries = list(directory.iterdir()) if os.path.isdir(directory) else []
     named = all(entry.match(SHARD_NAME.format("*", "*")) for entry in entries)
     return bool(entries) and named and all(is_ours(entry) for entry in entries)
 

@@ -218,7 +218,7 @@ class ContactMaps:
         """Units, frame, model, version, scene hash."""
         if not isinstance(self.source, Path):
             return {"units": UNITS, **(self.given_attributes or {})}
-        with _open(self.source) as file:
+        with _opened(self.source) as file:
             return dict(file.attrs)
 
     def __len__(self) -> int:
@@ -254,7 +254,7 @@ class ContactMaps:
     def _array(self, name: str, frames: int | None = None) -> Any:
         if not isinstance(self.source, Path):
             return np.asarray(self.source[name])
-        with _open(self.source) as file:
+        with _opened(self.source) as file:
             if name not in file:
                 raise InputError(f"has no '{name}'", self.source, "is it a contact.h5 of tkamb?")
             return file[name][:frames]
@@ -287,10 +287,16 @@ def write_maps(maps: ContactMaps, path: Path) -> None:
             writer.append(time, *frame, maps.femoral_pose[k])
 
 
-def _open(path: Path) -> Any:
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Have what h5py says of a missing or damaged file in one line."""
     try:
-        return h5py.File(path, "r")
+        with h5py.File(path, "r") as file:
+            yield file
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError("no such file", path) from None
-    except OSError as error:
-        raise InputError(f"cannot be read as HDF5 ({error})", path) from None
+    except (OSError, RuntimeError, KeyError, ValueError) as error:
+        reason = str(error).strip("'\"").splitlines()[0]
+        raise InputError(f"cannot be read as HDF5 ({reason})", path) from None

@@ -19,10 +19,10 @@ def lay_out(directory: Path) -> Path:
         InputError: the folder holds something, or cannot be written.
     """
     directory = Path(directory)
-    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-        mend = "give a new folder: nothing of yours is overwritten"
-        raise InputError("is there already and not empty", directory, mend)
     try:
+        if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+            mend = "give a new folder: nothing of yours is overwritten"
+            raise InputError("is there already and not empty", directory, mend)
         directory.parent.mkdir(parents=True, exist_ok=True)
         with (
             as_file(files("tkamb.starter") / "files") as source,

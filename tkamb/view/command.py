@@ -102,7 +102,7 @@ def _check(options: argparse.Namespace) -> None:
         for name in options.contact:
             contact_class(name)
         for path in options.runs:
-            if path.is_dir():
+            if os.path.isdir(path):
                 raise InputError(
                     "has its own contact model", path, "give the scene to choose another"
                 )

@@ -1,5 +1,6 @@
 """What there is to see: a results folder and its scene, or a scene that is run first."""
 
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,7 +76,7 @@ def open_run(
         InputError: nothing to see there, or the scene is no longer what was run.
     """
     path = Path(path)
-    if path.is_dir():
+    if os.path.isdir(path):
         if contact:
             raise InputError("has its own contact model", path, "give the scene to choose another")
         return _from_folder(path)
@@ -108,7 +109,7 @@ def check_frame(paths: Sequence[Path], frame: int) -> None:
         return
     most = 0
     for path in paths:
-        if path.is_dir():
+        if os.path.isdir(path):
             most = max(most, len(read_results(path)))
         else:
             most = max(most, len(load_case(load_scene(path)).motion.time))

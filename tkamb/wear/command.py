@@ -1,6 +1,7 @@
 """`tkamb wear`: arguments in, exit status out."""
 
 import argparse
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -90,4 +91,4 @@ def _wear(options: argparse.Namespace) -> int:
 
 def _stem(case: Path) -> str:
     place = case.resolve()
-    return place.name if place.is_dir() else place.parent.name
+    return place.name if os.path.isdir(place) else place.parent.name

@@ -1,5 +1,6 @@
 """From a scene, a folder of results or a simulator's profile to what is worn by what."""
 
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -77,10 +78,10 @@ def wear_setup(
         raise InputError(f"{frames} frames", "--frames-per-cycle", "give at least 2")
     path = Path(path)
     motion: CycleMotion | None
-    if path.is_dir() and simulator is None:
+    if os.path.isdir(path) and simulator is None:
         case, motion = _of_results(path)
     else:
-        if path.is_dir():
+        if os.path.isdir(path):
             path = _scene_of(read_results(path).summary, path)
         case = load_case(_with_contact(load_scene(path), contact, resolution_mm, path))
         motion = None if simulator else _of_scene(case.scene, path, frames, progress)
