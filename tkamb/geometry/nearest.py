@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 _MOST_SAMPLES = 150_000
 _CANDIDATES = 8
+FLAT = 1e-14
+"""A triangle whose squared area is less, relative to its edges', has no plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +69,36 @@ class NearestPoints:
         count = min(_CANDIDATES, len(self._faces))
         near = self._tree.query(points, k=count)[1].reshape(len(points), count)
         candidates = self._faces[near]
-        triangles = self.surface.triangles[candidates.reshape(-1)]
-        repeated = np.repeat(points, count, axis=0)
-        feet = nearest_on_triangles(triangles, repeated).reshape(-1, count, 3)
-        apart = np.linalg.norm(feet - points[:, None], axis=2)
-        row, best = np.arange(len(points)), apart.argmin(axis=1)
-        foot, face = feet[row, best], candidates[row, best]
-        return Nearest(apart[row, best], foot, face, self)
+        best = self._squared_distances(points, candidates).argmin(axis=1)
+        faces = candidates[np.arange(len(points)), best]
+        feet = nearest_on_triangles(self.surface.triangles[faces], points)
+        return Nearest(np.linalg.norm(feet - points, axis=1), feet, faces, self)
+
+    @cached_property
+    def _edges(self) -> tuple[Array, Array, Array, Array]:
+        """First corner (k, 3), the edges from it to the others, and their products (k, 3)."""
+        a, b, c = np.moveaxis(self.surface.triangles, 1, 0)
+        u, v = b - a, c - a
+        return a, u, v, np.stack([_dot(u, u), _dot(u, v), _dot(v, v)], axis=1)
+
+    def _squared_distances(self, points: Array, faces: Index) -> Array:
+        """Return the squared distance (n, m), m², of points (n, 3) to triangles (n, m).
+
+        By the products of w, from the first corner to the point, and the edges u and v: where
+        the foot on the plane lies outside, the least of the distances to the three edges.
+        """
+        corner, u, v, products = self._edges
+        uu, uv, vv = np.moveaxis(products[faces], -1, 0)
+        w = points[:, None] - corner[faces]
+        wu, wv = np.einsum("ijk,ijk->ij", w, u[faces]), np.einsum("ijk,ijk->ij", w, v[faces])
+        ww = np.einsum("ijk,ijk->ij", w, w)
+        area = uu * vv - uv * uv
+        area = np.where(area > FLAT * uu * vv, area, np.nan)
+        second, third = (vv * wu - uv * wv) / area, (uu * wv - uv * wu) / area
+        within = (second >= 0) & (third >= 0) & (second + third <= 1)
+        across, length = uu - uv + wv - wu, uu - 2 * uv + vv  # of the edge between the others
+        edges = ww - _gain(wu, uu), ww - _gain(wv, vv), ww - 2 * wu + uu - _gain(across, length)
+        return np.where(within, ww - second * wu - third * wv, np.minimum.reduce(edges))
 
     def heights(self, points: Array) -> Array:
         """Return the heights (n,) of points (n, 3) above the surface's nearest sample, m.
@@ -143,9 +168,20 @@ def _plane_weights(triangles: Array, points: Array) -> Array:
     uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)
     wu, wv = _dot(w, u), _dot(w, v)
     scale = uu * vv - uv * uv
-    scale = np.where(scale > 1e-14 * uu * vv, scale, np.nan)
+    scale = np.where(scale > FLAT * uu * vv, scale, np.nan)
     second, third = (vv * wu - uv * wv) / scale, (uu * wv - uv * wu) / scale
     return np.stack([1 - second - third, second, third], axis=1)
+
+
+def _gain(along: Array, length: Array) -> Array:
+    """Return by how much m² the foot on an edge is nearer than its start.
+
+    Args:
+        along: m², product of the edge and the way from its start to the point.
+        length: m², of the edge.
+    """
+    part = np.clip(np.divide(along, length, out=np.zeros_like(along), where=length > 0), 0, 1)
+    return np.asarray(part * (2 * along - part * length))
 
 
 def _dot(a: Array, b: Array) -> Array:
