@@ -258,8 +258,9 @@ class GroundReactionTable(SceneTable):
         default_factory=dict,
         description=(
             "role -> column: time, force_1..3 (N, along the file's x, y, z), "
-            "point_1..3 (centre of pressure), moment_1..3 (N·m, free moment at that point; "
-            "those not named and not in the file are zero)"
+            "point_1..3 (centre of pressure; the one along the vertical may be missing: the "
+            "plate then is at the laboratory's height 0), moment_1..3 (N·m, free moment at that "
+            "point; those not named and not in the file are zero)"
         ),
     )
     length_unit: LengthUnit | None = Field(None, description="of the file; a .c3d states its own")
