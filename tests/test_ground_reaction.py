@@ -167,3 +167,22 @@ def test_refusals(tmp_path):
     file = write(tmp_path / "g.csv", force, point, moment)
     with pytest.raises(InputError, match="covers 0 to 2 s, but"):
         load_ground_reaction(plate(file), AT + 1, "right")
+
+
+def test_a_plate_need_not_say_its_own_height(tmp_path):
+    """Its surface then is the laboratory's height 0; a missing horizontal column is refused."""
+    force, point, moment = step(STAMPS)
+    point[:, 1] = 0.0
+    given = write(tmp_path / "given.csv", force, point, moment)
+    rows = [line.split(",") for line in given.read_text(encoding="utf-8").splitlines()]
+    wanted = load_ground_reaction(plate(given), AT, "right")
+    for role, file in (("point_2", "height.csv"), ("point_3", "side.csv")):
+        kept = [k for k, name in enumerate(rows[0]) if name != role]
+        text = "\n".join(",".join(row[k] for k in kept) for row in rows)
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    found = load_ground_reaction(plate(tmp_path / "height.csv"), AT, "right")
+    np.testing.assert_array_equal(found.point, wanted.point)
+    np.testing.assert_array_equal(found.moment, wanted.moment)
+    assert found.level_assumed and not wanted.level_assumed
+    with pytest.raises(InputError, match="has no column 'point_3'"):
+        load_ground_reaction(plate(tmp_path / "side.csv"), AT, "right")

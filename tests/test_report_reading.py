@@ -102,7 +102,7 @@ def test_colours_that_meet_in_a_plot_are_told_apart(vision):
     together = (
         (style.MEDIAL, style.LATERAL, style.BLACK),
         (style.SUPERIOR, style.ANTERIOR, style.RIGHT, style.BLACK),
-        (style.QUADRICEPS, style.PATELLAR_LIGAMENT, style.PATELLOFEMORAL),
+        sorted(set(style.FORCE_COLOURS.values())),
         style.LIST,
     )
     for group in together:
@@ -133,6 +133,23 @@ def test_one_colour_has_one_meaning_over_all_plots(bend):
     assert meanings[style.LATERAL] == {"lateral"}
     assert meanings[style.SUPERIOR] == {"superior", "superior–inferior", "axial", "axial rotation"}
     assert not {style.MEDIAL, style.LATERAL, style.SUPERIOR} & {*style.LIST[1:], style.BLACK}
+
+
+def test_an_arrow_has_the_colour_of_its_curve(bend):
+    curves = {
+        line.label.split(",")[0]: line.colour
+        for panel in panels(bend)
+        if panel.name in ("forces", "condyles", "extensor")
+        for line in panel.lines
+    }
+    drawn = style.FORCE_COLOURS
+    assert drawn["medial condyle"] == curves["medial"]
+    assert drawn["lateral condyle"] == curves["lateral"]
+    assert drawn["knee"] == curves["total"]
+    for name in ("quadriceps", "patellar ligament", "patellofemoral"):
+        assert drawn[name] == curves[name]
+    colours = [colour for name, colour in drawn.items() if name != "knee"]
+    assert len(set(colours)) == len(colours)
 
 
 def test_what_may_be_concluded_follows_the_run(bend, gait):

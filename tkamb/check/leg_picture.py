@@ -22,12 +22,13 @@ from tkamb.geometry.frames import Array, transform
 from tkamb.geometry.surface import Surface
 from tkamb.output.style import (
     BLACK,
-    BLUE,
+    FORCE_COLOURS,
     GREEN,
     GREY,
-    PURPLE,
+    LIGAMENT,
+    PATELLAR_LIGAMENT,
+    QUADRICEPS,
     SKY,
-    VERMILLION,
     new_figure,
     settings,
 )  # fmt: skip
@@ -42,7 +43,7 @@ MARGIN = 0.08
 LEGEND = (
     f"In the laboratory, y up, grid 0.1 m. Arrow: force of the plate on the foot, 1 BW = "
     f"{METRES_PER_BW:g} m.\nGrey: femoral component, light blue: insert, green: button; "
-    "orange: tendons, pink: ligaments."
+    "dark red: quadriceps, pink: patellar ligament, purple: ligaments."
 )
 
 
@@ -119,10 +120,11 @@ def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str]]:
     found = []
     for bundle in mechanics.ligaments:
         poses = {link: state.pose(link) for link in (bundle.proximal.link, bundle.distal.link)}
-        found.append((np.stack(bundle.ends(poses)), PURPLE))
+        found.append((np.stack(bundle.ends(poses)), LIGAMENT))
     if mechanics.extensor is not None:
         with suppress(ComputationError):  # a patella that is lost there: the run says so
-            found += [(path.points, VERMILLION) for path in mechanics.extensor.paths(state)]
+            quadriceps, ligament = mechanics.extensor.paths(state)
+            found += [(quadriceps.points, QUADRICEPS), (ligament.points, PATELLAR_LIGAMENT)]
     return found
 
 
@@ -199,7 +201,13 @@ def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
         axes.plot(*view.page(points).T, color=colour, linewidth=1.3)
     if one.force is not None and one.loaded:
         tip = one.point + one.force / weight * METRES_PER_BW
-        arrow = {"arrowstyle": "-|>", "color": BLUE, "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0}
+        arrow = {
+            "arrowstyle": "-|>",
+            "color": FORCE_COLOURS["ground reaction"],
+            "linewidth": 1.8,
+            "shrinkA": 0,
+            "shrinkB": 0,
+        }
         head, tail = (tuple(view.page(end).tolist()) for end in (tip, one.point))
         axes.annotate("", head, tail, arrowprops=arrow)
         shown += [tip[None], one.point[None]]

@@ -51,6 +51,7 @@ class GroundReaction:
         moment: (f, 3) N·m about that point; vertical while the foot is loaded.
         loaded: (f,) whether the vertical force is at or above `unloaded_N`.
         odd: recorded samples around the frames that lie off their neighbours' curve.
+        level_assumed: no column says the plate's height, so it is the laboratory's 0.
     """
 
     force: Array
@@ -58,6 +59,7 @@ class GroundReaction:
     moment: Array
     loaded: np.ndarray
     odd: tuple[OddSample, ...] = ()
+    level_assumed: bool = False
 
 
 def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> GroundReaction:
@@ -107,7 +109,8 @@ def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> Gro
     wrench = np.concatenate([force, np.cross(point, force) + moment], axis=1)
     filtered, _, _ = differentiate_coordinates(stamps, wrench, source.cutoff, time, name=str(path))
     reaction = _at_centre_of_pressure(filtered, level, source.unloaded, time, stamps, point)
-    return replace(reaction, odd=odd)
+    assumed = not from_plates and _upright_point(source) not in {*source.columns, *recorded.columns}
+    return replace(reaction, odd=odd, level_assumed=assumed)
 
 
 def _odd_samples(
@@ -151,6 +154,11 @@ def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
         )
 
 
+def _upright_point(source: ForceRecording) -> str:
+    """Return the role of the centre of pressure's height: a plate need not record its own."""
+    return f"point_{'xyz'.index(source.laboratory_axes.split(',')[1][-1]) + 1}"
+
+
 def _read_columns(source: ForceRecording, recorded: Table) -> tuple[Array, Array, Array]:
     """Return force (N), point (m) and free moment (N·m), each (n, 3), in the laboratory."""
     roles = [f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)]
@@ -159,9 +167,10 @@ def _read_columns(source: ForceRecording, recorded: Table) -> tuple[Array, Array
     columns = []
     for role in roles:
         column = source.columns.get(role, role)
-        if role.startswith("point"):
+        given = role in source.columns or column in recorded.columns
+        if role.startswith("point") and (given or role != _upright_point(source)):
             columns.append(recorded.column(column))  # undefined while unloaded
-        elif role.startswith("force") or role in source.columns or column in recorded.columns:
+        elif role.startswith("force") or given:
             columns.append(recorded.complete_column(column))
         else:
             columns.append(np.zeros_like(columns[0]))

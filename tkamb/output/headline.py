@@ -164,9 +164,9 @@ def _shares(results: "Results") -> Card | None:
     rest = [f"by {name} {text}" for name, text in texts.items() if name != first]
     share = metrics.medial_share(results, "deformation" if "deformation" in texts else first)
     alone = int(((share <= 0) | (share >= 1)).sum())
-    rest += [f"one condyle carries nothing in {alone} frames"] if alone else []
+    rest += [f"one condyle carries nothing in {alone} frame{'s' * (alone > 1)}"] if alone else []
     apart = int((metrics.shares_apart(results) > SHARES_APART).sum())
-    rest += [f"the two contradict each other in {apart} frames"] if apart else []
+    rest += [f"the two contradict each other in {apart} frame{'s' * (apart > 1)}"] if apart else []
     rest += _adduction(results, unknown)
     detail = "; ".join([f"by {first}, the rest lateral", *rest])
     return Card("Medial share of the load", texts[first], detail, bool(alone or apart or unknown))

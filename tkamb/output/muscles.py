@@ -22,6 +22,7 @@ from tkamb.output.panels import Line, Panel
 from tkamb.output.style import (
     BLACK,
     GREY,
+    LIGAMENT,
     LIST,
     QUADRICEPS,
     new_figure,
@@ -93,7 +94,7 @@ def _contributions(results: "Results", side: str) -> Panel:
     total = results[f"{side}_force_equilibrium_N"]
     parts = {EXTERNAL: (EXTERNAL,), LIGAMENTS: (LIGAMENTS,)} | _groups(results)
     labels = {EXTERNAL: "external loads"}
-    shades = {EXTERNAL: GREY, LIGAMENTS: LIST[3]} | colours
+    shades = {EXTERNAL: GREY, LIGAMENTS: LIGAMENT} | colours
     lines = [Line("all", "all", scale * total, BLACK)]
     for k, (part, names) in enumerate(parts.items()):
         own = (EXTENSORS,) if part == "knee extensors" else names

@@ -19,9 +19,22 @@ MEDIAL, LATERAL = BLUE, VERMILLION
 SIDE_COLOURS = {"medial": MEDIAL, "lateral": LATERAL}
 SUPERIOR, ANTERIOR, RIGHT = "#5D3A9B", "#2A9D8F", "#7B8B00"
 """Of forces along the insert axes, and of moments and rotations about them."""
-QUADRICEPS, PATELLAR_LIGAMENT, PATELLOFEMORAL = "#882255", "#CC79A7", "#8C6D1F"
+QUADRICEPS, PATELLAR_LIGAMENT, PATELLOFEMORAL, HIP = "#882255", "#CC79A7", "#664400", "#6666EE"
 LIST = ("#332288", "#A6761D", "#009E73", "#AA4499")
 """Of ligaments and muscles, which are too many: they are told apart within one plot."""
+LIGAMENT = LIST[3]
+"""Of all ligaments together."""
+FORCE_COLOURS = {
+    "ground reaction": BLACK,
+    "hip": HIP,
+    "quadriceps": QUADRICEPS,
+    "patellar ligament": PATELLAR_LIGAMENT,
+    "patellofemoral": PATELLOFEMORAL,
+    "medial condyle": MEDIAL,
+    "lateral condyle": LATERAL,
+    "knee": BLACK,
+}
+"""Of every force that is drawn as an arrow; the plots draw the same force in the same colour."""
 CYCLE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK, GREY)
 PRESSURE_MAP = "viridis"
 

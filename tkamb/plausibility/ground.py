@@ -99,9 +99,10 @@ def foot_questions(case: Case) -> Iterator[Question]:
     forward /= np.maximum(np.linalg.norm(forward, axis=1), 1e-9)[:, None]
     ahead = np.einsum("fi,fi->f", away, forward)
     aside = away[:, 2] * forward[:, 0] - away[:, 0] * forward[:, 2]
+    right = "to the left of" if case.scene.patient.side == "left" else "to the right of"
     places = (
         ("ahead of", ahead, FOOT_FORWARD),
-        ("to the right of", aside, (-FOOT_ASIDE, FOOT_ASIDE)),
+        (right, aside, (-FOOT_ASIDE, FOOT_ASIDE)),
         ("below", -away[:, 1], ANKLE_ABOVE),
     )
     for word, place, (low, high) in places:

@@ -193,6 +193,8 @@ def assumptions(case: Case) -> list[str]:
         sentences.append("The motion is differentiated as given, unfiltered.")
     else:
         sentences.append(f"The motion is low-passed at {scene.motion.cutoff_Hz:g} Hz.")
+    if case.ground is not None and case.ground.level_assumed:
+        sentences.append("The force plate lies at the laboratory's height 0: no column says where.")
     if case.motion.unrecorded:
         sentences.append(
             f"Nobody recorded {', '.join(case.motion.unrecorded)}: they are found, and the rates "

@@ -127,7 +127,7 @@ class MotionTable(SceneTable):
     columns: dict[str, str] = Field(
         default_factory=dict,
         description=(
-            "role -> column name, where it differs from the role. Roles: time, flexion, "
+            "role -> column name, where it differs from the role. Roles: time (s), flexion, "
             "adduction, axial_rotation, ap, si, ml (coordinates); time, rotation_1..3, "
             "translation_1..3 (pose); patella_ap, patella_si, patella_rotation. Coordinates that "
             "[contact] releases need no column"
@@ -204,7 +204,7 @@ class TibiaTable(SceneTable):
     columns: dict[str, str] = Field(
         default_factory=dict,
         description=(
-            "role -> column: time, angle (sagittal; forward lean is positive) | "
+            "role -> column: time (s), angle (sagittal; forward lean is positive) | "
             "time, rotation_1..3, translation_1..3 (pose)"
         ),
     )
@@ -257,9 +257,10 @@ class GroundReactionTable(SceneTable):
     columns: dict[str, str] = Field(
         default_factory=dict,
         description=(
-            "role -> column: time, force_1..3 (N, along the file's x, y, z), "
-            "point_1..3 (centre of pressure), moment_1..3 (N·m, free moment at that point; "
-            "those not named and not in the file are zero)"
+            "role -> column: time (s), force_1..3 (N, along the file's x, y, z), "
+            "point_1..3 (centre of pressure; the one along the vertical may be missing: the "
+            "plate then is at the laboratory's height 0), moment_1..3 (N·m, free moment at that "
+            "point; those not named and not in the file are zero)"
         ),
     )
     length_unit: LengthUnit | None = Field(None, description="of the file; a .c3d states its own")

@@ -45,5 +45,5 @@ def add_new(commands: Any) -> None:
 
 def _new(options: argparse.Namespace) -> int:
     scene = lay_out(options.folder)
-    print(f"written: {scene}\nnext: tkamb run {scene}")
+    print(f"written: {scene}\nnext: tkamb check {scene}")
     return 0

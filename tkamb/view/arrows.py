@@ -8,8 +8,8 @@ import numpy as np
 from tkamb.body.knee import KneeGeometry
 from tkamb.body.load import PointForces
 from tkamb.geometry.frames import Array
+from tkamb.output.style import BLACK, FORCE_COLOURS
 from tkamb.units import MILLIMETRE
-from tkamb.view.colours import BLACK, FORCE
 from tkamb.view.drawing import Arrow, Marker
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def _arrow(
     meaning: str,
 ) -> Arrow:
     points = np.stack([point(one) for one in geometries])
-    return Arrow(name, FORCE[name], points, forces, name == "hip", meaning)
+    return Arrow(name, FORCE_COLOURS[name], points, forces, name == "hip", meaning)
 
 
 def centre_of_pressure(geometry: KneeGeometry) -> Array:
@@ -103,7 +103,7 @@ def _extensor(results: "Results", geometries: Sequence[KneeGeometry]) -> list[Ar
         ends = [_distal_end(one, name) for one in geometries]
         points = np.stack([point for point, _ in ends])
         forces = results[column][:, None] * np.stack([pull for _, pull in ends])
-        made.append(Arrow(name, FORCE[name], points, forces, False, meaning))
+        made.append(Arrow(name, FORCE_COLOURS[name], points, forces, False, meaning))
     normal, across, points = (
         np.stack(rows) for rows in zip(*map(_patella, geometries), strict=True)
     )
@@ -112,7 +112,7 @@ def _extensor(results: "Results", geometries: Sequence[KneeGeometry]) -> list[Ar
         + results["patellofemoral_tangential_N"][:, None] * across
     )
     name = "patellofemoral"
-    made.append(Arrow(name, FORCE[name], points, -forces, True, "on the femur"))
+    made.append(Arrow(name, FORCE_COLOURS[name], points, -forces, True, "on the femur"))
     return made
 
 
@@ -148,7 +148,7 @@ def _condyles(
             axis=1,
         )
         points = np.stack([one.state.pose("femur")[:3, 3] for one in geometries])
-        return [Arrow("knee", FORCE["knee"], points, forces, True, "on the tibia")]
+        return [Arrow("knee", FORCE_COLOURS["knee"], points, forces, True, "on the tibia")]
     made = []
     for side in ("medial", "lateral"):
         points = np.stack([_condyle_point(one, side) for one in geometries])
@@ -160,7 +160,7 @@ def _condyles(
         )
         forces = -results[f"{side}_force_equilibrium_N"][:, None] * ways
         name = f"{side} condyle"
-        made.append(Arrow(name, FORCE[name], points, forces, True, "on the insert"))
+        made.append(Arrow(name, FORCE_COLOURS[name], points, forces, True, "on the insert"))
     return made
 
 

@@ -4,32 +4,13 @@ import numpy as np
 from matplotlib import colormaps
 from numpy.typing import ArrayLike, NDArray
 
-from tkamb.output.style import (
-    BLACK,
-    GREEN,
-    LATERAL,
-    MEDIAL,
-    ORANGE,
-    PRESSURE_MAP,
-    PURPLE,
-    SKY,
-)
+from tkamb.output.style import PRESSURE_MAP, SKY
 
 METAL, INSERT, BONE, BUTTON = "#8d99a8", "#e4dfd0", "#f0e8d2", "#dcd8cc"
 FLOOR = "#b9c4c9"
 TENDON, WRAPPED = "#8c3b2e", "#f0c419"
 SLACK = "#9a9a9a"
 RECORDED = SKY
-FORCE = {
-    "ground reaction": BLACK,
-    "hip": PURPLE,
-    "quadriceps": GREEN,
-    "patellar ligament": ORANGE,
-    "patellofemoral": SKY,
-    "medial condyle": MEDIAL,
-    "lateral condyle": LATERAL,
-    "knee": MEDIAL,
-}
 
 Colours = NDArray[np.uint8]
 

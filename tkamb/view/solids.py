@@ -16,10 +16,11 @@ from tkamb.body.knee import KneeGeometry
 from tkamb.geometry.frames import Array, inverse, pose, transform
 from tkamb.geometry.surface import Surface
 from tkamb.output.maps import ContactMaps
+from tkamb.output.style import BLACK
 from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
 from tkamb.view.arrows import centre_of_pressure
-from tkamb.view.colours import BLACK, BONE, BUTTON, FLOOR, INSERT, METAL, RECORDED
+from tkamb.view.colours import BONE, BUTTON, FLOOR, INSERT, METAL, RECORDED
 from tkamb.view.drawing import Marker, Solid
 
 FEMUR_PROFILE = (
