@@ -76,18 +76,8 @@ def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> Gro
             loaded.
     """
     from_plates = (source.format or source.file.suffix.lower().lstrip(".")) == "c3d"
-    if from_plates:
-        stamps, force, point, moment = _read_plates(source)
-    else:
-        if source.surface:
-            raise InputError(
-                "is for plates of a .c3d: a table states its points itself",
-                "[ground_reaction] surface_mm",
-                "leave it out",
-            )
-        recorded = read_table(source.file, source.format)
-        stamps = recorded.time(source.columns.get("time", "time"))
-        force, point, moment = _read_columns(source, recorded)
+    read = _read_plates if from_plates else _read_table
+    stamps, force, point, moment, level_assumed = read(source)
     path = source.file
     check_spacing(path, stamps)
     _check_upward(force, source)
@@ -109,8 +99,21 @@ def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> Gro
     wrench = np.concatenate([force, np.cross(point, force) + moment], axis=1)
     filtered, _, _ = differentiate_coordinates(stamps, wrench, source.cutoff, time, name=str(path))
     reaction = _at_centre_of_pressure(filtered, level, source.unloaded, time, stamps, point)
-    assumed = not from_plates and _upright_point(source) not in {*source.columns, *recorded.columns}
-    return replace(reaction, odd=odd, level_assumed=assumed)
+    return replace(reaction, odd=odd, level_assumed=level_assumed)
+
+
+def _read_table(source: ForceRecording) -> tuple[Array, Array, Array, Array, bool]:
+    """Return what `_read_plates` does; a table without the points' heights has them at zero."""
+    if source.surface:
+        raise InputError(
+            "is for plates of a .c3d: a table states its points itself",
+            "[ground_reaction] surface_mm",
+            "leave it out",
+        )
+    recorded = read_table(source.file, source.format)
+    stamps = recorded.time(source.columns.get("time", "time"))
+    level_assumed = _upright_point(source) not in {*source.columns, *recorded.columns}
+    return stamps, *_read_columns(source, recorded), level_assumed
 
 
 def _odd_samples(
@@ -188,8 +191,10 @@ def _read_columns(source: ForceRecording, recorded: Table) -> tuple[Array, Array
     return force, point, moment
 
 
-def _read_plates(source: ForceRecording) -> tuple[Array, Array, Array, Array]:
+def _read_plates(source: ForceRecording) -> tuple[Array, Array, Array, Array, bool]:
     """Return times (k,) s, force, point and free moment, each (k, 3), of a recording's plates.
+
+    And False: how high the plates lie is recorded.
 
     The wrenches are summed about the laboratory's origin and kept: the point lies on the level
     of the plates' surface or that of a step on them, `surface_mm` above it, and is carried over
@@ -218,7 +223,8 @@ def _read_plates(source: ForceRecording) -> tuple[Array, Array, Array, Array]:
     level = levels[0] + source.surface
     point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], level)
     point = _hold_point(recording.analog_time, point, loaded, source.file)
-    return recording.analog_time, force, point, about_origin - np.cross(point, force)
+    moment = about_origin - np.cross(point, force)
+    return recording.analog_time, force, point, moment, False
 
 
 def _centre_of_pressure(force: Array, about_origin: Array, level: float) -> Array:
