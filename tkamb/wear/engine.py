@@ -69,7 +69,8 @@ class ContactEngine:
         state = self.model.prepare(pair)
         pressure = np.zeros((len(motion), len(state.points)))
         poses, failed, guess = motion.poses.copy(), {}, None
-        resting = motion.drive and RestingPoses(self.model, state, motion.drive)
+        drive = motion.drive
+        resting = None if drive is None else RestingPoses(self.model, state, drive)
         for k, (pose, load) in enumerate(zip(motion.poses, motion.load, strict=True)):
             if load <= 0:
                 continue
