@@ -35,8 +35,8 @@ DRAWING = {
     "studies": {*KNEE, "decks", "inputs", "output", "run", "simulation"} - {"body"},
     "muscles": {"geometry", "importing", "inputs", "opensim"},
     "designs": {"contact", "geometry"},
-    "wear": {"contact", "geometry", "inputs", "output", "results_folder", "run", "scene"}
-    | {"simulation"},
+    "wear": {"contact", "equilibrium", "geometry", "inputs", "output", "results_folder", "run"}
+    | {"scene", "simulation"},
     "uncertainty": {*KNEE, "columns", "inputs", "results", "results_folder", "run", "simulation"},
     "cohort": {"columns", "geometry", "output", "results", "run", "scene", "simulation"},
     "validation": {"contact", "designs", "geometry", "simulation", "studies"},

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import trimesh
 
-import shapes
 from scenes import write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
@@ -18,6 +17,7 @@ from tkamb.wear.motion import CycleMotion
 from tkamb.wear.profile import read_profile
 from tkamb.wear.registry import law_names, wear_law
 from tkamb.wear.setup import wear_setup
+from wear_bodies import balls_scene
 
 CYCLE = """cycle_percent,axial_force_N,flexion_deg,ap_mm,axial_rotation_deg
 0,300,0,0,0
@@ -38,21 +38,7 @@ def profile(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """The shipped scene with two balls on two dishes: few triangles, quickly worn."""
-    folder = tmp_path_factory.mktemp("balls")
-    bodies = {
-        "balls.stl": shapes.joined(*(shapes.sphere(0.022, 3, (0, 0, z)) for z in (-0.022, 0.022))),
-        "dishes.stl": shapes.two_dishes(),
-    }
-    path = write_scene(
-        folder,
-        drop=("patella", "quadriceps", "patellar_ligament"),
-        implant__femoral__mesh="balls.stl",
-        implant__insert__mesh="dishes.stl",
-    )
-    for name, body in bodies.items():
-        trimesh.Trimesh(body.vertices * 1e3, body.faces).export(folder / name)
-    return path
+    return balls_scene(tmp_path_factory.mktemp("balls"))
 
 
 @pytest.fixture(scope="module")

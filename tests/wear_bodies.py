@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 import shapes
+from scenes import write_scene
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.geometry.frames import inverse, pose, transform
@@ -18,6 +20,23 @@ from tkamb.wear.worn_surface import ArticularSurface
 
 MM = 1e-3
 DENSITY = 930.0
+
+
+def balls():
+    return shapes.joined(*(shapes.sphere(0.022, 3, (0, 0, z)) for z in (-0.022, 0.022)))
+
+
+def balls_scene(folder):
+    """The shipped scene with two balls on two dishes: few triangles, quickly worn."""
+    path = write_scene(
+        folder,
+        drop=("patella", "quadriceps", "patellar_ligament"),
+        implant__femoral__mesh="balls.stl",
+        implant__insert__mesh="dishes.stl",
+    )
+    for name, body in (("balls.stl", balls()), ("dishes.stl", shapes.two_dishes())):
+        trimesh.Trimesh(body.vertices * 1e3, body.faces).export(folder / name)
+    return path
 
 
 def stroke(length, frames, load, passes=2):

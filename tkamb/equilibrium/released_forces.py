@@ -1,7 +1,7 @@
-"""What drives the released knee coordinates at trial places, the patella held on the femur."""
+"""What drives free knee coordinates at trial places, in a leg or in a machine."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -27,13 +27,27 @@ def _no_sliding(place: Array, point: Array) -> Array:
     return np.zeros(3)
 
 
-class ReleasedForces:
-    """What drives the released coordinates at trial places, the patella held on the femur.
+class Joint(Protocol):
+    """What pushes the free coordinates beside the contact: of a leg, or of a simulator."""
+
+    @property
+    def released(self) -> tuple[int, ...]:
+        """Indices of the n free coordinates."""
+
+    def imbalance(self, coordinates: Array, contact: Array) -> Array:
+        """Return the generalised forces (..., n) at coordinates (..., 6) and a contact (6,)."""
+
+    def contact_gain(self, coordinates: Array) -> Array:
+        """Return how they follow the contact's wrench on the insert, (n, 6)."""
+
+
+class FreeForces:
+    """What drives the free coordinates of a joint at trial places.
 
     Args:
-        joint: of the body.
+        joint: what acts beside the contact.
         probe: of the contact model.
-        place: (6,) knee coordinates; those not released stay.
+        place: (6,) knee coordinates; those not free stay.
         friction: Coulomb coefficient.
         sliding: from coordinates (6,) and point (3,) to the femur's velocity there (3,), m/s.
 
@@ -43,20 +57,20 @@ class ReleasedForces:
 
     def __init__(
         self,
-        joint: JointEquilibrium,
+        joint: Joint,
         probe: "Probe",
         place: Array,
         friction: float = 0.0,
         sliding: Sliding = _no_sliding,
     ) -> None:
-        self._joint, self._probe, self._place = joint, probe, np.array(place, float)
+        self._drive, self._probe, self._place = joint, probe, np.array(place, float)
         self._friction, self._sliding = friction, sliding
         self._rows = list(joint.released)
         self._scale = SCALE[self._rows]
         self.seen: dict[bytes, ProbedContact] = {}
 
     def balance(self, stiffness: Array | None = None) -> Balance:
-        """Return where the released coordinates come to rest, from the given place."""
+        """Return where the free coordinates come to rest, from the given place."""
         return find_balance(self.trial, self._place[self._rows] * self._scale, stiffness)
 
     def contact(self, balance: Balance) -> "ProbedContact":
@@ -72,16 +86,59 @@ class ReleasedForces:
         wrench, stiffness = self._with_friction(place, contact)
         known_to = contact.accuracy * float(np.linalg.norm(wrench[:3]))
         if stiffness is None:
-            force = self._joint.imbalance(place, wrench) / self._scale
+            force = self._drive.imbalance(place, wrench) / self._scale
             return Trial(force, known_to=known_to)
         steps = np.zeros((len(x) + 1, 6))
         steps[np.arange(len(x)), self._rows] = TINY / self._scale
-        forces = self._joint.imbalance(place + steps, wrench) / self._scale
+        forces = self._drive.imbalance(place + steps, wrench) / self._scale
         change = (forces[:-1] - forces[-1]).T / TINY
         twists = knee_axes(place)[self._rows] / self._scale[:, None]
-        gain = self._joint.contact_gain(place) / self._scale[:, None]
+        gain = self._drive.contact_gain(place) / self._scale[:, None]
         tangent = -(change + gain @ stiffness @ twists.T)
         return Trial(forces[-1], tangent, contact.exact, known_to)
+
+    def at(self, balance: Balance) -> Array:
+        """Return the knee coordinates (6,) of a balance."""
+        return self._with(balance.coordinates)
+
+    def _with(self, x: Array) -> Array:
+        place = self._place.copy()
+        place[self._rows] = x / self._scale
+        return place
+
+    def _with_friction(self, place: Array, contact: "ProbedContact") -> tuple[Array, Array | None]:
+        """Return wrench (6,) on the insert with friction, and its stiffness (6, 6) if known."""
+        wrench, stiffness = np.zeros(6), np.zeros((6, 6))
+        for condyle in contact.condyles.values():
+            sliding = self._sliding(place, condyle.point)
+            touch = CondylePoint(condyle.point, condyle.normal, sliding, 0.0)
+            drag = touch.normal - touch.direction(self._friction)
+            rubbing = wrench_of(touch.point, drag)
+            wrench += condyle.wrench + condyle.force * rubbing
+            if condyle.stiffness is not None:
+                pressed = -touch.normal @ condyle.stiffness[:3]
+                stiffness += condyle.stiffness + np.outer(rubbing, pressed)
+        return wrench, stiffness if contact.tangent else None
+
+
+class ReleasedForces(FreeForces):
+    """What drives the released coordinates of a leg, the patella held on the femur.
+
+    Args:
+        joint: of the body.
+        probe, place, friction, sliding: see `FreeForces`.
+    """
+
+    def __init__(
+        self,
+        joint: JointEquilibrium,
+        probe: "Probe",
+        place: Array,
+        friction: float = 0.0,
+        sliding: Sliding = _no_sliding,
+    ) -> None:
+        super().__init__(joint, probe, place, friction, sliding)
+        self._joint = joint
 
     def tension_per_wrench(self, contact: "ProbedContact") -> Array | None:
         """Return v (6,): a further wrench dw on the insert adds v . dw to the ligament's tension.
@@ -116,10 +173,6 @@ class ReleasedForces:
         wrench, _ = self._with_friction(self._place, contact)
         return float(self._joint.kept(self._place, wrench)[-1])
 
-    def at(self, balance: Balance) -> Array:
-        """Return the knee coordinates (6,) of a balance."""
-        return self._with(balance.coordinates)
-
     def pushes(self, balance: Balance) -> bool:
         """Return whether the patellar ligament, where it is taut, would have to push."""
         if self._joint.line is None:
@@ -127,22 +180,3 @@ class ReleasedForces:
         place = self.at(balance)
         wrench, _ = self._with_friction(place, self.contact(balance))
         return bool(self._joint.kept(place, wrench)[-1] < 0)
-
-    def _with(self, x: Array) -> Array:
-        place = self._place.copy()
-        place[self._rows] = x / self._scale
-        return place
-
-    def _with_friction(self, place: Array, contact: "ProbedContact") -> tuple[Array, Array | None]:
-        """Return wrench (6,) on the insert with friction, and its stiffness (6, 6) if known."""
-        wrench, stiffness = np.zeros(6), np.zeros((6, 6))
-        for condyle in contact.condyles.values():
-            sliding = self._sliding(place, condyle.point)
-            touch = CondylePoint(condyle.point, condyle.normal, sliding, 0.0)
-            drag = touch.normal - touch.direction(self._friction)
-            rubbing = wrench_of(touch.point, drag)
-            wrench += condyle.wrench + condyle.force * rubbing
-            if condyle.stiffness is not None:
-                pressed = -touch.normal @ condyle.stiffness[:3]
-                stiffness += condyle.stiffness + np.outer(rubbing, pressed)
-        return wrench, stiffness if contact.tangent else None

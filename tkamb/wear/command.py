@@ -19,7 +19,11 @@ def add_wear(commands: Any) -> None:
         "--simulator",
         type=Path,
         metavar="PROFILE",
-        help="CSV of load and displacements per cent of the cycle, instead of the scene's motion",
+        help="CSV of load and displacements or forces per cent of the cycle, "
+        "instead of the scene's motion",
+    )
+    wear.add_argument(
+        "--springs", type=Path, metavar="F", help="the simulator's springs (.toml): force control"
     )
     wear.add_argument("--cycles", type=int, default=CYCLES, metavar="N")
     wear.add_argument(
@@ -63,6 +67,7 @@ def _wear(options: argparse.Namespace) -> int:
         material=options.material,
         wear_factor=options.wear_factor,
         simulator=options.simulator,
+        springs=options.springs,
         contact=options.contact,
         resolution_mm=options.resolution,
         frames=options.frames_per_cycle,

@@ -14,6 +14,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.frames import pose as pose_of
 from tkamb.geometry.surface import Surface
+from tkamb.wear.force_control import RestingPoses
 from tkamb.wear.motion import CycleMotion
 
 GRID = (-0.012, -0.006, 0.0, 0.006, 0.012)
@@ -33,7 +34,7 @@ class CycleMaps:
         triangles: (k, 3) between them.
         pressure: (f, m) Pa.
         poses: (f, 4, 4) at which the maps hold; the given ones where nothing is loaded.
-        failed: frame -> why its contact was not found.
+        failed: frame -> why its contact, or its equilibrium, was not found.
     """
 
     points: Array
@@ -60,14 +61,24 @@ class ContactEngine:
     bearing: Bearing = "fixed"
 
     def maps(self, insert: Surface, motion: CycleMotion) -> CycleMaps:
-        """Press the loads of a motion into an insert, frame by frame."""
+        """Press the loads of a motion into an insert, frame by frame.
+
+        The poses of a driven motion are found on this insert first.
+        """
         pair = ContactPair(self.femoral, insert, self.material, self.bearing)
         state = self.model.prepare(pair)
         pressure = np.zeros((len(motion), len(state.points)))
         poses, failed, guess = motion.poses.copy(), {}, None
+        drive = motion.drive
+        resting = None if drive is None else RestingPoses(self.model, state, drive)
         for k, (pose, load) in enumerate(zip(motion.poses, motion.load, strict=True)):
             if load <= 0:
                 continue
+            if resting is not None:
+                pose, why = resting.at(k, float(load), guess)
+                if why:
+                    failed[k] = why
+                    continue
             result = self.model.press(state, float(load), pose, guess)
             if result.status is not ContactStatus.OK:
                 failed[k] = "; ".join(result.flags) or result.status.value

@@ -23,11 +23,15 @@ def wear_identity(setup: WearSetup, case: WearCase, cycles: int, updates: int) -
     digest = hashlib.sha256()
     bodies = (setup.engine.femoral, case.articular.surface)
     arrays = [array for body in bodies for array in (body.vertices, body.faces)]
+    drive = case.motion.drive
+    if drive is not None:
+        arrays += [drive.coordinates, drive.applied, drive.zero]
     for array in (*arrays, case.motion.poses, case.motion.load):
         digest.update(np.ascontiguousarray(array, "<f8").tobytes())
     words = (setup.engine.model, setup.engine.material, setup.engine.bearing, case.law, case.creep)
     numbers = (case.density, case.motion.duration, case.motion.passes, cycles, updates)
-    digest.update(repr((words, numbers, code_identity())).encode())
+    machine = () if drive is None else (drive.free, drive.springs)
+    digest.update(repr((words, numbers, machine, code_identity())).encode())
     return digest.hexdigest()
 
 

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, inverse
+from tkamb.wear.force_control import ForceDrive
 
 LEVER = 0.025
 """m; what a turn moves at a condyle, to compare turns with translations."""
@@ -25,6 +26,8 @@ class CycleMotion:
         passes: how often the frames are gone through in a cycle: 1 for a closed cycle, 2 where
             the way back is the way out.
         notes: what a reader must know about it.
+        drive: finds the poses anew on every insert, from forces; None: they are prescribed. Those
+            of a driven motion are where its first search begins.
     """
 
     poses: Array
@@ -32,6 +35,7 @@ class CycleMotion:
     duration: float
     passes: int = 1
     notes: tuple[str, ...] = ()
+    drive: ForceDrive | None = None
 
     def __len__(self) -> int:
         return len(self.load)

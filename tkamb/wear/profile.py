@@ -1,4 +1,4 @@
-"""Profiles of a knee simulator: load and displacements per cent of the cycle, from a CSV file."""
+"""Profiles of a knee simulator: loads and displacements per cent of the cycle, from a CSV file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array, knee_pose
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
 from tkamb.inputs.tables import Table, read_table
 from tkamb.units import DEGREE, MILLIMETRE
+from tkamb.wear.force_control import SI, ForceDrive
+from tkamb.wear.springs import Springs
 
 PERCENT, LOAD = "cycle_percent", "axial_force_N"
 COORDINATES = {
@@ -19,7 +21,23 @@ COORDINATES = {
     "flexion_deg": (DEGREE, 5),
 }
 """Column -> unit, and its place among the knee coordinates."""
-LIMITS = {"ap_mm": 30.0, "ml_mm": 20.0, "axial_rotation_deg": 45.0, "adduction_deg": 20.0}
+FORCES = {
+    "ap_force_N": "ap_mm",
+    "ml_force_N": "ml_mm",
+    "axial_torque_Nm": "axial_rotation_deg",
+    "adduction_torque_Nm": "adduction_deg",
+}
+"""Column of force control -> the column whose place it takes."""
+LIMITS = {
+    "ap_mm": 30.0,
+    "ml_mm": 20.0,
+    "axial_rotation_deg": 45.0,
+    "adduction_deg": 20.0,
+    "ap_force_N": 2e3,
+    "ml_force_N": 2e3,
+    "axial_torque_Nm": 50.0,
+    "adduction_torque_Nm": 100.0,
+}
 """Largest size of a column's values."""
 FLEXION_LIMITS = (-30.0, 170.0)
 LARGEST_FORCE = 1e4
@@ -30,24 +48,55 @@ CLOSES_WITHIN = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """One cycle of a simulator in displacement control, at even steps.
+    """One cycle of a simulator, at even steps.
 
     Args:
         load: (f,) N, axial.
         coordinates: (f, 6) knee coordinates (`tkamb.geometry.frames`), m and rad; AP and ML from
-            the dwell position, SI zero: the load finds it.
+            the dwell position, SI zero: the load finds it; zero where a force is given instead.
+        applied: (f, 6) N and N·m on the femoral component along each coordinate that is found,
+            the axial force on SI among them.
+        free: indices of the coordinates that a force or torque is given for; none: displacement
+            control.
         source: the file.
     """
 
     load: Array
     coordinates: Array
+    applied: Array
+    free: tuple[int, ...]
     source: str
+
+    @property
+    def rotation(self) -> Array:
+        """The femoral component's rotation (3, 3) in the first row."""
+        return np.asarray(knee_pose(self.coordinates[0])[:3, :3])
 
     def poses(self, dwell: tuple[float, float]) -> Array:
         """Return pose_femoral_in_insert (f, 4, 4), AP and ML counted from `dwell` (x, z), m."""
-        shifted = self.coordinates.copy()
-        shifted[:, [0, 2]] += dwell
-        return knee_pose(shifted)
+        return knee_pose(self.coordinates + zero_at(dwell))
+
+    def drive(self, dwell: tuple[float, float], springs: Springs | None) -> ForceDrive | None:
+        """Return what force control does, counted from `dwell` (x, z), m; None: it is none.
+
+        Raises:
+            InputError: a spring on a coordinate that is not found from a force.
+        """
+        names = [KNEE_COORDINATES[i] for i in self.free]
+        for name in springs.springs if springs else ():
+            if name not in names:
+                what = f"there is a spring for '{name}', but the profile gives no force or torque"
+                raise InputError(what, self.source, "a spring acts under force control alone")
+        if not self.free:
+            return None
+        zero = zero_at(dwell)
+        free = tuple(sorted((*self.free, SI)))
+        return ForceDrive(self.coordinates + zero, self.applied, free, zero, springs)
+
+
+def zero_at(dwell: tuple[float, float]) -> Array:
+    """Return the knee coordinates (6,) of a dwell position (x, z), m."""
+    return np.array([dwell[0], 0.0, dwell[1], 0.0, 0.0, 0.0])
 
 
 def read_profile(path: str | Path, frames: int) -> Profile:
@@ -55,18 +104,21 @@ def read_profile(path: str | Path, frames: int) -> Profile:
 
     The file has a header and rows from 0 to 100 % of the cycle: cycle_percent, axial_force_N,
     flexion_deg, and any of ap_mm, ml_mm, axial_rotation_deg, adduction_deg; what is not given is
-    zero. Signs and frames are tkamb's: the femoral component's motion on the insert. Between
-    rows it is linear.
+    zero. In place of each of these there may be its force or torque: ap_force_N, ml_force_N,
+    axial_torque_Nm, adduction_torque_Nm. Signs and frames are tkamb's: the femoral component's
+    motion on the insert, and what acts on the femoral component. Between rows it is linear.
 
     Raises:
-        InputError: a column that is missing or unknown, a gap, a value out of range, per cents
-            that do not run from 0 to 100, or a cycle that does not close.
+        InputError: a column that is missing or unknown, a displacement and its force together,
+            a gap, a value out of range, per cents that do not run from 0 to 100, a cycle that
+            does not close, or force control without axial force.
     """
     table = read_table(Path(path), "csv")
-    known = (PERCENT, LOAD, *COORDINATES)
+    known = (PERCENT, LOAD, *COORDINATES, *FORCES)
     for name in table.columns:
         if name not in known:
             raise InputError(f"unknown column '{name}'", path, f"there are: {', '.join(known)}")
+    free = _free(table)
     percent = _percent(table)
     columns = {
         name: table.complete_column(name)
@@ -77,12 +129,31 @@ def read_profile(path: str | Path, frames: int) -> Profile:
         _check_range(name, values, path)
         _check_closed(name, values, path)
     even = np.linspace(0.0, 100.0, frames)
-    coordinates = np.zeros((frames, 6))
+    load = np.interp(even, percent, columns[LOAD])
+    if free and not (columns[LOAD] > 0).all():
+        row = int(np.flatnonzero(columns[LOAD] <= 0)[0])
+        what = f"'{LOAD}' is 0 in data row {row + 1}: no contact to find a position by"
+        raise InputError(what, path, "force control needs more than 0 N in each row")
+    coordinates, applied = np.zeros((2, frames, 6))
+    applied[:, SI] = -load
     for name, values in columns.items():
+        steps = np.interp(even, percent, values)
         if name in COORDINATES:
             unit, place = COORDINATES[name]
-            coordinates[:, place] = np.interp(even, percent, values) * unit
-    return Profile(np.interp(even, percent, columns[LOAD]), coordinates, str(path))
+            coordinates[:, place] = steps * unit
+        elif name in FORCES:
+            applied[:, COORDINATES[FORCES[name]][1]] = steps
+    return Profile(load, coordinates, applied, free, str(path))
+
+
+def _free(table: Table) -> tuple[int, ...]:
+    """Return the indices of the coordinates that a force or torque is given for."""
+    given = [name for name in FORCES if name in table.columns]
+    for name in given:
+        if FORCES[name] in table.columns:
+            what = f"both '{name}' and '{FORCES[name]}' are given"
+            raise InputError(what, table.path, "prescribe the position or apply the force")
+    return tuple(COORDINATES[FORCES[name]][1] for name in given)
 
 
 def _percent(table: Table) -> Array:

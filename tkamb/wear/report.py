@@ -18,6 +18,7 @@ from tkamb.geometry.frames import MIRROR, Array
 from tkamb.geometry.surface import Surface
 from tkamb.output.vtk import write_triangles
 from tkamb.units import MEGAPASCAL, MILLIMETRE
+from tkamb.wear.force_control import UNITS
 from tkamb.wear.kept import STATE_NAME
 from tkamb.wear.materials import WearMaterial
 from tkamb.wear.setup import WearSetup
@@ -81,10 +82,26 @@ class WearReport:
             "seconds_per_cycle": self.case.motion.duration,
             "largest_force_correction": self.state.map_error,
             "mean_cross_shear": _known(self._mean_cross_shear()),
+            **self._control(),
             "notes": list(self.case.motion.notes),
             "questions": self.questions(),
             "rows": [{k: _known(v) for k, v in row.items()} for row in self.state.rows],
             "code": code_identity(),
+        }
+
+    def _control(self) -> dict[str, Any]:
+        """Return what was prescribed, what was found in equilibrium, and where."""
+        drive = self.case.motion.drive
+        if drive is None:
+            return {"control": "displacement", "found_in_equilibrium": []}
+        springs = drive.springs
+        return {
+            "control": "force",
+            "found_in_equilibrium": drive.names,
+            "springs": None if springs is None else dict(springs.table),
+            "springs_sources": [] if springs is None else list(springs.sources),
+            "dwell_mm": [float(drive.zero[i] / MILLIMETRE) for i in (0, 2)],
+            "last_cycle": drive.rows(self.last.poses, self.last.failed),
         }
 
     @property
@@ -112,6 +129,13 @@ class WearReport:
                 f"{self.rate:.3g} mm3 a million cycles is far from a whole knee's {low:g} (ISO) to "
                 f"{high:g} (in-vivo loads) mm3 (Dreyer 2023): does the wear factor suit it?"
             )
+        most = max(row.get("failed_rows", 0.0) for row in self.state.rows)
+        if most:
+            why = next(iter(self.last.failed.values()), "in blocks before the last")
+            asked.append(
+                f"up to {most:.0f} of {len(self.case.motion)} rows of the profile failed and are "
+                f"left out of the cycle: {why}"
+            )
         if self.setup.engine.bearing == "mobile":
             asked.append("the backside of a mobile bearing wears too and is not modelled")
         if self.case.creep is None:
@@ -129,8 +153,21 @@ class WearReport:
             f"worn off {found['volume_mm3']:.4g} mm3, {found['mass_mg']:.4g} mg, "
             f"{found['max_depth_mm']:.4g} mm deep at most, over {found['worn_area_mm2']:.4g} mm2",
             f"rate {self.rate:.4g} mm3 per million cycles; creep {said}",
+            *self._found_lines(),
             *(f"note: {note}" for note in found["notes"]),
         ]
+
+    def _found_lines(self) -> list[str]:
+        """Return where force control found the knee on the last cycle; nothing without it."""
+        drive = self.case.motion.drive
+        if drive is None:
+            return []
+        found = drive.ranges(self.last.poses, self.last.failed)
+        places = (
+            f"{name} {found[f'{name}_low_{unit}']:.3g} to {found[f'{name}_high_{unit}']:.3g} {unit}"
+            for name, unit in ((name, UNITS[name][0]) for name in drive.names)
+        )
+        return [f"force control: {', '.join(places)}; {len(self.last.failed)} rows failed"]
 
     def write(self, folder: Path) -> None:
         """Write wear.csv, wear.json, wear.vtp, worn_insert.stl and wear.png, all or none.

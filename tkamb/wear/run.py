@@ -100,7 +100,7 @@ def prepare_wear(
         material: a name of `tkamb.wear.materials`, or a material file.
         wear_factor: mm³/(N m), in place of the material's.
         period: s of a simulator's cycle.
-        setup: see `tkamb.wear.setup.wear_setup`.
+        setup: simulator, springs, contact, …: see `tkamb.wear.setup.wear_setup`.
 
     Raises:
         InputError: whatever of it cannot be used.

@@ -21,7 +21,8 @@ from tkamb.simulation import simulate
 from tkamb.units import MILLIMETRE
 from tkamb.wear.engine import ContactEngine
 from tkamb.wear.motion import CycleMotion
-from tkamb.wear.profile import read_profile
+from tkamb.wear.profile import Profile, read_profile
+from tkamb.wear.springs import Springs, read_springs
 from tkamb.wear.worn_surface import ArticularSurface
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
@@ -54,6 +55,7 @@ def wear_setup(
     path: str | Path,
     *,
     simulator: str | Path | None = None,
+    springs: str | Path | None = None,
     contact: str | None = None,
     resolution_mm: float | None = None,
     frames: int = 40,
@@ -65,6 +67,7 @@ def wear_setup(
     Args:
         path: a scene file, or a folder that `tkamb run` wrote.
         simulator: a profile (`tkamb.wear.profile`) in place of the scene's motion.
+        springs: a file of its springs (`tkamb.wear.springs`), for force control.
         contact: contact model, in place of the scene's.
         resolution_mm: in place of the scene's.
         frames: most frames of a cycle.
@@ -77,6 +80,8 @@ def wear_setup(
     if frames < 2:
         raise InputError(f"{frames} frames", "--frames-per-cycle", "give at least 2")
     path = Path(path)
+    if springs is not None and simulator is None:
+        raise InputError("springs without a simulator", "--springs", "give --simulator too")
     motion: CycleMotion | None
     if os.path.isdir(path) and simulator is None:
         case, motion = _of_results(path)
@@ -89,21 +94,35 @@ def wear_setup(
     assert table is not None and case.femoral is not None and case.insert is not None
     engine = _engine(case, table)
     if simulator is not None:
-        profile = read_profile(simulator, frames)
-        poses = profile.poses((0.0, 0.0))
-        poses = profile.poses(engine.dwell(case.insert, poses[0, :3, :3]))
-        note = "a simulator's cycle in displacement control; AP and ML from the dwell position"
-        motion = CycleMotion(poses, profile.load, period, 1, (note,))
+        held = None if springs is None else read_springs(springs)
+        motion = _of_profile(read_profile(simulator, frames), held, engine, case, period)
     assert motion is not None
     return WearSetup(
         engine=engine,
         articular=ArticularSurface.of_insert(case.insert, table.resolution_mm * MILLIMETRE),
-        motion=motion.thinned(frames),
+        motion=motion if simulator else motion.thinned(frames),
         side=case.scene.patient.side,
         contact=table.model,
         resolution_mm=table.resolution_mm,
         source=str(simulator or path),
     )
+
+
+def _of_profile(
+    profile: Profile, springs: Springs | None, engine: ContactEngine, case: Case, period: float
+) -> CycleMotion:
+    """Return a simulator's cycle, in displacement or in force control."""
+    assert case.insert is not None and case.scene.contact is not None
+    profile.drive((0.0, 0.0), springs)  # springs that do not suit are refused before any search
+    dwell = engine.dwell(case.insert, profile.rotation)
+    drive = profile.drive(dwell, springs)
+    notes = ["a simulator's cycle in displacement control; AP and ML from the dwell position"]
+    if drive is not None:
+        found = ", ".join(drive.names)
+        notes = [f"a simulator's cycle in force control: {found} in equilibrium, without friction"]
+        if friction := case.scene.contact.friction:
+            notes.append(f"the scene's friction of {friction:g} is left out of force control")
+    return CycleMotion(profile.poses(dwell), profile.load, period, 1, tuple(notes), drive)
 
 
 def _of_scene(scene: Scene, path: Path, most: int, progress: Progress) -> CycleMotion:

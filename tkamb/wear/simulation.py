@@ -1,7 +1,7 @@
 """Many cycles in blocks: contact, wear and creep on the insert as the block before has left it."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -31,6 +31,8 @@ MOST_CHANGE = 0.2
 """Share of the worn volume that may lie elsewhere after a block."""
 MOST_HALVINGS = 256
 """A block is not made shorter than this part of the longest."""
+FEWEST_ROWS = 0.5
+"""Share of a force-controlled profile's rows without which there is no cycle."""
 HELPS = 1.1
 """Halving a block has to lessen the change by at least this factor to be done again."""
 
@@ -109,6 +111,8 @@ class CycleWear:
         normals: (n, 3) unit normals.
         area: (n,) m².
         map_error: largest relative correction of a map's force.
+        poses: (f, 4, 4) of the motion's frames.
+        failed: frame -> why it is left out of the cycle.
     """
 
     rate: Array
@@ -116,6 +120,8 @@ class CycleWear:
     normals: Array
     area: Array
     map_error: float
+    poses: Array
+    failed: Mapping[int, str]
 
     @property
     def peak_pressure(self) -> Array:
@@ -206,16 +212,35 @@ def _cycle(case: WearCase, state: WearState) -> CycleWear | str:
     """Return what a cycle does to the insert as it is; a text: why it has no contact."""
     insert = case.articular.lowered(state.fall)
     maps = case.engine.maps(insert, case.motion)
-    if maps.failed:
-        frame, why = next(iter(maps.failed.items()))
-        lost = f"no contact in {len(maps.failed)} of {len(case.motion)} frames"
-        return f"{lost}, the first of them {frame}: {why}"
+    rows = _rows(maps, case.motion)
+    if isinstance(rows, str):
+        return rows
     points = insert.vertices[case.articular.vertices]
     normals, area = case.articular.normals_and_areas(insert)
-    pressure = maps.pressure @ interpolation(maps.points, points).T
-    pressure, error = carried(pressure, area * normals[:, 1], case.motion.load)
-    history = SlidingHistory.of_cycle(maps.poses, pressure, points, normals, case.motion.passes)
-    return CycleWear(case.law.depth(history), history, normals, area, error)
+    pressure = maps.pressure[rows] @ interpolation(maps.points, points).T
+    pressure, error = carried(pressure, area * normals[:, 1], case.motion.load[rows])
+    poses, passes = maps.poses[rows], case.motion.passes
+    history = SlidingHistory.of_cycle(poses, pressure, points, normals, passes)
+    rate = case.law.depth(history)
+    return CycleWear(rate, history, normals, area, error, maps.poses, maps.failed)
+
+
+def _rows(maps: CycleMaps, motion: CycleMotion) -> list[int] | str:
+    """Return the frames that the cycle goes through; a text: why there is none.
+
+    Rows of a force-controlled profile that failed are left out, and the cycle closed by the first
+    that is left. Frames of a prescribed motion have all to be there.
+    """
+    every = range(len(motion))
+    known = [k for k in every if k not in maps.failed]
+    if not maps.failed:
+        return known
+    if motion.drive is None or len(known) < FEWEST_ROWS * len(motion):
+        frame, why = next(iter(maps.failed.items()))
+        lost = f"no contact in {len(maps.failed)} of {len(motion)} frames"
+        return f"{lost}, the first of them {frame}: {why}"
+    ends = known[0] == every[0] and known[-1] == every[-1]
+    return known if ends else [*known, known[0]]
 
 
 def _worn(case: WearCase, state: WearState, now: CycleWear, step: float) -> WearState:
@@ -256,7 +281,7 @@ def _row(case: WearCase, state: WearState, now: CycleWear) -> dict[str, float]:
     area = float(now.area[worn].sum())
     medial = articular.surface.vertices[articular.vertices, 2] < 0
     each = state.wear * now.area
-    crept = case.creep is not None
+    crept, drive = case.creep is not None, case.motion.drive
     lost = volume(articular.surface) - volume(articular.lowered(state.fall))
     return {
         "cycles": state.cycles,
@@ -270,4 +295,5 @@ def _row(case: WearCase, state: WearState, now: CycleWear) -> dict[str, float]:
         "creep_volume_mm3": state.creep_volume / MILLIMETRE**3 if crept else math.nan,
         "mesh_volume_lost_mm3": lost / MILLIMETRE**3,
         "peak_pressure_MPa": float(now.peak_pressure.max()) / MEGAPASCAL,
+        **({} if drive is None else drive.ranges(now.poses, now.failed)),
     }
