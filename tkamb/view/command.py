@@ -2,11 +2,11 @@
 
 import argparse
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
 from tkamb.errors import InputError
+from tkamb.guard import say
 from tkamb.view import CAMERAS
 
 HIGHEST_PORT = 65535
@@ -43,11 +43,8 @@ def add_view(commands: Any) -> None:
 
 
 def _view(options: argparse.Namespace) -> int:
-    def announce(line: str) -> None:
-        print(f"tkamb: {line}", file=sys.stderr, flush=True)
-
     _check(options)
-    announce(f"reading {', '.join(map(str, options.runs))}")
+    say(f"reading {', '.join(map(str, options.runs))}")
     from tqdm import tqdm
 
     from tkamb.view.run import check_frame, open_run
@@ -59,7 +56,7 @@ def _view(options: argparse.Namespace) -> int:
         return tqdm(frames, "drawing", unit="frame", disable=None)
 
     runs = [
-        open_run(path, contact=contact, progress=progress, announce=announce)
+        open_run(path, contact=contact, progress=progress, announce=say)
         for path in options.runs
         for contact in options.contact or [None]
     ]
@@ -80,7 +77,7 @@ def _view(options: argparse.Namespace) -> int:
 
         write_film(show, path, lambda frames: tqdm(frames, "filming", unit="frame", disable=None))
     if not (options.html or options.png or films):
-        show.open(announce, options.port)
+        show.open(say, options.port)
     return 0
 
 
