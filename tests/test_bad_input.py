@@ -109,6 +109,14 @@ def test_singular_inertia(tmp_path, capfd):
     assert "singular inertia" in run_refused(capfd, path)
 
 
+def test_urdf_with_a_joint_of_no_known_type(tmp_path, capfd):
+    """Pinocchio's parser prints lines of its own about it."""
+    path = write_scene(tmp_path)
+    urdf = tmp_path / "patient.urdf"
+    urdf.write_text(urdf.read_text().replace('"revolute"', '"hinge"', 1))
+    assert "unknown type 'hinge'; there are: revolute" in run_refused(capfd, path)
+
+
 def test_urdf_without_a_needed_joint(tmp_path, capfd):
     path = write_scene(tmp_path)
     urdf = tmp_path / "patient.urdf"

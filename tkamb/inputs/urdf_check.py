@@ -59,6 +59,7 @@ _CHILDREN = {
     "inertial": {"origin", "mass", "inertia"},
 }
 _MANY = {"visual", "collision"}
+_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _ANKLE_JOINT = "ankle"
 _MOST_TURNS = 8.0 * np.pi
 """rad: angles are below one turn; a larger number is in degrees."""
@@ -78,6 +79,10 @@ def check_elements(robot: ElementTree.Element, path: Path) -> None:
         for child in parent:
             if child.tag in _ATTRIBUTES:
                 _check_attributes(child, where)
+    for joint in robot.findall("joint"):
+        if joint.get("type") not in _TYPES:
+            where, kind = f"{path}: joint '{joint.get('name', '')}'", joint.get("type")
+            raise InputError(f"unknown type '{kind}'", where, names_near(str(kind), _TYPES))
     names = Counter(str(joint.get("name")) for joint in robot.findall("joint"))
     if twice := [name for name, count in names.items() if count > 1]:
         raise InputError(f"has two joints '{twice[0]}'", path, "rename one")
