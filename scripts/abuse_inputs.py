@@ -136,7 +136,7 @@ def urdfs(folder: Path, chance: random.Random) -> list[str]:
     for _ in range(chance.randint(1, 3)):
         how, lines = chance.randint(0, 4), text.splitlines()
         if how == 0:
-            path.write_bytes(spoilt(text.encode(), chance))
+            path.write_bytes(spoilt(text.encode("utf-8", "surrogatepass"), chance))
             return run(folder)
         if how == 1:
             lines.pop(chance.randrange(len(lines)))
