@@ -66,6 +66,8 @@ def test_table_summary_maps_and_mesh_tell_of_one_volume(written, scene):
     assert float(rows[-1]["cycles"]) == found["cycles"] == 100_000
     assert found["mass_mg"] == pytest.approx(0.93 * found["volume_mm3"])
     assert found["creep_depth_mm"] is None and rows[-1]["creep_depth_mm"] == ""
+    drawn = (written / "wear.vtp").read_bytes()
+    assert b"wear_depth_mm" in drawn and b"creep_depth_mm" not in drawn
     assert found["mesh_volume_lost_mm3"] == pytest.approx(found["volume_mm3"], rel=1e-6)
     worn, new = (
         trimesh.load(p) for p in (written / "worn_insert.stl", scene.parent / "dishes.stl")

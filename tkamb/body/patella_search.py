@@ -132,7 +132,9 @@ class _Closing:
         if not learns or abs(np.linalg.det(self._slopes)) < FLATTEST:
             self._slopes = _slopes_in_plane(balance)
         step = np.linalg.solve(self._slopes, -self.errors)
-        self._step = np.asarray(step * min(1.0, 5e-3 / max(float(np.linalg.norm(step)), 1e-12)))
+        self._step = np.asarray(
+            step * min(1.0, LONGEST_STEP[0] / max(float(np.linalg.norm(step)), 1e-12))
+        )
         return self._step
 
 

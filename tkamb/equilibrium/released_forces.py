@@ -1,7 +1,7 @@
 """What drives free knee coordinates at trial places, in a leg or in a machine."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -41,7 +41,10 @@ class Joint(Protocol):
         """Return how they follow the contact's wrench on the insert, (n, 6)."""
 
 
-class FreeForces:
+J = TypeVar("J", bound=Joint)
+
+
+class FreeForces(Generic[J]):
     """What drives the free coordinates of a joint at trial places.
 
     Args:
@@ -57,13 +60,13 @@ class FreeForces:
 
     def __init__(
         self,
-        joint: Joint,
+        joint: J,
         probe: "Probe",
         place: Array,
         friction: float = 0.0,
         sliding: Sliding = _no_sliding,
     ) -> None:
-        self._drive, self._probe, self._place = joint, probe, np.array(place, float)
+        self._joint, self._probe, self._place = joint, probe, np.array(place, float)
         self._friction, self._sliding = friction, sliding
         self._rows = list(joint.released)
         self._scale = SCALE[self._rows]
@@ -86,14 +89,14 @@ class FreeForces:
         wrench, stiffness = self._with_friction(place, contact)
         known_to = contact.accuracy * float(np.linalg.norm(wrench[:3]))
         if stiffness is None:
-            force = self._drive.imbalance(place, wrench) / self._scale
+            force = self._joint.imbalance(place, wrench) / self._scale
             return Trial(force, known_to=known_to)
         steps = np.zeros((len(x) + 1, 6))
         steps[np.arange(len(x)), self._rows] = TINY / self._scale
-        forces = self._drive.imbalance(place + steps, wrench) / self._scale
+        forces = self._joint.imbalance(place + steps, wrench) / self._scale
         change = (forces[:-1] - forces[-1]).T / TINY
         twists = knee_axes(place)[self._rows] / self._scale[:, None]
-        gain = self._drive.contact_gain(place) / self._scale[:, None]
+        gain = self._joint.contact_gain(place) / self._scale[:, None]
         tangent = -(change + gain @ stiffness @ twists.T)
         return Trial(forces[-1], tangent, contact.exact, known_to)
 
@@ -121,24 +124,8 @@ class FreeForces:
         return wrench, stiffness if contact.tangent else None
 
 
-class ReleasedForces(FreeForces):
-    """What drives the released coordinates of a leg, the patella held on the femur.
-
-    Args:
-        joint: of the body.
-        probe, place, friction, sliding: see `FreeForces`.
-    """
-
-    def __init__(
-        self,
-        joint: JointEquilibrium,
-        probe: "Probe",
-        place: Array,
-        friction: float = 0.0,
-        sliding: Sliding = _no_sliding,
-    ) -> None:
-        super().__init__(joint, probe, place, friction, sliding)
-        self._joint = joint
+class ReleasedForces(FreeForces[JointEquilibrium]):
+    """What drives the released coordinates of a leg, the patella held on the femur."""
 
     def tension_per_wrench(self, contact: "ProbedContact") -> Array | None:
         """Return v (6,): a further wrench dw on the insert adds v . dw to the ligament's tension.

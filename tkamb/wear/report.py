@@ -197,9 +197,10 @@ class WearReport:
     def _maps(self) -> dict[str, Array]:
         """Return the maps over all vertices of the insert, zero where nothing can wear."""
         state, places = self.state, self.case.articular.vertices
+        crept = {} if self.case.creep is None else {"creep_depth_mm": state.creep / MILLIMETRE}
         named = {
             "wear_depth_mm": state.wear / MILLIMETRE,
-            "creep_depth_mm": state.creep / MILLIMETRE,
+            **crept,
             "sliding_mm_per_cycle": self.last.history.distance / MILLIMETRE,
             "cross_shear_ratio": self.last.history.cross_shear,
             "peak_pressure_MPa": self.last.peak_pressure / MEGAPASCAL,
