@@ -44,6 +44,13 @@ def add_wear(commands: Any) -> None:
     wear.add_argument(
         "--period", type=float, default=1.0, metavar="S", help="of a simulator's cycle; for creep"
     )
+    wear.add_argument(
+        "--samples",
+        type=int,
+        metavar="N",
+        help="for bands; default: 32 where the scene has [uncertainty], else 0, for none",
+    )
+    wear.add_argument("--workers", type=int, default=1, metavar="N", help="processes for samples")
     wear.add_argument("--out", type=Path, metavar="DIR", help="output folder")
     wear.add_argument(
         "--force", action="store_true", help="write into a folder that is not tkamb's"
@@ -57,8 +64,10 @@ def _wear(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from tkamb.claim import claimed_directory
+    from tkamb.run.workers import Crew
     from tkamb.wear.run import prepare_wear
 
+    crew = Crew(options.workers)
     run = prepare_wear(
         options.case,
         cycles=options.cycles,
@@ -71,6 +80,7 @@ def _wear(options: argparse.Namespace) -> int:
         contact=options.contact,
         resolution_mm=options.resolution,
         frames=options.frames_per_cycle,
+        samples=options.samples,
         period=options.period,
         progress=lambda frames: tqdm(frames, "running", unit="frame", disable=None),
     )
@@ -81,6 +91,10 @@ def _wear(options: argparse.Namespace) -> int:
                 claimed,
                 resume=options.resume,
                 progress=lambda cycles: bar.update(cycles - bar.n),
+                crew=crew,
+                sample_progress=lambda samples, count: tqdm(
+                    samples, "samples", count, unit="sample", disable=None
+                ),
             )
         report.write(claimed)
     for question in report.questions():

@@ -17,6 +17,7 @@ from tkamb.run.summary import scene_hash
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.case import Case, load_case
 from tkamb.scene.tables import ContactTable
+from tkamb.scene.uncertainty import UncertaintyTable
 from tkamb.simulation import simulate
 from tkamb.units import MILLIMETRE
 from tkamb.wear.engine import ContactEngine
@@ -40,6 +41,9 @@ class WearSetup:
         contact: name of the contact model.
         resolution_mm: of its map.
         source: the file or folder that the motion comes from.
+        scene_sha256: of the scene and its files, as in a run's summary.
+        uncertainty: the scene's table; None: it has none.
+        simulated: the motion is a simulator's.
     """
 
     engine: ContactEngine
@@ -49,6 +53,9 @@ class WearSetup:
     contact: str
     resolution_mm: float
     source: str
+    scene_sha256: str
+    uncertainty: UncertaintyTable | None = None
+    simulated: bool = False
 
 
 def wear_setup(
@@ -105,6 +112,9 @@ def wear_setup(
         contact=table.model,
         resolution_mm=table.resolution_mm,
         source=str(simulator or path),
+        scene_sha256=scene_hash(case),
+        uncertainty=case.scene.uncertainty,
+        simulated=simulator is not None,
     )
 
 
