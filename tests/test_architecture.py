@@ -31,7 +31,7 @@ DRAWING = {
     "importing": {"geometry", "inputs", "opensim", "scene"},
     "run": {*KNEE, *SHOWN, "plausibility"} - {"results"},
     "output": {"columns", "contact", "geometry", "run"},
-    "view": {*KNEE, *SHOWN, "run", "simulation"} - {"columns"},
+    "view": {*KNEE, *SHOWN, "inputs", "run", "simulation"} - {"columns"},
     "studies": {*KNEE, "decks", "inputs", "output", "run", "simulation"} - {"body"},
     "muscles": {"geometry", "importing", "inputs", "opensim"},
     "designs": {"contact", "geometry"},

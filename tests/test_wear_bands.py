@@ -29,8 +29,8 @@ SPREAD = np.sqrt(np.log1p(0.44**2))
 
 
 def small_case(wear_factor=1e-6, creep=None):
-    plate = shapes.block(lambda x, z: 0.01 + 0 * x, 8 * MM, 8 * MM, 2 * MM)
-    surface = ArticularSurface.of_insert(plate, 2 * MM)
+    plate = shapes.block(lambda x, z: 0.01 + 0 * x, 8 * MM, 8 * MM, 4 * MM)
+    surface = ArticularSurface.of_insert(plate, 4 * MM)
     law = Archard(wear_factor)
     return WearCase(Pressed(always), surface, stroke(12 * MM, 3, 100.0), law, DENSITY, creep)
 

@@ -16,7 +16,7 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 from tkamb.view.arrows import contact_markers, force_arrows
 from tkamb.view.drawing import Drawing, PressureMap, Reading
 from tkamb.view.run import CaseResults, Progress
-from tkamb.view.solids import floor_and_foot, solids
+from tkamb.view.solids import floor_and_foot, solids, worn_insert
 from tkamb.view.strands import (
     centre_markers,
     centres_of_pressure,
@@ -69,7 +69,11 @@ def draw(
         times=results["time_s"],
         statuses=tuple(results.status),
         readings=readings(results, axis),
-        solids=solids(case, mechanics.poses[list(run.frames)], states, maps, rows) + floor,
+        solids=(
+            *solids(case, mechanics.poses[list(run.frames)], states, maps, rows),
+            *floor,
+            *worn_insert(results, case.scene.patient.side),
+        ),
         strands=tuple(strands),
         arrows=force_arrows(results, geometries, contact.friction if contact else 0.0),
         markers=tuple(markers),

@@ -41,7 +41,8 @@ class WearSetup:
         contact: name of the contact model.
         resolution_mm: of its map.
         source: the file or folder that the motion comes from.
-        scene_sha256: of the scene and its files, as in a run's summary.
+        scene_sha256: of the scene as it was given and with the contact that was asked for; a
+            run's summary has one of them.
         uncertainty: the scene's table; None: it has none.
         simulated: the motion is a simulator's.
     """
@@ -53,7 +54,7 @@ class WearSetup:
     contact: str
     resolution_mm: float
     source: str
-    scene_sha256: str
+    scene_sha256: tuple[str, ...]
     uncertainty: UncertaintyTable | None = None
     simulated: bool = False
 
@@ -92,10 +93,12 @@ def wear_setup(
     motion: CycleMotion | None
     if os.path.isdir(path) and simulator is None:
         case, motion = _of_results(path)
+        given = case.scene
     else:
         if os.path.isdir(path):
             path = _scene_of(read_results(path).summary, path)
-        case = load_case(_with_contact(load_scene(path), contact, resolution_mm, path))
+        given = load_scene(path)
+        case = load_case(_with_contact(given, contact, resolution_mm, path))
         motion = None if simulator else _of_scene(case.scene, path, frames, progress)
     table = _with_contact(case.scene, contact, resolution_mm, path).contact
     assert table is not None and case.femoral is not None and case.insert is not None
@@ -112,7 +115,9 @@ def wear_setup(
         contact=table.model,
         resolution_mm=table.resolution_mm,
         source=str(simulator or path),
-        scene_sha256=scene_hash(case),
+        scene_sha256=tuple(
+            dict.fromkeys(scene_hash(replace(case, scene=one)) for one in (given, case.scene))
+        ),
         uncertainty=case.scene.uncertainty,
         simulated=simulator is not None,
     )
