@@ -61,10 +61,16 @@ WEAR = {
     },
 }
 
+OTHERS = (("another's", "these"), ("this", "others"))
+"""Hashes of a scene and its files of which one is not that of `worn`."""
 
-def put_wear(folder, scene_sha256):
+
+def put_wear(folder, summary):
     """Put wear of a scene into a folder: 1 mm off a plate where z is negative."""
-    content = WEAR | {"scene_sha256": ["another's", scene_sha256]}
+    content = WEAR | {
+        "scene_sha256": ["another's", summary["scene_sha256"]],
+        "files_sha256": summary["identity"]["content of a file"],
+    }
     (folder / "wear.json").write_text(json.dumps(content), encoding="utf-8")
     (folder / "wear.png").write_bytes(PIXEL)
     plate = shapes.plate()
@@ -75,9 +81,10 @@ def put_wear(folder, scene_sha256):
 @pytest.fixture
 def worn(tmp_path):
     """Results with wear of their scene beside them."""
-    put_wear(tmp_path, "this")
     results = make_run("bend")
-    summary = results.summary | {"scene_sha256": "this"}
+    identity = {"content of a file": "these"}
+    summary = results.summary | {"scene_sha256": "this", "identity": identity}
+    put_wear(tmp_path, summary)
     return replace(results, directory=tmp_path, summary=summary)
 
 
@@ -95,7 +102,8 @@ def test_the_report_shows_wear_with_its_band_and_says_first_how_sure_it_is(worn,
 
 def test_wear_of_another_scene_is_not_shown_and_that_is_said(worn):
     folder = worn.directory
-    for content in (WEAR, WEAR | {"scene_sha256": ["another's"]}, []):
+    others = [WEAR | {"scene_sha256": [s], "files_sha256": f} for s, f in OTHERS]
+    for content in (WEAR, *others, []):
         (folder / "wear.json").write_text(json.dumps(content), encoding="utf-8")
         assert wear_section(worn) == {"other": OTHER}
         assert worn_insert(worn, "right") == ()
@@ -128,7 +136,7 @@ def test_colours_go_from_the_inserts_own_to_the_deepest():
 def test_the_page_switches_between_the_new_and_the_worn_insert(tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(shipped_run(), folder)
-    put_wear(folder, read_results(folder).summary["scene_sha256"])
+    put_wear(folder, read_results(folder).summary)
     show = Show([open_run(folder)])
     assert show.drawings[0].deepest_wear == 1.0
     assert len(pack(show.drawings)) > 0

@@ -24,8 +24,8 @@ ROWS = (
 )
 """What is shown, and its key."""
 OTHER = (
-    "The wear.json in this folder is of another scene, or of a tkamb that did not say which: it is "
-    "not shown."
+    "The wear.json in this folder is of another scene or other meshes, or of a tkamb that did not "
+    "say which: it is not shown."
 )
 
 
@@ -58,7 +58,7 @@ def wear_section(results: "Results") -> dict[str, Any] | None:
 
 
 def wear_of_run(results: "Results") -> dict[str, Any] | None:
-    """Return wear.json beside a run; empty where it is of another scene, None without one.
+    """Return wear.json beside a run; empty where scene or files are others, None without one.
 
     Raises:
         InputError: it cannot be read.
@@ -67,8 +67,12 @@ def wear_of_run(results: "Results") -> dict[str, Any] | None:
     if folder is None or not (folder / WEAR_NAME).is_file():
         return None
     found = read_json(folder / WEAR_NAME, LARGEST, what="wear.json")
-    known = found.get("scene_sha256") if isinstance(found, dict) else None
-    return found if known and results.summary.get("scene_sha256") in known else {}
+    if not isinstance(found, dict) or not found.get("files_sha256"):
+        return {}
+    summary = results.summary
+    files = (summary.get("identity") or {}).get("content of a file")
+    same = summary.get("scene_sha256") in found["scene_sha256"] and files == found["files_sha256"]
+    return found if same else {}
 
 
 def _legend(found: dict[str, Any], bands: dict[str, Any]) -> str:

@@ -4,7 +4,10 @@ import argparse
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tkamb.wear.run import WearRun
 
 CYCLES, UPDATES, FRAMES = 5_000_000, 10, 40
 
@@ -65,25 +68,8 @@ def _wear(options: argparse.Namespace) -> int:
 
     from tkamb.claim import claimed_directory
     from tkamb.run.workers import Crew
-    from tkamb.wear.run import prepare_wear
 
-    crew = Crew(options.workers)
-    run = prepare_wear(
-        options.case,
-        cycles=options.cycles,
-        updates=options.updates,
-        law=options.law,
-        material=options.material,
-        wear_factor=options.wear_factor,
-        simulator=options.simulator,
-        springs=options.springs,
-        contact=options.contact,
-        resolution_mm=options.resolution,
-        frames=options.frames_per_cycle,
-        samples=options.samples,
-        period=options.period,
-        progress=lambda frames: tqdm(frames, "running", unit="frame", disable=None),
-    )
+    crew, run = Crew(options.workers), _prepared(options)
     folder = options.out or Path("out") / f"{_stem(options.case)}_wear"
     with claimed_directory(folder, options.force) as claimed:
         with tqdm(total=options.cycles, desc="wearing", unit="cycle", disable=None) as bar:
@@ -106,6 +92,29 @@ def _wear(options: argparse.Namespace) -> int:
     else:
         print("\n".join([*report.lines(), f"maps: {folder / 'wear.vtp'}"]))
     return 0
+
+
+def _prepared(options: argparse.Namespace) -> "WearRun":
+    from tqdm import tqdm
+
+    from tkamb.wear.run import prepare_wear
+
+    return prepare_wear(
+        options.case,
+        cycles=options.cycles,
+        updates=options.updates,
+        law=options.law,
+        material=options.material,
+        wear_factor=options.wear_factor,
+        simulator=options.simulator,
+        springs=options.springs,
+        contact=options.contact,
+        resolution_mm=options.resolution,
+        frames=options.frames_per_cycle,
+        samples=options.samples,
+        period=options.period,
+        progress=lambda frames: tqdm(frames, "running", unit="frame", disable=None),
+    )
 
 
 def _stem(case: Path) -> str:

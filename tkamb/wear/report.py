@@ -89,6 +89,7 @@ class WearReport:
             "resolution_mm": self.setup.resolution_mm,
             "source": self.setup.source,
             "scene_sha256": self.setup.scene_sha256,
+            "files_sha256": self.setup.files_sha256,
             "side": self.setup.side,
             "frames": len(self.case.motion),
             "passes_per_cycle": self.case.motion.passes,

@@ -15,7 +15,7 @@ from tkamb.wear.kept import keep_state, kept_state, wear_identity
 from tkamb.wear.materials import WearMaterial, wear_material
 from tkamb.wear.report import SAMPLES_NAME, WearReport
 from tkamb.wear.setup import WearSetup, wear_setup
-from tkamb.wear.simulation import WearCase, WearState, check_blocks, simulate_wear
+from tkamb.wear.simulation import CycleWear, WearCase, WearState, check_blocks, simulate_wear
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,29 +60,10 @@ class WearRun:
             InputError: what the folder keeps is of another simulation, or no contact is found.
             KeyboardInterrupt: with a folder, saying what is kept there.
         """
-        state = None
-
-        def keep(done: WearState) -> None:
-            progress(done.cycles)
-            if folder is not None:
-                keep_state(folder, done, identity)
-
+        identity = ""
         if folder is not None:
             identity = wear_identity(self.setup, self.case, self.cycles, self.updates)
-            state = kept_state(folder, identity) if resume else None
-        try:
-            state, last = simulate_wear(
-                self.case, self.cycles, self.updates, state=state, keep=keep
-            )
-        except KeyboardInterrupt:
-            kept = None
-            if folder is not None:
-                with suppress(InputError):  # what another simulation left is not ours to tell of
-                    kept = kept_state(folder, identity)
-            if kept is None:
-                raise
-            done = f"{kept.cycles:.6g} cycles are kept"
-            raise KeyboardInterrupt(f"{done}; go on with --resume") from None
+        state, last = self._simulated(folder, identity, resume, progress)
         bands = None
         if self.sampling is not None:
             shards = None
@@ -94,6 +75,33 @@ class WearRun:
         return WearReport(
             self.setup, self.case, self.material, state, last, self.cycles, self.updates, bands
         )
+
+    def _simulated(
+        self,
+        folder: Path | None,
+        identity: str,
+        resume: bool,
+        progress: Callable[[float], None],
+    ) -> tuple[WearState, CycleWear]:
+        """Return the end of the simulation, kept in the folder block by block."""
+
+        def keep(done: WearState) -> None:
+            progress(done.cycles)
+            if folder is not None:
+                keep_state(folder, done, identity)
+
+        state = kept_state(folder, identity) if folder is not None and resume else None
+        try:
+            return simulate_wear(self.case, self.cycles, self.updates, state=state, keep=keep)
+        except KeyboardInterrupt:
+            kept = None
+            if folder is not None:
+                with suppress(InputError):  # what another simulation left is not ours to tell of
+                    kept = kept_state(folder, identity)
+            if kept is None:
+                raise
+            done = f"{kept.cycles:.6g} cycles are kept"
+            raise KeyboardInterrupt(f"{done}; go on with --resume") from None
 
 
 def prepare_wear(
