@@ -13,6 +13,7 @@ from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_coordinates
 from tkamb.run.shards import Shards
+from tkamb.run.workers import Crew
 from tkamb.scene.uncertainty import UncertaintyTable
 from tkamb.uncertainty.inputs import Draw, VariedInput
 from tkamb.wear.bands import Sampling, check_samples
@@ -21,7 +22,7 @@ from tkamb.wear.laws import Archard
 from tkamb.wear.sample import moved_case, varied_wear_inputs
 from tkamb.wear.simulation import WearCase, simulate_wear
 from tkamb.wear.worn_surface import ArticularSurface
-from wear_bodies import DENSITY, MM, Pressed, always, balls_scene, stroke
+from wear_bodies import DENSITY, MM, Pressed, always, ball_case, balls_scene, stroke, swing
 
 FACTOR = VariedInput("wear_factor", 0.44, "relative")
 CYCLES = 1_000_000
@@ -149,3 +150,15 @@ def test_a_scene_with_uncertainty_gets_bands_in_every_output(capsys, tmp_path):
     assert found["bands"]["standard_deviations"] == {"ml (mm)": 1.0, "wear_factor (relative)": 0.6}
     assert "loads" in found["bands"]["not_varied"]
     assert not (tmp_path / "out/.wear_samples").exists()
+
+
+@pytest.mark.slow
+def test_two_workers_give_the_numbers_of_one_with_a_contact_model():
+    """Modulus and place vary too: each worker prepares the contact of every sample anew."""
+    case = ball_case(shapes.trough(0.03), 20 * MM, swing(0.5, 3, 500.0), 1e-7, 3.0)
+    inputs = (VariedInput("ap", 0.5, "mm"), VariedInput("young_modulus", 0.1, "relative"), FACTOR)
+    alone, rows = sampled(case, inputs)
+    together, _ = sampled(case, inputs, crew=Crew(2))
+    assert together.rows == alone.rows
+    low, high = (alone.rows[-1][f"volume_mm3_{end}"] for end in ("p05", "p95"))
+    assert 0 < low < rows[-1]["volume_mm3"] < high
