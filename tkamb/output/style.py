@@ -92,7 +92,10 @@ def svg_text(figure: "Figure", name: str, dpi: int = 200) -> str:
     """
     buffer = io.StringIO()
     with settings():
-        figure.savefig(buffer, format="svg", dpi=dpi, metadata={"Date": None, "Creator": None})
+        from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+        figure.set_dpi(dpi)  # not savefig, which draws everything twice: once to lay it out
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<(metadata|style)\b.*?</\1>", "", text, flags=re.DOTALL)
