@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 
-from tkamb.output.metrics import body_weight
 from tkamb.scene import load_scene
 from tkamb.simulation import simulate
 
@@ -22,7 +21,7 @@ def bend(scene: Path) -> dict[str, float]:
     )
     flexion = np.asarray(found["flexion_deg"])
     ratio = tension / ligament
-    weight = body_weight(found)
+    weight = float(total[0] / found["force_total_BW"][0])
     return {
         "si_share": 100.0 * float((np.abs(si) / total).min()),
         "start_force": float(np.asarray(found["force_total_BW"])[0]),
