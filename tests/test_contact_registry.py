@@ -1,5 +1,6 @@
 """Contact models by name, and the conformance of every one of them."""
 
+import shutil
 import sys
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint
@@ -8,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from scenes import write_scene
 from tkamb import named_classes
+from tkamb.compare.comparison import compare_folders
 from tkamb.contact.foundation import ElasticFoundation
 from tkamb.contact.registry import (
     BUILT_IN,
@@ -18,6 +21,9 @@ from tkamb.contact.registry import (
     contact_names,
 )
 from tkamb.errors import InputError
+from tkamb.results_folder import verify_results, write_results
+from tkamb.scene import load_scene
+from tkamb.simulation import simulate
 from tkamb.testing import ConformanceError, check_contact_model
 
 PLUGIN = Path(__file__).parent / "plugin"
@@ -173,3 +179,26 @@ def test_models_are_values():
     assert contact_model("foundation", 1.5) == contact_model("foundation", 1.5)
     assert contact_model("foundation", 1.5).resolution == pytest.approx(1.5e-3)
     assert np.isclose(contact_model("hertz").resolution, 1e-3)
+
+
+def test_the_code_of_another_package_is_part_of_a_runs_identity(tmp_path, monkeypatch):
+    """A default changed in a plug-in changes numbers, but neither the scene nor tkamb's code."""
+    packages = tmp_path / "packages"
+    shutil.copytree(PLUGIN, packages)
+    monkeypatch.syspath_prepend(str(packages))
+    table = {"contact.model": "winkler", "contact.resolution_mm": 3.0}
+    scene = load_scene(write_scene(tmp_path / "scene"), table)
+    folders = [tmp_path / name for name in ("before", "after")]
+    source = packages / "tkamb_winkler" / "model.py"
+    for folder in folders:
+        write_results(simulate(scene, frames=slice(0, 1), directory=folder), folder)
+        assert verify_results(folder).notes == ()
+        if folder == folders[0]:
+            source.write_text(source.read_text() + "\n# another one\n")
+    words = "computed by another code of the contact model 'winkler'"
+    assert verify_results(folders[0]).notes == (words,)
+    assert any("code of the contact model" in note for note in compare_folders(folders).notes)
+    with pytest.raises(InputError, match="another code of the contact model"):
+        simulate(scene, frames=slice(0, 1), directory=folders[0], resume=True)
+    for name in [n for n in sys.modules if n.startswith("tkamb_winkler")]:
+        del sys.modules[name]

@@ -16,6 +16,7 @@ from tkamb.claim import claimed_directory, settle
 from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
 from tkamb.files import MEGABYTE, read_json, sha256_of
+from tkamb.plug_ins import CONTACT_CODE, contact_code
 from tkamb.results import Results, csv_text, read_bands, read_csv
 
 if TYPE_CHECKING:
@@ -251,6 +252,17 @@ def _notes(summary: Mapping[str, Any]) -> list[str]:
     notes, made_by = [], identity.get("version of tkamb")
     if made_by != version("tkamb") or identity.get("code of tkamb") != code_identity():
         notes.append(f"computed by other code (tkamb {made_by}; this is {version('tkamb')})")
+    contact = summary.get("contact")
+    if CONTACT_CODE in identity and isinstance(contact, Mapping):
+        notes += _plug_in_note(str(contact.get("model")), identity[CONTACT_CODE])
     if summary.get("unfinished_frames"):
         notes.append(f"unfinished: {summary['unfinished_frames']} frames are still to be computed")
     return notes
+
+
+def _plug_in_note(model: str, code: str) -> list[str]:
+    try:
+        same = contact_code(model) == code
+    except InputError as error:
+        return [f"its code cannot be compared: {error}"]
+    return [] if same else [f"computed by another code of the contact model '{model}'"]

@@ -12,6 +12,7 @@ from tkamb.compare.pairing import Pairing, pair_frames
 from tkamb.errors import InputError
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
 from tkamb.output.metrics import failed
+from tkamb.plug_ins import CONTACT_CODE
 from tkamb.results import Results
 from tkamb.results_folder import read_results
 
@@ -203,8 +204,9 @@ def _notes(runs: Sequence[Run]) -> list[str]:
     tables = [run.results.summary.get("contact") or {} for run in runs]
     for key in sorted({key for table in tables for key in table}):
         notes += _unlike(runs, f"contact, {key}", [table.get(key) for table in tables])
-    codes = [(run.results.summary.get(VERSIONS) or {}).get("code of tkamb") for run in runs]
-    notes += _unlike(runs, "code of tkamb", codes)
+    for code in ("code of tkamb", CONTACT_CODE):
+        codes = [(run.results.summary.get(VERSIONS) or {}).get(code) for run in runs]
+        notes += _unlike(runs, code, codes)
     for run in runs:
         notes += _frames_note(runs[0], run)
     return notes

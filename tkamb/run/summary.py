@@ -16,6 +16,7 @@ from tkamb.columns import JOINT_MOMENT, RESERVE, belongs, family_column, name_in
 from tkamb.equilibrium.mechanics import STRAIN_FLEXIONS
 from tkamb.files import sha256_of
 from tkamb.known_errors import as_json, known_error
+from tkamb.plug_ins import CONTACT_CODE, contact_code
 from tkamb.run.status import FAILED
 from tkamb.scene.case import Case
 from tkamb.scene.tables import ContactTable, MusclesTable
@@ -133,14 +134,20 @@ def scene_hash(case: Case) -> str:
 
 
 def run_identity(case: Case, frames: range) -> dict[str, Any]:
-    """Return what makes two runs the same: scene, what its files hold, frames, version, code."""
-    return {
+    """Return what makes two runs the same: scene, what its files hold, frames, version, code.
+
+    A contact model of another package adds that package's code.
+    """
+    identity = {
         "scene": scene_hash(case),
         "content of a file": files_hash(case),
         "choice of frames": [frames.start, frames.stop, frames.step],
         "version of tkamb": version("tkamb"),
         "code of tkamb": code_identity(),
     }
+    contact = case.scene.contact
+    foreign = None if contact is None else contact_code(contact.model)
+    return identity if foreign is None else identity | {CONTACT_CODE: foreign}
 
 
 def files_hash(case: Case) -> str:

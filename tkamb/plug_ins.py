@@ -1,0 +1,50 @@
+"""Which code of another package computes the contact: the hash of that package.
+
+It stands in a run's identity beside the code of tkamb, since a default that is changed there
+changes numbers and neither the scene nor tkamb.
+"""
+
+import hashlib
+from collections.abc import Iterable
+from importlib.util import find_spec
+from pathlib import Path
+
+from tkamb.contact.registry import BUILT_IN, contact_class
+
+CONTACT_CODE = "code of the contact model"
+"""What it is called in a run's identity."""
+SUFFIXES = (".py", ".so", ".pyd")
+
+
+def contact_code(model: str) -> str | None:
+    """Return the SHA-256 of the package that offers a contact model; None for a built-in one.
+
+    Raises:
+        InputError: no such name, or it cannot be loaded.
+    """
+    return None if model in BUILT_IN else package_code(contact_class(model).__module__)
+
+
+def package_code(module: str) -> str:
+    """Return the SHA-256 of the package of a module: its source, and what is compiled.
+
+    Args:
+        module: dotted name; a module without a package stands for its one file.
+
+    Raises:
+        ImportError: there is no such package.
+    """
+    spec = find_spec(module.partition(".")[0])
+    if spec is None:
+        raise ImportError(f"no package of module '{module}'")
+    digest = hashlib.sha256()
+    for root in spec.submodule_search_locations or ():
+        for path in sorted(_code_in(Path(root))):
+            digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    if spec.submodule_search_locations is None and spec.origin is not None:
+        digest.update(Path(spec.origin).read_bytes())
+    return digest.hexdigest()
+
+
+def _code_in(folder: Path) -> Iterable[Path]:
+    return (path for path in folder.rglob("*") if path.suffix in SUFFIXES and path.is_file())
