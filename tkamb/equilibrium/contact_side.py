@@ -18,6 +18,7 @@ import numpy as np
 
 from tkamb.body.contact_points import CondylePoint
 from tkamb.body.knee import solve_knee, unsolved
+from tkamb.contact.cam_post import CamPost, CondylesAndPost, PostContact
 from tkamb.contact.materials import material
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import ContactPair
@@ -33,7 +34,7 @@ from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates, knee_pose
 from tkamb.scene.case import Case
-from tkamb.units import DEGREE
+from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.equilibrium.released import KneeEquilibrium
@@ -57,6 +58,9 @@ ADDUCTION_STEP = 0.02 * DEGREE
 """Small against the 0.2 to 0.5 deg that unload a condyle, and it moves some 60 N, thirty times
 what the lattice's tolerance leaves open; steps of 0.005 to 0.1 deg agree within 5 to 15 %."""
 
+POSE_KNOWN = 0.5 * MILLIMETRE
+"""How well fluoroscopy knows a position: a deeper overlap of cam and post is asked about."""
+
 ADDUCTION = KNEE_COORDINATES.index("adduction")
 
 
@@ -69,10 +73,16 @@ class ContactSide:
         state: what the model's `prepare` returned for these surfaces, if there is one already.
         sensitivity: whether each frame tells how its split changes with the adduction, which
             takes one more press.
+        post: cam and post, if they are prepared already.
     """
 
     def __init__(
-        self, case: Case, mechanics: Mechanics, state: Any = None, sensitivity: bool = True
+        self,
+        case: Case,
+        mechanics: Mechanics,
+        state: Any = None,
+        sensitivity: bool = True,
+        post: CamPost | None = None,
     ) -> None:
         table = case.scene.contact
         insert = case.scene.implant.insert
@@ -83,6 +93,7 @@ class ContactSide:
         pair = ContactPair(case.femoral, case.insert, material(table.material), insert.bearing)
         start = clock.perf_counter()
         self.state = self.model.prepare(pair) if state is None else state
+        self.post = self._cam_post(post)
         self.prepare_seconds = clock.perf_counter() - start
 
         self._sensitivity = sensitivity and "adduction" not in table.released
@@ -90,7 +101,20 @@ class ContactSide:
         if table.released:
             from tkamb.equilibrium.released import ReleasedKnee
 
-            self.released = ReleasedKnee(mechanics, self.model.probe(self.state), table.released)
+            probe = self.model.probe(self.state)
+            if self.post is not None:
+                probe = CondylesAndPost(probe, self.post.probe())
+            self.released = ReleasedKnee(mechanics, probe, table.released)
+
+    def _cam_post(self, post: CamPost | None) -> CamPost | None:
+        """Return cam and post of the state's material, prepared, if the scene asks for them."""
+        case, pair = self.case, self.state.pair
+        if case.post is None:
+            return None
+        if post is None:
+            assert case.femoral is not None
+            return CamPost(self.model, case.femoral, case.post, case.split, pair.material)
+        return post if post.material == pair.material else post.of_material(pair.material)
 
     def frame(self, k: int, before: Sequence[FrameContact] = ()) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact of frame k, as coupled as the scene asks.
@@ -123,7 +147,7 @@ class ContactSide:
         if contact.adjustment and contact.adjustment.restored:
             body = self.mechanics.frame(k, contact.adjustment)
             contact = self.carry(body, self.mechanics.poses[k], contact.result)
-        if self.table.coupling == "none":
+        if self.table.coupling == "none" and self.post is None:
             return body, contact
         return self._couple(k, body, contact)
 
@@ -154,14 +178,21 @@ class ContactSide:
     def _couple(
         self, k: int, body: FrameLoads, contact: FrameContact
     ) -> tuple[FrameLoads, FrameContact]:
-        """Return body and contact once the resultants of the one are the points of the other."""
+        """Return body and contact once the one's resultants and post act in the other."""
         seconds, place = contact.seconds, self.case.motion.coordinates[k]
         for iteration in range(1, MOST_ITERATIONS + 1):
             if contact.result is None:
                 return body, contact
             load, points = body.loads.contact_force[1], _points(body)
-            found = self.resultants(k, place, contact.result)
-            geometry = replace(body.geometry, condyles=body.geometry.condyles | found)
+            coupled = self.table.coupling == "points"
+            found = self.resultants(k, place, contact.result) if coupled else {}
+            post = self._on_post(contact.result.pose)
+            if post is not None and post.problem:
+                return replace(body, loads=unsolved([post.problem])), replace(
+                    contact, result=None, problem=post.problem, post=post
+                )
+            pushed = self.mechanics.post_loads(k, place, post.load if post else None)
+            geometry = replace(body.geometry, condyles=body.geometry.condyles | found, post=pushed)
             geometry, loads = self.mechanics.solved(k, geometry)
             body = replace(body, geometry=geometry, loads=loads)
             contact = self.carry(body, self.mechanics.poses[k], contact.result)
@@ -173,7 +204,8 @@ class ContactSide:
                 seconds=seconds,
                 iterations=iteration,
                 load_change=change,
-                point_change=moved,
+                point_change=moved if coupled else NAN,
+                post=post,
             )
             if change < LOAD_CHANGE and moved < POINT_CHANGE:
                 return body, contact
@@ -206,6 +238,7 @@ class ContactSide:
             result = self.model.evaluate(self.state, knee_pose(knee.coordinates), guess)
             result = within_insert(self.state, result)
             contact = self._contact(result, None, 0.0)
+            contact = replace(contact, post=self._on_post(result.pose))
         contact = replace(
             contact,
             seconds=clock.perf_counter() - start,
@@ -275,7 +308,12 @@ class ContactSide:
             }
             touching = self.resultants(k, knee.coordinates, contact.result)
             lifted = frozenset(self.mechanics.sides - set(touching))
-            geometry = replace(geometry, condyles=separated | touching, lifted=lifted)
+            geometry = replace(
+                geometry,
+                condyles=separated | touching,
+                lifted=lifted,
+                post=self.mechanics.post_loads(k, knee.coordinates, knee.contact.post),
+            )
             loads = solve_knee(geometry, self.mechanics.friction)
         seconds = clock.perf_counter() - start
         return FrameLoads(geometry, loads, None, 0.0, seconds)
@@ -283,6 +321,15 @@ class ContactSide:
     def resultants(self, k: int, place: Array, result: ContactResult) -> dict[str, CondylePoint]:
         """Return the contact's resultants as the contact points of the equations."""
         return self.mechanics.resultants(k, place, condyle_wrenches(result, self.case.split))
+
+    def _on_post(self, pose: Array) -> PostContact | None:
+        """Return cam and post at a pose (4, 4), if the scene asks for them."""
+        if self.post is None:
+            return None
+        post = self.post.at(pose)
+        if "ap" in self.table.released or post.problem or not post.gap < -POSE_KNOWN:
+            return post
+        return replace(post, flags=(*post.flags, _overlap(post)))
 
     def _nearest_points(self, k: int) -> dict[str, Array]:
         query = self.mechanics.query
@@ -311,6 +358,14 @@ class ContactSide:
 
 def _points(body: FrameLoads) -> dict[str, Array]:
     return {side: condyle.point for side, condyle in body.geometry.condyles.items()}
+
+
+def _overlap(post: PostContact) -> str:
+    """Return what a reader must know of a cam that the recorded pose drives into the post."""
+    return (
+        f"cam and post overlap by {-post.gap / MILLIMETRE:.1f} mm as recorded, which makes "
+        f"{np.linalg.norm(post.force):.0f} N: release ap"
+    )
 
 
 def _travel(before: dict[str, Array], after: dict[str, Array]) -> float:
