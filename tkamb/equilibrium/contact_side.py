@@ -18,7 +18,6 @@ import numpy as np
 
 from tkamb.body.contact_points import CondylePoint
 from tkamb.body.knee import solve_knee, unsolved
-from tkamb.contact.cam_post import CamPost, CondylesAndPost, PostContact
 from tkamb.contact.materials import material
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import ContactPair
@@ -30,13 +29,15 @@ from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.frame_contact import FrameContact
 from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
+from tkamb.equilibrium.post_side import cam_on_post, post_contact
 from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates, knee_pose
 from tkamb.scene.case import Case
-from tkamb.units import DEGREE, MILLIMETRE
+from tkamb.units import DEGREE
 
 if TYPE_CHECKING:
+    from tkamb.contact.cam_post import CamPost
     from tkamb.equilibrium.released import KneeEquilibrium
 
 NAN = float("nan")
@@ -57,9 +58,6 @@ FIRST_DEPTH = 5e-5
 ADDUCTION_STEP = 0.02 * DEGREE
 """Small against the 0.2 to 0.5 deg that unload a condyle, and it moves some 60 N, thirty times
 what the lattice's tolerance leaves open; steps of 0.005 to 0.1 deg agree within 5 to 15 %."""
-
-POSE_KNOWN = 0.5 * MILLIMETRE
-"""How well fluoroscopy knows a position: a deeper overlap of cam and post is asked about."""
 
 ADDUCTION = KNEE_COORDINATES.index("adduction")
 
@@ -82,7 +80,7 @@ class ContactSide:
         mechanics: Mechanics,
         state: Any = None,
         sensitivity: bool = True,
-        post: CamPost | None = None,
+        post: "CamPost | None" = None,
     ) -> None:
         table = case.scene.contact
         insert = case.scene.implant.insert
@@ -93,7 +91,7 @@ class ContactSide:
         pair = ContactPair(case.femoral, case.insert, material(table.material), insert.bearing)
         start = clock.perf_counter()
         self.state = self.model.prepare(pair) if state is None else state
-        self.post = self._cam_post(post)
+        self.post = cam_on_post(case, self.model, self.state.pair.material, post)
         self.prepare_seconds = clock.perf_counter() - start
 
         self._sensitivity = sensitivity and "adduction" not in table.released
@@ -103,18 +101,8 @@ class ContactSide:
 
             probe = self.model.probe(self.state)
             if self.post is not None:
-                probe = CondylesAndPost(probe, self.post.probe())
+                probe = self.post.probe_with(probe)
             self.released = ReleasedKnee(mechanics, probe, table.released)
-
-    def _cam_post(self, post: CamPost | None) -> CamPost | None:
-        """Return cam and post of the state's material, prepared, if the scene asks for them."""
-        case, pair = self.case, self.state.pair
-        if case.post is None:
-            return None
-        if post is None:
-            assert case.femoral is not None
-            return CamPost(self.model, case.femoral, case.post, case.split, pair.material)
-        return post if post.material == pair.material else post.of_material(pair.material)
 
     def frame(self, k: int, before: Sequence[FrameContact] = ()) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact of frame k, as coupled as the scene asks.
@@ -186,7 +174,7 @@ class ContactSide:
             load, points = body.loads.contact_force[1], _points(body)
             coupled = self.table.coupling == "points"
             found = self.resultants(k, place, contact.result) if coupled else {}
-            post = self._on_post(contact.result.pose)
+            post = post_contact(self.post, contact.result.pose, self.table)
             if post is not None and post.problem:
                 return replace(body, loads=unsolved([post.problem])), replace(
                     contact, result=None, problem=post.problem, post=post
@@ -238,7 +226,7 @@ class ContactSide:
             result = self.model.evaluate(self.state, knee_pose(knee.coordinates), guess)
             result = within_insert(self.state, result)
             contact = self._contact(result, None, 0.0)
-            contact = replace(contact, post=self._on_post(result.pose))
+            contact = replace(contact, post=post_contact(self.post, result.pose, self.table))
         contact = replace(
             contact,
             seconds=clock.perf_counter() - start,
@@ -291,7 +279,19 @@ class ContactSide:
         yield self.on_the_insert(recorded)
 
     def on_the_insert(self, place: Array) -> Array:
-        """Return coordinates (6,) whose superior-inferior one makes the condyles just touch."""
+        """Return coordinates (6,) whose superior-inferior one makes the condyles just touch.
+
+        Where AP is released and a cam overlaps the post, AP makes them just touch, too.
+        """
+        touching = self._on_the_dishes(place)
+        if self.post is None or "ap" not in self.table.released:
+            return touching
+        gap = self.post.clearance(knee_pose(touching))
+        if not gap < 0:
+            return touching
+        return self._on_the_dishes(np.array([place[0] + gap + FIRST_DEPTH, *place[1:]]))
+
+    def _on_the_dishes(self, place: Array) -> Array:
         height = self.state.pair.first_touch_height(knee_pose(place))
         return np.array([place[0], height - FIRST_DEPTH, *place[2:]])
 
@@ -322,15 +322,6 @@ class ContactSide:
         """Return the contact's resultants as the contact points of the equations."""
         return self.mechanics.resultants(k, place, condyle_wrenches(result, self.case.split))
 
-    def _on_post(self, pose: Array) -> PostContact | None:
-        """Return cam and post at a pose (4, 4), if the scene asks for them."""
-        if self.post is None:
-            return None
-        post = self.post.at(pose)
-        if "ap" in self.table.released or post.problem or not post.gap < -POSE_KNOWN:
-            return post
-        return replace(post, flags=(*post.flags, _overlap(post)))
-
     def _nearest_points(self, k: int) -> dict[str, Array]:
         query = self.mechanics.query
         assert query is not None
@@ -358,14 +349,6 @@ class ContactSide:
 
 def _points(body: FrameLoads) -> dict[str, Array]:
     return {side: condyle.point for side, condyle in body.geometry.condyles.items()}
-
-
-def _overlap(post: PostContact) -> str:
-    """Return what a reader must know of a cam that the recorded pose drives into the post."""
-    return (
-        f"cam and post overlap by {-post.gap / MILLIMETRE:.1f} mm as recorded, which makes "
-        f"{np.linalg.norm(post.force):.0f} N: release ap"
-    )
 
 
 def _travel(before: dict[str, Array], after: dict[str, Array]) -> float:
