@@ -326,7 +326,7 @@ def test_a_left_knee_gives_the_right_knees_numbers(tmp_path):
     for scene in (write_scene(tmp_path / "right"), write_mirrored_patient(tmp_path / "left")):
         DESIGN.write_meshes(tmp_path / "ps")
         for mesh, name in ((CAM_MESH, "femoral_component.stl"), (INSERT_MESH, "insert.stl")):
-            if "left" in str(scene):
+            if scene.parent.name == "left":
                 mirror_mesh(tmp_path / "ps" / mesh)
             (tmp_path / "ps" / mesh).replace(scene.parent / name)
         found.append(simulate(load_scene(scene, overrides), frames=slice(70, 81, 10)))
