@@ -64,7 +64,8 @@ class Post:
         """Say what is not modelled."""
         return (
             f"post at x = {self.x / MILLIMETRE:.0f}, z = {self.z / MILLIMETRE:.0f} mm, "
-            f"{self.height / MILLIMETRE:.0f} mm above the dishes: cam-post contact is not modelled"
+            f"{self.height / MILLIMETRE:.0f} mm above the dishes: cam-post contact is not modelled "
+            "without [contact] post"
         )
 
 
