@@ -155,7 +155,7 @@ def test_engagement_is_where_a_circle_meets_a_line(femoral, parts):
 
     pair = CamPost(contact_model("foundation"), femoral, parts[1], 0.0, LINEAR)
     found = brentq(lambda flexion: pair.at(place(flexion, ap(flexion))).gap, 60.0, 100.0, xtol=1e-4)
-    assert found == pytest.approx(brentq(distance, 60.0, 100.0), abs=0.02)
+    assert found == pytest.approx(brentq(distance, 60.0, 100.0), abs=0.01)
     assert (pair.at(place(found - 0.1, ap(found - 0.1))).force == 0).all()
     assert pair.at(place(found + 1.0, ap(found + 1.0))).force[0] > 1.0
 
@@ -191,6 +191,15 @@ def test_lattice_and_finite_elements_agree_on_the_post():
     assert lattice.force[0] == pytest.approx(fe.force[0], rel=0.05)
     assert lattice.area == pytest.approx(fe.area, rel=0.05)
     assert lattice.peak_pressure == pytest.approx(fe.peak_pressure, rel=0.05)
+
+
+def test_a_cylinder_on_a_deep_post_is_hertzs_line_contact():
+    """Half-width b = 2 sqrt(F R/(pi E*)), peak 2 F/(pi b), F per length as found (Johnson 1985)."""
+    found = cylinder_on_post("lattice-linear", LINEAR, 0.75, 30e-3).at(pressed_in(0.1e-3, 30e-3))
+    per_length, strain = found.force[0] / LENGTH, 1.0 - LINEAR.poisson_ratio**2
+    half = 2.0 * np.sqrt(per_length * 30e-3 * strain / (np.pi * LINEAR.young_modulus))
+    assert found.area == pytest.approx(2.0 * half * LENGTH, rel=0.05)
+    assert found.peak_pressure == pytest.approx(2.0 * per_length / (np.pi * half), rel=0.05)
 
 
 def test_stiffness_is_the_change_of_the_wrench(femoral, parts):
