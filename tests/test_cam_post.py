@@ -193,6 +193,7 @@ def test_lattice_and_finite_elements_agree_on_the_post():
     assert lattice.peak_pressure == pytest.approx(fe.peak_pressure, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_cylinder_on_a_deep_post_is_hertzs_line_contact():
     """Half-width b = 2 sqrt(F R/(pi E*)), peak 2 F/(pi b), F per length as found (Johnson 1985)."""
     found = cylinder_on_post("lattice-linear", LINEAR, 0.75, 30e-3).at(pressed_in(0.1e-3, 30e-3))
