@@ -188,7 +188,7 @@ def folders(folder: Path, chance: random.Random) -> list[str]:
         path, how = out / chance.choice(names), chance.randint(0, 5)
         if how == 0 and path.is_file():
             path.write_bytes(spoilt(path.read_bytes(), chance))
-        elif how == 1:
+        elif how == 1 and not path.is_dir():
             path.unlink(missing_ok=True)
         elif how == 2 and not path.exists():
             chance.choice([path.mkdir, path.touch, lambda p=path: os.mkfifo(p)])()

@@ -10,7 +10,7 @@ from joints import HALF, flat_joint
 from scenes import write_scene
 from tkamb import simulate
 from tkamb.contact.registry import contact_model
-from tkamb.equilibrium.contact_side import ContactSide, split_sensitivity
+from tkamb.equilibrium.contact_side import ContactSide, split_sensitivity, split_tangent
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_pose
 from tkamb.output.axis import horizontal_axis
@@ -36,6 +36,17 @@ def shipped(tmp_path_factory):
     return simulate(write_scene(tmp_path_factory.mktemp("shipped"), **COARSE), frames=FRAMES)
 
 
+def test_the_tangent_and_a_turned_press_tell_the_same_of_the_shipped_knee(tmp_path):
+    """Within the roughness of its facets."""
+    case = load_case(load_scene(write_scene(tmp_path)))
+    side = ContactSide(case, Mechanics(case))
+    for k in (10, 60, 95):
+        _, contact = side.frame(k)
+        turned = split_sensitivity(side.model, side.state, contact.result)
+        assert contact.sensitivity == pytest.approx(turned, rel=0.03)
+        assert contact.sensitivity != turned
+
+
 @pytest.mark.parametrize("name", ["foundation-linear", "lattice-linear"])
 def test_two_spheres_share_by_their_stiffness(name):
     """A layer carries F = c d^2 under a sphere: dF/dd = 2F/d, half the width apart per radian.
@@ -49,6 +60,15 @@ def test_two_spheres_share_by_their_stiffness(name):
     result = model.press(state, load, knee_pose(np.zeros(6)))
     expected = power * (load / 2) / result.approach * HALF
     assert split_sensitivity(model, state, result) == pytest.approx(expected, rel=0.1)
+
+
+def test_the_tangent_of_a_layer_under_two_spheres():
+    """A ring of columns that enters makes the tangent jump: by less, the finer they are."""
+    model, load = contact_model("foundation-linear", 0.25), 1000.0
+    state = model.prepare(flat_joint())
+    result = model.press(state, load, knee_pose(np.zeros(6)))
+    expected = 2.0 * (load / 2) / result.approach * HALF
+    assert split_tangent(model.probe(state), result) == pytest.approx(expected, rel=0.02)
 
 
 def test_sensitivity_is_the_slope_of_presses_farther_apart(tmp_path):

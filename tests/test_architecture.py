@@ -39,7 +39,7 @@ DRAWING = {
     | {"scene", "simulation"},
     "uncertainty": {*KNEE, "columns", "inputs", "results", "results_folder", "run", "simulation"},
     "cohort": {"columns", "geometry", "output", "results", "run", "scene", "simulation"},
-    "validation": {"contact", "designs", "geometry", "simulation", "studies"},
+    "validation": {"contact", "designs", "geometry", "scene", "simulation", "studies"},
 }
 """Which folder knows which folders and which modules beside them: inputs → body → (equilibrium ⇄
 contact) → results → output, view and studies; the scene is where files become bodies."""

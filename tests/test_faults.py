@@ -22,7 +22,9 @@ MOST = 400
 @pytest.fixture(autouse=True)
 def plain_report(monkeypatch):
     """The report's drawing takes a second and writes nothing."""
-    monkeypatch.setattr("tkamb.output.report.report_html", lambda results: "<html></html>")
+    monkeypatch.setattr(
+        "tkamb.output.report.report_html", lambda results, progress=None: "<html></html>"
+    )
 
 
 @pytest.fixture

@@ -89,7 +89,7 @@ def stiff_knee():
 
 
 def test_indices_of_a_scene_add_up_where_loads_add_up(tmp_path, monkeypatch):
-    monkeypatch.setattr("tkamb.output.report.report_html", lambda results: "page")
+    monkeypatch.setattr("tkamb.output.report.report_html", lambda results, progress=None: "page")
     folder = tmp_path / "out"
     found = estimate_uncertainty(
         stiff_knee(),

@@ -15,7 +15,7 @@ def run_through(stream):
     with Stages(3, stream) as stages:
         stages.begin("reading")
         assert list(stages.frames(range(4))) == [0, 1, 2, 3]
-        stages.begin("writing")
+        assert list(stages.plots("ab")) == ["a", "b"]
     return stream.getvalue()
 
 
@@ -23,7 +23,7 @@ def test_a_terminal_sees_each_stage_once_with_its_time_and_the_frames_time_left(
     told = run_through(Terminal())
     assert re.search(r"1/3 reading … \d+\.\d s\n", told)
     assert re.search(r"2/3 computing frames: 100%.*4/4 \[\d\d:\d\d<\d\d:\d\d", told)
-    assert re.search(r"3/3 writing … \d+\.\d s\n$", told)
+    assert re.search(r"3/3 writing results and report: 100%.*2/2 \[\d\d:\d\d<", told)
 
 
 def test_a_pipe_sees_nothing():

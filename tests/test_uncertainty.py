@@ -239,7 +239,7 @@ def test_two_runs_into_one_folder_are_refused_before_anything_is_computed(tmp_pa
 
 def test_a_full_disk_leaves_no_bands_or_all_of_them(tmp_path, monkeypatch):
     found = estimate_uncertainty(bodies_alone(), samples=20, frames=slice(0, 1))
-    monkeypatch.setattr("tkamb.output.report.report_html", lambda results: "page")
+    monkeypatch.setattr("tkamb.output.report.report_html", lambda results, progress=None: "page")
 
     def write(folder, number=None):
         folder.mkdir()

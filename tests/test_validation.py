@@ -46,7 +46,8 @@ def test_badge_counts_hits():
 
 
 def test_cheap_values_are_computed_anew():
-    anew = {**benchmarks.film(), **benchmarks.patch()}
+    anew = {**benchmarks.film(), **benchmarks.patch(), **benchmarks.refinement()}
+    anew |= benchmarks.speed(ROOT / "docs" / "tradeoff.json")
     for name, value in anew.items():
         assert value == pytest.approx(STORED["values"][name], rel=1e-3), name
 

@@ -140,8 +140,7 @@ def _run(options: argparse.Namespace) -> int:
         )
         if profile:
             results.summary["profile"] = profile.report(results, options.scene)
-        stages.begin("writing results and report")
-        write_results(results, directory)
+        write_results(results, directory, progress=stages.plots)
     failed = [k for k, status in enumerate(results.status) if status.startswith(FAILED)]
     for k in failed:
         print(f"tkamb: frame {k}: {results.status[k]}", file=sys.stderr)

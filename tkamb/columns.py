@@ -173,8 +173,8 @@ COLUMNS: tuple[Column, ...] = (
     Column("adjust_share_change", "the same, of medial_share_equilibrium", _ADJUST),
     Column(
         "medial_force_per_adduction_N_per_deg",
-        "change of medial_force_N with adduction at constant load, a finite difference; zero where "
-        "one condyle carries all, until the other touches",
+        "change of medial_force_N with adduction at constant load, the foundation's tangent, or a "
+        "finite difference; zero where one condyle carries all, until the other touches",
         _RECORDED,
     ),
     Column(

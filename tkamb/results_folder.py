@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -20,6 +20,7 @@ from tkamb.results import Results, csv_text, read_bands, read_csv
 
 if TYPE_CHECKING:
     from tkamb.output.maps import ContactMaps
+    from tkamb.output.panels import Panel
 
 CSV_NAME, SUMMARY_NAME, REPORT_NAME = "results.csv", "summary.json", "report.html"
 MAPS_NAME = "contact.h5"
@@ -99,6 +100,7 @@ def write_results(
     *,
     force: bool = False,
     more: Mapping[str, Callable[[Path], object]] | None = None,
+    progress: Callable[[Sequence["Panel"]], Iterable["Panel"]] = lambda drawn: drawn,
 ) -> None:
     """Write results.csv, summary.json, contact.h5 and report.html: all of them or none.
 
@@ -110,6 +112,7 @@ def write_results(
         directory: the folder; made if it is not there.
         force: write even into a folder that holds things that are not tkamb's.
         more: of `UNCERTAINTY_NAMES`, what writes the file at a path; those left out are removed.
+        progress: wraps the plots of the report, a progress bar for example.
 
     Raises:
         InputError: the folder cannot be claimed (`tkamb.claim`) or written.
@@ -125,7 +128,7 @@ def write_results(
             for name, write in (more or {}).items():
                 write(files.path(name))
             put_numbers(results, files)
-            write_synced(files.path(REPORT_NAME), report_html(results))
+            write_synced(files.path(REPORT_NAME), report_html(results, progress))
         remove_shards(folder)
 
 

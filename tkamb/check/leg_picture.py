@@ -23,7 +23,6 @@ from tkamb.geometry.surface import Surface
 from tkamb.output.style import (
     BLACK,
     FORCE_COLOURS,
-    GREEN,
     GREY,
     LIGAMENT,
     PATELLAR_LIGAMENT,
@@ -41,8 +40,8 @@ KNEE_HALF_WIDTH = 0.085
 MARGIN = 0.08
 """m, around what is shown."""
 LEGEND = (
-    f"In the laboratory, y up, grid 0.1 m. Arrow: force of the plate on the foot, 1 BW = "
-    f"{METRES_PER_BW:g} m.\nGrey: femoral component, light blue: insert, green: button; "
+    f"In the laboratory, y up, grid 0.1 m. Green arrow: force of the plate on the foot, 1 BW = "
+    f"{METRES_PER_BW:g} m.\nGrey: femoral component, light blue: insert and button; "
     "dark red: quadriceps, pink: patellar ligament, purple: ligaments."
 )
 
@@ -97,7 +96,7 @@ def leg_frame(mechanics: Mechanics, k: int) -> LegFrame:
     parts = (
         (case.insert, np.eye(4), SKY),
         (case.femoral, state.pose("femur"), GREY),
-        (case.patella, state.pose("patella") if case.patella else np.eye(4), GREEN),
+        (case.patella, state.pose("patella") if case.patella else np.eye(4), SKY),
     )
     bodies = tuple(
         (surface.moved(to_laboratory @ pose), colour)

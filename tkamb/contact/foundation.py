@@ -212,6 +212,8 @@ class FoundationProbe:
         state: what its `prepare` returned.
     """
 
+    exact: ClassVar[bool] = True
+
     def __init__(self, law: Law, state: SampledContact) -> None:
         self._law, self._state = law, state
         self._corners = _corners(state.pair.femoral.bounds)

@@ -6,7 +6,7 @@ of `evaluate`. A model that knows its tangent brings a faster probe with stiffne
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -90,7 +90,12 @@ class Probe:
         model: any contact model.
         state: what its `prepare` returned.
         guess: an earlier result.
+
+    Attributes:
+        exact: every answer brings the tangent, and it costs less than a press.
     """
+
+    exact: ClassVar[bool] = False
 
     def __init__(self, model: Evaluates, state: Any, guess: ContactResult | None = None) -> None:
         self._model, self._state, self._guess = model, state, guess

@@ -32,12 +32,13 @@ from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.equilibrium.post_side import cam_on_post, post_contact
 from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
-from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates, knee_pose
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_axes, knee_coordinates, knee_pose
 from tkamb.scene.case import Case
 from tkamb.units import DEGREE
 
 if TYPE_CHECKING:
     from tkamb.contact.cam_post import CamPost
+    from tkamb.contact.probe import Probe
     from tkamb.equilibrium.released import KneeEquilibrium
 
 NAN = float("nan")
@@ -59,7 +60,7 @@ ADDUCTION_STEP = 0.02 * DEGREE
 """Small against the 0.2 to 0.5 deg that unload a condyle, and it moves some 60 N, thirty times
 what the lattice's tolerance leaves open; steps of 0.005 to 0.1 deg agree within 5 to 15 %."""
 
-ADDUCTION = KNEE_COORDINATES.index("adduction")
+ADDUCTION, SUPERIOR = (KNEE_COORDINATES.index(name) for name in ("adduction", "si"))
 
 
 class ContactSide:
@@ -70,7 +71,7 @@ class ContactSide:
         mechanics: its body side.
         state: what the model's `prepare` returned for these surfaces, if there is one already.
         sensitivity: whether each frame tells how its split changes with the adduction, which
-            takes one more press.
+            takes one more press of a model without a tangent.
         post: cam and post, if they are prepared already.
     """
 
@@ -95,14 +96,13 @@ class ContactSide:
         self.prepare_seconds = clock.perf_counter() - start
 
         self._sensitivity = sensitivity and "adduction" not in table.released
+        self._probe = self.model.probe(self.state)
         self.released = None
         if table.released:
             from tkamb.equilibrium.released import ReleasedKnee
 
-            probe = self.model.probe(self.state)
-            if self.post is not None:
-                probe = self.post.probe_with(probe)
-            self.released = ReleasedKnee(mechanics, probe, table.released)
+            both = self._probe if self.post is None else self.post.probe_with(self._probe)
+            self.released = ReleasedKnee(mechanics, both, table.released)
 
     def frame(self, k: int, before: Sequence[FrameContact] = ()) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact of frame k, as coupled as the scene asks.
@@ -121,7 +121,10 @@ class ContactSide:
         if not self._sensitivity:
             return body, contact
         start = clock.perf_counter()
-        sensitivity = split_sensitivity(self.model, self.state, contact.result)
+        if self._probe.exact:
+            sensitivity = split_tangent(self._probe, contact.result)
+        else:
+            sensitivity = split_sensitivity(self.model, self.state, contact.result)
         seconds = contact.seconds + clock.perf_counter() - start
         return body, replace(contact, sensitivity=sensitivity, seconds=seconds)
 
@@ -374,6 +377,32 @@ def split_sensitivity(model: ContactModel, state: Any, result: ContactResult) ->
     if turned.status is not ContactStatus.OK:
         return float("nan")
     return (_medial(turned) - _medial(result)) / ADDUCTION_STEP
+
+
+def split_tangent(probe: "Probe", result: ContactResult) -> float:
+    """Return what `split_sensitivity` does, from the tangent of a model that knows it.
+
+    With the tangents t of the wrenches F on the insert, at a constant superior-inferior load
+    the femur follows an adduction da by dy = -(sum t_y,a / sum t_y,y) da, and the medial force
+    changes by n . (t_a da + t_y dy).
+
+    Args:
+        probe: of the contact model, exact.
+        result: a contact.
+    """
+    place = knee_coordinates(result.pose)
+    condyles = probe.at(result.pose).condyles
+    if "medial" not in condyles:
+        return 0.0
+    twists = knee_axes(place)[[ADDUCTION, SUPERIOR]].T
+    changes = {
+        side: condyle.stiffness[:3] @ twists
+        for side, condyle in condyles.items()
+        if condyle.stiffness is not None
+    }
+    total = sum(change[1] for change in changes.values())
+    follow = np.array([1.0, -total[0] / total[1]])
+    return float(-condyles["medial"].normal @ changes["medial"] @ follow)
 
 
 def _medial(result: ContactResult) -> float:

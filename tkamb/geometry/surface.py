@@ -2,16 +2,18 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 
 from tkamb.geometry.frames import Array, Index, transform
 from tkamb.geometry.nearest import NearestPoints
 from tkamb.geometry.normals import SHARP_EDGE, corner_angles, corner_normals, interpolated
 from tkamb.geometry.ragged import Ragged
 from tkamb.geometry.rays import RayCaster
+
+if TYPE_CHECKING:
+    import trimesh
 
 SMOOTH_WITHIN = np.radians(30.0)
 """rad; triangles that meet at a larger angle belong to different smooth surfaces."""
@@ -35,8 +37,10 @@ class Surface:
     name: str = "surface"
 
     @cached_property
-    def mesh(self) -> trimesh.Trimesh:
+    def mesh(self) -> "trimesh.Trimesh":
         """The same surface for trimesh, unprocessed."""
+        import trimesh  # half a second, which a report or a message need not wait for
+
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
     @cached_property

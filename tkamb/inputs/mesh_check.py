@@ -156,7 +156,7 @@ class MeshHealth:
 
     def _axis_questions(self) -> list[str]:
         if not self.flats:
-            return ["  no flat side that could be an insert's bottom"]
+            return ["  no large flat side: no insert, or one without a flat bottom"]
         flat = self.flats[0]
         tilt = "" if flat.tilt_deg < 0.05 else f", tilted by {flat.tilt_deg:.1f} deg"
         up = f"{'-' if flat.faces[0] == '+' else '+'}{flat.faces[1]}"
@@ -164,8 +164,9 @@ class MeshHealth:
         along = next(axis for axis in "xyz" if axis not in (flat.faces[1], across))
         lines = [
             f"  largest flat side faces {flat.faces} ({100 * flat.area_share:.0f} % of the "
-            f"area{tilt}): an insert's bottom? then superior is {up}, the longer side {across} "
-            f"is right or left, {along} anterior or posterior: --axes ±{along},{up},±{across}"
+            f"area{tilt}). If this is an insert: its bottom? then superior is {up}, the longer "
+            f"side {across} is right or left, {along} anterior or posterior: "
+            f"--axes ±{along},{up},±{across}"
         ]
         others = ", ".join(flat.faces for flat in self.flats[1:])
         return [*lines, f"  flat sides of comparable area face {others}"] if others else lines

@@ -4,6 +4,7 @@ Its frame slider moves one cursor in every plot; the numbers of the frames stand
 JSON, rounded to five digits. Without scripts, and on paper, the page reads as before.
 """
 
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,8 @@ from tkamb.output.tables import flag_rows, motion_table, strain_table
 
 if TYPE_CHECKING:
     from tkamb.results import Results
+
+Progress = Callable[[Sequence[Panel]], Iterable[Panel]]
 
 PACKAGE = "tkamb.output"
 POLICY = (
@@ -57,8 +60,13 @@ def write_report(results: "Results", path: str | Path) -> None:
     write_text(Path(path), report_html(results))
 
 
-def report_html(results: "Results") -> str:
-    """Return the report as HTML: vector plots, pictures and style are inside the page."""
+def report_html(results: "Results", progress: Progress = lambda drawn: drawn) -> str:
+    """Return the report as HTML: vector plots, pictures and style are inside the page.
+
+    Args:
+        results: of a run.
+        progress: wraps the plots, a progress bar for example.
+    """
     axis = horizontal_axis(results)
     style = asset(PACKAGE, "report.css")
     script = "\n".join(asset(PACKAGE, name) for name in SCRIPTS)
@@ -76,7 +84,7 @@ def report_html(results: "Results") -> str:
         sentences=_sentences(results.summary),
         maps=maps,
         legend=_legend(results),
-        plots=[_plot(panel, results, axis) for panel in panels(results)],
+        plots=[_plot(panel, results, axis) for panel in progress(panels(results))],
         muscles=_muscles(results, axis),
         motion=motion_table(results, axis),
         strain=strain_table(results.summary),

@@ -20,12 +20,13 @@ SIDE_COLOURS = {"medial": MEDIAL, "lateral": LATERAL}
 SUPERIOR, ANTERIOR, RIGHT = "#5D3A9B", "#2A9D8F", "#7B8B00"
 """Of forces along the insert axes, and of moments and rotations about them."""
 QUADRICEPS, PATELLAR_LIGAMENT, PATELLOFEMORAL, HIP = "#882255", "#CC79A7", "#664400", "#6666EE"
+GROUND = "#388C54"
 LIST = ("#332288", "#A6761D", "#009E73", "#AA4499")
 """Of ligaments and muscles, which are too many: they are told apart within one plot."""
 LIGAMENT = LIST[3]
 """Of all ligaments together."""
 FORCE_COLOURS = {
-    "ground reaction": BLACK,
+    "ground reaction": GROUND,
     "hip": HIP,
     "quadriceps": QUADRICEPS,
     "patellar ligament": PATELLAR_LIGAMENT,
@@ -92,7 +93,10 @@ def svg_text(figure: "Figure", name: str, dpi: int = 200) -> str:
     """
     buffer = io.StringIO()
     with settings():
-        figure.savefig(buffer, format="svg", dpi=dpi, metadata={"Date": None, "Creator": None})
+        from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+        figure.set_dpi(dpi)  # not savefig, which draws everything twice: once to lay it out
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<(metadata|style)\b.*?</\1>", "", text, flags=re.DOTALL)

@@ -3,7 +3,9 @@
 import sys
 import time as clock
 from collections.abc import Iterable, Sequence
-from typing import Self, TextIO
+from typing import Self, TextIO, TypeVar
+
+_T = TypeVar("_T")
 
 
 class Stages:
@@ -35,18 +37,25 @@ class Stages:
 
     def frames(self, indices: Sequence[int]) -> Iterable[int]:
         """Begin the stage of the frames and return them with a bar that says the time left."""
-        from tqdm import tqdm
+        return self._counted("computing frames", indices, "frame")
 
-        self.end()
-        self._number += 1
-        name = f"{self._number}/{self._count} computing frames"
-        return tqdm(indices, name, unit="frame", file=self._stream, disable=not self._shown)
+    def plots(self, drawn: Sequence[_T]) -> Iterable[_T]:
+        """Begin the last stage and return the report's plots, likewise."""
+        return self._counted("writing results and report", drawn, "plot")
 
     def end(self) -> None:
         """End the stage, with the time that it took."""
         if self._open:
             self._write(f" {clock.perf_counter() - self._began:.1f} s\n")
         self._open = False
+
+    def _counted(self, name: str, items: Sequence[_T], unit: str) -> Iterable[_T]:
+        from tqdm import tqdm
+
+        self.end()
+        self._number += 1
+        name = f"{self._number}/{self._count} {name}"
+        return tqdm(items, name, unit=unit, file=self._stream, disable=not self._shown)
 
     def _write(self, words: str) -> None:
         if self._shown:

@@ -109,29 +109,17 @@ def load_case(scene: Scene) -> Case:
     """
     with_patella = scene.patella is not None
     chain = Chain(load_urdf(in_si(scene.patient), with_patella), with_patella)
-    parts = _Parts(scene)
+    # tables before meshes, which take longer: a mistake in them is told at once
+    parts = _Parts(scene) if scene.motion.interpretation == "pose" else None
     released = scene.contact.released if scene.contact else ()
     motion = load_motion(
         in_si(scene.motion),
         scene.patient.side,
-        parts.insert_mesh_in_insert,
-        parts.femoral_mesh_in_femur,
+        parts.insert_mesh_in_insert if parts else np.eye(4),
+        parts.femoral_mesh_in_femur if parts else np.eye(4),
         (*released, "si") if released else (),
         chain.insert_in_tibia,
     )
-    if motion.unrecorded:
-        from tkamb.scene.derived_motion import seated_motion
-
-        assert parts.femoral is not None and parts.insert is not None
-        motion = seated_motion(motion, parts.femoral, parts.insert, scene.motion.cutoff_Hz)
-    if scene.motion.motion == "roll-slip":
-        from tkamb.scene.derived_motion import rolling_motion
-
-        assert parts.femoral is not None and parts.insert is not None
-        table = scene.motion
-        motion = rolling_motion(
-            motion, parts.femoral, parts.insert, table.slip_share, table.cutoff_Hz
-        )
     tibia = ground = None
     if scene.tibia:
         from tkamb.inputs.tibia import load_tibia
@@ -148,6 +136,8 @@ def load_case(scene: Scene) -> Case:
         ground = load_ground_reaction(in_si(scene.ground_reaction), motion.time, scene.patient.side)
         if tibia and scene.ground_reaction.applied == "cop":
             check_under_foot(ground, tibia.pose[:, :3, 3], scene.ground_reaction.file)
+    parts = parts or _Parts(scene)
+    motion = _derived(scene, motion, parts)
     muscles: tuple[Muscle, ...] = ()
     patellar_ligament = None
     if scene.patella:
@@ -175,6 +165,24 @@ def load_case(scene: Scene) -> Case:
     from tkamb.scene.scaling import scaled_case
 
     return scaled_case(case)
+
+
+def _derived(scene: Scene, motion: KneeMotion, parts: "_Parts") -> KneeMotion:
+    """Return the motion with what follows from the surfaces: a seat, a roll with slip."""
+    table = scene.motion
+    if motion.unrecorded:
+        from tkamb.scene.derived_motion import seated_motion
+
+        assert parts.femoral is not None and parts.insert is not None
+        motion = seated_motion(motion, parts.femoral, parts.insert, table.cutoff_Hz)
+    if table.motion == "roll-slip":
+        from tkamb.scene.derived_motion import rolling_motion
+
+        assert parts.femoral is not None and parts.insert is not None
+        motion = rolling_motion(
+            motion, parts.femoral, parts.insert, table.slip_share, table.cutoff_Hz
+        )
+    return motion
 
 
 def _measured(scene: Scene, motion: KneeMotion) -> "MeasuredForce | None":

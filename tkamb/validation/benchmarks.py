@@ -3,6 +3,7 @@
 Every function returns {id of `published.toml`: our value in the unit named there}.
 """
 
+import json
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -78,12 +79,16 @@ def _doubled(model: Any, state: Any, depth: float = 5e-5) -> float:
     return float(force[1] / force[0])
 
 
+def _plate_on_box() -> ContactPair:
+    """Return the source's patch test: a rigid plate wider than a box that is fixed below."""
+    plate = block(flat(10e-3), (20e-3, 20e-3), 2e-3, "plate")
+    box = block(flat(3e-3), (12e-3, 12e-3))
+    return ContactPair(plate, box, materials.material("polyethylene-linear"))
+
+
 def patch() -> Values:
     """Return pressures under a rigid plate on a box, 1000 N, 1 mm."""
-    linear = materials.material("polyethylene-linear")
-    plate = block(flat(10e-3), (20e-3, 20e-3), 2e-3, "plate")
-    pair = ContactPair(plate, block(flat(3e-3), (12e-3, 12e-3)), linear)
-    found = {}
+    pair, found = _plate_on_box(), {}
     for name, key, options in (
         ("fe", "fe", {}),
         ("lattice-source", "source", {"pressure_rule": "source"}),
@@ -94,6 +99,38 @@ def patch() -> Values:
         found[f"patch_{key}_max"] = loaded.max() / MEGAPASCAL
         found[f"patch_{key}_min"] = loaded.min() / MEGAPASCAL
     return found
+
+
+def refinement() -> Values:
+    """Return approaches under that plate at 1.5 mm, off finite elements of 0.75 mm, %."""
+    pair = _plate_on_box()
+
+    def approach(name: str, size_mm: float) -> float:
+        model = _model(name, size_mm)
+        return float(model.press(model.prepare(pair), 1000.0, UPRIGHT).approach)
+
+    fine = approach("fe", 0.75)
+    return {
+        f"refinement_{key}": 100.0 * abs(approach(name, 1.5) / fine - 1.0)
+        for name, key in (("lattice-source", "source"), ("lattice-linear", "lattice"))
+    }
+
+
+def speed(trade_off: Path) -> Values:
+    """Return how many times longer finite elements take than the source's lattice, per position.
+
+    Both on the two condyles with cells of 2 mm, as `tkamb tradeoff` measured them in one run.
+
+    Args:
+        trade_off: its JSON.
+    """
+    rows = json.loads(trade_off.read_text(encoding="utf-8"))
+    seconds = {
+        row["contact"]: row["warm_seconds"]
+        for row in rows
+        if (row["case"], row["resolution_mm"]) == ("two condyles", 2.0)
+    }
+    return {"speed_source": seconds["calculix C3D8I"] / seconds["lattice-source"]}
 
 
 def against_fe(designs: Path, name: str = "nkii_cp") -> Values:
