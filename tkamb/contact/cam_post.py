@@ -199,7 +199,7 @@ class CamPost:
         """Return what a search for equilibrium asks: wrench and stiffness, insert frame."""
         return PostProbe(self, self.model.probe(self.state))
 
-    def probe_with(self, condyles: Any) -> "CondylesAndPost":
+    def probe_with(self, condyles: Any) -> Any:
         """Return the same, together with a probe of the condyles."""
         return CondylesAndPost(condyles, self.probe())
 
