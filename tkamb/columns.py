@@ -237,7 +237,11 @@ COLUMNS: tuple[Column, ...] = (
             ("peak_pressure_MPa", "largest pressure there"),
             ("cop_si_mm", "centre of pressure on the post, insert y"),
             ("cop_ml_mm", "the same, insert z"),
-            ("gap_mm", "clearance of cam and post along insert x; negative: they overlap"),
+            (
+                "gap_mm",
+                "clearance of cam and post along insert x; negative: they overlap; empty where "
+                "the cam is not behind the post",
+            ),
         )
     ),
 )
