@@ -41,6 +41,8 @@ SKIN = 1e-3
 TICKS, ZOOMS = 41, 3
 """Rays along either edge of the grid on which the clearance is looked for, and how often it is made
 twenty times finer: 16 mm are known to less than a micrometre."""
+BESIDE = 3 * MILLIMETRE
+"""How far the cam is taken beside the post, which the femur's ML position moves."""
 NO_LINE_CONTACT = ("hertz",)
 """Models that know no contact along a line."""
 
@@ -149,7 +151,7 @@ class CamPost:
         front = np.array([high[0], (low[1] + high[1]) / 2, (low[2] + high[2]) / 2])
         self.in_turned = np.eye(4)
         self.in_turned[:3, :3], self.in_turned[:3, 3] = TURN, -TURN @ front
-        cam = cam_of(femoral, split, (high[2] - low[2]) / 2)
+        cam = cam_of(femoral, split, (high[2] - low[2]) / 2 + BESIDE)
         self._foot = float(low[1])
         self._prepare(model, PostPair(cam, post.moved(self.in_turned), material))
 
@@ -275,7 +277,7 @@ def cam_of(femoral: Surface, split: float | None, reach: float) -> Surface:
     Args:
         femoral: femoral component, femoral frame.
         split: z (m) between the condyles.
-        reach: m, half the width of the post: triangles within it on either side count.
+        reach: m; triangles within it on either side of the split count.
 
     Raises:
         InputError: nothing lies there.
