@@ -2,6 +2,10 @@
 
 import csv
 import json
+import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -12,6 +16,7 @@ from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_coordinates
 from tkamb.wear import run as wear_run
+from tkamb.wear.kept import STATE_NAME
 from tkamb.wear.materials import material_names, wear_material
 from tkamb.wear.motion import CycleMotion
 from tkamb.wear.profile import read_profile
@@ -111,6 +116,25 @@ def test_a_killed_simulation_goes_on_to_the_same_end(monkeypatch, capsys, tmp_pa
         (tmp_path / name / "wear.csv").read_text(encoding="utf-8") for name in ("whole", "part")
     )
     assert part == whole
+
+
+@pytest.mark.slow
+def test_a_simulation_that_was_killed_goes_on_to_the_same_end(tmp_path, profile, scene):
+    """SIGKILL as soon as the first block is kept: nothing is lost, nothing half written is read."""
+    worn = ["wear", str(scene), "--simulator", str(profile), *QUICK[:-1], "6", "--cycles", "60000"]
+    assert main([*worn, "--out", str(tmp_path / "whole")]) == 0
+    part = tmp_path / "part"
+    command = [sys.executable, "-c", "import sys; from tkamb.cli import main; sys.exit(main())"]
+    process = subprocess.Popen([*command, *worn, "--out", str(part)], stderr=subprocess.DEVNULL)
+    while not (part / STATE_NAME).exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    assert not (part / "wear.csv").exists()
+    assert main([*worn, "--out", str(part), "--resume"]) == 0
+    for name in ("wear.csv", "worn_insert.stl", "wear.vtp"):
+        assert (part / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
 def test_bad_input_is_one_line_and_leaves_no_folder(capsys, tmp_path, profile, scene):

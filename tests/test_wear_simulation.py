@@ -2,14 +2,17 @@
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.optimize import brentq
 
 import shapes
+from contact_bodies import dished_insert
 from tkamb.errors import InputError
+from tkamb.geometry.surface import Surface
 from tkamb.wear.creep import LogarithmicCreep
 from tkamb.wear.laws import Archard, ContactArea, CrossShear, PressureCrossShear
 from tkamb.wear.simulation import simulate_wear
-from wear_bodies import DENSITY, MM, ball_case, plate_case, stroke, swing
+from wear_bodies import DENSITY, MM, ball_case, plate_case, stroke, swing, swinging_case
 
 K = 1e-6
 PLATE = 40 * 60  # mm²
@@ -79,6 +82,26 @@ def test_a_moving_pin_spreads_its_wear_over_its_track():
 
 
 def test_a_cylinder_swinging_on_a_plate_wears_k_F_R_angle():
+    """Sliding under the axis is R times the angle; the depth integrates to the work's volume."""
+    drum = trimesh.creation.cylinder(20 * MM, 30 * MM, sections=720)
+    drum = Surface(np.asarray(drum.vertices), np.asarray(drum.faces, np.int64), "cylinder")
+    case = swinging_case(drum, shapes.plate(0.012), swing(0.5, 5, 500.0))
+    row = last(case, 1000, 1)[1]
+    assert row["volume_mm3"] == pytest.approx(K * 500.0 * 20e-3 * 1.0 * 1e3, rel=0.01)
+    assert row["mesh_volume_lost_mm3"] == pytest.approx(row["volume_mm3"], rel=1e-6)
+
+
+def test_a_ball_in_a_dish_takes_from_the_mesh_what_the_map_says_over_several_updates():
+    dish = dished_insert(lambda x, z: 36 * MM - np.sqrt((30 * MM) ** 2 - x**2 - z**2), spacing=MM)
+    case = swinging_case(shapes.sphere(25 * MM, 4), dish, swing(0.5, 5, 500.0))
+    rows = simulate_wear(case, 30_000, 3)[0].rows
+    assert len(rows) >= 4
+    for row in rows[1:]:
+        assert row["mesh_volume_lost_mm3"] == pytest.approx(row["volume_mm3"], rel=1e-6)
+        assert row["volume_mm3"] == pytest.approx(K * 500.0 * 25e-3 * 1.0 * row["cycles"], rel=0.01)
+
+
+def test_a_ball_swinging_in_a_trough_wears_k_F_R_angle():
     """Sliding at the contact is R times the angle, and the work F R angle whatever the shape."""
     case = ball_case(shapes.trough(0.03), 20 * MM, swing(0.5, 5, 500.0), K, 2.0, facets=5)
     row = last(case, 100_000, 1)[1]

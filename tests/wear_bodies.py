@@ -86,10 +86,12 @@ def plate_case(motion, law, under=always, creep=None, thickness=0.01, **more):
 
 def ball_case(insert, radius, motion, wear_factor, resolution=1.0, facets=3):
     """A sphere, by a contact model."""
-    engine = ContactEngine(
-        contact_model("foundation", resolution),
-        shapes.sphere(radius, facets),
-        material("polyethylene"),
-    )
+    return swinging_case(shapes.sphere(radius, facets), insert, motion, wear_factor, resolution)
+
+
+def swinging_case(femoral, insert, motion, wear_factor=1e-6, resolution=2.0):
+    """A body, by a contact model."""
+    model = contact_model("foundation", resolution)
+    engine = ContactEngine(model, femoral, material("polyethylene"))
     articular = ArticularSurface.of_insert(insert, resolution * MM)
     return WearCase(engine, articular, motion, Archard(wear_factor), DENSITY)

@@ -7,7 +7,9 @@ bytes, or, compressed by zlib, by the number and sizes of their blocks.
 import base64
 import re
 import zlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -18,6 +20,8 @@ from tkamb.files import MESH_LIMIT, parse_xml, read_bytes
 from tkamb.geometry.frames import Array
 
 Indices = NDArray[np.int64]
+
+Read = TypeVar("Read")
 
 _TYPES = {"Float32": "f4", "Float64": "f8"} | {
     f"{sign}Int{bits}": f"{letter}{bits // 8}"
@@ -36,9 +40,22 @@ def read_vtp(path: str | Path) -> tuple[Array, Indices]:
     Raises:
         InputError: no such file, not PolyData, cut short, strips, or another encoding.
     """
+    return _read(path, lambda found: found.triangles())
+
+
+def read_vtp_values(path: str | Path, name: str) -> Array:
+    """Return the data (n,) of that name at the points of a .vtp file.
+
+    Raises:
+        InputError: as `read_vtp`, or no such data.
+    """
+    return _read(path, lambda found: found.values(name))
+
+
+def _read(path: str | Path, what: "Callable[[_PolyData], Read]") -> Read:
     content = read_bytes(path, MESH_LIMIT, what="mesh file")
     try:
-        return _PolyData(content, path).triangles()
+        return what(_PolyData(content, path))
     except (ValueError, KeyError, OverflowError, zlib.error) as error:  # base64's is a ValueError
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(f"cannot be read as VTK PolyData ({reason})", path, _AGAIN) from None
@@ -85,6 +102,14 @@ class _PolyData:
             points.append(corners.astype(float))
             start += len(corners)
         return np.concatenate(points), np.concatenate(faces)
+
+    def values(self, name: str) -> Array:
+        """Return one array of the points' data of all pieces."""
+        found = []
+        for piece in self._root.iter("Piece"):
+            named = {array.get("Name"): array for array in piece.iterfind("PointData/DataArray")}
+            found.append(self._array(named.get(name), name).astype(float))
+        return np.concatenate(found)
 
     def _fans(self, piece: Element, points: int) -> Indices:
         """Return the polygons of a piece as triangles (k, 3)."""

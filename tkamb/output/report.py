@@ -23,6 +23,7 @@ from tkamb.output.pressure_maps import draw_maps, draw_paths, mapped_frames, top
 from tkamb.output.reading import conclusions
 from tkamb.output.style import svg_text
 from tkamb.output.tables import flag_rows, motion_table, strain_table
+from tkamb.output.wear import wear_section
 
 if TYPE_CHECKING:
     from tkamb.results import Results
@@ -86,6 +87,7 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
         legend=_legend(results),
         plots=[_plot(panel, results, axis) for panel in progress(panels(results))],
         muscles=_muscles(results, axis),
+        wear=wear_section(results),
         motion=motion_table(results, axis),
         strain=strain_table(results.summary),
         flags=flag_rows(results, axis),

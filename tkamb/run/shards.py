@@ -54,13 +54,16 @@ class Shards:
         identity: what makes two runs the same: name -> text or numbers.
         resume: keep what an earlier run with the same identity left; else it is removed with
             the first frame.
+        name: of the folder in it.
 
     Raises:
         InputError: the earlier run was another one, or the folder is a symbolic link.
     """
 
-    def __init__(self, directory: Path, identity: Mapping[str, Any], resume: bool) -> None:
-        self.folder = directory / FOLDER
+    def __init__(
+        self, directory: Path, identity: Mapping[str, Any], resume: bool, name: str = FOLDER
+    ) -> None:
+        self.folder = directory / name
         self._directory, self._begun = directory, False
         self._identity = json.dumps(dict(identity), indent=1)
         if self.folder.is_symlink():
@@ -79,7 +82,7 @@ class Shards:
         if self._begun:
             return
         if not self.resumed:
-            remove_shards(self._directory)
+            remove_shards(self._directory, self.folder.name)
         try:
             self.folder.mkdir(exist_ok=True)
         except OSError as error:
@@ -153,9 +156,9 @@ def check_same_run(
         )
 
 
-def remove_shards(directory: Path) -> None:
+def remove_shards(directory: Path, name: str = FOLDER) -> None:
     """Remove the finished frames; what says whose they are goes first."""
-    folder = directory / FOLDER
+    folder = directory / name
     if folder.is_symlink():
         return
     for name in OWN_NAMES:

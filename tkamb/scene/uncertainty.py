@@ -108,6 +108,14 @@ class UncertaintyTable(SceneTable):
         0.0,
         description="relative, of [output] yield_stress_MPa, which tells overloaded area" + _GIVE,
     )
+    wear_factor: Share = Field(
+        0.44,
+        description="relative, of the wear factor, for `tkamb wear` alone; default: 5 to 95 % are "
+        "a factor of two either way of the median. An assumption: laboratories differ by more",
+    )
+    creep: Share = Field(
+        0.0, description="relative, of both constants of creep, for `tkamb wear` alone" + _GIVE
+    )
     femoral_placement_mm: Length = Field(
         0.0,
         description="AP, SI and ML each: the femur's ligament and muscle attachments against the "

@@ -35,6 +35,16 @@ def activation_scale() -> Colours:
     return _sample("BuPu", np.linspace(0.35, 1.0, 256))
 
 
+def wear_scale() -> Colours:
+    """Return the 256 colours (256, 3) from no wear to the deepest."""
+    return _sample("YlGnBu", np.linspace(0.0, 1.0, 256))
+
+
+def wear_colours(depth: ArrayLike, limit: float) -> Colours:
+    """Return colours (..., 3) of depths of wear; none (<= 0) is the insert's colour."""
+    return _on_scale(depth, limit, wear_scale(), INSERT)
+
+
 def strain_colours(strain: ArrayLike, limit: float) -> Colours:
     """Return colours (..., 3) of ligament strains; slack (strain <= 0) is grey."""
     return _on_scale(strain, limit, strain_scale())
@@ -45,10 +55,10 @@ def activation_colours(activation: ArrayLike, limit: float) -> Colours:
     return _on_scale(activation, limit, activation_scale())
 
 
-def _on_scale(values: ArrayLike, limit: float, scale: Colours) -> Colours:
+def _on_scale(values: ArrayLike, limit: float, scale: Colours, none: str = SLACK) -> Colours:
     values = np.asarray(values, float)
     level = np.clip(np.nan_to_num(values) / (limit or 1.0) * 255.0, 0.0, 255.0).astype(int)
-    return np.where((values > 0)[..., None], scale[level], rgb(SLACK)).astype(np.uint8)
+    return np.where((values > 0)[..., None], scale[level], rgb(none)).astype(np.uint8)
 
 
 def _sample(name: str, at: NDArray[np.float64]) -> Colours:

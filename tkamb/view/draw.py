@@ -16,7 +16,7 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 from tkamb.view.arrows import contact_markers, force_arrows
 from tkamb.view.drawing import Drawing, PressureMap, Reading
 from tkamb.view.run import CaseResults, Progress
-from tkamb.view.solids import floor_and_foot, solids
+from tkamb.view.solids import floor_and_foot, solids, worn_insert
 from tkamb.view.strands import (
     centre_markers,
     centres_of_pressure,
@@ -50,6 +50,7 @@ def draw(
     rows = [found.get(k, -1) for k in range(len(results))]
     contact = case.scene.contact
     floor, centre = floor_and_foot(case, geometries, run.frames)
+    others = floor + worn_insert(results, case.scene.patient.side)
     bundles, limit = ligament_strands(mechanics, states)
     muscles, most_active = muscle_strands(geometries)
     strands = [*bundles, *extensor_strands(mechanics, states, results), *muscles]
@@ -69,7 +70,7 @@ def draw(
         times=results["time_s"],
         statuses=tuple(results.status),
         readings=readings(results, axis),
-        solids=solids(case, mechanics.poses[list(run.frames)], states, maps, rows) + floor,
+        solids=solids(case, mechanics.poses[list(run.frames)], states, maps, rows) + others,
         strands=tuple(strands),
         arrows=force_arrows(results, geometries, contact.friction if contact else 0.0),
         markers=tuple(markers),

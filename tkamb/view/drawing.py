@@ -15,6 +15,7 @@ from tkamb.geometry.surface import Surface
 LAYERS = (
     "femoral component",
     "insert",
+    "worn insert",
     "patella",
     "bones",
     "floor",
@@ -30,7 +31,7 @@ LAYERS = (
 )
 """What can be switched on and off, in the order of the page."""
 
-HIDDEN_AT_FIRST = ("recorded pose", "lattice")
+HIDDEN_AT_FIRST = ("worn insert", "recorded pose", "lattice")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,7 @@ class Solid:
         colour: "#rrggbb".
         opacity: 0 to 1.
         poses: (f, 4, 4) or (1, 4, 4) pose in the insert frame.
+        wear: (n,) mm, worn off each vertex, which colours it; None: one colour.
     """
 
     name: str
@@ -52,6 +54,7 @@ class Solid:
     colour: str
     opacity: float
     poses: Array
+    wear: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,3 +195,8 @@ class Drawing:
 
     def __len__(self) -> int:
         return len(self.labels)
+
+    @property
+    def deepest_wear(self) -> float:
+        """Largest depth, mm; 0 without wear."""
+        return max((float(s.wear.max()) for s in self.solids if s.wear is not None), default=0.0)

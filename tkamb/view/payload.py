@@ -18,11 +18,19 @@ from meshcat.commands import SetObject, SetTransform
 from meshcat.geometry import MeshLambertMaterial, TriangularMeshGeometry, pack_numpy_array
 from meshcat.path import Path as NodePath
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from tkamb.geometry.frames import Array
 from tkamb.output.levels import pressure_levels
 from tkamb.units import MILLIMETRE
-from tkamb.view.colours import activation_scale, pressure_scale, strain_scale
+from tkamb.view.colours import (
+    Colours,
+    activation_scale,
+    pressure_scale,
+    strain_scale,
+    wear_colours,
+    wear_scale,
+)
 from tkamb.view.drawing import (
     HIDDEN_AT_FIRST,
     LAYERS,
@@ -33,13 +41,19 @@ from tkamb.view.drawing import (
     Solid,
     Strand,
 )
-from tkamb.view.shading import Shaded, shade
+from tkamb.view.shading import MOST_TRIANGLES, Shaded, shade
 
 METRES_PER_BODY_WEIGHT = 0.03
 """Length of an arrow of one body weight."""
 
 LEVELS = 32767
 """Steps from no pressure to the largest."""
+
+MOST_COLOURED = 100_000
+"""Triangles of a surface that its colours divide: merged ones would blur them."""
+
+WHITE = "#ffffff"
+"""Of a material whose vertices have colours of their own."""
 
 FRONT = 0
 """three.js: triangles are seen from outside only, which spares half of them."""
@@ -84,6 +98,7 @@ def pack(drawings: Sequence[Drawing]) -> bytes:
     block = Block()
     peak = peak_pressure(drawings)
     limit = max(one.strain_limit for one in drawings)
+    deepest = max(one.deepest_wear for one in drawings)
     return block.compress(
         {
             "layers": list(LAYERS),
@@ -92,10 +107,12 @@ def pack(drawings: Sequence[Drawing]) -> bytes:
             "peak_MPa": peak,
             "strain_limit": limit,
             "activation_limit": max(one.activation_limit for one in drawings),
+            "wear_limit_mm": deepest,
+            "wear_scale": block.put(wear_scale(), "uint8"),
             "pressure_scale": block.put(pressure_scale(), "uint8"),
             "strain_scale": block.put(strain_scale(), "uint8"),
             "activation_scale": block.put(activation_scale(), "uint8"),
-            "views": [_view(block, k, one, peak) for k, one in enumerate(drawings)],
+            "views": [_view(block, k, one, peak, deepest) for k, one in enumerate(drawings)],
         }
     )
 
@@ -117,11 +134,13 @@ def packed_lattice(lines: Array) -> bytes:
     return block.compress({"lattice": block.put(lines, "float32")})
 
 
-def _view(block: Block, number: int, drawing: Drawing, peak: float) -> dict[str, Any]:
+def _view(
+    block: Block, number: int, drawing: Drawing, peak: float, deepest: float
+) -> dict[str, Any]:
     root = f"/tkamb/{number}"
     commands, moving, notes = [_insert_transform(root, drawing.side)], [], list(drawing.notes)
     for solid in drawing.solids:
-        shape = shade(solid.surface)
+        shape = shade(solid.surface, MOST_TRIANGLES if solid.wear is None else MOST_COLOURED)
         if shape.error:
             notes.append(
                 f"{solid.name.capitalize()}: drawn with {len(shape.faces)} of "
@@ -129,7 +148,7 @@ def _view(block: Block, number: int, drawing: Drawing, peak: float) -> dict[str,
                 "from the true surface."
             )
         path = _node_name(root, solid.layer, solid.name)
-        commands += _commands(path, solid, shape)
+        commands += _commands(path, solid, shape, deepest)
         if len(solid.poses) > 1:
             poses = block.put(np.swapaxes(solid.poses, 1, 2), "float32")
             moving.append({"path": path, "poses": poses})
@@ -214,11 +233,19 @@ def _insert_transform(root: str, side: str) -> SetTransform:
     return SetTransform(turn, _node(root))
 
 
-def _commands(path: str, solid: Solid, shape: Shaded) -> list[Any]:
+def _commands(path: str, solid: Solid, shape: Shaded, deepest: float) -> list[Any]:
+    """Return what hangs a solid into the scene; wear colours it on a scale up to `deepest` mm."""
+    colours, colour = None, solid.colour
+    if solid.wear is not None:
+        nearest = cKDTree(solid.surface.vertices).query(shape.vertices)[1]
+        colours, colour = wear_colours(solid.wear[nearest], deepest), WHITE
     material = MeshLambertMaterial(
-        color=int(solid.colour.removeprefix("#"), 16), opacity=solid.opacity, side=FRONT
+        color=int(colour.removeprefix("#"), 16),
+        opacity=solid.opacity,
+        side=FRONT,
+        vertexColors=colours is not None,
     )
-    made = [SetObject(_Mesh(shape), material, _node(path))]
+    made = [SetObject(_Mesh(shape, colours), material, _node(path))]
     if len(solid.poses) == 1:
         made.append(SetTransform(solid.poses[0], _node(path)))
     return made
@@ -234,10 +261,11 @@ def _node(path: str) -> NodePath:
 
 
 class _Mesh(TriangularMeshGeometry):
-    """meshcat's mesh with our normals."""
+    """meshcat's mesh with our normals, and a colour per vertex where there are any."""
 
-    def __init__(self, shape: Shaded) -> None:
-        super().__init__(shape.vertices, shape.faces)
+    def __init__(self, shape: Shaded, colours: Colours | None) -> None:
+        share = None if colours is None else colours / np.float32(255.0)
+        super().__init__(shape.vertices, shape.faces, share)
         self._normals = shape.normals
 
     def lower(self, object_data: Any) -> Any:

@@ -7,21 +7,27 @@ where the shank does, so that the arrow of the ground reaction does not hang in 
 """
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
 
 from tkamb.body.chain import ChainState
 from tkamb.body.knee import KneeGeometry
-from tkamb.geometry.frames import Array, inverse, pose, transform
+from tkamb.geometry.frames import MIRROR, Array, inverse, pose, transform
 from tkamb.geometry.surface import Surface
+from tkamb.inputs.vtp import read_vtp, read_vtp_values
 from tkamb.output.maps import ContactMaps
 from tkamb.output.style import BLACK
+from tkamb.output.wear import WORN_NAME, wear_of_run
 from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
 from tkamb.view.arrows import centre_of_pressure
 from tkamb.view.colours import BONE, BUTTON, FLOOR, INSERT, METAL, RECORDED
 from tkamb.view.drawing import Marker, Solid
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
 
 FEMUR_PROFILE = (
     (0.015, 19.0),
@@ -103,6 +109,28 @@ def solids(
         bone = _patella(case)
         found.append(Solid("patella", "patella", bone, BONE, 0.55, poses))
     return tuple(found)
+
+
+def worn_insert(results: "Results", side: str) -> tuple[Solid, ...]:
+    """Return the insert as `tkamb wear` left it, coloured by depth; nothing without one.
+
+    Args:
+        results: of a run, whose folder may hold wear.vtp of the same scene.
+        side: of the knee; the file of a left one is not mirrored, the drawing is.
+
+    Raises:
+        InputError: wear.json or wear.vtp cannot be read.
+    """
+    if not wear_of_run(results):
+        return ()
+    assert results.directory is not None
+    path = results.directory / WORN_NAME
+    points, faces = read_vtp(path)
+    depth = read_vtp_values(path, "wear_depth_mm")
+    if side == "left":
+        points, faces = points @ MIRROR, faces[:, ::-1]
+    worn = Surface(points, faces, "worn insert")
+    return (Solid(worn.name, "worn insert", worn, INSERT, 1.0, np.eye(4)[None], depth),)
 
 
 def _contact_poses(recorded: Array, maps: ContactMaps | None, rows: Sequence[int]) -> Array:

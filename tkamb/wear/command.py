@@ -4,7 +4,10 @@ import argparse
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tkamb.wear.run import WearRun
 
 CYCLES, UPDATES, FRAMES = 5_000_000, 10, 40
 
@@ -44,6 +47,13 @@ def add_wear(commands: Any) -> None:
     wear.add_argument(
         "--period", type=float, default=1.0, metavar="S", help="of a simulator's cycle; for creep"
     )
+    wear.add_argument(
+        "--samples",
+        type=int,
+        metavar="N",
+        help="for bands; default: 32 where the scene has [uncertainty], else 0, for none",
+    )
+    wear.add_argument("--workers", type=int, default=1, metavar="N", help="processes for samples")
     wear.add_argument("--out", type=Path, metavar="DIR", help="output folder")
     wear.add_argument(
         "--force", action="store_true", help="write into a folder that is not tkamb's"
@@ -57,23 +67,9 @@ def _wear(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from tkamb.claim import claimed_directory
-    from tkamb.wear.run import prepare_wear
+    from tkamb.run.workers import Crew
 
-    run = prepare_wear(
-        options.case,
-        cycles=options.cycles,
-        updates=options.updates,
-        law=options.law,
-        material=options.material,
-        wear_factor=options.wear_factor,
-        simulator=options.simulator,
-        springs=options.springs,
-        contact=options.contact,
-        resolution_mm=options.resolution,
-        frames=options.frames_per_cycle,
-        period=options.period,
-        progress=lambda frames: tqdm(frames, "running", unit="frame", disable=None),
-    )
+    crew, run = Crew(options.workers), _prepared(options)
     folder = options.out or Path("out") / f"{_stem(options.case)}_wear"
     with claimed_directory(folder, options.force) as claimed:
         with tqdm(total=options.cycles, desc="wearing", unit="cycle", disable=None) as bar:
@@ -81,6 +77,10 @@ def _wear(options: argparse.Namespace) -> int:
                 claimed,
                 resume=options.resume,
                 progress=lambda cycles: bar.update(cycles - bar.n),
+                crew=crew,
+                sample_progress=lambda samples, count: tqdm(
+                    samples, "samples", count, unit="sample", disable=None
+                ),
             )
         report.write(claimed)
     for question in report.questions():
@@ -92,6 +92,29 @@ def _wear(options: argparse.Namespace) -> int:
     else:
         print("\n".join([*report.lines(), f"maps: {folder / 'wear.vtp'}"]))
     return 0
+
+
+def _prepared(options: argparse.Namespace) -> "WearRun":
+    from tqdm import tqdm
+
+    from tkamb.wear.run import prepare_wear
+
+    return prepare_wear(
+        options.case,
+        cycles=options.cycles,
+        updates=options.updates,
+        law=options.law,
+        material=options.material,
+        wear_factor=options.wear_factor,
+        simulator=options.simulator,
+        springs=options.springs,
+        contact=options.contact,
+        resolution_mm=options.resolution,
+        frames=options.frames_per_cycle,
+        samples=options.samples,
+        period=options.period,
+        progress=lambda frames: tqdm(frames, "running", unit="frame", disable=None),
+    )
 
 
 def _stem(case: Path) -> str:

@@ -42,6 +42,11 @@ class LogarithmicCreep:
                 f"cannot be {self.reference_min}", "[creep] reference_min", "give minutes above 0"
             )
 
+    def times(self, factor: float) -> "LogarithmicCreep":
+        """Return the law with both constants times a factor."""
+        compliance, per_decade = self.compliance_per_MPa, self.per_decade_per_MPa
+        return LogarithmicCreep(compliance * factor, per_decade * factor, self.reference_min)
+
     def strain_per_pascal(self, time: float) -> float:
         """Return the strain per Pa of constant pressure after `time` (s)."""
         if time <= 0:

@@ -65,7 +65,7 @@ class CycleMotion:
         apart = [distance(poses[0], pose) for pose in poses]
         span = float(time[-1] - time[0])
         if apart[-1] > CLOSES_WITHIN * max(apart):
-            notes.append("its ends do not meet: a cycle is the motion there and back")
+            notes.append("the motion's ends do not meet: a cycle is the motion there and back")
             return cls(poses, load, 2.0 * span, 2, tuple(notes))
         notes.append("a closed cycle, with the step from the last frame to the first")
         step = span / (len(time) - 1)

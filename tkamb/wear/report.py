@@ -17,7 +17,9 @@ from tkamb.code_identity import code_identity
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.geometry.surface import Surface
 from tkamb.output.vtk import write_triangles
+from tkamb.run.shards import remove_shards
 from tkamb.units import MEGAPASCAL, MILLIMETRE
+from tkamb.wear.bands import WearBands
 from tkamb.wear.force_control import UNITS
 from tkamb.wear.kept import STATE_NAME
 from tkamb.wear.materials import WearMaterial
@@ -25,6 +27,13 @@ from tkamb.wear.setup import WearSetup
 from tkamb.wear.simulation import CycleWear, WearCase, WearState
 
 MILLION = 1e6
+SAMPLES_NAME = ".wear_samples"
+"""Folder of the finished samples while a simulation is under way."""
+FIRST = (
+    "Worn volume, mass and depth follow the wear factor, which differs by a factor of two and more "
+    "between laboratories."
+)
+"""What is said before any number."""
 DEAREST_CORRECTION = 0.05
 """Correction of a map's force beyond which the map is too coarse."""
 PUBLISHED_RATES = (1.6, 4.4)
@@ -46,6 +55,7 @@ class WearReport:
         last: what the next cycle would do.
         cycles: asked for.
         updates: asked for.
+        bands: beside the rows; None: not asked for.
     """
 
     setup: WearSetup
@@ -55,12 +65,14 @@ class WearReport:
     last: CycleWear
     cycles: int
     updates: int
+    bands: WearBands | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `tkamb wear --json` prints; None stands for what is not modelled."""
         last = {key: _known(value) for key, value in self.state.rows[-1].items()}
         law = self.case.law
         return {
+            "first": FIRST,
             **last,
             "status": self.state.end or "ok",
             "cycles_asked": self.cycles,
@@ -76,6 +88,8 @@ class WearReport:
             "contact": self.setup.contact,
             "resolution_mm": self.setup.resolution_mm,
             "source": self.setup.source,
+            "scene_sha256": self.setup.scene_sha256,
+            "files_sha256": self.setup.files_sha256,
             "side": self.setup.side,
             "frames": len(self.case.motion),
             "passes_per_cycle": self.case.motion.passes,
@@ -83,11 +97,18 @@ class WearReport:
             "largest_force_correction": self.state.map_error,
             "mean_cross_shear": _known(self._mean_cross_shear()),
             **self._control(),
+            "bands": None if self.bands is None else self.bands.as_dict(),
             "notes": list(self.case.motion.notes),
             "questions": self.questions(),
-            "rows": [{k: _known(v) for k, v in row.items()} for row in self.state.rows],
+            "rows": [{k: _known(v) for k, v in row.items()} for row in self._rows()],
             "code": code_identity(),
         }
+
+    def _rows(self) -> list[dict[str, float]]:
+        """Return the table, with its bands where there are any."""
+        rows = self.state.rows
+        beside = [{}] * len(rows) if self.bands is None else self.bands.rows
+        return [row | band for row, band in zip(rows, beside, strict=True)]
 
     def _control(self) -> dict[str, Any]:
         """Return what was prescribed, what was found in equilibrium, and where."""
@@ -138,6 +159,8 @@ class WearReport:
             )
         if self.setup.engine.bearing == "mobile":
             asked.append("the backside of a mobile bearing wears too and is not modelled")
+        if self.bands is not None:
+            asked += self.bands.questions()
         if self.case.creep is None:
             asked.append("creep is not modelled: the material gives no [creep]")
         return asked
@@ -148,11 +171,13 @@ class WearReport:
         creep = found["creep_depth_mm"]
         said = "not modelled" if creep is None else f"{creep:.4g} mm deep"
         return [
+            FIRST,
             f"{found['cycles']:.6g} cycles in {found['blocks']} blocks, {found['law']}, "
             f"{found['material']}: {found['status']}",
             f"worn off {found['volume_mm3']:.4g} mm3, {found['mass_mg']:.4g} mg, "
             f"{found['max_depth_mm']:.4g} mm deep at most, over {found['worn_area_mm2']:.4g} mm2",
             f"rate {self.rate:.4g} mm3 per million cycles; creep {said}",
+            *([] if self.bands is None else self.bands.lines()),
             *self._found_lines(),
             *(f"note: {note}" for note in found["notes"]),
         ]
@@ -175,17 +200,18 @@ class WearReport:
         Raises:
             InputError: the folder cannot be written.
         """
-        from tkamb.wear.picture import draw_maps
+        from tkamb.wear.picture import draw_wear
 
         surface, maps = self._worn(), self._maps()
         with replaced_together(folder) as files:
-            write_synced(files.path("wear.csv"), _table(self.state.rows))
+            write_synced(files.path("wear.csv"), _table(self._rows()))
             write_synced(files.path("wear.json"), json.dumps(self.as_dict(), indent=2) + "\n")
             write_triangles(files.path("wear.vtp"), surface.vertices, surface.faces, maps)
             in_mm = trimesh.Trimesh(surface.vertices / MILLIMETRE, surface.faces, process=False)
             in_mm.export(files.path("worn_insert.stl"), file_type="stl")
-            draw_maps(surface, maps, files.path("wear.png"))
+            draw_wear(surface, maps, self._rows(), files.path("wear.png"))
             files.remove(STATE_NAME)
+        remove_shards(folder, SAMPLES_NAME)
 
     def _worn(self) -> Surface:
         """Return the worn insert; a left knee's as it is, not mirrored."""

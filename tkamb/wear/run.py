@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from tkamb.errors import InputError
+from tkamb.run.shards import Shards
+from tkamb.run.workers import Crew
+from tkamb.wear.bands import SAMPLES, Progress, Sampling, check_samples
 from tkamb.wear.kept import keep_state, kept_state, wear_identity
 from tkamb.wear.materials import WearMaterial, wear_material
-from tkamb.wear.report import WearReport
+from tkamb.wear.report import SAMPLES_NAME, WearReport
 from tkamb.wear.setup import WearSetup, wear_setup
-from tkamb.wear.simulation import WearCase, WearState, check_blocks, simulate_wear
+from tkamb.wear.simulation import CycleWear, WearCase, WearState, check_blocks, simulate_wear
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +28,7 @@ class WearRun:
         material: with sources.
         cycles: how many.
         updates: of the geometry.
+        sampling: for bands; None: none.
     """
 
     setup: WearSetup
@@ -32,6 +36,7 @@ class WearRun:
     material: WearMaterial
     cycles: int
     updates: int
+    sampling: Sampling | None = None
 
     def compute(
         self,
@@ -39,6 +44,8 @@ class WearRun:
         *,
         resume: bool = False,
         progress: Callable[[float], None] = lambda cycles: None,
+        crew: Crew | None = None,
+        sample_progress: Progress = lambda samples, count: samples,
     ) -> WearReport:
         """Simulate and return the report.
 
@@ -46,25 +53,46 @@ class WearRun:
             folder: where the state is kept after each block; None: nowhere.
             resume: go on with the state that the folder keeps.
             progress: is told the cycles that are done.
+            crew: who computes the samples; default: this process.
+            sample_progress: wraps the samples as they come.
 
         Raises:
             InputError: what the folder keeps is of another simulation, or no contact is found.
             KeyboardInterrupt: with a folder, saying what is kept there.
         """
-        state = None
+        identity = ""
+        if folder is not None:
+            identity = wear_identity(self.setup, self.case, self.cycles, self.updates)
+        state, last = self._simulated(folder, identity, resume, progress)
+        bands = None
+        if self.sampling is not None:
+            shards = None
+            if folder is not None:
+                shards = Shards(folder, {"wear simulation": identity}, resume, SAMPLES_NAME)
+            bands = self.sampling.bands(
+                (self.case, self.cycles, self.updates), state.rows, crew, shards, sample_progress
+            )
+        return WearReport(
+            self.setup, self.case, self.material, state, last, self.cycles, self.updates, bands
+        )
+
+    def _simulated(
+        self,
+        folder: Path | None,
+        identity: str,
+        resume: bool,
+        progress: Callable[[float], None],
+    ) -> tuple[WearState, CycleWear]:
+        """Return the end of the simulation, kept in the folder block by block."""
 
         def keep(done: WearState) -> None:
             progress(done.cycles)
             if folder is not None:
                 keep_state(folder, done, identity)
 
-        if folder is not None:
-            identity = wear_identity(self.setup, self.case, self.cycles, self.updates)
-            state = kept_state(folder, identity) if resume else None
+        state = kept_state(folder, identity) if folder is not None and resume else None
         try:
-            state, last = simulate_wear(
-                self.case, self.cycles, self.updates, state=state, keep=keep
-            )
+            return simulate_wear(self.case, self.cycles, self.updates, state=state, keep=keep)
         except KeyboardInterrupt:
             kept = None
             if folder is not None:
@@ -74,9 +102,6 @@ class WearRun:
                 raise
             done = f"{kept.cycles:.6g} cycles are kept"
             raise KeyboardInterrupt(f"{done}; go on with --resume") from None
-        return WearReport(
-            self.setup, self.case, self.material, state, last, self.cycles, self.updates
-        )
 
 
 def prepare_wear(
@@ -87,6 +112,7 @@ def prepare_wear(
     law: str | None = None,
     material: str | Path = "conventional",
     wear_factor: float | None = None,
+    samples: int | None = None,
     period: float = 1.0,
     **setup: Any,
 ) -> WearRun:
@@ -99,6 +125,7 @@ def prepare_wear(
         law: a name of `tkamb.wear.registry`; None: the material's own.
         material: a name of `tkamb.wear.materials`, or a material file.
         wear_factor: mm³/(N m), in place of the material's.
+        samples: for bands, at least 20; 0: none; None: 32 where the scene has [uncertainty].
         period: s of a simulator's cycle.
         setup: simulator, springs, contact, …: see `tkamb.wear.setup.wear_setup`.
 
@@ -106,6 +133,7 @@ def prepare_wear(
         InputError: whatever of it cannot be used.
     """
     check_blocks(cycles, updates)
+    check_samples(samples or 0)
     if not (math.isfinite(period) and 0.05 <= period <= 3600):
         raise InputError(f"{period} s", "--period", "give 0.05 to 3600 s a cycle")
     made_of = wear_material(material)
@@ -119,4 +147,7 @@ def prepare_wear(
         made_of.density_kg_per_m3,
         made_of.creep,
     )
-    return WearRun(ready, case, made_of, cycles, updates)
+    if samples is None:
+        samples = SAMPLES if ready.uncertainty else 0
+    sampling = Sampling.of(ready, case, samples) if samples else None
+    return WearRun(ready, case, made_of, cycles, updates, sampling)

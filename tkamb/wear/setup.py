@@ -13,10 +13,11 @@ from tkamb.contact.registry import contact_model, contact_options
 from tkamb.errors import InputError
 from tkamb.output.maps import ContactMaps
 from tkamb.results_folder import read_results
-from tkamb.run.summary import scene_hash
+from tkamb.run.summary import files_hash, scene_hash
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.case import Case, load_case
 from tkamb.scene.tables import ContactTable
+from tkamb.scene.uncertainty import UncertaintyTable
 from tkamb.simulation import simulate
 from tkamb.units import MILLIMETRE
 from tkamb.wear.engine import ContactEngine
@@ -40,6 +41,11 @@ class WearSetup:
         contact: name of the contact model.
         resolution_mm: of its map.
         source: the file or folder that the motion comes from.
+        scene_sha256: of the scene as it was given and with the contact that was asked for; a
+            run's summary has one of them.
+        files_sha256: of the files that the scene names, likewise.
+        uncertainty: the scene's table; None: it has none.
+        simulated: the motion is a simulator's.
     """
 
     engine: ContactEngine
@@ -49,6 +55,10 @@ class WearSetup:
     contact: str
     resolution_mm: float
     source: str
+    scene_sha256: tuple[str, ...]
+    files_sha256: str
+    uncertainty: UncertaintyTable | None = None
+    simulated: bool = False
 
 
 def wear_setup(
@@ -82,14 +92,16 @@ def wear_setup(
     path = Path(path)
     if springs is not None and simulator is None:
         raise InputError("springs without a simulator", "--springs", "give --simulator too")
-    motion: CycleMotion | None
+    motion: CycleMotion | None = None
     if os.path.isdir(path) and simulator is None:
         case, motion = _of_results(path)
+        hashes = _hashes(case, case.scene)
     else:
         if os.path.isdir(path):
             path = _scene_of(read_results(path).summary, path)
-        case = load_case(_with_contact(load_scene(path), contact, resolution_mm, path))
-        motion = None if simulator else _of_scene(case.scene, path, frames, progress)
+        given = load_scene(path)
+        case = load_case(_with_contact(given, contact, resolution_mm, path))
+        hashes = _hashes(case, given)
     table = _with_contact(case.scene, contact, resolution_mm, path).contact
     assert table is not None and case.femoral is not None and case.insert is not None
     if case.post is not None:
@@ -99,7 +111,8 @@ def wear_setup(
     if simulator is not None:
         held = None if springs is None else read_springs(springs)
         motion = _of_profile(read_profile(simulator, frames), held, engine, case, period)
-    assert motion is not None
+    elif motion is None:
+        motion = _of_scene(case.scene, path, frames, progress)
     return WearSetup(
         engine=engine,
         articular=ArticularSurface.of_insert(case.insert, table.resolution_mm * MILLIMETRE),
@@ -108,7 +121,17 @@ def wear_setup(
         contact=table.model,
         resolution_mm=table.resolution_mm,
         source=str(simulator or path),
+        scene_sha256=hashes,
+        files_sha256=files_hash(case),
+        uncertainty=case.scene.uncertainty,
+        simulated=simulator is not None,
     )
+
+
+def _hashes(case: Case, given: Scene) -> tuple[str, ...]:
+    """Return the hashes that a run of the scene has: as given, and with the contact asked for."""
+    scenes = (given, case.scene)
+    return tuple(dict.fromkeys(scene_hash(replace(case, scene=one)) for one in scenes))
 
 
 def _of_profile(

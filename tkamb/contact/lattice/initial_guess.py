@@ -49,6 +49,8 @@ class InitialGuess:
         moved: (m, 3) m, displacement of the candidates in an earlier solution, or None.
         reach: m, every node with a smaller vertical gap is a candidate.
         region: outside of which h is zero, or None.
+        offset: (m, 3) m, displacement of the candidates of a linear material that no contact
+            force made, or None.
     """
 
     candidates: Index
@@ -59,6 +61,7 @@ class InitialGuess:
     moved: Array | None = None
     reach: float = np.inf
     region: Region | None = None
+    offset: Array | None = None
 
     @property
     def cold(self) -> "InitialGuess":

@@ -165,13 +165,14 @@ def _solve_linear(
 ) -> Solution:
     """Repeat rays and contact until the sliding nodes rest."""
     points = problem.surface_points[guess.candidates]
-    nothing, active, passes = np.zeros_like(points), guess.active, 0
-    first = nothing if guess.moved is None else guess.moved
+    offset = np.zeros_like(points) if guess.offset is None else guess.offset
+    active, passes = guess.active, 0
+    first = offset if guess.moved is None else guess.moved
     sliding = SlidingNodes(problem, points, first, pose, guess.planes)
     while True:
         passes += 1
         planes = sliding.planes
-        forces, moved = solve_pass(guess.response, nothing, points, planes, load, active)
+        forces, moved = solve_pass(guess.response, offset, points, planes, load, active)
         active = forces.active
         missed = sliding.follow(moved, forces)
         done = missed <= tolerance.force

@@ -54,6 +54,14 @@ function addCameras() {
   });
 }
 
+// What lies above the worn insert and would hide it.
+const UNWORN = ["insert", "pressure map"];
+
+function switchLayer(layer, shown) {
+  tkamb.switchedOff[shown ? "delete" : "add"](layer);
+  tkamb.showLayer(layer, shown);
+}
+
 function addLayers(canAsk) {
   tkamb.switchedOff = new Set(tkamb.data.hidden);
   for (const layer of tkamb.data.layers) {
@@ -62,8 +70,9 @@ function addLayers(canAsk) {
     const box = made("input", "", label, {type: "checkbox", "data-layer": layer});
     label.append(layer === "recorded pose" ? "recorded pose (ghost)" : layer);
     box.addEventListener("change", () => {
-      tkamb.switchedOff[box.checked ? "delete" : "add"](layer);
-      tkamb.showLayer(layer, box.checked);
+      switchLayer(layer, box.checked);
+      if (layer === "worn insert") UNWORN.forEach((other) => switchLayer(other, !box.checked));
+      showSwitches();
       if (layer === "lattice" && tkamb.live) tkamb.live.fetchLattice();
     });
   }
@@ -84,9 +93,11 @@ function addLegends() {
   const {data, views} = tkamb;
   const peak = data.peak_MPa;
   element("pressure-bar").hidden = !(peak > 0);
+  element("wear-bar").hidden = !(data.wear_limit_mm > 0);
   element("strain-bar").hidden = !(data.strain_limit > 0);
   element("activation-bar").hidden = !(data.activation_limit > 0);
   colourBar("pressure-bar", data.pressure_scale, peak, 1);
+  colourBar("wear-bar", data.wear_scale, data.wear_limit_mm, data.wear_limit_mm < 0.1 ? 3 : 2);
   colourBar("strain-bar", data.strain_scale, 100 * data.strain_limit, 1);
   colourBar("activation-bar", data.activation_scale, 100 * data.activation_limit, 1);
   if (views.length > 1) {

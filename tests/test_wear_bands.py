@@ -1,0 +1,164 @@
+"""Bands of worn volume: known where wear is proportional to what varies."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import shapes
+from interrupted_runs import broken_off
+from tkamb.cli import main
+from tkamb.errors import InputError
+from tkamb.geometry.frames import KNEE_COORDINATES, knee_coordinates
+from tkamb.run.shards import Shards
+from tkamb.run.workers import Crew
+from tkamb.scene.uncertainty import UncertaintyTable
+from tkamb.uncertainty.inputs import Draw, VariedInput
+from tkamb.wear.bands import Sampling, check_samples
+from tkamb.wear.creep import LogarithmicCreep
+from tkamb.wear.laws import Archard
+from tkamb.wear.sample import moved_case, varied_wear_inputs
+from tkamb.wear.simulation import WearCase, simulate_wear
+from tkamb.wear.worn_surface import ArticularSurface
+from wear_bodies import DENSITY, MM, Pressed, always, ball_case, balls_scene, stroke, swing
+
+FACTOR = VariedInput("wear_factor", 0.44, "relative")
+CYCLES = 1_000_000
+SPREAD = np.sqrt(np.log1p(0.44**2))
+
+
+def small_case(wear_factor=1e-6, creep=None):
+    plate = shapes.block(lambda x, z: 0.01 + 0 * x, 8 * MM, 8 * MM, 4 * MM)
+    surface = ArticularSurface.of_insert(plate, 4 * MM)
+    law = Archard(wear_factor)
+    return WearCase(Pressed(always), surface, stroke(12 * MM, 3, 100.0), law, DENSITY, creep)
+
+
+def sampled(case, inputs=(FACTOR,), samples=20, **options):
+    state, _ = simulate_wear(case, CYCLES, 2)
+    sampling = Sampling(inputs, np.eye(len(inputs)), samples, 1, 0.5)
+    return sampling.bands((case, CYCLES, 2), state.rows, **options), state.rows
+
+
+def test_a_plate_has_the_band_of_its_wear_factor():
+    """Volume and depth are proportional to k: their quantiles are those of the lognormal."""
+    bands, rows = sampled(small_case(), samples=64)
+    for end, at in (("p05", 0.05), ("p50", 0.5), ("p95", 0.95)):
+        factor = np.exp(SPREAD * norm.ppf(at) - 0.5 * SPREAD**2)
+        for name in ("volume_mm3", "max_depth_mm"):
+            for row, band in zip(rows[1:], bands.rows[1:], strict=True):
+                assert band[f"{name}_{end}"] == pytest.approx(factor * row[name], rel=0.05)
+    assert np.exp(SPREAD * norm.ppf(0.95)) == pytest.approx(2.0, rel=0.01)
+    assert bands.rows[0]["volume_mm3_p95"] == 0.0
+    assert (bands.failed, bands.ended) == (0, 0)
+
+
+def test_creep_has_the_band_of_its_constants_and_none_of_the_wear_factor():
+    law = LogarithmicCreep(3e-3, 8e-4, 1.0)
+    inputs = (VariedInput("creep", 0.2, "relative"),)
+    bands, _ = sampled(small_case(0.0, law), inputs, samples=32)
+    low, high = (bands.rows[-1][f"creep_depth_mm_{end}"] for end in ("p05", "p95"))
+    spread = np.sqrt(np.log1p(0.2**2))
+    assert high / low == pytest.approx(np.exp(2 * spread * norm.ppf(0.95)), rel=0.05)
+    assert bands.rows[-1]["volume_mm3_p95"] == 0.0
+    without, _ = sampled(small_case(1e-6, law))
+    crept = {without.rows[-1][f"creep_depth_mm_{end}"] for end in ("p05", "p95")}
+    assert max(crept) == pytest.approx(min(crept), rel=1e-3)
+
+
+def test_samples_that_wear_through_are_counted_and_in_no_band_from_there_on():
+    """9.9 mm are there, and the middle sample takes 80 % of it: k decides who gets to the end."""
+    depth = 100.0 / 64 * 24e-3 * CYCLES  # mm per mm³/(N m)
+    bands, _ = sampled(small_case(0.8 * 9.9 / depth), samples=64)
+    assert 10 < bands.ended < 32
+    assert bands.rows[-1]["max_depth_mm_p95"] < 9.9
+    assert f"{bands.ended} of 64 samples wore through" in bands.questions()[0]
+    most, _ = sampled(small_case(1.5 * 9.9 / depth))
+    assert np.isnan(most.rows[-1]["volume_mm3_p50"])  # more than half: nothing is said
+
+
+def test_a_sample_moves_the_whole_cycle_by_the_constant_part_of_its_pose_error():
+    inputs = (VariedInput("ap", 2.0, "mm"), VariedInput("axial_rotation", 3.0, "deg"))
+    case = small_case()
+    moved = moved_case(case, Draw(inputs, np.array([1.0, -2.0]), np.zeros((1, 0)), 0.25))
+    shift = knee_coordinates(moved.motion.poses) - knee_coordinates(case.motion.poses)
+    expected = {"ap": 0.5 * 2.0 * MM, "axial_rotation": -0.5 * np.radians(6.0)}
+    for name, column in zip(KNEE_COORDINATES, shift.T, strict=True):
+        assert column == pytest.approx(expected.get(name, 0.0), abs=1e-12)
+    assert moved.motion.load is case.motion.load
+
+
+def test_a_simulators_place_varies_only_where_the_table_says_so():
+    case = small_case()
+    said = UncertaintyTable.model_validate({"ap_mm": 0.5})
+    names = {one.name for one in varied_wear_inputs(said, case.motion, None, True)}
+    assert names == {"ap", "wear_factor"}
+    recorded = {one.name for one in varied_wear_inputs(said, case.motion, None, False)}
+    assert recorded == {"ap", "ml", "adduction", "axial_rotation", "flexion", "wear_factor"}
+    nothing = UncertaintyTable.model_validate({"wear_factor": 0.0})
+    with pytest.raises(InputError, match="nothing of a wear simulation varies"):
+        varied_wear_inputs(nothing, case.motion, None, True)
+
+
+def test_interrupted_samples_go_on_to_the_same_band(tmp_path):
+    case, identity = small_case(), {"wear simulation": "x"}
+    whole, _ = sampled(case)
+    begun = Shards(tmp_path, identity, False, ".samples")
+    with pytest.raises(KeyboardInterrupt, match="8 of 20 samples are kept"):
+        sampled(case, shards=begun, progress=broken_off(8))
+    computed = []
+
+    def counted(samples, count):
+        computed.append(count)
+        return samples
+
+    again = Shards(tmp_path, identity, True, ".samples")
+    resumed, _ = sampled(case, shards=again, progress=counted)
+    assert computed == [12]
+    assert resumed.rows == whole.rows
+
+
+@pytest.mark.parametrize("samples", [-1, 5, 10**6])
+def test_too_few_or_too_many_samples_are_refused(samples):
+    with pytest.raises(InputError, match="--samples"):
+        check_samples(samples)
+
+
+@pytest.mark.slow
+def test_a_scene_with_uncertainty_gets_bands_in_every_output(capsys, tmp_path):
+    cycle = tmp_path / "cycle.csv"
+    cycle.write_text(
+        "cycle_percent,axial_force_N,flexion_deg\n0,300,0\n50,900,30\n100,300,0\n", "utf-8"
+    )
+    scene = balls_scene(tmp_path / "scene")
+    with open(scene, "a", encoding="utf-8") as file:
+        file.write("\n[uncertainty]\nwear_factor = 0.6\nml_mm = 1.0\n")
+    quick = ("--simulator", str(cycle), "--resolution", "4", "--frames-per-cycle", "3")
+    quick = (*quick, "--updates", "1", "--cycles", "1000")
+    assert main(["wear", str(scene), *quick, "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert "factor of two" in said[0]
+    assert any(line.startswith("5 to 95 % of 32 samples: volume") for line in said)
+    found = json.loads((tmp_path / "out/wear.json").read_text())
+    with open(tmp_path / "out/wear.csv", encoding="utf-8") as file:
+        last = list(csv.DictReader(file))[-1]
+    low, high = (found["bands"][f"volume_mm3_{end}"] for end in ("p05", "p95"))
+    assert 0 < low < found["volume_mm3"] < high
+    assert float(last["volume_mm3_p95"]) == high
+    assert found["bands"]["standard_deviations"] == {"ml (mm)": 1.0, "wear_factor (relative)": 0.6}
+    assert "loads" in found["bands"]["not_varied"]
+    assert not (tmp_path / "out/.wear_samples").exists()
+
+
+@pytest.mark.slow
+def test_two_workers_give_the_numbers_of_one_with_a_contact_model():
+    """Modulus and place vary too: each worker prepares the contact of every sample anew."""
+    case = ball_case(shapes.trough(0.03), 20 * MM, swing(0.5, 3, 500.0), 1e-7, 3.0)
+    inputs = (VariedInput("ap", 0.5, "mm"), VariedInput("young_modulus", 0.1, "relative"), FACTOR)
+    alone, rows = sampled(case, inputs)
+    together, _ = sampled(case, inputs, crew=Crew(2))
+    assert together.rows == alone.rows
+    low, high = (alone.rows[-1][f"volume_mm3_{end}"] for end in ("p05", "p95"))
+    assert 0 < low < rows[-1]["volume_mm3"] < high

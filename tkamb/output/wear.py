@@ -1,0 +1,100 @@
+"""The report's section on wear: what `tkamb wear` wrote into the folder of a run."""
+
+import base64
+from typing import TYPE_CHECKING, Any
+
+from tkamb.files import MEGABYTE, read_bytes, read_json
+
+if TYPE_CHECKING:
+    from tkamb.results import Results
+
+WEAR_NAME, PICTURE_NAME, WORN_NAME = "wear.json", "wear.png", "wear.vtp"
+LARGEST = 64 * MEGABYTE
+ROWS = (
+    ("worn volume, mm³", "volume_mm3"),
+    ("worn mass, mg", "mass_mg"),
+    ("largest depth, mm", "max_depth_mm"),
+    ("mean depth where worn, mm", "mean_depth_mm"),
+    ("worn area, mm²", "worn_area_mm2"),
+    ("medial share of the volume", "medial_share"),
+    ("volume per million cycles, mm³", "volume_mm3_per_Mc"),
+    ("mass per million cycles, mg", "mass_mg_per_Mc"),
+    ("creep depth, mm", "creep_depth_mm"),
+    ("creep volume, mm³", "creep_volume_mm3"),
+)
+"""What is shown, and its key."""
+OTHER = (
+    "The wear.json in this folder is of another scene or other meshes, or of a tkamb that did not "
+    "say which: it is not shown."
+)
+
+
+def wear_section(results: "Results") -> dict[str, Any] | None:
+    """Return what the section shows; None where the folder holds no wear.
+
+    Wear of another scene than the run's is not shown, and that is said.
+
+    Raises:
+        InputError: wear.json or its picture cannot be read.
+    """
+    found, folder = wear_of_run(results), results.directory
+    if found is None or folder is None:
+        return None
+    if not found:
+        return {"other": OTHER}
+    bands = found["bands"] or {}
+    picture = base64.b64encode(read_bytes(folder / PICTURE_NAME, LARGEST)).decode("ascii")
+    return {
+        "other": None,
+        "first": found["first"],
+        "cycles": f"{found['cycles']:,.0f}",
+        "banded": bool(bands),
+        "rows": [(name, _number(found[key]), _band(bands, key)) for name, key in ROWS],
+        "legend": _legend(found, bands),
+        "picture": f"data:image/png;base64,{picture}",
+        "alt": "maps of wear, sliding, cross-shear and pressure, and the worn volume over cycles",
+        "notes": [*found["questions"], *found["notes"]],
+    }
+
+
+def wear_of_run(results: "Results") -> dict[str, Any] | None:
+    """Return wear.json beside a run; empty where scene or files are others, None without one.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    folder = results.directory
+    if folder is None or not (folder / WEAR_NAME).is_file():
+        return None
+    found = read_json(folder / WEAR_NAME, LARGEST, what="wear.json")
+    if not isinstance(found, dict) or not found.get("files_sha256"):
+        return {}
+    summary = results.summary
+    files = (summary.get("identity") or {}).get("content of a file")
+    same = summary.get("scene_sha256") in found["scene_sha256"] and files == found["files_sha256"]
+    return found if same else {}
+
+
+def _legend(found: dict[str, Any], bands: dict[str, Any]) -> str:
+    """Return in words what was simulated, and what of it varied."""
+    words = (
+        f"Law {found['law']}, material {found['material']}, {found['control']} control, contact "
+        f"{found['contact']} at {found['resolution_mm']:g} mm, {found['blocks']} blocks of cycles; "
+        f"status: {found['status']}. Motion: {found['source']}."
+    )
+    if not bands:
+        return f"{words} No band: no input was varied."
+    deviations = ", ".join(f"{name} {one:g}" for name, one in bands["standard_deviations"].items())
+    return (
+        f"{words} 5 to 95 % of {bands['samples']} samples; standard deviations: {deviations}. "
+        f"Not in the band: {bands['not_varied']}."
+    )
+
+
+def _band(bands: dict[str, Any], key: str) -> str:
+    low, high = bands.get(f"{key}_p05"), bands.get(f"{key}_p95")
+    return "–" if low is None or high is None else f"{_number(low)} to {_number(high)}"
+
+
+def _number(value: float | None) -> str:
+    return "not modelled" if value is None else f"{value:.4g}"
