@@ -26,7 +26,7 @@ def write_mirrored_patient(folder):
     changes["ligament"] = scene["ligament"]
     path = write_scene(folder, **changes)
     for name in ("femoral_component", "insert", "patellar_button"):
-        _mirror_mesh(path.parent / f"{name}.stl")
+        mirror_mesh(path.parent / f"{name}.stl")
     _negate_columns(path.parent / "motion.csv", ("ml_mm",))
     _negate_columns(path.parent / "ground_reaction.csv", ("force_z_N", "point_z_mm"))
     urdf = path.parent / "patient.urdf"
@@ -38,7 +38,8 @@ def _flip(point):
     return [point[0], point[1], -point[2]]
 
 
-def _mirror_mesh(path):
+def mirror_mesh(path):
+    """Reflect the mesh of a file in the sagittal plane."""
     mesh = trimesh.load(path)
     trimesh.Trimesh(mesh.vertices @ MIRROR, mesh.faces[:, ::-1], process=False).export(path)
 

@@ -7,7 +7,13 @@ import pytest
 
 from knees import UP, bent_knee
 from shared_trials import two_flexors
-from tkamb.body.contributions import EXTENSORS, EXTERNAL, LIGAMENTS, condyle_contributions
+from tkamb.body.contributions import (
+    EXTENSORS,
+    EXTERNAL,
+    LIGAMENTS,
+    POST,
+    condyle_contributions,
+)
 from tkamb.body.load import PointForces, wrench_of
 from tkamb.body.unknowns import AXES
 from tkamb.equilibrium.shared_muscles import SharedMuscles
@@ -66,6 +72,23 @@ def on_link(loads, link):
     """Return the wrench (6,) of loads on one link."""
     own = [load for load in loads if load.link == link]
     return sum(wrench_of(load.points, load.forces).sum(axis=0) for load in own)
+
+
+def test_a_cam_on_the_post_is_a_cause_of_its_own():
+    """With it the causes still sum up, and its own is the statics of the shank."""
+    place, push = np.array([-0.003, 0.02, 0.004]), np.array([400.0, -60.0, 20.0])
+    post = (
+        PointForces("tibia", place[None], push[None]),
+        PointForces("femur", place[None], -push[None]),
+    )
+    geometry, _ = solved("taut")
+    geometry, loads = SharedMuscles(two_flexors(1, reserve=2.0, least=0.05)).solve(
+        0, replace(geometry, post=post), FRICTION
+    )
+    parts = condyle_contributions(geometry, loads, FRICTION)
+    for side, force in shank_alone(geometry, wrench_of(place, push)).items():
+        assert parts[side][POST] == pytest.approx(force, rel=1e-9)
+        assert sum(parts[side].values()) == pytest.approx(loads.values[f"{side}_normal"], abs=1e-6)
 
 
 def test_the_quadriceps_presses_by_the_patellar_ligament_alone():

@@ -39,7 +39,10 @@ def test_radii_measured_back_from_the_meshes(design):
 
 
 def test_meshes_are_closed_and_turn_outwards(design):
-    for vertices, faces in (design.femoral.mesh(), design.insert.mesh(), design.insert.tray()):
+    meshes = [design.femoral.mesh(), design.insert.mesh(), design.insert.tray()]
+    if design.femoral.cam is not None:
+        meshes.append(design.femoral.mesh_with_cam())
+    for vertices, faces in meshes:
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         assert mesh.is_watertight
         assert mesh.is_winding_consistent
@@ -70,12 +73,31 @@ def test_mesh_check_passes_and_the_post_is_found(tmp_path, capsys):
     files = design.write_meshes(tmp_path)
     assert main(["mesh", "check", *map(str, files)]) == 0
     said = capsys.readouterr().out
-    assert said.count("watertight") == 3
+    assert said.count("watertight") == len(files) == 4
     assert "millimetres?" in said
     insert = load_surface(tmp_path / "insert.stl", "mm", "+x,+y,+z", name="insert", closed=True)
     assert find_post(insert) is not None
     flat = replace(design.insert, post=None)
     assert flat.mesh()[0][:, 1].max() < design.insert.mesh()[0][:, 1].max()
+
+
+def test_a_cam_crosses_the_box_clear_of_the_eminence():
+    """LPS-Flex alone has one; on the dishes it passes the eminence by more than 1 mm."""
+    cams = {name: load_design(ROOT / name).femoral.cam for name in FOLDERS.values()}
+    assert {name for name, cam in cams.items() if cam} == {"lps_flex"}
+    design, cam = load_design(ROOT / "lps_flex"), cams["lps_flex"]
+    insert, across = replace(design.insert, post=None), np.linspace(-cam.radius, cam.radius, 101)
+    below = np.sqrt(cam.radius**2 - across**2)
+    for flexion in np.radians(np.arange(0.0, 121.0, 5.0)):
+        cosine, sine = np.cos(flexion), np.sin(flexion)
+        x = -6.0 + cosine * cam.centre_ap - sine * cam.centre_si + across
+        y = 29.5 + sine * cam.centre_ap + cosine * cam.centre_si - below
+        assert (y - insert.height(x, np.zeros_like(x))).min() > 1.0
+    with pytest.raises(InputError, match="has no cam"):
+        load_design(ROOT / "nkii_cp").femoral.mesh_with_cam()
+    ahead = replace(design.femoral, cam=replace(cam, centre_ap=40.0))
+    with pytest.raises(InputError, match="do not hold the cam"):
+        ahead.mesh_with_cam()
 
 
 def test_a_circle_is_measured_exactly():

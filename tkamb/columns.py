@@ -16,12 +16,14 @@ class Column:
         meaning: one line; vectors are in the insert frame unless it says otherwise.
         needs: scene tables without which the column is empty.
         kind: how its cells are written.
+        optional: left out of the file, not empty, where nothing asks for it.
     """
 
     name: str
     meaning: str
     needs: str = ""
     kind: Kind = "number"
+    optional: bool = False
 
 
 _GROUND = "[ground_reaction]"
@@ -36,6 +38,7 @@ _RECORDED = "[contact] with adduction not released"
 _MARKERS = "[motion.markers]"
 _ADJUST = "[contact] with adjust = true"
 _MEASURED = "[measured]"
+_POST = "[contact] post; then there is no such column"
 
 LIGAMENT = "ligament_<name>_N"
 """Stands for one column per [[ligament]], in the scene's order."""
@@ -59,7 +62,11 @@ COLUMNS: tuple[Column, ...] = (
         "axial_rotation_deg",
         "positive: the femur rotates externally on the tibia; as solved where released",
     ),
-    Column("force_si_N", "contact force on the insert, no residuals: along -y, compression > 0"),
+    Column(
+        "force_si_N",
+        "contact force on the insert, a modelled post's among it, no residuals: along -y, "
+        "compression > 0",
+    ),
     Column("force_ap_N", "the same, insert x"),
     Column("force_ml_N", "the same, insert z"),
     Column("force_total_N", "magnitude of that force"),
@@ -219,6 +226,24 @@ COLUMNS: tuple[Column, ...] = (
     Column("measured_total_N", "axial force that was measured, as force_si_N", _MEASURED),
     Column("measured_medial_N", "the same of the medial condyle", _MEASURED),
     Column("measured_lateral_N", "the same of the lateral condyle", _MEASURED),
+    *(
+        Column(f"post_{name}", meaning, _POST, optional=True)
+        for name, meaning in (
+            ("force_N", "normal force of the cam on the insert's post, zero where apart"),
+            ("force_ap_N", "the same, insert x"),
+            ("force_si_N", "the same, along -y"),
+            ("force_ml_N", "the same, insert z"),
+            ("area_mm2", "area in contact of cam and post"),
+            ("peak_pressure_MPa", "largest pressure there"),
+            ("cop_si_mm", "centre of pressure on the post, insert y"),
+            ("cop_ml_mm", "the same, insert z"),
+            (
+                "gap_mm",
+                "clearance of cam and post along insert x; negative: they overlap; empty where "
+                "the cam is not behind the post",
+            ),
+        )
+    ),
 )
 
 RENAMED = {"softest_N_per_mm": "smallest_stiffness_N_per_mm"}
@@ -272,13 +297,13 @@ def ligament_of(column: str) -> str:
 
 
 def ordered_names(present: Iterable[str]) -> tuple[str, ...]:
-    """Return every fixed column in order, with the families' columns of `present` in place."""
+    """Return every fixed column in order, with families' and optional ones of `present`."""
     given = list(present)
     names: list[str] = []
     for column in COLUMNS:
         if column.name in FAMILIES:
             names.extend(name for name in given if belongs(name, column.name))
-        else:
+        elif column.name in given or not column.optional:
             names.append(column.name)
     return tuple(names)
 

@@ -71,6 +71,7 @@ class KneeGeometry:
         coordinates: (6,) knee coordinates, m and rad, at which all this stands.
         tensions: ligament name -> N.
         share: the other muscles, with their forces, if modelled.
+        post: known loads of a cam on the insert's post, if modelled.
         problems: plain words, why the equations cannot be set up; empty when all is well.
     """
 
@@ -84,6 +85,7 @@ class KneeGeometry:
     coordinates: Array = field(default_factory=lambda: np.full(6, np.nan))
     tensions: dict[str, float] = field(default_factory=dict)
     share: MuscleShare | None = None
+    post: tuple[PointForces, ...] = ()
     problems: tuple[str, ...] = ()
 
 
@@ -93,7 +95,7 @@ class KneeLoads:
 
     Args:
         values: magnitude of each unknown, N or N·m.
-        contact_force: (3,) N on the femur, insert frame, without residuals.
+        contact_force: (3,) N of the condyles on the femur, insert frame, without residuals.
         external_flexion: N·m, moment that tends to flex, about the femoral ML axis.
         external_adduction: N·m, moment that tends to adduct, about the floating axis.
         sensitivity: N, largest change of the total contact force when the residuals' point
@@ -210,7 +212,7 @@ class KneeSystem:
         ground = [geometry.ground] if geometry.ground else []
         couples = [unknowns.moment_pair("tibia", "femur", unknowns.AXES[a]) for a in ("ap", "ml")]
         pulls = geometry.share.loads(state) if geometry.share else ()
-        known = (*geometry.ligaments, *pulls)
+        known = (*geometry.ligaments, *geometry.post, *pulls)
         groups = [*(unknown.loads for unknown in found), *couples, ground, known]
         columns = state.generalised(groups)
         self._columns, self._couples = columns[:, :-4], columns[:, -4:-2]

@@ -94,4 +94,5 @@ def _beyond(case: Case) -> list[str]:
     """Return what tkamb has no table for, as far as it matters to this scene."""
     others = [] if case.scene.muscles else ["muscles other than the quadriceps"]
     patella = ["out-of-plane motion of the patella"] if case.scene.patella else []
-    return [*others, *patella, "cam–post contact", "wear and creep (`tkamb wear`)"]
+    post = [] if case.post is not None else ["cam–post contact"]
+    return [*others, *patella, *post, "wear and creep (`tkamb wear`)"]

@@ -62,6 +62,7 @@ class ProbedContact:
         tangent: the condyles' stiffness is known,
         exact: and is the tangent, no guide to it.
         accuracy: share of the contact force to which the model knows it.
+        post: what a cam does to the insert's post; None where it carries nothing.
     """
 
     condyles: dict[str, CondyleWrench]
@@ -69,11 +70,17 @@ class ProbedContact:
     tangent: bool = False
     exact: bool = True
     accuracy: float = 0.0
+    post: CondyleWrench | None = None
+
+    @property
+    def loads(self) -> tuple[CondyleWrench, ...]:
+        """What each condyle, and the post, takes."""
+        return (*self.condyles.values(), *(() if self.post is None else (self.post,)))
 
     @property
     def wrench(self) -> Array:
         """(6,) on the insert."""
-        return sum((c.wrench for c in self.condyles.values()), np.zeros(6))
+        return sum((load.wrench for load in self.loads), np.zeros(6))
 
 
 class Probe:

@@ -1,6 +1,6 @@
 """A design file: the documented dimensions of one implant, and its meshes.
 
-Keys are the fields of `FemoralComponent`, `Insert` and `Post` with their unit behind them.
+Keys are the fields of `FemoralComponent`, `Cam`, `Insert` and `Post` with their unit behind them.
 """
 
 import tomllib
@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from tkamb.contact.pair import Bearing
 from tkamb.designs import solids
-from tkamb.designs.femoral import FemoralComponent
+from tkamb.designs.femoral import Cam, FemoralComponent
 from tkamb.designs.insert import Insert, Post
 from tkamb.designs.touch import Articulation
 from tkamb.errors import InputError
@@ -19,7 +19,8 @@ from tkamb.files import read_text
 
 DESIGN_FILE = "design.toml"
 FEMORAL_MESH, INSERT_MESH, TRAY_MESH = "femoral_component.stl", "insert.stl", "tray.stl"
-_Part = TypeVar("_Part", FemoralComponent, Insert, Post)
+CAM_MESH = "femoral_component_with_cam.stl"
+_Part = TypeVar("_Part", FemoralComponent, Cam, Insert, Post)
 
 
 @dataclass(frozen=True)
@@ -53,13 +54,15 @@ class Design:
         return self.articulation.insert
 
     def write_meshes(self, folder: Path) -> tuple[Path, ...]:
-        """Write femoral component, insert and tray as binary STL in mm; return the files."""
+        """Write the parts as binary STL in mm, a component with a cam with and without it."""
         folder.mkdir(parents=True, exist_ok=True)
         meshes = {
             FEMORAL_MESH: self.femoral.mesh(),
             INSERT_MESH: self.insert.mesh(),
             TRAY_MESH: self.insert.tray(),
         }
+        if self.femoral.cam is not None:
+            meshes[CAM_MESH] = self.femoral.mesh_with_cam()
         for name, (vertices, faces) in meshes.items():
             solids.write_stl(folder / name, vertices, faces)
         return tuple(folder / name for name in meshes)
@@ -76,14 +79,15 @@ def load_design(folder: str | Path) -> Design:
         rows = tomllib.loads(read_text(file, what="design file"))
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"is no TOML ({error})", file, "mend the line it names") from None
-    unknown = set(rows) - {"title", "bearing", "femoral", "insert", "post", "sources"}
+    unknown = set(rows) - {"title", "bearing", "femoral", "cam", "insert", "post", "sources"}
     if unknown:
         raise InputError(f"unknown key '{min(unknown)}'", file, "see models/designs/README.md")
     bearing = rows.get("bearing", "fixed")
     if bearing not in ("fixed", "mobile"):
         raise InputError(f"'{bearing}' is no bearing", file, "give fixed or mobile")
     post = _part(Post, rows["post"], file) if "post" in rows else None
-    femoral = _part(FemoralComponent, rows.get("femoral", {}), file)
+    cam = _part(Cam, rows["cam"], file) if "cam" in rows else None
+    femoral = _part(FemoralComponent, {**rows.get("femoral", {}), "cam": cam}, file)
     insert = _part(Insert, {**rows.get("insert", {}), "post": post}, file)
     return Design(
         name=Path(folder).resolve().name,
@@ -105,7 +109,7 @@ def _part(kind: type[_Part], given: Mapping[str, Any], file: Path) -> _Part:
     for key, value in given.items():
         unit = next((u for u in UNITS if key.endswith(u)), "")
         name = key.removesuffix(unit)
-        if name not in known or (not unit and name != "post"):
+        if name not in known or (not unit and name not in ("cam", "post")):
             raise InputError(
                 f"unknown key '{key}'", file, f"known, with _mm or _deg: {', '.join(sorted(known))}"
             )

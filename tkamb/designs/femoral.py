@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tkamb.designs import solids
+from tkamb.designs.cam import Cam, joined
 from tkamb.designs.sagittal import SagittalProfile
+from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 
 Arcs = tuple[tuple[float, float, float], ...]
@@ -50,6 +52,7 @@ class FemoralComponent:
         thickness: of the component.
         thickness_at_flange_top: the same at the top of the flange.
         blend_half: the groove within this distance blends unequal J-curves.
+        cam: of a posterior-stabilised component; None for one without.
     """
 
     medial_arcs: Arcs
@@ -69,6 +72,7 @@ class FemoralComponent:
     thickness: float = 9.0
     thickness_at_flange_top: float = 6.5
     blend_half: float = 11.0
+    cam: Cam | None = None
 
     @cached_property
     def profile(self) -> SagittalProfile:
@@ -144,6 +148,16 @@ class FemoralComponent:
         columns = {0, *range(0, middle, 5), middle - 1, middle, *range(middle, 2 * middle, 5)}
         kept = sorted({*range(0, len(rows), 4), bridge, len(rows) - 1})
         return solids.close_sheets(outer, inner, kept, sorted({*columns, 2 * middle - 1}), bridge)
+
+    def mesh_with_cam(self) -> tuple[Array, NDArray[np.int64]]:
+        """Return the closed triangulation of `mesh` with the cam across its box.
+
+        Raises:
+            InputError: the component has no cam, or none that the walls of the box can hold.
+        """
+        if self.cam is None:
+            raise InputError("the femoral component has no cam", "[cam]", "give its dimensions")
+        return joined(self.cam, self.notch_half, *self.mesh())
 
     def _below(self, phi: Array, z: Array, depth: Array) -> Array:
         """Points (..., 3) at a depth below the J-curve that holds at z."""

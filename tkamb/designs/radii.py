@@ -6,6 +6,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
+from tkamb.designs.cam import Cam
 from tkamb.designs.design import Design
 from tkamb.designs.femoral import FemoralComponent
 from tkamb.designs.insert import Insert
@@ -59,7 +60,15 @@ def measured_radii(design: Design) -> list[Radius]:
         profile = femoral.profile if sign < 0 else femoral.lateral_profile
         found += _femoral(body, femoral, profile, sign, side)
         found += _dish(dish, insert, sign, side)
+    if femoral.cam is not None:
+        found.append(_cam(femoral, femoral.cam))
     return found
+
+
+def _cam(femoral: FemoralComponent, cam: Cam) -> Radius:
+    cut = section(_mesh(*femoral.mesh_with_cam()), [0.0, 0.0, 1.0], np.zeros(3))[:, :2]
+    near = np.linalg.norm(cut - [cam.centre_ap, cam.centre_si], axis=1) < 2.0 * cam.radius
+    return Radius("cam", cam.radius, circle_radius(cut[near]))
 
 
 def _mesh(vertices: Array, faces: NDArray[np.int64]) -> trimesh.Trimesh:

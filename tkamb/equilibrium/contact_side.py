@@ -29,6 +29,7 @@ from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.frame_contact import FrameContact
 from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
+from tkamb.equilibrium.post_side import cam_on_post, post_contact
 from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_axes, knee_coordinates, knee_pose
@@ -36,6 +37,7 @@ from tkamb.scene.case import Case
 from tkamb.units import DEGREE
 
 if TYPE_CHECKING:
+    from tkamb.contact.cam_post import CamPost
     from tkamb.contact.probe import Probe
     from tkamb.equilibrium.released import KneeEquilibrium
 
@@ -70,10 +72,16 @@ class ContactSide:
         state: what the model's `prepare` returned for these surfaces, if there is one already.
         sensitivity: whether each frame tells how its split changes with the adduction, which
             takes one more press of a model without a tangent.
+        post: cam and post, if they are prepared already.
     """
 
     def __init__(
-        self, case: Case, mechanics: Mechanics, state: Any = None, sensitivity: bool = True
+        self,
+        case: Case,
+        mechanics: Mechanics,
+        state: Any = None,
+        sensitivity: bool = True,
+        post: "CamPost | None" = None,
     ) -> None:
         table = case.scene.contact
         insert = case.scene.implant.insert
@@ -84,6 +92,7 @@ class ContactSide:
         pair = ContactPair(case.femoral, case.insert, material(table.material), insert.bearing)
         start = clock.perf_counter()
         self.state = self.model.prepare(pair) if state is None else state
+        self.post = cam_on_post(case, self.model, self.state.pair.material, post)
         self.prepare_seconds = clock.perf_counter() - start
 
         self._sensitivity = sensitivity and "adduction" not in table.released
@@ -92,7 +101,8 @@ class ContactSide:
         if table.released:
             from tkamb.equilibrium.released import ReleasedKnee
 
-            self.released = ReleasedKnee(mechanics, self._probe, table.released)
+            both = self._probe if self.post is None else self.post.probe_with(self._probe)
+            self.released = ReleasedKnee(mechanics, both, table.released)
 
     def frame(self, k: int, before: Sequence[FrameContact] = ()) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact of frame k, as coupled as the scene asks.
@@ -128,7 +138,7 @@ class ContactSide:
         if contact.adjustment and contact.adjustment.restored:
             body = self.mechanics.frame(k, contact.adjustment)
             contact = self.carry(body, self.mechanics.poses[k], contact.result)
-        if self.table.coupling == "none":
+        if self.table.coupling == "none" and self.post is None:
             return body, contact
         return self._couple(k, body, contact)
 
@@ -159,14 +169,21 @@ class ContactSide:
     def _couple(
         self, k: int, body: FrameLoads, contact: FrameContact
     ) -> tuple[FrameLoads, FrameContact]:
-        """Return body and contact once the resultants of the one are the points of the other."""
+        """Return body and contact once the one's resultants and post act in the other."""
         seconds, place = contact.seconds, self.case.motion.coordinates[k]
         for iteration in range(1, MOST_ITERATIONS + 1):
             if contact.result is None:
                 return body, contact
             load, points = body.loads.contact_force[1], _points(body)
-            found = self.resultants(k, place, contact.result)
-            geometry = replace(body.geometry, condyles=body.geometry.condyles | found)
+            coupled = self.table.coupling == "points"
+            found = self.resultants(k, place, contact.result) if coupled else {}
+            post = post_contact(self.post, contact.result.pose, self.table)
+            if post is not None and post.problem:
+                return replace(body, loads=unsolved([post.problem])), replace(
+                    contact, result=None, problem=post.problem, post=post
+                )
+            pushed = self.mechanics.post_loads(k, place, post.load if post else None)
+            geometry = replace(body.geometry, condyles=body.geometry.condyles | found, post=pushed)
             geometry, loads = self.mechanics.solved(k, geometry)
             body = replace(body, geometry=geometry, loads=loads)
             contact = self.carry(body, self.mechanics.poses[k], contact.result)
@@ -178,7 +195,8 @@ class ContactSide:
                 seconds=seconds,
                 iterations=iteration,
                 load_change=change,
-                point_change=moved,
+                point_change=moved if coupled else NAN,
+                post=post,
             )
             if change < LOAD_CHANGE and moved < POINT_CHANGE:
                 return body, contact
@@ -211,6 +229,7 @@ class ContactSide:
             result = self.model.evaluate(self.state, knee_pose(knee.coordinates), guess)
             result = within_insert(self.state, result)
             contact = self._contact(result, None, 0.0)
+            contact = replace(contact, post=post_contact(self.post, result.pose, self.table))
         contact = replace(
             contact,
             seconds=clock.perf_counter() - start,
@@ -263,7 +282,19 @@ class ContactSide:
         yield self.on_the_insert(recorded)
 
     def on_the_insert(self, place: Array) -> Array:
-        """Return coordinates (6,) whose superior-inferior one makes the condyles just touch."""
+        """Return coordinates (6,) whose superior-inferior one makes the condyles just touch.
+
+        Where AP is released and a cam overlaps the post, AP makes them just touch, too.
+        """
+        touching = self._on_the_dishes(place)
+        if self.post is None or "ap" not in self.table.released:
+            return touching
+        gap = self.post.clearance(knee_pose(touching))
+        if not gap < 0:
+            return touching
+        return self._on_the_dishes(np.array([place[0] + gap + FIRST_DEPTH, *place[1:]]))
+
+    def _on_the_dishes(self, place: Array) -> Array:
         height = self.state.pair.first_touch_height(knee_pose(place))
         return np.array([place[0], height - FIRST_DEPTH, *place[2:]])
 
@@ -280,7 +311,12 @@ class ContactSide:
             }
             touching = self.resultants(k, knee.coordinates, contact.result)
             lifted = frozenset(self.mechanics.sides - set(touching))
-            geometry = replace(geometry, condyles=separated | touching, lifted=lifted)
+            geometry = replace(
+                geometry,
+                condyles=separated | touching,
+                lifted=lifted,
+                post=self.mechanics.post_loads(k, knee.coordinates, knee.contact.post),
+            )
             loads = solve_knee(geometry, self.mechanics.friction)
         seconds = clock.perf_counter() - start
         return FrameLoads(geometry, loads, None, 0.0, seconds)

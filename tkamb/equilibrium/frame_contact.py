@@ -11,6 +11,7 @@ from tkamb.contact.result import ContactResult
 from tkamb.geometry.adjustment import Adjustment
 
 if TYPE_CHECKING:
+    from tkamb.contact.cam_post import PostContact
     from tkamb.equilibrium.released import KneeEquilibrium
 
 NAN = float("nan")
@@ -34,6 +35,7 @@ class FrameContact:
         sensitivity: N/rad, of the medial force to adduction (`split_sensitivity`); NaN where
             adduction is released, or there is one condyle.
         triangles: (k, 3) of the map.
+        post: cam and post, where the scene asks for their contact.
     """
 
     result: ContactResult | None
@@ -48,6 +50,7 @@ class FrameContact:
     equilibrium: "KneeEquilibrium | None" = None
     sensitivity: float = NAN
     triangles: NDArray[np.int64] | None = None
+    post: "PostContact | None" = None
 
     def area_above(self, side: str, pressure: float) -> float:
         """Return the share of a condyle's contact area above a pressure (Pa), 1 at most.

@@ -213,6 +213,27 @@ class Mechanics:
             for side, condyle in condyles.items()
         }
 
+    def post_loads(
+        self, k: int, coordinates: Array, post: "CondyleWrench | None"
+    ) -> tuple[PointForces, ...]:
+        """Return what a cam on the post does to tibia and femur, with friction as a condyle's.
+
+        Args:
+            k: frame; the rates are the recorded ones.
+            coordinates: (6,) where the knee is.
+            post: what the cam does to the insert there; None: nothing.
+        """
+        if post is None:
+            return ()
+        sliding = self.sliding(k, coordinates, post.point)
+        touch = CondylePoint(post.point, post.normal, sliding, 0.0)
+        force = -post.force * touch.direction(self.friction)
+        twist = post.wrench[3:] - np.cross(post.point, post.wrench[:3])
+        return (
+            PointForces("tibia", post.point[None], force[None], twist),
+            PointForces("femur", post.point[None], -force[None], -twist),
+        )
+
     def slips(self) -> "dict[str, CondyleSlip]":
         """Return side -> rolling and slipping of all frames; empty without the two surfaces."""
         case = self.case

@@ -219,6 +219,7 @@ class ReleasedKnee:
             share = muscles.share_of_yielding_knee(k, geometry, friction, base, gain)
         else:
             points = mechanics.resultants(k, place, here.condyles)
+            geometry = replace(geometry, post=mechanics.post_loads(k, place, here.post))
             off = frozenset(mechanics.sides - set(points)) if points else frozenset[str]()
             share = muscles.share(k, replace(geometry, condyles=points), friction, off)
             if touch is None and share.status != "ok":

@@ -112,7 +112,7 @@ class FreeForces(Generic[J]):
     def _with_friction(self, place: Array, contact: "ProbedContact") -> tuple[Array, Array | None]:
         """Return wrench (6,) on the insert with friction, and its stiffness (6, 6) if known."""
         wrench, stiffness = np.zeros(6), np.zeros((6, 6))
-        for condyle in contact.condyles.values():
+        for condyle in contact.loads:
             sliding = self._sliding(place, condyle.point)
             touch = CondylePoint(condyle.point, condyle.normal, sliding, 0.0)
             drag = touch.normal - touch.direction(self._friction)

@@ -1,7 +1,8 @@
-"""A post on the insert: found so that nobody takes cam-post contact for modelled.
+"""A post on the insert: found, and divided from the dishes where its contact is modelled.
 
 A posterior-stabilised insert carries a post that meets a cam of the femoral component
-sideways. Contact along y, as modelled here, cannot see that.
+sideways. Contact along y, as of the condyles, cannot see that: `divide_insert` makes two bodies of
+the insert, the dishes for the condyles and the post for the cam.
 """
 
 from dataclasses import dataclass
@@ -9,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_dilation, label
 
+from tkamb.errors import InputError
+from tkamb.geometry.cut import closed_by_fans, merged, pieces, split_faces
 from tkamb.geometry.frames import Array, Mask
 from tkamb.geometry.height_field import inside_intervals
 from tkamb.geometry.surface import Surface
@@ -24,6 +27,14 @@ STEEP_SHARE = 0.75
 """... on at least this share of its outline."""
 MIDDLE_SHARE = 0.25
 """The centre of a post lies within this share of the width from the middle."""
+FOOT_RING = (3, 5)
+"""Lines outwards from the patch: the ground around the foot, clear of a post's draft."""
+FOOT_CLEARANCE = 0.25e-3
+"""m above that ground: where the post is cut off the dishes."""
+BACK_SHARE = 0.75
+"""Of the post's height above its foot: where its front is taken to hold it."""
+THINNEST = 2e-3
+"""m: a post with less behind its front is none that carries."""
 
 
 @dataclass(frozen=True)
@@ -35,19 +46,26 @@ class Post:
         z: m, its centre.
         height: m, of its tip above the lowest dish.
         area: m², its footprint.
+        foot: m, y at which it rises free of everything around it.
+        front: m, x of its anterior face, at three quarters of its height above the foot.
+        half_width: m, along z.
     """
 
     x: float
     z: float
     height: float
     area: float
+    foot: float
+    front: float
+    half_width: float
 
     @property
     def notice(self) -> str:
         """Say what is not modelled."""
         return (
             f"post at x = {self.x / MILLIMETRE:.0f}, z = {self.z / MILLIMETRE:.0f} mm, "
-            f"{self.height / MILLIMETRE:.0f} mm above the dishes: cam-post contact is not modelled"
+            f"{self.height / MILLIMETRE:.0f} mm above the dishes: cam-post contact is not modelled "
+            "without [contact] post"
         )
 
 
@@ -69,9 +87,54 @@ def find_post(insert: Surface) -> Post | None:
         i, k = np.nonzero(patch)
         centred = abs(z[k].mean() - (low[2] + high[2]) / 2) < MIDDLE_SHARE * (high[2] - low[2]) / 2
         if centred and patch.sum() >= 9 and _steep_share(top, patch) >= STEEP_SHARE:
-            height = float(top[patch].max() - dish)
-            return Post(float(x[i].mean()), float(z[k].mean()), height, len(i) * SPACING**2)
+            tip = float(top[patch].max())
+            foot = _ground(top, patch) + FOOT_CLEARANCE
+            high = patch & (top > foot + BACK_SHARE * (tip - foot))
+            return Post(
+                x=float(x[i].mean()),
+                z=float(z[k].mean()),
+                height=tip - dish,
+                area=len(i) * SPACING**2,
+                foot=foot,
+                front=float(x[np.nonzero(high)[0]].max()),
+                half_width=float(np.ptp(z[k]) / 2 + SPACING / 2),
+            )
     return None
+
+
+def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
+    """Return the insert without its post, and the post, both closed, insert frame.
+
+    The post is what stands above its foot, a plane across y just above all that surrounds it;
+    what is left of it below belongs to the dishes. It ends in front in a plane across x, its flat
+    back in the contact of the cam: what lies before that plane is left out, and the plane
+    takes no part in the deformation.
+
+    Args:
+        insert: closed, insert frame.
+
+    Raises:
+        InputError: there is no post, or it cannot be divided.
+    """
+    post, where = find_post(insert), "[contact] post"
+    if post is None:
+        raise InputError("the insert has no post", where, "leave the key out")
+    vertices, below, above = split_faces(*merged(insert.vertices, insert.faces), 1, post.foot)
+    number = pieces(vertices, above)
+    middles = vertices[above].mean(axis=1)[:, [0, 2]]
+    own = number == number[np.hypot(*(middles - [post.x, post.z]).T).argmin()]
+    dishes = closed_by_fans(vertices, np.concatenate([below, above[~own]]), insert.name)
+    vertices, behind, _ = split_faces(*closed_by_fans(vertices, above[own], "post"), 0, post.front)
+    if not len(behind) or np.ptp(vertices[behind][:, :, 0]) < THINNEST:
+        raise InputError("the post has no depth that could carry a cam", where, "leave it out")
+    return Surface(*dishes, insert.name), Surface(*closed_by_fans(vertices, behind, "post"), "post")
+
+
+def _ground(top: Array, patch: Mask) -> float:
+    """Return the highest y (m) of what surrounds the foot of a patch."""
+    near, far = (binary_dilation(patch, iterations=n) for n in FOOT_RING)
+    ring = top[far & ~near]
+    return float(ring[np.isfinite(ring)].max())
 
 
 def _steep_share(top: Array, patch: Mask) -> float:

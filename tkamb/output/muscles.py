@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from tkamb.results import Results
 
 GROUP_COLOURS = (QUADRICEPS, *LIST, GREY, GREY)
-EXTERNAL, LIGAMENTS, EXTENSORS = "external", "ligaments", "quadriceps"
+EXTERNAL, LIGAMENTS, POST, EXTENSORS = "external", "ligaments", "post", "quadriceps"
 """Contributions beside those of single muscles."""
 HELD = (
     "What makes a force: each load alone in the frame's equations, with pose, contact points and "
@@ -92,15 +92,15 @@ def _forces(results: "Results") -> Panel:
 def _contributions(results: "Results", side: str) -> Panel:
     family, scale, colours = CONTRIBUTIONS[side], 1 / body_weight(results), _colours(results)
     total = results[f"{side}_force_equilibrium_N"]
-    parts = {EXTERNAL: (EXTERNAL,), LIGAMENTS: (LIGAMENTS,)} | _groups(results)
+    parts = {name: (name,) for name in (EXTERNAL, LIGAMENTS, POST)} | _groups(results)
     labels = {EXTERNAL: "external loads"}
-    shades = {EXTERNAL: GREY, LIGAMENTS: LIGAMENT} | colours
+    shades = {EXTERNAL: GREY, LIGAMENTS: LIGAMENT, POST: BLACK} | colours
     lines = [Line("all", "all", scale * total, BLACK)]
     for k, (part, names) in enumerate(parts.items()):
         own = (EXTENSORS,) if part == "knee extensors" else names
         values = _sum(results, family, own)
         if np.isfinite(values).any():
-            dashed = part in (EXTERNAL, LIGAMENTS)
+            dashed = part in (EXTERNAL, LIGAMENTS, POST)
             label = labels.get(part, part)
             lines.append(Line(f"part-{k}", label, scale * values, shades[part], dashed))
     panel = Panel(f"from_{side}", f"What makes the {side} force", "BW", tuple(lines))

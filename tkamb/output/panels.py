@@ -95,8 +95,8 @@ def panels(results: "Results") -> tuple[Panel, ...]:
     """Return the plots whose numbers the run has, in the report's order."""
     makers: tuple[Callable[[Results], Panel], ...] = (
         _total, _condyles, _share, _sensitivity, _extensor, _ratios, _areas, _pressures, _yield,
-        _external, _ground, _ligaments, _residuals, _residual_moment, _hip_force, _hip_moment,
-        _motion, _slip, _adjustment, _adjustment_effect, _condition,
+        _post, _external, _ground, _ligaments, _residuals, _residual_moment, _hip_force,
+        _hip_moment, _motion, _slip, _adjustment, _adjustment_effect, _condition,
     )  # fmt: skip
     made = (_without_empty_lines(make(results)) for make in makers)
     return tuple(panel for panel in made if panel.lines)
@@ -268,6 +268,18 @@ def _yield(results: "Results") -> Panel:
     if not any(np.nanmax(line.values, initial=0) > 0 for line in lines):
         lines = ()
     return Panel("above_yield", "Contact area above yield", "% of the condyle's area", lines)
+
+
+def _post(results: "Results") -> Panel:
+    scale, right = 1 / body_weight(results), lateral_axis_name(results)
+    lines = (
+        _line(results, "post_force_N", "total", BLACK, scale=scale),
+        _line(results, "post_force_ap_N", "anterior", ANTERIOR, scale=scale),
+        _line(results, "post_force_si_N", "inferior", SUPERIOR, scale=scale),
+        _line(results, "post_force_ml_N", right, RIGHT, scale=scale),
+    )
+    note = "On the insert, without friction; the contact force holds it."
+    return Panel("post", "Force of the cam on the post", "BW", lines, note)
 
 
 def _external(results: "Results") -> Panel:

@@ -57,7 +57,7 @@ def frame_status(
     if body.loads.ambiguous:
         words.append("several load states balance: the one that leaves out fewest is taken")
     words += contradictions(case, body, contact)
-    words += list(contact.flags) if contact else []
+    words += [*contact.flags, *(contact.post.flags if contact.post else ())] if contact else []
     words += doubts
     if failures:
         return FAILED + "; ".join([*failures, *words])

@@ -28,6 +28,11 @@ RESIDUALS = (
     "residual_sensitivity_N is the change of the total force when that point moves by 10 mm in y."
 )
 
+POST_HELD = (
+    "Cam and post: the post is held at its anterior face, so that it does not bend at its root; "
+    "friction as of the condyles; the column force_si_N and its like hold the post's force too."
+)
+
 MUCH_RESERVE = 0.05
 """Of the coordinate's largest moment."""
 
@@ -235,6 +240,8 @@ def assumptions(case: Case) -> list[str]:
             sentences.append(scene.muscles.emg.sentence)
     if scene.contact:
         sentences.append(_agreement(scene.contact))
+    if case.post is not None:
+        sentences.append(POST_HELD)
     if scene.patient.side == "left":
         sentences.append("A left knee is computed as its mirror image: z is lateral.")
     return sentences

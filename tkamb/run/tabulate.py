@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from tkamb.body.contact_points import CondylePoint
     from tkamb.body.crossing import MuscleShare
     from tkamb.body.slip import CondyleSlip
+    from tkamb.contact.cam_post import PostContact
     from tkamb.equilibrium.frame_contact import FrameContact
     from tkamb.inputs.marker_motion import MarkerKinematics
 
@@ -111,6 +112,8 @@ def _marker_row(markers: "MarkerKinematics", time: Array) -> dict[str, Any]:
 def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
     loads, values, extensor = frame.loads, frame.loads.values, frame.geometry.extensor
     on_insert = -loads.contact_force
+    for push in frame.geometry.post[:1]:  # on the tibia; the second is its opposite
+        on_insert = on_insert + push.forces[0]
     total = float(np.linalg.norm(on_insert))
     normal = {side: normal_force(frame, side) for side in SIDES}
     row = {
@@ -214,7 +217,23 @@ def _contact_row(frame: "FrameContact", yield_stress: float) -> dict[str, float]
         row["adjust_restored"] = float(frame.adjustment.restored)
     for side in SIDES:
         row |= _condyle_row(side, frame, yield_stress)
-    return row
+    return row if frame.post is None else row | _post_row(frame.post)
+
+
+def _post_row(post: "PostContact") -> dict[str, float]:
+    """Return what a cam does to the post."""
+    force, centre, gone = post.force, post.centre, NAN if post.problem else 1.0
+    return {
+        "post_force_N": float(np.linalg.norm(force)),
+        "post_force_ap_N": force[0],
+        "post_force_si_N": -force[1],
+        "post_force_ml_N": force[2],
+        "post_area_mm2": gone * post.area / MILLIMETRE**2,
+        "post_peak_pressure_MPa": gone * post.peak_pressure / MEGAPASCAL,
+        "post_cop_si_mm": centre[1] / MILLIMETRE,
+        "post_cop_ml_mm": centre[2] / MILLIMETRE,
+        "post_gap_mm": post.gap / MILLIMETRE,
+    }
 
 
 def _pose_row(frame: "FrameContact") -> dict[str, float]:

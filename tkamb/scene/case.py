@@ -40,13 +40,14 @@ class Case:
         tibia: the shank in the laboratory; None: upright and at rest.
         ground: ground reaction in the laboratory.
         femoral: femoral component in the femur link's frame.
-        insert: insert in the insert frame.
+        insert: insert in the insert frame; without its post where that has a contact of its own.
         patella: patellar button in the patella link's frame.
         ligaments: the bundles, generic ones among them; slack lengths where the scene has them.
         muscles: the muscles.
         patellar_ligament: the patellar ligament.
         measured: what an instrumented implant measured.
         emg: envelopes of the muscles' surface EMG.
+        post: the insert's post, insert frame, where the scene asks for its contact.
     """
 
     scene: Scene
@@ -62,6 +63,7 @@ class Case:
     patellar_ligament: "PatellarLigament | None" = None
     measured: "MeasuredForce | None" = None
     emg: "Envelopes | None" = None
+    post: "Surface | None" = None
 
     @cached_property
     def split(self) -> float | None:
@@ -156,6 +158,7 @@ def load_case(scene: Scene) -> Case:
         patellar_ligament,
         _measured(scene, motion),
         _emg(scene),
+        parts.post,
     )
     if scene.patient.scale == 1.0:
         return case
@@ -229,6 +232,7 @@ class _Parts:
         self.femoral: Surface | None = None
         self.insert: Surface | None = None
         self.patella: Surface | None = None
+        self.post: Surface | None = None
         self.insert_mesh_in_insert = self.femoral_mesh_in_femur = np.eye(4)
         if wants_insert:
             if not implant.insert:
@@ -265,6 +269,10 @@ class _Parts:
             raise
         self.insert_mesh_in_insert = placement @ pose(axes_rotation(table.axes), np.zeros(3))
         self.insert = self._right(surface.moved(placement))
+        if scene.contact is not None and scene.contact.post:
+            from tkamb.geometry.post import divide_insert
+
+            self.insert, self.post = divide_insert(self.insert)
 
     def _could_be_insert(self, table: FemoralImplantTable) -> bool:
         """Say whether the mesh that the scene calls femoral has an insert's flat bottom."""

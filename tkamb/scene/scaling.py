@@ -50,6 +50,7 @@ def scaled_case(case: "Case") -> "Case":
         femoral=_surface(case.femoral, s),
         insert=_surface(case.insert, s),
         patella=_surface(case.patella, s),
+        post=_surface(case.post, s),
         ligaments=tuple(_ligament(one, s) for one in case.ligaments),
         muscles=tuple(_muscle(one, s) for one in case.muscles),
         patellar_ligament=_patellar_ligament(case.patellar_ligament, s),

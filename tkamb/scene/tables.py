@@ -289,6 +289,12 @@ class ContactTable(SceneTable):
             "muscle line: adduction, axial_rotation, ap, si, ml (si always does)"
         ),
     )
+    post: Switch = Field(
+        False,
+        description=(
+            "cam–post contact: the insert's post and the femoral cam as a second pair of surfaces"
+        ),
+    )
     options: dict[str, Any] = Field(
         default_factory=dict, description="the model's own, see `tkamb contact list`"
     )

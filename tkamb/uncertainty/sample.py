@@ -139,7 +139,7 @@ class Sampler:
             material = state.pair.material
             stiffer = replace(material, young_modulus=material.young_modulus * factor)
             state = self._side.model.prepare(replace(state.pair, material=stiffer))
-        return ContactSide(case, mechanics, state, sensitivity=False)
+        return ContactSide(case, mechanics, state, sensitivity=False, post=self._side.post)
 
 
 class BandWorker:

@@ -85,6 +85,8 @@ def solids(
     found = []
     if case.insert is not None:
         found.append(Solid("insert", "insert", case.insert, INSERT, 1.0, still))
+    if case.post is not None:
+        found.append(Solid("post", "insert", case.post, INSERT, 1.0, still))
     if case.femoral is not None:
         poses = _contact_poses(solved, maps, rows)
         found.append(

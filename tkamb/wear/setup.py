@@ -85,7 +85,7 @@ def wear_setup(
         progress: wraps the frames of a scene that has to be run.
 
     Raises:
-        InputError: the scene, folder or profile cannot be used, or has no contact.
+        InputError: the scene, folder or profile cannot be used, has no contact, or one of a post.
     """
     if frames < 2:
         raise InputError(f"{frames} frames", "--frames-per-cycle", "give at least 2")
@@ -104,6 +104,9 @@ def wear_setup(
         hashes = _hashes(case, given)
     table = _with_contact(case.scene, contact, resolution_mm, path).contact
     assert table is not None and case.femoral is not None and case.insert is not None
+    if case.post is not None:
+        mend = "leave the key out: the dishes' wear alone is modelled"
+        raise InputError("the post does not wear", "[contact] post", mend)
     engine = _engine(case, table)
     if simulator is not None:
         held = None if springs is None else read_springs(springs)

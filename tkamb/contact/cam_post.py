@@ -1,0 +1,295 @@
+"""Cam and post as a contact pair of its own: the same contact model, in a turned frame.
+
+The contract presses a femoral component along -y into an insert whose flat bottom lies in
+y = 0. A post that is met from behind answers it when it is turned: with the insert's axes x
+anterior, y superior, z to the right, the turned ones are
+
+    x' = y,    y' = x_f - x,    z' = z,
+
+x_f the flat front of the post (`tkamb.geometry.post.divide_insert`). Its posterior face then
+looks up along y', its front is the bottom that the models hold, and its depth their
+thickness: **the post does not bend at its root**. The pair is evaluated at a pose, never pressed.
+
+With R and t of pose_insert_in_turned and X = [[R, t x R], [0, R]], which takes the small
+displacement of the femur (of its point at the origin, then rotation) into the turned frame, power
+is the same in both, so that wrench and stiffness come back as
+
+    w = X^T w',    K = X^T K' X.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from tkamb.contact.materials import Material
+from tkamb.contact.model import ContactModel
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.probe import CondyleWrench, ProbedContact, condyle_wrenches
+from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, inverse, rotate, transform
+from tkamb.geometry.surface import Surface
+from tkamb.units import MILLIMETRE
+
+WHERE = "[contact] post"
+TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""Rows: the turned axes in the insert frame."""
+UP = np.array([0.0, 1.0, 0.0])
+SKIN = 1e-3
+"""m; rays start so far above the post."""
+TICKS, ZOOMS = 41, 3
+"""Rays along either edge of the grid on which the clearance is looked for, and how often it is made
+twenty times finer: 16 mm are known to less than a micrometre."""
+BESIDE = 3 * MILLIMETRE
+"""How far the cam is taken beside the post, which the femur's ML position moves."""
+NO_LINE_CONTACT = ("hertz",)
+"""Models that know no contact along a line."""
+
+
+class PostPair(ContactPair):
+    """A cam and a post in the turned frame: one contact, whatever its side."""
+
+    @property
+    def split(self) -> None:
+        """None: cam and post are not divided into medial and lateral."""
+
+    def clearance(self, pose: Array) -> float:
+        """Return the least distance (m) along y' between cam and post; NaN beside each other.
+
+        Rays along y' on a grid over the post, then twice on a finer one about the least: parts
+        are drawn with triangles as long as they are wide, and line up in lines.
+
+        Args:
+            pose: (4, 4) pose_femoral_in_turned.
+        """
+        low, high = self.insert.bounds[:, [0, 2]]
+        least = np.nan
+        for _ in range(ZOOMS):
+            ticks = np.linspace(low, high, TICKS)
+            x, z = (grid.ravel() for grid in np.meshgrid(*ticks.T, indexing="ij"))
+            gap = self._apart(np.column_stack([x, np.zeros_like(x), z]), pose)
+            if not np.isfinite(gap).any():
+                break
+            k = int(np.nanargmin(gap))
+            least, reach = float(gap[k]), (high - low) / (TICKS - 1)
+            place = np.array([x[k], z[k]])
+            low = np.maximum(place - reach, self.insert.bounds[0, [0, 2]])
+            high = np.minimum(place + reach, self.insert.bounds[1, [0, 2]])
+        return least
+
+    def _apart(self, points: Array, pose: Array) -> Array:
+        """Return the distance (n,) along y' at places (n, 3); NaN where either is not there."""
+        far, back = float(np.abs(self.femoral.bounds).max()), inverse(pose)
+        below = points + (pose[1, 3] - 2 * far) * UP
+        up, _ = self.femoral.rays.first(transform(back, below), rotate(back, UP))
+        above = points + (self.insert.bounds[1, 1] + SKIN) * UP
+        down, _ = self.insert.rays.first(above, -UP)
+        gap = (below[:, 1] + up) - (above[:, 1] - down)
+        return np.where(np.isfinite(gap), gap, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class PostContact:
+    """Cam and post at one pose, insert frame; nothing carried: zero force, no place.
+
+    Args:
+        load: on the insert, normal forces alone; None where nothing is carried.
+        gap: m along x between cam and post; negative: they overlap.
+        area: m².
+        peak_pressure: Pa.
+        flags: plain words that a reader must know.
+        problem: why there is no result, or empty.
+    """
+
+    load: CondyleWrench | None
+    gap: float
+    area: float = 0.0
+    peak_pressure: float = 0.0
+    flags: tuple[str, ...] = ()
+    problem: str = ""
+
+    @property
+    def force(self) -> Array:
+        """(3,) N on the insert; NaN where it could not be computed."""
+        if self.problem:
+            return np.full(3, np.nan)
+        return np.zeros(3) if self.load is None else self.load.wrench[:3]
+
+    @property
+    def centre(self) -> Array:
+        """(3,) m, the centre of pressure; NaN where nothing is carried."""
+        return np.full(3, np.nan) if self.load is None else self.load.centre
+
+
+class CamPost:
+    """A contact model prepared for a cam and a post.
+
+    Args:
+        model: the contact model.
+        femoral: femoral component with its cam, femoral frame.
+        post: closed, insert frame, flat in front (`divide_insert`).
+        split: z (m, femoral frame) between the condyles.
+        material: of the post.
+
+    Raises:
+        InputError: the model knows no contact along a line, or there is no cam.
+    """
+
+    def __init__(
+        self,
+        model: ContactModel,
+        femoral: Surface,
+        post: Surface,
+        split: float | None,
+        material: Material,
+    ) -> None:
+        if model.name in NO_LINE_CONTACT:
+            mend = "take foundation, lattice or fe"
+            raise InputError(f"contact model '{model.name}' has no line contact", WHERE, mend)
+        low, high = post.bounds
+        front = np.array([high[0], (low[1] + high[1]) / 2, (low[2] + high[2]) / 2])
+        self.in_turned = np.eye(4)
+        self.in_turned[:3, :3], self.in_turned[:3, 3] = TURN, -TURN @ front
+        cam = cam_of(femoral, split, (high[2] - low[2]) / 2 + BESIDE)
+        self._foot = float(low[1])
+        self._prepare(model, PostPair(cam, post.moved(self.in_turned), material))
+
+    def _prepare(self, model: ContactModel, pair: ContactPair) -> None:
+        self.model, self.state = model, model.prepare(pair)
+
+    @property
+    def material(self) -> Material:
+        """Of the post."""
+        return self.state.pair.material
+
+    def of_material(self, material: Material) -> "CamPost":
+        """Return the same cam and post of another material."""
+        other = object.__new__(CamPost)
+        other.in_turned, other._foot = self.in_turned, self._foot
+        other._prepare(self.model, replace(self.state.pair, material=material))
+        return other
+
+    def at(self, pose: Array) -> PostContact:
+        """Return the contact at a pose_femoral_in_insert (4, 4)."""
+        gap = self.clearance(pose)
+        result = self.model.evaluate(self.state, self.in_turned @ pose)
+        if result.status is not ContactStatus.OK:
+            words = (flag.replace("insert's thickness", "post's depth") for flag in result.flags)
+            reason = "; ".join((result.status.value.replace("_", " "), *words))
+            overlap = f", overlap {-gap / MILLIMETRE:.1f} mm" if gap < 0 else ""
+            return PostContact(None, gap, problem=f"cam-post contact {reason}{overlap}")
+        if result.medial is None:
+            return PostContact(None, gap)
+        return PostContact(
+            self._in_insert(condyle_wrenches(result, None)["medial"]),
+            gap,
+            result.medial.area,
+            result.medial.peak_pressure,
+            self._flags(result),
+        )
+
+    def clearance(self, pose: Array) -> float:
+        """Return the least distance (m) along x between cam and post at a pose (4, 4).
+
+        Negative: they overlap; NaN: they do not lie behind one another.
+        """
+        pair: PostPair = self.state.pair
+        return pair.clearance(self.in_turned @ pose)
+
+    def probe(self) -> "PostProbe":
+        """Return what a search for equilibrium asks: wrench and stiffness, insert frame."""
+        return PostProbe(self, self.model.probe(self.state))
+
+    def probe_with(self, condyles: Any) -> Any:
+        """Return the same, together with a probe of the condyles."""
+        return CondylesAndPost(condyles, self.probe())
+
+    def seen(self, contact: ProbedContact) -> ProbedContact:
+        """Return a probed contact of the turned frame as the post's in the insert frame."""
+        load = contact.condyles.get("medial")
+        post = None if load is None else self._in_insert(load)
+        return replace(contact, condyles={}, post=post)
+
+    def _in_insert(self, load: CondyleWrench) -> CondyleWrench:
+        x = twist_matrix(self.in_turned)
+        stiffness = None if load.stiffness is None else x.T @ load.stiffness @ x
+        centre = transform(inverse(self.in_turned), load.centre)
+        return CondyleWrench(x.T @ load.wrench, centre, stiffness)
+
+    def _flags(self, result: ContactResult) -> tuple[str, ...]:
+        loaded = transform(inverse(self.in_turned), result.points[result.pressure > 0])
+        words = [flag.replace("medial", "post") for flag in result.flags]
+        if loaded[:, 1].min() < self._foot + self.model.resolution:
+            words.append("cam meets the foot of the post: what lies below it is not seen")
+        return tuple(words)
+
+
+class PostProbe:
+    """Cam and post at neighbouring poses; see `tkamb.contact.probe.Probe`."""
+
+    def __init__(self, cam_post: CamPost, turned: Any) -> None:
+        self._cam_post, self._turned = cam_post, turned
+
+    def at(self, pose: Array) -> ProbedContact:
+        """Return the contact at a pose_femoral_in_insert (4, 4): its post alone."""
+        return self._cam_post.seen(self._turned.at(self._cam_post.in_turned @ pose))
+
+
+class CondylesAndPost:
+    """The condyles and the post of one insert at neighbouring poses, as one contact.
+
+    Args:
+        condyles: probe of the condyles on the dishes.
+        post: probe of the cam on the post.
+    """
+
+    def __init__(self, condyles: Any, post: PostProbe) -> None:
+        self._condyles, self._post = condyles, post
+
+    def at(self, pose: Array) -> ProbedContact:
+        """Return the contact at a pose_femoral_in_insert (4, 4)."""
+        condyles, post = self._condyles.at(pose), self._post.at(pose)
+        return ProbedContact(
+            condyles.condyles,
+            condyles.known and post.known,
+            condyles.tangent and post.tangent,
+            condyles.exact and post.exact,
+            max(condyles.accuracy, post.accuracy),
+            post.post,
+        )
+
+
+def twist_matrix(pose: Array) -> Array:
+    """Return X (6, 6), which takes displacement and rotation of one frame into another's.
+
+    Args:
+        pose: (4, 4) pose of the first frame in the other.
+    """
+    turn, (x, y, z) = pose[:3, :3], pose[:3, 3]
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.block([[turn, cross @ turn], [np.zeros((3, 3)), turn]])
+
+
+def cam_of(femoral: Surface, split: float | None, reach: float) -> Surface:
+    """Return the cam: what lies between the condyles in the posterior half of the component.
+
+    Args:
+        femoral: femoral component, femoral frame.
+        split: z (m) between the condyles.
+        reach: m; triangles within it on either side of the split count.
+
+    Raises:
+        InputError: nothing lies there.
+    """
+    if split is None:
+        mend = "leave the key out, or give a component with two condyles"
+        raise InputError("one condyle has no cam", WHERE, mend)
+    across = femoral.triangles[:, :, 2] - split
+    behind = femoral.triangles[:, :, 0].max(axis=1) < femoral.bounds[:, 0].mean()
+    own = behind & (across.min(axis=1) < reach) & (across.max(axis=1) > -reach)
+    if not own.any():
+        what = "the femoral component has no cam between its condyles"
+        raise InputError(what, WHERE, "leave the key out, or give the mesh with its cam")
+    used, faces = np.unique(femoral.faces[own], return_inverse=True)
+    return Surface(femoral.vertices[used], faces.reshape(-1, 3).astype(np.int64), "cam")
