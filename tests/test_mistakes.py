@@ -164,6 +164,8 @@ FLAGGED = {
                    "off its neighbours' curve"),
     "URDF in pounds": (urdf("10.620000", "23.413"), "pounds?"),
     "centimetres": (key("patient.height_mm", 1200.0), "of the body height"),
+    "lean's sign": (cells("tibia.csv", "lean_deg", lambda v: -v), "the hip is # mm behind .*lean"),
+    "back to front": (key("implant.femoral.axes", "-x,+y,-z"), "is it back to front"),
 }  # fmt: skip
 
 
@@ -183,7 +185,7 @@ def test_flagged_in_every_frame_it_concerns(knee, name):
     outcome = knee.outcome(edit)
     assert not outcome.refused
     assert any(re.search(words, word) for word in outcome.words), outcome.words
-    if name != "one sample":
+    if name not in ("one sample", "lean's sign"):  # of frames before and after
         assert {word.partition(":")[0] for word in outcome.words} >= {"0", "2", "4"}
 
 

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from scipy.optimize import fsolve
 
+from tkamb import starter as starter_package
 from tkamb.body.patella import (
     ExtensorMechanism,
     PatellaState,
@@ -17,6 +18,7 @@ from tkamb.body.patella import (
 from tkamb.body.patella_search import solve_patella
 from tkamb.body.patellofemoral import PatellofemoralContact
 from tkamb.equilibrium.known import extensor_frames
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.frames import Array, inverse, knee_pose, transform
 from tkamb.geometry.surface import Surface
 from tkamb.scene import load_scene
@@ -339,3 +341,16 @@ def test_shipped_patella_moves_smoothly(shipped: tuple[Array, list[PatellaState]
     bend = np.abs(np.diff(places, n=2, axis=0)).max(axis=0)
     assert (bend[:2] < 2e-4).all()
     assert bend[2] < np.deg2rad(0.4)
+
+
+def test_a_patella_that_is_lost_from_a_frame_far_off_is_found_from_its_own():
+    """A coarse choice of frames must not lose what the frames between would have found."""
+    starter = Path(starter_package.__file__).parent / "files" / "scene.toml"
+    mechanics = Mechanics(load_case(load_scene(starter)))
+    extensor, pose = mechanics.extensor, mechanics.poses[0]
+    own, far = extensor.states[0], extensor.states[-1]
+    lost = solve_patella(extensor._mechanism, pose, far.coordinates, far.slopes)
+    assert not lost.status.found
+    found = extensor.patella(0, pose, far)
+    assert found.status.found
+    np.testing.assert_allclose(found.coordinates, own.coordinates, atol=1e-6)

@@ -130,8 +130,13 @@ class ExtensorFrames:
         if self._contacts is not None:
             recorded = self.states[k].coordinates
             return patella_at(self._mechanism, pose, recorded, self._contacts[k])
-        near = self.states[k] if guess is None else guess
-        return solve_patella(self._mechanism, pose, near.coordinates, near.slopes)
+        own = self.states[k]
+        near = own if guess is None else guess
+        found = solve_patella(self._mechanism, pose, near.coordinates, near.slopes)
+        if found.status.found or near is own or not own.status.found:
+            return found
+        # from a frame far before it may be found nowhere
+        return solve_patella(self._mechanism, pose, own.coordinates, own.slopes)
 
     def at(
         self, k: int, flexion: float, state: ChainState, patella: PatellaState | None = None

@@ -224,7 +224,7 @@ def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:
         first = results.summary["first_wrapping_flexion_deg"]
         detail += "; wraps nowhere" if first is None else f"; wraps the femur from {first:.0f}°"
     slope = results.columns.get("quadriceps_per_dome_mm_N")
-    if slope is not None and np.isfinite(slope[found.frame]):
+    if slope is not None and np.isfinite(slope[found.frame]) and found.value > 0:
         percent = 100 * abs(slope[found.frame]) / found.value
         detail += f"; ± {percent:.1f} % per mm of the button's height on the patella"
     return Card("Peak quadriceps tension", f"{value:.2f} BW", detail)
@@ -234,6 +234,10 @@ def _residuals(results: "Results") -> Card | None:
     share = 100 * metrics.residual_share(results)
     if not np.isfinite(share).any():
         return None
+    released = (results.summary.get("contact") or {}).get("released") or ()
+    if {"ap", "ml", "axial_rotation"} <= set(released):
+        at_rest = "AP, ML and axial rotation are released: what they need is part of the solution"
+        return Card("Residual force", "none", at_rest)
     middle = f"{np.nanmedian(share):.1f} %"
     detail = f"median over the frames, at most {np.nanmax(share):.1f} %, of the SI contact force"
     change = 100 * results["residual_sensitivity_N"] / results["force_total_N"]

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tkamb.geometry.frames import knee_pose, transform
+from tkamb.geometry.frames import Array, knee_pose, transform
 from tkamb.plausibility.question import Question
 from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
@@ -24,6 +24,9 @@ SWING = 0.03
 """Of forward over upward: below, a force hardly leans and the sign of its lean says nothing."""
 AWAY = 0.03
 """Of sideways over upward force, outwards: in standing, walking and squatting it is inwards."""
+HIP_AWAY = 0.6
+"""Of shank and thigh together: sitting with an upright shank has 0.55; the models' walking, stairs
+and squats stay within 0.41."""
 AT_ANKLE = 0.015
 """m: who stands has it 0.04 ahead; a path as near as this to the ankle is in another unit."""
 
@@ -56,12 +59,8 @@ def direction_questions(case: Case) -> Iterator[Question]:
     loaded = ground.loaded & (ground.force[:, 1] > WELL_LOADED * ground.force[:, 1].max())
     if loaded.sum() < 5:
         return
-    hip_in_femur = case.chain.link_in("hip", "femur")[:3, 3]
-    femur = tibia.pose @ case.chain.insert_in_tibia @ knee_pose(case.motion.coordinates)
-    leg = (transform(femur, hip_in_femur[None])[:, 0] - ground.point)[loaded]
-    force = ground.force[loaded]
-    forward = tibia.pose[loaded, :3, 0] * [1.0, 0.0, 1.0]
-    forward /= np.maximum(np.linalg.norm(forward, axis=1), 1e-9)[:, None]
+    leg = _to_hip(case)[loaded]
+    force, forward = ground.force[loaded], _forward(case)[loaded]
     slopes = [np.einsum("fi,fi->f", line, forward) / line[:, 1] for line in (force, leg)]
     if min(np.std(slope) for slope in slopes) > SWING and np.corrcoef(slopes)[0, 1] < -0.5:
         yield Question(
@@ -79,6 +78,47 @@ def direction_questions(case: Case) -> Iterator[Question]:
         )
 
 
+def posture_questions(case: Case) -> Iterator[Question]:
+    """Whether the hip of a leg that bears the body is anywhere above the foot."""
+    ground, tibia, table = case.ground, case.tibia, case.scene.ground_reaction
+    if ground is None or tibia is None or table is None or table.applied != "cop":
+        return
+    loaded = ground.loaded & (ground.force[:, 1] > WELL_LOADED * ground.force[:, 1].max())
+    if not loaded.any():
+        return
+    chain = case.chain
+    length = float(
+        np.linalg.norm(chain.insert_in_tibia[:3, 3])
+        + np.linalg.norm(chain.link_in("hip", "femur")[:3, 3])
+    )
+    ahead = np.einsum("fi,fi->f", _to_hip(case), _forward(case))
+    off = loaded & (np.abs(ahead) > HIP_AWAY * length)
+    if off.any():
+        k = int(np.argmax(np.where(off, np.abs(ahead), 0.0)))
+        side = "ahead of" if ahead[k] > 0 else "behind"
+        yield Question(
+            f"the hip is {abs(ahead[k]) / MILLIMETRE:.0f} mm {side} the centre of pressure of a "
+            "leg that bears the body: is the sign of [tibia]'s lean, or of the flexion, turned?",
+            "hip far from above the foot",
+            off,
+        )
+
+
+def _to_hip(case: Case) -> Array:
+    """Return the way (f, 3), m, from the centre of pressure to the hip, laboratory axes."""
+    assert case.ground is not None and case.tibia is not None
+    femur = case.tibia.pose @ case.chain.insert_in_tibia @ knee_pose(case.motion.coordinates)
+    hip = transform(femur, case.chain.link_in("hip", "femur")[:3, 3][None])[:, 0]
+    return np.asarray(hip - case.ground.point)
+
+
+def _forward(case: Case) -> Array:
+    """Return the level direction (f, 3) to which the shank's front points."""
+    assert case.tibia is not None
+    forward = case.tibia.pose[:, :3, 0] * [1.0, 0.0, 1.0]
+    return np.asarray(forward / np.maximum(np.linalg.norm(forward, axis=1), 1e-9)[:, None])
+
+
 def foot_questions(case: Case) -> Iterator[Question]:
     """Whether the centre of pressure lies under the foot that the shank stands on."""
     ground, tibia, table = case.ground, case.tibia, case.scene.ground_reaction
@@ -87,7 +127,7 @@ def foot_questions(case: Case) -> Iterator[Question]:
     loaded = ground.loaded & (ground.force[:, 1] > WELL_LOADED * ground.force[:, 1].max())
     if not loaded.any():
         return
-    away = ground.point - tibia.pose[:, :3, 3]
+    away, forward = ground.point - tibia.pose[:, :3, 3], _forward(case)
     nearest = float(np.linalg.norm(away[loaded][:, [0, 2]], axis=1).max())
     if nearest < AT_ANKLE:
         yield Question(
@@ -95,8 +135,6 @@ def foot_questions(case: Case) -> Iterator[Question]:
             "seen from above: is it in centimetres or metres?",
             "centre of pressure stays under the ankle",
         )
-    forward = tibia.pose[:, :3, 0] * [1.0, 0.0, 1.0]
-    forward /= np.maximum(np.linalg.norm(forward, axis=1), 1e-9)[:, None]
     ahead = np.einsum("fi,fi->f", away, forward)
     aside = away[:, 2] * forward[:, 0] - away[:, 0] * forward[:, 2]
     right = "to the left of" if case.scene.patient.side == "left" else "to the right of"

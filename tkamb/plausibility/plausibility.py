@@ -4,7 +4,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.plausibility.ground import direction_questions, foot_questions, load_questions
+from tkamb.plausibility.ground import (
+    direction_questions,
+    foot_questions,
+    load_questions,
+    posture_questions,
+)
+from tkamb.plausibility.implant import implant_questions
 from tkamb.plausibility.movement import motion_questions, sample_questions
 from tkamb.plausibility.question import Question, some
 from tkamb.plausibility.segments import segment_questions
@@ -36,6 +42,8 @@ class Plausibility:
             *load_questions(case),
             *foot_questions(case),
             *direction_questions(case),
+            *posture_questions(case),
+            *implant_questions(case),
         ]
         if case.ligaments or case.muscles:
             found += _line_questions(mechanics)
