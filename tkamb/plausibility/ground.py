@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tkamb.geometry.frames import Array, knee_pose, transform
+from tkamb.geometry.frames import Array, Mask, knee_pose, transform
 from tkamb.plausibility.question import Question
 from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
@@ -53,11 +53,8 @@ def direction_questions(case: Case) -> Iterator[Question]:
     slope forward goes with that of the line from the centre of pressure to the hip, and it
     points to the other leg, not away from it.
     """
-    ground, tibia, table = case.ground, case.tibia, case.scene.ground_reaction
-    if ground is None or tibia is None or table is None or table.applied != "cop":
-        return
-    loaded = ground.loaded & (ground.force[:, 1] > WELL_LOADED * ground.force[:, 1].max())
-    if loaded.sum() < 5:
+    ground, loaded = case.ground, _well_loaded(case)
+    if ground is None or loaded.sum() < 5:
         return
     leg = _to_hip(case)[loaded]
     force, forward = ground.force[loaded], _forward(case)[loaded]
@@ -80,11 +77,8 @@ def direction_questions(case: Case) -> Iterator[Question]:
 
 def posture_questions(case: Case) -> Iterator[Question]:
     """Whether the hip of a leg that bears the body is anywhere above the foot."""
-    ground, tibia, table = case.ground, case.tibia, case.scene.ground_reaction
-    if ground is None or tibia is None or table is None or table.applied != "cop":
-        return
-    loaded = ground.loaded & (ground.force[:, 1] > WELL_LOADED * ground.force[:, 1].max())
-    if not loaded.any():
+    ground, tibia, loaded = case.ground, case.tibia, _well_loaded(case)
+    if ground is None or tibia is None or not loaded.any():
         return
     chain = case.chain
     length = float(
@@ -104,6 +98,15 @@ def posture_questions(case: Case) -> Iterator[Question]:
         )
 
 
+def _well_loaded(case: Case) -> Mask:
+    """Return in which frames (f,) the foot bears well; none without a centre of pressure."""
+    ground, table = case.ground, case.scene.ground_reaction
+    if ground is None or case.tibia is None or table is None or table.applied != "cop":
+        return np.zeros(len(case.motion.time), bool)
+    upward = ground.force[:, 1]
+    return np.asarray(ground.loaded & (upward > WELL_LOADED * upward.max()))
+
+
 def _to_hip(case: Case) -> Array:
     """Return the way (f, 3), m, from the centre of pressure to the hip, laboratory axes."""
     assert case.ground is not None and case.tibia is not None
@@ -121,11 +124,8 @@ def _forward(case: Case) -> Array:
 
 def foot_questions(case: Case) -> Iterator[Question]:
     """Whether the centre of pressure lies under the foot that the shank stands on."""
-    ground, tibia, table = case.ground, case.tibia, case.scene.ground_reaction
-    if ground is None or tibia is None or table is None or table.applied != "cop":
-        return
-    loaded = ground.loaded & (ground.force[:, 1] > WELL_LOADED * ground.force[:, 1].max())
-    if not loaded.any():
+    ground, tibia, loaded = case.ground, case.tibia, _well_loaded(case)
+    if ground is None or tibia is None or not loaded.any():
         return
     away, forward = ground.point - tibia.pose[:, :3, 3], _forward(case)
     nearest = float(np.linalg.norm(away[loaded][:, [0, 2]], axis=1).max())
