@@ -253,3 +253,29 @@ def test_a_misspelt_column_of_the_results():
     results = Results({"time_s": [0.0], "status": ["ok"]})
     with pytest.raises(InputError, match="no column 'forse_total_N'; did you mean force_total_N"):
         results["forse_total_N"]
+
+
+def test_a_question_that_is_answered_is_a_note_and_no_flag(tmp_path, capfd):
+    answers = {"in pounds?": "weighed with a load of 90 kg"}
+    table = {"patient__mass_kg": 165.3, "output__answers": answers}
+    scene = write_scene(tmp_path / "scene", ("contact", "ligament"), **table)
+    out = tmp_path / "out"
+    assert main(["run", str(scene), "--out", str(out), "--frames", "0:100:50"]) == 0
+    assert "pounds" not in capfd.readouterr().err
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["questions"] == []
+    assert any("pounds? weighed with a load" in note for note in summary["notes"])
+    with (out / "results.csv").open() as file:
+        assert not any("disagree" in row["status"] for row in csv.DictReader(file))
+
+
+@pytest.mark.parametrize(
+    ("answers", "words"),
+    [({"in stones": "no"}, "no question holds 'in stones'"), ({"in pounds?": " "}, "no answer")],
+)
+def test_an_answer_without_question_or_reason(tmp_path, capfd, answers, words):
+    table = {"patient__mass_kg": 165.3, "output__answers": answers}
+    scene = write_scene(tmp_path / "scene", ("contact", "ligament"), **table)
+    assert main(["run", str(scene), "--out", str(tmp_path / "out")]) == 2
+    assert words in capfd.readouterr().err
+    assert not (tmp_path / "out").exists()

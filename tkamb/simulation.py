@@ -142,7 +142,9 @@ class _Run:
         muscles = self.solver.mechanics.muscles
         if muscles is not None:
             summary["muscle_groups"] = muscles.groups
-        summary["questions"] = [question.text for question in self.solver.plausibility.questions]
+        plausibility = self.solver.plausibility
+        summary["questions"] = [question.text for question in plausibility.questions]
+        summary["notes"] += plausibility.answered
         summary["identity"] = self.identity
         summary["inputs"] = self.inputs
         summary["resumed_frames"] = self.resumed

@@ -25,6 +25,7 @@ class SceneCheck:
         not_modelled: what the scene leaves out.
         assumptions: what the numbers would rest on.
         questions: what is unlikely about it, with the likely mistake.
+        answered: of these, what the scene answers.
     """
 
     scene: Path
@@ -33,6 +34,7 @@ class SceneCheck:
     not_modelled: tuple[str, ...]
     assumptions: tuple[str, ...]
     questions: tuple[str, ...]
+    answered: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
         """Return the check as lines of text."""
@@ -43,6 +45,7 @@ class SceneCheck:
             f"not modelled: {', '.join(self.not_modelled)}",
             *(f"assumed: {sentence}" for sentence in self.assumptions),
             *(f"question: {question}" for question in self.questions or nothing),
+            *self.answered,
         ]
 
     def as_dict(self) -> dict[str, Any]:
@@ -59,6 +62,7 @@ class SceneCheck:
             "not_modelled": list(self.not_modelled),
             "assumptions": list(self.assumptions),
             "questions": list(self.questions),
+            "answered": list(self.answered),
         }
 
 
@@ -80,13 +84,15 @@ def check_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> Sc
         material(scene.contact.material)
     case = load_case(scene)
     mechanics = Mechanics(case)
+    plausibility = Plausibility(mechanics)
     return SceneCheck(
         Path(path),
         mechanics,
         inventory(mechanics),
         (*not_modelled(case), *_beyond(case)),
         tuple(assumptions(case)),
-        tuple(question.text for question in Plausibility(mechanics).questions),
+        tuple(question.text for question in plausibility.questions),
+        plausibility.answered,
     )
 
 

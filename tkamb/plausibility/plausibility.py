@@ -1,9 +1,11 @@
 """All questions of a case, and what they say about a frame."""
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tkamb.errors import InputError
 from tkamb.plausibility.ground import (
     direction_questions,
     foot_questions,
@@ -18,6 +20,7 @@ from tkamb.plausibility.segments import segment_questions
 if TYPE_CHECKING:
     from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 
+ANSWERS = "[output] answers"
 FORCE_BW = 8.0
 """BW: instrumented knees measured 5 to 6 at most, in stumbling (Bergmann et al. 2014)."""
 
@@ -29,7 +32,11 @@ class Plausibility:
         mechanics: its body side, prepared.
 
     Attributes:
-        questions: all of them.
+        questions: those that the scene does not answer.
+        answered: question and answer, each in words.
+
+    Raises:
+        InputError: an answer is empty, or to a question that nobody asks.
     """
 
     def __init__(self, mechanics: "Mechanics") -> None:
@@ -47,7 +54,7 @@ class Plausibility:
         ]
         if case.ligaments or case.muscles:
             found += _line_questions(mechanics)
-        self.questions: tuple[Question, ...] = tuple(found)
+        self.questions, self.answered = _answered(found, case.scene.output.answers)
 
     def flags(self, k: int, body: "FrameLoads") -> list[str]:
         """Return the words for the status of frame k."""
@@ -65,6 +72,29 @@ class Plausibility:
                 f"contact force of {force:.1f} BW, more than any knee was measured to bear"
             )
         return words
+
+
+def _answered(
+    asked: Sequence[Question], answers: Mapping[str, str]
+) -> tuple[tuple[Question, ...], tuple[str, ...]]:
+    """Return the questions without an answer, and those with one in words.
+
+    Args:
+        asked: all of them.
+        answers: words of a question's text -> its answer.
+    """
+    left, told = list(asked), []
+    for words, answer in answers.items():
+        own = [question for question in left if words and words.lower() in question.text.lower()]
+        if not own:
+            texts = "; ".join(question.text for question in left) or "there is none"
+            mend = f"leave it out, or take words of one that is asked: {texts}"
+            raise InputError(f"no question holds '{words}'", ANSWERS, mend)
+        if not answer.strip():
+            raise InputError(f"'{words}' has no answer", ANSWERS, "say why the input is right")
+        told += [f"Answered: {question.text} {answer}" for question in own]
+        left = [question for question in left if question not in own]
+    return tuple(left), tuple(told)
 
 
 def _line_questions(mechanics: "Mechanics") -> list[Question]:

@@ -323,3 +323,7 @@ class OutputTable(SceneTable):
         None, description="the report draws what instrumented knees measured in it"
     )
     notes: list[str] = Field(default_factory=list, description="printed in the report")
+    answers: dict[str, str] = Field(
+        default_factory=dict,
+        description="words of a question -> its answer: a note then, and no flag",
+    )
