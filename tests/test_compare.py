@@ -53,6 +53,8 @@ def test_a_known_difference_is_found_at_its_frame(folders):
     assert found.runs[1].pairing.exact
     one = of(found, "force_total_N")
     assert (one.max_abs, one.at_frame, one.frames) == (pytest.approx(7.0), 10, 20)
+    peak = np.nanmax(np.abs(found.runs[0].results[one.column]))
+    assert one.percent == pytest.approx(700.0 / peak)
     assert one.at == pytest.approx(60.0)
     assert one.rms == pytest.approx(7.0 / np.sqrt(20)) and one.mean == pytest.approx(7.0 / 20)
     assert of(found, "medial_area_mm2").max_abs == 0.0

@@ -61,6 +61,7 @@ class Difference:
         run: label of the run.
         column: name, with its unit.
         max_abs: largest absolute difference.
+        percent: that, of the first run's largest absolute value; NaN where it is zero.
         at_frame: of the first run, where it is.
         at: the place of that frame, deg, per cent or s.
         rms: root mean square of the differences.
@@ -71,6 +72,7 @@ class Difference:
     run: str
     column: str
     max_abs: float
+    percent: float
     at_frame: int
     at: float
     rms: float
@@ -112,7 +114,10 @@ class Comparison:
                 for run in self.runs
             ],
             "notes": list(self.notes),
-            "differences": [asdict(one) for one in self.differences],
+            "differences": [
+                asdict(one) | {"percent": one.percent if np.isfinite(one.percent) else None}
+                for one in self.differences
+            ],
         }
 
 
@@ -181,11 +186,13 @@ def differences(first: Run, run: Run) -> list[Difference]:
         if not np.isfinite(off).any():
             continue
         worst = int(np.nanargmax(np.abs(off)))
+        largest = float(np.nanmax(np.abs(values)))
         found.append(
             Difference(
                 run.label,
                 column,
                 float(abs(off[worst])),
+                100.0 * float(abs(off[worst])) / largest if largest > 0 else float("nan"),
                 worst,
                 float(first.axis.values[worst]),
                 float(np.sqrt(np.nanmean(off**2))),

@@ -1,5 +1,6 @@
 """A comparison as one page that stands by itself."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -108,6 +109,7 @@ def _rows(comparison: Comparison, found: Sequence[Difference]) -> list[list[str]
             one.run,
             one.column,
             f"{one.max_abs:.4g}",
+            f"{one.percent:.3g}" if math.isfinite(one.percent) else "–",
             f"{one.at_frame} ({one.at:.4g}{unit})" if one.max_abs else "–",
             f"{one.rms:.4g}",
             f"{one.mean:+.4g}" if one.mean else "0",
@@ -119,7 +121,7 @@ def _rows(comparison: Comparison, found: Sequence[Difference]) -> list[list[str]
 
 def table_lines(comparison: Comparison) -> list[str]:
     """Return notes and the first differences as lines of text."""
-    heads = ["run", "column", "max", "at frame", "rms", "mean", "frames"]
+    heads = ["run", "column", "max", "% of peak", "at frame", "rms", "mean", "frames"]
     rows = [heads, *_rows(comparison, headline(comparison))]
     widths = [max(len(row[k]) for row in rows) for k in range(len(heads))]
     table = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
