@@ -36,7 +36,7 @@ DRAWING = {
     "muscles": {"geometry", "importing", "inputs", "opensim"},
     "designs": {"contact", "geometry"},
     "wear": {"contact", "equilibrium", "geometry", "inputs", "output", "results_folder", "run"}
-    | {"scene", "simulation", "uncertainty"},
+    | {"plug_ins", "scene", "simulation", "uncertainty"},
     "uncertainty": {*KNEE, "columns", "inputs", "results", "results_folder", "run", "simulation"},
     "cohort": {"columns", "geometry", "output", "results", "run", "scene", "simulation"},
     "validation": {"contact", "designs", "geometry", "scene", "simulation", "studies"},

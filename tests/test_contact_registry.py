@@ -21,6 +21,7 @@ from tkamb.contact.registry import (
     contact_names,
 )
 from tkamb.errors import InputError
+from tkamb.plug_ins import contact_code, foreign_code
 from tkamb.results_folder import verify_results, write_results
 from tkamb.scene import load_scene
 from tkamb.simulation import simulate
@@ -202,3 +203,9 @@ def test_the_code_of_another_package_is_part_of_a_runs_identity(tmp_path, monkey
         simulate(scene, frames=slice(0, 1), directory=folders[0], resume=True)
     for name in [n for n in sys.modules if n.startswith("tkamb_winkler")]:
         del sys.modules[name]
+
+
+def test_code_of_tkamb_is_not_foreign(plugin):
+    assert foreign_code(contact_model("foundation")) is None
+    winkler = contact_model("winkler", 1.0, modulus=1e11)
+    assert foreign_code(winkler) == contact_code("winkler") != contact_code("foundation")

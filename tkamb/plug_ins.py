@@ -1,4 +1,4 @@
-"""Which code of another package computes the contact: the hash of that package.
+"""Which code of another package computes contact or wear: the hash of that package.
 
 It stands in a run's identity beside the code of tkamb, since a default that is changed there
 changes numbers and neither the scene nor tkamb.
@@ -23,6 +23,12 @@ def contact_code(model: str) -> str | None:
         InputError: no such name, or it cannot be loaded.
     """
     return None if model in BUILT_IN else package_code(contact_class(model).__module__)
+
+
+def foreign_code(thing: object) -> str | None:
+    """Return the SHA-256 of the package of an object's class; None for one of tkamb's."""
+    module = type(thing).__module__
+    return None if module.partition(".")[0] == "tkamb" else package_code(module)
 
 
 def package_code(module: str) -> str:

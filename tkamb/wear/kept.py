@@ -12,6 +12,7 @@ from tkamb.atomic import replaced_file
 from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
 from tkamb.files import MESH_LIMIT, read_bytes
+from tkamb.plug_ins import foreign_code
 from tkamb.wear.setup import WearSetup
 from tkamb.wear.simulation import WearCase, WearState
 
@@ -31,7 +32,8 @@ def wear_identity(setup: WearSetup, case: WearCase, cycles: int, updates: int) -
     words = (setup.engine.model, setup.engine.material, setup.engine.bearing, case.law, case.creep)
     numbers = (case.density, case.motion.duration, case.motion.passes, cycles, updates)
     machine = () if drive is None else (drive.free, drive.springs)
-    digest.update(repr((words, numbers, machine, code_identity())).encode())
+    others = (foreign_code(setup.engine.model), foreign_code(case.law))
+    digest.update(repr((words, numbers, machine, code_identity(), *others)).encode())
     return digest.hexdigest()
 
 
