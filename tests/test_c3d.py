@@ -115,6 +115,9 @@ def test_one_foot_on_two_plates_is_their_summed_wrench_at_one_centre_of_pressure
     np.testing.assert_allclose(ground.point, point @ into.T, atol=1e-5)
     np.testing.assert_allclose(ground.moment[:, 1], free, atol=1e-3)
     assert ground.loaded.all()
+    on_plate = in_si(table.model_copy(update={"force": "on the plate"}))
+    with pytest.raises(InputError, match="leave out force"):
+        load_ground_reaction(on_plate, time, "right")
 
 
 def test_on_a_step_the_point_moves_along_the_line_of_action(tmp_path):

@@ -72,9 +72,10 @@ class Case:
 
     def rates(self, time: Array, places: Array) -> tuple[Array, Array, Array]:
         """Return places of the patella (n, 3) filtered as the recording is, and derivatives."""
-        from tkamb.inputs.filtering import differentiate_coordinates
+        from tkamb.inputs.filtering import check_frames, differentiate_coordinates
 
         cutoff = self.scene.motion.cutoff_Hz
+        check_frames(self.motion.time, cutoff, self.scene.motion.frames)
         return differentiate_coordinates(time, places, cutoff, name="places of the patella")
 
     @property
