@@ -186,7 +186,7 @@ def test_frames_too_few_for_the_cutoff_are_named_with_how_many_would_do():
     time = np.linspace(0.0, 2.0, 26)
     check_frames(time, 6.0, 26)
     differentiate_coordinates(time, np.zeros(26), 6.0)  # the number that the message gives does
-    with pytest.raises(InputError, match="frames = 25 resamples to 12 Hz.*give 26 or more"):
+    with pytest.raises(InputError, match=r"frames = 25 resamples to 12 Hz.*give 26 or more"):
         check_frames(np.linspace(0.0, 2.0, 25), 6.0, 25)
     check_frames(np.linspace(0.0, 2.0, 25), "none", 25)
 

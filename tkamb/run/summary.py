@@ -218,6 +218,8 @@ def assumptions(case: Case) -> list[str]:
         sentences.append(
             "The ground reaction acts at the ankle centre, without moment (Sharma 2008)."
         )
+    if scene.ground_reaction and scene.ground_reaction.force == "on the plate":
+        sentences.append("The ground reaction is recorded as the force on the plate: signs turned.")
     if not scene.patella:
         sentences.append(
             "No muscles: the knee's flexion moment is carried by nothing (a residual)."
