@@ -22,8 +22,9 @@ from tkamb.scene.tables import ContactTable, MusclesTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 RESIDUALS = (
-    "Residuals are the AP and ML force and the axial moment on the tibia that balance still "
-    "needs at the midpoint of the contact points; an exact model would leave none. "
+    "Residuals are the forces along AP (anterior–posterior) and ML (medial–lateral) and the moment "
+    "about the tibia's long axis that balance still needs at the midpoint of the contact points; "
+    "an exact model would leave none. "
     "residual_sensitivity_N is the change of the total force when that point moves by 10 mm in y."
 )
 
