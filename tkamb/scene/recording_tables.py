@@ -161,8 +161,9 @@ class MotionTable(SceneTable):
         None,
         ge=2,
         description="resample to so many frames; default: as recorded. The recording is filtered "
-        "at its own samples first; a solved patella and roll-slip are filtered at the frames, "
-        "which must then be more than twice cutoff_Hz a second",
+        "at its own samples first; what is found at the frames (a solved patella, roll-slip, "
+        "the first guess of coordinates that nobody recorded) is filtered there, so that these "
+        "must be more than twice cutoff_Hz a second",
     )
 
     @model_validator(mode="after")
