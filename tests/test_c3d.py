@@ -2,6 +2,7 @@
 
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from tkamb.errors import InputError
 from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.ground_reaction import load_ground_reaction
 from tkamb.inputs.markers import matched_labels
+from tkamb.inputs.samples import OddSample
 from tkamb.inputs.tables import read_table
+from tkamb.plausibility.movement import sample_questions
 from tkamb.scene.recording_tables import GroundReactionTable
 from tkamb.scene.si import in_si
 
@@ -115,6 +118,21 @@ def test_one_foot_on_two_plates_is_their_summed_wrench_at_one_centre_of_pressure
     np.testing.assert_allclose(ground.point, point @ into.T, atol=1e-5)
     np.testing.assert_allclose(ground.moment[:, 1], free, atol=1e-3)
     assert ground.loaded.all()
+    on_plate = in_si(table.model_copy(update={"force": "on the plate"}))
+    with pytest.raises(InputError, match="leave out force"):
+        load_ground_reaction(on_plate, time, "right")
+
+
+def test_an_odd_sample_of_a_c3d_is_no_cell_but_a_spike_of_its_plates(tmp_path):
+    path = two_plates(tmp_path)
+    table = GroundReactionTable(file=path, plates=(1, 2), cutoff_Hz=6.0)
+    ground = SimpleNamespace(odd=(OddSample(path, "upward force", 0.05, 75.8, "N"),))
+    motion = SimpleNamespace(time=np.linspace(0.0, 0.1, 11), odd=())
+    scene = SimpleNamespace(ground_reaction=table)
+    case = SimpleNamespace(motion=motion, tibia=None, ground=ground, scene=scene)
+    (question,) = sample_questions(case)
+    assert "two.c3d: upward force of plates 1, 2 at 0.05 s lies 75.8 N" in question.text
+    assert "spike" in question.text and "cell" not in question.text
 
 
 def test_on_a_step_the_point_moves_along_the_line_of_action(tmp_path):

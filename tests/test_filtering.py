@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, pose
-from tkamb.inputs.filtering import differentiate_coordinates, differentiate_poses
+from tkamb.inputs.filtering import check_frames, differentiate_coordinates, differentiate_poses
 
 CUTOFF = 6.0
 
@@ -180,6 +180,15 @@ def test_unusable_samples(time, value, cutoff, message):
     with pytest.raises(InputError, match=message) as caught:
         differentiate_coordinates(time, value, cutoff, name="gait.csv")
     assert "gait.csv" in str(caught.value)
+
+
+def test_frames_too_few_for_the_cutoff_are_named_with_how_many_would_do():
+    time = np.linspace(0.0, 2.0, 26)
+    check_frames(time, 6.0, 26)
+    differentiate_coordinates(time, np.zeros(26), 6.0)  # the number that the message gives does
+    with pytest.raises(InputError, match=r"frames = 25 resamples to 12 Hz.*give 26 or more"):
+        check_frames(np.linspace(0.0, 2.0, 25), 6.0, 25)
+    check_frames(np.linspace(0.0, 2.0, 25), "none", 25)
 
 
 def test_never_outside_the_record():

@@ -121,6 +121,21 @@ def test_laboratory_axes_and_left_foot(tmp_path):
         np.testing.assert_allclose(other.moment, right.moment, atol=1e-10)
 
 
+def test_force_on_the_plate_is_the_opposite_of_that_on_the_foot(tmp_path):
+    """Newton's third law: three signs of the force and the moment's turn, the point stays."""
+    force, point, moment = step(STAMPS)
+    foot = write(tmp_path / "foot.csv", force, point, moment)
+    on_foot = load_ground_reaction(plate(foot), AT, "left")
+    file = write(tmp_path / "plate.csv", -force, point, -moment)
+    on_plate = load_ground_reaction(plate(file, force="on the plate"), AT, "left")
+    for name in ("force", "point", "moment", "loaded"):
+        np.testing.assert_array_equal(getattr(on_plate, name), getattr(on_foot, name))
+    with pytest.raises(InputError, match='Then say force = "on the plate"'):
+        load_ground_reaction(plate(file), AT, "left")
+    with pytest.raises(InputError, match="leave out force"):
+        load_ground_reaction(plate(foot, force="on the plate"), AT, "left")
+
+
 def test_millimetres_and_absent_free_moment(tmp_path):
     force, point, moment = step(STAMPS)
     metres = load_ground_reaction(

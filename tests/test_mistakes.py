@@ -120,6 +120,7 @@ REFUSED = {
         text("tibia.csv", lambda t: t.replace(",", ";").replace(".", ",")), "semicolons"),
     "stiffness": (key("ligament.0.stiffness_N_per_mm", 91250.0), "is it in N/m?"),
     "true": (key("patient.mass_kg", True), "true is none"),
+    "no list": (key("contact.released", "adduction"), r'"adduction" is no list; .*\["adduction"\]'),
     "in quotes": (key("patient.mass_kg", "75"), '"75" in quotes is none'),
     "mass of 500": (key("patient.mass_kg", 500.0), "not within 20 to 300; is it in kilograms?"),
     "mass of 0.075": (key("patient.mass_kg", 0.075), "not within 20 to 300"),
@@ -151,7 +152,7 @@ FLAGGED = {
         both(*(cells("ground_reaction.csv", f"point_{a}_mm", lambda v: 1e-3 * v) for a in "xyz")),
         "is it in centimetres or metres?"),
     "centre's sign": (cells("ground_reaction.csv", "point_x_mm", lambda v: -v),
-                      "where no foot is .*is its sign"),
+                      "mm behind the ankle .*where no foot is .*is its sign"),
     "point in metres": (key("ligament.0.proximal.point_mm", [0.0015, 0.0005, -0.042]),
                         "is point_mm in metres?"),
     "pounds": (key("patient.mass_kg", 165.3), "pounds?"),
@@ -247,6 +248,8 @@ def test_a_key_of_the_command_line_is_named(tmp_path, capfd):
     scene = write_scene(tmp_path)
     assert main(["run", str(scene), "--set", "contact.fricton=0.1"]) == 2
     assert "--set contact.fricton: unknown key" in capfd.readouterr().err
+    assert main(["run", str(scene), "--set", "contact.released=adduction"]) == 2
+    assert """--set 'contact.released=["adduction"]'""" in capfd.readouterr().err
 
 
 def test_a_misspelt_column_of_the_results():

@@ -1,5 +1,7 @@
 """`tkamb new`: what it lays out runs as it is, and it takes nothing that is somebody's."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,27 @@ def test_what_is_laid_out_runs_as_it_is(tmp_path):
     # Fewer triangles and two of the six ligaments: the leg and its loads are the shipped ones.
     np.testing.assert_allclose(started["quadriceps_N"], shipped["quadriceps_N"], rtol=0.02)
     np.testing.assert_allclose(started["force_total_BW"], shipped["force_total_BW"], rtol=0.05)
+
+
+def test_the_small_scene_of_the_page_is_the_starter_in_other_names_units_and_axes(tmp_path):
+    """Centimetres, a plate of its own axes and the force on the plate; the patella is solved."""
+    assert main(["new", str(tmp_path / "knee")]) == 0
+    page = (MODEL.parents[1] / "docs" / "your_own_patient.md").read_text(encoding="utf-8")
+    written = re.findall(r"^`(\S+)`:\n\n```\w+\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    assert len(written) == 4
+    laid_out = {"ligament": [], "contact.model": "foundation", "contact.resolution_mm": 2.0}
+    first = slice(0, 6, 5)
+    started = tkamb.simulate(
+        tkamb.load_scene(tmp_path / "knee" / "scene.toml", laid_out), frames=first
+    )
+    for name, text in written:
+        (tmp_path / "knee" / name).write_text(text, encoding="utf-8")
+    own = tkamb.simulate(tmp_path / "knee" / "scene.toml", frames=first)
+    for name in ("ground_reaction_ap_N", "ground_reaction_si_N", "force_total_BW"):
+        np.testing.assert_allclose(own[name], started[name], rtol=1e-3)
+    # the solved patella against the recorded one, which was solved on finer meshes
+    np.testing.assert_allclose(own["quadriceps_N"], started["quadriceps_N"], rtol=3e-3)
+    assert "Nobody was measured" not in str(own.summary["notes"])
 
 
 def test_a_folder_that_holds_something_is_left_as_it_is(tmp_path, capfd):

@@ -94,7 +94,8 @@ COLUMNS: tuple[Column, ...] = (
     Column("quadriceps_wrap_deg", "angle over which the quadriceps wraps the femur", _MUSCLE),
     Column(
         "quadriceps_per_dome_mm_N",
-        "change of quadriceps_N as the button sits 1 mm higher on the patella, its place kept",
+        "change of quadriceps_N as the button, its dome, sits 1 mm higher on the patella, "
+        "its place kept",
         _MUSCLE,
     ),
     Column("patellofemoral_per_dome_mm_N", "the same, of patellofemoral_N", _MUSCLE),
@@ -131,7 +132,11 @@ COLUMNS: tuple[Column, ...] = (
     Column("lateral_area_above_yield", "share of the lateral area above yield", _CONTACT),
     Column("medial_thickness_mm", "insert under the medial centre of pressure", _CONTACT),
     Column("lateral_thickness_mm", "insert under the lateral centre of pressure", _CONTACT),
-    Column("condition_number", "of the equilibrium system with scaled columns"),
+    Column(
+        "condition_number",
+        "of the equilibrium system with scaled columns: how much a relative error of the inputs "
+        "may grow in the solution",
+    ),
     Column("body_seconds", "computing time of the rigid-body equations"),
     Column("query_seconds", "computing time of the closest points on the meshes", _IMPLANT),
     Column("contact_seconds", "computing time of the contact", _CONTACT),

@@ -137,6 +137,10 @@ def _contact_list(options: argparse.Namespace) -> int:
 
     for name, line in contact_descriptions().items():
         print(f"{name:18s} {line}")
+    print(
+        "times are those of one press; a frame is one press, with released coordinates twenty to "
+        "eighty"
+    )
     return 0
 
 

@@ -24,7 +24,8 @@ def add_set(command: Any) -> None:
         default=[],
         type=_setting,
         metavar="TABLE.KEY=VALUE",
-        help="override a key of the scene",
+        help="override a key of the scene; a list in brackets and quotes: "
+        "--set 'contact.released=[\"adduction\"]'",
     )
 
 

@@ -58,7 +58,7 @@ def check_contact_model(
     tolerance: float = 2e-3,
     integral_tolerance: float = 2e-2,
 ) -> None:
-    """Try a contact model against every property of the contract.
+    """Try a contact model against every property of the contract; silence means that all hold.
 
     Args:
         model: the model.

@@ -3,7 +3,8 @@
 Fluoroscopy of the implant on a stride of marker and plate recordings. Only the quadriceps pulls
 here, so the force lies below the 2.3 to 2.6 body weights that instrumented knees measure in
 walking (D'Lima 2007, Kutzner 2010): what is missing are hamstrings, gastrocnemius and hip muscles,
-and most frames are flagged. The scene needs subject DM's files (models/dm/README.md).
+and most frames are flagged. It runs in a clone of the repository, which has models/, and needs
+subject DM's files (models/dm/README.md).
 """
 
 from pathlib import Path

@@ -3,7 +3,8 @@
 Markers and plates of a two-legged squat. Nobody recorded where the implant sat, so adduction, axial
 rotation and sliding are found: contact, ligaments and muscle line balance. Watch the ratio of
 patellar ligament to quadriceps: the patella is a balance beam whose lever shortens as the knee
-bends. The scene needs subject JW's files (models/jw/README.md).
+bends. It runs in a clone of the repository, which has models/, and needs
+subject JW's files (models/jw/README.md).
 """
 
 from pathlib import Path

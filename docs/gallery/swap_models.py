@@ -1,8 +1,9 @@
 """Swap contact models.
 
-The same bodies, pose and load by four models, which differ in what they assume: `hertz` knows two
-curvatures, `foundation` has springs side by side, the lattices carry shear, `lattice` yields. All
-of them balance the load; what each is known to be off by stands in the table of `tkamb tradeoff`.
+The same bodies, pose and load by three models, which differ in what they assume: `hertz` knows two
+curvatures, `foundation` has springs side by side, `lattice-linear` carries shear; add `lattice`,
+which yields too and takes longer. All of them balance the load; what each is known to be off by
+stands in the table of `tkamb tradeoff`.
 """
 
 from pathlib import Path

@@ -18,7 +18,7 @@ from tkamb.body.patellofemoral import PatellarContact, PatellofemoralContact
 from tkamb.body.unknowns import Unknown, muscle_load
 from tkamb.body.wrapping import TautPath, is_inside
 from tkamb.errors import ComputationError, InputError
-from tkamb.geometry.frames import Array, inverse, transform
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_coordinates, transform
 from tkamb.geometry.sections import sagittal_outline
 from tkamb.geometry.surface import Surface
 from tkamb.units import DEGREE
@@ -82,7 +82,7 @@ class ExtensorFrames:
             ]
         else:
             self.states = _solve_all(self._mechanism, poses)
-            self._joints = self._differentiate(time, rates)
+            self._joints = self._differentiate(time, poses, rates)
 
     def _take(self, parts: ExtensorParts) -> PatellofemoralContact:
         """Build the lines and the mechanism of parts; return its contact as it was prepared."""
@@ -232,7 +232,7 @@ class ExtensorFrames:
         )
         return mechanism, prepared
 
-    def _differentiate(self, time: Array, rates: Rates) -> Array:
+    def _differentiate(self, time: Array, poses: Array, rates: Rates) -> Array:
         """Return the solved coordinates with their rates (f, 3, 3); NaN where it is lost.
 
         Lost frames between found ones are bridged for the rates of their neighbours (shape-
@@ -242,11 +242,13 @@ class ExtensorFrames:
         places = np.array([state.coordinates for state in self.states])
         found = np.flatnonzero(np.isfinite(places).all(axis=1))
         if len(found) < 2:
+            flexion = knee_coordinates(poses)[:, KNEE_COORDINATES.index("flexion")] / DEGREE
             raise InputError(
                 f"no place of the patella is found in {len(places) - len(found)} of "
                 f"{len(places)} frames; first: {self.states[0].status.value}",
                 "[patella]",
-                "check its mesh, the lines' points and length_mm",
+                "check its mesh, the lines' points, length_mm, and the motion's angle_unit: "
+                f"flexion is read as {flexion.min():.3g} to {flexion.max():.3g} deg",
             )
         part = slice(found[0], found[-1] + 1)
         bridged = PchipInterpolator(time[found], places[found])(time[part])

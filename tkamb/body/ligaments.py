@@ -218,7 +218,9 @@ def _with_slack_length(bundle: Ligament, poses: Mapping[str, Array], flexion: Ar
             f"its reference pose is at {bundle.reference_flexion / DEGREE:g} deg of flexion, but "
             f"the nearest recorded frame is at {flexion[reference] / DEGREE:.0f} deg",
             where,
-            "give slack_length_mm, or a reference strain at a flexion that was recorded",
+            "give slack_length_mm, or a reference strain at a flexion that was recorded; check the "
+            f"motion's angle_unit: flexion is read as {np.nanmin(flexion) / DEGREE:.3g} to "
+            f"{np.nanmax(flexion) / DEGREE:.3g} deg",
         )
     return replace(bundle, slack_length=length / (1.0 + bundle.reference_strain))
 

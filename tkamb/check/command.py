@@ -28,13 +28,16 @@ def add_check(commands: Any) -> None:
 
 def _check(options: argparse.Namespace) -> int:
     from tkamb.check.scene_check import check_scene
+    from tkamb.run.stages import Stages
 
     if options.out and options.out.suffix.lower() not in PICTURES:
         mend = f"name it like check{PICTURES[0]}"
         raise InputError(f"is none of {', '.join(PICTURES)}", options.out, mend)
-    found = check_scene(options.scene, dict(options.set))
-    if options.out:
-        _write_picture(found, options.out)
+    with Stages(4 if options.out else 3) as stages:
+        found = check_scene(options.scene, dict(options.set), stages.begin)
+        if options.out:
+            stages.begin("drawing the leg")
+            _write_picture(found, options.out)
     written = [f"picture: {options.out}"] if options.out else []
     lines = [*found.lines(), *written, f"next: tkamb run {options.scene}"]
     print(json.dumps(found.as_dict(), indent=2) if options.json else "\n".join(lines))

@@ -113,7 +113,8 @@ def _ground(case: Case) -> Entry:
     vertical = ground.force[:, 1] / case.body_weight
     loaded = f"foot loaded in {int(np.sum(ground.loaded))} of {len(vertical)} frames"
     place = "at the ankle" if table.applied == "ankle" else "at the centre of pressure"
-    text = f"{_range('vertical', vertical, 'BW', 2)}, {loaded}; applied {place}"
+    turned = ", signs turned: force on the plate" if table.force == "on the plate" else ""
+    text = f"{_range('vertical', vertical, 'BW', 2)}, {loaded}; applied {place}{turned}"
     return Entry("ground reaction", table.file, text)
 
 

@@ -1,5 +1,6 @@
 """A scene read whole and looked at, before anything is run."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,7 +67,11 @@ class SceneCheck:
         }
 
 
-def check_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> SceneCheck:
+def check_scene(
+    path: str | Path,
+    overrides: dict[str, Any] | None = None,
+    begin: Callable[[str], None] = lambda stage: None,
+) -> SceneCheck:
     """Read every file of a scene and ask what is unlikely about it; nothing is run.
 
     The contact model is made, but not prepared: a mesh that it cannot use is found by a run.
@@ -74,16 +79,20 @@ def check_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> Sc
     Args:
         path: of the scene.
         overrides: dotted key -> value, as `tkamb.load_scene` takes them.
+        begin: is told each stage as it begins.
 
     Raises:
         InputError: what `tkamb run` would refuse of the scene and its files.
     """
+    begin("reading the scene and its files")
     scene = load_scene(path, overrides)
     if scene.contact:
         contact_model(scene.contact.model, scene.contact.resolution_mm, **scene.contact.options)
         material(scene.contact.material)
     case = load_case(scene)
+    begin("placing leg, patella and muscles")
     mechanics = Mechanics(case)
+    begin("looking for what is unlikely")
     plausibility = Plausibility(mechanics)
     return SceneCheck(
         Path(path),

@@ -111,7 +111,8 @@ def _import(options: argparse.Namespace) -> int:
 
     patient = import_patient(import_request(options), options.out)
     markers = write_patient(patient, options.out, options.scene)
-    print("\n".join([*patient.report, *markers, f"scene: {options.out / options.scene}"]))
+    scene = options.out / options.scene
+    print("\n".join([*patient.report, *markers, f"scene: {scene}", f"next: tkamb check {scene}"]))
     return 0
 
 

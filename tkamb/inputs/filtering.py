@@ -157,6 +157,25 @@ def _check_samples(time: Array, values: Array, at: Array, name: str) -> None:
         )
 
 
+def check_frames(time: Array, cutoff_Hz: Cutoff, frames: int | None) -> None:
+    """Raise an InputError where `frames` resample to times (f,) s too far apart for the cut-off.
+
+    A recording is filtered at its own samples before it is resampled; what is found at the
+    frames (a solved patella, a rolling femur) is filtered at the frames' own rate.
+    """
+    if frames is None or cutoff_Hz == "none":
+        return
+    rate = (len(time) - 1) / float(time[-1] - time[0])
+    if cutoff_Hz >= 0.5 * rate:
+        least = math.floor(2.0 * cutoff_Hz * float(time[-1] - time[0])) + 2
+        raise InputError(
+            f"frames = {frames} resamples to {rate:.3g} Hz, and what is found at the frames is "
+            f"low-passed at {cutoff_Hz:g} Hz too, which needs more than twice as many a second",
+            "[motion] frames",
+            f"give {least} or more, or none, and look at few of them with --frames A:B:STEP",
+        )
+
+
 def _check_cutoff(time: Array, cutoff_Hz: float, name: str) -> None:
     duration, half_rate = time[-1] - time[0], 0.5 / np.diff(time).max()
     if not (math.isfinite(cutoff_Hz) and cutoff_Hz > 0):

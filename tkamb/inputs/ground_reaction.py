@@ -26,6 +26,8 @@ from tkamb.inputs.samples import OddSample, check_range, check_spacing, odd_samp
 from tkamb.inputs.tables import Table, read_table
 from tkamb.units import MILLIMETRE
 
+DIRECTIONS = ("forward", "upward", "rightward")
+"""The laboratory's axes, for the reader: a file's own may be others."""
 LEVEL_TOLERANCE = 0.01
 """m; a centre of pressure that rises by more than this is not on a level plate."""
 LARGEST_FORCE = 20000.0
@@ -131,10 +133,10 @@ def _odd_samples(
     kept = set(stamps[inside].tolist())
     odd: list[OddSample] = []
     for axis in range(3):
-        one = (path, f"force_{axis + 1}", stamps, force[:, axis])
+        one = (path, f"{DIRECTIONS[axis]} force", stamps, force[:, axis])
         odd += odd_samples(*one, float(floors[axis]), 1.0, "N")
         if point is not None:
-            one = (path, f"point_{axis + 1}", stamps, point[:, axis])
+            one = (path, f"centre of pressure, {DIRECTIONS[axis]}", stamps, point[:, axis])
             odd += odd_samples(*one, ODD_POINT, MILLIMETRE, "mm")
     return tuple(sample for sample in odd if sample.time in kept)
 
@@ -179,7 +181,8 @@ def _read_columns(source: ForceRecording, recorded: Table) -> tuple[Array, Array
             columns.append(np.zeros_like(columns[0]))
     values = np.stack(columns, axis=1).reshape(-1, 3, 3) @ rotation.T
     scale = recorded.unit_scale(source.length_unit, "length_unit")
-    force, point, moment = values[:, 0], values[:, 1] * scale, values[:, 2]
+    force, point = source.sign * values[:, 0], values[:, 1] * scale
+    moment = source.sign * values[:, 2]
     for kind, found, largest, unit in (
         ("force", force, LARGEST_FORCE, "N"),
         ("moment", moment, LARGEST_MOMENT, "N·m"),
@@ -213,7 +216,7 @@ def _read_plates(source: ForceRecording) -> tuple[Array, Array, Array, Array, bo
         )
     rotation = laboratory_rotation(source.laboratory_axes, source.file)
     plates = [there[number] for number in dict.fromkeys(source.plates)]
-    wrench = np.sum([plate.wrench for plate in plates], axis=0)
+    wrench = source.sign * np.sum([plate.wrench for plate in plates], axis=0)
     force, about_origin = wrench[:, :3] @ rotation.T, wrench[:, 3:] @ rotation.T
     levels = [float((rotation @ plate.centre)[1]) for plate in plates]
     if np.ptp(levels) > LEVEL_TOLERANCE:
@@ -245,7 +248,9 @@ def _check_upward(force: Array, source: ForceRecording) -> None:
             f"the ground pushes the foot up with {max(up, 0.0):.4g} N at most, but {word} with "
             f"{size:.4g} N",
             source.file,
-            "check [ground_reaction] columns and laboratory_axes; it is the force on the foot",
+            "check [ground_reaction] columns and laboratory_axes; is it the force on the "
+            f"{'foot' if source.sign < 0 else 'plate'}? Then "
+            + ("leave out force" if source.sign < 0 else 'say force = "on the plate"'),
         )
 
 

@@ -173,6 +173,7 @@ class ForceRecording:
         columns: role -> column name.
         length_unit: of the file.
         laboratory_axes: axes of the file that point forward, up and right.
+        force: what the file's force acts on; that on the plate is the opposite of that on the foot.
         unloaded: N, vertical force below which the centre of pressure is held.
         surface: m, of a C3D file: height above the plates of what the foot stands on.
     """
@@ -184,8 +185,14 @@ class ForceRecording:
     columns: dict[str, str]
     length_unit: str | None
     laboratory_axes: str
+    force: Literal["on the foot", "on the plate"]
     unloaded: float
     surface: float
+
+    @property
+    def sign(self) -> float:
+        """What turns the file's force and moment into those on the foot."""
+        return -1.0 if self.force == "on the plate" else 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,7 +98,7 @@ def check_spacing(path: Path, time: Array) -> None:
         raise InputError(
             f"samples are {spacing:g} s apart, too far to be a movement",
             path,
-            "is the time in seconds?",
+            "is the time in seconds? No key says another unit: rewrite the column in seconds",
         )
 
 

@@ -219,7 +219,8 @@ def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:
     value = found.value / metrics.body_weight(results)
     ligament = _range(metrics.tension_ratio(results, "patellar_ligament_N"), "", 2)
     patella = _range(metrics.tension_ratio(results, "patellofemoral_N"), "", 2)
-    detail = f"{_where(results, axis, found.frame)}; PL/Q {ligament}, PF/Q {patella}"
+    detail = f"{_where(results, axis, found.frame)}; over the quadriceps: patellar ligament (PL/Q) "
+    detail += f"{ligament}, patellofemoral force (PF/Q) {patella}"
     if "first_wrapping_flexion_deg" in results.summary:
         first = results.summary["first_wrapping_flexion_deg"]
         detail += "; wraps nowhere" if first is None else f"; wraps the femur from {first:.0f}°"

@@ -226,7 +226,10 @@ def _ratios(results: "Results") -> Panel:
         Line("PL/Q", "patellar ligament, PL/Q", ligament, PATELLAR_LIGAMENT),
         Line("PF/Q", "patellofemoral, PF/Q", patella, PATELLOFEMORAL),
     )
-    return Panel("ratios", "Ratios to the quadriceps tension", "force / quadriceps", lines)
+    note = (
+        "PL/Q: tension of the patellar ligament over that of the quadriceps; PF/Q: patellofemoral."
+    )
+    return Panel("ratios", "Ratios to the quadriceps tension", "force / quadriceps", lines, note)
 
 
 def _areas(results: "Results") -> Panel:

@@ -137,19 +137,23 @@ def foot_questions(case: Case) -> Iterator[Question]:
         )
     ahead = np.einsum("fi,fi->f", away, forward)
     aside = away[:, 2] * forward[:, 0] - away[:, 0] * forward[:, 2]
-    right = "to the left of" if case.scene.patient.side == "left" else "to the right of"
+    sides = ("to the right of", "to the left of")
+    if case.scene.patient.side == "left":  # read as a right foot's, mirrored
+        sides = sides[::-1]
     places = (
-        ("ahead of", ahead, FOOT_FORWARD),
-        (right, aside, (-FOOT_ASIDE, FOOT_ASIDE)),
-        ("below", -away[:, 1], ANKLE_ABOVE),
+        ("ahead of", "behind", ahead, FOOT_FORWARD),
+        (*sides, aside, (-FOOT_ASIDE, FOOT_ASIDE)),
+        ("below", "above", -away[:, 1], ANKLE_ABOVE),
     )
-    for word, place, (low, high) in places:
+    for word, opposite, place, (low, high) in places:
         off = loaded & ((place < low) | (place > high))
         if off.any():
             k = int(np.argmax(np.where(off, np.maximum(low - place, place - high), -np.inf)))
             yield Question(
-                f"the centre of pressure lies {place[k] / MILLIMETRE:.0f} mm {word} the ankle at "
+                f"the centre of pressure lies {abs(place[k]) / MILLIMETRE:.0f} mm "
+                f"{word if place[k] >= 0 else opposite} the ankle at "
                 f"{case.motion.time[k]:.4g} s, where no foot is ({low / MILLIMETRE:.0f} to "
-                f"{high / MILLIMETRE:.0f}): is its sign, unit or axis another one, or the ankle's?",
+                f"{high / MILLIMETRE:.0f} mm {word} it): is its sign, unit or axis another one, or "
+                "the ankle's?",
                 "centre of pressure not under the foot",
             )

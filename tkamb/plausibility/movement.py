@@ -8,6 +8,7 @@ from tkamb.geometry.frames import KNEE_COORDINATES
 from tkamb.inputs.samples import OddSample
 from tkamb.plausibility.question import Question
 from tkamb.scene.case import Case
+from tkamb.scene.recording_tables import GroundReactionTable
 from tkamb.units import DEGREE
 
 FLEXION_RADIANS = 3.3
@@ -68,12 +69,21 @@ def sample_questions(case: Case) -> Iterator[Question]:
         near = np.zeros(len(time), bool)
         for sample in samples:
             near |= np.abs(time - sample.time) <= 3.0 * reach
-        yield Question(_odd_text(samples, worst), "recorded sample off its neighbours' curve", near)
+        text = _odd_text(samples, worst, case.scene.ground_reaction)
+        yield Question(text, "recorded sample off its neighbours' curve", near)
 
 
-def _odd_text(samples: Sequence[OddSample], worst: OddSample) -> str:
+def _odd_text(
+    samples: Sequence[OddSample], worst: OddSample, ground: GroundReactionTable | None
+) -> str:
+    """Return the question about a file's odd samples; a C3D file has no cells, but plates."""
     more = f" and {len(samples) - 1} more" if len(samples) > 1 else ""
+    of_plates = ground is not None and worst.path == ground.file and bool(ground.plates)
+    numbers = ", ".join(map(str, ground.plates)) if ground and of_plates else ""
+    what = f"{worst.what} of plates {numbers}" if of_plates else worst.what
+    mistake = "is it a spike" if of_plates else "is a cell mistyped"
     return (
-        f"{worst.path.name}: {worst.what} at {worst.time:.4g} s{more} lies {worst.away:.3g} "
-        f"{worst.unit} off its neighbours' curve: is a cell mistyped, or is it noise?"
+        f"{worst.path.name}: {what} at {worst.time:.4g} s{more} lies {worst.away:.3g} "
+        f"{worst.unit} off its neighbours' curve: {mistake}, or is it noise? cutoff_Hz filters "
+        "noise; anything else is to be mended in the file"
     )

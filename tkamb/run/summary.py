@@ -23,8 +23,9 @@ from tkamb.scene.tables import ContactTable, MusclesTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 RESIDUALS = (
-    "Residuals are the AP and ML force and the axial moment on the tibia that balance still "
-    "needs at the midpoint of the contact points; an exact model would leave none. "
+    "Residuals are the forces along AP (anterior–posterior) and ML (medial–lateral) and the moment "
+    "about the tibia's long axis that balance still needs at the midpoint of the contact points; "
+    "an exact model would leave none. "
     "residual_sensitivity_N is the change of the total force when that point moves by 10 mm in y."
 )
 
@@ -230,6 +231,8 @@ def assumptions(case: Case) -> list[str]:
         sentences.append(
             "The ground reaction acts at the ankle centre, without moment (Sharma 2008)."
         )
+    if scene.ground_reaction and scene.ground_reaction.force == "on the plate":
+        sentences.append("The ground reaction is recorded as the force on the plate: signs turned.")
     if not scene.patella:
         sentences.append(
             "No muscles: the knee's flexion moment is carried by nothing (a residual)."

@@ -10,6 +10,7 @@ import numpy as np
 from tkamb.body.chain import Chain
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, pose
+from tkamb.inputs.filtering import check_frames, differentiate_coordinates
 from tkamb.inputs.motion import KneeMotion, load_motion
 from tkamb.inputs.patient import load_urdf
 from tkamb.scene.scene import Scene
@@ -74,9 +75,8 @@ class Case:
 
     def rates(self, time: Array, places: Array) -> tuple[Array, Array, Array]:
         """Return places of the patella (n, 3) filtered as the recording is, and derivatives."""
-        from tkamb.inputs.filtering import differentiate_coordinates
-
         cutoff = self.scene.motion.cutoff_Hz
+        check_frames(self.motion.time, cutoff, self.scene.motion.frames)
         return differentiate_coordinates(time, places, cutoff, name="places of the patella")
 
     @property
@@ -170,6 +170,8 @@ def load_case(scene: Scene) -> Case:
 def _derived(scene: Scene, motion: KneeMotion, parts: "_Parts") -> KneeMotion:
     """Return the motion with what follows from the surfaces: a seat, a roll with slip."""
     table = scene.motion
+    if motion.unrecorded or table.motion == "roll-slip":
+        check_frames(motion.time, table.cutoff_Hz, table.frames)
     if motion.unrecorded:
         from tkamb.scene.derived_motion import seated_motion
 

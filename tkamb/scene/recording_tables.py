@@ -158,7 +158,12 @@ class MotionTable(SceneTable):
         0.0, ge=-100, le=100, description="per cent of the cycle at cycle_s[0]"
     )
     frames: Count | None = Field(
-        None, ge=2, description="resample to so many frames; default: as recorded"
+        None,
+        ge=2,
+        description="resample to so many frames; default: as recorded. The recording is filtered "
+        "at its own samples first; what is found at the frames (a solved patella, roll-slip, "
+        "the first guess of coordinates that nobody recorded) is filtered there, so that these "
+        "must be more than twice cutoff_Hz a second",
     )
 
     @model_validator(mode="after")
@@ -266,6 +271,12 @@ class GroundReactionTable(SceneTable):
     length_unit: LengthUnit | None = Field(None, description="of the file; a .c3d states its own")
     laboratory_axes: Axes = Field(
         "+x,+y,+z", description="axes of the file that point forward, up and right"
+    )
+    force: Literal["on the foot", "on the plate"] = Field(
+        "on the foot",
+        description="what the file's force acts on: 'on the plate' turns the signs of force and "
+        "free moment (Newton's third law), which no choice of axes does; the centre of pressure "
+        "stays",
     )
     applied: Literal["cop", "ankle"] = Field(
         "cop", description="'ankle' applies the force alone at the ankle centre (Sharma 2008)"

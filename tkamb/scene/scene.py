@@ -4,6 +4,7 @@ A scene is a TOML file. Units are in the key names, paths are relative to the fi
 unknown key is an error. `load_scene` reads and validates it; nothing else is opened.
 """
 
+import json
 import os
 import tomllib
 from pathlib import Path
@@ -194,7 +195,20 @@ def _complaint(error: ValidationError, path: Path, overrides: dict[str, Any]) ->
     message = first["msg"].removeprefix("Value error, ")
     if first["type"] in ("float_type", "int_type", "bool_type"):
         message += f", {_shown(first['input'])} is none"
+    if first["type"] in ("tuple_type", "list_type"):
+        message = _as_list(key, first["input"], option == key)
     return InputError(f"'{key}': {message}" if key else message, where, advice)
+
+
+def _as_list(key: str, value: Any, from_command_line: bool) -> str:
+    """Return how to write a list where a single value was given."""
+    if isinstance(value, dict):
+        return f"is one table; write [[{key}]], with two brackets, above each"
+    shown = json.dumps(value, default=str)
+    written = (
+        f"--set '{key}=[{shown}]'" if from_command_line else f"{key.split('.')[-1]} = [{shown}]"
+    )
+    return f"{shown} is no list; in brackets it is one: {written}"
 
 
 def _shown(value: Any) -> str:

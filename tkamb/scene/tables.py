@@ -278,7 +278,11 @@ class ContactTable(SceneTable):
     resolution_mm: Number = Field(1.0, gt=0)
     material: str = Field("polyethylene", description="a name of `tkamb.contact.materials`")
     friction: Number = Field(0.05, ge=0, le=1, description="Coulomb coefficient")
-    adjust: Switch = Field(False, description="femoral adjustment before contact")
+    adjust: Switch = Field(
+        False,
+        description="turns the recorded femur in the coronal plane, by 0.5 deg at most, until both "
+        "condyles touch, before the contact model presses",
+    )
     coupling: Literal["none", "points"] = Field(
         "none", description="'points': the resultants of the deformed contact act in the equations"
     )

@@ -131,7 +131,9 @@ class UncertaintyTable(SceneTable):
         0.0, description="AP, SI and ML each: the patellar ligament's distal end" + _GIVE
     )
     dome_mm: Length = Field(
-        0.0, description="AP and SI each: a recorded patella on the femur" + _GIVE
+        0.0,
+        description="AP and SI each: where a recorded patella, the dome of its button, is on the "
+        "femur" + _GIVE,
     )
     correlation: tuple[CorrelationTable, ...] = Field(
         (), description="inputs that err together; needs a positive semi-definite matrix"

@@ -99,6 +99,9 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         progress=lambda samples, count: tqdm(samples, total=count, unit="sample", disable=None),
     )
     said.append("one input at a time by one standard deviation: minus, plus; no interactions")
+    said.append(
+        "an offset either way may raise a force: it climbs one flank of the insert or other"
+    )
     print("\n".join([*screen_lines(rows), *(f"({line})" for line in said)]))
     return 0 if rows else 1
 

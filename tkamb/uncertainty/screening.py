@@ -114,9 +114,15 @@ def screen_lines(rows: Sequence[Screened], width: int = 20) -> list[str]:
         sizes = np.abs([[row.minus, row.plus] for row in own])
         largest = np.nanmax(sizes) if np.isfinite(sizes).any() else 0.0
         for row in own:
-            name = f"{row.varied.name} ± {row.varied.deviation:g} {row.varied.unit}"
+            unit = "" if row.varied.unit == "1" else f" {row.varied.unit}"
+            name = f"{row.varied.name} ± {row.varied.deviation:g}{unit}"
             bar = _bar(row, largest, width)
             lines.append(f"  {name:<34} {_change(row.minus)} {_change(row.plus)}  {bar}")
+    if any(not np.isfinite([row.minus, row.plus]).all() for row in rows):
+        lines.append(
+            "failed: with the input so far off the frame has no result, often a pose that no load "
+            "balances; what it would change is not known, so it stands first"
+        )
     return lines
 
 
