@@ -9,8 +9,6 @@ from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 
-from tkamb.contact.registry import BUILT_IN, contact_class
-
 CONTACT_CODE = "code of the contact model"
 """What it is called in a run's identity."""
 SUFFIXES = (".py", ".so", ".pyd")
@@ -22,6 +20,8 @@ def contact_code(model: str) -> str | None:
     Raises:
         InputError: no such name, or it cannot be loaded.
     """
+    from tkamb.contact.registry import BUILT_IN, contact_class  # only where contact is modelled
+
     return None if model in BUILT_IN else package_code(contact_class(model).__module__)
 
 
