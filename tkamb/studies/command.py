@@ -110,6 +110,8 @@ def _study_stability(options: argparse.Namespace, directory: Path) -> int:
     kept = KeptRows(directory, options.resume)
     judged = study.run_stability(cases, kept=kept, workers=max(1, options.workers))
     verdicts, whole = gather(judged, [1.0] * len(cases))
+    if not whole:
+        verdicts = study.kept_verdicts(cases, kept)
     text = json.dumps(study.summary(verdicts), indent=1, allow_nan=False)
     lines = [*unfinished(len(verdicts), len(cases)), *table(verdicts)]
     _write(directory, "stability", text, lines, picture(verdicts) if verdicts else None)

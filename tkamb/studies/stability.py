@@ -88,6 +88,19 @@ def run_stability(
         pool.shutdown()
 
 
+def kept_verdicts(
+    cases: Sequence[Case], kept: KeptRows, longest: float = LONGEST_SECONDS
+) -> list[Verdict]:
+    """Return the verdicts that are kept, in the cases' order: those finished before others, too."""
+    rows, stored = (kept.get(_row_key(case, longest)) for case in cases), stored_verdicts()
+    found = [Verdict(**row) for row in rows if row is not None]
+    return [replace(verdict, expected=stored.get(verdict.key)) for verdict in found]
+
+
+def _row_key(case: Case, longest: float) -> str:
+    return row_key(type(case).__name__, asdict(case), longest)
+
+
 class _Judges:
     """Cases put to processes that may crash or hang, a new one for each case.
 
@@ -108,7 +121,7 @@ class _Judges:
         """Return the verdict on a case, kept or new."""
         if self._kept is None:
             return self._judged_apart(case)
-        key = row_key(type(case).__name__, asdict(case), self._longest)
+        key = _row_key(case, self._longest)
         row = self._kept.get(key)
         if row is not None:
             return Verdict(**row)
