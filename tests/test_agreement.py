@@ -10,8 +10,9 @@ from joints import HALF, flat_joint
 from scenes import write_scene
 from tkamb import simulate
 from tkamb.contact.registry import contact_model
-from tkamb.equilibrium.contact_side import ContactSide, split_sensitivity, split_tangent
+from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.equilibrium.mechanics import Mechanics
+from tkamb.equilibrium.split_sensitivity import split_sensitivity, split_tangent
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_pose
 from tkamb.output.axis import horizontal_axis
 from tkamb.output.headline import cards

@@ -32,13 +32,22 @@ DRAWING = {
     "run": {*KNEE, *SHOWN, "plausibility", "plug_ins"} - {"results"},
     "output": {"columns", "contact", "geometry", "run"},
     "view": {*KNEE, *SHOWN, "inputs", "run", "simulation"} - {"columns"},
-    "studies": {*KNEE, "decks", "inputs", "output", "run", "simulation"} - {"body"},
+    "studies": {*KNEE, "plug_ins", "decks", "inputs", "output", "run", "simulation"} - {"body"},
     "muscles": {"geometry", "importing", "inputs", "opensim"},
     "designs": {"contact", "geometry"},
     "wear": {"contact", "equilibrium", "geometry", "inputs", "output", "results_folder", "run"}
     | {"plug_ins", "scene", "simulation", "uncertainty"},
     "uncertainty": {*KNEE, "columns", "inputs", "results", "results_folder", "run", "simulation"},
-    "cohort": {"columns", "geometry", "output", "results", "run", "scene", "simulation"},
+    "cohort": {
+        "columns",
+        "geometry",
+        "output",
+        "plug_ins",
+        "results",
+        "run",
+        "scene",
+        "simulation",
+    },
     "validation": {"contact", "designs", "geometry", "scene", "simulation", "studies"},
 }
 """Which folder knows which folders and which modules beside them: inputs → body → (equilibrium ⇄

@@ -5,12 +5,15 @@ import sys
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from scenes import write_scene
 from tkamb import named_classes
+from tkamb.cohort import run as cohort_run
+from tkamb.cohort.plan import load_cohort
 from tkamb.compare.comparison import compare_folders
 from tkamb.contact.foundation import ElasticFoundation
 from tkamb.contact.registry import (
@@ -21,10 +24,12 @@ from tkamb.contact.registry import (
     contact_names,
 )
 from tkamb.errors import InputError
-from tkamb.plug_ins import contact_code, foreign_code
+from tkamb.plug_ins import CONTACT_CODE, contact_code, foreign_code
 from tkamb.results_folder import verify_results, write_results
 from tkamb.scene import load_scene
 from tkamb.simulation import simulate
+from tkamb.studies import tradeoff
+from tkamb.studies.measures import Job
 from tkamb.testing import ConformanceError, check_contact_model
 
 PLUGIN = Path(__file__).parent / "plugin"
@@ -209,3 +214,21 @@ def test_code_of_tkamb_is_not_foreign(plugin):
     assert foreign_code(contact_model("foundation")) is None
     winkler = contact_model("winkler", 1.0, modulus=1e11)
     assert foreign_code(winkler) == contact_code("winkler") != contact_code("foundation")
+
+
+def test_a_cohort_and_the_trade_off_know_a_plug_ins_code(plugin, tmp_path, monkeypatch):
+    scene = write_scene(tmp_path / "scene")
+    text = f"set = {{ 'contact.model' = '%s' }}\n[[trial]]\nname = 'bend'\nscene = '{scene}'\n"
+    keys = []
+    for model in ("foundation", "winkler"):
+        path = tmp_path / f"{model}.toml"
+        path.write_text(text % model)
+        keys.append(cohort_run._identity(load_cohort(path)).get(CONTACT_CODE))
+    assert keys == [None, {"winkler": contact_code("winkler")}]
+    seen = []
+    monkeypatch.setattr(tradeoff, "row_key", lambda *what: seen.append(what) or "key")
+    monkeypatch.setattr(tradeoff, "measure_apart", lambda job: None)
+    monkeypatch.setattr(tradeoff, "compared", lambda *what: None)
+    reference = SimpleNamespace(hash="", values={})
+    list(tradeoff.run_tradeoff([Job("sphere", "winkler", 2.0)], {"sphere": reference}))
+    assert contact_code("winkler") in seen[0]

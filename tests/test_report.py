@@ -175,6 +175,22 @@ def test_headline_numbers_are_those_of_the_columns(bend, gait):
     assert "6 to be read with care" in shown["Frames computed"].detail
 
 
+def test_residuals_of_a_released_pose_are_none_only_where_they_are(bend):
+    """What is released needs none; a search that left some must not be said to have left none."""
+
+    def shown(factor):
+        contact = {"released": ["ap", "ml", "axial_rotation"]}
+        columns = dict(bend.columns)
+        for name in ("residual_ap_N", "residual_ml_N"):
+            columns[name] = factor * np.asarray(columns[name], float)
+        results = Results(columns, bend.summary | {"contact": contact}, None)
+        (card,) = [c for c in cards(results, horizontal_axis(results)) if "Residual" in c.title]
+        return card.value
+
+    assert shown(0.0) == "none"
+    assert shown(1.0).endswith("%")
+
+
 def test_residuals_are_relative_to_the_superior_inferior_force(bend):
     expected = np.hypot(bend["residual_ap_N"], bend["residual_ml_N"]) / bend["force_si_N"]
     assert np.allclose(metrics.residual_share(bend), expected)

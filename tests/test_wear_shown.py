@@ -154,3 +154,19 @@ def test_the_page_switches_between_the_new_and_the_worn_insert(tmp_path):
         page.evaluate("document.querySelector('[data-layer=\"worn insert\"]').click()")
         assert page.evaluate(shown) == [True, False, True]
         assert page.problems == []
+
+
+@pytest.mark.parametrize(
+    "damage", [{"bands": 3}, {"bands": {"samples": 1}}, {"cycles": "many"}, {"questions": None}]
+)
+def test_a_damaged_wear_json_is_one_line(worn, damage):
+    path = worn.directory / "wear.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | damage), encoding="utf-8")
+    with pytest.raises(InputError, match=r"not as tkamb wear writes it.*run tkamb wear again"):
+        wear_section(worn)
+
+
+def test_wear_that_names_no_scene_is_not_shown(worn):
+    path = worn.directory / "wear.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"scene_sha256": 5}))
+    assert wear_section(worn) == {"other": OTHER}

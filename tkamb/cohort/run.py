@@ -14,6 +14,7 @@ from tkamb.cohort.kept import write_cohort
 from tkamb.cohort.outcome import CohortWorker, Outcome
 from tkamb.cohort.plan import Cohort, load_cohort
 from tkamb.errors import InputError
+from tkamb.plug_ins import CONTACT_CODE, contact_code
 from tkamb.run.shards import Shards, remove_shards
 from tkamb.run.workers import Crew, Progress, Task
 
@@ -118,8 +119,10 @@ def run_cohort(
 
 
 def _identity(cohort: Cohort) -> dict[str, Any]:
-    code = {"version of tkamb": version("tkamb"), "code of tkamb": code_identity()}
-    return cohort.identity() | code
+    code: dict[str, Any] = {"version of tkamb": version("tkamb"), "code of tkamb": code_identity()}
+    models = sorted({run.scene.contact.model for run in cohort.runs if run.scene.contact})
+    foreign = {name: found for name in models if (found := contact_code(name)) is not None}
+    return cohort.identity() | code | ({CONTACT_CODE: foreign} if foreign else {})
 
 
 @contextmanager

@@ -19,7 +19,6 @@ import numpy as np
 from tkamb.body.contact_points import CondylePoint
 from tkamb.body.knee import solve_knee, unsolved
 from tkamb.contact.materials import material
-from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import within_insert
 from tkamb.contact.probe import condyle_wrenches
@@ -30,15 +29,14 @@ from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.frame_contact import FrameContact
 from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.equilibrium.post_side import cam_on_post, post_contact
+from tkamb.equilibrium.split_sensitivity import split_sensitivity, split_tangent
 from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
-from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_axes, knee_coordinates, knee_pose
+from tkamb.geometry.frames import Array, knee_pose
 from tkamb.scene.case import Case
-from tkamb.units import DEGREE
 
 if TYPE_CHECKING:
     from tkamb.contact.cam_post import CamPost
-    from tkamb.contact.probe import Probe
     from tkamb.equilibrium.released import KneeEquilibrium
 
 NAN = float("nan")
@@ -56,11 +54,6 @@ ASTRAY = (
 """Ends of a search that another start may mend."""
 FIRST_DEPTH = 5e-5
 """m: how deep the search for released coordinates begins."""
-ADDUCTION_STEP = 0.02 * DEGREE
-"""Small against the 0.2 to 0.5 deg that unload a condyle, and it moves some 60 N, thirty times
-what the lattice's tolerance leaves open; steps of 0.005 to 0.1 deg agree within 5 to 15 %."""
-
-ADDUCTION, SUPERIOR = (KNEE_COORDINATES.index(name) for name in ("adduction", "si"))
 
 
 class ContactSide:
@@ -357,53 +350,3 @@ def _points(body: FrameLoads) -> dict[str, Array]:
 def _travel(before: dict[str, Array], after: dict[str, Array]) -> float:
     """Return the farthest (m) that a contact point has moved."""
     return max(float(np.linalg.norm(after[side] - before[side])) for side in after)
-
-
-def split_sensitivity(model: ContactModel, state: Any, result: ContactResult) -> float:
-    """Return the change of the medial force with the adduction at a constant load, N/rad.
-
-    Zero where one condyle carries everything: it then holds only until the other touches. NaN
-    where the turned press does not succeed.
-
-    Args:
-        model: the contact model.
-        state: what its `prepare` returned.
-        result: a contact; the load is what it carries along -y.
-    """
-    load = -float(result.wrench_on_insert[1])
-    place = knee_coordinates(result.pose)
-    place[ADDUCTION] += ADDUCTION_STEP
-    turned = model.press(state, load, knee_pose(place), result)
-    if turned.status is not ContactStatus.OK:
-        return float("nan")
-    return (_medial(turned) - _medial(result)) / ADDUCTION_STEP
-
-
-def split_tangent(probe: "Probe", result: ContactResult) -> float:
-    """Return what `split_sensitivity` does, from the tangent of a model that knows it.
-
-    With the tangents t of the wrenches F on the insert, at a constant superior-inferior load
-    the femur follows an adduction da by dy = -(sum t_y,a / sum t_y,y) da, and the medial force
-    changes by n . (t_a da + t_y dy).
-
-    Args:
-        probe: of the contact model, exact.
-        result: a contact.
-    """
-    place = knee_coordinates(result.pose)
-    condyles = probe.at(result.pose).condyles
-    if "medial" not in condyles:
-        return 0.0
-    twists = knee_axes(place)[[ADDUCTION, SUPERIOR]].T
-    changes = {
-        side: condyle.stiffness[:3] @ twists
-        for side, condyle in condyles.items()
-        if condyle.stiffness is not None
-    }
-    total = sum(change[1] for change in changes.values())
-    follow = np.array([1.0, -total[0] / total[1]])
-    return float(-condyles["medial"].normal @ changes["medial"] @ follow)
-
-
-def _medial(result: ContactResult) -> float:
-    return result.medial.force if result.medial else 0.0

@@ -3,6 +3,7 @@
 import base64
 from typing import TYPE_CHECKING, Any
 
+from tkamb.errors import InputError
 from tkamb.files import MEGABYTE, read_bytes, read_json
 
 if TYPE_CHECKING:
@@ -42,8 +43,17 @@ def wear_section(results: "Results") -> dict[str, Any] | None:
         return None
     if not found:
         return {"other": OTHER}
-    bands = found["bands"] or {}
     picture = base64.b64encode(read_bytes(folder / PICTURE_NAME, LARGEST)).decode("ascii")
+    try:
+        return _shown(found, picture)
+    except (KeyError, TypeError, ValueError, AttributeError):
+        mend = "run tkamb wear again, or remove it"
+        raise InputError("is not as tkamb wear writes it", folder / WEAR_NAME, mend) from None
+
+
+def _shown(found: dict[str, Any], picture: str) -> dict[str, Any]:
+    """Return the section of wear.json and its picture in base 64."""
+    bands = found["bands"] or {}
     return {
         "other": None,
         "first": found["first"],
@@ -69,10 +79,10 @@ def wear_of_run(results: "Results") -> dict[str, Any] | None:
     found = read_json(folder / WEAR_NAME, LARGEST, what="wear.json")
     if not isinstance(found, dict) or not found.get("files_sha256"):
         return {}
-    summary = results.summary
+    summary, scenes = results.summary, found.get("scene_sha256")
     files = (summary.get("identity") or {}).get("content of a file")
-    same = summary.get("scene_sha256") in found["scene_sha256"] and files == found["files_sha256"]
-    return found if same else {}
+    same = isinstance(scenes, list) and summary.get("scene_sha256") in scenes
+    return found if same and files == found["files_sha256"] else {}
 
 
 def _legend(found: dict[str, Any], bands: dict[str, Any]) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 
 from tkamb.contact.registry import contact_names
 from tkamb.decks.calculix import ELEMENT
+from tkamb.plug_ins import contact_code
 from tkamb.studies.calculix import find_program
 from tkamb.studies.cases import StudyCase, case_names, study_case
 from tkamb.studies.kept_rows import KeptRows, row_key
@@ -127,7 +128,8 @@ def run_tradeoff(
     """
     for job in wanted:
         reference = references[job.case]
-        key = row_key("tradeoff", asdict(job), reference.hash, reference.values)
+        code = contact_code(job.contact)
+        key = row_key("tradeoff", asdict(job), code, reference.hash, reference.values)
         found = kept.get(key) if kept else None
         measured = Measure(**found) if found else measure_apart(job)
         if kept and not found:
