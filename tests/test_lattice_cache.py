@@ -33,9 +33,9 @@ def cached(counts=(5, 3, 6), limit=1e9, nu=0.45):
 
     def make():
         made.append(True)
-        return prepare_operator(solid.stiffness, index, held, top, SINGLE)
+        return prepare_operator(solid.stiffness, index, held, top, SINGLE).coarsened()
 
-    return cache.cached_operator(solid, held, top, make, limit), bool(made), solid
+    return cache.cached_operator(solid, held, top, make, True, limit), bool(made), solid
 
 
 def solve_twice(_):
@@ -70,8 +70,9 @@ def test_key_knows_material_boundary_and_shape():
         cache.operator_key(parts((5, 3, 7))[0], held, top),
         cache.operator_key(solid, ~held, top),
         cache.operator_key(solid, held, top[:-1]),
+        cache.operator_key(solid, held, top, coarse=False),
     }
-    assert len(keys) == 5
+    assert len(keys) == 6
 
 
 def only_file(folder):
@@ -157,7 +158,7 @@ def test_a_wrong_operator_with_a_right_hash_is_noticed(folder, caplog, what):
     path = only_file(folder)
     fronts, blocks = list(operator.factor.fronts), list(operator.half.blocks)
     if what == "fronts":
-        fronts = [replace(f, block=f.block * np.float32(0.9)) for f in fronts]
+        fronts = [replace(f, scale=f.scale * np.float32(0.9)) for f in fronts]
     elif what == "half":
         blocks = [replace(b, values=b.values * np.float32(0.9)) for b in blocks]
     elif what == "one block":
@@ -174,18 +175,19 @@ def test_a_wrong_operator_with_a_right_hash_is_noticed(folder, caplog, what):
     wrong = replace(operator, factor=replace(operator.factor, fronts=fronts), half=half)
     cache.write_operator(path, path.stem, wrong)
     check_made_again_with_one_notice(folder, caplog)
-    assert operator_error(cached()[0], solid) < 1e-6
+    assert operator_error(cached()[0], solid) < 1e-3
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.45, 0.4999])
 @pytest.mark.parametrize("bearing", ["fixed", "mobile"])
 def test_a_sound_operator_agrees_with_the_cells(nu, bearing):
-    """float32 leaves its rounding alone, whatever the condition of the stiffness."""
+    """Its numbers' rounding alone is left, whatever the condition of the stiffness."""
     for kind in (CalibratedNetwork, BbarHexahedra):
         solid, index, _, top = parts((8, 3, 7), nu, kind)
         held = fixed_unknowns(solid.nodes, np.flatnonzero(index[:, 1] == 0), bearing)
         operator = prepare_operator(solid.stiffness, index, held, top, SINGLE)
         assert operator_error(operator, solid) < 1e-6
+        assert operator_error(operator.coarsened(), solid) < 5e-4
 
 
 def test_orphans_go_and_are_counted(folder, caplog):

@@ -15,10 +15,10 @@ from tkamb.contact.materials import material
 MM = 1e-3
 
 
-def prepared(bearing, counts=(9, 4, 12), stretch=0.5):
+def prepared(bearing, counts=(9, 4, 12), stretch=0.5, nu=0.46):
     edges = np.full(3, MM)
     nodes, index, cells, _ = block(counts, edges, stretch)
-    solid = CalibratedNetwork(nodes, cells, edges, material("polyethylene"))
+    solid = CalibratedNetwork(nodes, cells, edges, material("polyethylene", poisson_ratio=nu))
     bottom = np.flatnonzero(index[:, 1] == 0)
     held = fixed_unknowns(nodes, bottom, bearing)
     top = np.flatnonzero(index[:, 1] == counts[1])
@@ -34,6 +34,22 @@ def test_solve_agrees_with_superlu(bearing):
     u = operator.solve(force)
     assert u.ravel()[free] == pytest.approx(exact, rel=1e-8, abs=1e-10 * np.abs(exact).max())
     assert not u.ravel()[held].any()
+
+
+@pytest.mark.parametrize("nu", [0.3, 0.46, 0.4999])
+@pytest.mark.parametrize("bearing", ["fixed", "mobile"])
+def test_sixteen_bits_are_enough_whatever_the_condition(bearing, nu):
+    """Displacements and strains under a neighbouring pair of forces, against double precision."""
+    solid, _, operator, top = prepared(bearing, nu=nu)
+    coarse = operator.coarsened()
+    assert all(front.block.dtype == np.int16 for front in coarse.factor.fronts)
+    force = np.zeros_like(solid.nodes)
+    force[top[[60, 61]], 1] = -1.0, 0.7
+    exact = operator.solve(force)
+    error = coarse.solve(force) - exact
+    assert 0 < np.abs(error).max() < 2e-4 * np.abs(exact).max()
+    strain = np.abs(solid.strain(exact)).max()
+    assert 0 < np.abs(solid.strain(error)).max() < 1e-4 * strain
 
 
 @pytest.mark.parametrize("bearing", ["fixed", "mobile"])

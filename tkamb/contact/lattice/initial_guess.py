@@ -10,6 +10,10 @@ from tkamb.geometry.frames import Array, Index, Mask
 
 MARGIN = 0.25
 """Nodes count as candidates this share of the depth beyond first touch."""
+ARM = 0.03
+"""m, from the femoral axis to the contact."""
+STRAIGHT = 0.5
+"""Share of a way that may lead aside if the last change is to go on."""
 SPARE = 1.6
 """The stored compliance covers nodes down to this many times the depth asked for."""
 
@@ -27,6 +31,8 @@ class WarmStart:
         moved: (c, 3) m, displacement of the contact nodes that were candidates, else 0.
         depth: m, how far the femoral component went below the lowest contact node.
         region: outside of which h is zero, or None.
+        pose: (4, 4) pose_femoral_in_insert where it was.
+        before: where the solution ended that this one began from, or None.
     """
 
     problem: ContactProblem
@@ -34,6 +40,36 @@ class WarmStart:
     moved: Array
     depth: float
     region: Region | None
+    pose: Array
+    before: "WarmStart | None" = None
+
+    def foreseen(self, pose: Array) -> "WarmStart":
+        """Return what is to be expected at a pose: this, or this and its last change once more.
+
+        The change counts as far as the way to the pose goes on along the last one.
+        """
+        last, h = self.before, self.nonlinear_residual
+        if last is None or h is None or last.nonlinear_residual is None:
+            return self
+        step, way = _way(last.pose, self.pose), _way(self.pose, pose)
+        along = float(step @ way) / max(float(step @ step), 1e-300)
+        if not np.linalg.norm(way - along * step) <= STRAIGHT * np.linalg.norm(way):
+            return self
+        along = min(max(along, 0.0), 1.0)
+        both = self.moved.any(axis=1, keepdims=True) & last.moved.any(axis=1, keepdims=True)
+        return replace(
+            self,
+            nonlinear_residual=h + along * (h - last.nonlinear_residual),
+            moved=self.moved + along * np.where(both, self.moved - last.moved, 0.0),
+        )
+
+
+def _way(start: Array, end: Array) -> Array:
+    """Return the way between two poses (12,), m: turns at `ARM`; what is along y the load asks."""
+    change = end[:3] - start[:3]
+    change[:, :3] *= ARM
+    change[1, 3] = 0.0
+    return change.ravel()
 
 
 @dataclass(frozen=True, eq=False)

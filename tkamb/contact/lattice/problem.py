@@ -111,6 +111,16 @@ class ContactProblem:
         points.flags.writeable = False
         return points
 
+    @cached_property
+    def free_nodes(self) -> Mask:
+        """Which nodes (n,) can move at all."""
+        return np.asarray(~self.held.reshape(-1, 3).all(axis=1), bool)
+
+    @cached_property
+    def everywhere(self) -> "Region":
+        """The region of all elements."""
+        return Region.of(self, np.arange(len(self.solid.scatter.elements)))
+
 
 @dataclass(frozen=True, eq=False)
 class TangentPlanes:
@@ -191,14 +201,9 @@ class Region:
         scatter = problem.solid.scatter
         touched = np.zeros(scatter.nodes, bool)
         touched[scatter.elements[elements]] = True
-        nodes = np.flatnonzero(touched & ~problem.held.reshape(-1, 3).all(axis=1))
+        nodes = np.flatnonzero(touched & problem.free_nodes)
         whole = len(elements) == len(scatter.elements)
         return cls(elements, nodes, problem.operator.fronts_of(nodes), whole)
-
-    @classmethod
-    def everywhere(cls, problem: ContactProblem) -> "Region":
-        """Return the region of all elements."""
-        return cls.of(problem, np.arange(len(problem.solid.scatter.elements)))
 
 
 @dataclass(frozen=True, eq=False)

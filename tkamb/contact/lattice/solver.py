@@ -201,7 +201,7 @@ class NonlinearBalance:
 
     def __init__(self, problem: ContactProblem, guess: InitialGuess, tolerance: float) -> None:
         self._problem, self._response, self._tolerance = problem, guess.response, tolerance
-        self.region = Region.everywhere(problem) if guess.region is None else guess.region
+        self.region = problem.everywhere if guess.region is None else guess.region
         self.h = np.zeros_like(problem.solid.nodes)
         if guess.nonlinear_residual is not None:
             self.h[self.region.nodes] = guess.nonlinear_residual[self.region.nodes]
@@ -223,10 +223,11 @@ class NonlinearBalance:
         region, operator = self.region, self._problem.operator
         if self._narrowed:
             return
-        rest = np.setdiff1d(np.arange(len(operator.factor.fronts)), region.fronts)
+        everywhere = self._problem.everywhere
+        rest = np.setdiff1d(everywhere.fronts, region.fronts, assume_unique=True)
         operator.factor.backward(self._x, rest)
         self.field = operator.nodal(self._x)
-        self._look(Region.everywhere(self._problem))
+        self._look(everywhere)
 
     def advance(self) -> None:
         """Take the next h."""
@@ -251,7 +252,7 @@ class NonlinearBalance:
         value = self._summed(forces, region)
         self.residual = float(np.linalg.norm(value - self._taken)) / self._size
         if region.whole:
-            size = np.linalg.norm(forces, axis=1)
+            size = np.sqrt(np.einsum("ij,ij->i", forces, forces))
             count = elements_that_count(size, SHARE * self._tolerance * self._size)
             self.region = Region.of(self._problem, region.elements[count])
             value = self._summed(forces[count], self.region)

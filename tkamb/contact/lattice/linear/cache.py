@@ -34,21 +34,21 @@ from numpy.typing import NDArray
 from tkamb.code_identity import code_identity
 from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor, Front
 from tkamb.contact.lattice.linear.operator import ElasticOperator, operator_error
-from tkamb.contact.lattice.linear.response import Block, HalfResponse
+from tkamb.contact.lattice.linear.response import SINGLE, Block, HalfResponse
 from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.errors import InputError
 from tkamb.files import open_regular
-from tkamb.geometry.frames import Array, Index, Mask
+from tkamb.geometry.frames import Index, Mask
 
-MAGIC = b"tkamb operator 3"
+MAGIC = b"tkamb operator 4"
 LONGEST_HEADER = 1_000_000
 """Bytes; a header has some hundreds."""
 LEAST_UNKNOWNS = 20_000
 """Smaller operators are not kept."""
 SIZE_LIMIT = 6e9
 """Bytes that the folder may hold."""
-LARGEST_ERROR = 1e-5
-"""Of an operator that is read (`operator_error`): float32 leaves 5e-7, whatever nu or bearing."""
+LARGEST_ERROR = 2e-3
+"""Of an operator that is read (`operator_error`): 16 bits leave 5e-4, whatever nu or bearing."""
 ORPHAN_SECONDS = 60.0
 """A half-written file that nobody has locked is an orphan after this time."""
 
@@ -64,11 +64,14 @@ def cache_folder() -> Path:
     return (Path(root) if root else Path.home() / ".cache") / "tkamb"
 
 
-def operator_key(solid: Solid, held: NDArray[Any], contact_nodes: NDArray[Any]) -> str:
+def operator_key(
+    solid: Solid, held: NDArray[Any], contact_nodes: NDArray[Any], coarse: bool = True
+) -> str:
     """Return the content hash of an operator: of all that it depends on, and of the code."""
     material = solid.material
     made_by = code_identity("contact/lattice")
-    words = (made_by, type(solid).__name__, material.young_modulus, material.poisson_ratio)
+    kind = (type(solid).__name__, "16 bits" if coarse else "single")
+    words = (made_by, *kind, material.young_modulus, material.poisson_ratio)
     digest = hashlib.sha256(repr(words).encode())
     for array in (solid.nodes, solid.spacing, solid.cells, held, contact_nodes):
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -80,6 +83,7 @@ def cached_operator(
     held: Mask,
     contact_nodes: Index,
     make: Callable[[], ElasticOperator],
+    coarse: bool = True,
     limit: float = SIZE_LIMIT,
 ) -> ElasticOperator:
     """Return a solid's operator, from disk or newly made and kept.
@@ -91,11 +95,12 @@ def cached_operator(
         held: (3n,) unknowns held by the boundary.
         contact_nodes: (c,) nodes that can be touched.
         make: makes the operator.
+        coarse: whether that has a factor of 16-bit integers.
         limit: bytes that the folder may hold; a larger operator is not kept.
     """
     if int((~held).sum()) < LEAST_UNKNOWNS:
         return make()
-    key = operator_key(solid, held, contact_nodes)
+    key = operator_key(solid, held, contact_nodes, coarse)
     path = cache_folder() / f"{key}.operator"
     try:
         found = read_operator(path, key, limit)
@@ -105,7 +110,7 @@ def cached_operator(
     except DamagedOperator as damage:
         _log.warning("%s: %s; the operator is made again", path, damage)
     made = make()
-    if sum(block.nbytes for block in _floats(made)) <= limit:
+    if sum(block.nbytes for block in _blocks(made)) <= limit:
         try:
             write_operator(path, key, made)
             prune(path.parent, limit)
@@ -143,7 +148,7 @@ def check_operator(
 def write_operator(path: Path, key: str, operator: ElasticOperator) -> None:
     """Write beside the path, then move there in one step."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    arrays = [*_integers(operator), *_floats(operator)]
+    arrays = [*_tables(operator), *_blocks(operator)]
     header = json.dumps(
         {
             "key": key,
@@ -169,7 +174,7 @@ def write_operator(path: Path, key: str, operator: ElasticOperator) -> None:
         raise
 
 
-def _integers(operator: ElasticOperator) -> list[NDArray[Any]]:
+def _tables(operator: ElasticOperator) -> list[NDArray[Any]]:
     fronts, blocks = operator.factor.fronts, operator.half.blocks
     sizes = [[f.start, f.stop, f.parent, len(f.boundary)] for f in fronts]
     rows = [[b.start, b.stop, b.first, b.last] for b in blocks]
@@ -179,12 +184,13 @@ def _integers(operator: ElasticOperator) -> list[NDArray[Any]]:
         operator.factor.order,
         np.array(sizes, np.int64).reshape(-1, 4),
         np.concatenate([np.zeros(0, np.int64), *(f.boundary for f in fronts)]),
+        np.concatenate([np.zeros(0, SINGLE), *(f.scale for f in fronts)]),
         operator.half.rank,
         np.array(rows, np.int64).reshape(-1, 4),
     ]
 
 
-def _floats(operator: ElasticOperator) -> list[Array]:
+def _blocks(operator: ElasticOperator) -> list[NDArray[Any]]:
     return [f.block for f in operator.factor.fronts] + [b.values for b in operator.half.blocks]
 
 
@@ -239,25 +245,38 @@ def _arrays(file: BinaryIO, size: int, key: str) -> Iterator[NDArray[Any]]:
 
 
 def _operator_of(arrays: list[NDArray[Any]]) -> ElasticOperator:
-    """Return the operator of the arrays of `_integers` and `_floats`, one after the other."""
-    free, contact_nodes, order, sizes, boundaries, rank, rows, *values = arrays
+    """Return the operator of the arrays of `_tables` and `_blocks`, one after the other.
+
+    Compiled code looks at no bounds: every index is held against them here.
+    """
+    free, contact_nodes, order, sizes, boundaries, scales, rank, rows, *values = arrays
     if len(values) != len(sizes) + len(rows):
         raise ValueError("another number of blocks")
-    edge, fronts = 0, []
+    unknowns, edge, last, fronts = len(order), 0, 0, []
+    _check(order, 0, unknowns)
     for (start, stop, parent, touched), block in zip(sizes.tolist(), values, strict=False):
         boundary = boundaries[edge : edge + touched]
-        if block.shape != (stop - start + touched, stop - start) or len(boundary) != touched:
+        scale = scales[last : last + stop - start + touched]
+        if block.shape != (len(scale), stop - start) or len(boundary) != touched:
             raise ValueError("a block of another shape")
-        fronts.append(Front(start, stop, boundary, parent, block))
-        edge += touched
+        _check(np.array([start, stop - 1, *boundary]), 0, unknowns)
+        _check(np.array([parent]), -1, len(sizes))
+        fronts.append(Front(start, stop, boundary, parent, block, scale))
+        edge, last = edge + touched, last + len(scale)
     blocks = []
-    for (start, stop, first, last), block in zip(rows.tolist(), values[len(sizes) :], strict=True):
-        if block.shape != (stop - start, last - first):
+    for (start, stop, first, end), block in zip(rows.tolist(), values[len(sizes) :], strict=True):
+        if block.shape != (stop - start, end - first):
             raise ValueError("a block of another shape")
-        blocks.append(Block(start, stop, first, last, block))
+        blocks.append(Block(start, stop, first, end, block))
     return ElasticOperator(
         free, CholeskyFactor(order, fronts), contact_nodes, HalfResponse(rank, blocks)
     )
+
+
+def _check(indices: Index, least: int, end: int) -> None:
+    """Raise ValueError unless all indices lie in [least, end)."""
+    if len(indices) and not (indices.min() >= least and indices.max() < end):
+        raise ValueError("an index that leads nowhere")
 
 
 def prune(folder: Path, limit: float) -> None:

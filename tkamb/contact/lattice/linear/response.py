@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from tkamb.contact.lattice.compiled import compiled
 from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor
 from tkamb.geometry.frames import Array, Index
 
@@ -56,17 +57,17 @@ class HalfResponse:
         ordered = np.zeros(self.columns)
         ordered[self.rank[self.rank >= 0]] = force[self.rank >= 0]
         for block in self.blocks:
-            part = ordered[block.first : block.last].astype(block.values.dtype)
+            part = ordered[block.first : block.last]
             if part.any():
-                y[block.start : block.stop] += np.einsum("ij,j->i", block.values, part)
+                _add_product(block.values, part, y[block.start : block.stop])
 
     def project(self, y: Array) -> Array:
         """Return Zᵀ y (q,): displacement of the unknowns under the load whose L⁻¹ f is y."""
         ordered = np.zeros(self.columns)
         for block in self.blocks:
-            part = y[block.start : block.stop].astype(block.values.dtype)
+            part = y[block.start : block.stop]
             if part.any():
-                ordered[block.first : block.last] += np.einsum("ij,i->j", block.values, part)
+                _add_transposed_product(block.values, part, ordered[block.first : block.last])
         return np.where(self.rank >= 0, ordered[np.maximum(self.rank, 0)], 0.0)
 
     def among(self, unknowns: Index) -> "HalfResponse":
@@ -108,6 +109,30 @@ class HalfResponse:
     def columns(self) -> int:
         """How many columns Z has."""
         return int((self.rank >= 0).sum())
+
+
+@compiled
+def _add_product(values: Array, x: Array, y: Array) -> None:
+    """Add A x to y, worked out in the precision of A (m, n)."""
+    rows, columns = values.shape
+    own, zero = x.astype(values.dtype), values.dtype.type(0)
+    for i in range(rows):
+        total = zero
+        for j in range(columns):
+            total += values[i, j] * own[j]
+        y[i] += total
+
+
+@compiled
+def _add_transposed_product(values: Array, x: Array, y: Array) -> None:
+    """Add Aᵀ x to y, worked out in the precision of A (m, n)."""
+    rows, columns = values.shape
+    own, total = x.astype(values.dtype), np.zeros(columns, values.dtype)
+    for i in range(rows):
+        for j in range(columns):
+            total[j] += own[i] * values[i, j]
+    for j in range(columns):
+        y[j] += total[j]
 
 
 def unknowns_of(nodes: Index) -> Index:

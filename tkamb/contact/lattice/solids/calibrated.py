@@ -21,9 +21,11 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
+from numpy.typing import NDArray
 
+from tkamb.contact.lattice.compiled import compiled
 from tkamb.contact.lattice.meshing.cells import CORNERS, PAIR_AXES, PAIRS, mean_gradient
-from tkamb.contact.lattice.solids.curve import ShearCurve
+from tkamb.contact.lattice.solids.curve import LEAST_STRAIN, ShearCurve
 from tkamb.contact.lattice.solids.solid import DEVIATORIC, CellSolid, strain_matrix
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array, Index
@@ -144,9 +146,13 @@ class CalibratedNetwork(CellSolid):
 
     def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return (mu - mu_s) K_d u of the cells, N, (k, 24); see `Solid`."""
-        force, equivalent = self._state(displacement, chosen)
-        softened = self.material.shear_modulus - self.curve.modulus(equivalent)
-        return softened[:, None] * force
+        cells = np.arange(len(self.cells)) if chosen is None else chosen
+        if self.curve.spline is None:
+            return np.zeros((len(cells), 24))
+        curve = (self.curve.shear_modulus, self.curve.spline.x, self.curve.spline.c)
+        return _softened_forces(
+            self._diagonals, self._volumes, *curve, self.cells, cells, displacement
+        )
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n): mu_s K_d + mu_s'/(3 V e) (K_d u)(K_d u)ᵀ + bulk."""
@@ -159,19 +165,101 @@ class CalibratedNetwork(CellSolid):
         return self.pattern.assemble(matrices)
 
     @cached_property
-    def _others(self) -> Array:
-        """K_d of the cells that are not of the commonest shape."""
-        return self.deviatoric[self.shape_of_cell[self.kinds[1]]]
+    def _diagonals(self) -> NDArray[np.float32]:
+        """K_d of each cell by diagonals (c, 13, 24): entry i of the k-th is K_d[i, i + k mod 24].
+
+        The matrix is symmetric, so that thirteen wrapped diagonals say all. The first and the
+        last one are halved: `_shear_forces` takes each twice.
+        """
+        row = np.arange(24)
+        column = (row + np.arange(13)[:, None]) % 24
+        packed = self.deviatoric[:, row, column].astype(np.float32)
+        packed[:, [0, 12]] /= 2
+        return packed[self.shape_of_cell]
+
+    @cached_property
+    def _volumes(self) -> Array:
+        """V of each cell (c,), m³."""
+        return self.volume[self.shape_of_cell]
 
     def _state(self, displacement: Array, chosen: Index | None = None) -> tuple[Array, Array]:
         """Return K_d u (k, 24) and the equivalent strain e (k,) of the chosen cells."""
-        local = self.scatter.gather(displacement, chosen)
-        cells = slice(None) if chosen is None else chosen
-        matrices, index = self._others, self.index_among_others[cells]
-        force = local @ self.deviatoric[self.kinds[0]]
-        others = np.flatnonzero(index >= 0)
-        matrices = matrices if chosen is None else matrices[index[others]]
-        force[others] = np.einsum("cij,cj->ci", matrices, local[others])
-        energy = np.einsum("ci,ci->c", local, force)
-        volume = self.volume[self.shape_of_cell[cells]]
-        return force, np.sqrt(np.maximum(energy, 0) / (3 * volume))
+        cells = np.arange(len(self.cells)) if chosen is None else chosen
+        return _shear_forces(self._diagonals, self._volumes, self.cells, cells, displacement)
+
+
+@compiled
+def _shear_force(
+    diagonals: NDArray[np.float32],
+    nodes: Index,
+    displacement: Array,
+    u: Array,
+    force: Array,
+) -> float:
+    """Put K_d u of a cell into force (36,), of which 24 count; return uᵀ K_d u; u (36,) is scratch.
+
+    u is taken from the cell's first node: K_d knows nothing of the way all nodes go together,
+    and without it single precision of K_d does. Each diagonal meets u twice, above and below the
+    main one, in stretches that fill vector registers.
+    """
+    for corner in range(8):
+        for axis in range(3):
+            u[3 * corner + axis] = displacement[nodes[corner], axis] - displacement[nodes[0], axis]
+    u[24:] = u[:12]
+    force[:] = 0.0
+    for shift in range(13):
+        for i in range(24):
+            force[i] += diagonals[shift, i] * u[i + shift]
+        for i in range(24):
+            force[i + shift] += diagonals[shift, i] * u[i]
+    force[:12] += force[24:]
+    energy = 0.0
+    for i in range(24):
+        energy += force[i] * u[i]
+    return max(energy, 0.0)
+
+
+@compiled
+def _shear_forces(
+    diagonals: NDArray[np.float32],
+    volumes: Array,
+    nodes: Index,
+    chosen: Index,
+    displacement: Array,
+) -> tuple[Array, Array]:
+    """Return K_d u (k, 24) and the equivalent strain (k,) of chosen cells."""
+    forces, strains = np.empty((len(chosen), 24)), np.empty(len(chosen))
+    u, force = np.empty(36), np.empty(36)
+    for k in range(len(chosen)):
+        cell = chosen[k]
+        energy = _shear_force(diagonals[cell], nodes[cell], displacement, u, force)
+        strains[k] = np.sqrt(energy / (3 * volumes[cell]))
+        forces[k] = force[:24]
+    return forces, strains
+
+
+@compiled
+def _softened_forces(
+    diagonals: NDArray[np.float32],
+    volumes: Array,
+    shear_modulus: float,
+    knots: Array,
+    cubic: Array,
+    nodes: Index,
+    chosen: Index,
+    displacement: Array,
+) -> Array:
+    """Return (mu - mu_s) K_d u (k, 24) of chosen cells; 3 mu_s e is cubic between knots of e."""
+    forces = np.empty((len(chosen), 24))
+    u, force = np.empty(36), np.empty(36)
+    for k in range(len(chosen)):
+        cell = chosen[k]
+        energy = _shear_force(diagonals[cell], nodes[cell], displacement, u, force)
+        strain = min(max(np.sqrt(energy / (3 * volumes[cell])), LEAST_STRAIN), knots[-1])
+        part = min(np.searchsorted(knots, strain, side="right") - 1, len(knots) - 2)
+        x = strain - knots[part]
+        stress = ((cubic[0, part] * x + cubic[1, part]) * x + cubic[2, part]) * x + cubic[3, part]
+        softened = shear_modulus - stress / (3 * strain)
+        for i in range(24):
+            forces[k, i] = softened * force[i]
+    return forces

@@ -17,6 +17,8 @@ from scipy.interpolate import CubicHermiteSpline
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array
 
+LEAST_STRAIN = 1e-9
+"""Below it the secant modulus is taken as it is there."""
 _STRAINS = np.concatenate([[0.0], np.geomspace(1e-7, 20.0, 6000)])
 
 
@@ -47,13 +49,13 @@ class ShearCurve:
         """Return the secant shear modulus mu_s, Pa, at equivalent strains e >= 0."""
         if self.spline is None:
             return np.full_like(equivalent, self.shear_modulus)
-        floored = np.clip(equivalent, 1e-9, self.spline.x[-1])
+        floored = np.clip(equivalent, LEAST_STRAIN, self.spline.x[-1])
         return self.spline(floored) / (3 * floored)
 
     def softening(self, equivalent: Array) -> Array:
         """Return (d mu_s / d e) / e, Pa, at equivalent strains e >= 0: never positive."""
         if self.spline is None:
             return np.zeros_like(equivalent)
-        floored = np.clip(equivalent, 1e-9, self.spline.x[-1])
+        floored = np.clip(equivalent, LEAST_STRAIN, self.spline.x[-1])
         slope = self.spline(floored, 1) / 3 - self.modulus(floored)
         return np.where(equivalent < 1e-7, 0.0, slope / floored**2)

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sparse
 
+from tkamb.contact.lattice.compiled import compiled
 from tkamb.contact.lattice.meshing.cells import group_shapes, mean_gradient
 from tkamb.contact.materials import Material
 from tkamb.errors import InputError
@@ -80,17 +81,45 @@ class Scatter:
 
     def gather(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return (k, 3p) of the chosen elements, by default of all, from nodal (n, 3)."""
-        elements = self.elements if chosen is None else self.elements[chosen]
+        elements = elements_of(self.elements, chosen)
         return displacement[elements].reshape(len(elements), 3 * elements.shape[1])
 
     def sum(self, forces: Array, chosen: Index | None = None) -> Array:
         """Return nodal (n, 3) from (k, 3p) of the chosen elements, by default of all."""
-        flat = (self.elements if chosen is None else self.elements[chosen]).ravel()
-        parts = forces.reshape(-1, 3)
         total = np.zeros((self.nodes, 3))
-        for axis in range(3) if len(flat) else ():
-            total[:, axis] = np.bincount(flat, parts[:, axis], self.nodes)
+        _add_up(forces.reshape(-1, 3), elements_of(self.elements, chosen).ravel(), total)
         return total
+
+
+def elements_of(elements: Index, chosen: Index | None) -> Index:
+    """Return some rows, by default all."""
+    return elements if chosen is None else elements[chosen]
+
+
+@compiled
+def _add_up(parts: Array, nodes: Index, total: Array) -> None:
+    """Add vectors (k, 3) to those of their nodes (n, 3)."""
+    for k in range(len(nodes)):
+        for axis in range(3):
+            total[nodes[k], axis] += parts[k, axis]
+
+
+@compiled
+def _mean_strains(cells: Index, gradients: Array, displacement: Array) -> Array:
+    """Return the symmetric mean gradient (c, 3, 3) of nodal displacements (n, 3)."""
+    strains = np.empty((len(cells), 3, 3))
+    gradient = np.empty((3, 3))
+    for cell in range(len(cells)):
+        gradient[:] = 0.0
+        for corner in range(8):
+            for a in range(3):
+                moved = displacement[cells[cell, corner], a]
+                for b in range(3):
+                    gradient[a, b] += moved * gradients[cell, corner, b]
+        for a in range(3):
+            for b in range(3):
+                strains[cell, a, b] = (gradient[a, b] + gradient[b, a]) / 2
+    return strains
 
 
 class Solid(ABC):
@@ -169,22 +198,12 @@ class Solid(ABC):
 
     def strain(self, displacement: Array) -> Array:
         """Return each cell's mean strain (c, 3, 3)."""
-        common, others, gradients = self._mean_gradients
-        local = displacement[self.cells].reshape(-1, 24)
-        gradient = (local @ common).reshape(-1, 3, 3)
-        for a in range(3):
-            for b in range(3):
-                along = np.einsum("cn,nc->c", local[others, a::3], gradients[:, b])
-                gradient[others, a, b] = along
-        return (gradient + np.swapaxes(gradient, 1, 2)) / 2
+        return _mean_strains(self.cells, self._mean_gradients, displacement)
 
     @cached_property
-    def _mean_gradients(self) -> tuple[Array, Index, Array]:
-        """Mean gradients of the commonest shape as (24, 9), the other cells, theirs (8, 3, k)."""
-        gradients, (common, others) = mean_gradient(self.shapes)[0], self.kinds
-        matrix = np.einsum("nb,ac->ncab", gradients[common], np.eye(3)).reshape(24, 9)
-        theirs = gradients[self.shape_of_cell[others]]
-        return matrix, others, np.ascontiguousarray(theirs.transpose(1, 2, 0))
+    def _mean_gradients(self) -> Array:
+        """Mean gradients (c, 8, 3) of the cells' shape functions, 1/m."""
+        return mean_gradient(self.shapes)[0][self.shape_of_cell]
 
     @cached_property
     def kinds(self) -> tuple[int, Index]:
