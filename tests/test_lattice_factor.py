@@ -41,8 +41,9 @@ def test_solve_agrees_with_superlu(bearing):
 def test_sixteen_bits_are_enough_whatever_the_condition(bearing, nu):
     """Displacements and strains under a neighbouring pair of forces, against double precision."""
     solid, _, operator, top = prepared(bearing, nu=nu)
-    coarse = operator.coarsened()
-    assert all(front.block.dtype == np.int16 for front in coarse.factor.fronts)
+    fronts = [front.coarsened() for front in operator.factor.fronts]
+    assert all(front.block.dtype == np.int16 for front in fronts)
+    coarse = replace(operator, factor=replace(operator.factor, fronts=fronts))
     force = np.zeros_like(solid.nodes)
     force[top[[60, 61]], 1] = -1.0, 0.7
     exact = operator.solve(force)

@@ -119,8 +119,7 @@ class CellContact(ContactModel):
             try:
                 check_assembly_memory(len(lattice.cells))
                 index = lattice.index
-                made = prepare_operator(solid.stiffness, index, held, nodes, SINGLE)
-                return made.coarsened() if coarse else made
+                return prepare_operator(solid.stiffness, index, held, nodes, SINGLE, coarse)
             except TooLittleMemoryError as short:
                 size = f"{self.resolution / MILLIMETRE:g} mm"
                 raise InputError(

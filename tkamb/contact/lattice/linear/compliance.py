@@ -113,8 +113,7 @@ class ComplianceCache:
                 both = np.union1d(wanted, self.nodes)
                 self._take(both if len(both) <= MOST_STORED else wanted)
             here, there = np.searchsorted(self.nodes, nodes), np.searchsorted(self.nodes, pushed)
-            axes = np.arange(3)
-            compliance = self.compliance[np.ix_(axes, here, axes, there)]
+            compliance = _taken(_taken(self.compliance, here, 1), there, 3)
         return np.einsum("aibj,jb->ia", compliance, force)
 
     def _take(self, nodes: Index) -> None:

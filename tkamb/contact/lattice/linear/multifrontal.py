@@ -144,10 +144,6 @@ class CholeskyFactor:
         """How many numbers the factor holds."""
         return sum(front.block.size for front in self.fronts)
 
-    def coarsened(self) -> "CholeskyFactor":
-        """Return it in 16-bit integers: half the memory of single precision, half to read."""
-        return replace(self, fronts=[front.coarsened() for front in self.fronts])
-
     def solve(self, right: Array) -> Array:
         """Return x (n,) of A x = right."""
         x = right[self.order].astype(np.float64)

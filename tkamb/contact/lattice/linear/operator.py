@@ -1,6 +1,6 @@
 """The linear operator of one insert: factor, boundary conditions, response of contact nodes."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -31,10 +31,6 @@ class ElasticOperator:
     factor: CholeskyFactor
     contact_nodes: Index
     half: HalfResponse
-
-    def coarsened(self) -> "ElasticOperator":
-        """Return it with a factor of 16-bit integers; the stored response stays as it is."""
-        return replace(self, factor=self.factor.coarsened())
 
     def solve(self, force: Array) -> Array:
         """Return the displacement (n, 3), m, under nodal forces (n, 3), N."""
@@ -112,6 +108,7 @@ def prepare_operator(
     held: Mask,
     contact_nodes: Index,
     precision: type[np.floating] = np.float64,
+    coarse: bool = False,
 ) -> ElasticOperator:
     """Factorise a stiffness matrix (3n, 3n) and work out the contact nodes' half response.
 
@@ -121,6 +118,8 @@ def prepare_operator(
         held: (3n,) unknowns that are zero.
         contact_nodes: (c,).
         precision: in which the numbers are kept; they are worked out in float64.
+        coarse: keep the factor, not the response, in 16-bit integers: half the memory of single
+            precision, and half to read in every solve.
 
     Raises:
         TooLittleMemoryError: they do not fit into the memory that is left.
@@ -146,7 +145,11 @@ def prepare_operator(
     rank = np.full(len(free), -1)
     rank[np.flatnonzero(free)[factor.order]] = np.arange(len(factor.order))
     wanted = rank[(3 * contact_nodes[:, None] + np.arange(3)).ravel()]
-    return ElasticOperator(free, factor, contact_nodes, half_response(factor, wanted, precision))
+    half = half_response(factor, wanted, precision)
+    if coarse:
+        for member, front in enumerate(factor.fronts):  # one at a time: both do not fit
+            factor.fronts[member] = front.coarsened()
+    return ElasticOperator(free, factor, contact_nodes, half)
 
 
 def operator_error(operator: ElasticOperator, solid: Solid) -> float:
