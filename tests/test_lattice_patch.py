@@ -5,15 +5,17 @@ import pytest
 import scipy.sparse.linalg as linalg
 
 from lattice_blocks import block, uniform_strain
+from tkamb.contact.lattice.meshing.cells import gauss_gradients, mean_gradient
 from tkamb.contact.lattice.solids.bbar import BbarHexahedra
 from tkamb.contact.lattice.solids.calibrated import (
     CalibratedNetwork,
     body_diagonal_stiffness,
     box_corners,
-    deviatoric_matrices,
     spring_families,
     spring_matrix,
 )
+from tkamb.contact.lattice.solids.cell_loops import deviatoric_matrices
+from tkamb.contact.lattice.solids.solid import DEVIATORIC, strain_matrix
 from tkamb.contact.lattice.source.springs import SourceNetwork, source_factor
 from tkamb.contact.materials import Material
 
@@ -25,6 +27,52 @@ STRAIN = np.array([0.7, -1.1, 0.4, 0.3, -0.5, 0.6]) * 1e-3
 
 def material(nu):
     return Material("m", 561.5e6, nu)
+
+
+def cell_of(corners, edges):
+    """Return K_d (s, 24, 24), g (s, 24) and V (s,) of cells in a lattice of boxes."""
+    gradients, volume = mean_gradient(corners)
+    springs = spring_families(edges, body_diagonal_stiffness(edges))
+    matrices = deviatoric_matrices(corners, gradients, volume, springs)
+    return matrices, gradients.reshape(-1, 24), volume
+
+
+def sheared(edges, count=20):
+    """Return corners (count, 8, 3) of boxes whose corners have been moved about."""
+    corners = np.repeat(box_corners(edges)[None], count, axis=0)
+    return corners + np.random.default_rng(5).normal(size=corners.shape) * 0.1 * edges.min()
+
+
+def test_the_compiled_cell_is_the_formula():
+    """K_d = V Bᵀ (2 I_dev) B + Pᵀ K_spr P with whole matrices, on cells out of shape."""
+    edges = np.array([1.0, 1.2, 0.9]) * MM
+    corners = sheared(edges)
+    at_points, weights = gauss_gradients(corners)
+    volume = weights.sum(axis=1)
+    gradients = np.einsum("cp,cpni->cni", weights, at_points) / volume[:, None, None]
+    strain = strain_matrix(gradients)
+    mean = volume[:, None, None] * (np.swapaxes(strain, 1, 2) @ DEVIATORIC @ strain)
+    rest = np.eye(8) - corners @ np.swapaxes(gradients, 1, 2)
+    rest = np.stack([np.kron(one, np.eye(3)) for one in rest])
+    springs = spring_matrix(corners, spring_families(edges, body_diagonal_stiffness(edges)))
+    matrices, g, v = cell_of(corners, edges)
+    assert v == pytest.approx(volume, rel=1e-12)
+    assert g == pytest.approx(gradients.reshape(-1, 24), rel=1e-9, abs=1e-12 / MM)
+    exact = mean + np.swapaxes(rest, 1, 2) @ springs @ rest
+    assert np.abs(matrices - exact).max() < 1e-12 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize("nu", [0.3, 0.4999])
+@pytest.mark.parametrize("kind", [CalibratedNetwork, BbarHexahedra])
+def test_forces_summed_cell_by_cell_are_those_of_the_assembled_stiffness(kind, nu):
+    """What a stored operator is held against; single precision of K_d in the lattice."""
+    edges = np.array([1.0, 1.2, 0.9]) * MM
+    nodes, _, cells, _ = block((3, 2, 3), edges, 0.3)
+    made = kind(nodes, cells, edges, material(nu))
+    u = np.random.default_rng(6).normal(size=nodes.shape)
+    force = made.stiffness @ u.ravel()
+    error = np.abs(made.linear_force(u).ravel() - force).max()
+    assert error < 1e-7 * np.abs(force).max()
 
 
 def boundary_of(index):
@@ -73,7 +121,7 @@ def test_cell_has_six_rigid_modes_and_no_other(nu, edges, shear):
     edges = np.array(edges) * MM
     corners = box_corners(edges)[None].copy()
     corners[0, [2, 3, 6, 7], 1] += shear * edges[1] * np.array([1.0, 0.0, 0.6, 0.3])
-    deviatoric, g, volume = deviatoric_matrices(corners, edges)
+    deviatoric, g, volume = cell_of(corners, edges)
     m = material(nu)
     k = m.shear_modulus * deviatoric[0] + m.bulk_modulus * volume[0] * np.outer(g[0], g[0])
     values = np.linalg.eigvalsh(k) / (m.shear_modulus * edges.mean())
@@ -99,7 +147,7 @@ def test_projection_leaves_normal_strain_of_a_box_to_the_springs():
     """On a box K_d is the springs less their bulk part, but for the twist that shear excites."""
     edges = np.array([1.0, 1.2, 0.9])
     k_b = body_diagonal_stiffness(edges)
-    deviatoric, g, volume = deviatoric_matrices(box_corners(edges)[None], edges)
+    deviatoric, g, volume = cell_of(box_corners(edges)[None], edges)
     springs = spring_matrix(box_corners(edges)[None], spring_families(edges, k_b))[0]
     springs -= 5 / 3 * volume[0] * np.outer(g[0], g[0])
     u = uniform_strain(box_corners(edges), [1, 2, 3, 0, 0, 0]).ravel()

@@ -86,7 +86,7 @@ def factor_memory(
         tree: dissection of n nodes.
         joined: (n, n) pattern: which nodes are joined.
         touched: (n,) nodes whose response is wanted.
-        itemsize: bytes of a number that is kept; they are worked out in 8.
+        itemsize: bytes of a number that is kept; the factor is worked out in 8.
     """
     rank = np.empty(joined.shape[0], np.int64)
     rank[np.concatenate(tree.own)] = np.arange(len(rank))
@@ -112,4 +112,4 @@ def factor_memory(
                 below.setdefault(parent, []).append(boundary)
         start = stop
     entries = UNKNOWNS**2 * joined.nnz
-    return MATRIX_BYTES * entries + max(peak, itemsize * kept + 8.0 * response)
+    return MATRIX_BYTES * entries + max(peak, itemsize * (kept + response))

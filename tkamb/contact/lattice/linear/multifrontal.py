@@ -14,8 +14,8 @@ The products of a solve read every W once, without the zeros of L11⁻¹: memory
 for. Compiled loops over a few rows at a time read faster than `einsum` and than BLAS.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -239,41 +239,39 @@ def _backward(block: NDArray[Any], scale: Array, boundary: Index, start: int, x:
         x[start + j] = total[j]
 
 
-def factorise(
+def fronts_of(
     matrix: sparse.csr_matrix,
     tree: Dissection,
     unknowns: list[Index],
     precision: type[np.floating] = np.float64,
-) -> CholeskyFactor:
-    """Return the Cholesky factor.
+) -> Iterator[Front]:
+    """Yield the fronts of the Cholesky factor, children before parents.
 
     Args:
         matrix: (n, n) symmetric positive definite.
         tree: dissection; used for its parents.
         unknowns: unknowns that each tree member eliminates.
-        precision: in which the factor is kept; it is worked out in float64.
+        precision: in which the fronts are yielded; they are worked out in float64.
 
     Raises:
         ComputationError: the matrix is not positive definite.
     """
     order = np.concatenate(unknowns)
-    permuted = matrix[order][:, order].tocsc()
-    permuted.sort_indices()
+    matrix = matrix[order][:, order].tocsc()
+    matrix.sort_indices()
     updates: dict[int, list[tuple[Index, Array]]] = {}
     row = np.empty(len(order), np.int64)
-    fronts: list[Front] = []
     start = 0
     for member, own in enumerate(unknowns):
         stop = start + len(own)
         front, update = _eliminate(
-            permuted, start, stop, updates.pop(member, []), row, tree.parent[member]
+            matrix, start, stop, updates.pop(member, []), row, tree.parent[member]
         )
-        block = np.ascontiguousarray(front.block, dtype=precision)
-        fronts.append(replace(front, block=block, scale=front.scale.astype(precision)))
         if len(front.boundary):
             updates.setdefault(front.parent, []).append((front.boundary, update))
+        block = np.ascontiguousarray(front.block, dtype=precision)
+        yield replace(front, block=block, scale=front.scale.astype(precision))
         start = stop
-    return CholeskyFactor(order, fronts)
 
 
 def _eliminate(
@@ -302,9 +300,9 @@ def _eliminate(
     for indices, update in children:
         split = int(np.searchsorted(indices, stop))
         here, there = indices[:split] - start, row[indices[split:]]
-        _extend_add(own, here, here, update[:split, :split])
-        _extend_add(mixed, there, here, update[split:, :split])
-        _extend_add(rest, there, there, update[split:, split:])
+        _extend_add(own, here, here, update[:split, :split], True)
+        _extend_add(mixed, there, here, update[split:, :split], False)
+        _extend_add(rest, there, there, update[split:, split:], True)
     lower, info = lapack.dpotrf(own, lower=1, clean=1, overwrite_a=1)
     if info:
         raise ComputationError("the stiffness matrix is not positive definite")
@@ -317,17 +315,9 @@ def _eliminate(
     return Front(start, stop, boundary, parent, block, np.ones(len(block))), rest
 
 
-def _extend_add(target: Array, rows: Index, columns: Index, update: Array) -> None:
-    """Add update to target[rows, columns], run by run of consecutive indices."""
-    for a, b in _runs(rows):
-        for c, d in _runs(columns):
-            target[rows[a] : rows[b - 1] + 1, columns[c] : columns[d - 1] + 1] += update[a:b, c:d]
-
-
-def _runs(indices: Index) -> list[tuple[int, int]]:
-    """Return the stretches [a, b) of consecutive values of an increasing list."""
-    if not len(indices):
-        return []
-    breaks = np.flatnonzero(np.diff(indices) != 1) + 1
-    edges = [0, *breaks.tolist(), len(indices)]
-    return list(pairwise(edges))
+@compiled
+def _extend_add(target: Array, rows: Index, columns: Index, update: Array, lower: bool) -> None:
+    """Add update to target[rows, columns]; of a square one only what is below the diagonal."""
+    for j in range(len(columns)):
+        for i in range(j if lower else 0, len(rows)):
+            target[rows[i], columns[j]] += update[i, j]

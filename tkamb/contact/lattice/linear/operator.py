@@ -7,8 +7,8 @@ import numpy as np
 import scipy.sparse as sparse
 
 from tkamb.contact.lattice.linear.memory_need import check_memory, factor_memory
-from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor, dissect, factorise
-from tkamb.contact.lattice.linear.response import HalfResponse, half_response
+from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor, dissect, fronts_of
+from tkamb.contact.lattice.linear.response import HalfResponse, HalfSolves
 from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.contact.pair import Bearing
 from tkamb.geometry.frames import Array, Index, Mask
@@ -117,7 +117,8 @@ def prepare_operator(
         index: (n, 3) lattice index of each node.
         held: (3n,) unknowns that are zero.
         contact_nodes: (c,).
-        precision: in which the numbers are kept; they are worked out in float64.
+        precision: in which the numbers are kept, and the response is worked out; the factor is
+            worked out in float64.
         coarse: keep the factor, not the response, in 16-bit integers: half the memory of single
             precision, and half to read in every solve.
 
@@ -141,15 +142,17 @@ def prepare_operator(
     for own in tree.own:
         wanted = (3 * some[own][:, None] + np.arange(3)).ravel()
         unknowns.append(number[wanted[free[wanted]]])
-    factor = factorise(stiffness[free][:, free], tree, unknowns, precision)
+    order = np.concatenate(unknowns)
     rank = np.full(len(free), -1)
-    rank[np.flatnonzero(free)[factor.order]] = np.arange(len(factor.order))
+    rank[np.flatnonzero(free)[order]] = np.arange(len(order))
     wanted = rank[(3 * contact_nodes[:, None] + np.arange(3)).ravel()]
-    half = half_response(factor, wanted, precision)
-    if coarse:
-        for member, front in enumerate(factor.fronts):  # one at a time: both do not fit
-            factor.fronts[member] = front.coarsened()
-    return ElasticOperator(free, factor, contact_nodes, half)
+    starts = np.cumsum([0, *map(len, unknowns)])
+    half, fronts = HalfSolves(starts, tree.parent, wanted, precision), []
+    made = fronts_of(stiffness[free][:, free], tree, unknowns, precision)
+    for member, front in enumerate(made):
+        half.add(member, front)
+        fronts.append(front.coarsened() if coarse else front)
+    return ElasticOperator(free, CholeskyFactor(order, fronts), contact_nodes, half.response())
 
 
 def operator_error(operator: ElasticOperator, solid: Solid) -> float:

@@ -7,12 +7,14 @@ follow each other, so Z is kept as one dense block per member of the tree.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tkamb.contact.lattice.compiled import compiled
-from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor
+from tkamb.contact.lattice.linear.multifrontal import Front
 from tkamb.geometry.frames import Array, Index
 
 Precision = type[np.floating[Any]]
@@ -37,7 +39,7 @@ class Block:
     stop: int
     first: int
     last: int
-    values: Array
+    values: NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,68 +142,77 @@ def unknowns_of(nodes: Index) -> Index:
     return (3 * nodes[:, None] + np.arange(3)).ravel()
 
 
-def half_response(
-    factor: CholeskyFactor, unknowns: Index, precision: Precision = np.float64
-) -> HalfResponse:
-    """Return L⁻¹ of unit forces on unknowns given in elimination order (q,), -1 = held.
+class HalfSolves:
+    """L⁻¹ of unit forces on some unknowns, worked out front by front as the factor is.
 
-    Work and memory go along the paths to the root only. It is worked out in float64 and kept
-    in `precision`.
+    Work and memory go along the paths to the root only. It is worked out in `precision`: in
+    single precision compliances are right to 1e-6 of the largest.
+
+    Args:
+        starts: (f + 1,) first unknown of each front in elimination order, and how many there are.
+        parents: front above each, -1 at a root.
+        unknowns: (q,) in elimination order, -1 = held.
+        precision: of what is worked out and kept.
     """
-    live = np.flatnonzero(unknowns >= 0)
-    order = live[np.argsort(unknowns[live])]
-    rows = unknowns[order]
-    rank = np.full(len(unknowns), -1)
-    rank[order] = np.arange(len(order))
-    spans = _column_spans(factor, rows)
-    values = {
-        member: np.zeros((front.stop - front.start, span[1] - span[0]), order="F")
-        for member, (front, span) in enumerate(zip(factor.fronts, spans, strict=True))
-        if span[1] > span[0]
-    }
-    blocks = []
-    for member, right in values.items():
-        front, (first, last) = factor.fronts[member], spans[member]
-        a, b = np.searchsorted(rows, [front.start, front.stop])
-        right[rows[a:b] - front.start, np.arange(a, b) - first] += 1.0
+
+    def __init__(
+        self, starts: Index, parents: list[int], unknowns: Index, precision: Precision
+    ) -> None:
+        live = np.flatnonzero(unknowns >= 0)
+        order = live[np.argsort(unknowns[live])]
+        self._rows, self._rank = unknowns[order], np.full(len(unknowns), -1)
+        self._rank[order] = np.arange(len(order))
+        self._starts, self._parents, self._precision = starts, parents, precision
+        self._spans = self._column_spans()
+        self._waiting: dict[int, NDArray[Any]] = {}
+        self._blocks: list[Block] = []
+
+    def add(self, member: int, front: Front) -> None:
+        """Take the next front, before its numbers are made coarser."""
+        first, last = self._spans[member]
+        if last == first:
+            return
+        right = self._of(member)
+        del self._waiting[member]
+        a, b = np.searchsorted(self._rows, [front.start, front.stop])
+        right[self._rows[a:b] - front.start, np.arange(a, b) - first] += 1.0
         product = front.block @ right
-        _pass_up(factor, values, spans, member, product[front.stop - front.start :])
-        done: Array = np.ascontiguousarray(product[: front.stop - front.start], dtype=precision)
-        blocks.append(Block(front.start, front.stop, first, last, done))
-        values[member] = done
-    return HalfResponse(rank, blocks)
+        self._pass_up(member, front.boundary, product[front.stop - front.start :])
+        done = product[: front.stop - front.start].copy()
+        self._blocks.append(Block(front.start, front.stop, first, last, done))
 
+    def response(self) -> HalfResponse:
+        """Return what all fronts have made."""
+        return HalfResponse(self._rank, self._blocks)
 
-def _column_spans(factor: CholeskyFactor, rows: Index) -> list[tuple[int, int]]:
-    """Return for each member the columns [first, last) whose path to the root meets it."""
-    spans = [
-        (int(np.searchsorted(rows, f.start)), int(np.searchsorted(rows, f.stop)))
-        for f in factor.fronts
-    ]
-    for member, front in enumerate(factor.fronts):
-        first, last = spans[member]
-        if front.parent >= 0 and last > first:
-            begin, end = spans[front.parent]
-            empty = end == begin
-            spans[front.parent] = (first if empty else min(begin, first), max(last, end))
-    return spans
+    def _of(self, member: int) -> NDArray[Any]:
+        """Return a front's right-hand side so far (own unknowns, its columns)."""
+        if member not in self._waiting:
+            first, last = self._spans[member]
+            shape = (self._starts[member + 1] - self._starts[member], last - first)
+            self._waiting[member] = np.zeros(shape, self._precision)
+        return self._waiting[member]
 
+    def _column_spans(self) -> list[tuple[int, int]]:
+        """Return for each front the columns [first, last) whose path to the root meets it."""
+        edges = np.searchsorted(self._rows, self._starts).tolist()
+        spans = list(pairwise(edges))
+        for member, parent in enumerate(self._parents):
+            first, last = spans[member]
+            if parent >= 0 and last > first:
+                begin, end = spans[parent]
+                empty = end == begin
+                spans[parent] = (first if empty else min(begin, first), max(last, end))
+        return spans
 
-def _pass_up(
-    factor: CholeskyFactor,
-    values: dict[int, Array],
-    spans: list[tuple[int, int]],
-    member: int,
-    passed: Array,
-) -> None:
-    """Take a member's products (m, columns) from the right-hand sides of those above it."""
-    boundary, above, at = factor.fronts[member].boundary, factor.fronts[member].parent, 0
-    first, last = spans[member]
-    while at < len(boundary):
-        upper = factor.fronts[above]
-        end = int(np.searchsorted(boundary, upper.stop))
-        if end > at:
-            start = spans[above][0]
-            local = boundary[at:end] - upper.start
-            values[above][local, first - start : last - start] -= passed[at:end]
-        above, at = upper.parent, end
+    def _pass_up(self, member: int, boundary: Index, passed: NDArray[Any]) -> None:
+        """Take a front's products (m, columns) from the right-hand sides of those above it."""
+        above, at = self._parents[member], 0
+        first, last = self._spans[member]
+        while at < len(boundary):
+            end = int(np.searchsorted(boundary, self._starts[above + 1]))
+            if end > at:
+                start = self._spans[above][0]
+                local = boundary[at:end] - self._starts[above]
+                self._of(above)[local, first - start : last - start] -= passed[at:end]
+            above, at = self._parents[above], end

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.contact.lattice.compiled import compiled
 from tkamb.geometry.frames import Array, Index
 
 CORNERS = np.array(
@@ -176,24 +177,36 @@ def gauss_gradients(corners: Array) -> tuple[Array, Array]:
     return gradients, weights
 
 
+@compiled
 def mean_gradient(corners: Array) -> tuple[Array, Array]:
     """Return the volume-averaged gradients (s, 8, 3), 1/m, and the volume (s,), m³.
 
     They reproduce a linear field exactly: sum_i x_i g_i = identity
-    (Flanagan & Belytschko, Int J Numer Meth Eng 17:679, 1981).
+    (Flanagan & Belytschko, Int J Numer Meth Eng 17:679, 1981). At a Gauss point with the
+    Jacobian J the gradients times the weight are the cofactors of J by the reference gradients,
+    so that an inverted cell needs no inverse.
     """
-    gradients, weights = gauss_gradients(corners)
-    volume = weights.sum(axis=1)
-    return np.einsum("sg,sgnx->snx", weights, gradients) / volume[:, None, None], volume
-
-
-def group_shapes(corners: Array, tolerance: float = 1e-9) -> tuple[Array, Index]:
-    """Return the distinct cell shapes (s, 8, 3) and each cell's shape (c,).
-
-    Cells of a regular lattice repeat: what depends on shape alone is worked out once. Two
-    shapes are the same when their corners differ by less than about `tolerance` (m).
-    """
-    relative = corners - corners[:, :1]
-    keys = np.round(relative.reshape(len(corners), 24) / tolerance).astype(np.int64)
-    _, first, shape = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    return relative[first], shape.reshape(-1).astype(np.int64)
+    gradients, volume = np.zeros((len(corners), 8, 3)), np.zeros(len(corners))
+    j, cofactor = np.empty((3, 3)), np.empty((3, 3))
+    for cell in range(len(corners)):
+        for point in range(8):
+            j[:] = 0.0
+            for node in range(8):
+                for d in range(3):
+                    for x in range(3):
+                        j[d, x] += REFERENCE_GRADIENTS[point, node, d] * corners[cell, node, x]
+            for d in range(3):
+                e, f = (d + 1) % 3, (d + 2) % 3
+                for x in range(3):
+                    y, z = (x + 1) % 3, (x + 2) % 3
+                    cofactor[d, x] = (j[e, y] * j[f, z] - j[e, z] * j[f, y]) / 8
+            for x in range(3):
+                volume[cell] += j[0, x] * cofactor[0, x]
+            for node in range(8):
+                for d in range(3):
+                    for x in range(3):
+                        gradients[cell, node, x] += (
+                            cofactor[d, x] * REFERENCE_GRADIENTS[point, node, d]
+                        )
+        gradients[cell] /= volume[cell]
+    return gradients, volume

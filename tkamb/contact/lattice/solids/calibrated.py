@@ -14,19 +14,25 @@ docs/lattice.md). Taking the bulk part (5/3) V g gᵀ away leaves the deviatoric
     K_d = V B̄ᵀ (2 I_dev) B̄ + Pᵀ K_spr P
 
 with B̄ the strain of the cell's mean gradient and P what the mean gradient does not explain.
-On a box this is K_spr - (5/3) V g gᵀ; on a sheared cell it keeps the patch exact.
+On a box this is K_spr - (5/3) V g gᵀ; on a sheared cell it keeps the patch exact
+(`cell_loops.py` works it out).
 """
 
+from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.compiled import compiled
-from tkamb.contact.lattice.meshing.cells import CORNERS, PAIR_AXES, PAIRS, mean_gradient
-from tkamb.contact.lattice.solids.curve import LEAST_STRAIN, ShearCurve
-from tkamb.contact.lattice.solids.solid import DEVIATORIC, CellSolid, strain_matrix
+from tkamb.contact.lattice.meshing.cells import CORNERS, PAIR_AXES, PAIRS
+from tkamb.contact.lattice.solids.cell_loops import (
+    deviatoric_matrices,
+    shear_forces,
+    softened_forces,
+)
+from tkamb.contact.lattice.solids.curve import ShearCurve
+from tkamb.contact.lattice.solids.solid import Solid, chunks
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array, Index
 
@@ -101,34 +107,7 @@ def body_diagonal_stiffness(edges: Array) -> float:
     return float(candidates[np.linalg.eigvalsh(matrices)[:, 6].argmax()])
 
 
-def unexplained(corners: Array, gradients: Array) -> Array:
-    """Return P (s, 24, 24): displacements minus the linear field of the cell's mean gradient."""
-    linear = np.einsum("sia,sja->sij", corners, gradients)
-    projection = np.eye(8) - linear
-    return np.einsum("sij,ab->siajb", projection, np.eye(3)).reshape(-1, 24, 24)
-
-
-def deviatoric_matrices(corners: Array, edges: Array) -> tuple[Array, Array, Array]:
-    """Return K_d, g and V of cells with the springs of the nominal box.
-
-    Args:
-        corners: (s, 8, 3) m, true shapes.
-        edges: (3,) m, edges of the lattice's box cell: they set the spring stiffnesses.
-
-    Returns:
-        K_d (s, 24, 24) in m per unit shear modulus, mean-dilatation vector g (s, 24) in 1/m
-        and volume V (s,) in m³. A cell is mu K_d + K V g gᵀ with the bulk modulus K.
-    """
-    stiffness = spring_families(edges, body_diagonal_stiffness(edges))
-    gradients, volume = mean_gradient(corners)
-    strain = strain_matrix(gradients)
-    mean = np.einsum("s,sri,rq,sqj->sij", volume, strain, DEVIATORIC, strain, optimize=True)
-    rest = unexplained(corners, gradients)
-    springs = np.swapaxes(rest, 1, 2) @ spring_matrix(corners, stiffness) @ rest
-    return mean + springs, gradients.reshape(-1, 24), volume
-
-
-class CalibratedNetwork(CellSolid):
+class CalibratedNetwork(Solid):
     """Cells mu_s K_d + K V g gᵀ, with mu_s from the cell's equivalent strain.
 
     e² = uᵀ K_d u / (3 V), 3 mu_s = q(e)/e: the forces derive from an energy, so the tangent
@@ -137,12 +116,26 @@ class CalibratedNetwork(CellSolid):
 
     def __init__(self, nodes: Array, cells: Index, spacing: Array, material: Material) -> None:
         super().__init__(nodes, cells, spacing, material)
-        self.deviatoric, self.dilatation, self.volume = deviatoric_matrices(self.shapes, spacing)
+        self.springs = spring_families(spacing, body_diagonal_stiffness(spacing))
         self.curve = ShearCurve.of(material)
 
-    def shape_stiffness(self) -> Array:
-        """Return mu K_d + K V g gᵀ of each shape (s, 24, 24), N/m."""
-        return self.material.shear_modulus * self.deviatoric + self.bulk
+    def _deviatoric(self, cells: slice) -> Array:
+        """Return K_d of some cells (k, 24, 24), m per unit shear modulus."""
+        measures = self.gradients[cells], self.volume[cells]
+        return deviatoric_matrices(self.corners(cells), *measures, self.springs)
+
+    @property
+    def stiffness(self) -> sparse.csr_matrix:
+        """Linear stiffness (3n, 3n), N/m: mu K_d + K V g gᵀ of the cells."""
+        mu = self.material.shear_modulus
+        some = chunks(len(self.cells))
+        return self.pattern.assemble(mu * self._deviatoric(c) + self.bulk(c) for c in some)
+
+    def linear_force(self, displacement: Array) -> Array:
+        """Return K u, N, (n, 3); see `Solid`."""
+        force, _ = self._state(displacement)
+        force *= self.material.shear_modulus
+        return self.scatter.sum(force + self.bulk_force(displacement))
 
     def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return (mu - mu_s) K_d u of the cells, N, (k, 24); see `Solid`."""
@@ -150,116 +143,40 @@ class CalibratedNetwork(CellSolid):
         if self.curve.spline is None:
             return np.zeros((len(cells), 24))
         curve = (self.curve.shear_modulus, self.curve.spline.x, self.curve.spline.c)
-        return _softened_forces(
-            self._diagonals, self._volumes, *curve, self.cells, cells, displacement
+        return softened_forces(
+            self._diagonals, self.volume, *curve, self.cells, cells, displacement
         )
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n): mu_s K_d + mu_s'/(3 V e) (K_d u)(K_d u)ᵀ + bulk."""
         force, equivalent = self._state(displacement)
-        shape = self.shape_of_cell
         secant, softening = self.curve.modulus(equivalent), self.curve.softening(equivalent)
-        scale = softening / (3 * self.volume[shape])
-        matrices = secant[:, None, None] * self.deviatoric[shape] + self.bulk[shape]
-        matrices += scale[:, None, None] * force[:, :, None] * force[:, None, :]
-        return self.pattern.assemble(matrices)
+        scale = softening / (3 * self.volume)
+
+        def matrices() -> Iterator[Array]:
+            for some in chunks(len(self.cells)):
+                result = secant[some, None, None] * self._deviatoric(some) + self.bulk(some)
+                outer = force[some, :, None] * force[some, None, :]
+                yield result + scale[some, None, None] * outer
+
+        return self.pattern.assemble(matrices())
 
     @cached_property
     def _diagonals(self) -> NDArray[np.float32]:
         """K_d of each cell by diagonals (c, 13, 24): entry i of the k-th is K_d[i, i + k mod 24].
 
         The matrix is symmetric, so that thirteen wrapped diagonals say all. The first and the
-        last one are halved: `_shear_forces` takes each twice.
+        last one are halved: `shear_forces` takes each twice.
         """
         row = np.arange(24)
         column = (row + np.arange(13)[:, None]) % 24
-        packed = self.deviatoric[:, row, column].astype(np.float32)
-        packed[:, [0, 12]] /= 2
-        return packed[self.shape_of_cell]
-
-    @cached_property
-    def _volumes(self) -> Array:
-        """V of each cell (c,), m³."""
-        return self.volume[self.shape_of_cell]
+        diagonals = np.empty((len(self.cells), 13, 24), np.float32)
+        for some in chunks(len(self.cells)):
+            diagonals[some] = self._deviatoric(some)[:, row, column]
+        diagonals[:, [0, 12]] /= 2
+        return diagonals
 
     def _state(self, displacement: Array, chosen: Index | None = None) -> tuple[Array, Array]:
         """Return K_d u (k, 24) and the equivalent strain e (k,) of the chosen cells."""
         cells = np.arange(len(self.cells)) if chosen is None else chosen
-        return _shear_forces(self._diagonals, self._volumes, self.cells, cells, displacement)
-
-
-@compiled
-def _shear_force(
-    diagonals: NDArray[np.float32],
-    nodes: Index,
-    displacement: Array,
-    u: Array,
-    force: Array,
-) -> float:
-    """Put K_d u of a cell into force (36,), of which 24 count; return uᵀ K_d u; u (36,) is scratch.
-
-    u is taken from the cell's first node: K_d knows nothing of the way all nodes go together,
-    and without it single precision of K_d does. Each diagonal meets u twice, above and below the
-    main one, in stretches that fill vector registers.
-    """
-    for corner in range(8):
-        for axis in range(3):
-            u[3 * corner + axis] = displacement[nodes[corner], axis] - displacement[nodes[0], axis]
-    u[24:] = u[:12]
-    force[:] = 0.0
-    for shift in range(13):
-        for i in range(24):
-            force[i] += diagonals[shift, i] * u[i + shift]
-        for i in range(24):
-            force[i + shift] += diagonals[shift, i] * u[i]
-    force[:12] += force[24:]
-    energy = 0.0
-    for i in range(24):
-        energy += force[i] * u[i]
-    return max(energy, 0.0)
-
-
-@compiled
-def _shear_forces(
-    diagonals: NDArray[np.float32],
-    volumes: Array,
-    nodes: Index,
-    chosen: Index,
-    displacement: Array,
-) -> tuple[Array, Array]:
-    """Return K_d u (k, 24) and the equivalent strain (k,) of chosen cells."""
-    forces, strains = np.empty((len(chosen), 24)), np.empty(len(chosen))
-    u, force = np.empty(36), np.empty(36)
-    for k in range(len(chosen)):
-        cell = chosen[k]
-        energy = _shear_force(diagonals[cell], nodes[cell], displacement, u, force)
-        strains[k] = np.sqrt(energy / (3 * volumes[cell]))
-        forces[k] = force[:24]
-    return forces, strains
-
-
-@compiled
-def _softened_forces(
-    diagonals: NDArray[np.float32],
-    volumes: Array,
-    shear_modulus: float,
-    knots: Array,
-    cubic: Array,
-    nodes: Index,
-    chosen: Index,
-    displacement: Array,
-) -> Array:
-    """Return (mu - mu_s) K_d u (k, 24) of chosen cells; 3 mu_s e is cubic between knots of e."""
-    forces = np.empty((len(chosen), 24))
-    u, force = np.empty(36), np.empty(36)
-    for k in range(len(chosen)):
-        cell = chosen[k]
-        energy = _shear_force(diagonals[cell], nodes[cell], displacement, u, force)
-        strain = min(max(np.sqrt(energy / (3 * volumes[cell])), LEAST_STRAIN), knots[-1])
-        part = min(np.searchsorted(knots, strain, side="right") - 1, len(knots) - 2)
-        x = strain - knots[part]
-        stress = ((cubic[0, part] * x + cubic[1, part]) * x + cubic[2, part]) * x + cubic[3, part]
-        softened = shear_modulus - stress / (3 * strain)
-        for i in range(24):
-            forces[k, i] = softened * force[i]
-    return forces
+        return shear_forces(self._diagonals, self.volume, self.cells, cells, displacement)

@@ -1,18 +1,23 @@
 """A solid made of cells: linear stiffness, what nonlinearity takes away, tangent."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
+from numpy.typing import NDArray
 
 from tkamb.contact.lattice.compiled import compiled
-from tkamb.contact.lattice.meshing.cells import group_shapes, mean_gradient
+from tkamb.contact.lattice.meshing.cells import mean_gradient
 from tkamb.contact.materials import Material
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index
 
+CHUNK = 2000
+"""Cells whose matrices are at hand at once: 9 MB."""
 DEVIATORIC = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 DEVIATORIC[:3, :3] -= 2 / 3
 """2 dev eps : dev eps as a form (6, 6) in [xx, yy, zz, 2xy, 2yz, 2zx]."""
@@ -47,24 +52,31 @@ class Pattern:
         """How many nodes."""
         return len(self.indptr) - 1
 
-    def assemble(self, matrices: Array, shape: Index | None = None) -> sparse.csr_matrix:
+    def assemble(self, matrices: Iterable[Array]) -> sparse.csr_matrix:
         """Return the sum (3n, 3n) of the elements' matrices.
 
         Args:
-            matrices: (c, 3p, 3p), or (s, 3p, 3p) with `shape`.
-            shape: (c,) which matrix each element takes.
+            matrices: some elements' (k, 3p, 3p) after the other's, in their order.
         """
-        count = matrices.shape[1] // 3
-        blocks = matrices.reshape(-1, count, 3, count, 3).transpose(2, 4, 0, 1, 3)
-        blocks = blocks.reshape(9, -1, count**2)
-        data = np.empty((len(self.indices), 9))
-        flat = self.slot.ravel()
-        for entry in range(9):
-            values = blocks[entry] if shape is None else blocks[entry][shape]
-            data[:, entry] = np.bincount(flat, values.ravel(), len(self.indices))
-        return sparse.bsr_matrix(
-            (data.reshape(-1, 3, 3), self.indices, self.indptr), (3 * self.nodes, 3 * self.nodes)
-        ).tocsr()
+        blocks, at = np.zeros((len(self.indices), 3, 3)), 0
+        for some in matrices:
+            _add_blocks(some, self.slot[at : at + len(some)], blocks)
+            at += len(some)
+        size = 3 * self.nodes
+        return sparse.bsr_matrix((blocks, self.indices, self.indptr), (size, size)).tocsr()
+
+
+@compiled
+def _add_blocks(matrices: Array, slot: Index, blocks: Array) -> None:
+    """Add the (3, 3) blocks of matrices (k, 3p, 3p) to the slots (k, p²) that they have."""
+    count = matrices.shape[1] // 3
+    for k in range(len(matrices)):
+        for i in range(count):
+            for j in range(count):
+                block = blocks[slot[k, count * i + j]]
+                for a in range(3):
+                    for b in range(3):
+                        block[a, b] += matrices[k, 3 * i + a, 3 * j + b]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +103,7 @@ class Scatter:
         return total
 
 
-def elements_of(elements: Index, chosen: Index | None) -> Index:
+def elements_of(elements: NDArray[Any], chosen: Index | None) -> NDArray[Any]:
     """Return some rows, by default all."""
     return elements if chosen is None else elements[chosen]
 
@@ -131,21 +143,29 @@ class Solid(ABC):
         spacing: (3,) m, edges of the lattice's box cell.
         material: its E, nu and stress-strain law.
 
+    Attributes:
+        gradients: (c, 8, 3) mean gradients of the cells' shape functions, 1/m.
+        volume: (c,) m³.
+
     Raises:
         InputError: a cell is turned inside out.
     """
 
     def __init__(self, nodes: Array, cells: Index, spacing: Array, material: Material) -> None:
         self.nodes, self.cells, self.spacing, self.material = nodes, cells, spacing, material
-        self.shapes, self.shape_of_cell = group_shapes(nodes[cells])
-        _, volume = mean_gradient(self.shapes)
-        if not (volume > 0).all():
+        self.gradients, self.volume = mean_gradient(self.corners())
+        if not (self.volume > 0).all():
             raise InputError(
-                f"{int((volume <= 0)[self.shape_of_cell].sum())} cells are turned inside out",
+                f"{int((self.volume <= 0).sum())} cells are turned inside out",
                 "lattice",
                 "take a finer resolution",
             )
         self.scatter = Scatter(cells, len(nodes))
+
+    def corners(self, cells: slice = slice(None)) -> Array:
+        """Return the corners (k, 8, 3), m, of cells, from their first."""
+        corners = self.nodes[self.cells[cells]]
+        return np.ascontiguousarray(corners - corners[:, :1])
 
     @cached_property
     def pattern(self) -> Pattern:
@@ -155,7 +175,7 @@ class Solid(ABC):
     @property
     @abstractmethod
     def stiffness(self) -> sparse.csr_matrix:
-        """Linear stiffness (3n, 3n), N/m."""
+        """Linear stiffness (3n, 3n), N/m; assembled anew, it is as large as half of the factor."""
 
     @abstractmethod
     def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
@@ -196,63 +216,27 @@ class Solid(ABC):
         first = float(np.linalg.eigvalsh(strain[norm.argmax()])[0])
         return float(np.linalg.eigvalsh(strain[norm >= -first])[:, 0].min())
 
+    def bulk(self, cells: slice) -> Array:
+        """Return K V g gᵀ of some cells (k, 24, 24), N/m, g · u their mean dilatation."""
+        g = self.gradients[cells].reshape(-1, 24)
+        scale = self.material.bulk_modulus * self.volume[cells]
+        return (scale[:, None] * g)[:, :, None] * g[:, None, :]
+
+    def bulk_force(self, displacement: Array) -> Array:
+        """Return K V g (g · u) of all cells (c, 24), N."""
+        g = self.gradients.reshape(-1, 24)
+        dilatation = np.einsum("ci,ci->c", g, displacement[self.cells].reshape(-1, 24))
+        return (self.material.bulk_modulus * self.volume * dilatation)[:, None] * g
+
     def strain(self, displacement: Array) -> Array:
         """Return each cell's mean strain (c, 3, 3)."""
-        return _mean_strains(self.cells, self._mean_gradients, displacement)
-
-    @cached_property
-    def _mean_gradients(self) -> Array:
-        """Mean gradients (c, 8, 3) of the cells' shape functions, 1/m."""
-        return mean_gradient(self.shapes)[0][self.shape_of_cell]
-
-    @cached_property
-    def kinds(self) -> tuple[int, Index]:
-        """The commonest shape, and the cells (k,) of all others."""
-        common = int(np.bincount(self.shape_of_cell).argmax())
-        return common, np.flatnonzero(self.shape_of_cell != common)
+        return _mean_strains(self.cells, self.gradients, displacement)
 
 
-class CellSolid(Solid):
-    """A solid whose cells are a shear part and an elastic bulk K V g gᵀ, shape by shape.
-
-    Attributes:
-        dilatation: (s, 24) g, 1/m: the mean dilatation of a cell is g · u.
-        volume: (s,) V, m³.
-    """
-
-    dilatation: Array
-    volume: Array
-
-    @abstractmethod
-    def shape_stiffness(self) -> Array:
-        """Return the linear stiffness of each shape (s, 24, 24), N/m."""
-
-    @cached_property
-    def stiffness(self) -> sparse.csr_matrix:
-        """Linear stiffness (3n, 3n), N/m."""
-        return self.pattern.assemble(self.shape_stiffness(), self.shape_of_cell)
-
-    def linear_force(self, displacement: Array) -> Array:
-        """Return K u, N, (n, 3); see `Solid`."""
-        matrices, local = self.shape_stiffness(), self.scatter.gather(displacement)
-        common, others = self.kinds
-        force = local @ matrices[common]
-        force[others] = np.einsum("cij,cj->ci", matrices[self.shape_of_cell[others]], local[others])
-        return self.scatter.sum(force)
-
-    @cached_property
-    def bulk(self) -> Array:
-        """K V g gᵀ of each shape (s, 24, 24), N/m."""
-        g, scale = self.dilatation, self.material.bulk_modulus * self.volume
-        return scale[:, None, None] * g[:, :, None] * g[:, None, :]
-
-    @cached_property
-    def index_among_others(self) -> Index:
-        """Index (c,) of each cell among those that are not of the commonest shape, or -1."""
-        others = self.kinds[1]
-        index = np.full(len(self.cells), -1)
-        index[others] = np.arange(len(others))
-        return index
+def chunks(count: int) -> Iterator[slice]:
+    """Yield stretches of so many cells."""
+    for first in range(0, count, CHUNK):
+        yield slice(first, min(first + CHUNK, count))
 
 
 def strain_matrix(gradients: Array) -> Array:

@@ -63,7 +63,7 @@ class SourceNetwork(Solid):
         self.lines = nodes[springs[:, 1]] - nodes[springs[:, 0]]
         self.lengths = np.linalg.norm(self.lines, axis=1)
 
-    @cached_property
+    @property
     def stiffness(self) -> sparse.csr_matrix:
         """Linear stiffness (3n, 3n), N/m."""
         k = np.full(len(self.springs), self.material.young_modulus * self.factor)
@@ -106,7 +106,7 @@ class SourceNetwork(Solid):
     def _assembled(self, stiffness: Array, direction: Array) -> sparse.csr_matrix:
         block = stiffness[:, None, None] * direction[:, :, None] * direction[:, None, :]
         matrices = np.block([[block, -block], [-block, block]])
-        return self._spring_pattern.assemble(matrices)
+        return self._spring_pattern.assemble([matrices])
 
     def _state(
         self, displacement: Array, springs: Index | slice = slice(None)
