@@ -9,6 +9,7 @@ import pytest
 from joints import HALF, flat_joint
 from scenes import write_scene
 from tkamb import simulate
+from tkamb.contact.probe import Probe
 from tkamb.contact.registry import contact_model
 from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.equilibrium.mechanics import Mechanics
@@ -43,7 +44,7 @@ def test_the_tangent_and_a_turned_press_tell_the_same_of_the_shipped_knee(tmp_pa
     side = ContactSide(case, Mechanics(case))
     for k in (10, 60, 95):
         _, contact = side.frame(k)
-        turned = split_sensitivity(side.model, side.state, contact.result)
+        turned = split_sensitivity(Probe(side.model, side.state), contact.result)
         assert contact.sensitivity == pytest.approx(turned, rel=0.03)
         assert contact.sensitivity != turned
 
@@ -60,7 +61,7 @@ def test_two_spheres_share_by_their_stiffness(name):
     state = model.prepare(pair)
     result = model.press(state, load, knee_pose(np.zeros(6)))
     expected = power * (load / 2) / result.approach * HALF
-    assert split_sensitivity(model, state, result) == pytest.approx(expected, rel=0.1)
+    assert split_sensitivity(Probe(model, state), result) == pytest.approx(expected, rel=0.1)
 
 
 def test_the_tangent_of_a_layer_under_two_spheres():

@@ -52,6 +52,15 @@ class Evaluates(Protocol):
         """Return the contact at a pose."""
 
 
+class Presses(Evaluates, Protocol):
+    """A contact model that finds the approach of a load, too."""
+
+    def press(
+        self, state: Any, load: float, pose: Array, guess: ContactResult | None = None
+    ) -> ContactResult:
+        """Return the contact under a load (N)."""
+
+
 @dataclass(frozen=True)
 class LoadSearch:
     """What the search for a load found.

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from tkamb.contact.pressing import Evaluates
+from tkamb.contact.pressing import Presses
 from tkamb.contact.result import ContactResult, ContactStatus, medial_points, wrench_of
 from tkamb.geometry.frames import Array
 
@@ -97,16 +97,24 @@ class Probe:
 
     exact: ClassVar[bool] = False
 
-    def __init__(self, model: Evaluates, state: Any, guess: ContactResult | None = None) -> None:
+    def __init__(self, model: Presses, state: Any, guess: ContactResult | None = None) -> None:
         self._model, self._state, self._guess = model, state, guess
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4)."""
-        result = self._model.evaluate(self._state, pose, self._guess)
+        result = self.evaluated(pose)
         if result.status is not ContactStatus.OK:
             return ProbedContact({}, known=False)
         self._guess = result
         return self.seen(result)
+
+    def evaluated(self, pose: Array) -> ContactResult:
+        """Return the contact at a pose (4, 4), of which only the forces need be right."""
+        return self._model.evaluate(self._state, pose, self._guess)
+
+    def pressed(self, load: float, pose: Array, guess: ContactResult) -> ContactResult:
+        """Return the contact under a load (N), of which only the forces need be right."""
+        return self._model.press(self._state, load, pose, guess)
 
     def seen(self, result: ContactResult) -> ProbedContact:
         """Return what a result says of the condyles."""

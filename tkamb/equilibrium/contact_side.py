@@ -117,7 +117,7 @@ class ContactSide:
         if self._probe.exact:
             sensitivity = split_tangent(self._probe, contact.result)
         else:
-            sensitivity = split_sensitivity(self.model, self.state, contact.result)
+            sensitivity = split_sensitivity(self._probe, contact.result)
         seconds = contact.seconds + clock.perf_counter() - start
         return body, replace(contact, sensitivity=sensitivity, seconds=seconds)
 

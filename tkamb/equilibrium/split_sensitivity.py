@@ -1,10 +1,9 @@
 """How the split between the condyles answers to the adduction, at a constant load."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.contact.model import ContactModel
 from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_axes, knee_coordinates, knee_pose
 from tkamb.units import DEGREE
@@ -19,21 +18,20 @@ what the lattice's tolerance leaves open; steps of 0.005 to 0.1 deg agree within
 ADDUCTION, SUPERIOR = (KNEE_COORDINATES.index(name) for name in ("adduction", "si"))
 
 
-def split_sensitivity(model: ContactModel, state: Any, result: ContactResult) -> float:
+def split_sensitivity(probe: "Probe", result: ContactResult) -> float:
     """Return the change of the medial force with the adduction at a constant load, N/rad.
 
     Zero where one condyle carries everything: it then holds only until the other touches. NaN
     where the turned press does not succeed.
 
     Args:
-        model: the contact model.
-        state: what its `prepare` returned.
+        probe: of the contact model.
         result: a contact; the load is what it carries along -y.
     """
     load = -float(result.wrench_on_insert[1])
     place = knee_coordinates(result.pose)
     place[ADDUCTION] += ADDUCTION_STEP
-    turned = model.press(state, load, knee_pose(place), result)
+    turned = probe.pressed(load, knee_pose(place), result)
     if turned.status is not ContactStatus.OK:
         return float("nan")
     return (_medial(turned) - _medial(result)) / ADDUCTION_STEP

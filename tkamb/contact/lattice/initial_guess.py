@@ -10,6 +10,12 @@ from tkamb.geometry.frames import Array, Index, Mask
 
 MARGIN = 0.25
 """Nodes count as candidates this share of the depth beyond first touch."""
+UNSEEN_WAY = 0.1
+"""Of a cell: so far the contact may go without a look at all elements; measured, not proven: what
+then comes to count outside of the region stays below a tenth of the tolerance (see
+`tests/test_lattice_sketch.py`)."""
+UNSEEN_GROWTH = 1.1
+"""And so much may its forces grow."""
 ARM = 0.03
 """m, from the femoral axis to the contact."""
 STRAIGHT = 0.5
@@ -32,6 +38,7 @@ class WarmStart:
         depth: m, how far the femoral component went below the lowest contact node.
         region: outside of which h is zero, or None.
         pose: (4, 4) pose_femoral_in_insert where it was.
+        looked: the contact forces' norm, N, and the pose when all elements were last looked at.
         before: where the solution ended that this one began from, or None.
     """
 
@@ -41,7 +48,14 @@ class WarmStart:
     depth: float
     region: Region | None
     pose: Array
+    looked: tuple[float, Array]
     before: "WarmStart | None" = None
+
+    def near(self, pose: Array) -> bool:
+        """Return whether a pose is so close to where all elements were looked at that none of
+        those left out can have come to count while the forces have not grown."""
+        reach = UNSEEN_WAY * float(self.problem.solid.spacing.min())
+        return bool(np.linalg.norm(_way(self.looked[1], pose)) <= reach)
 
     def foreseen(self, pose: Array) -> "WarmStart":
         """Return what is to be expected at a pose: this, or this and its last change once more.
@@ -87,6 +101,8 @@ class InitialGuess:
         region: outside of which h is zero, or None.
         offset: (m, 3) m, displacement of the candidates of a linear material that no contact
             force made, or None.
+        unseen: N, contact forces up to which the elements outside of the region need not be
+            looked at; 0: they are looked at.
     """
 
     candidates: Index
@@ -98,11 +114,12 @@ class InitialGuess:
     reach: float = np.inf
     region: Region | None = None
     offset: Array | None = None
+    unseen: float = 0.0
 
     @property
     def cold(self) -> "InitialGuess":
         """The same without what an earlier solution left."""
-        return replace(self, nonlinear_residual=None, moved=None, region=None)
+        return replace(self, nonlinear_residual=None, moved=None, region=None, unseen=0.0)
 
 
 def initial_guess(
@@ -113,6 +130,7 @@ def initial_guess(
     at_pose: bool,
     touched: Mask | None,
     warm: WarmStart | None,
+    unseen: float = 0.0,
 ) -> InitialGuess:
     """Return candidates, their response and a first active set.
 
@@ -124,6 +142,7 @@ def initial_guess(
         at_pose: the femoral component stays at the pose: candidates overlap it already.
         touched: (c,) nodes in contact in a neighbouring solution, or None.
         warm: where a neighbouring solution ended, or None.
+        unseen: N, see `InitialGuess`; without `warm` all elements are looked at.
     """
     lowest = float(gaps.min())
     reach = lowest + (1 + MARGIN) * depth
@@ -144,6 +163,7 @@ def initial_guess(
         nonlinear_residual=warm.nonlinear_residual,
         moved=warm.moved[nodes],
         region=warm.region,
+        unseen=unseen,
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from tkamb.contact.lattice.flags import unseen_flags
 from tkamb.contact.lattice.initial_guess import (
+    UNSEEN_GROWTH,
     InitialGuess,
     WarmStart,
     guessed_depth,
@@ -133,9 +134,21 @@ class CellContact(ContactModel):
         return cached_operator(solid, held, nodes, make, coarse)
 
     def evaluate(
-        self, state: LatticeState, pose: Array, guess: ContactResult | None = None
+        self,
+        state: LatticeState,
+        pose: Array,
+        guess: ContactResult | None = None,
+        sketch: bool = False,
     ) -> ContactResult:
-        """Return the contact at a pose; see `ContactModel`."""
+        """Return the contact at a pose; see `ContactModel`.
+
+        Args:
+            state: what `prepare` returned.
+            pose: (4, 4) pose_femoral_in_insert.
+            guess: an earlier result.
+            sketch: forces alone count: areas are whole nodes', nothing is flagged, and close to
+                the guess the elements that did not count there are not looked at.
+        """
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
             return ContactResult.failed(state, pose, "the pose is not finite")
@@ -143,12 +156,17 @@ class CellContact(ContactModel):
         deepest = -float(gaps.min())
         if deepest <= TOUCHING:
             return ContactResult.of(state, pose, np.zeros(len(gaps)), gaps)
-        return self._solved(state, pose, None, (gaps, planes), deepest, guess)
+        return self._solved(state, pose, None, (gaps, planes), deepest, guess, sketch)
 
     def press(
-        self, state: LatticeState, load: float, pose: Array, guess: ContactResult | None = None
+        self,
+        state: LatticeState,
+        load: float,
+        pose: Array,
+        guess: ContactResult | None = None,
+        sketch: bool = False,
     ) -> ContactResult:
-        """Find the approach that carries `load` (N); see `ContactModel`."""
+        """Find the approach that carries `load` (N); see `ContactModel` and `evaluate`."""
         check_load(load)
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
@@ -172,7 +190,7 @@ class CellContact(ContactModel):
             depth = guess.approach
         else:
             depth = guessed_depth(state.problem, gaps, state.surface.area, load)
-        return self._solved(state, pose, load, (gaps, planes), depth, guess)
+        return self._solved(state, pose, load, (gaps, planes), depth, guess, sketch)
 
     def probe(self, state: LatticeState, guess: ContactResult | None = None) -> Probe:
         """Return the probe with stiffness; see `ContactModel`."""
@@ -188,6 +206,7 @@ class CellContact(ContactModel):
         rest: tuple[Array, TangentPlanes],
         depth: float,
         guess: ContactResult | None,
+        sketch: bool,
     ) -> ContactResult:
         """Solve with growing candidate sets until they cover the approach.
 
@@ -197,10 +216,12 @@ class CellContact(ContactModel):
         tolerance = Tolerance(self.tolerance)
         last = warm_start_of(state, guess)
         warm = None if last is None else last.foreseen(pose)
+        near = sketch and last is not None and last.near(pose)
+        unseen = UNSEEN_GROWTH * last.looked[0] if last is not None and near else 0.0
         touched = guess.pressure > 0 if guess and len(guess.pressure) == len(gaps) else None
         for _ in range(MOST_GROWTHS):
             start = initial_guess(
-                state.compliance, gaps, planes, depth, load is None, touched, warm
+                state.compliance, gaps, planes, depth, load is None, touched, warm, unseen
             )
             solution = self._solution(state.problem, pose, load, start, tolerance)
             covered = load is None or len(start.candidates) == np.isfinite(gaps).sum()
@@ -210,13 +231,17 @@ class CellContact(ContactModel):
                 moved = np.zeros_like(state.surface.points)
                 moved[solution.candidates] = solution.displacement
                 below += solution.forces.approach
+                looked = float(np.linalg.norm(solution.forces.force)), pose
+                if last is not None and not solution.seen:
+                    looked = last.looked
                 warm = WarmStart(
                     state.problem, solution.nonlinear_residual, moved, below, solution.region,
-                    pose, None if last is None else replace(last, before=None),
+                    pose, looked, None if last is None else replace(last, before=None),
                 )  # fmt: skip
             if covered or reached <= start.reach:
-                result = result_of(state, pose, load, gaps, solution, self.pressure_rule)
-                if load is not None:
+                rule = self.pressure_rule
+                result = result_of(state, pose, load, gaps, solution, rule, sketch)
+                if load is not None and not sketch:
                     sunk = solution.forces.approach + max(-float(gaps.min()), 0.0)
                     result = within_insert(state, result, *unseen_flags(state, result, sunk))
                 return replace(result, warm_start=warm) if solution.converged else result

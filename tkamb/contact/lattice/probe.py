@@ -12,17 +12,36 @@ are those of `evaluate`, the stiffness is a guide to where they vanish.
 """
 
 from dataclasses import replace
+from typing import Any, Protocol
 
 import numpy as np
 
 from tkamb.contact.lattice.problem import ContactProblem, LatticeState
-from tkamb.contact.pressing import Evaluates
 from tkamb.contact.probe import Probe, ProbedContact, condyle_wrenches
 from tkamb.contact.result import ContactResult, medial_points
 from tkamb.geometry.frames import Array, Index
 
 TURN_STEP = 5e-5
 """m: between the places where femoral normals are compared; well below a cell."""
+
+
+class Sketches(Protocol):
+    """A model whose `evaluate` and `press` can leave out all but the forces."""
+
+    def evaluate(
+        self, state: Any, pose: Array, guess: ContactResult | None = None, sketch: bool = False
+    ) -> ContactResult:
+        """See `tkamb.contact.lattice.model.CellContact`."""
+
+    def press(
+        self,
+        state: Any,
+        load: float,
+        pose: Array,
+        guess: ContactResult | None = None,
+        sketch: bool = False,
+    ) -> ContactResult:
+        """See `tkamb.contact.lattice.model.CellContact`."""
 
 
 class LatticeProbe(Probe):
@@ -37,13 +56,21 @@ class LatticeProbe(Probe):
 
     def __init__(
         self,
-        model: Evaluates,
+        model: Sketches,
         state: LatticeState,
         guess: ContactResult | None,
         accuracy: float,
     ) -> None:
         super().__init__(model, state, guess)
-        self._accuracy = accuracy
+        self._sketches, self._accuracy = model, accuracy
+
+    def evaluated(self, pose: Array) -> ContactResult:
+        """Return the forces at a pose; see `Probe`."""
+        return self._sketches.evaluate(self._state, pose, self._guess, sketch=True)
+
+    def pressed(self, load: float, pose: Array, guess: ContactResult) -> ContactResult:
+        """Return the forces under a load; see `Probe`."""
+        return self._sketches.press(self._state, load, pose, guess, sketch=True)
 
     def seen(self, result: ContactResult) -> ProbedContact:
         """Return what a result says of the condyles, with their stiffness."""

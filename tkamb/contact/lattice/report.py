@@ -1,6 +1,7 @@
 """From a solution of the lattice to the contract's result: pressures, sums, flags."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -22,6 +23,7 @@ def result_of(
     gaps: Array,
     solution: Solution,
     rule: PressureRule,
+    sketch: bool = False,
 ) -> ContactResult:
     """Return the contract's result.
 
@@ -32,18 +34,27 @@ def result_of(
         gaps: (c,) vertical gaps at that pose, m.
         solution: what the solver found.
         rule: how a nodal force becomes a pressure.
+        sketch: forces alone count: no areas within nodes, no gaps beside the contact, no flags.
     """
     depth = solution.forces.approach if load is not None else 0.0
     pose = pose.copy()
     pose[1, 3] -= depth
     if solution.field is not None and not np.isfinite(solution.field).all():
         return ContactResult.failed(state, pose, "the solver left the range of numbers")
+    force, pressure, area = _pressures(state, gaps - depth, solution, rule)
+    made = partial(
+        ContactResult.of,
+        status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
+        iterations=solution.passes,
+        residual=solution.residual,
+    )
+    if sketch:
+        return made(state, pose, pressure, gaps - depth, force, area, area)
     flags, collapsed = strain_flags(state, solution)
     if collapsed:
         return ContactResult.failed(state, pose, *flags)
     if not solution.converged:
         flags = (*flags, unsettled_flag(solution))
-    force, pressure, area = _pressures(state, gaps - depth, solution, rule)
     gap = _gaps(state, pose, gaps - depth, force, solution)
     surface, covered = state.surface, area
     if rule == "tributary":
@@ -51,13 +62,7 @@ def result_of(
             surface.points, surface.triangles, surface.triangle_area,
             pressure, gap, state.pair.material,
         )  # fmt: skip
-    result = ContactResult.of(
-        state, pose, pressure, gap, force, area, covered,
-        status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
-        iterations=solution.passes,
-        residual=solution.residual,
-        flags=flags,
-    )  # fmt: skip
+    result = made(state, pose, pressure, gap, force, area, covered, flags=flags)
     return replace(result, flags=(*result.flags, *unresolved_flags(state, result)))
 
 

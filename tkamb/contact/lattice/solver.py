@@ -61,6 +61,7 @@ class Solution:
         residual: out-of-balance force or distance from the femoral surface, the larger one,
             both relative.
         region: outside of which h is zero, or None.
+        seen: all elements were looked at; else `field` is that of the region.
     """
 
     candidates: Index
@@ -72,6 +73,7 @@ class Solution:
     passes: int
     residual: float
     region: Region | None = None
+    seen: bool = True
 
     @property
     def converged(self) -> bool:
@@ -108,13 +110,14 @@ def solve(
         active = forces.active
         balance.respond(forces.force[:, None] * planes.normals)
         missed = sliding.follow(moved, forces)
-        if max(balance.residual, missed) <= tolerance.force:
+        if max(balance.residual, missed) <= tolerance.force and balance.size > guess.unseen:
             balance.look_everywhere()
         residual = max(balance.residual, missed)
         done = residual <= tolerance.force
         forces = replace(forces, converged=done and forces.converged)
         field, h, region = balance.field, balance.h, balance.region
-        now = Solution(chosen, forces, planes, moved, field, h, passes, residual, region)
+        seen = balance.size > guess.unseen
+        now = Solution(chosen, forces, planes, moved, field, h, passes, residual, region, seen)
         if done:
             return now
         best = now if best is None or residual < best.residual else best
@@ -197,6 +200,7 @@ class NonlinearBalance:
         offset: (m, 3) m, displacement of the candidates without contact forces.
         field: (n, 3) m, displacement of the nodes looked at, 0 elsewhere.
         residual: imbalance of the elements looked at, relative to the contact forces.
+        size: N, norm of the contact forces.
     """
 
     def __init__(self, problem: ContactProblem, guess: InitialGuess, tolerance: float) -> None:
@@ -211,7 +215,7 @@ class NonlinearBalance:
     def respond(self, pushed: Array) -> None:
         """Work out displacements and imbalance of the region under contact forces (m, 3), N."""
         operator, region = self._problem.operator, self.region
-        self._size = max(float(np.linalg.norm(pushed)), 1e-300)
+        self.size = max(float(np.linalg.norm(pushed)), 1e-300)
         self._response.push(pushed, self._x)
         operator.factor.backward(self._x, region.fronts)
         self.field = np.zeros_like(self.h)
@@ -250,10 +254,10 @@ class NonlinearBalance:
         solid = self._problem.solid
         forces = solid.nonlinear_residual(self.field, None if region.whole else region.elements)
         value = self._summed(forces, region)
-        self.residual = float(np.linalg.norm(value - self._taken)) / self._size
+        self.residual = float(np.linalg.norm(value - self._taken)) / self.size
         if region.whole:
             size = np.sqrt(np.einsum("ij,ij->i", forces, forces))
-            count = elements_that_count(size, SHARE * self._tolerance * self._size)
+            count = elements_that_count(size, SHARE * self._tolerance * self.size)
             self.region = Region.of(self._problem, region.elements[count])
             value = self._summed(forces[count], self.region)
             self._narrowed = True

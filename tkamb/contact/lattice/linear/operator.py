@@ -149,6 +149,7 @@ def prepare_operator(
     starts = np.cumsum([0, *map(len, unknowns)])
     half, fronts = HalfSolves(starts, tree.parent, wanted, precision), []
     made = fronts_of(stiffness[free][:, free], tree, unknowns, precision)
+    del stiffness, joined  # as large as half of the factor, and not needed any more
     for member, front in enumerate(made):
         half.add(member, front)
         fronts.append(front.coarsened() if coarse else front)
