@@ -165,7 +165,8 @@ class ClosestPointQuery:
         """Return gap and points of the deepest point of triangles, cutting the best finer."""
         corners = self.femoral.triangles[faces]
         triangles = transform(pose, corners.reshape(-1, 3)).reshape(-1, 3, 3)
-        points = triangles.reshape(-1, 3)
+        _, first = np.unique(self.femoral.faces[faces], return_index=True)
+        points = triangles.reshape(-1, 3)[first]  # corners that triangles share count once
         for _ in range(_ROUNDS):
             triangles = _quartered(triangles)
             near = self._nearest.at(triangles.mean(axis=1))
