@@ -1,6 +1,7 @@
 """Condyles, closest and lowest points: closed forms, brute force, and subject DM's gaps."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -181,6 +182,23 @@ def test_each_condyle_has_its_own_gap():
     varus = query.at(knee_pose([0, 0.028, 0, 0, np.radians(1), 0]))
     expected = 0.044 * np.sin(np.radians(1))
     assert varus.lateral.gap - varus.medial.gap == pytest.approx(expected, rel=0.03)
+
+
+def test_the_ceiling_spares_only_points_outside_the_insert(monkeypatch):
+    """From 1 mm apart to 2 mm inside, turned: the gaps are those with every vertex asked."""
+    femoral, insert = bicondylar(), two_dishes()
+    bounded, all_asked = (ClosestPointQuery(femoral, insert, 0.0) for _ in range(2))
+    monkeypatch.setattr(
+        all_asked, "_ceiling", SimpleNamespace(over=lambda points: np.full(len(points), np.inf))
+    )
+    rng = np.random.default_rng(2)
+    for height in (0.029, 0.028, 0.0279, 0.026):
+        at = knee_pose([*rng.uniform(-4e-3, 4e-3, 3), *rng.uniform(-0.05, 0.05, 2), 0.7])
+        at[1, 3] = height
+        found, expected = bounded.at(at), all_asked.at(at)
+        for side in ("medial", "lateral"):
+            one, other = vars(getattr(found, side)), vars(getattr(expected, side))
+            assert all(np.array_equal(one[key], other[key]) for key in other)
 
 
 def test_moving_both_bodies_in_the_plane_changes_nothing():

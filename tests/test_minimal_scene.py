@@ -24,6 +24,12 @@ print(json.dumps({
 }))
 """
 
+SHOWN = """
+import sys
+import tkamb.output.report, tkamb.results_folder
+print([n for n in ("scipy", "trimesh", "pinocchio", "pydantic", "fcl") if n in sys.modules])
+"""
+
 MUSCLES = ("quadriceps", "patellar_ligament", "patella")
 
 
@@ -33,6 +39,11 @@ def watched(path):
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
+
+
+def test_a_report_waits_for_nothing_that_computes():
+    done = subprocess.run([sys.executable, "-c", SHOWN], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 def test_patient_and_motion_alone_touch_nothing_else(tmp_path):

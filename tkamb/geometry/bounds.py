@@ -1,6 +1,7 @@
 """Bounds of two surfaces' heights that spare first touch most of its rays."""
 
 from collections.abc import Iterator
+from functools import cached_property
 
 import numpy as np
 
@@ -41,7 +42,7 @@ class HeightBound:
         self._origin = low
         self._edge = max(CELL_EDGE, float((high - low).max()) / MOST_CELLS)
         self._last = ((high - low) // self._edge).astype(np.int64)
-        self._planes = np.stack(self._all_planes(surface, lift))
+        self._cells, self._area = self._cell_planes(surface, lift)
         self._level = np.ceil(np.log2(np.arange(1, self._last.max() + 2))).astype(np.int64)
         number = np.ravel_multi_index(
             tuple(self._place(surface.vertices[:, [0, 2]]).T), tuple(self._last + 1)
@@ -51,7 +52,7 @@ class HeightBound:
     def over(self, points: Array) -> Array:
         """Return a height (n,), m, that the surface over the points (n, 3) does not exceed."""
         xz = points[:, [0, 2]]
-        plane = self._planes[0][tuple(self._place(xz).T)]
+        plane = self._cells[tuple(self._place(xz).T)]
         return np.einsum("ij,ij->i", plane[:, :2], xz) + plane[:, 2]
 
     def planes(self, low: Array, high: Array) -> Array:
@@ -89,8 +90,8 @@ class HeightBound:
         index = np.floor((xz - self._origin) / self._edge).astype(np.int64)
         return np.clip(index, 0, self._last)
 
-    def _all_planes(self, surface: Surface, lift: Array | None) -> list[Array]:
-        """Return the planes (i, j, 4) of windows of 2^k cells from each cell on."""
+    def _cell_planes(self, surface: Surface, lift: Array | None) -> tuple[Array, Array]:
+        """Return the planes (i, j, 4) over each cell, and the area vectors (i, j, 3) in it."""
         faces = surface.faces[surface.face_normals[:, 1] > 0]
         triangles = surface.vertices[faces]
         a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
@@ -106,10 +107,15 @@ class HeightBound:
             rise = (planes[cells][:, None, :2] * xz[chosen]).sum(axis=2)
             np.maximum.at(planes[..., 2], cells, (heights[chosen] - rise).max(axis=1))
             np.maximum.at(planes[..., 3], cells, (lifted[chosen] - rise).max(axis=1))
-        return self._windows(planes, total)
+        return planes, total
 
-    def _windows(self, planes: Array, area: Array) -> list[Array]:
-        """Join four windows to one of twice the edge, until one covers all."""
+    @cached_property
+    def _planes(self) -> Array:
+        """Planes (k, i, j, 4) of windows of 2^k cells from each cell on.
+
+        Four windows are joined to one of twice the edge, until one covers all.
+        """
+        planes, area = self._cells, self._area
         all_planes, size = [planes], 1
         corner = np.stack(np.meshgrid(*(np.arange(n + 1) for n in self._last), indexing="ij"), -1)
         low = self._origin + corner * self._edge
@@ -127,7 +133,7 @@ class HeightBound:
                     joined[..., 2:] = np.maximum(joined[..., 2:], plane[..., 2:] + rise[..., None])
             all_planes.append(joined)
             size *= 2
-        return all_planes
+        return np.stack(all_planes)
 
     def _covered(self, low: Array, high: Array) -> Iterator[tuple[Index, tuple[Index, Index]]]:
         """Yield rectangles (m,) and one cell (m,), (m,) that each of them covers."""

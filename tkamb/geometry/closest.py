@@ -7,6 +7,7 @@ import fcl
 import numpy as np
 from scipy.spatial import cKDTree
 
+from tkamb.geometry.bounds import HeightBound
 from tkamb.geometry.condyles import FACET_DEPTH, SAMPLE_SPACING, condyle_faces
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import Array, Index, inverse, rotate, transform
@@ -20,6 +21,8 @@ FACING_COSINE = 0.7
 """Cosine of the angle between the surfaces, above which they face each other."""
 ESTIMATE_ERROR = 1e-4
 """m; how far the quick estimate of a gap may be out on coarse meshes."""
+ABOVE = 1e-6
+"""m; a point that far above a bound of the insert's height is outside it, rounding included."""
 _ROUNDS = 3
 _KEPT = 8
 _BATCH = 64
@@ -77,9 +80,13 @@ class ClosestPointQuery:
     def __init__(self, femoral: Surface, insert: Surface, split: float | None) -> None:
         self.femoral, self.insert, self.split = femoral, insert, split
         self._nearest = insert.nearest
-        self._insert_tree = _tree(insert, np.arange(len(insert.faces)))
+        self._ceiling = HeightBound(insert)
         medial, lateral = condyle_faces(femoral, split)
         self._condyles = [_Condyle(femoral, faces) for faces in (medial, lateral) if len(faces)]
+
+    @cached_property
+    def _insert_tree(self) -> fcl.BVHModel:
+        return _tree(self.insert, np.arange(len(self.insert.faces)))
 
     @cached_property
     def first_touch(self) -> FirstTouch:
@@ -127,13 +134,16 @@ class ClosestPointQuery:
     def _deepest_vertices(self, condyle: "_Condyle", pose: Array) -> Index:
         """Return the deepest few vertices inside the insert, deepest first; none if apart.
 
-        The depth along y bounds the depth from above and orders the search.
+        The depth along y bounds the depth from above and orders the search; what lies above all
+        that faces up over its place has none.
         """
         low, high = self.insert.bounds
         near = np.flatnonzero(condyle.points @ pose[1, :3] + pose[1, 3] < high[1])
         points = transform(pose, condyle.points[near])
         within = ((points > low) & (points < high)).all(axis=1)
         near, points = near[within], points[within]
+        under = points[:, 1] < self._ceiling.over(points) + ABOVE
+        near, points = near[under], points[under]
         below = self._depth_along_y(points)
         order = np.argsort(-below)
         order = order[below[order] > 0]
@@ -155,7 +165,8 @@ class ClosestPointQuery:
         """Return gap and points of the deepest point of triangles, cutting the best finer."""
         corners = self.femoral.triangles[faces]
         triangles = transform(pose, corners.reshape(-1, 3)).reshape(-1, 3, 3)
-        points = triangles.reshape(-1, 3)
+        _, first = np.unique(self.femoral.faces[faces], return_index=True)
+        points = triangles.reshape(-1, 3)[first]  # corners that triangles share count once
         for _ in range(_ROUNDS):
             triangles = _quartered(triangles)
             near = self._nearest.at(triangles.mean(axis=1))
@@ -176,12 +187,16 @@ class _Condyle:
     """The triangles of one condyle: their tree, their vertices."""
 
     def __init__(self, femoral: Surface, faces: Index) -> None:
-        self.faces = faces
-        self.tree = _tree(femoral, faces)
+        self.faces, self._femoral = faces, femoral
         self.vertices = np.unique(femoral.faces[faces])
         self.points = femoral.vertices[self.vertices]
         self.region = _CloseRegion(femoral, faces)
         self._corners = femoral.faces[faces]
+
+    @cached_property
+    def tree(self) -> fcl.BVHModel:
+        """The triangles as a tree; only a condyle that is apart asks for it."""
+        return _tree(self._femoral, self.faces)
 
     def placed(self, pose: Array) -> fcl.CollisionObject:
         """Return the condyle's tree at a pose (4, 4)."""
@@ -251,8 +266,10 @@ class _CloseRegion:
 def _thinned(samples: Array, areas: Array) -> tuple[Index, Array]:
     """Keep one sample of each cube of the spacing: its index, and the area of them all."""
     cubes = np.floor(samples / SAMPLE_SPACING).astype(np.int64)
+    cubes -= cubes.min(axis=0)
+    number = np.ravel_multi_index(tuple(cubes.T), tuple(cubes.max(axis=0) + 1))
     order = np.argsort(-areas, kind="stable")
-    _, first, cube = np.unique(cubes[order], axis=0, return_index=True, return_inverse=True)
+    _, first, cube = np.unique(number[order], return_index=True, return_inverse=True)
     total = np.bincount(cube.reshape(-1), areas[order])
     return order[first].astype(np.int64), np.asarray(total, np.float64)
 

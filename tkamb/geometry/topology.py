@@ -3,9 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, QhullError
 
 from tkamb.geometry.frames import Array, Index
 
@@ -98,6 +95,8 @@ def _measured(vertices: Array, loop: Index) -> BoundaryLoop:
 
 
 def _width(points: Array) -> float:
+    from scipy.spatial import ConvexHull, QhullError  # slow to import: a report needs no hull
+
     plane = np.linalg.svd(points, full_matrices=False)[2][:2]
     flat = points @ plane.T
     try:
@@ -112,6 +111,9 @@ def _width(points: Array) -> float:
 
 def connected_parts(faces: Index) -> Index:
     """Return for every face (k,) the number of the connected part that it belongs to."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     n = int(faces.max(initial=0)) + 1
     edges = half_edges(faces)
     graph = coo_matrix((np.ones(len(edges), bool), edges.T), shape=(n, n))

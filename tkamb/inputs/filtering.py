@@ -23,16 +23,17 @@ References:
 """
 
 import math
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.interpolate import BSpline, make_interp_spline
-from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, pose
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
 
 Cutoff = float | Literal["none"]
 
@@ -195,7 +196,10 @@ def _check_cutoff(time: Array, cutoff_Hz: float, name: str) -> None:
         )
 
 
-def _interpolating_spline(time: Array, values: Array, periodic: bool) -> BSpline:
+def _interpolating_spline(time: Array, values: Array, periodic: bool) -> "BSpline":
+    # here and below: a mistake in a table is told without waiting for scipy.interpolate
+    from scipy.interpolate import make_interp_spline
+
     if periodic:
         values = values.copy()
         values[0] = values[-1] = 0.5 * (values[0] + values[-1])
@@ -203,8 +207,11 @@ def _interpolating_spline(time: Array, values: Array, periodic: bool) -> BSpline
     return make_interp_spline(time, values, DEGREE)
 
 
-def _smoothing_spline(time: Array, values: Array, cutoff_Hz: float, periodic: bool) -> BSpline:
+def _smoothing_spline(time: Array, values: Array, cutoff_Hz: float, periodic: bool) -> "BSpline":
     """Return the penalised least-squares spline of the module's equation."""
+    from scipy.interpolate import BSpline
+    from scipy.sparse.linalg import splu
+
     unit = 1.0 / (2.0 * math.pi * cutoff_Hz)  # in this unit of time lambda is one
     start, end = time[0] / unit, time[-1] / unit
     wanted = math.ceil((end - start) * KNOTS_PER_PERIOD / math.tau)
@@ -234,6 +241,8 @@ def _third_derivative_gram(spans: int, step: float) -> sp.csr_array:
     coefficients, over step^3, as coefficients of degree two; three Gauss points per span
     integrate their products exactly.
     """
+    from scipy.interpolate import BSpline
+
     knots = np.arange(-2.0, spans + 3.0)
     nodes, weights = np.polynomial.legendre.leggauss(3)
     points = (np.arange(spans)[:, None] + 0.5 + 0.5 * nodes).ravel()

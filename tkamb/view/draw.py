@@ -5,8 +5,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.contact.lattice.meshing.cells import FACES
-from tkamb.contact.lattice.meshing.grid import build_grid
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
 from tkamb.output.headline import run_title
@@ -117,6 +115,9 @@ def lattice_lines(case: Case) -> Array:
     """
     if case.scene.contact is None or case.insert is None:
         return np.empty((0, 2, 3))
+    from tkamb.contact.lattice.meshing.cells import FACES
+    from tkamb.contact.lattice.meshing.grid import build_grid
+
     lattice = build_grid(case.insert, case.scene.contact.resolution_mm * MILLIMETRE)
     faces = lattice.cells[:, FACES].reshape(-1, 4)
     _, first, count = np.unique(
