@@ -177,8 +177,11 @@ class HalfSolves:
         a, b = np.searchsorted(self._rows, [front.start, front.stop])
         right[self._rows[a:b] - front.start, np.arange(a, b) - first] += 1.0
         product = front.block @ right
-        self._pass_up(member, front.boundary, product[front.stop - front.start :])
-        done = product[: front.stop - front.start].copy()
+        del right  # at the root as large as the rows that are kept
+        done = product
+        if len(front.boundary):
+            self._pass_up(member, front.boundary, product[front.stop - front.start :])
+            done = product[: front.stop - front.start].copy()
         self._blocks.append(Block(front.start, front.stop, first, last, done))
 
     def response(self) -> HalfResponse:
