@@ -8,9 +8,9 @@ circle. So the forces go only a part omega of the way from those held, f, to tho
 
 d and d' the last two f' - f: Aitken's secant for a vector. At the end f' itself is held.
 
-How the knee yields to the muscles, which decides their arms, is found anew in the first passes
-only: the contact's stiffness jumps from facet to facet, and forces that follow every jump would
-never settle. What it is by then belongs to a pose some micrometres away.
+How the knee yields to the muscles, which decides their arms, is found anew in every pass where the
+contact's stiffness is a smooth function of the pose. Else in the first passes only: forces that
+follow each of its jumps would never settle, and what it is by then belongs to another pose.
 
 References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.1620010306;
 Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
@@ -51,9 +51,9 @@ class Relaxation:
         self._yields: Array | None = None
         self._passes = 0
 
-    def kept(self, found: Callable[[], Array | None]) -> Array | None:
-        """Return how the knee yields, from `found` in the first passes."""
-        if self._passes < FRESH:
+    def kept(self, found: Callable[[], Array | None], smooth: bool) -> Array | None:
+        """Return how the knee yields, from `found`: always if that is smooth, or at first."""
+        if smooth or self._passes < FRESH:
             self._yields = found()
         self._passes += 1
         return self._yields

@@ -46,6 +46,8 @@ FORCE_SHARE = 2e-4
 """of it: or this part of it, by which the patella's jumps from facet to facet change it."""
 MOST_PASSES = 20
 """Passes by which knee and patella settle; each halves what is left where the knee is soft."""
+LEFT = 0.1
+"""Share of the way of a pass that it may leave to the next."""
 SLACK = 1e-3
 """N: an extensor group of muscles that pulls with less is slack."""
 
@@ -136,6 +138,7 @@ class ReleasedKnee:
                 max(moved, shift) < KNEE_CHANGE
                 and change < max(FORCE_CHANGE, FORCE_SHARE * float(np.linalg.norm(force)))
                 and mixing.settled
+                and knee.balance.at_rest
             ):
                 return knee
         assert knee is not None
@@ -160,7 +163,7 @@ class ReleasedKnee:
             share = mixing.mixed(self._share(k, geometry, middle, touch, held, mixing))
             geometry, slack = replace(geometry, share=share), muscles.tension(share) < SLACK
         forces = self._forces(k, geometry, middle, slack)
-        balance = forces.balance(before.balance.stiffness if before else None)
+        balance = forces.balance(before.balance.stiffness if before else None, LEFT)
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
         if balance.status is not BalanceStatus.OK:
             problem = problem or f"released: {balance.status.value}" + (
@@ -178,7 +181,8 @@ class ReleasedKnee:
             problem,
         )
         # with other muscles their sharing says whether the quadriceps is slack
-        return knee, not muscles and contact.known and forces.pushes(balance)
+        ended = balance.at_rest or balance.status is not BalanceStatus.OK
+        return knee, ended and not muscles and contact.known and forces.pushes(balance)
 
     def _share(
         self,
@@ -212,10 +216,11 @@ class ReleasedKnee:
         gain = None
         if held is not None:
             forces = self._forces(k, replace(geometry, share=held), middle, False)
-            gain = mixing.kept(lambda: forces.tension_per_wrench(here))
+            smooth = self._probe.smoothed(knee_pose(place), here)
+            gain = mixing.kept(lambda: forces.tension_per_wrench(smooth), self._probe.smooths)
         if held is not None and gain is not None:
             pull = held.wrench(geometry.state.pose("tibia"), geometry.state.pose("femur"))
-            base = forces.tension(here) - float(gain @ pull)
+            base = forces.tension_at_rest(here, gain) - float(gain @ pull)
             share = muscles.share_of_yielding_knee(k, geometry, friction, base, gain)
         else:
             points = mechanics.resultants(k, place, here.condyles)
