@@ -29,6 +29,7 @@ from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.frame_contact import FrameContact
 from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.equilibrium.post_side import cam_on_post, post_contact
+from tkamb.equilibrium.released_forces import SCALE
 from tkamb.equilibrium.split_sensitivity import split_sensitivity, split_tangent
 from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
@@ -203,12 +204,12 @@ class ContactSide:
 
         Args:
             k: frame.
-            before: the contacts of the frames before; the last two that were found are where
-                the search begins.
+            before: the contacts of the frames before; where the last three that were found
+                go on is where the search begins.
         """
         released, start = self.released, clock.perf_counter()
         assert released is not None
-        good = [contact for contact in before if contact.equilibrium and contact.result][-2:]
+        good = [contact for contact in before if contact.equilibrium and contact.result][-3:]
         guess = good[-1].result if good else None
         points = {} if len(released.released) == 5 else self._nearest_points(k)
         try:
@@ -239,7 +240,7 @@ class ContactSide:
 
         Args:
             k: frame.
-            found: the last two frames that were found.
+            found: the last three frames that were found.
             points: side -> where a condyle that carries nothing is nearest to the insert.
 
         Raises:
@@ -268,7 +269,7 @@ class ContactSide:
         """
         assert self.released is not None
         recorded, rows = self.case.motion.coordinates[k], list(self.released.released)
-        for number, place in enumerate([2 * found[-1] - found[0], found[-1]] if found else []):
+        for number, place in enumerate([carried_on(found), found[-1]] if found else []):
             start = recorded.copy()
             start[rows] = place[rows]
             yield start if number == 0 else self.on_the_insert(start)
@@ -341,6 +342,22 @@ class ContactSide:
         """Return a contact that could not be computed, and why."""
         none = np.zeros(len(self.state.points), bool)
         return FrameContact(None, none, None, 0.0, problem, ())
+
+
+def carried_on(found: list[Array]) -> Array:
+    """Return the coordinates (6,) after those of up to three frames.
+
+    The last step is made again, or that part of it by which the step before foretold it: a
+    lightly loaded knee wanders to and fro.
+    """
+    if len(found) == 1:
+        return found[0]
+    step = (found[-1] - found[-2]) * SCALE
+    part = 1.0
+    if len(found) == 3:
+        last = (found[1] - found[0]) * SCALE
+        part = float(np.clip(last @ step / max(float(last @ last), 1e-18), 0.0, 1.0))
+    return found[-1] + part * (found[-1] - found[-2])
 
 
 def _points(body: FrameLoads) -> dict[str, Array]:
