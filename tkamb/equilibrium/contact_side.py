@@ -12,6 +12,7 @@
 import time as clock
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,6 +54,8 @@ ASTRAY = (
     BalanceStatus.RUNS_AWAY,  # as far from a bad start as from a good one
 )
 """Ends of a search that another start may mend."""
+FARTHEST_AHEAD = 2e-3
+"""m: a search begins at most so far ahead of the last frame."""
 FIRST_DEPTH = 5e-5
 """m: how deep the search for released coordinates begins."""
 
@@ -347,17 +350,15 @@ class ContactSide:
 def carried_on(found: list[Array]) -> Array:
     """Return the coordinates (6,) after those of up to three frames.
 
-    The last step is made again, or that part of it by which the step before foretold it: a
-    lightly loaded knee wanders to and fro.
+    The last step is made again, or that part of it by which the step before foretold it, and no
+    farther than `FARTHEST_AHEAD`: a lightly loaded knee wanders to and fro.
     """
-    if len(found) == 1:
-        return found[0]
-    step = (found[-1] - found[-2]) * SCALE
-    part = 1.0
-    if len(found) == 3:
-        last = (found[1] - found[0]) * SCALE
-        part = float(np.clip(last @ step / max(float(last @ last), 1e-18), 0.0, 1.0))
-    return found[-1] + part * (found[-1] - found[-2])
+    if len(found) < 3:
+        return found[-1]
+    before, step = ((b - a) * SCALE for a, b in pairwise(found))
+    part = float(before @ step) / max(float(before @ before), 1e-18)
+    longest = FARTHEST_AHEAD / max(float(np.linalg.norm(step)), 1e-9)
+    return found[-1] + min(max(part, 0.0), 1.0, longest) * (found[-1] - found[-2])
 
 
 def _points(body: FrameLoads) -> dict[str, Array]:

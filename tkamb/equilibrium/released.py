@@ -119,7 +119,7 @@ class ReleasedKnee:
         """
         place, middle, force = np.array(start, float), np.array(start[:3]), np.full(3, np.nan)
         knee, slack, trials, passes = before, False, 0, 0
-        touch, mixing = None, Relaxation()
+        touch, mixing, ways = None, Relaxation(), [np.inf, np.inf]
         while passes < MOST_PASSES:
             knee, pushes = self._pass(k, place, middle, slack, knee, touch, mixing)
             touch = knee.contact
@@ -129,16 +129,18 @@ class ReleasedKnee:
             moved = np.abs((knee.coordinates - place) * SCALE).max()
             place, force, last = knee.coordinates, knee.contact.wrench[:3], middle
             middle = _middle(knee.contact, points, place)
-            shift = np.abs(middle - last).max() if self._keeps else 0.0
+            ways.append(max(moved, np.abs(middle - last).max() if self._keeps else 0.0))
             if pushes:
                 # a line that pushes drives the knee away: slack, it begins where this began
                 slack, knee, touch = True, before, None
                 place, middle, force = np.array(start, float), np.array(start[:3]), force * np.nan
+                ways = [np.inf, np.inf]
             elif knee.problem or (
-                max(moved, shift) < KNEE_CHANGE
-                and change < max(FORCE_CHANGE, FORCE_SHARE * float(np.linalg.norm(force)))
-                and mixing.settled
+                mixing.settled
                 and knee.balance.at_rest
+                and ahead(ways[-3:]) * ways[-1] < KNEE_CHANGE
+                and ahead(ways[-3:]) * change
+                < max(FORCE_CHANGE, FORCE_SHARE * float(np.linalg.norm(force)))
             ):
                 return knee
         assert knee is not None
@@ -258,6 +260,23 @@ class ReleasedKnee:
         )
         sliding = partial(mechanics.sliding, k)
         return ReleasedForces(joint, self._probe, geometry.coordinates, mechanics.friction, sliding)
+
+
+def ahead(ways: Sequence[float]) -> float:
+    """Return how far a search of ever shorter passes still goes, per way of its last pass.
+
+    With q the greater of the last two ratios of successive passes, the geometric series of what
+    would follow is q / (1 - q). Where a pass did not at least halve the way of the one before,
+    or there were less than three: 1, so that the last pass itself has to be short.
+
+    Args:
+        ways: m, by which the last three passes moved; inf where there was none.
+    """
+    first, second, last = ways
+    if not 0.0 < second <= 0.5 * first < np.inf or last > 0.5 * second:
+        return 1.0
+    ratio = max(last / second, second / first)
+    return ratio / (1.0 - ratio)
 
 
 def _middle(contact: "ProbedContact", points: dict[str, Array] | None, place: Array) -> Array:
