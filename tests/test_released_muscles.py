@@ -106,9 +106,7 @@ def test_the_answer_does_not_hang_on_where_the_search_began(side, resting):
     assert np.abs(away).max() < 2e-6
     np.testing.assert_allclose(body.geometry.share.force, series.geometry.share.force, atol=0.1)
     force = series.loads.contact_force
-    np.testing.assert_allclose(
-        body.loads.contact_force, force, atol=2e-4 * np.linalg.norm(force)
-    )
+    np.testing.assert_allclose(body.loads.contact_force, force, atol=2e-4 * np.linalg.norm(force))
 
 
 def test_activations_are_continuous(resting):

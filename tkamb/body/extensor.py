@@ -133,13 +133,13 @@ class ExtensorFrames:
         own = self.states[k]
         if guess is not None and own.status.found:
             # a guess from a frame far before may lead nowhere, where its own leads to the place
-            near = (guess.coordinates, guess.slopes)
-            found = solve_patella(self._mechanism, pose, *near, anywhere=False)
+            near = guess.coordinates
+            found = solve_patella(self._mechanism, pose, near, guess.slopes, anywhere=False)
             if found.status.found:
                 return found
             guess = None
-        near = own if guess is None else guess
-        return solve_patella(self._mechanism, pose, near.coordinates, near.slopes)
+        last = own if guess is None else guess
+        return solve_patella(self._mechanism, pose, last.coordinates, last.slopes)
 
     def at(
         self, k: int, flexion: float, state: ChainState, patella: PatellaState | None = None
