@@ -47,7 +47,7 @@ FORCE_SHARE = 2e-4
 MOST_PASSES = 20
 """Passes by which knee and patella settle; each halves what is left where the knee is soft."""
 LEFT = 0.1
-"""Share of the way of a pass that it may leave to the next."""
+"""Share of its way that a pass may leave to the next, where muscles make it a few passes anyway."""
 SLACK = 1e-3
 """N: an extensor group of muscles that pulls with less is slack."""
 
@@ -165,7 +165,8 @@ class ReleasedKnee:
             share = mixing.mixed(self._share(k, geometry, middle, touch, held, mixing))
             geometry, slack = replace(geometry, share=share), muscles.tension(share) < SLACK
         forces = self._forces(k, geometry, middle, slack)
-        balance = forces.balance(before.balance.stiffness if before else None, LEFT)
+        stiffness = before.balance.stiffness if before else None
+        balance = forces.balance(stiffness, LEFT if muscles else 0.0)
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
         if balance.status is not BalanceStatus.OK:
             problem = problem or f"released: {balance.status.value}" + (
