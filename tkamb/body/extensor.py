@@ -131,12 +131,15 @@ class ExtensorFrames:
             recorded = self.states[k].coordinates
             return patella_at(self._mechanism, pose, recorded, self._contacts[k])
         own = self.states[k]
-        near = own if guess is None else guess
-        found = solve_patella(self._mechanism, pose, near.coordinates, near.slopes)
-        if found.status.found or near is own or not own.status.found:
-            return found
-        # from a frame far before it may be found nowhere
-        return solve_patella(self._mechanism, pose, own.coordinates, own.slopes)
+        if guess is not None and own.status.found:
+            # a guess from a frame far before may lead nowhere, where its own leads to the place
+            near = guess.coordinates
+            found = solve_patella(self._mechanism, pose, near, guess.slopes, anywhere=False)
+            if found.status.found:
+                return found
+            guess = None
+        last = own if guess is None else guess
+        return solve_patella(self._mechanism, pose, last.coordinates, last.slopes)
 
     def at(
         self, k: int, flexion: float, state: ChainState, patella: PatellaState | None = None

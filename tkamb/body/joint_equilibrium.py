@@ -91,7 +91,7 @@ class JointEquilibrium:
 
     def contact_gain(self, coordinates: Array) -> Array:
         """Return d r / d w_contact (n, 6) at coordinates (6,)."""
-        axes, columns, _ = self._sum_loads(coordinates, np.zeros(6))
+        axes, columns = knee_axes(coordinates), self.columns(coordinates)
         rows = axes[self._prescribed]
         through = np.eye(6) - columns @ np.linalg.solve(rows @ columns, rows)
         return np.asarray(-axes[list(self.released)] @ through)
@@ -104,12 +104,17 @@ class JointEquilibrium:
             contact: (6,) w_contact on the insert.
             kept: (6 - n,) y.
         """
-        axes, columns, wrench = self._sum_loads(coordinates, contact)
-        return -np.einsum("...ij,...j->...i", axes, wrench + columns @ kept)
+        left = self.unbalanced(coordinates, contact, kept)
+        return -np.einsum("...ij,...j->...i", knee_axes(coordinates), left)
+
+    def unbalanced(self, coordinates: Array, contact: Array, kept: Array) -> Array:
+        """Return R (..., 6), the wrench on the insert that is left over; see `whole`."""
+        _, columns, wrench = self._sum_loads(coordinates, contact)
+        return np.asarray(wrench + columns @ kept)
 
     def columns(self, coordinates: Array) -> Array:
         """Return B (6, 6 - n) at coordinates (6,)."""
-        return self._sum_loads(coordinates, np.zeros(6))[1]
+        return self._columns(knee_pose(coordinates))
 
     @property
     def _prescribed(self) -> list[int]:
@@ -121,10 +126,14 @@ class JointEquilibrium:
         wrench = self.external + contact + self.ligaments.wrench(poses)
         if self.share is not None:
             wrench = wrench + self.share.wrench(self.tibia, poses)
-        columns = np.broadcast_to(self.keeping, (*wrench.shape[:-1], *self.keeping.shape))
-        if self.line is not None:
-            columns = np.concatenate([columns, self.line.wrench(poses)[..., None]], axis=-1)
-        return knee_axes(coordinates), columns, wrench
+        return knee_axes(coordinates), self._columns(poses), wrench
+
+    def _columns(self, poses: Array) -> Array:
+        """Return B (..., 6, 6 - n) at poses (..., 4, 4)."""
+        columns = np.broadcast_to(self.keeping, (*poses.shape[:-2], *self.keeping.shape))
+        if self.line is None:
+            return columns
+        return np.concatenate([columns, self.line.wrench(poses)[..., None]], axis=-1)
 
 
 def _magnitudes(rows: Array, columns: Array, wrench: Array) -> Array:

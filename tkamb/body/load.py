@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, cross
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class PointForces:
 def wrench_of(points: Array, forces: Array) -> Array:
     """Return force and moment (..., 6) about the origin of forces (..., 3) at points (..., 3)."""
     points = np.broadcast_to(points, forces.shape)
-    return np.concatenate([forces, np.cross(points, forces)], axis=-1)
+    return np.concatenate([forces, cross(points, forces)], axis=-1)
 
 
 def wrenches(loads: Sequence[PointForces]) -> Array:
@@ -62,5 +62,5 @@ def wrenches(loads: Sequence[PointForces]) -> Array:
 def total_wrench(loads: Sequence[PointForces], point: Array) -> Array:
     """Return the summed force and moment (6,) of several loads about `point` (3,)."""
     total = wrenches(loads).sum(axis=0)
-    total[3:] -= np.cross(point, total[:3])
+    total[3:] -= cross(point, total[:3])
     return total

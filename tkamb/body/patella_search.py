@@ -71,6 +71,7 @@ def solve_patella(
     pose_femur_in_insert: Array,
     guess: Array | None = None,
     slopes: Array | None = None,
+    anywhere: bool = True,
 ) -> PatellaState:
     """Return the patella's place at one frame.
 
@@ -79,6 +80,7 @@ def solve_patella(
         pose_femur_in_insert: (4, 4) of the femur link.
         guess: (3,) coordinates of the previous frame; None searches all rotations.
         slopes: its `slopes`, if it has them.
+        anywhere: search all rotations where the guess leads nowhere.
 
     Returns:
         The state; coordinates and forces are NaN unless status is OK, SEVERAL or EDGE.
@@ -91,6 +93,8 @@ def solve_patella(
         except ComputationError:
             found = None  # a guess that leads nowhere says nothing: all rotations are searched
     if found is None:
+        if not anywhere:
+            return _nothing(PatellaStatus.MOMENT)
         try:
             found, several = search.scan()
         except _Lost as lost:

@@ -16,7 +16,7 @@ import numpy as np
 
 from tkamb.body.contact_points import CondylePoint
 from tkamb.body.load import PointForces
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, cross
 
 LARGEST_CONDITION = 1e4
 """Above this condition number (unit columns) a frame counts as singular.
@@ -145,7 +145,7 @@ def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown
         normal: (3,) unit, out of the femur into the patella, in the sagittal plane.
         femur_ml: (3,) the femur's ML axis.
     """
-    tangent = np.cross(femur_ml, normal)
+    tangent = cross(femur_ml, normal)
     return [
         Unknown("patellofemoral", pair("patella", "femur", point, normal)),
         Unknown("patellofemoral_tangential", pair("patella", "femur", point, tangent)),
@@ -159,11 +159,11 @@ def unloaded_patella(point: Array, femur_ml: Array) -> list[Unknown]:
         point: (3,) where it rests on the femur.
         femur_ml: (3,) the femur's ML axis, normal to the patella's plane.
     """
-    first = np.cross(femur_ml, AXES["ap"])
+    first = cross(femur_ml, AXES["ap"])
     first /= np.linalg.norm(first)
     return [
         Unknown("patella_rest_1", pair("patella", "femur", point, first)),
-        Unknown("patella_rest_2", pair("patella", "femur", point, np.cross(femur_ml, first))),
+        Unknown("patella_rest_2", pair("patella", "femur", point, cross(femur_ml, first))),
         Unknown("patella_rest_moment", moment_pair("patella", "femur", femur_ml)),
     ]
 

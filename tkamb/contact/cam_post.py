@@ -246,18 +246,27 @@ class CondylesAndPost:
 
     def __init__(self, condyles: Any, post: PostProbe) -> None:
         self._condyles, self._post = condyles, post
+        self.smooths: bool = condyles.smooths
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4)."""
-        condyles, post = self._condyles.at(pose), self._post.at(pose)
-        return ProbedContact(
-            condyles.condyles,
-            condyles.known and post.known,
-            condyles.tangent and post.tangent,
-            condyles.exact and post.exact,
-            max(condyles.accuracy, post.accuracy),
-            post.post,
-        )
+        return _together(self._condyles.at(pose), self._post.at(pose))
+
+    def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
+        """Return the contact there with a stiffness without jumps; the post's is as it is."""
+        condyles = self._condyles.smoothed(pose, replace(contact, post=None))
+        return _together(condyles, replace(contact, condyles={}))
+
+
+def _together(condyles: ProbedContact, post: ProbedContact) -> ProbedContact:
+    return ProbedContact(
+        condyles.condyles,
+        condyles.known and post.known,
+        condyles.tangent and post.tangent,
+        condyles.exact and post.exact,
+        max(condyles.accuracy, post.accuracy),
+        post.post,
+    )
 
 
 def twist_matrix(pose: Array) -> Array:

@@ -1,6 +1,6 @@
 """Elastic foundation: a bed of independent springs under a rigid femoral component."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -10,8 +10,14 @@ from tkamb.contact.model import ContactModel
 from tkamb.contact.pressing import LOAD_TOLERANCE, press_by_search
 from tkamb.contact.probe import CondyleWrench, ProbedContact
 from tkamb.contact.result import ContactResult, ContactStatus, medial_points
-from tkamb.contact.samples import DEEPEST, SampledContact, gaps_along_normals, gaps_and_facets
-from tkamb.geometry.frames import Array, transform
+from tkamb.contact.samples import (
+    DEEPEST,
+    SampledContact,
+    SurfaceSamples,
+    gaps_along_normals,
+    gaps_and_facets,
+)
+from tkamb.geometry.frames import Array, Index, Mask, cross, inverse, rotate, transform
 
 Law = Literal["nonlinear", "linear"]
 
@@ -24,6 +30,8 @@ NARROW = 1e-9
 WELL_BELOW = 0.99
 SMALL_LOAD = 1.0
 """N; a reaction below that share of a load, less this, does not reach the load within `NARROW`."""
+WIDEST_EDGE = 3e-4
+"""m: no gap is taken to change by more across a column."""
 NEARBY = 1.5e-3
 """m; the columns nearer than this are looked at while the femur moves by less."""
 
@@ -213,6 +221,7 @@ class FoundationProbe:
     """
 
     exact: ClassVar[bool] = True
+    smooths: ClassVar[bool] = True
 
     def __init__(self, law: Law, state: SampledContact) -> None:
         self._law, self._state = law, state
@@ -222,37 +231,74 @@ class FoundationProbe:
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4), with its stiffness."""
         pose = np.asarray(pose, float)
-        if not self._covers(pose):
-            gap = gaps_and_facets(self._state.surface, self._state.pair.femoral, pose)[0]
-            self._near, self._centre = self._state.surface.part(gap < 2 * NEARBY), pose.copy()
-        samples = self._near
-        gap, femoral_normal = gaps_and_facets(samples, self._state.pair.femoral, pose)
+        samples, (gap, femoral_normal, _) = self._columns(pose)
         loaded = gap < 0
         if not loaded.any():
             return ProbedContact({}, tangent=True)
-        samples, gap, femoral_normal = samples.part(loaded), gap[loaded], femoral_normal[loaded]
-        thickness = np.maximum(samples.thickness, THINNEST)
-        strain = -gap / thickness
+        samples, gap = samples.part(loaded), gap[loaded]
+        strain = -gap / np.maximum(samples.thickness, THINNEST)
         if not (strain < DEEPEST).all():
             return ProbedContact({}, known=False)
-        material, law = self._state.pair.material, self._law
-        force = layer_pressure(law, material, strain) * samples.area
-        slope = layer_slope(law, material, strain) / thickness * samples.area
-        push = screws(samples.points, samples.normals)
-        along = np.einsum("ij,ij->i", femoral_normal, samples.normals)
-        met = (
-            screws(samples.points + gap[:, None] * samples.normals, femoral_normal) / along[:, None]
-        )
-        medial = medial_points(samples.points, pose, self._state.pair.split)
+        force = layer_pressure(self._law, self._state.pair.material, strain) * samples.area
+        push, stiffness = self._stiffness(samples, gap, femoral_normal[loaded])
         condyles = {}
-        for side, own in (("medial", medial), ("lateral", ~medial)):
+        for side, own in self._sides(samples, pose):
             if own.any():
                 condyles[side] = CondyleWrench(
                     -force[own] @ push[own],
                     force[own] @ samples.points[own] / force[own].sum(),
-                    (slope[own, None] * push[own]).T @ met[own],
+                    push[own].T @ stiffness[own],
                 )
         return ProbedContact(condyles, tangent=True)
+
+    def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
+        """Return the contact with its stiffness averaged over a column's width; see `Probe`.
+
+        A column's stiffness starts at once when it is touched, so that the tangent jumps when
+        one is, the one across the normal by half. Here a column counts by the share of its cell
+        that lies within the contact's edge, the gap being linear across it, and femoral
+        normals are the smooth surface's, as a displacement by a cell meets them on the mean.
+        """
+        samples, (gap, _, face) = self._columns(pose)
+        near = gap < WIDEST_EDGE
+        samples, gap, femoral = samples.part(near), gap[near], self._state.pair.femoral
+        met = transform(inverse(pose), samples.points + gap[:, None] * samples.normals)
+        normals = rotate(pose, femoral.smooth_normals(met, face[near]))
+        cosine = np.abs(np.einsum("ij,ij->i", normals, samples.normals))
+        change = samples.resolution * np.sqrt(np.maximum(1.0 - cosine**2, 0.0)) / cosine
+        edge = np.clip(change, NARROW, WIDEST_EDGE)
+        share = np.clip(0.5 - gap / edge, 0.0, 1.0)
+        push, stiffness = self._stiffness(samples, np.minimum(gap, 0.0), normals)
+        stiffness *= share[:, None]
+        condyles = {
+            side: replace(contact.condyles[side], stiffness=push[own].T @ stiffness[own])
+            for side, own in self._sides(samples, pose)
+            if side in contact.condyles
+        }
+        return replace(contact, condyles=condyles)
+
+    def _columns(self, pose: Array) -> tuple[SurfaceSamples, tuple[Array, Array, Index]]:
+        """Return the columns near by, and their gaps and facets."""
+        femoral = self._state.pair.femoral
+        if not self._covers(pose):
+            gap = gaps_and_facets(self._state.surface, femoral, pose)[0]
+            self._near, self._centre = self._state.surface.part(gap < 2 * NEARBY), pose.copy()
+        return self._near, gaps_and_facets(self._near, femoral, pose)
+
+    def _stiffness(
+        self, samples: SurfaceSamples, gap: Array, femoral_normal: Array
+    ) -> tuple[Array, Array]:
+        """Return the screws (n, 6) of the columns' normals, and of what changes their force."""
+        thickness = np.maximum(samples.thickness, THINNEST)
+        slope = layer_slope(self._law, self._state.pair.material, -gap / thickness)
+        push = screws(samples.points, samples.normals)
+        along = np.einsum("ij,ij->i", femoral_normal, samples.normals)
+        met = screws(samples.points + gap[:, None] * samples.normals, femoral_normal)
+        return push, met * (slope / thickness * samples.area / along)[:, None]
+
+    def _sides(self, samples: SurfaceSamples, pose: Array) -> tuple[tuple[str, Mask], ...]:
+        medial = medial_points(samples.points, pose, self._state.pair.split)
+        return ("medial", medial), ("lateral", ~medial)
 
     def _covers(self, pose: Array) -> bool:
         """Return whether no femoral point has come nearer than the chosen columns reach."""
@@ -264,7 +310,7 @@ class FoundationProbe:
 
 def screws(points: Array, directions: Array) -> Array:
     """Return direction and moment about the origin (n, 6) of lines through points (n, 3)."""
-    return np.hstack([directions, np.cross(points, directions)])
+    return np.hstack([directions, cross(points, directions)])
 
 
 def _corners(bounds: Array) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 
 from tkamb.contact.pressing import Presses
 from tkamb.contact.result import ContactResult, ContactStatus, medial_points, wrench_of
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, cross
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +48,8 @@ class CondyleWrench:
         they leave a small moment, about this point only its part along the resultant.
         """
         force = self.wrench[:3]
-        left = self.wrench[3:] - np.cross(self.centre, force)
-        return self.centre + np.cross(force, left) / (force @ force)
+        left = self.wrench[3:] - cross(self.centre, force)
+        return self.centre + cross(force, left) / (force @ force)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +93,11 @@ class Probe:
 
     Attributes:
         exact: every answer brings the tangent, and it costs less than a press.
+        smooths: `smoothed` does what it says.
     """
 
     exact: ClassVar[bool] = False
+    smooths: ClassVar[bool] = False
 
     def __init__(self, model: Presses, state: Any, guess: ContactResult | None = None) -> None:
         self._model, self._state, self._guess = model, state, guess
@@ -115,6 +117,15 @@ class Probe:
     def pressed(self, load: float, pose: Array, guess: ContactResult) -> ContactResult:
         """Return the contact under a load (N), of which only the forces need be right."""
         return self._model.press(self._state, load, pose, guess)
+
+    def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
+        """Return the contact with a stiffness that holds on the mean of a finite displacement.
+
+        Args:
+            pose: (4, 4) pose_femoral_in_insert.
+            contact: there; a model that does not know better returns it.
+        """
+        return contact
 
     def seen(self, result: ContactResult) -> ProbedContact:
         """Return what a result says of the condyles."""

@@ -99,10 +99,12 @@ def gaps_along_normals(samples: SurfaceSamples, femoral: Surface, pose: Array) -
     return gaps_and_facets(samples, femoral, pose)[0]
 
 
-def gaps_and_facets(samples: SurfaceSamples, femoral: Surface, pose: Array) -> tuple[Array, Array]:
-    """Return the gap (n,), see `gaps_along_normals`, and the normals (n, 3) of what is met.
+def gaps_and_facets(
+    samples: SurfaceSamples, femoral: Surface, pose: Array
+) -> tuple[Array, Array, Index]:
+    """Return the gap (n,), see `gaps_along_normals`, and normals (n, 3) and numbers (n,) of facets.
 
-    The normals are those of the femoral facets, in the insert frame.
+    They are those of the femoral facets that are met, the normals in the insert frame.
     """
     back = inverse(pose)
     normals = rotate(back, samples.normals)
@@ -112,7 +114,7 @@ def gaps_and_facets(samples: SurfaceSamples, femoral: Surface, pose: Array) -> t
     met = femoral.face_normals[face]
     facing = np.einsum("ij,ij->i", normals, met)
     gap = np.where((face >= 0) & (facing > 0), -np.inf, distance - below)
-    return gap, rotate(pose, met)
+    return gap, rotate(pose, met), face
 
 
 def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:

@@ -89,6 +89,7 @@ class Balance:
         trials: how often the forces were computed.
         smallest_stiffness: N/m, smallest real part of the stiffness' eigenvalues.
         work: N·m done by the forces along each step taken, all positive.
+        at_rest: to the tolerances; else only as near as was asked for.
     """
 
     coordinates: Array
@@ -99,12 +100,15 @@ class Balance:
     trials: int
     smallest_stiffness: float
     work: tuple[float, ...]
+    at_rest: bool = True
 
 
 Forces = Callable[[Array], Trial]
 
 
-def find_balance(forces: Forces, start: Array, stiffness: Array | None = None) -> Balance:
+def find_balance(
+    forces: Forces, start: Array, stiffness: Array | None = None, left: float = 0.0
+) -> Balance:
     """Find coordinates at which no force is left.
 
     Args:
@@ -112,12 +116,14 @@ def find_balance(forces: Forces, start: Array, stiffness: Array | None = None) -
         start: (n,) m.
         stiffness: (n, n) N/m of an earlier search near by, a guess that saves trials where
             `forces` does not bring its own.
+        left: share of the way from the start that may be left of a search which is repeated
+            under other forces; 0: none.
     """
-    found = _Search(forces, np.array(start, float), stiffness).run()
+    found = _Search(forces, np.array(start, float), stiffness, left).run()
     if found.status not in (BalanceStatus.RUNS_AWAY, BalanceStatus.NOT_CONVERGED):
         return found
     # Newton's direction may lead off over the facets of a contact; the way downhill may not.
-    again = _Search(forces, np.array(start, float), stiffness, downhill=True).run()
+    again = _Search(forces, np.array(start, float), stiffness, left, downhill=True).run()
     if again.status is not BalanceStatus.OK:
         return found
     return replace(again, trials=found.trials + again.trials, steps=found.steps + again.steps)
@@ -125,9 +131,14 @@ def find_balance(forces: Forces, start: Array, stiffness: Array | None = None) -
 
 class _Search:
     def __init__(
-        self, forces: Forces, start: Array, stiffness: Array | None, downhill: bool = False
+        self,
+        forces: Forces,
+        start: Array,
+        stiffness: Array | None,
+        left: float,
+        downhill: bool = False,
     ) -> None:
-        self._forces, self._start, self._downhill = forces, start, downhill
+        self._forces, self._start, self._downhill, self._left = forces, start, downhill, left
         self._trials, self._steps = 0, 0
         self._fresh, self._since, self._unknown = False, 0, False
         self._radius, self._refused = FIRST_RADIUS, False
@@ -152,6 +163,8 @@ class _Search:
                 return self._end(BalanceStatus.OUT_OF_RANGE)
             if self._converged():
                 return self._end(self._kind())
+            if self._near():
+                return replace(self._end(BalanceStatus.OK), at_rest=False)
             if np.abs(self.x - self._start).max() > LONGEST_TRAVEL:
                 return self._end(BalanceStatus.RUNS_AWAY)
             if self._radius < NARROWEST_RADIUS and (self._own or self._fresh):
@@ -249,6 +262,14 @@ class _Search:
         held = values > SMALLEST_STIFFNESS
         step = right[held].T @ ((left.T @ self.force)[held] / values[held])
         return bool((np.abs(step) < STEP_TOLERANCE).all())
+
+    def _near(self) -> bool:
+        """Return whether the step that is left is short against the way from the start."""
+        way = self._left * float(np.linalg.norm(self.x - self._start))
+        if way == 0.0 or self._smallest_stiffness() <= SMALLEST_STIFFNESS:
+            return False
+        step = float(np.linalg.norm(np.linalg.solve(self.stiffness, self.force)))
+        return step < min(way, self._radius)
 
     def _kind(self) -> BalanceStatus:
         if not (self._own or self._fresh) and self._smallest_stiffness() <= SMALLEST_STIFFNESS:

@@ -12,6 +12,7 @@
 import time as clock
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.frame_contact import FrameContact
 from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.equilibrium.post_side import cam_on_post, post_contact
+from tkamb.equilibrium.released_forces import SCALE
 from tkamb.equilibrium.split_sensitivity import split_sensitivity, split_tangent
 from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
@@ -52,6 +54,8 @@ ASTRAY = (
     BalanceStatus.RUNS_AWAY,  # as far from a bad start as from a good one
 )
 """Ends of a search that another start may mend."""
+FARTHEST_AHEAD = 2e-3
+"""m: a search begins at most so far ahead of the last frame."""
 FIRST_DEPTH = 5e-5
 """m: how deep the search for released coordinates begins."""
 
@@ -203,12 +207,12 @@ class ContactSide:
 
         Args:
             k: frame.
-            before: the contacts of the frames before; the last two that were found are where
-                the search begins.
+            before: the contacts of the frames before; where the last three that were found
+                go on is where the search begins.
         """
         released, start = self.released, clock.perf_counter()
         assert released is not None
-        good = [contact for contact in before if contact.equilibrium and contact.result][-2:]
+        good = [contact for contact in before if contact.equilibrium and contact.result][-3:]
         guess = good[-1].result if good else None
         points = {} if len(released.released) == 5 else self._nearest_points(k)
         try:
@@ -239,7 +243,7 @@ class ContactSide:
 
         Args:
             k: frame.
-            found: the last two frames that were found.
+            found: the last three frames that were found.
             points: side -> where a condyle that carries nothing is nearest to the insert.
 
         Raises:
@@ -268,7 +272,7 @@ class ContactSide:
         """
         assert self.released is not None
         recorded, rows = self.case.motion.coordinates[k], list(self.released.released)
-        for number, place in enumerate([2 * found[-1] - found[0], found[-1]] if found else []):
+        for number, place in enumerate([carried_on(found), found[-1]] if found else []):
             start = recorded.copy()
             start[rows] = place[rows]
             yield start if number == 0 else self.on_the_insert(start)
@@ -341,6 +345,20 @@ class ContactSide:
         """Return a contact that could not be computed, and why."""
         none = np.zeros(len(self.state.points), bool)
         return FrameContact(None, none, None, 0.0, problem, ())
+
+
+def carried_on(found: list[Array]) -> Array:
+    """Return the coordinates (6,) after those of up to three frames.
+
+    The last step is made again, or that part of it by which the step before foretold it, and no
+    farther than `FARTHEST_AHEAD`: a lightly loaded knee wanders to and fro.
+    """
+    if len(found) < 3:
+        return found[-1]
+    before, step = ((b - a) * SCALE for a, b in pairwise(found))
+    part = float(before @ step) / max(float(before @ before), 1e-18)
+    longest = FARTHEST_AHEAD / max(float(np.linalg.norm(step)), 1e-9)
+    return found[-1] + min(max(part, 0.0), 1.0, longest) * (found[-1] - found[-2])
 
 
 def _points(body: FrameLoads) -> dict[str, Array]:

@@ -20,7 +20,7 @@ from tkamb.body.knee import KneeGeometry, KneeLoads, solve_knee, unsolved
 from tkamb.body.load import PointForces
 from tkamb.equilibrium.known import Known, contact_query, extensor_frames
 from tkamb.errors import ComputationError, InputError, TkambError
-from tkamb.geometry.frames import SIDES, Array, knee_pose, knee_twist
+from tkamb.geometry.frames import SIDES, Array, cross, knee_pose, knee_twist
 from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
 
@@ -189,7 +189,7 @@ class Mechanics:
             point: (3,) m, insert frame.
         """
         velocity, spin = knee_twist(coordinates, self.case.motion.velocity[k])
-        return np.asarray(velocity + np.cross(spin, point - coordinates[:3]))
+        return np.asarray(velocity + cross(spin, point - coordinates[:3]))
 
     @property
     def sides(self) -> set[str]:
@@ -228,7 +228,7 @@ class Mechanics:
         sliding = self.sliding(k, coordinates, post.point)
         touch = CondylePoint(post.point, post.normal, sliding, 0.0)
         force = -post.force * touch.direction(self.friction)
-        twist = post.wrench[3:] - np.cross(post.point, post.wrench[:3])
+        twist = post.wrench[3:] - cross(post.point, post.wrench[:3])
         return (
             PointForces("tibia", post.point[None], force[None], twist),
             PointForces("femur", post.point[None], -force[None], -twist),

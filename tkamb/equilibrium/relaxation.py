@@ -8,9 +8,10 @@ circle. So the forces go only a part omega of the way from those held, f, to tho
 
 d and d' the last two f' - f: Aitken's secant for a vector. At the end f' itself is held.
 
-How the knee yields to the muscles, which decides their arms, is found anew in the first passes
-only: the contact's stiffness jumps from facet to facet, and forces that follow every jump would
-never settle. What it is by then belongs to a pose some micrometres away.
+How the knee yields to the muscles, which decides their arms, is found anew until the forces settle
+where the contact's stiffness is a smooth function of the pose, so that the answer does not hang on
+where the search began. Else, and where they do not settle (a condyle that rests on a few columns),
+in the first passes only: forces that follow each of its jumps never would.
 
 References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.1620010306;
 Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
@@ -33,7 +34,7 @@ LEAST, MOST = 0.05, 1.0
 """The limits of omega."""
 
 
-FRESH = 3
+FRESH, FRESH_IF_SMOOTH = 3, 8
 """In so many passes it is found anew how the knee yields."""
 
 
@@ -51,9 +52,14 @@ class Relaxation:
         self._yields: Array | None = None
         self._passes = 0
 
-    def kept(self, found: Callable[[], Array | None]) -> Array | None:
-        """Return how the knee yields, from `found` in the first passes."""
-        if self._passes < FRESH:
+    def kept(self, found: Callable[[], Array | None], smooth: bool) -> Array | None:
+        """Return how the knee yields, from `found` in the first passes.
+
+        Args:
+            found: computes it.
+            smooth: it is a smooth function of the pose.
+        """
+        if self._passes < (FRESH_IF_SMOOTH if smooth else FRESH):
             self._yields = found()
         self._passes += 1
         return self._yields

@@ -46,6 +46,8 @@ FORCE_SHARE = 2e-4
 """of it: or this part of it, by which the patella's jumps from facet to facet change it."""
 MOST_PASSES = 20
 """Passes by which knee and patella settle; each halves what is left where the knee is soft."""
+LEFT = 0.1
+"""Share of its way that a pass may leave to the next, where muscles make it a few passes anyway."""
 SLACK = 1e-3
 """N: an extensor group of muscles that pulls with less is slack."""
 
@@ -117,7 +119,7 @@ class ReleasedKnee:
         """
         place, middle, force = np.array(start, float), np.array(start[:3]), np.full(3, np.nan)
         knee, slack, trials, passes = before, False, 0, 0
-        touch, mixing = None, Relaxation()
+        touch, mixing, ways = None, Relaxation(), [np.inf, np.inf]
         while passes < MOST_PASSES:
             knee, pushes = self._pass(k, place, middle, slack, knee, touch, mixing)
             touch = knee.contact
@@ -127,15 +129,18 @@ class ReleasedKnee:
             moved = np.abs((knee.coordinates - place) * SCALE).max()
             place, force, last = knee.coordinates, knee.contact.wrench[:3], middle
             middle = _middle(knee.contact, points, place)
-            shift = np.abs(middle - last).max() if self._keeps else 0.0
+            ways.append(max(moved, np.abs(middle - last).max() if self._keeps else 0.0))
             if pushes:
                 # a line that pushes drives the knee away: slack, it begins where this began
                 slack, knee, touch = True, before, None
                 place, middle, force = np.array(start, float), np.array(start[:3]), force * np.nan
+                ways = [np.inf, np.inf]
             elif knee.problem or (
-                max(moved, shift) < KNEE_CHANGE
-                and change < max(FORCE_CHANGE, FORCE_SHARE * float(np.linalg.norm(force)))
-                and mixing.settled
+                mixing.settled
+                and knee.balance.at_rest
+                and ahead(ways[-3:]) * ways[-1] < KNEE_CHANGE
+                and ahead(ways[-3:]) * change
+                < max(FORCE_CHANGE, FORCE_SHARE * float(np.linalg.norm(force)))
             ):
                 return knee
         assert knee is not None
@@ -160,7 +165,8 @@ class ReleasedKnee:
             share = mixing.mixed(self._share(k, geometry, middle, touch, held, mixing))
             geometry, slack = replace(geometry, share=share), muscles.tension(share) < SLACK
         forces = self._forces(k, geometry, middle, slack)
-        balance = forces.balance(before.balance.stiffness if before else None)
+        stiffness = before.balance.stiffness if before else None
+        balance = forces.balance(stiffness, LEFT if muscles else 0.0)
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
         if balance.status is not BalanceStatus.OK:
             problem = problem or f"released: {balance.status.value}" + (
@@ -178,7 +184,8 @@ class ReleasedKnee:
             problem,
         )
         # with other muscles their sharing says whether the quadriceps is slack
-        return knee, not muscles and contact.known and forces.pushes(balance)
+        ended = balance.at_rest or balance.status is not BalanceStatus.OK
+        return knee, ended and not muscles and contact.known and forces.pushes(balance)
 
     def _share(
         self,
@@ -212,10 +219,11 @@ class ReleasedKnee:
         gain = None
         if held is not None:
             forces = self._forces(k, replace(geometry, share=held), middle, False)
-            gain = mixing.kept(lambda: forces.tension_per_wrench(here))
+            smooth = self._probe.smoothed(knee_pose(place), here)
+            gain = mixing.kept(lambda: forces.tension_per_wrench(smooth), self._probe.smooths)
         if held is not None and gain is not None:
             pull = held.wrench(geometry.state.pose("tibia"), geometry.state.pose("femur"))
-            base = forces.tension(here) - float(gain @ pull)
+            base = forces.tension_at_rest(here, gain) - float(gain @ pull)
             share = muscles.share_of_yielding_knee(k, geometry, friction, base, gain)
         else:
             points = mechanics.resultants(k, place, here.condyles)
@@ -253,6 +261,23 @@ class ReleasedKnee:
         )
         sliding = partial(mechanics.sliding, k)
         return ReleasedForces(joint, self._probe, geometry.coordinates, mechanics.friction, sliding)
+
+
+def ahead(ways: Sequence[float]) -> float:
+    """Return how far a search of ever shorter passes still goes, per way of its last pass.
+
+    With q the greater of the last two ratios of successive passes, the geometric series of what
+    would follow is q / (1 - q). Where a pass did not at least halve the way of the one before,
+    or there were less than three: 1, so that the last pass itself has to be short.
+
+    Args:
+        ways: m, by which the last three passes moved; inf where there was none.
+    """
+    first, second, last = ways
+    if not 0.0 < second <= 0.5 * first < np.inf or last > 0.5 * second:
+        return 1.0
+    ratio = max(last / second, second / first)
+    return ratio / (1.0 - ratio)
 
 
 def _middle(contact: "ProbedContact", points: dict[str, Array] | None, place: Array) -> Array:

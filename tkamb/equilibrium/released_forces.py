@@ -72,9 +72,14 @@ class FreeForces(Generic[J]):
         self._scale = SCALE[self._rows]
         self.seen: dict[bytes, ProbedContact] = {}
 
-    def balance(self, stiffness: Array | None = None) -> Balance:
-        """Return where the free coordinates come to rest, from the given place."""
-        return find_balance(self.trial, self._place[self._rows] * self._scale, stiffness)
+    def balance(self, stiffness: Array | None = None, left: float = 0.0) -> Balance:
+        """Return where the free coordinates come to rest, from the given place.
+
+        Args:
+            stiffness: (n, n) N/m of a search near by.
+            left: share of the way that may be left, see `find_balance`.
+        """
+        return find_balance(self.trial, self._place[self._rows] * self._scale, stiffness, left)
 
     def contact(self, balance: Balance) -> "ProbedContact":
         """Return the contact of a balance."""
@@ -155,10 +160,18 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
         matrix = np.hstack([-change, axes @ self._joint.columns(place)])
         return np.asarray(-np.linalg.solve(matrix, axes)[-1])
 
-    def tension(self, contact: "ProbedContact") -> float:
-        """Return the tension (N) by which the patellar ligament balances flexion there."""
+    def tension_at_rest(self, contact: "ProbedContact", per_wrench: Array) -> float:
+        """Return the tension (N) by which the patellar ligament balances flexion near by, at rest.
+
+        A wrench that the place leaves unbalanced counts as one more that the knee yields to.
+
+        Args:
+            contact: at the place where the search begins.
+            per_wrench: (6,), see `tension_per_wrench`.
+        """
         wrench, _ = self._with_friction(self._place, contact)
-        return float(self._joint.kept(self._place, wrench)[-1])
+        kept = self._joint.kept(self._place, wrench)
+        return float(kept[-1] + per_wrench @ self._joint.unbalanced(self._place, wrench, kept))
 
     def pushes(self, balance: Balance) -> bool:
         """Return whether the patellar ligament, where it is taut, would have to push."""

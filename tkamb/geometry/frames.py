@@ -14,8 +14,6 @@ flexion about the femoral ML axis (positive in flexion), adduction about the flo
 Reference: Grood & Suntay, J Biomech Eng 105:136 (1983), doi:10.1115/1.3138397.
 """
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -34,6 +32,8 @@ PATELLA_COORDINATES = PATELLA_JOINT_NAMES = ("patella_ap", "patella_si", "patell
 
 SIDES = ("medial", "lateral")
 """The condyles."""
+
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 def pose(rotation: ArrayLike, translation: ArrayLike) -> Array:
@@ -72,14 +72,26 @@ def rotate(pose_a_in_b: ArrayLike, vectors: ArrayLike) -> Array:
     return vectors @ np.swapaxes(rotation, -1, -2)
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Return a x b of vectors (..., 3): `np.cross` to the last bit, without its 40 µs a call."""
+    return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
+
+
 def knee_pose(coordinates: ArrayLike) -> Array:
     """Return pose_femoral_in_insert (..., 4, 4) from knee coordinates (..., 6), m and rad."""
-    from scipy.spatial.transform import Rotation  # slow to import, and not all need it
-
-    c: Any = np.asarray(coordinates, float)
-    angles = np.stack([-c[..., 3], -c[..., 4], c[..., 5]], axis=-1)
-    rotation = Rotation.from_euler("YXZ", angles.reshape(-1, 3)).as_matrix()
-    return pose(rotation.reshape(*c.shape[:-1], 3, 3), c[..., :3])
+    c = np.asarray(coordinates, float)
+    sine, cosine = np.sin(c[..., 3:]), np.cos(c[..., 3:])
+    sa, sd, sf = sine[..., 0], sine[..., 1], sine[..., 2]
+    ca, cd, cf = cosine[..., 0], cosine[..., 1], cosine[..., 2]
+    result = np.zeros((*c.shape[:-1], 4, 4))
+    # Ry(-axial_rotation) Rx(-adduction) Rz(flexion), written out
+    result[..., 0, 0], result[..., 0, 1] = ca * cf + sa * sd * sf, sa * sd * cf - ca * sf
+    result[..., 0, 2], result[..., 1, 0] = -sa * cd, cd * sf
+    result[..., 1, 1], result[..., 1, 2] = cd * cf, sd
+    result[..., 2, 0], result[..., 2, 1] = sa * cf - ca * sd * sf, -sa * sf - ca * sd * cf
+    result[..., 2, 2], result[..., 3, 3] = ca * cd, 1.0
+    result[..., :3, 3] = c[..., :3]
+    return result
 
 
 def knee_coordinates(pose_femoral_in_insert: ArrayLike) -> Array:
@@ -144,5 +156,5 @@ def knee_axes(coordinates: ArrayLike) -> Array:
     axes[..., 5, 3] = -np.sin(turn) * np.cos(tilt)
     axes[..., 5, 4] = np.sin(tilt)
     axes[..., 5, 5] = np.cos(turn) * np.cos(tilt)
-    axes[..., 3:, :3] = np.cross(c[..., None, :3], axes[..., 3:, 3:])
+    axes[..., 3:, :3] = cross(c[..., None, :3], axes[..., 3:, 3:])
     return axes

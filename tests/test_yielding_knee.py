@@ -1,0 +1,87 @@
+"""What passes between muscles and knee are made of: smooth stiffness, rough passes, their end."""
+
+import numpy as np
+import pytest
+
+from joints import BALL, HEIGHT, LINEAR, flat_joint
+from tkamb.contact.foundation import LinearFoundation
+from tkamb.equilibrium.balance import BalanceStatus, Trial, find_balance
+from tkamb.equilibrium.contact_side import FARTHEST_AHEAD, carried_on
+from tkamb.equilibrium.released import KNEE_CHANGE, ahead
+from tkamb.equilibrium.released_forces import SCALE
+from tkamb.geometry.frames import knee_pose
+
+CELL = 1e-3
+
+
+def test_the_mean_stiffness_is_the_closed_form_and_does_not_jump():
+    """Two spheres on a layer: dF/dd = 2 pi (M/h) (2 R d - d²), wherever the columns stand."""
+    model = LinearFoundation(CELL)
+    probe = model.probe(model.prepare(flat_joint()))
+    for depth in (0.05e-3, 0.15e-3):
+        found = []
+        for x in np.linspace(0, CELL, 11):
+            pose = knee_pose(np.array([x, HEIGHT + BALL - depth, 0.0003, 0, 0, 0.3]))
+            contact = probe.at(pose)
+            smooth = probe.smoothed(pose, contact)
+            assert np.array_equal(smooth.wrench, contact.wrench)
+            found.append([sum(c.stiffness[1, 1] for c in s.loads) for s in (contact, smooth)])
+        tangent, mean = np.abs(np.array(found).T)
+        exact = 2 * np.pi * LINEAR.confined_modulus / HEIGHT * (2 * BALL * depth - depth**2)
+        assert mean == pytest.approx(np.full(11, exact), rel=0.06)
+        assert np.abs(np.diff(mean)).max() < 0.2 * np.abs(np.diff(tangent)).max()
+
+
+def springs(x):
+    """Springs that harden: f = load - K x - c x³."""
+    stiffness = np.array([[3e5, 1e4], [1e4, 5e4]])
+    force = np.array([200.0, -150.0]) - stiffness @ x - 1e10 * x**3
+    return Trial(force, stiffness + np.diag(3e10 * x**2))
+
+
+def test_a_rough_search_leaves_no_more_than_it_may_and_says_so():
+    start = np.array([4e-3, 5e-3])
+    rest = find_balance(springs, start)
+    rough = find_balance(springs, start, left=0.1)
+    assert rest.status is rough.status is BalanceStatus.OK
+    assert rest.at_rest
+    assert not rough.at_rest
+    assert rough.trials < rest.trials
+    missed = np.linalg.norm(rough.coordinates - rest.coordinates)
+    assert 0 < missed < 0.15 * np.linalg.norm(rough.coordinates - start)
+    assert find_balance(springs, rest.coordinates, left=0.1).at_rest
+
+
+def test_a_rough_search_does_not_end_where_nothing_holds_it():
+    """On a hilltop a short Newton step leads up it."""
+    hilltop = find_balance(lambda x: Trial(1e5 * x, -1e5 * np.eye(1)), np.array([1e-4]), left=0.5)
+    assert hilltop.status is not BalanceStatus.OK
+
+
+@pytest.mark.parametrize("ratio", [0.02, 0.3, 0.45])
+def test_what_is_ahead_of_passes_that_shrink_is_their_series(ratio):
+    ways = 1e-3 * ratio ** np.arange(60)
+    for k in range(2, 8):
+        assert ahead(ways[k - 2 : k + 1]) * ways[k] == pytest.approx(ways[k + 1 :].sum(), rel=1e-6)
+
+
+def test_what_is_ahead_is_not_guessed_from_passes_that_do_not_settle():
+    """One short pass after a long one foretells nothing: a search that trusts it ends too soon."""
+    short = 1.5 * KNEE_CHANGE
+    for ways in ([np.inf, np.inf, short], [np.inf, 1e-3, short], [1e-3, 0.9e-3, short]):
+        assert ahead(ways) == 1.0
+    assert ahead([1e-3, 4e-4, 3e-4]) == 1.0
+    # alternating q = 0.4, 0.02: the greater of both ratios bounds what follows
+    ways = 1e-3 * np.cumprod([1.0, *([0.4, 0.02] * 5)])
+    for k in range(2, len(ways) - 1):
+        assert ahead(ways[k - 2 : k + 1]) * ways[k] >= ways[k + 1 :].sum()
+
+
+def test_a_search_begins_where_steady_frames_go_on_and_no_farther():
+    step = np.array([3e-4, -1e-4, 2e-4, 4e-3, 1e-3, 0.0])
+    steady = [np.zeros(6), step, 2 * step]
+    assert carried_on(steady) == pytest.approx(3 * step, abs=1e-15)
+    assert np.array_equal(carried_on(steady[:1]), steady[0])
+    assert np.array_equal(carried_on([np.zeros(6), step, np.zeros(6)]), np.zeros(6))
+    leap = carried_on([np.zeros(6), 50 * step, 100 * step]) - 100 * step
+    assert np.linalg.norm(leap * SCALE) == pytest.approx(FARTHEST_AHEAD, rel=1e-9)
