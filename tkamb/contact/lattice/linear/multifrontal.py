@@ -257,7 +257,7 @@ def fronts_of(
         ComputationError: the matrix is not positive definite.
     """
     order = np.concatenate(unknowns)
-    matrix = matrix[order][:, order].tocsc()
+    matrix = matrix[order][:, order].T  # symmetric: its rows are its columns
     matrix.sort_indices()
     updates: dict[int, list[tuple[Index, Array]]] = {}
     row = np.empty(len(order), np.int64)
@@ -297,7 +297,8 @@ def _eliminate(
     own[rows[inside] - start, columns[inside]] = values[inside]
     row[boundary] = np.arange(m)
     mixed[row[rows[below]], columns[below]] = values[below]
-    for indices, update in children:
+    while children:  # each is freed when it has been added
+        indices, update = children.pop()
         split = int(np.searchsorted(indices, stop))
         here, there = indices[:split] - start, row[indices[split:]]
         _extend_add(own, here, here, update[:split, :split], True)
@@ -306,7 +307,7 @@ def _eliminate(
     lower, info = lapack.dpotrf(own, lower=1, clean=1, overwrite_a=1)
     if info:
         raise ComputationError("the stiffness matrix is not positive definite")
-    inverse, _ = lapack.dtrtri(lower, lower=1)
+    inverse, _ = lapack.dtrtri(lower, lower=1, overwrite_c=1)
     if m:
         mixed = blas.dtrmm(1.0, inverse, mixed, side=1, lower=1, trans_a=1, overwrite_b=1)
         rest = blas.dsyrk(-1.0, mixed, 1.0, rest, lower=1, overwrite_c=1)
