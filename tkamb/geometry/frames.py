@@ -14,6 +14,8 @@ flexion about the femoral ML axis (positive in flexion), adduction about the flo
 Reference: Grood & Suntay, J Biomech Eng 105:136 (1983), doi:10.1115/1.3138397.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -79,19 +81,12 @@ def cross(a: Array, b: Array) -> Array:
 
 def knee_pose(coordinates: ArrayLike) -> Array:
     """Return pose_femoral_in_insert (..., 4, 4) from knee coordinates (..., 6), m and rad."""
-    c = np.asarray(coordinates, float)
-    sine, cosine = np.sin(c[..., 3:]), np.cos(c[..., 3:])
-    sa, sd, sf = sine[..., 0], sine[..., 1], sine[..., 2]
-    ca, cd, cf = cosine[..., 0], cosine[..., 1], cosine[..., 2]
-    result = np.zeros((*c.shape[:-1], 4, 4))
-    # Ry(-axial_rotation) Rx(-adduction) Rz(flexion), written out
-    result[..., 0, 0], result[..., 0, 1] = ca * cf + sa * sd * sf, sa * sd * cf - ca * sf
-    result[..., 0, 2], result[..., 1, 0] = -sa * cd, cd * sf
-    result[..., 1, 1], result[..., 1, 2] = cd * cf, sd
-    result[..., 2, 0], result[..., 2, 1] = sa * cf - ca * sd * sf, -sa * sf - ca * sd * cf
-    result[..., 2, 2], result[..., 3, 3] = ca * cd, 1.0
-    result[..., :3, 3] = c[..., :3]
-    return result
+    from scipy.spatial.transform import Rotation  # slow to import, and not all need it
+
+    c: Any = np.asarray(coordinates, float)
+    angles = np.stack([-c[..., 3], -c[..., 4], c[..., 5]], axis=-1)
+    rotation = Rotation.from_euler("YXZ", angles.reshape(-1, 3)).as_matrix()
+    return pose(rotation.reshape(*c.shape[:-1], 3, 3), c[..., :3])
 
 
 def knee_coordinates(pose_femoral_in_insert: ArrayLike) -> Array:
