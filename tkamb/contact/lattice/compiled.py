@@ -6,15 +6,32 @@ be taken in another order, as vector registers do; nothing else of IEEE arithmet
 Indices are not held against bounds.
 """
 
+import logging
 from collections.abc import Callable
+from functools import cache
 from typing import Any, TypeVar, cast
 
 from numba import njit
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+_log = logging.getLogger("tkamb")
+
 
 def compiled(function: Function) -> Function:
     """Return the function compiled; it lets other threads run."""
-    compiler: Any = njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
-    return cast(Function, compiler(function))
+    options: dict[str, Any] = {"nogil": True, "fastmath": {"reassoc", "contract", "nsz"}}
+    compiler: Any = njit
+    try:
+        return cast(Function, compiler(cache=True, **options)(function))
+    except RuntimeError:  # numba finds no folder that it may write to
+        _say_once()
+        return cast(Function, compiler(**options)(function))
+
+
+@cache
+def _say_once() -> None:
+    _log.warning(
+        "compiled loops of the lattice are not kept: every process compiles them anew, ten seconds "
+        "or more; let NUMBA_CACHE_DIR name a folder that can be written to"
+    )
