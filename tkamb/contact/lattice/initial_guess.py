@@ -11,9 +11,8 @@ from tkamb.geometry.frames import Array, Index, Mask
 MARGIN = 0.25
 """Nodes count as candidates this share of the depth beyond first touch."""
 UNSEEN_WAY = 0.1
-"""Of a cell: so far the contact may go without a look at all elements; measured, not proven: what
-then comes to count outside of the region stays below a tenth of the tolerance (see
-`tests/test_lattice_sketch.py`)."""
+"""Of a cell: so far the contact may go without a look at all elements. Measured, not proven: the
+whole solid is then in balance to 1.2 times the tolerance (`tests/test_lattice_sketch.py`)."""
 UNSEEN_GROWTH = 1.1
 """And so much may its forces grow."""
 ARM = 0.03
@@ -52,8 +51,7 @@ class WarmStart:
     before: "WarmStart | None" = None
 
     def near(self, pose: Array) -> bool:
-        """Return whether a pose is so close to where all elements were looked at that none of
-        those left out can have come to count while the forces have not grown."""
+        """Return whether a pose is within `UNSEEN_WAY` of where all elements were looked at."""
         reach = UNSEEN_WAY * float(self.problem.solid.spacing.min())
         return bool(np.linalg.norm(_way(self.looked[1], pose)) <= reach)
 
