@@ -77,3 +77,15 @@ def test_a_sketch_flags_nothing_and_without_a_guess_looks_at_all(state):
     assert result.flags == ()
     assert np.array_equal(result.nodal_force, whole.nodal_force)
     assert result.status is whole.status
+
+
+@pytest.mark.slow
+def test_a_sketch_that_compresses_cells_to_nothing_is_out_of_range(state):
+    """A step of a search that went far too deep: it must not come back with forces."""
+    touching = MODEL.press(state, LOAD, place(0.0))
+    deep = touching.pose.copy()
+    deep[1, 3] -= 6e-3
+    whole = MODEL.evaluate(state, deep)
+    sketch = MODEL.evaluate(state, deep, touching, sketch=True)
+    assert any("compressed to nothing" in flag for flag in whole.flags)
+    assert sketch.status is whole.status is not touching.status

@@ -48,11 +48,13 @@ def result_of(
         iterations=solution.passes,
         residual=solution.residual,
     )
+    flags: tuple[str, ...] = ()
+    if solution.seen:  # a sketch close by knows the strains of its region alone
+        flags, collapsed = strain_flags(state, solution)
+        if collapsed:
+            return ContactResult.failed(state, pose, *flags)
     if sketch:
         return made(state, pose, pressure, gaps - depth, force, area, area)
-    flags, collapsed = strain_flags(state, solution)
-    if collapsed:
-        return ContactResult.failed(state, pose, *flags)
     if not solution.converged:
         flags = (*flags, unsettled_flag(solution))
     gap = _gaps(state, pose, gaps - depth, force, solution)

@@ -104,7 +104,8 @@ def solve(
         forces, moved = solve_pass(guess.response, balance.offset, points, planes, load, active)
         if warm and not forces.active.any():
             # What a heavier contact left behind holds the nodes down: begin without it.
-            warm, balance = False, NonlinearBalance(problem, guess.cold, tolerance.force)
+            warm, guess = False, guess.cold
+            balance = NonlinearBalance(problem, guess, tolerance.force)
             sliding = SlidingNodes(problem, points, balance.offset, pose, guess.planes)
             continue
         active = forces.active
