@@ -111,6 +111,7 @@ class PatellofemoralContact:
         self._corner_normals, self._sharp = femoral.corner_normals, sharp_edges(femoral)
         self._samples = _joint_side(patellar)
         self._left: NDArray[np.bool_] = np.asarray(self._samples[:, 2] < 0.0)
+        self._sides = (self._left, ~self._left)
         self._forget()
 
     def _forget(self) -> None:
@@ -136,7 +137,7 @@ class PatellofemoralContact:
     def at(self, coordinates: Array) -> PatellarContact:
         """Return the contact at (ap, si, rotation), m and rad."""
         self._measure(transform(self.pose(np.asarray(coordinates, float)), self._samples))
-        sides = [self._side(self._left), self._side(~self._left)]
+        sides = [self._side(side) for side in self._sides]
         gaps, points, normals, edges = (np.array(part) for part in zip(*sides, strict=True))
         out_of_plane = np.stack([normals[:, 2], points[:, 2] - self.ml])
         left = _share_left(gaps, out_of_plane, self._yield)
@@ -163,15 +164,17 @@ class PatellofemoralContact:
         return bool((apart < 0.0).any())
 
     def _measure(self, here: Array) -> None:
-        """Bring the distances up to date wherever they could matter."""
+        """Bring the distances up to date wherever they could matter.
+
+        A sample that has moved by m since it was seen at distance d lies between d - m and d + m:
+        what cannot come within `REACH` of its side's nearest keeps what was seen.
+        """
         moved = np.linalg.norm(here - self._seen_at, axis=1)
-        lower = np.where(np.isfinite(moved), self._distance - moved, -np.inf)
-        sides = (self._left, ~self._left)
-        first = np.array([np.flatnonzero(side)[np.argmin(lower[side])] for side in sides])
-        self._look(here, first)
-        moved[first] = 0.0
-        reach = np.where(self._left, *(self._distance[first] + REACH))
-        self._look(here, np.flatnonzero((moved > 0.0) & (lower < reach)))
+        new = ~np.isfinite(moved)
+        farthest = np.where(new, np.inf, self._distance + moved)
+        nearest = np.where(new, -np.inf, self._distance - moved)
+        reach = np.where(self._left, *(farthest[side].min() + REACH for side in self._sides))
+        self._look(here, np.flatnonzero((moved > 0.0) & (nearest < reach)))
 
     def _look(self, here: Array, which: NDArray[np.int64]) -> None:
         if len(which) == 0:

@@ -164,7 +164,7 @@ class ReleasedKnee:
             held = None if touch is None or before is None else before.geometry.share
             share = mixing.mixed(self._share(k, geometry, middle, touch, held, mixing))
             geometry, slack = replace(geometry, share=share), muscles.tension(share) < SLACK
-        forces = self._forces(k, geometry, middle, slack)
+        forces = self._forces(k, geometry, middle, slack, touch)
         stiffness = before.balance.stiffness if before else None
         balance = forces.balance(stiffness, LEFT if muscles else 0.0)
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
@@ -248,7 +248,12 @@ class ReleasedKnee:
         return extensor.patella(k, knee_pose(place), guess)
 
     def _forces(
-        self, k: int, geometry: KneeGeometry, middle: Array, slack: bool
+        self,
+        k: int,
+        geometry: KneeGeometry,
+        middle: Array,
+        slack: bool,
+        touch: "ProbedContact | None" = None,
     ) -> "ReleasedForces":
         mechanics = self._mechanics
         joint = joint_equilibrium(
@@ -260,7 +265,8 @@ class ReleasedKnee:
             slack,
         )
         sliding = partial(mechanics.sliding, k)
-        return ReleasedForces(joint, self._probe, geometry.coordinates, mechanics.friction, sliding)
+        place, friction = geometry.coordinates, mechanics.friction
+        return ReleasedForces(joint, self._probe, place, friction, sliding, touch)
 
 
 def ahead(ways: Sequence[float]) -> float:

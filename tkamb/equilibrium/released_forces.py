@@ -53,6 +53,7 @@ class FreeForces(Generic[J]):
         place: (6,) knee coordinates; those not free stay.
         friction: Coulomb coefficient.
         sliding: from coordinates (6,) and point (3,) to the femur's velocity there (3,), m/s.
+        touch: the contact at that place, where it is known already.
 
     Attributes:
         seen: scaled coordinates as bytes -> contact there.
@@ -65,12 +66,16 @@ class FreeForces(Generic[J]):
         place: Array,
         friction: float = 0.0,
         sliding: Sliding = _no_sliding,
+        touch: "ProbedContact | None" = None,
     ) -> None:
         self._joint, self._probe, self._place = joint, probe, np.array(place, float)
         self._friction, self._sliding = friction, sliding
         self._rows = list(joint.released)
         self._scale = SCALE[self._rows]
+        self._start = self._place[self._rows] * self._scale
         self.seen: dict[bytes, ProbedContact] = {}
+        if touch is not None:
+            self.seen[self._start.tobytes()] = touch
 
     def balance(self, stiffness: Array | None = None, left: float = 0.0) -> Balance:
         """Return where the free coordinates come to rest, from the given place.
@@ -79,7 +84,7 @@ class FreeForces(Generic[J]):
             stiffness: (n, n) N/m of a search near by.
             left: share of the way that may be left, see `find_balance`.
         """
-        return find_balance(self.trial, self._place[self._rows] * self._scale, stiffness, left)
+        return find_balance(self.trial, self._start, stiffness, left)
 
     def contact(self, balance: Balance) -> "ProbedContact":
         """Return the contact of a balance."""
@@ -87,8 +92,10 @@ class FreeForces(Generic[J]):
 
     def trial(self, x: Array) -> Trial:
         """Return scaled forces and stiffness at scaled coordinates (n,), m."""
-        place = self._with(x)
-        contact = self.seen[x.tobytes()] = self._probe.at(knee_pose(place))
+        place, key = self._with(x), x.tobytes()
+        contact = self.seen.get(key)
+        if contact is None:
+            contact = self.seen[key] = self._probe.at(knee_pose(place))
         if not contact.known:
             return Trial(np.full(len(x), np.nan))
         wrench, stiffness = self._with_friction(place, contact)
