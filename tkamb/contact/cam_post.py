@@ -246,7 +246,6 @@ class CondylesAndPost:
 
     def __init__(self, condyles: Any, post: PostProbe) -> None:
         self._condyles, self._post = condyles, post
-        self.smooths: bool = condyles.smooths
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4)."""

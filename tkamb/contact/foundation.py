@@ -221,7 +221,6 @@ class FoundationProbe:
     """
 
     exact: ClassVar[bool] = True
-    smooths: ClassVar[bool] = True
 
     def __init__(self, law: Law, state: SampledContact) -> None:
         self._law, self._state = law, state

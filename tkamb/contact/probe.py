@@ -93,11 +93,9 @@ class Probe:
 
     Attributes:
         exact: every answer brings the tangent, and it costs less than a press.
-        smooths: `smoothed` does what it says.
     """
 
     exact: ClassVar[bool] = False
-    smooths: ClassVar[bool] = False
 
     def __init__(self, model: Presses, state: Any, guess: ContactResult | None = None) -> None:
         self._model, self._state, self._guess = model, state, guess

@@ -107,7 +107,11 @@ Forces = Callable[[Array], Trial]
 
 
 def find_balance(
-    forces: Forces, start: Array, stiffness: Array | None = None, left: float = 0.0
+    forces: Forces,
+    start: Array,
+    stiffness: Array | None = None,
+    left: float = 0.0,
+    reach: float = np.inf,
 ) -> Balance:
     """Find coordinates at which no force is left.
 
@@ -118,12 +122,13 @@ def find_balance(
             `forces` does not bring its own.
         left: share of the way from the start that may be left of a search which is repeated
             under other forces; 0: none.
+        reach: m, such a search ends where a coordinate is farther from the start.
     """
-    found = _Search(forces, np.array(start, float), stiffness, left).run()
+    found = _Search(forces, np.array(start, float), stiffness, left, reach).run()
     if found.status not in (BalanceStatus.RUNS_AWAY, BalanceStatus.NOT_CONVERGED):
         return found
     # Newton's direction may lead off over the facets of a contact; the way downhill may not.
-    again = _Search(forces, np.array(start, float), stiffness, left, downhill=True).run()
+    again = _Search(forces, np.array(start, float), stiffness, left, reach, downhill=True).run()
     if again.status is not BalanceStatus.OK:
         return found
     return replace(again, trials=found.trials + again.trials, steps=found.steps + again.steps)
@@ -136,9 +141,11 @@ class _Search:
         start: Array,
         stiffness: Array | None,
         left: float,
+        reach: float,
         downhill: bool = False,
     ) -> None:
-        self._forces, self._start, self._downhill, self._left = forces, start, downhill, left
+        self._forces, self._start, self._downhill = forces, start, downhill
+        self._left, self._reach = left, reach
         self._trials, self._steps = 0, 0
         self._fresh, self._since, self._unknown = False, 0, False
         self._radius, self._refused = FIRST_RADIUS, False
@@ -163,9 +170,9 @@ class _Search:
                 return self._end(BalanceStatus.OUT_OF_RANGE)
             if self._converged():
                 return self._end(self._kind())
-            if self._near():
+            if self._near() or self._travel() > self._reach:
                 return replace(self._end(BalanceStatus.OK), at_rest=False)
-            if np.abs(self.x - self._start).max() > LONGEST_TRAVEL:
+            if self._travel() > LONGEST_TRAVEL:
                 return self._end(BalanceStatus.RUNS_AWAY)
             if self._radius < NARROWEST_RADIUS and (self._own or self._fresh):
                 break
@@ -262,6 +269,9 @@ class _Search:
         held = values > SMALLEST_STIFFNESS
         step = right[held].T @ ((left.T @ self.force)[held] / values[held])
         return bool((np.abs(step) < STEP_TOLERANCE).all())
+
+    def _travel(self) -> float:
+        return float(np.abs(self.x - self._start).max())
 
     def _near(self) -> bool:
         """Return whether the step that is left is short against the way from the start."""

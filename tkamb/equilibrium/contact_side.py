@@ -56,6 +56,8 @@ ASTRAY = (
 """Ends of a search that another start may mend."""
 FARTHEST_AHEAD = 2e-3
 """m: a search begins at most so far ahead of the last frame."""
+OPEN = 0.02
+"""Share of how the knee yields to the muscles that a settled search leaves open."""
 FIRST_DEPTH = 5e-5
 """m: how deep the search for released coordinates begins."""
 
@@ -226,7 +228,9 @@ class ContactSide:
             result = self.model.evaluate(self.state, knee_pose(knee.coordinates), guess)
             result = within_insert(self.state, result)
             contact = self._contact(result, None, 0.0)
-            contact = replace(contact, post=post_contact(self.post, result.pose, self.table))
+            flags = (*contact.flags, *_doubts(knee))
+            post = post_contact(self.post, result.pose, self.table)
+            contact = replace(contact, flags=flags, post=post)
         contact = replace(
             contact,
             seconds=clock.perf_counter() - start,
@@ -359,6 +363,16 @@ def carried_on(found: list[Array]) -> Array:
     part = float(before @ step) / max(float(before @ before), 1e-18)
     longest = FARTHEST_AHEAD / max(float(np.linalg.norm(step)), 1e-9)
     return found[-1] + min(max(part, 0.0), 1.0, longest) * (found[-1] - found[-2])
+
+
+def _doubts(knee: "KneeEquilibrium") -> tuple[str, ...]:
+    """Return a flag where it hangs on the search how the knee yields to the muscles."""
+    if knee.doubt <= OPEN:
+        return ()
+    return (
+        f"how the knee yields to the muscles does not settle ({100 * knee.doubt:.0f} % of it is "
+        "open): with another start the forces come out a few per cent elsewhere",
+    )
 
 
 def _points(body: FrameLoads) -> dict[str, Array]:

@@ -8,21 +8,22 @@ circle. So the forces go only a part omega of the way from those held, f, to tho
 
 d and d' the last two f' - f: Aitken's secant for a vector. At the end f' itself is held.
 
-How the knee yields to the muscles, which decides their arms, is found anew until the forces settle
-where the contact's stiffness is a smooth function of the pose, so that the answer does not hang on
-where the search began. Else, and where they do not settle (a condyle that rests on a few columns),
-in the first passes only: forces that follow each of its jumps never would.
+How the knee yields to the muscles decides their arms, and hangs itself on where the knee rests. It
+is taken as found in the first passes; then it goes only half of the way to what is found, so that
+it comes to rest where the contact's stiffness changes fast with the pose. Where even that goes on
+and on (a condyle about to lift, whose pose jumps), it is kept at last, and `doubt` says what of it
+is left open.
 
 References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.1620010306;
 Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tkamb.equilibrium.released_forces import LEVER
 from tkamb.geometry.frames import Array
 
 if TYPE_CHECKING:
@@ -34,8 +35,11 @@ LEAST, MOST = 0.05, 1.0
 """The limits of omega."""
 
 
-FRESH, FRESH_IF_SMOOTH = 3, 8
-"""In so many passes it is found anew how the knee yields."""
+FRESH, MIXED = 4, 12
+"""So many passes take how the knee yields as found, and half-way until that many are made."""
+HALF = 0.5
+TURNS = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
+"""Makes answers to forces and to moments comparable."""
 
 
 class Relaxation:
@@ -43,6 +47,8 @@ class Relaxation:
 
     Attributes:
         settled: what was asked for last agrees with what was held, and is held now.
+        doubt: share of how the knee yields that was still to change when it was kept; 0: it is
+            as found.
     """
 
     def __init__(self) -> None:
@@ -50,18 +56,23 @@ class Relaxation:
         self._last: Array | None = None
         self._part, self.settled = MOST, True
         self._yields: Array | None = None
-        self._passes = 0
+        self._passes, self.doubt = 0, 0.0
 
-    def kept(self, found: Callable[[], Array | None], smooth: bool) -> Array | None:
-        """Return how the knee yields, from `found` in the first passes.
+    def yielding(self, found: Array | None) -> Array | None:
+        """Return how the knee is taken to yield.
 
         Args:
-            found: computes it.
-            smooth: it is a smooth function of the pose.
+            found: how it does where it rests, see `ReleasedForces.tension_per_wrench`.
         """
-        if self._passes < (FRESH_IF_SMOOTH if smooth else FRESH):
-            self._yields = found()
         self._passes += 1
+        last = self._yields
+        if last is None or found is None or self._passes <= FRESH:
+            self._yields = found
+        elif self._passes <= MIXED:
+            self._yields = last + HALF * (found - last)
+        else:
+            away = (found - last) * TURNS
+            self.doubt = float(np.linalg.norm(away) / np.linalg.norm(last * TURNS))
         return self._yields
 
     def mixed(self, asked: "MuscleShare") -> "MuscleShare":

@@ -31,7 +31,7 @@ from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.equilibrium.relaxation import Relaxation
 from tkamb.equilibrium.released_forces import SCALE, ReleasedForces
 from tkamb.errors import ComputationError
-from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_axes, knee_pose
 
 if TYPE_CHECKING:
     from tkamb.body.crossing import MuscleShare
@@ -48,6 +48,12 @@ MOST_PASSES = 20
 """Passes by which knee and patella settle; each halves what is left where the knee is soft."""
 LEFT = 0.1
 """Share of its way that a pass may leave to the next, where muscles make it a few passes anyway."""
+REACH = 3e-3
+"""m: and so far it may go: the muscles' forces hold near by only."""
+ABOUT, MOST_HEIGHTS = 0.5, 4
+"""Where a search begins the load is to differ by less than this share from the last frame's, at one
+of so many heights."""
+SUPERIOR = KNEE_COORDINATES.index("si")
 SLACK = 1e-3
 """N: an extensor group of muscles that pulls with less is slack."""
 
@@ -66,6 +72,7 @@ class KneeEquilibrium:
         trials: how often the contact was computed.
         change: N, what the last pass changed in the contact force.
         problem: why this is no result, or empty.
+        doubt: see `Relaxation`.
     """
 
     coordinates: Array
@@ -77,6 +84,7 @@ class KneeEquilibrium:
     trials: int
     change: float
     problem: str
+    doubt: float = 0.0
 
 
 def released_indices(names: Sequence[str]) -> tuple[int, ...]:
@@ -120,6 +128,8 @@ class ReleasedKnee:
         place, middle, force = np.array(start, float), np.array(start[:3]), np.full(3, np.nan)
         knee, slack, trials, passes = before, False, 0, 0
         touch, mixing, ways = None, Relaxation(), [np.inf, np.inf]
+        if self._mechanics.muscles and before:
+            place, touch = self._carrying(place, before.contact)
         while passes < MOST_PASSES:
             knee, pushes = self._pass(k, place, middle, slack, knee, touch, mixing)
             touch = knee.contact
@@ -142,9 +152,36 @@ class ReleasedKnee:
                 and ahead(ways[-3:]) * change
                 < max(FORCE_CHANGE, FORCE_SHARE * float(np.linalg.norm(force)))
             ):
-                return knee
+                return replace(knee, doubt=mixing.doubt)
         assert knee is not None
         return replace(knee, problem="knee and patella do not settle together")
+
+    def _carrying(
+        self, place: Array, like: "ProbedContact"
+    ) -> "tuple[Array, ProbedContact | None]":
+        """Return the place, raised or lowered until it carries about what another contact does.
+
+        Returns:
+            Coordinates (6,) and the contact there; None if the same condyles do not carry, or the
+            model does not know its tangent.
+        """
+        load = float(like.wrench[1])
+        for _ in range(MOST_HEIGHTS):
+            here = self._probe.at(knee_pose(place))
+            if not here.tangent or not here.condyles or set(here.condyles) != set(like.condyles):
+                break
+            more = float(here.wrench[1]) - load
+            if abs(more) < ABOUT * abs(load):
+                return place, here
+            twist = knee_axes(place)[SUPERIOR]
+            slope = sum(
+                float(c.stiffness[1] @ twist) for c in here.loads if c.stiffness is not None
+            )
+            if not slope > 0.0:
+                break
+            place = place.copy()
+            place[SUPERIOR] -= more / slope
+        return place, None
 
     def _pass(
         self,
@@ -162,11 +199,12 @@ class ReleasedKnee:
         muscles = self._mechanics.muscles
         if muscles is not None and not geometry.problems:
             held = None if touch is None or before is None else before.geometry.share
+            held = None if held is None else muscles.at(k, held)
             share = mixing.mixed(self._share(k, geometry, middle, touch, held, mixing))
             geometry, slack = replace(geometry, share=share), muscles.tension(share) < SLACK
         forces = self._forces(k, geometry, middle, slack, touch)
         stiffness = before.balance.stiffness if before else None
-        balance = forces.balance(stiffness, LEFT if muscles else 0.0)
+        balance = forces.balance(stiffness, *((LEFT, REACH) if muscles else ()))
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
         if balance.status is not BalanceStatus.OK:
             problem = problem or f"released: {balance.status.value}" + (
@@ -198,15 +236,17 @@ class ReleasedKnee:
     ) -> "MuscleShare":
         """Return what each muscle carries, the released coordinates yielding to it.
 
-        Where the search begins, or the contact model has no tangent, contact points stay; where
-        these make the first equations singular the knee's forces pass through the femoral origin.
+        Where no contact is known yet, or the contact model has no tangent, contact points stay;
+        where these make the first equations singular the knee's forces pass through the femoral
+        origin.
 
         Args:
             k: frame.
             geometry: the frame without its contact.
             middle: (3,) m, where residual forces act.
-            touch: the contact there; None where the search begins.
-            held: what was held when the knee came to rest there.
+            touch: the contact there; None where the search begins without one like the last
+                frame's.
+            held: what was held last, in this frame or the one before.
             mixing: keeps how the knee yields.
 
         Raises:
@@ -220,7 +260,7 @@ class ReleasedKnee:
         if held is not None:
             forces = self._forces(k, replace(geometry, share=held), middle, False)
             smooth = self._probe.smoothed(knee_pose(place), here)
-            gain = mixing.kept(lambda: forces.tension_per_wrench(smooth), self._probe.smooths)
+            gain = mixing.yielding(forces.tension_per_wrench(smooth))
         if held is not None and gain is not None:
             pull = held.wrench(geometry.state.pose("tibia"), geometry.state.pose("femur"))
             base = forces.tension_at_rest(here, gain) - float(gain @ pull)

@@ -77,14 +77,17 @@ class FreeForces(Generic[J]):
         if touch is not None:
             self.seen[self._start.tobytes()] = touch
 
-    def balance(self, stiffness: Array | None = None, left: float = 0.0) -> Balance:
+    def balance(
+        self, stiffness: Array | None = None, left: float = 0.0, reach: float = np.inf
+    ) -> Balance:
         """Return where the free coordinates come to rest, from the given place.
 
         Args:
             stiffness: (n, n) N/m of a search near by.
             left: share of the way that may be left, see `find_balance`.
+            reach: m, likewise, how far it may go.
         """
-        return find_balance(self.trial, self._start, stiffness, left)
+        return find_balance(self.trial, self._start, stiffness, left, reach)
 
     def contact(self, balance: Balance) -> "ProbedContact":
         """Return the contact of a balance."""

@@ -97,6 +97,10 @@ class SharedMuscles:
             return self._failed(lines, f"failed: {error.what}")
         return self._shared(k, lines, row)
 
+    def at(self, k: int, share: MuscleShare) -> MuscleShare:
+        """Return the forces of a share along the lines of frame k."""
+        return replace(share, lines=self._lines(k))
+
     def _lines(self, k: int) -> CrossingLines:
         return CrossingLines(self._shank[k], self._thigh[k])
 
