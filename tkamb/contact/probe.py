@@ -112,8 +112,21 @@ class Probe:
         """Return the contact at a pose (4, 4), of which only the forces need be right."""
         return self._model.evaluate(self._state, pose, self._guess)
 
-    def pressed(self, load: float, pose: Array, guess: ContactResult) -> ContactResult:
-        """Return the contact under a load (N), of which only the forces need be right."""
+    def pressed(
+        self,
+        load: float,
+        pose: Array,
+        guess: ContactResult,
+        like: tuple[ContactResult, ContactResult] | None = None,
+    ) -> ContactResult:
+        """Return the contact under a load (N), of which only the forces need be right.
+
+        Args:
+            load: N.
+            pose: (4, 4) pose_femoral_in_insert.
+            guess: the contact near by.
+            like: start and end of a like step near by, by which a probe may guess this one's end.
+        """
         return self._model.press(self._state, load, pose, guess)
 
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:

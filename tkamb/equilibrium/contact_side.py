@@ -119,13 +119,15 @@ class ContactSide:
             return body, contact
         if not self._sensitivity:
             return body, contact
-        start = clock.perf_counter()
+        start, turned = clock.perf_counter(), None
         if self._probe.exact:
             sensitivity = split_tangent(self._probe, contact.result)
         else:
-            sensitivity = split_sensitivity(self._probe, contact.result)
+            last = before[-1] if before else None
+            like = (last.result, last.turned) if last and last.result and last.turned else None
+            sensitivity, turned = split_sensitivity(self._probe, contact.result, like)
         seconds = contact.seconds + clock.perf_counter() - start
-        return body, replace(contact, sensitivity=sensitivity, seconds=seconds)
+        return body, replace(contact, sensitivity=sensitivity, turned=turned, seconds=seconds)
 
     def _press_recorded(
         self, k: int, before: Sequence[FrameContact]

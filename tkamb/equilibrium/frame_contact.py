@@ -34,6 +34,7 @@ class FrameContact:
         equilibrium: the search for the released coordinates, if there are any.
         sensitivity: N/rad, of the medial force to adduction (`split_sensitivity`); NaN where
             adduction is released, or there is one condyle.
+        turned: the contact with a little more adduction from which that was found, if one was.
         triangles: (k, 3) of the map.
         post: cam and post, where the scene asks for their contact.
     """
@@ -49,6 +50,7 @@ class FrameContact:
     point_change: float = NAN
     equilibrium: "KneeEquilibrium | None" = None
     sensitivity: float = NAN
+    turned: ContactResult | None = None
     triangles: NDArray[np.int64] | None = None
     post: "PostContact | None" = None
 

@@ -18,7 +18,11 @@ what the lattice's tolerance leaves open; steps of 0.005 to 0.1 deg agree within
 ADDUCTION, SUPERIOR = (KNEE_COORDINATES.index(name) for name in ("adduction", "si"))
 
 
-def split_sensitivity(probe: "Probe", result: ContactResult) -> float:
+def split_sensitivity(
+    probe: "Probe",
+    result: ContactResult,
+    like: tuple[ContactResult, ContactResult] | None = None,
+) -> tuple[float, ContactResult | None]:
     """Return the change of the medial force with the adduction at a constant load, N/rad.
 
     Zero where one condyle carries everything: it then holds only until the other touches. NaN
@@ -27,14 +31,18 @@ def split_sensitivity(probe: "Probe", result: ContactResult) -> float:
     Args:
         probe: of the contact model.
         result: a contact; the load is what it carries along -y.
+        like: another contact and what this returned of it, which may save time.
+
+    Returns:
+        The change, and the contact with the adduction turned; None where that does not succeed.
     """
     load = -float(result.wrench_on_insert[1])
     place = knee_coordinates(result.pose)
     place[ADDUCTION] += ADDUCTION_STEP
-    turned = probe.pressed(load, knee_pose(place), result)
+    turned = probe.pressed(load, knee_pose(place), result, like)
     if turned.status is not ContactStatus.OK:
-        return float("nan")
-    return (_medial(turned) - _medial(result)) / ADDUCTION_STEP
+        return float("nan"), None
+    return (_medial(turned) - _medial(result)) / ADDUCTION_STEP, turned
 
 
 def split_tangent(probe: "Probe", result: ContactResult) -> float:

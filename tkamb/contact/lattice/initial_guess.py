@@ -75,6 +75,25 @@ class WarmStart:
             moved=self.moved + along * np.where(both, self.moved - last.moved, 0.0),
         )
 
+    def going_as(self, start: "WarmStart", end: "WarmStart", pose: Array) -> "WarmStart":
+        """Return this as if the change from another solution to the one after it had led here.
+
+        `foreseen` at the pose then expects that change once more.
+
+        Args:
+            start: where a like step began elsewhere.
+            end: where that ended.
+            pose: (4, 4) where the step from here leads.
+        """
+        h, first, last = self.nonlinear_residual, start.nonlinear_residual, end.nonlinear_residual
+        if h is None or first is None or last is None:
+            return self
+        moved = self.moved - (end.moved - start.moved)
+        came = replace(
+            self, nonlinear_residual=h - (last - first), moved=moved, pose=2 * self.pose - pose
+        )
+        return replace(self, before=replace(came, before=None))
+
 
 def _way(start: Array, end: Array) -> Array:
     """Return the way between two poses (12,), m: turns at `ARM`; what is along y the load asks."""

@@ -52,6 +52,8 @@ TOUCHING = 1e-13
 """m; bodies that overlap by less carry nothing: 1e-6 N at 1e7 N/m."""
 COARSE = 1e-3
 """From this tolerance on the factor is kept in 16 bits: they leave an imbalance of 3e-4."""
+ROUGH = 3.0
+"""Times the tolerance, for a step whose end is foreseen: what it changes is known to 1 %."""
 REACH = 1.08
 """Candidates must cover this many times the approach that was found."""
 
@@ -196,7 +198,8 @@ class CellContact(ContactModel):
         """Return the probe with stiffness; see `ContactModel`."""
         if self.direction == "vertical":
             return Probe(self, state, guess)
-        return LatticeProbe(self, state, guess, self.tolerance)
+        rough = replace(self, tolerance=ROUGH * self.tolerance)
+        return LatticeProbe(self, state, guess, self.tolerance, rough)
 
     def _solved(
         self,

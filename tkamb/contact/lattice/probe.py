@@ -52,6 +52,7 @@ class LatticeProbe(Probe):
         state: what its `prepare` returned.
         guess: an earlier result.
         accuracy: the model's tolerance, share of the contact force.
+        rough: the model with a wider tolerance, for steps whose end is foreseen.
     """
 
     def __init__(
@@ -60,17 +61,28 @@ class LatticeProbe(Probe):
         state: LatticeState,
         guess: ContactResult | None,
         accuracy: float,
+        rough: Sketches,
     ) -> None:
         super().__init__(model, state, guess)
-        self._sketches, self._accuracy = model, accuracy
+        self._sketches, self._accuracy, self._rough = model, accuracy, rough
 
     def evaluated(self, pose: Array) -> ContactResult:
         """Return the forces at a pose; see `Probe`."""
         return self._sketches.evaluate(self._state, pose, self._guess, sketch=True)
 
-    def pressed(self, load: float, pose: Array, guess: ContactResult) -> ContactResult:
+    def pressed(
+        self,
+        load: float,
+        pose: Array,
+        guess: ContactResult,
+        like: tuple[ContactResult, ContactResult] | None = None,
+    ) -> ContactResult:
         """Return the forces under a load; see `Probe`."""
-        return self._sketches.press(self._state, load, pose, guess, sketch=True)
+        here, *step = (result.warm_start for result in (guess, *(like or ())))
+        if here is None or None in step or not step:
+            return self._sketches.press(self._state, load, pose, guess, sketch=True)
+        guess = replace(guess, warm_start=here.going_as(*step, pose))
+        return self._rough.press(self._state, load, pose, guess, sketch=True)
 
     def seen(self, result: ContactResult) -> ProbedContact:
         """Return what a result says of the condyles, with their stiffness."""
