@@ -23,7 +23,6 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.meshing.cells import CORNERS, PAIR_AXES, PAIRS
 from tkamb.contact.lattice.solids.cell_loops import (
@@ -143,9 +142,7 @@ class CalibratedNetwork(Solid):
         if self.curve.spline is None:
             return np.zeros((len(cells), 24))
         curve = (self.curve.shear_modulus, self.curve.spline.x, self.curve.spline.c)
-        return softened_forces(
-            self._diagonals, self.volume, *curve, self.cells, cells, displacement
-        )
+        return softened_forces(*self._shapes, *curve, self.cells, cells, displacement)
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n): mu_s K_d + mu_s'/(3 V e) (K_d u)(K_d u)ᵀ + bulk."""
@@ -162,21 +159,12 @@ class CalibratedNetwork(Solid):
         return self.pattern.assemble(matrices())
 
     @cached_property
-    def _diagonals(self) -> NDArray[np.float32]:
-        """K_d of each cell by diagonals (c, 13, 24): entry i of the k-th is K_d[i, i + k mod 24].
-
-        The matrix is symmetric, so that thirteen wrapped diagonals say all. The first and the
-        last one are halved: `shear_forces` takes each twice.
-        """
-        row = np.arange(24)
-        column = (row + np.arange(13)[:, None]) % 24
-        diagonals = np.empty((len(self.cells), 13, 24), np.float32)
-        for some in chunks(len(self.cells)):
-            diagonals[some] = self._deviatoric(some)[:, row, column]
-        diagonals[:, [0, 12]] /= 2
-        return diagonals
+    def _shapes(self) -> tuple[Array, Array, Array, Array]:
+        """Corners (c, 8, 3), mean gradients (c, 8, 3), volumes (c,) and springs (28,)."""
+        corners = self.corners()
+        return corners, np.ascontiguousarray(self.gradients), self.volume, self.springs
 
     def _state(self, displacement: Array, chosen: Index | None = None) -> tuple[Array, Array]:
         """Return K_d u (k, 24) and the equivalent strain e (k,) of the chosen cells."""
         cells = np.arange(len(self.cells)) if chosen is None else chosen
-        return shear_forces(self._diagonals, self.volume, self.cells, cells, displacement)
+        return shear_forces(*self._shapes, self.cells, cells, displacement)

@@ -1,7 +1,6 @@
 """The calibrated cell in compiled loops: its matrix, and the forces of displaced cells."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tkamb.contact.lattice.compiled import compiled
 from tkamb.contact.lattice.meshing.cells import PAIRS
@@ -52,39 +51,83 @@ def deviatoric_matrices(corners: Array, gradients: Array, volumes: Array, spring
 
 @compiled
 def _shear_force(
-    diagonals: NDArray[np.float32],
+    x: Array,
+    g: Array,
+    volume: float,
+    springs: Array,
     nodes: Index,
     displacement: Array,
     u: Array,
+    rest: Array,
     force: Array,
 ) -> float:
-    """Put K_d u of a cell into force (36,), of which 24 count; return uᵀ K_d u; u (36,) is scratch.
+    """Put K_d u of a cell into force (8, 3); return uᵀ K_d u.
 
-    u is taken from the cell's first node: K_d knows nothing of the way all nodes go together,
-    and without it single precision of K_d does. Each diagonal meets u twice, above and below the
-    main one, in stretches that fill vector registers.
+    K_d is never made: from G = sum u_i g_iᵀ follow the rests u_i - G x_i, from these the springs'
+    forces t_i, and with D = 2 V dev(sym G) - sum t_i x_iᵀ the nodes' forces t_i + D g_i. G and D
+    are held in nine registers: an array would be written and read in every line.
+
+    Args:
+        x: (8, 3) m, corners.
+        g: (8, 3) 1/m, mean gradients.
+        volume: m³.
+        springs: (28,) m, `spring_families` of the nominal box.
+        nodes: (8,).
+        displacement: (n, 3) m.
+        u: (8, 3) scratch, as `rest`: displacements from the cell's first node.
+        rest: (8, 3).
+        force: (8, 3) m².
     """
-    for corner in range(8):
-        for axis in range(3):
-            u[3 * corner + axis] = displacement[nodes[corner], axis] - displacement[nodes[0], axis]
-    u[24:] = u[:12]
-    force[:] = 0.0
-    for shift in range(13):
-        for i in range(24):
-            force[i] += diagonals[shift, i] * u[i + shift]
-        for i in range(24):
-            force[i + shift] += diagonals[shift, i] * u[i]
-    force[:12] += force[24:]
+    xx = xy = xz = yx = yy = yz = zx = zy = zz = 0.0
+    for i in range(8):
+        for a in range(3):
+            u[i, a] = displacement[nodes[i], a] - displacement[nodes[0], a]
+        xx, xy, xz = xx + u[i, 0] * g[i, 0], xy + u[i, 0] * g[i, 1], xz + u[i, 0] * g[i, 2]
+        yx, yy, yz = yx + u[i, 1] * g[i, 0], yy + u[i, 1] * g[i, 1], yz + u[i, 1] * g[i, 2]
+        zx, zy, zz = zx + u[i, 2] * g[i, 0], zy + u[i, 2] * g[i, 1], zz + u[i, 2] * g[i, 2]
+    for i in range(8):
+        rest[i, 0] = u[i, 0] - (xx * x[i, 0] + xy * x[i, 1] + xz * x[i, 2])
+        rest[i, 1] = u[i, 1] - (yx * x[i, 0] + yy * x[i, 1] + yz * x[i, 2])
+        rest[i, 2] = u[i, 2] - (zx * x[i, 0] + zy * x[i, 1] + zz * x[i, 2])
+        force[i, 0] = force[i, 1] = force[i, 2] = 0.0
+    spring = 0
+    for i in range(8):
+        for j in range(i + 1, 8):
+            line_x, line_y, line_z = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
+            pull = (rest[j, 0] - rest[i, 0]) * line_x + (rest[j, 1] - rest[i, 1]) * line_y
+            pull += (rest[j, 2] - rest[i, 2]) * line_z
+            pull *= springs[spring] / (line_x * line_x + line_y * line_y + line_z * line_z)
+            force[i, 0] -= pull * line_x
+            force[i, 1] -= pull * line_y
+            force[i, 2] -= pull * line_z
+            force[j, 0] += pull * line_x
+            force[j, 1] += pull * line_y
+            force[j, 2] += pull * line_z
+            spring += 1
+    mean = 2.0 / 3.0 * (xx + yy + zz)
+    xy, xz, yz = volume * (xy + yx), volume * (xz + zx), volume * (yz + zy)
+    yx, zx, zy = xy, xz, yz
+    xx, yy, zz = volume * (2 * xx - mean), volume * (2 * yy - mean), volume * (2 * zz - mean)
+    for i in range(8):
+        fx, fy, fz = force[i, 0], force[i, 1], force[i, 2]
+        xx, xy, xz = xx - fx * x[i, 0], xy - fx * x[i, 1], xz - fx * x[i, 2]
+        yx, yy, yz = yx - fy * x[i, 0], yy - fy * x[i, 1], yz - fy * x[i, 2]
+        zx, zy, zz = zx - fz * x[i, 0], zy - fz * x[i, 1], zz - fz * x[i, 2]
     energy = 0.0
-    for i in range(24):
-        energy += force[i] * u[i]
+    for i in range(8):
+        force[i, 0] += xx * g[i, 0] + xy * g[i, 1] + xz * g[i, 2]
+        force[i, 1] += yx * g[i, 0] + yy * g[i, 1] + yz * g[i, 2]
+        force[i, 2] += zx * g[i, 0] + zy * g[i, 1] + zz * g[i, 2]
+        energy += force[i, 0] * u[i, 0] + force[i, 1] * u[i, 1] + force[i, 2] * u[i, 2]
     return max(energy, 0.0)
 
 
 @compiled
 def shear_forces(
-    diagonals: NDArray[np.float32],
+    corners: Array,
+    gradients: Array,
     volumes: Array,
+    springs: Array,
     nodes: Index,
     chosen: Index,
     displacement: Array,
@@ -92,26 +135,30 @@ def shear_forces(
     """Return K_d u (k, 24) and the equivalent strain (k,), e² = uᵀ K_d u / (3 V), of cells.
 
     Args:
-        diagonals: (c, 13, 24) K_d, m, see `CalibratedNetwork`.
+        corners: (c, 8, 3) m.
+        gradients: (c, 8, 3) mean gradients, 1/m.
         volumes: (c,) m³.
+        springs: (28,) m.
         nodes: (c, 8) of the cells.
         chosen: (k,) cells.
         displacement: (n, 3) m.
     """
     forces, strains = np.empty((len(chosen), 24)), np.empty(len(chosen))
-    u, force = np.empty(36), np.empty(36)
+    u, rest = np.empty((8, 3)), np.empty((8, 3))
     for k in range(len(chosen)):
-        cell = chosen[k]
-        energy = _shear_force(diagonals[cell], nodes[cell], displacement, u, force)
-        strains[k] = np.sqrt(energy / (3 * volumes[cell]))
-        forces[k] = force[:24]
+        cell, force = chosen[k], forces[k].reshape(8, 3)
+        x, g, volume = corners[cell], gradients[cell], volumes[cell]
+        energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, rest, force)
+        strains[k] = np.sqrt(energy / (3 * volume))
     return forces, strains
 
 
 @compiled
 def softened_forces(
-    diagonals: NDArray[np.float32],
+    corners: Array,
+    gradients: Array,
     volumes: Array,
+    springs: Array,
     shear_modulus: float,
     knots: Array,
     cubic: Array,
@@ -122,8 +169,10 @@ def softened_forces(
     """Return (mu - mu_s) K_d u (k, 24), N, of cells; see `shear_forces`.
 
     Args:
-        diagonals: (c, 13, 24) K_d, m.
+        corners: (c, 8, 3) m.
+        gradients: (c, 8, 3) 1/m.
         volumes: (c,) m³.
+        springs: (28,) m.
         shear_modulus: mu, Pa.
         knots: (q,) e between which 3 mu_s e is cubic.
         cubic: (4, q - 1) its coefficients, the highest power first.
@@ -132,15 +181,16 @@ def softened_forces(
         displacement: (n, 3) m.
     """
     forces = np.empty((len(chosen), 24))
-    u, force = np.empty(36), np.empty(36)
+    u, rest = np.empty((8, 3)), np.empty((8, 3))
     for k in range(len(chosen)):
-        cell = chosen[k]
-        energy = _shear_force(diagonals[cell], nodes[cell], displacement, u, force)
-        strain = min(max(np.sqrt(energy / (3 * volumes[cell])), LEAST_STRAIN), knots[-1])
+        cell, force = chosen[k], forces[k].reshape(8, 3)
+        x, g, volume = corners[cell], gradients[cell], volumes[cell]
+        energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, rest, force)
+        strain = min(max(np.sqrt(energy / (3 * volume)), LEAST_STRAIN), knots[-1])
         part = min(np.searchsorted(knots, strain, side="right") - 1, len(knots) - 2)
-        x = strain - knots[part]
-        stress = ((cubic[0, part] * x + cubic[1, part]) * x + cubic[2, part]) * x + cubic[3, part]
+        y = strain - knots[part]
+        stress = ((cubic[0, part] * y + cubic[1, part]) * y + cubic[2, part]) * y + cubic[3, part]
         softened = shear_modulus - stress / (3 * strain)
         for i in range(24):
-            forces[k, i] = softened * force[i]
+            forces[k, i] *= softened
     return forces
