@@ -35,7 +35,7 @@ LEAST, MOST = 0.05, 1.0
 """The limits of omega."""
 
 
-FRESH, MIXED = 4, 12
+FRESH, MIXED = 4, 10
 """So many passes take how the knee yields as found, and half-way until that many are made."""
 HALF = 0.5
 TURNS = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])

@@ -44,12 +44,13 @@ FORCE_CHANGE = 0.1
 """N: neither does the contact force,"""
 FORCE_SHARE = 2e-4
 """of it: or this part of it, by which the patella's jumps from facet to facet change it."""
-MOST_PASSES = 20
+MOST_PASSES = 24
 """Passes by which knee and patella settle; each halves what is left where the knee is soft."""
 LEFT = 0.1
 """Share of its way that a pass may leave to the next, where muscles make it a few passes anyway."""
 REACH = 3e-3
-"""m: and so far it may go: the muscles' forces hold near by only."""
+"""m: and so far it may go from a contact like the last frame's, from which the muscles' forces are
+known: they hold near by only."""
 ABOUT, MOST_HEIGHTS = 0.5, 4
 """Where a search begins the load is to differ by less than this share from the last frame's, at one
 of so many heights."""
@@ -130,8 +131,9 @@ class ReleasedKnee:
         touch, mixing, ways = None, Relaxation(), [np.inf, np.inf]
         if self._mechanics.muscles and before:
             place, touch = self._carrying(place, before.contact)
+        reach = REACH if touch else np.inf
         while passes < MOST_PASSES:
-            knee, pushes = self._pass(k, place, middle, slack, knee, touch, mixing)
+            knee, pushes = self._pass(k, place, middle, slack, knee, touch, mixing, reach)
             touch = knee.contact
             passes, trials = passes + 1, trials + knee.balance.trials
             change = float(np.linalg.norm(knee.contact.wrench[:3] - force))
@@ -192,6 +194,7 @@ class ReleasedKnee:
         before: KneeEquilibrium | None,
         touch: "ProbedContact | None",
         mixing: Relaxation,
+        reach: float,
     ) -> tuple[KneeEquilibrium, bool]:
         """Return the knee at rest with the patella as at `place`, and whether it would push."""
         patella = self._patella(k, place, before.patella if before else None)
@@ -204,7 +207,7 @@ class ReleasedKnee:
             geometry, slack = replace(geometry, share=share), muscles.tension(share) < SLACK
         forces = self._forces(k, geometry, middle, slack, touch)
         stiffness = before.balance.stiffness if before else None
-        balance = forces.balance(stiffness, *((LEFT, REACH) if muscles else ()))
+        balance = forces.balance(stiffness, *((LEFT, reach) if muscles else ()))
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
         if balance.status is not BalanceStatus.OK:
             problem = problem or f"released: {balance.status.value}" + (
