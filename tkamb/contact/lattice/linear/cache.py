@@ -20,6 +20,7 @@ import fcntl
 import hashlib
 import json
 import logging
+import mmap
 import os
 import stat
 import tempfile
@@ -40,7 +41,9 @@ from tkamb.errors import InputError
 from tkamb.files import open_regular
 from tkamb.geometry.frames import Index, Mask
 
-MAGIC = b"tkamb operator 4"
+MAGIC = b"tkamb operator 5"
+BOUNDARY = 64
+"""Bytes; every array begins at a multiple of it."""
 LONGEST_HEADER = 1_000_000
 """Bytes; a header has some hundreds."""
 LEAST_UNKNOWNS = 20_000
@@ -156,6 +159,7 @@ def write_operator(path: Path, key: str, operator: ElasticOperator) -> None:
             "arrays": [[array.dtype.str, list(array.shape)] for array in arrays],
         }
     ).encode()
+    header += b" " * _padding(len(MAGIC) + 40 + len(header))
     digest = hashlib.sha256(len(header).to_bytes(8, "little") + header)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=".tkamb-", suffix=".part")
     try:
@@ -164,8 +168,9 @@ def write_operator(path: Path, key: str, operator: ElasticOperator) -> None:
             file.write(MAGIC + bytes(32) + len(header).to_bytes(8, "little") + header)
             for array in arrays:
                 content = np.ascontiguousarray(array).data.cast("B") if array.size else b""
-                digest.update(content)
-                file.write(content)
+                for part in (content, bytes(_padding(array.nbytes))):
+                    digest.update(part)
+                    file.write(part)
             file.seek(len(MAGIC))
             file.write(digest.digest())
         os.replace(name, path)
@@ -231,17 +236,23 @@ def _arrays(file: BinaryIO, size: int, key: str) -> Iterator[NDArray[Any]]:
         raise ValueError("another key or code")
     shapes = [(np.dtype(kind), tuple(map(int, shape))) for kind, shape in header["arrays"]]
     sizes = [kind.itemsize * int(np.prod(shape, dtype=object)) for kind, shape in shapes]
-    if any(n < 0 for n in sizes) or len(start) + length + sum(sizes) != size:
+    firsts = np.cumsum([len(start) + length, *(n + _padding(n) for n in sizes)]).tolist()
+    if any(n < 0 for n in sizes) or firsts[-1] != size:
         raise ValueError("another size than its header says")
-    content = np.fromfile(file, np.uint8)
+    # Mapped, not read: nothing is copied, and processes share it. A file is never written in
+    # place; what is written to a mapped array stays this process's own.
+    content = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY))
     digest = hashlib.sha256(start[-8:] + text)
-    digest.update(content.data)
+    digest.update(content[firsts[0] :])
     if digest.digest() != start[len(MAGIC) : len(MAGIC) + 32]:
         raise ValueError("another SHA-256")
-    ends = np.cumsum([0, *sizes])
-    for (kind, shape), first, last in zip(shapes, ends[:-1], ends[1:], strict=True):
-        # A copy where the bytes do not lie at a multiple of the item's size.
-        yield np.require(content[first:last].view(kind).reshape(shape), requirements="A")
+    for (kind, shape), first, n in zip(shapes, firsts, sizes, strict=False):
+        yield np.frombuffer(content[first : first + n], kind).reshape(shape)
+
+
+def _padding(length: int) -> int:
+    """Return how many bytes are missing to the next boundary, at which an array may begin."""
+    return -length % BOUNDARY
 
 
 def _operator_of(arrays: list[NDArray[Any]]) -> ElasticOperator:
