@@ -93,7 +93,7 @@ def test_flexion_stays_as_recorded_and_what_is_kept_too(bend):
 )
 def test_starts_5_mm_and_5_deg_away_reach_the_same_rest(bend, resting, away):
     home = resting[60][1].equilibrium.coordinates
-    start = bend.on_the_insert(home + np.append(away, 0.0))
+    start = bend.starts.on_the_insert(home + np.append(away, 0.0))
     again = bend.released.find(60, start)
     assert again.problem == ""
     assert np.abs((again.coordinates - home) * SCALE).max() < 2e-5
@@ -111,14 +111,14 @@ def test_a_frame_that_needs_flexors_rests_with_the_quadriceps_slack(bend):
         assert knee.balance.status is BalanceStatus.OK and knee.patella.status.found
         assert body.loads.values["residual_flexion"] < -10.0
         away = np.array([2e-3, 0, 1e-3, 0, np.radians(1), 0])
-        start = side.on_the_insert(knee.coordinates + away)
+        start = side.starts.on_the_insert(knee.coordinates + away)
         again = side.released.find(k, start)
         assert np.abs((again.coordinates - knee.coordinates) * SCALE).max() < 2e-5
 
 
 def test_a_start_over_the_rim_says_that_it_did_not_arrive(bend, resting):
     home = resting[60][1].equilibrium.coordinates
-    start = bend.on_the_insert(home + np.array([-5e-3, 0, 5e-3, np.radians(-5), 0, 0]))
+    start = bend.starts.on_the_insert(home + np.array([-5e-3, 0, 5e-3, np.radians(-5), 0, 0]))
     assert bend.released.find(60, start).problem == ("released: out of the contact model's range")
 
 

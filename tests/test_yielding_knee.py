@@ -6,9 +6,9 @@ import pytest
 from joints import BALL, HEIGHT, LINEAR, flat_joint
 from tkamb.contact.foundation import LinearFoundation
 from tkamb.equilibrium.balance import BalanceStatus, Trial, find_balance
-from tkamb.equilibrium.contact_side import FARTHEST_AHEAD, carried_on
 from tkamb.equilibrium.released import KNEE_CHANGE, ahead
 from tkamb.equilibrium.released_forces import SCALE
+from tkamb.equilibrium.starts import FARTHEST_AHEAD, carried_on
 from tkamb.geometry.frames import knee_pose
 
 CELL = 1e-3

@@ -10,9 +10,8 @@
 """
 
 import time as clock
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,11 +25,9 @@ from tkamb.contact.probe import condyle_wrenches
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult, ContactStatus, medial_points
 from tkamb.equilibrium.adjusted_press import press_adjusted
-from tkamb.equilibrium.balance import BalanceStatus
 from tkamb.equilibrium.frame_contact import FrameContact
 from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.equilibrium.post_side import cam_on_post, post_contact
-from tkamb.equilibrium.released_forces import SCALE
 from tkamb.equilibrium.split_sensitivity import split_sensitivity, split_tangent
 from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
@@ -48,18 +45,8 @@ LOAD_CHANGE = 0.1
 POINT_CHANGE = 1e-6
 """m, of the centres of pressure between them."""
 MOST_ITERATIONS = 20
-ASTRAY = (
-    BalanceStatus.OUT_OF_RANGE,
-    BalanceStatus.NOT_CONVERGED,
-    BalanceStatus.RUNS_AWAY,  # as far from a bad start as from a good one
-)
-"""Ends of a search that another start may mend."""
-FARTHEST_AHEAD = 2e-3
-"""m: a search begins at most so far ahead of the last frame."""
 OPEN = 0.02
 """Share of how the knee yields to the muscles that a settled search leaves open."""
-FIRST_DEPTH = 5e-5
-"""m: how deep the search for released coordinates begins."""
 
 
 class ContactSide:
@@ -99,9 +86,11 @@ class ContactSide:
         self.released = None
         if table.released:
             from tkamb.equilibrium.released import ReleasedKnee
+            from tkamb.equilibrium.starts import Starts
 
             both = self._probe if self.post is None else self.post.probe_with(self._probe)
             self.released = ReleasedKnee(mechanics, both, table.released)
+            self.starts = Starts(case, self.released, self.state.pair, self.post)
 
     def frame(self, k: int, before: Sequence[FrameContact] = ()) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact of frame k, as coupled as the scene asks.
@@ -220,7 +209,7 @@ class ContactSide:
         guess = good[-1].result if good else None
         points = {} if len(released.released) == 5 else self._nearest_points(k)
         try:
-            knee = self._rest(k, [c.equilibrium for c in good if c.equilibrium], points)
+            knee = self.starts.rest(k, [c.equilibrium for c in good if c.equilibrium], points)
         except ComputationError as error:
             contact = self.nothing(error.what)
             body = self.mechanics.frame(k)
@@ -241,65 +230,6 @@ class ContactSide:
             equilibrium=knee,
         )
         return self._equilibrium_loads(k, knee, contact, points), contact
-
-    def _rest(
-        self, k: int, found: "Sequence[KneeEquilibrium]", points: dict[str, Array]
-    ) -> "KneeEquilibrium":
-        """Return the knee at rest, from the first start that leads there.
-
-        Args:
-            k: frame.
-            found: the last three frames that were found.
-            points: side -> where a condyle that carries nothing is nearest to the insert.
-
-        Raises:
-            ComputationError: no start lies over the insert, or no muscle forces carry the frame.
-        """
-        assert self.released is not None
-        knee, failure = None, "the femoral component does not lie over the insert"
-        for place in self._starts(k, [knee.coordinates for knee in found]):
-            if not np.isfinite(place).all():
-                continue
-            try:
-                knee = self.released.find(k, place, points, found[-1] if found else None)
-            except ComputationError as error:
-                failure = error.what
-                continue
-            if knee.balance.status not in ASTRAY and not (knee.problem and self.mechanics.muscles):
-                break
-        if knee is None:
-            raise ComputationError(failure)
-        return knee
-
-    def _starts(self, k: int, found: list[Array]) -> Iterator[Array]:
-        """Yield where a search may begin: as the last frames went on, as the last, as recorded.
-
-        The first keeps its height, the others just touch.
-        """
-        assert self.released is not None
-        recorded, rows = self.case.motion.coordinates[k], list(self.released.released)
-        for number, place in enumerate([carried_on(found), found[-1]] if found else []):
-            start = recorded.copy()
-            start[rows] = place[rows]
-            yield start if number == 0 else self.on_the_insert(start)
-        yield self.on_the_insert(recorded)
-
-    def on_the_insert(self, place: Array) -> Array:
-        """Return coordinates (6,) whose superior-inferior one makes the condyles just touch.
-
-        Where AP is released and a cam overlaps the post, AP makes them just touch, too.
-        """
-        touching = self._on_the_dishes(place)
-        if self.post is None or "ap" not in self.table.released:
-            return touching
-        gap = self.post.clearance(knee_pose(touching))
-        if not gap < 0:
-            return touching
-        return self._on_the_dishes(np.array([place[0] + gap + FIRST_DEPTH, *place[1:]]))
-
-    def _on_the_dishes(self, place: Array) -> Array:
-        height = self.state.pair.first_touch_height(knee_pose(place))
-        return np.array([place[0], height - FIRST_DEPTH, *place[2:]])
 
     def _equilibrium_loads(
         self, k: int, knee: "KneeEquilibrium", contact: FrameContact, points: dict[str, Array]
@@ -351,20 +281,6 @@ class ContactSide:
         """Return a contact that could not be computed, and why."""
         none = np.zeros(len(self.state.points), bool)
         return FrameContact(None, none, None, 0.0, problem, ())
-
-
-def carried_on(found: list[Array]) -> Array:
-    """Return the coordinates (6,) after those of up to three frames.
-
-    The last step is made again, or that part of it by which the step before foretold it, and no
-    farther than `FARTHEST_AHEAD`: a lightly loaded knee wanders to and fro.
-    """
-    if len(found) < 3:
-        return found[-1]
-    before, step = ((b - a) * SCALE for a, b in pairwise(found))
-    part = float(before @ step) / max(float(before @ before), 1e-18)
-    longest = FARTHEST_AHEAD / max(float(np.linalg.norm(step)), 1e-9)
-    return found[-1] + min(max(part, 0.0), 1.0, longest) * (found[-1] - found[-2])
 
 
 def _doubts(knee: "KneeEquilibrium") -> tuple[str, ...]:

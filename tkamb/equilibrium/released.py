@@ -100,12 +100,16 @@ class ReleasedKnee:
         mechanics: the body side.
         probe: of the contact model.
         names: the released coordinates, "si" understood.
+
+    Attributes:
+        released: their indices.
+        muscles: the load is shared among muscles.
     """
 
     def __init__(self, mechanics: Mechanics, probe: "Probe", names: Sequence[str]) -> None:
         self._mechanics, self._probe = mechanics, probe
+        self.muscles = mechanics.muscles is not None
         self.released = released_indices(names)
-        self._rows = list(self.released)
 
     def find(
         self,
