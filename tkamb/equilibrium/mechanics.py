@@ -3,6 +3,7 @@
 import time as clock
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -234,14 +235,19 @@ class Mechanics:
             PointForces("femur", post.point[None], -force[None], -twist),
         )
 
-    def slips(self) -> "dict[str, CondyleSlip]":
-        """Return side -> rolling and slipping of all frames; empty without the two surfaces."""
+    def slips(self, last: int) -> "dict[str, CondyleSlip]":
+        """Return side -> rolling and slipping up to a frame; empty without the two surfaces.
+
+        Args:
+            last: the last frame whose slip and its rate are wanted: the rate takes one more.
+        """
         case = self.case
         if self.query is None or case.femoral is None or case.insert is None:
             return {}
         from tkamb.body.slip import condyle_slip
 
-        found = condyle_slip(case.femoral, case.insert, case.split, case.motion.coordinates)
+        recorded = case.motion.coordinates[: last + 2]
+        found = condyle_slip(case.femoral, case.insert, case.split, recorded)
         sides = zip(SIDES, found, strict=True)
         return {side: slip for side, slip in sides if slip is not None}
 
@@ -320,13 +326,14 @@ class Mechanics:
             return (), {}
         from tkamb.body.ligaments import build_ligaments, strain_table
 
-        poses = self.recorded_poses()
+        poses = self.recorded_poses
         flexion = self.case.motion.coordinates[:, 5]
         bundles = build_ligaments(self.case.ligaments, poses, flexion)
         return bundles, strain_table(bundles, poses, flexion, STRAIN_FLEXIONS)
 
+    @cached_property
     def recorded_poses(self) -> dict[str, Array]:
-        """Return link -> pose_link_in_insert (f, 4, 4) as recorded, of links with attachments."""
+        """Link -> pose_link_in_insert (f, 4, 4) as recorded, of links with attachments."""
         recorded, ligament = self.case.motion.coordinates, self.case.patellar_ligament
         states = [self.case.chain.at(self._chain_motion(k, x)) for k, x in enumerate(recorded)]
         links = self._attachment_links()
