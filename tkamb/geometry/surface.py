@@ -10,6 +10,7 @@ from tkamb.geometry.frames import Array, Index, transform
 from tkamb.geometry.normals import SHARP_EDGE, corner_angles, corner_normals, interpolated
 from tkamb.geometry.ragged import Ragged
 from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.topology import same_places
 
 if TYPE_CHECKING:
     import trimesh
@@ -100,8 +101,7 @@ class Surface:
     @cached_property
     def corner_vertices(self) -> Index:
         """The faces (k, 3) with vertices at the same place taken for one."""
-        _, merged = np.unique(self.vertices, axis=0, return_inverse=True)
-        return merged.reshape(-1)[self.faces].astype(np.int64)
+        return same_places(self.vertices)[1][self.faces]
 
     @cached_property
     def corners_at_vertices(self) -> Ragged:
