@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from tkamb.body.slip import CondyleSlip
     from tkamb.contact.probe import CondyleWrench
     from tkamb.geometry.adjustment import Adjustment
+    from tkamb.geometry.closest import ClosestPointQuery
 
 STRAIN_FLEXIONS = (0.0, 60.0, 90.0)
 """deg: where the strains of the ligaments are shown."""
@@ -67,6 +68,7 @@ class Mechanics:
     Args:
         case: the scene with its files read.
         known: what is known already of a case that this one is a sample of.
+        near: whether the condyles are known to be near the insert.
 
     Attributes:
         poses: (f, 4, 4) recorded pose_femur_in_insert.
@@ -77,12 +79,11 @@ class Mechanics:
         muscles: those that share the load; None if the quadriceps alone acts.
     """
 
-    def __init__(self, case: Case, known: Known | None = None) -> None:
-        self.case = case
+    def __init__(self, case: Case, known: Known | None = None, near: bool = False) -> None:
+        self.case, self._known = case, known
         self.poses = knee_pose(case.motion.coordinates)
         self.friction = case.scene.contact.friction if case.scene.contact else 0.0
-        self.query = known.query if known else contact_query(case)
-        if known is None:
+        if known is None and not near:
             self._check_near()
         self.extensor = None
         if case.scene.patella:
@@ -94,10 +95,15 @@ class Mechanics:
 
             self.muscles = load_muscles(case)
 
+    @cached_property
+    def query(self) -> "ClosestPointQuery | None":
+        """Closest points of the two surfaces; None without [contact]."""
+        return self._known.query if self._known else contact_query(self.case)
+
     def _check_near(self) -> None:
         """Raise where the condyles are nowhere near the insert, whatever the frame."""
         contact = self.case.scene.contact
-        if self.query is None or contact is None or contact.released:
+        if contact is None or contact.released or self.query is None:
             return
         middle, last = len(self.poses) // 2, len(self.poses) - 1
         nearest: list[float] = []

@@ -30,6 +30,9 @@ OWN_NAMES = (IDENTITY_NAME, "contact.h5", "*.frame", ".tkamb-*.part")
 LARGEST = 2e9
 """Bytes of a frame; a map of 100,000 points has 5 MB."""
 
+CONTACT_PLACES = ("contact_points", "contact_normals")
+"""(2, 3) m and unit: where the medial and the lateral condyle touch; NaN where it does not."""
+
 Row = dict[str, Any]
 
 
