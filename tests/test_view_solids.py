@@ -5,15 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from matplotlib import colormaps
 from scipy.spatial import cKDTree
 
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.frames import inverse, transform
 from tkamb.geometry.surface import Surface
 from tkamb.output.metrics import JUMP
+from tkamb.output.style import PRESSURE_MAP
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
-from tkamb.view import shapes
+from tkamb.view import colours, shapes
 from tkamb.view.draw import draw
 from tkamb.view.run import open_run
 from tkamb.view.shading import MOST_TRIANGLES, decimate, shade
@@ -178,3 +180,17 @@ def test_the_farthest_point_is_that_of_all_distances():
     points = rng.normal(scale=0.03, size=(3000, 3))
     nearest = ball().nearest
     assert nearest.farthest(points) == nearest.at(points).distance.max()
+
+
+@pytest.mark.parametrize(
+    ("scale", "name", "lowest"),
+    [
+        (colours.pressure_scale, PRESSURE_MAP, 0.0),
+        (colours.strain_scale, "YlOrRd", 0.15),
+        (colours.activation_scale, "BuPu", 0.35),
+        (colours.wear_scale, "YlGnBu", 0.0),
+    ],
+)
+def test_the_scales_are_matplotlib_s(scale, name, lowest):
+    wanted = colormaps[name](np.linspace(lowest, 1.0, 256))[:, :3] * 255.0
+    assert np.array_equal(scale(), np.round(wanted))

@@ -143,7 +143,9 @@ class Surface:
         return NearestPoints(self)
 
     def moved(self, pose_here_in_there: Array) -> "Surface":
-        """Return the surface in another frame."""
+        """Return the surface in another frame; where that is the same, itself."""
+        if np.array_equal(pose_here_in_there, np.eye(4)):
+            return self
         return Surface(transform(pose_here_in_there, self.vertices), self.faces, self.name)
 
     def __getstate__(self) -> dict[str, Any]:
