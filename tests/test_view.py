@@ -71,6 +71,7 @@ def test_where_condyles_touch_is_read_from_the_run_or_looked_for(folder, tmp_pat
     old = tmp_path / "old"
     shutil.copytree(folder, old)
     with h5py.File(old / "contact.h5", "r+") as file:
+        assert file["contact_points_m"].shape == (len(file["time_s"]), 3, 3)
         assert np.isfinite(file["contact_points_m"][()]).all()
         del file["contact_points_m"], file["contact_normals"]
     read, looked_for = open_run(folder), open_run(folder)
@@ -81,6 +82,10 @@ def test_where_condyles_touch_is_read_from_the_run_or_looked_for(folder, tmp_pat
             np.testing.assert_allclose(contact.point, other.condyles[side].point, atol=1e-12)
             direction = contact.direction(0.05)
             np.testing.assert_allclose(direction, other.condyles[side].direction(0.05), atol=1e-12)
+        for part in ("contact_point", "contact_normal"):
+            found = [getattr(geometry.extensor, part) for geometry in (one, other)]
+            np.testing.assert_allclose(*found, atol=1e-12)
+        np.testing.assert_array_equal(one.state.pose("patella"), other.state.pose("patella"))
 
 
 def test_a_wrapped_tendon_lies_on_its_outline_and_says_so(show):

@@ -68,7 +68,7 @@ class MapWriter:
         self._file.create_dataset("points_m", data=points)
         self._file.create_dataset("triangles", data=triangles)
         n = len(points)
-        shapes = ((n,), (n,), (n, 3), (4, 4), (2, 3), (2, 3))
+        shapes = ((n,), (n,), (n, 3), (4, 4), (3, 3), (3, 3))
         for name, shape in zip(PER_FRAME, shapes, strict=False):
             self._grow(name, shape)
         self._file.create_dataset("time_s", (0,), float, maxshape=(None,), chunks=(256,))
@@ -102,9 +102,9 @@ class MapWriter:
             gap: (n,) m.
             nodal_force: (n, 3) N on the insert.
             femoral_pose: (4, 4) pose_femoral_in_insert at which the map holds.
-            contact_points: (2, 3) m, where the medial and the lateral condyle touch; NaN where
-                it does not, or where that is not known.
-            contact_normals: (2, 3) unit, out of the insert there.
+            contact_points: (3, 3) m, where the medial and the lateral condyle touch the insert
+                and the patella the femoral component; NaN where that is not known.
+            contact_normals: (3, 3) unit, there: out of the insert, into the patella.
         """
         values = (pressure, gap, nodal_force, femoral_pose, contact_points, contact_normals)
         with self._written():
@@ -223,15 +223,15 @@ class ContactMaps:
 
     @cached_property
     def contact_points_m(self) -> Array:
-        """(f, 2, 3) where the medial and the lateral condyle touch, as the equations take it.
+        """(f, 3, 3) where medial condyle, lateral condyle and patella touch in the equations.
 
-        NaN where it does not; NaN throughout in a file from before they were kept.
+        NaN where they do not; NaN throughout in a file from before they were kept.
         """
         return self._kept_since("contact_points_m")
 
     @cached_property
     def contact_normals(self) -> Array:
-        """(f, 2, 3) unit normals out of the insert there, likewise."""
+        """(f, 3, 3) unit normals there, out of the insert and into the patella, likewise."""
         return self._kept_since("contact_normals")
 
     @cached_property
@@ -273,12 +273,12 @@ class ContactMaps:
         return {name: getattr(self, name)[k] for name in ("pressure_Pa", "gap_m", "nodal_force_N")}
 
     def _kept_since(self, name: str) -> Array:
-        """Return an array (f, 2, 3) that early files do not have; NaN for those."""
-        count = len(self.time_s)
+        """Return an array (f, 3, 3) that early files do not have; NaN for those."""
+        nothing = np.full((len(self.time_s), 3, 3), np.nan)
         if not isinstance(self.source, Path):
-            return np.asarray(self.source.get(name, np.full((count, 2, 3), np.nan)), float)
+            return np.asarray(self.source.get(name, nothing), float)
         with _opened(self.source) as file:
-            return file[name][:count] if name in file else np.full((count, 2, 3), np.nan)
+            return file[name][: len(nothing)] if name in file else nothing
 
     def _array(self, name: str, frames: int | None = None) -> Any:
         if not isinstance(self.source, Path):

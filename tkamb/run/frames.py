@@ -65,7 +65,7 @@ class FrameSolver:
             body, contact = self.side.frame(k, self.before)
             self.before.append(contact)
             del self.before[:-LAST_FRAMES]
-            arrays = contact_arrays(contact, body.geometry.condyles)
+            arrays = contact_arrays(contact, body.geometry)
         doubts = self.plausibility.flags(k, body)
         status = frame_status(self._case, k, body, contact, doubts)
         return k, frame_row(self._case, k, body, contact, self._slips, status), arrays

@@ -31,7 +31,7 @@ LARGEST = 2e9
 """Bytes of a frame; a map of 100,000 points has 5 MB."""
 
 CONTACT_PLACES = ("contact_points", "contact_normals")
-"""(2, 3) m and unit: where the medial and the lateral condyle touch; NaN where it does not."""
+"""(3, 3) m and unit: where medial condyle, lateral condyle and patella touch; NaN without."""
 
 Row = dict[str, Any]
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from tkamb.body.contact_points import CondylePoint
 from tkamb.body.knee import KneeGeometry
+from tkamb.body.patella import touching_patella
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
 from tkamb.geometry.frames import SIDES
@@ -43,9 +44,9 @@ class CaseResults:
     def geometries(self, progress: Progress = lambda frames: frames) -> list[KneeGeometry]:
         """Return what the equations of every frame worked on.
 
-        Where the condyles touch stands in the maps of the run, or is looked for again. Where
-        body and contact were made to agree, both are solved again: the places where forces act
-        come from the contact.
+        Where condyles and patella touch stands in the maps of the run, or is looked for again.
+        Where body and contact were made to agree, both are solved again: the places where forces
+        act come from the contact.
         """
         contact = self.case.scene.contact
         if contact is None or (contact.coupling == "none" and not contact.released):
@@ -73,15 +74,18 @@ class CaseResults:
         if maps is None or row is None or mechanics.muscles is not None:
             return mechanics.frame(k).geometry
         place = self.case.motion.coordinates[k]
-        stored = zip(SIDES, maps.contact_points_m[row], maps.contact_normals[row], strict=True)
+        points, normals = maps.contact_points_m[row], maps.contact_normals[row]
         condyles = {
             side: CondylePoint(point, normal, mechanics.sliding(k, place, point), np.nan)
-            for side, point, normal in stored
+            for side, point, normal in zip(SIDES, points[:2], normals[:2], strict=True)
             if np.isfinite(point).all()
         }
         if not condyles:
             return mechanics.frame(k).geometry
-        return replace(mechanics.geometry(k), condyles=condyles)
+        patella = None
+        if mechanics.extensor is not None and np.isfinite(points[2]).all():
+            patella = touching_patella(mechanics.extensor.joints(k)[0], points[2], normals[2])
+        return replace(mechanics.geometry(k, patella=patella), condyles=condyles)
 
 
 def open_run(
