@@ -13,6 +13,7 @@ from shapes import joined, plate, sphere, two_dishes
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry import topology
+from tkamb.geometry.normals import corner_angles, corner_normals
 from tkamb.geometry.repair import repair
 from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import boundary_loops
@@ -404,3 +405,17 @@ def test_edges_are_those_of_trimesh_and_say_whether_a_surface_is_closed():
     assert topology.is_closed(ball.faces)
     assert not topology.is_closed(turned)
     assert not topology.is_closed(ball.faces[1:])
+
+
+@pytest.mark.parametrize("surface", [plate(), sphere(0.02), two_dishes()])
+def test_corner_normals_are_the_means_over_what_turns_little(surface):
+    """By the definition, triangle by triangle at a vertex."""
+    weights, crease = corner_angles(surface), np.deg2rad(40.0)
+    found = corner_normals(surface, crease, weights)
+    for face in range(0, len(surface.faces), 97):
+        for corner, vertex in enumerate(surface.corner_vertices[face]):
+            around, at = np.nonzero(surface.corner_vertices == vertex)
+            normals = surface.face_normals[around]
+            near = normals @ surface.face_normals[face] >= np.cos(crease)
+            mean = weights[around, at][near] @ normals[near]
+            np.testing.assert_allclose(found[face, corner], mean / np.linalg.norm(mean), atol=1e-12)
