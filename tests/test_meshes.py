@@ -419,3 +419,9 @@ def test_corner_normals_are_the_means_over_what_turns_little(surface):
             near = normals @ surface.face_normals[face] >= np.cos(crease)
             mean = weights[around, at][near] @ normals[near]
             np.testing.assert_allclose(found[face, corner], mean / np.linalg.norm(mean), atol=1e-12)
+
+
+def test_the_longest_edge_of_every_triangle():
+    surface = two_dishes()
+    edges = np.diff(surface.triangles[:, [0, 1, 2, 0]], axis=1)
+    np.testing.assert_allclose(surface.longest_edges, np.linalg.norm(edges, axis=2).max(axis=1))

@@ -141,7 +141,7 @@ def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
     150 000 samples.
     """
     triangles = surface.triangles
-    longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
+    longest = surface.longest_edges
     cuts = np.maximum(np.ceil(longest / spacing).astype(int), 1)
     while (cuts**2).sum() > max(_MOST_SAMPLES, len(triangles)) and cuts.max() > 1:
         spacing *= 1.2
