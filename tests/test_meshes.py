@@ -12,11 +12,13 @@ from hypothesis import strategies as st
 from shapes import joined, plate, sphere, two_dishes
 from tkamb.cli import main
 from tkamb.errors import InputError
+from tkamb.geometry import topology
+from tkamb.geometry.normals import corner_angles, corner_normals
 from tkamb.geometry.repair import repair
 from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import boundary_loops
 from tkamb.inputs.mesh_check import check_mesh
-from tkamb.inputs.meshes import BONE_SIZE, axes_rotation, load_surface, mirrored
+from tkamb.inputs.meshes import BONE_SIZE, axes_rotation, load_surface, mirrored, read_triangles
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real data are not here")
@@ -374,3 +376,52 @@ def test_real_inserts_with_lost_triangles_and_jitter(tmp_path, subject, caplog):
     noisy = Surface(moved, insert.faces)
     rough = load_surface(save(tmp_path / "noisy.stl", noisy), "mm", name="insert", closed=True)
     assert rough.mesh.volume == pytest.approx(insert.mesh.volume, rel=1e-3)
+
+
+def test_a_binary_stl_is_read_as_trimesh_reads_it(tmp_path):
+    path = save(tmp_path / "ball.stl", sphere(0.02))
+    theirs = trimesh.load(path, force="mesh", process=False)
+    vertices, faces = read_triangles(path)
+    assert np.array_equal(vertices, theirs.vertices)
+    assert np.array_equal(faces, theirs.faces)
+
+
+@pytest.mark.parametrize("hashed", [True, False])
+def test_points_at_one_place_are_found_whatever_their_hash(monkeypatch, hashed):
+    if not hashed:
+        monkeypatch.setattr(topology, "_ODD", np.zeros(3, np.uint64))
+    points = np.array([[0.0, 1, 2], [3, 4, 5], [-0.0, 1, 2], [3, 4, 5.5], [3, 4, 5]])
+    first, place = topology.same_places(points)
+    assert first.tolist() == [0, 1, 3]
+    assert place.tolist() == [0, 1, 0, 2, 1]
+
+
+def test_edges_are_those_of_trimesh_and_say_whether_a_surface_is_closed():
+    ball = sphere(0.02)
+    edges = topology.each_edge(ball.faces)
+    assert sorted(edges.tolist()) == sorted(ball.mesh.edges_unique.tolist())
+    turned = ball.faces.copy()
+    turned[3] = turned[3][::-1]
+    assert topology.is_closed(ball.faces)
+    assert not topology.is_closed(turned)
+    assert not topology.is_closed(ball.faces[1:])
+
+
+@pytest.mark.parametrize("surface", [plate(), sphere(0.02), two_dishes()])
+def test_corner_normals_are_the_means_over_what_turns_little(surface):
+    """By the definition, triangle by triangle at a vertex."""
+    weights, crease = corner_angles(surface), np.deg2rad(40.0)
+    found = corner_normals(surface, crease, weights)
+    for face in range(0, len(surface.faces), 97):
+        for corner, vertex in enumerate(surface.corner_vertices[face]):
+            around, at = np.nonzero(surface.corner_vertices == vertex)
+            normals = surface.face_normals[around]
+            near = normals @ surface.face_normals[face] >= np.cos(crease)
+            mean = weights[around, at][near] @ normals[near]
+            np.testing.assert_allclose(found[face, corner], mean / np.linalg.norm(mean), atol=1e-12)
+
+
+def test_the_longest_edge_of_every_triangle():
+    surface = two_dishes()
+    edges = np.diff(surface.triangles[:, [0, 1, 2, 0]], axis=1)
+    np.testing.assert_allclose(surface.longest_edges, np.linalg.norm(edges, axis=2).max(axis=1))

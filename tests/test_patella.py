@@ -354,3 +354,16 @@ def test_a_patella_that_is_lost_from_a_frame_far_off_is_found_from_its_own():
     found = extensor.patella(0, pose, far)
     assert found.status.found
     np.testing.assert_allclose(found.coordinates, own.coordinates, atol=1e-6)
+
+
+def test_a_recorded_contact_does_not_depend_on_what_was_looked_at_before(
+    mechanism: ExtensorMechanism,
+) -> None:
+    """A part of a motion has the answers of the whole: to the last digit, whatever came before."""
+    places = [np.array([0.05 + 1e-4 * k, 1e-3 * k, 0.02 * k]) for k in range(8)]
+    contact = mechanism.contact.unused()
+    after_others = [contact.at(place) for place in places][-1]
+    alone = mechanism.contact.unused().at(places[-1])
+    assert vars(alone).keys() == vars(after_others).keys()
+    for name, value in vars(alone).items():
+        np.testing.assert_array_equal(vars(after_others)[name], value)

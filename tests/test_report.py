@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 
 from headless import Page
 from synthetic_run import MASS_KG, make_run
@@ -15,11 +16,11 @@ from tkamb.output import metrics
 from tkamb.output.axis import horizontal_axis, round_step
 from tkamb.output.headline import cards
 from tkamb.output.metrics import map_rows
-from tkamb.output.panels import panels
-from tkamb.output.plots import draw_panel
+from tkamb.output.panels import Line, Panel, panels
+from tkamb.output.plots import WIDTH, draw_panel
 from tkamb.output.pressure_maps import draw_maps, mapped_frames, top_view
-from tkamb.output.report import report_html, write_report
-from tkamb.output.style import svg_text
+from tkamb.output.report import THIRD, report_html, write_report
+from tkamb.output.style import BLACK, svg_text
 from tkamb.output.tables import flag_rows, motion_table, reasons
 from tkamb.results import Results
 
@@ -502,3 +503,25 @@ def test_on_paper_it_has_six_pages_at_most(page, tmp_path, chromium):
     path.write_text(page, encoding="utf-8")
     printed = Page(chromium).open(path.as_uri(), LIVE).pdf()
     assert 2 <= len(re.findall(rb"/Type /Page\b", printed)) <= 6
+
+
+@pytest.mark.parametrize("width", [WIDTH, THIRD])
+@pytest.mark.parametrize("scale", [1.0, 1e-4, 1e7])
+def test_nothing_of_a_plot_is_cut_off_and_it_fills_its_picture(bend, gait, width, scale):
+    """Long and short numbers, a level, a range, a second axis, a legend wider than the plot."""
+    wordy = [Line(f"l{k}", f"a long name {k}", scale * np.arange(101.0), BLACK) for k in range(6)]
+    drawn = [(run, panel) for run in (bend, gait) for panel in panels(run)]
+    counts = (3, 4, 6) if width == WIDTH else (1, 2)
+    made = [Panel(f"{count} lines", "", "N", tuple(wordy[:count])) for count in counts]
+    drawn = [(run, panel) for run in (bend, gait) for panel in panels(run)]
+    drawn = (drawn if scale == 1.0 and width == WIDTH else []) + [(bend, one) for one in made]
+    for run, panel in drawn:
+        figure = draw_panel(panel, run, horizontal_axis(run), width)
+        canvas = FigureCanvasSVG(figure)
+        canvas.draw()
+        inked = figure.axes[0].get_tightbbox(figure._get_renderer())
+        size = figure.dpi * figure.get_size_inches()
+        assert (inked.min > -1.0).all(), panel.name
+        assert (inked.max < size + 1.0).all(), panel.name
+        assert inked.width > 0.93 * size[0], panel.name
+        assert inked.height > 0.93 * size[1], panel.name

@@ -8,10 +8,12 @@ import pytest
 
 from scenes import fast_scene, write_scene
 from tkamb import load_scene, simulate
+from tkamb.body.patellofemoral import PatellofemoralContact
 from tkamb.columns import COLUMNS
 from tkamb.contact.foundation import ElasticFoundation
 from tkamb.contact.result import ContactStatus
 from tkamb.errors import InputError
+from tkamb.geometry.condyles import LowestPoints
 
 EVERY_TENTH = slice(0, 101, 10)
 
@@ -43,6 +45,32 @@ def test_the_parts_of_the_time_are_parts_of_the_whole(timed_bend):
     parts = np.stack([results[name] for name in sorted(CLOCKS)])
     assert (parts > 0.0).all()
     assert parts.sum() < seconds
+
+
+def test_a_part_of_the_motion_has_the_answers_of_the_whole(bend, monkeypatch):
+    """It takes the patella and the slip of its own frames alone; slip is counted from frame 0."""
+    places, lows = [], []
+    monkeypatch.setattr(PatellofemoralContact, "at", seen(places, PatellofemoralContact.at))
+    monkeypatch.setattr(LowestPoints, "at", seen(lows, LowestPoints.at))
+    part = simulate(fast_scene(), frames=slice(40, 51, 10))
+    assert len(places) == 2
+    assert len(lows) == 52
+    for name, values in part.columns.items():
+        if name == "status":
+            assert values == bend.status[4:6]
+        elif name not in CLOCKS and name != "iterations":
+            close = 1e-5 if name in CONTACT_COLUMNS else 1e-12  # another guess for the contact
+            np.testing.assert_allclose(values, bend[name][4:6], rtol=close, err_msg=name)
+
+
+def seen(arguments, method):
+    """Return a method that notes what it is asked."""
+
+    def asked(self, argument):
+        arguments.append(argument)
+        return method(self, argument)
+
+    return asked
 
 
 def test_forces_go_the_way_of_the_source(bend):

@@ -3,9 +3,11 @@
 import http.client
 import json
 import re
+import shutil
 import socket
 from importlib.resources import files
 
+import h5py
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from tkamb.body.wrapping import TautPath
 from tkamb.cli import main
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.surface import Surface
+from tkamb.output.maps import ContactMaps
 from tkamb.view import CAMERAS
 from tkamb.view.colours import SLACK, TENDON, rgb
 from tkamb.view.drawing import PressureMap
@@ -61,6 +64,28 @@ def sphere(rings=60):
 
     ball = trimesh.creation.uv_sphere(radius=0.03, count=[rings, rings])
     return Surface(np.asarray(ball.vertices), np.asarray(ball.faces, np.int64), "ball")
+
+
+def test_where_condyles_touch_is_read_from_the_run_or_looked_for(folder, tmp_path):
+    """A contact.h5 of an earlier release does not have it: the drawing is the same."""
+    old = tmp_path / "old"
+    shutil.copytree(folder, old)
+    with h5py.File(old / "contact.h5", "r+") as file:
+        assert file["contact_points_m"].shape == (len(file["time_s"]), 3, 3)
+        assert np.isfinite(file["contact_points_m"][()]).all()
+        del file["contact_points_m"], file["contact_normals"]
+    read, looked_for = open_run(folder), open_run(folder)
+    object.__setattr__(looked_for.results, "maps", ContactMaps(old / "contact.h5"))
+    for one, other in zip(read.geometries(), looked_for.geometries(), strict=True):
+        assert one.condyles.keys() == other.condyles.keys() == {"medial", "lateral"}
+        for side, contact in one.condyles.items():
+            np.testing.assert_allclose(contact.point, other.condyles[side].point, atol=1e-12)
+            direction = contact.direction(0.05)
+            np.testing.assert_allclose(direction, other.condyles[side].direction(0.05), atol=1e-12)
+        for part in ("contact_point", "contact_normal"):
+            found = [getattr(geometry.extensor, part) for geometry in (one, other)]
+            np.testing.assert_allclose(*found, atol=1e-12)
+        np.testing.assert_array_equal(one.state.pose("patella"), other.state.pose("patella"))
 
 
 def test_a_wrapped_tendon_lies_on_its_outline_and_says_so(show):

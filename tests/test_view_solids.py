@@ -5,14 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from matplotlib import colormaps
 from scipy.spatial import cKDTree
 
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.frames import inverse, transform
 from tkamb.geometry.surface import Surface
 from tkamb.output.metrics import JUMP
+from tkamb.output.style import PRESSURE_MAP
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
+from tkamb.view import colours, shapes
 from tkamb.view.draw import draw
 from tkamb.view.run import open_run
 from tkamb.view.shading import MOST_TRIANGLES, decimate, shade
@@ -155,3 +158,39 @@ def test_the_bone_that_the_scene_names_is_drawn():
     assert len(femur.surface.faces) == len(given.faces)
     hip = np.linalg.norm(femur.surface.vertices, axis=1).max()
     assert 0.3 < hip < 0.6
+
+
+def test_stand_ins_are_closed_and_as_large_as_their_shapes():
+    radius, height = np.array([0.02, 0.01, 0.03]), np.array([0.0, 0.1, 0.2])
+    cones = np.diff(height) * (radius[1:] ** 2 + radius[1:] * radius[:-1] + radius[:-1] ** 2) / 3
+    share = 28 / (2 * np.pi) * np.sin(2 * np.pi / 28)  # a polygon's of its circle
+    for made, volume, rel in (
+        (shapes.box(np.array([0.3, 0.1, 0.2]), "box"), 6e-3, 1e-12),
+        (shapes.hull(shapes.sphere_points(), "ball"), 4 / 3 * np.pi, 0.01),
+        (shapes.revolved(radius, height, "shaft"), np.pi * share * cones.sum(), 1e-9),
+    ):
+        mesh = trimesh.Trimesh(made.vertices, made.faces, process=False)
+        assert mesh.is_watertight
+        assert mesh.is_winding_consistent
+        assert mesh.volume == pytest.approx(volume, rel=rel)
+
+
+def test_the_farthest_point_is_that_of_all_distances():
+    rng = np.random.default_rng(3)
+    points = rng.normal(scale=0.03, size=(3000, 3))
+    nearest = ball().nearest
+    assert nearest.farthest(points) == nearest.at(points).distance.max()
+
+
+@pytest.mark.parametrize(
+    ("scale", "name", "lowest"),
+    [
+        (colours.pressure_scale, PRESSURE_MAP, 0.0),
+        (colours.strain_scale, "YlOrRd", 0.15),
+        (colours.activation_scale, "BuPu", 0.35),
+        (colours.wear_scale, "YlGnBu", 0.0),
+    ],
+)
+def test_the_scales_are_matplotlib_s(scale, name, lowest):
+    wanted = colormaps[name](np.linspace(lowest, 1.0, 256))[:, :3] * 255.0
+    assert np.array_equal(scale(), np.round(wanted))

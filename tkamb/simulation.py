@@ -103,7 +103,7 @@ class _Run:
 
     def prepare(self) -> None:
         """Build both sides of the equilibrium; whatever is wrong with the input shows here."""
-        self.solver = FrameSolver(self.case)
+        self.solver = FrameSolver(self.case, self.indices)
         self.seconds = {"read": clock.perf_counter() - self.start}
         if self.solver.side is not None:
             self.seconds["prepare contact"] = self.solver.side.prepare_seconds

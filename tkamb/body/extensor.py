@@ -4,6 +4,7 @@ import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import overload
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -60,7 +61,7 @@ class ExtensorFrames:
     Attributes:
         muscle: its line of action.
         ligament: the patellar ligament's.
-        states: the patella at each frame.
+        states: the patella at each frame; a recorded one is looked at when it is asked for.
 
     Raises:
         InputError: a line starts inside what it wraps, or the patella is found nowhere.
@@ -70,16 +71,12 @@ class ExtensorFrames:
         self, parts: ExtensorParts, time: Array, poses: Array, recorded: Array | None, rates: Rates
     ) -> None:
         prepared = self._take(parts)
-        self._contacts: tuple[PatellarContact, ...] | None = None
+        self._contacts: _RecordedContacts | None = None
+        self.states: Sequence[PatellaState]
         if recorded is not None:
             self._joints = recorded
             self._contacts = _recorded_contacts(prepared, recorded[:, 0].tobytes())
-            self.states = [
-                patella_at(self._mechanism, pose, coordinates, contact)
-                for pose, coordinates, contact in zip(
-                    poses, recorded[:, 0], self._contacts, strict=True
-                )
-            ]
+            self.states = _RecordedStates(self._mechanism, poses, self._contacts)
         else:
             self.states = _solve_all(self._mechanism, poses)
             self._joints = self._differentiate(time, poses, rates)
@@ -109,12 +106,13 @@ class ExtensorFrames:
         """
         other = copy.copy(self)
         other._take(parts)
-        other.states, other._joints = list(self.states), self._joints.copy()
+        states, other._joints = list(self.states), self._joints.copy()
         for k in frames:
             near = self.states[k]
             found = solve_patella(other._mechanism, poses[k], near.coordinates, near.slopes)
-            other.states[k] = found
+            states[k] = found
             other._joints[k, 0] += found.coordinates - near.coordinates
+        other.states = states
         return other
 
     def joints(self, k: int) -> Array:
@@ -128,7 +126,7 @@ class ExtensorFrames:
         where it was at the recorded pose.
         """
         if self._contacts is not None:
-            recorded = self.states[k].coordinates
+            recorded = self._contacts.places[k]
             return patella_at(self._mechanism, pose, recorded, self._contacts[k])
         own = self.states[k]
         if guess is not None and own.status.found:
@@ -274,18 +272,59 @@ def _patellar_contact(femoral: Surface, button: Surface, joint: bytes) -> Patell
     return PatellofemoralContact(femoral.moved(inverse(joint_in_femur)), button)
 
 
+class _RecordedContacts:
+    """The contact at each recorded place, found once it is asked for.
+
+    Args:
+        contact: of the two surfaces, unused.
+        places: (f, 3) m and rad, recorded coordinates of the patella.
+    """
+
+    def __init__(self, contact: PatellofemoralContact, places: Array) -> None:
+        self.places, self._contact = places, contact
+        self._found: dict[int, PatellarContact] = {}
+
+    def __getitem__(self, k: int) -> PatellarContact:
+        if k not in self._found:
+            self._found[k] = self._contact.at(self.places[k])
+        return self._found[k]
+
+
 @lru_cache(maxsize=1)
-def _recorded_contacts(
-    prepared: PatellofemoralContact, coordinates: bytes
-) -> tuple[PatellarContact, ...]:
-    """Return the contact at each recorded place: where the knee is does not change it.
+def _recorded_contacts(prepared: PatellofemoralContact, coordinates: bytes) -> _RecordedContacts:
+    """Return the contacts at recorded places: where the knee is does not change them.
 
     Args:
         prepared: the contact; told from others by its identity.
         coordinates: (f, 3) m and rad, their bytes.
     """
-    contact = prepared.unused()
-    return tuple(contact.at(place) for place in np.frombuffer(coordinates).reshape(-1, 3))
+    return _RecordedContacts(prepared.unused(), np.frombuffer(coordinates).reshape(-1, 3))
+
+
+class _RecordedStates(Sequence[PatellaState]):
+    """The patella where it was recorded, at the recorded poses of the femur (f, 4, 4)."""
+
+    def __init__(
+        self, mechanism: ExtensorMechanism, poses: Array, contacts: _RecordedContacts
+    ) -> None:
+        self._mechanism, self._poses, self._contacts = mechanism, poses, contacts
+        self._found: dict[int, PatellaState] = {}
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    @overload
+    def __getitem__(self, k: int) -> PatellaState: ...
+    @overload
+    def __getitem__(self, k: slice) -> list[PatellaState]: ...
+    def __getitem__(self, k: int | slice) -> PatellaState | list[PatellaState]:
+        if isinstance(k, slice):
+            return [self[one] for one in range(len(self))[k]]
+        k = range(len(self))[k]
+        if k not in self._found:
+            place, contact = self._contacts.places[k], self._contacts[k]
+            self._found[k] = patella_at(self._mechanism, self._poses[k], place, contact)
+        return self._found[k]
 
 
 def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]:

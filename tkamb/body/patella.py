@@ -132,6 +132,20 @@ def patella_at(
     return frame.state(balance, PatellaStatus.EDGE if edge else PatellaStatus.OK)
 
 
+def touching_patella(coordinates: Array, point: Array, normal: Array) -> PatellaState:
+    """Return the state of a patella of which place and contact are known, and nothing else.
+
+    Args:
+        coordinates: (3,) of the patella, m and rad.
+        point: (3,) m, contact point, insert frame.
+        normal: (3,) unit, into the patella, insert frame.
+    """
+    nan = float("nan")
+    on_patella = np.full(3, nan)
+    known = (coordinates, point, normal, on_patella)
+    return PatellaState(*known, nan, nan, nan, nan, nan, PatellaStatus.OK)
+
+
 class PatellaFrame:
     """The mechanism at one frame, in the patellar joint's frame."""
 

@@ -31,7 +31,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.errors import InputError
+from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, pose, transform
 from tkamb.geometry.normals import sharp_edges
 from tkamb.geometry.surface import Surface
@@ -42,8 +42,8 @@ PATCH_DEPTH = 5e-5
 SAMPLE_SPACING = 1e-3
 """m: spacing of the samples of the button, in the patella's coronal plane."""
 
-REACH = 14.0 * PATCH_DEPTH
-"""m: samples farther than this behind the nearest one weigh nothing (exp(-14) = 1e-6)."""
+REACH = 20.0 * PATCH_DEPTH
+"""m: samples farther than this behind the nearest one weigh nothing (exp(-20) = 2e-9)."""
 
 COARSE = 60
 """Samples that a quick look takes."""
@@ -53,6 +53,9 @@ LATERAL_YIELD = 0.01
 
 TILT_YIELD = 10.0
 """rad/m: d above, the tilt (5.7 deg) if the whole force acted 10 mm beside the middle."""
+
+SIDEWAYS = 1e-9
+"""Sagittal part of a unit normal below which there is none."""
 
 EDGE_MARGIN = 0.02
 """Barycentric distance from a sharp edge within which a point lies on it."""
@@ -85,7 +88,8 @@ class PatellofemoralContact:
     """Contact between button and femoral component, prepared for many positions.
 
     Distances of samples that cannot matter are carried over from the position before, with
-    what the samples have moved since as a bound: this saves time and changes nothing.
+    what the samples have moved since as a bound: this saves time and changes nothing, since
+    samples beyond `REACH` have no weight.
 
     Args:
         femoral: femoral component in the patellar joint's frame; triangles share vertices.
@@ -135,7 +139,11 @@ class PatellofemoralContact:
         return pose([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], [ap, si, self.ml])
 
     def at(self, coordinates: Array) -> PatellarContact:
-        """Return the contact at (ap, si, rotation), m and rad."""
+        """Return the contact at (ap, si, rotation), m and rad.
+
+        Raises:
+            ComputationError: it pushes straight sideways, which no line in the plane can balance.
+        """
         self._measure(transform(self.pose(np.asarray(coordinates, float)), self._samples))
         sides = [self._side(side) for side in self._sides]
         gaps, points, normals, edges = (np.array(part) for part in zip(*sides, strict=True))
@@ -144,11 +152,14 @@ class PatellofemoralContact:
         weights = np.array([left, 1.0 - left])
         force, sideways = weights @ normals, out_of_plane @ weights
         sagittal = np.array([force[0], force[1], 0.0])
+        length = float(np.linalg.norm(sagittal))
+        if length < SIDEWAYS:
+            raise ComputationError("the femur pushes the patella straight sideways")
         shift, tilt = self._yield * sideways
         return PatellarContact(
             gap=float(weights @ gaps + 0.5 * self._yield @ sideways**2),
             point=_on_line_of_action(weights, points, normals),
-            normal=sagittal / np.linalg.norm(sagittal),
+            normal=sagittal / length,
             share_left=left,
             shift=float(shift),
             tilt=float(tilt),
@@ -194,7 +205,8 @@ class PatellofemoralContact:
     def _side(self, side: NDArray[np.bool_]) -> tuple[float, Array, Array, float]:
         """Return g, p, n and the share on edges of one side."""
         distance = self._distance[side]
-        weights = np.exp(-(distance - distance.min()) / PATCH_DEPTH)
+        behind = distance - distance.min()
+        weights = np.where(behind < REACH, np.exp(-behind / PATCH_DEPTH), 0.0)
         weights /= weights.sum()
         gap = float(weights @ distance) - PATCH_DEPTH
         edge = float(weights @ self._on_edge[side])

@@ -33,6 +33,8 @@ UP = np.array([0.0, 1.0, 0.0])
 class CondyleSlip:
     """Rolling and slipping of one condyle; cumulated from the first frame, NaN where lost.
 
+    Of the first f frames of a motion.
+
     Args:
         femoral_arc: (f,) m, on the femoral surface, positive backwards.
         insert_arc: (f,) m, on the insert, positive backwards.
@@ -50,8 +52,8 @@ class CondyleSlip:
         return np.asarray(self.femoral_arc - (self.insert_arc - self.axial_part))
 
     def slip_velocity(self, time: Array) -> Array:
-        """Return (f,) m/s, by central differences of the slip over time (f,) s."""
-        return np.asarray(np.gradient(self.slip, time))
+        """Return (f,) m/s, by central differences of the slip over the motion's time, s."""
+        return np.asarray(np.gradient(self.slip, time[: len(self.slip)]))
 
 
 class InsertProfile:

@@ -3,6 +3,7 @@
 import time as clock
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from tkamb.body.slip import CondyleSlip
     from tkamb.contact.probe import CondyleWrench
     from tkamb.geometry.adjustment import Adjustment
+    from tkamb.geometry.closest import ClosestPointQuery
 
 STRAIN_FLEXIONS = (0.0, 60.0, 90.0)
 """deg: where the strains of the ligaments are shown."""
@@ -66,6 +68,7 @@ class Mechanics:
     Args:
         case: the scene with its files read.
         known: what is known already of a case that this one is a sample of.
+        near: whether the condyles are known to be near the insert.
 
     Attributes:
         poses: (f, 4, 4) recorded pose_femur_in_insert.
@@ -76,12 +79,11 @@ class Mechanics:
         muscles: those that share the load; None if the quadriceps alone acts.
     """
 
-    def __init__(self, case: Case, known: Known | None = None) -> None:
-        self.case = case
+    def __init__(self, case: Case, known: Known | None = None, near: bool = False) -> None:
+        self.case, self._known = case, known
         self.poses = knee_pose(case.motion.coordinates)
         self.friction = case.scene.contact.friction if case.scene.contact else 0.0
-        self.query = known.query if known else contact_query(case)
-        if known is None:
+        if known is None and not near:
             self._check_near()
         self.extensor = None
         if case.scene.patella:
@@ -93,10 +95,15 @@ class Mechanics:
 
             self.muscles = load_muscles(case)
 
+    @cached_property
+    def query(self) -> "ClosestPointQuery | None":
+        """Closest points of the two surfaces; None without [contact]."""
+        return self._known.query if self._known else contact_query(self.case)
+
     def _check_near(self) -> None:
         """Raise where the condyles are nowhere near the insert, whatever the frame."""
         contact = self.case.scene.contact
-        if self.query is None or contact is None or contact.released:
+        if contact is None or contact.released or self.query is None:
             return
         middle, last = len(self.poses) // 2, len(self.poses) - 1
         nearest: list[float] = []
@@ -234,14 +241,19 @@ class Mechanics:
             PointForces("femur", post.point[None], -force[None], -twist),
         )
 
-    def slips(self) -> "dict[str, CondyleSlip]":
-        """Return side -> rolling and slipping of all frames; empty without the two surfaces."""
+    def slips(self, last: int) -> "dict[str, CondyleSlip]":
+        """Return side -> rolling and slipping up to a frame; empty without the two surfaces.
+
+        Args:
+            last: the last frame whose slip and its rate are wanted: the rate takes one more.
+        """
         case = self.case
         if self.query is None or case.femoral is None or case.insert is None:
             return {}
         from tkamb.body.slip import condyle_slip
 
-        found = condyle_slip(case.femoral, case.insert, case.split, case.motion.coordinates)
+        recorded = case.motion.coordinates[: last + 2]
+        found = condyle_slip(case.femoral, case.insert, case.split, recorded)
         sides = zip(SIDES, found, strict=True)
         return {side: slip for side, slip in sides if slip is not None}
 
@@ -320,13 +332,14 @@ class Mechanics:
             return (), {}
         from tkamb.body.ligaments import build_ligaments, strain_table
 
-        poses = self.recorded_poses()
+        poses = self.recorded_poses
         flexion = self.case.motion.coordinates[:, 5]
         bundles = build_ligaments(self.case.ligaments, poses, flexion)
         return bundles, strain_table(bundles, poses, flexion, STRAIN_FLEXIONS)
 
+    @cached_property
     def recorded_poses(self) -> dict[str, Array]:
-        """Return link -> pose_link_in_insert (f, 4, 4) as recorded, of links with attachments."""
+        """Link -> pose_link_in_insert (f, 4, 4) as recorded, of links with attachments."""
         recorded, ligament = self.case.motion.coordinates, self.case.patellar_ligament
         states = [self.case.chain.at(self._chain_motion(k, x)) for k, x in enumerate(recorded)]
         links = self._attachment_links()

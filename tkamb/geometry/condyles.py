@@ -1,5 +1,7 @@
 """Where a femoral component parts into two condyles, and the lowest point of each."""
 
+from functools import lru_cache
+
 import numpy as np
 
 from tkamb.geometry.frames import Array, Index, rotate, transform
@@ -18,6 +20,7 @@ _FLEXIONS = np.radians(np.arange(0.0, 121.0, 15.0))
 _DEEPEST = 15e-3
 
 
+@lru_cache(maxsize=2)
 def condyle_split(femoral: Surface) -> float | None:
     """Return the z (m, femoral frame) between the condyles; None for a single condyle.
 

@@ -9,6 +9,7 @@ from tkamb.geometry.bounds import HeightBound, Patches
 from tkamb.geometry.frames import Array, Index, Mask, inverse, rotate, transform
 from tkamb.geometry.ragged import Ragged
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.topology import each_edge
 
 UP = np.array([0.0, 1.0, 0.0])
 EDGE_BAND = 0.03
@@ -180,7 +181,7 @@ class _Edges:
     """
 
     def __init__(self, surface: Surface, chosen: Mask) -> None:
-        edges = np.asarray(surface.mesh.edges_unique, np.int64)
+        edges = each_edge(surface.faces)
         self._ends = edges[chosen[edges].all(axis=1)]
         ends = surface.vertices[self._ends]
         self._band = EDGE_BAND * np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)

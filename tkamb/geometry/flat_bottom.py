@@ -61,8 +61,9 @@ def find_flats(surface: Surface) -> list[FlatBottom]:
     free = area > 0
     flats: list[FlatBottom] = []
     for _ in range(12):
-        flat = _largest_flat(surface, normals, area, free) if free.any() else None
-        if flat is None or (flats and flat.area < COMPARABLE_SHARE * max(f.area for f in flats)):
+        least = COMPARABLE_SHARE * max((f.area for f in flats), default=0.0)
+        flat = _largest_flat(surface, normals, area, free, least) if free.any() else None
+        if flat is None or flat.area < least:
             break
         flats.append(flat)
         free = free.copy()
@@ -182,10 +183,16 @@ def _levelling(normal: Array) -> Array:
     return Rotation.from_rotvec(axis / sine * angle).as_matrix()
 
 
-def _largest_flat(surface: Surface, normals: Array, area: Array, free: Mask) -> FlatBottom | None:
+def _largest_flat(
+    surface: Surface, normals: Array, area: Array, free: Mask, least: float
+) -> FlatBottom | None:
+    """Return the largest flat of the free triangles; None if it cannot have the least area, m²."""
     best: FlatBottom | None = None
     for seed in _peaks(normals[free], area[free]):
-        flat = _grown(surface, normals, area, free, seed)
+        near = np.flatnonzero(free & (normals @ seed > math.cos(_CONE)))
+        if area[near].sum() < (least if best is None else best.area):
+            continue
+        flat = _grown(surface, normals, area, near, seed)
         if flat is not None and (best is None or flat.area > best.area):
             best = flat
     return best
@@ -209,9 +216,8 @@ def _peaks(normals: Array, area: Array) -> list[Array]:
 
 
 def _grown(
-    surface: Surface, normals: Array, area: Array, free: Mask, seed: Array
+    surface: Surface, normals: Array, area: Array, near: Index, seed: Array
 ) -> FlatBottom | None:
-    near = np.flatnonzero(free & (normals @ seed > math.cos(_CONE)))
     corners, weight = surface.triangles[near], area[near]
     normal, cone = _sharpened(seed, normals[near], weight), _CONE
     offset = _densest(corners.mean(axis=1) @ normal, weight, 20 * FLATNESS)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _MOST_SAMPLES = 150_000
 _CANDIDATES = 8
+_BATCH = 512
 FLAT = 1e-14
 """A triangle whose squared area is less, relative to its edges', has no plane."""
 
@@ -74,6 +75,20 @@ class NearestPoints:
         feet = nearest_on_triangles(self.surface.triangles[faces], points)
         return Nearest(np.linalg.norm(feet - points, axis=1), feet, faces, self)
 
+    def farthest(self, points: Array) -> float:
+        """Return the largest of the distances `at` points (n, 3), m.
+
+        The nearest sample's bounds each from above, so that few are measured.
+        """
+        bound = self._tree.query(points)[0]
+        order, largest = np.argsort(-bound), 0.0
+        for start in range(0, len(order), _BATCH):
+            batch = order[start : start + _BATCH]
+            if bound[batch[0]] <= largest:
+                break
+            largest = max(largest, float(self.at(points[batch]).distance.max()))
+        return largest
+
     @cached_property
     def _edges(self) -> tuple[Array, Array, Array, Array]:
         """First corner (k, 3), the edges from it to the others, and their products (k, 3)."""
@@ -126,7 +141,7 @@ def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
     150 000 samples.
     """
     triangles = surface.triangles
-    longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
+    longest = surface.longest_edges
     cuts = np.maximum(np.ceil(longest / spacing).astype(int), 1)
     while (cuts**2).sum() > max(_MOST_SAMPLES, len(triangles)) and cuts.max() > 1:
         spacing *= 1.2

@@ -15,6 +15,8 @@ SHARP_EDGE = float(np.deg2rad(40.0))
 """rad: neighbouring triangles that turn by more than this meet in a sharp edge."""
 NO_CREASE = float(np.pi)
 """rad: all triangles at a vertex count, however they turn."""
+ROUNDING = 1e-9
+"""Of a cosine."""
 
 
 def corner_normals(surface: "Surface", crease: float, weights: Array) -> Array:
@@ -29,15 +31,20 @@ def corner_normals(surface: "Surface", crease: float, weights: Array) -> Array:
         crease: rad; `NO_CREASE`: the same normal for all corners at a vertex.
         weights: (k, 3) of each triangle at its corners: `corner_angles`, or its area.
     """
-    normals, vertex = surface.face_normals, surface.corner_vertices.ravel()
-    if crease >= NO_CREASE:
-        weighted = weights.reshape(-1, 1) * np.repeat(normals, 3, axis=0)
-        total = _sums(vertex, weighted)[vertex]
-    else:
-        here, there = surface.corners_at_vertices.of(vertex)
-        turn = np.einsum("pj,pj->p", normals[here // 3], normals[there // 3])
-        weight = np.where(turn >= np.cos(crease), weights.ravel()[there], 0.0)
-        total = _sums(here, weight[:, None] * normals[there // 3])
+    normals, vertex = np.repeat(surface.face_normals, 3, axis=0), surface.corner_vertices.ravel()
+    weighted = weights.reshape(-1, 1) * normals
+    mean = _sums(vertex, weighted)
+    total = mean[vertex]
+    if crease < NO_CREASE:
+        # two within half the crease of the mean turn by no more than all of it: those need no pairs
+        lean = np.einsum("cj,cj->c", normals, _unit(mean)[vertex])
+        rough = np.zeros(len(mean), bool)
+        rough[vertex[~(lean > np.cos(crease / 2) + ROUNDING)]] = True
+        corners = np.flatnonzero(rough[vertex])
+        here, there = surface.corners_at_vertices.of(vertex[corners])
+        turn = np.einsum("pj,pj->p", normals[corners[here]], normals[there])
+        counts = (turn >= np.cos(crease))[:, None]
+        total[corners] = _sums(here, np.where(counts, weighted[there], 0.0), len(corners))
     return _unit(total).reshape(-1, 3, 3)
 
 
@@ -71,8 +78,9 @@ def sharp_edges(surface: "Surface", sharp: float = SHARP_EDGE) -> Mask:
     return np.roll(flags[edge].reshape(-1, 3), -1, axis=1)
 
 
-def _sums(index: Index, rows: Array) -> Array:
-    return np.stack([np.bincount(index, column) for column in rows.T], axis=1)
+def _sums(index: Index, rows: Array, count: int = 0) -> Array:
+    """Return the sums (count or more, n) of the rows (m, n) with each index (m,)."""
+    return np.stack([np.bincount(index, column, count) for column in rows.T], axis=1)
 
 
 def _unit(vectors: Array) -> Array:

@@ -260,7 +260,7 @@ def _least_altitudes(surface: "Surface") -> Array:
     """Return the least altitude (k,) of every triangle, m."""
     edges = np.roll(surface.triangles, 1, axis=1) - surface.triangles
     doubled = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    longest = np.linalg.norm(edges, axis=2).max(axis=1)
+    longest = surface.longest_edges
     return np.divide(doubled, longest, out=np.zeros_like(doubled), where=longest > 0.0)
 
 

@@ -7,14 +7,16 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from tkamb.geometry.frames import Array, Index
+from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.topology import (
     BoundaryLoop,
     boundary_loops,
     connected_parts,
     edge_use,
     half_edges,
+    is_closed,
     open_edges,
+    same_places,
     signed_volumes,
 )
 
@@ -58,20 +60,23 @@ def repair(vertices: Array, faces: Index) -> Repair:
         vertices: (n, 3) m, finite.
         faces: (k, 3) indices into the vertices.
     """
-    unused = len(vertices) - len(np.unique(faces))
+    unused = len(vertices) - int(_used(vertices, faces).sum())
     vertices, faces = _merged(vertices, faces)
     faces, collapsed = _without_collapsed(faces)
     faces, duplicates = _without_duplicates(faces)
-    faces, turned, one_sided = _wound(vertices, faces)
-    faces, welded = _welded(vertices, faces)
-    if welded:
-        faces, more = _without_collapsed(faces)
-        collapsed += more
-        faces, more = _without_duplicates(faces)
-        duplicates += more
-        faces, more, one_sided = _wound(vertices, faces)
-        turned += more
-    vertices, faces, filled, widest = _filled(vertices, faces)
+    turned, welded, filled, widest, one_sided = 0, 0, 0, 0.0, False
+    closed = is_closed(faces)
+    if not closed:
+        faces, turned, one_sided = _wound(vertices, faces)
+        faces, welded = _welded(vertices, faces)
+        if welded:
+            faces, more = _without_collapsed(faces)
+            collapsed += more
+            faces, more = _without_duplicates(faces)
+            duplicates += more
+            faces, more, one_sided = _wound(vertices, faces)
+            turned += more
+        vertices, faces, filled, widest = _filled(vertices, faces)
     faces, inside_out = _outward(vertices, faces)
     vertices, faces = _referenced(vertices, faces)
     notices = (
@@ -84,6 +89,8 @@ def repair(vertices: Array, faces: Index) -> Repair:
         _notice(filled, "small hole", f"closed (up to {1e3 * widest:.2g} mm wide)"),
     )
     said = tuple(notice for notice in notices if notice)
+    if closed:
+        return Repair(vertices, faces, said, (), np.empty(0, np.int64), one_sided)
     holes = tuple(boundary_loops(vertices, faces))
     return Repair(vertices, faces, said, holes, _forks(faces), one_sided)
 
@@ -94,12 +101,8 @@ def _notice(count: int, noun: str, what: str) -> str:
 
 
 def _merged(vertices: Array, faces: Index) -> tuple[Array, Index]:
-    rows = np.ascontiguousarray(vertices + 0.0).view("V24").reshape(-1)
-    _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    return vertices[first[order]] + 0.0, rank[inverse.reshape(-1)][faces]
+    first, place = same_places(vertices)
+    return vertices[first] + 0.0, place[faces]
 
 
 def _without_collapsed(faces: Index) -> tuple[Index, int]:
@@ -111,8 +114,13 @@ def _without_collapsed(faces: Index) -> tuple[Index, int]:
 def _without_duplicates(faces: Index) -> tuple[Index, int]:
     """Keep one of equal faces; of two back to back (a fold without thickness) keep none."""
     corners = np.sort(faces, axis=1)
+    most = int(faces.max(initial=0)) + 1
+    _, pair = np.unique(corners[:, 0] * most + corners[:, 1], return_inverse=True)
     _, first, group, count = np.unique(
-        corners, axis=0, return_index=True, return_inverse=True, return_counts=True
+        pair.reshape(-1) * most + corners[:, 2],
+        return_index=True,
+        return_inverse=True,
+        return_counts=True,
     )
     if (count == 1).all():
         return faces, 0
@@ -198,8 +206,10 @@ def _filled(vertices: Array, faces: Index) -> tuple[Array, Index, int, float]:
 def _outward(vertices: Array, faces: Index) -> tuple[Index, int]:
     """Turn closed bodies that are inside out; a void within another body stays one."""
     part = connected_parts(faces)
-    open_parts = set(np.unique(part[np.isin(faces, open_edges(faces)).any(axis=1)]))
     volume = np.bincount(part, signed_volumes(vertices, faces))
+    if (volume >= 0).all():
+        return faces, 0
+    open_parts = set(np.unique(part[np.isin(faces, open_edges(faces)).any(axis=1)]))
     boxes = [_box(vertices[faces[part == p]]) for p in range(len(volume))]
     result, turned = faces.copy(), 0
     for p in np.flatnonzero(volume < 0):
@@ -220,8 +230,15 @@ def _box(corners: Array) -> tuple[Array, Array]:
 
 
 def _referenced(vertices: Array, faces: Index) -> tuple[Array, Index]:
-    used, index = np.unique(faces, return_inverse=True)
-    return vertices[used], index.reshape(faces.shape).astype(np.int64)
+    used = _used(vertices, faces)
+    return vertices[used], (np.cumsum(used) - 1)[faces]
+
+
+def _used(vertices: Array, faces: Index) -> Mask:
+    """Say which vertices (n,) a face has."""
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    return used
 
 
 def _forks(faces: Index) -> Index:

@@ -10,6 +10,7 @@ from tkamb.geometry.frames import Array, Index, transform
 from tkamb.geometry.normals import SHARP_EDGE, corner_angles, corner_normals, interpolated
 from tkamb.geometry.ragged import Ragged
 from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.topology import same_places
 
 if TYPE_CHECKING:
     import trimesh
@@ -61,6 +62,15 @@ class Surface:
         return np.linalg.norm(self._cross, axis=1) / 2.0
 
     @cached_property
+    def longest_edges(self) -> Array:
+        """The longest edge (k,) of every triangle, m."""
+        corners = np.moveaxis(self.triangles, (1, 2), (0, 1)).copy()  # by corner and axis: quicker
+        square = [
+            (end - start) ** 2 for start, end in zip(corners, corners[[1, 2, 0]], strict=True)
+        ]
+        return np.sqrt(np.maximum.reduce([x + y + z for x, y, z in square]))
+
+    @cached_property
     def _cross(self) -> Array:
         """Normals (k, 3) as long as twice the triangles' areas, m²."""
         a, b, c = np.moveaxis(self.triangles, 1, 0)
@@ -100,8 +110,7 @@ class Surface:
     @cached_property
     def corner_vertices(self) -> Index:
         """The faces (k, 3) with vertices at the same place taken for one."""
-        _, merged = np.unique(self.vertices, axis=0, return_inverse=True)
-        return merged.reshape(-1)[self.faces].astype(np.int64)
+        return same_places(self.vertices)[1][self.faces]
 
     @cached_property
     def corners_at_vertices(self) -> Ragged:
@@ -143,7 +152,9 @@ class Surface:
         return NearestPoints(self)
 
     def moved(self, pose_here_in_there: Array) -> "Surface":
-        """Return the surface in another frame."""
+        """Return the surface in another frame; where that is the same, itself."""
+        if np.array_equal(pose_here_in_there, np.eye(4)):
+            return self
         return Surface(transform(pose_here_in_there, self.vertices), self.faces, self.name)
 
     def __getstate__(self) -> dict[str, Any]:

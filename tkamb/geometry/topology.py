@@ -38,6 +38,45 @@ def edge_use(faces: Index) -> tuple[Index, Index]:
     return edge.reshape(-1), count
 
 
+def each_edge(faces: Index) -> Index:
+    """Return the undirected edges (m, 2) of the faces, each once."""
+    edge, count = edge_use(faces)
+    ends = np.empty((len(count), 2), np.int64)
+    ends[edge] = np.sort(half_edges(faces), axis=1)
+    return ends
+
+
+def is_closed(faces: Index) -> bool:
+    """Say whether two faces meet in every edge, and run through it in opposite directions."""
+    edge, count = edge_use(faces)
+    start, end = half_edges(faces).T
+    balance = np.bincount(edge, np.sign(end - start), len(count))
+    return bool((count == 2).all() and (balance == 0).all())
+
+
+def same_places(points: Array) -> tuple[Index, Index]:
+    """Return which points (n, 3) are the first of those at one place, and each one's place (n,).
+
+    Places are numbered as their first points follow each other. Points are held together by a
+    hash of their bits, and compared where it says that they are the same.
+    """
+    bits = np.ascontiguousarray(points + 0.0).view(np.uint64)  # of -0 and 0 the same
+    mixed = bits * _ODD
+    mixed ^= mixed >> np.uint64(32)
+    _, first, place = np.unique((mixed * _ODD).sum(axis=1), return_index=True, return_inverse=True)
+    if (bits != bits[first[place]]).any():
+        rows = bits.view("V24").reshape(-1)
+        _, first, place = np.unique(rows, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return first[order], rank[place.reshape(-1)]
+
+
+_ODD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+"""Multipliers of the hash: odd, so that no bit is lost."""
+
+
 def open_edges(faces: Index) -> Index:
     """Return the directed edges (m, 2) that only one face uses."""
     edge, count = edge_use(faces)

@@ -87,12 +87,22 @@ class PageGrid:
         over = face >= 0
         return over.reshape(x.shape), self._surface.faces[face[over]], weights[over]
 
-    def sample(self, values: Array) -> Array:
-        """Return values (n,) of the points on the grid (rows, columns), linear in a triangle.
+    def sample(self, values: Array, every: int = 1) -> Array:
+        """Return values (..., n) of the points on the grid (..., rows, columns).
 
-        Rows run from the anterior edge down, columns to the page's right; -1 off the insert.
+        Linear in a triangle. Rows run from the anterior edge down, columns to the page's right;
+        -1 off the insert.
+
+        Args:
+            values: (..., n), one or more fields.
+            every: which rows and columns: all, every second ...
         """
         over, corners, weights = self._hits
-        found = np.full(over.shape, -1.0)
-        found[over] = np.einsum("ij,ij->i", weights, values[corners])
+        chosen = np.zeros(over.shape, bool)
+        chosen[::every, ::every] = True
+        corners, weights = corners[chosen[over]], weights[chosen[over]]
+        over = over[::every, ::every]
+        found = np.full((*values.shape[:-1], *over.shape), -1.0)
+        for here in np.ndindex(values.shape[:-1]):
+            found[here][over] = np.einsum("ij,ij->i", weights, values[here][corners])
         return found

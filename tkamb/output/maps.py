@@ -26,7 +26,10 @@ if TYPE_CHECKING:
 
 UNITS = "SI: m, s, Pa, N; poses 4x4"
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-PER_FRAME = ("pressure_Pa", "gap_m", "nodal_force_N", "femoral_pose", "time_s")
+PER_FRAME = (
+    *("pressure_Pa", "gap_m", "nodal_force_N", "femoral_pose"),
+    *("contact_points_m", "contact_normals", "time_s"),
+)
 
 
 class MapWriter:
@@ -65,7 +68,7 @@ class MapWriter:
         self._file.create_dataset("points_m", data=points)
         self._file.create_dataset("triangles", data=triangles)
         n = len(points)
-        shapes = ((n,), (n,), (n, 3), (4, 4))
+        shapes = ((n,), (n,), (n, 3), (4, 4), (3, 3), (3, 3))
         for name, shape in zip(PER_FRAME, shapes, strict=False):
             self._grow(name, shape)
         self._file.create_dataset("time_s", (0,), float, maxshape=(None,), chunks=(256,))
@@ -88,6 +91,8 @@ class MapWriter:
         gap: ArrayLike,
         nodal_force: ArrayLike,
         femoral_pose: ArrayLike,
+        contact_points: ArrayLike = np.nan,
+        contact_normals: ArrayLike = np.nan,
     ) -> None:
         """Add one frame and flush it.
 
@@ -97,8 +102,11 @@ class MapWriter:
             gap: (n,) m.
             nodal_force: (n, 3) N on the insert.
             femoral_pose: (4, 4) pose_femoral_in_insert at which the map holds.
+            contact_points: (3, 3) m, where the medial and the lateral condyle touch the insert
+                and the patella the femoral component; NaN where that is not known.
+            contact_normals: (3, 3) unit, there: out of the insert, into the patella.
         """
-        values = (pressure, gap, nodal_force, femoral_pose)
+        values = (pressure, gap, nodal_force, femoral_pose, contact_points, contact_normals)
         with self._written():
             frame = len(self)
             for name, value in zip(PER_FRAME, values, strict=False):
@@ -214,6 +222,19 @@ class ContactMaps:
         return self._array("femoral_pose", len(self.time_s))
 
     @cached_property
+    def contact_points_m(self) -> Array:
+        """(f, 3, 3) where medial condyle, lateral condyle and patella touch in the equations.
+
+        NaN where they do not; NaN throughout in a file from before they were kept.
+        """
+        return self._kept_since("contact_points_m")
+
+    @cached_property
+    def contact_normals(self) -> Array:
+        """(f, 3, 3) unit normals there, out of the insert and into the patella, likewise."""
+        return self._kept_since("contact_normals")
+
+    @cached_property
     def attributes(self) -> dict[str, Any]:
         """Units, frame, model, version, scene hash."""
         if not isinstance(self.source, Path):
@@ -251,6 +272,14 @@ class ContactMaps:
         """Return pressure_Pa (n,), gap_m (n,) and nodal_force_N (n, 3) of frame k by name."""
         return {name: getattr(self, name)[k] for name in ("pressure_Pa", "gap_m", "nodal_force_N")}
 
+    def _kept_since(self, name: str) -> Array:
+        """Return an array (f, 3, 3) that early files do not have; NaN for those."""
+        nothing = np.full((len(self.time_s), 3, 3), np.nan)
+        if not isinstance(self.source, Path):
+            return np.asarray(self.source.get(name, nothing), float)
+        with _opened(self.source) as file:
+            return file[name][: len(nothing)] if name in file else nothing
+
     def _array(self, name: str, frames: int | None = None) -> Any:
         if not isinstance(self.source, Path):
             return np.asarray(self.source[name])
@@ -284,7 +313,8 @@ def write_maps(maps: ContactMaps, path: Path) -> None:
     ):
         for k, time in enumerate(maps.time_s):
             frame = (maps.pressure_Pa[k], maps.gap_m[k], maps.nodal_force_N[k])
-            writer.append(time, *frame, maps.femoral_pose[k])
+            places = (maps.contact_points_m[k], maps.contact_normals[k])
+            writer.append(time, *frame, maps.femoral_pose[k], *places)
 
 
 @contextmanager

@@ -17,7 +17,15 @@ from tkamb.errors import InputError
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
 from tkamb.output.metrics import failed, flagged
 from tkamb.output.panels import Line, Panel, centre_panel, panels
-from tkamb.output.style import BLACK, GREY, ORANGE, legend_above, new_figure, settings
+from tkamb.output.style import (
+    BLACK,
+    GREY,
+    ORANGE,
+    legend_above,
+    new_figure,
+    settings,
+    text_width,
+)
 
 if TYPE_CHECKING:
     from tkamb.results import Results
@@ -26,6 +34,17 @@ WIDTH, HEIGHT = 5.4, 3.1
 DEFAULT = ("forces", "condyles", "ratios", "pressures")
 TITLE_PAD, LEGEND_ROW = 8.0, 14.0
 """Points between a plot and its title, for each row of the legend between them."""
+EDGE, FOOT, OVERHANG = 3.0, 31.5, 13.0
+"""Points around a plot: beside all its labels; for those of the horizontal axis; for half of its
+last label."""
+TICKS, AXIS_LABEL = 6.5, 13.0
+"""Points that ticks with their gap and the vertical axis' label take."""
+TICK_LABEL, SIDE_LABEL, LEGEND = 9.0, 8.0, 8.5
+"""Points, sizes of letters."""
+SIDE_GAP = 0.01
+"""Of the width, between the axes and what is written beside them."""
+HANDLE, COLUMN_GAP = 2.7, 1.4
+"""Of a legend's letters: a handle with its gap, and the gap between columns."""
 DASHES = (0, (4, 2))
 BAND_OPACITY = 0.16
 SPAN = "#e2e2e2"
@@ -45,6 +64,7 @@ def draw_panel(
         _label_axes(axes, panel, axis)
         mark_frames(axes, results, axis)
         legend_above(axes, _legend_columns(panel))
+        _place_alone(axes, panel)
     return figure
 
 
@@ -81,6 +101,47 @@ def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = Non
             axes.set_title(panel.title, loc="left", pad=above, fontweight="bold")
             legend_above(axes, columns)
     return figure
+
+
+def _place_alone(axes: Axes, panel: Panel) -> None:
+    """Give a plot that stands alone the room that its labels need.
+
+    The places are those that matplotlib's constrained layout finds, which looks at everything
+    four times; it still places what is not simple: a second axis, a factor over the vertical
+    axis, a legend that is too wide.
+    """
+    formatter, (low, high) = axes.yaxis.get_major_formatter(), sorted(axes.get_ylim())
+    ticks = axes.yaxis.get_majorticklocs()
+    labels = formatter.format_ticks(list(ticks))
+    shown = [label for tick, label in zip(ticks, labels, strict=True) if low <= tick <= high]
+    if panel.second or formatter.get_offset():
+        return
+    beside = max((text_width(one, TICK_LABEL) for one in shown), default=0.0)
+    left = EDGE + TICKS + beside + (AXIS_LABEL if axes.get_ylabel() else 0.0)
+    words = [one[-1] for one in (panel.level, panel.span) if one]
+    lines = [line for one in words for line in one.split(" ", 1)]
+    outside = max((text_width(line, SIDE_LABEL) for line in lines), default=0.0)
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    width, height = 72 * figure.get_size_inches()
+    right = max(EDGE + outside + SIDE_GAP * width, OVERHANG)
+    columns = _legend_columns(panel)
+    if _legend_width(panel, columns) > width - left - EDGE:
+        return
+    rows = -(-len(panel.lines) // columns)
+    top = EDGE + LEGEND * (1.0 + rows + 0.5 * (rows - 1))
+    figure.set_layout_engine("none")
+    axes.set_position(
+        (left / width, FOOT / height, 1 - (left + right) / width, 1 - (FOOT + top) / height)
+    )
+
+
+def _legend_width(panel: Panel, columns: int) -> float:
+    """Return the width (points) of the legend of `legend_above`."""
+    texts = [text_width(line.label, LEGEND) for line in panel.lines]
+    rows = -(-len(texts) // columns)
+    wide = [max(texts[k : k + rows]) for k in range(0, len(texts), rows)]
+    return sum(wide) + LEGEND * (HANDLE * len(wide) + COLUMN_GAP * (len(wide) - 1) + 1.0)
 
 
 def mark_frames(axes: Axes, results: "Results", axis: HorizontalAxis) -> None:

@@ -102,7 +102,7 @@ def _line_questions(mechanics: "Mechanics") -> list[Question]:
 
     case = mechanics.case
     found = [*lines.attachment_questions(case), *lines.stiffness_questions(case)]
-    poses = mechanics.recorded_poses()
+    poses = mechanics.recorded_poses
     found += lines.extensor_questions(case, poses)
     if not (case.scene.contact and case.scene.contact.released):
         strains = {b.name: b.strain(b.length(poses)) for b in mechanics.ligaments}

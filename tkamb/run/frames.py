@@ -35,6 +35,7 @@ class FrameSolver:
 
     Args:
         case: the scene with its files read.
+        frames: those that are asked for; None: any may be.
 
     Attributes:
         mechanics: the body side.
@@ -45,11 +46,11 @@ class FrameSolver:
         InputError: whatever is wrong with the input.
     """
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: Case, frames: range | None = None) -> None:
         self._case = case
         self.mechanics = Mechanics(case)
         self.plausibility = Plausibility(self.mechanics)
-        self._slips = self.mechanics.slips()
+        self._slips = self.mechanics.slips(max(frames or range(len(case.motion.time))))
         self.side = self._contact_side() if case.scene.contact else None
         self.before: list[FrameContact] = []
 
@@ -64,7 +65,7 @@ class FrameSolver:
             body, contact = self.side.frame(k, self.before)
             self.before.append(contact)
             del self.before[:-LAST_FRAMES]
-            arrays = contact_arrays(contact)
+            arrays = contact_arrays(contact, body.geometry)
         doubts = self.plausibility.flags(k, body)
         status = frame_status(self._case, k, body, contact, doubts)
         return k, frame_row(self._case, k, body, contact, self._slips, status), arrays
@@ -78,8 +79,8 @@ class FrameSolver:
 class ChunkSolver:
     """What a worker does: reads the scene once, and computes chunk after chunk."""
 
-    def __init__(self, scene: Scene) -> None:
-        self._solver = FrameSolver(load_case(scene))
+    def __init__(self, scene: Scene, indices: range) -> None:
+        self._solver = FrameSolver(load_case(scene), indices)
 
     def __call__(self, number: int, frames: Sequence[int]) -> list[Finished]:
         """Return the frames of a chunk."""
@@ -106,7 +107,7 @@ def finished_in_order(
         chunks.setdefault(indices.index(k) // CHUNK, []).append(k)
     early: dict[int, list[Finished]] = {}
     turn = iter(chunks)
-    answers = Crew(workers).answers(Task(ChunkSolver, (scene,)), list(chunks.items()))
+    answers = Crew(workers).answers(Task(ChunkSolver, (scene, indices)), list(chunks.items()))
     expected: Any = next(turn, None)
     for number, frames in answers:
         early[number] = frames

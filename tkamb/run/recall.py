@@ -17,20 +17,36 @@ from tkamb.equilibrium.balance import Balance, BalanceStatus
 from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.equilibrium.frame_contact import FrameContact
 from tkamb.equilibrium.released import KneeEquilibrium
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import SIDES, Array
+from tkamb.run.shards import CONTACT_PLACES
 
 if TYPE_CHECKING:
+    from tkamb.body.knee import KneeGeometry
     from tkamb.equilibrium.mechanics import Mechanics
 
 RESULT_ARRAYS = ("pose", "normals", "pressure", "area", "gap", "nodal_force", "wrench_on_insert")
 
 
-def contact_arrays(contact: FrameContact | None) -> dict[str, Array] | None:
-    """Return what is worth keeping of a frame's contact by name; None without a result."""
+def contact_arrays(
+    contact: FrameContact | None, geometry: "KneeGeometry"
+) -> dict[str, Array] | None:
+    """Return what is worth keeping of a frame's contact by name; None without a result.
+
+    Args:
+        contact: of the frame.
+        geometry: what the equations worked on.
+    """
     if contact is None or contact.result is None:
         return None
     result, knee = contact.result, contact.equilibrium
     arrays = {name: np.asarray(getattr(result, name), float) for name in RESULT_ARRAYS}
+    points, normals = np.full((2, 3, 3), np.nan)
+    for side, condyle in geometry.condyles.items():
+        points[SIDES.index(side)], normals[SIDES.index(side)] = condyle.point, condyle.normal
+    if geometry.extensor is not None:
+        points[2] = geometry.extensor.contact_point
+        normals[2] = geometry.extensor.contact_normal
+    arrays |= zip(CONTACT_PLACES, (points, normals), strict=True)
     if knee is not None:
         arrays["equilibrium_coordinates"] = knee.coordinates
         arrays["equilibrium_force"] = knee.balance.force

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 from tkamb.atomic import replaced_together
 from tkamb.geometry.frames import Array
 from tkamb.results_folder import MAPS_NAME, REPORT_NAME, SUMMARY_NAME, put_numbers, read_results
-from tkamb.run.shards import Row, Shard, Shards, check_same_run
+from tkamb.run.shards import CONTACT_PLACES, Row, Shard, Shards, check_same_run
 
 if TYPE_CHECKING:
     from tkamb.output.maps import ContactMaps, MapWriter
     from tkamb.results import Results
 
-MAPS = ("pressure", "gap", "nodal_force", "pose")
+MAPS = ("pressure", "gap", "nodal_force", "pose", *CONTACT_PLACES)
 SHORTEST_PAUSE = 1.0
 """s between two copies of what is finished."""
 DEAREST_SHARE = 0.05

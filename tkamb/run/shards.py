@@ -30,6 +30,9 @@ OWN_NAMES = (IDENTITY_NAME, "contact.h5", "*.frame", ".tkamb-*.part")
 LARGEST = 2e9
 """Bytes of a frame; a map of 100,000 points has 5 MB."""
 
+CONTACT_PLACES = ("contact_points", "contact_normals")
+"""(3, 3) m and unit: where medial condyle, lateral condyle and patella touch; NaN without."""
+
 Row = dict[str, Any]
 
 

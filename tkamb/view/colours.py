@@ -1,10 +1,17 @@
-"""The viewer's colours: scales and palette that colour-blind readers can tell apart."""
+"""The viewer's colours: scales and palette that colour-blind readers can tell apart.
+
+The scales are matplotlib's (viridis, and ColorBrewer's by Brewer 2002), as bytes in an asset:
+matplotlib takes a tenth of a second to load.
+"""
+
+import json
+from functools import lru_cache
 
 import numpy as np
-from matplotlib import colormaps
 from numpy.typing import ArrayLike, NDArray
 
-from tkamb.output.style import PRESSURE_MAP, SKY
+from tkamb.output.pages import asset
+from tkamb.output.style import SKY
 
 METAL, INSERT, BONE, BUTTON = "#8d99a8", "#e4dfd0", "#f0e8d2", "#dcd8cc"
 FLOOR = "#b9c4c9"
@@ -22,22 +29,22 @@ def rgb(colour: str) -> Colours:
 
 def pressure_scale() -> Colours:
     """Return the 256 colours (256, 3) from no pressure to the largest of all frames."""
-    return _sample(PRESSURE_MAP, np.linspace(0.0, 1.0, 256))
+    return _scales()["pressure"]
 
 
 def strain_scale() -> Colours:
     """Return the 256 colours (256, 3) from no strain to the limit."""
-    return _sample("YlOrRd", np.linspace(0.15, 1.0, 256))
+    return _scales()["strain"]
 
 
 def activation_scale() -> Colours:
     """Return the 256 colours (256, 3) from no activation to the limit."""
-    return _sample("BuPu", np.linspace(0.35, 1.0, 256))
+    return _scales()["activation"]
 
 
 def wear_scale() -> Colours:
     """Return the 256 colours (256, 3) from no wear to the deepest."""
-    return _sample("YlGnBu", np.linspace(0.0, 1.0, 256))
+    return _scales()["wear"]
 
 
 def wear_colours(depth: ArrayLike, limit: float) -> Colours:
@@ -61,5 +68,11 @@ def _on_scale(values: ArrayLike, limit: float, scale: Colours, none: str = SLACK
     return np.where((values > 0)[..., None], scale[level], rgb(none)).astype(np.uint8)
 
 
-def _sample(name: str, at: NDArray[np.float64]) -> Colours:
-    return np.round(colormaps[name](at)[:, :3] * 255.0).astype(np.uint8)
+@lru_cache(maxsize=1)
+def _scales() -> dict[str, Colours]:
+    """Return the scales (256, 3) by name."""
+    stored = json.loads(asset("tkamb.view", "scales.json"))
+    return {
+        name: np.frombuffer(bytes.fromhex(text), np.uint8).reshape(256, 3)
+        for name, text in stored.items()
+    }

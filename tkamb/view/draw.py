@@ -42,7 +42,7 @@ def draw(
         lattice: whether the contact model's grid is drawn too.
     """
     case, mechanics, results = run.case, run.mechanics, run.results
-    geometries = [body.geometry for body in run.bodies(progress)]
+    geometries = run.geometries(progress)
     states = [one.state for one in geometries]
     maps, found = results.maps, map_rows(results)
     rows = [found.get(k, -1) for k in range(len(results))]

@@ -2,11 +2,18 @@
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
+import numpy as np
+
+from tkamb.body.contact_points import CondylePoint
+from tkamb.body.knee import KneeGeometry
+from tkamb.body.patella import touching_patella
+from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
+from tkamb.geometry.frames import SIDES
+from tkamb.output.metrics import map_rows
 from tkamb.results import Results
 from tkamb.results_folder import SUMMARY_NAME, read_results
 from tkamb.run.rerun import RUN_AGAIN, case_of_results, same_files
@@ -34,25 +41,51 @@ class CaseResults:
     results: Results
     frames: tuple[int, ...]
 
-    def bodies(self, progress: Progress = lambda frames: frames) -> list[FrameLoads]:
-        """Return the body side of every frame, for its geometry.
+    def geometries(self, progress: Progress = lambda frames: frames) -> list[KneeGeometry]:
+        """Return what the equations of every frame worked on.
 
-        Where body and contact were made to agree, both are solved again: the places where
-        forces act come from the contact.
+        Where condyles and patella touch stands in the maps of the run, or is looked for again.
+        Where body and contact were made to agree, both are solved again: the places where forces
+        act come from the contact.
         """
         contact = self.case.scene.contact
         if contact is None or (contact.coupling == "none" and not contact.released):
-            return [self.mechanics.frame(k) for k in progress(self.frames)]
+            rows = map_rows(self.results)
+            return [self._geometry(k, rows.get(row)) for row, k in enumerate(progress(self.frames))]
         from tkamb.equilibrium.contact_side import ContactSide
         from tkamb.equilibrium.frame_contact import FrameContact
 
-        side, found = ContactSide(self.case, self.mechanics), []
+        side, found = ContactSide(self.case, self.mechanics), list[KneeGeometry]()
         touched: list[FrameContact] = []
         for k in progress(self.frames):
             body, contact_of_frame = side.frame(k, touched)
-            found.append(body)
+            found.append(body.geometry)
             touched.append(contact_of_frame)
         return found
+
+    def _geometry(self, k: int, row: int | None) -> KneeGeometry:
+        """Return what the equations of a frame of the motion worked on.
+
+        Args:
+            k: frame.
+            row: of its map; None without one.
+        """
+        maps, mechanics = self.results.maps, self.mechanics
+        if maps is None or row is None or mechanics.muscles is not None:
+            return mechanics.frame(k).geometry
+        place = self.case.motion.coordinates[k]
+        points, normals = maps.contact_points_m[row], maps.contact_normals[row]
+        condyles = {
+            side: CondylePoint(point, normal, mechanics.sliding(k, place, point), np.nan)
+            for side, point, normal in zip(SIDES, points[:2], normals[:2], strict=True)
+            if np.isfinite(point).all()
+        }
+        if not condyles:
+            return mechanics.frame(k).geometry
+        patella = None
+        if mechanics.extensor is not None and np.isfinite(points[2]).all():
+            patella = touching_patella(mechanics.extensor.joints(k)[0], points[2], normals[2])
+        return replace(mechanics.geometry(k, patella=patella), condyles=condyles)
 
 
 def open_run(
@@ -135,7 +168,7 @@ def match_frames(case: Case, results: Results) -> CaseResults:
         raise InputError(
             f"no frame at {error.args[0]} s in the scene's motion", "results", RUN_AGAIN
         ) from None
-    return CaseResults(case, Mechanics(case), results, frames)
+    return CaseResults(case, Mechanics(case, near=True), results, frames)
 
 
 def run_of_results(results: Results) -> CaseResults:

@@ -18,10 +18,10 @@ from tkamb.view.drawing import Drawing
 from tkamb.view.page import page_html, screenshot
 from tkamb.view.payload import pack, peak_pressure
 from tkamb.view.run import CaseResults, Progress, no_frame, run_of_results
-from tkamb.view.server import ContactSwitch, ViewServer
 
 if TYPE_CHECKING:
     from tkamb.results import Results
+    from tkamb.view.server import ViewServer
 
 Line = Callable[[str], None]
 
@@ -104,12 +104,14 @@ class Show:
             raise InputError(f"no view '{camera}'", "--camera", f"there are: {', '.join(CAMERAS)}")
         return frame % most, camera
 
-    def server(self, port: int = 0) -> ViewServer:
+    def server(self, port: int = 0) -> "ViewServer":
         """Return the server of the live window, not yet started.
 
         Raises:
             InputError: the port is taken.
         """
+        from tkamb.view.server import ContactSwitch, ViewServer
+
         switch = ContactSwitch(self.runs[0], peak_pressure(self.drawings))
         html = page_html(self.title, None, frame=self.frame, view=self.camera, live=switch.models())
         return ViewServer(html, self.packed, switch, port)
@@ -138,7 +140,7 @@ def open_window(url: str) -> bool:
     return webbrowser.open(url)
 
 
-def serve_in_background(server: ViewServer) -> threading.Thread:
+def serve_in_background(server: "ViewServer") -> threading.Thread:
     """Start a server beside the caller, for notebooks and tests."""
     thread = threading.Thread(target=server.serve, daemon=True)
     thread.start()

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from tkamb.body.chain import ChainState
 from tkamb.body.knee import KneeGeometry
@@ -25,6 +26,7 @@ from tkamb.units import MILLIMETRE
 from tkamb.view.arrows import centre_of_pressure
 from tkamb.view.colours import BONE, BUTTON, FLOOR, INSERT, METAL, RECORDED
 from tkamb.view.drawing import Marker, Solid
+from tkamb.view.shapes import box, hull, revolved, sphere_points
 
 if TYPE_CHECKING:
     from tkamb.results import Results
@@ -165,12 +167,7 @@ def _shaft(end: Array, profile: tuple[tuple[float, float], ...], name: str) -> S
     share, radius = np.array(profile).T
     at = np.linspace(share[0], share[-1], 24)
     radii = np.interp(at, share, radius * MILLIMETRE)
-    outline = np.column_stack(
-        [np.concatenate([[0.0], radii, [0.0]]), length * np.concatenate([at[:1], at, at[-1:]])]
-    )
-    mesh = trimesh.creation.revolve(outline, sections=28)
-    turn = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], end / length)
-    return _surface(mesh, name).moved(turn)
+    return revolved(radii, length * at, name).moved(_turned([0.0, 0.0, 1.0], end))
 
 
 def _patella(case: Case) -> Surface:
@@ -178,13 +175,16 @@ def _patella(case: Case) -> Surface:
     assert case.patellar_ligament is not None
     ends = (case.muscles[0].points[-1], case.patellar_ligament.proximal)
     top, bottom = (transform(case.chain.link_in(end.link, "patella"), end.position) for end in ends)
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    along = top - bottom
-    half = 0.5 * float(np.linalg.norm(along))
-    radii = np.array([PATELLA_DEPTH, half, PATELLA_WIDTH])
-    turn = trimesh.geometry.align_vectors([0.0, 1.0, 0.0], along / (2.0 * half))[:3, :3]
-    ball.apply_scale(radii)
-    return _surface(ball, "patella").moved(pose(turn, 0.5 * (top + bottom)))
+    radii = np.array([PATELLA_DEPTH, 0.5 * float(np.linalg.norm(top - bottom)), PATELLA_WIDTH])
+    placed = _turned([0.0, 1.0, 0.0], top - bottom)
+    placed[:3, 3] = 0.5 * (top + bottom)
+    return hull(sphere_points() * radii, "patella").moved(placed)
+
+
+def _turned(axis: ArrayLike, towards: Array) -> Array:
+    """Return the smallest turn (4, 4) of an axis (3,) towards a direction (3,)."""
+    rotation, _ = Rotation.align_vectors(np.atleast_2d(towards), np.atleast_2d(axis))
+    return pose(rotation.as_matrix(), np.zeros(3))
 
 
 def floor_and_foot(
@@ -228,24 +228,18 @@ def _floor_pose(geometry: KneeGeometry, tibia_in_laboratory: Array, floor: float
 
 
 def _floor_surface() -> Surface:
-    box = trimesh.creation.box(PLATE)
-    box.apply_translation([PLATE_CENTRE, -0.5 * PLATE[1], 0.0])
-    return _surface(box, "floor")
+    return box(PLATE, "floor").moved(pose(np.eye(3), [PLATE_CENTRE, -0.5 * PLATE[1], 0.0]))
 
 
 def _foot_surface(height: float) -> Surface:
     """Return a foot whose ankle is `height` (m) above the sole."""
     ankle = (0.0, height / MILLIMETRE, 0.0, ANKLE_RADIUS)
-    parts = [_hull((*SOLE, INSTEP)), _hull((INSTEP, ankle))]
-    return _surface(parts[0] + parts[1], "foot")
+    sole, leg = _hull((*SOLE, INSTEP)), _hull((INSTEP, ankle))
+    faces = np.concatenate([sole.faces, leg.faces + len(sole.vertices)])
+    return Surface(np.concatenate([sole.vertices, leg.vertices]), faces, "foot")
 
 
-def _hull(balls: Sequence[tuple[float, ...]]) -> trimesh.Trimesh:
+def _hull(balls: Sequence[tuple[float, ...]]) -> Surface:
     """Return the hull of balls: centre and radius in mm."""
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    points = [ball.vertices * radius + centre for *centre, radius in balls]
-    return trimesh.convex.convex_hull(np.concatenate(points) * MILLIMETRE)
-
-
-def _surface(mesh: trimesh.Trimesh, name: str) -> Surface:
-    return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64), name)
+    points = [sphere_points() * radius + centre for *centre, radius in balls]
+    return hull(np.concatenate(points) * MILLIMETRE, "balls")
