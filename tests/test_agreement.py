@@ -11,6 +11,7 @@ from scenes import write_scene
 from tkamb import simulate
 from tkamb.contact.probe import Probe
 from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactResult
 from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.equilibrium.split_sensitivity import split_sensitivity, split_tangent
@@ -86,6 +87,30 @@ def test_the_tangent_of_a_layer_under_two_spheres():
     result = model.press(state, load, knee_pose(np.zeros(6)))
     expected = 2.0 * (load / 2) / result.approach * HALF
     assert split_tangent(model.probe(state), result) == pytest.approx(expected, rel=0.02)
+
+
+def test_a_probe_sees_in_a_result_what_it_finds_at_its_pose():
+    """To the bit, also where the search for it had looked at columns about another pose."""
+    model = contact_model("foundation", 1.0)
+    state = model.prepare(flat_joint())
+    result = model.press(state, 1000.0, knee_pose(np.zeros(6)))
+    away = result.pose.copy()
+    away[:3, 3] += [5e-3, 2e-3, 0.0]
+    probe = model.probe(state)
+    probe.at(away)
+    seen, found = probe.seen(result), model.probe(state).at(result.pose)
+    assert set(seen.condyles) == set(found.condyles) == {"medial", "lateral"}
+    for side, condyle in seen.condyles.items():
+        assert np.array_equal(condyle.wrench, found.condyles[side].wrench)
+        assert np.array_equal(condyle.stiffness, found.condyles[side].stiffness)
+
+
+def test_a_probe_looks_at_the_whole_bed_where_a_result_failed():
+    model = contact_model("foundation", 1.0)
+    state = model.prepare(flat_joint())
+    pose = model.press(state, 1000.0, knee_pose(np.zeros(6))).pose
+    failed = ContactResult.failed(state, pose, "no result")
+    assert set(model.probe(state).seen(failed).condyles) == {"medial", "lateral"}
 
 
 def test_sensitivity_is_the_slope_of_presses_farther_apart(tmp_path):

@@ -250,6 +250,16 @@ class FoundationProbe:
                 )
         return ProbedContact(condyles, tangent=True)
 
+    def seen(self, result: ContactResult) -> ProbedContact:
+        """Return what `at` does at a result's pose, without a look at the whole bed.
+
+        The result's gaps are the whole bed's already, by the same rays: they say which columns
+        are near by. A failed result has none.
+        """
+        if not np.isnan(result.gap).any():
+            self._look_at(result.pose, result.gap)
+        return self.at(result.pose)
+
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
         """Return the contact with its stiffness averaged over a column's width; see `Probe`.
 
@@ -281,8 +291,12 @@ class FoundationProbe:
         femoral = self._state.pair.femoral
         if not self._covers(pose):
             gap = gaps_and_facets(self._state.surface, femoral, pose)[0]
-            self._near, self._centre = self._state.surface.part(gap < 2 * NEARBY), pose.copy()
+            self._look_at(pose, gap)
         return self._near, gaps_and_facets(self._near, femoral, pose)
+
+    def _look_at(self, pose: Array, gap: Array) -> None:
+        """Take the columns that are near by at a pose, by the gaps (n,) of the whole bed."""
+        self._near, self._centre = self._state.surface.part(gap < 2 * NEARBY), pose.copy()
 
     def _stiffness(
         self, samples: SurfaceSamples, gap: Array, femoral_normal: Array

@@ -57,7 +57,7 @@ def split_tangent(probe: "Probe", result: ContactResult) -> float:
         result: a contact.
     """
     place = knee_coordinates(result.pose)
-    condyles = probe.at(result.pose).condyles
+    condyles = probe.seen(result).condyles
     if len(condyles) < 2:
         return 0.0
     twists = knee_axes(place)[[ADDUCTION, SUPERIOR]].T
