@@ -226,6 +226,7 @@ class FoundationProbe:
         self._law, self._state = law, state
         self._corners = _corners(state.pair.femoral.bounds)
         self._near, self._centre = state.surface, np.full((4, 4), np.nan)
+        self._seen: tuple[Array, tuple[Array, Array, Index]] | None = None
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4), with its stiffness."""
@@ -292,11 +293,14 @@ class FoundationProbe:
         if not self._covers(pose):
             gap = gaps_and_facets(self._state.surface, femoral, pose)[0]
             self._look_at(pose, gap)
-        return self._near, gaps_and_facets(self._near, femoral, pose)
+        if self._seen is None or not np.array_equal(self._seen[0], pose):
+            self._seen = pose.copy(), gaps_and_facets(self._near, femoral, pose)
+        return self._near, self._seen[1]
 
     def _look_at(self, pose: Array, gap: Array) -> None:
         """Take the columns that are near by at a pose, by the gaps (n,) of the whole bed."""
         self._near, self._centre = self._state.surface.part(gap < 2 * NEARBY), pose.copy()
+        self._seen = None
 
     def _stiffness(
         self, samples: SurfaceSamples, gap: Array, femoral_normal: Array
