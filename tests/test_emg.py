@@ -13,7 +13,7 @@ from tkamb.errors import InputError
 from tkamb.inputs.emg import Envelopes, envelope, load_envelopes
 from tkamb.muscles.emg import EmgGuide
 from tkamb.muscles.sharing import KKT_LIMIT
-from tkamb.run.emg import compare_emg
+from tkamb.run.emg import compare_emg, fitted_normalisation
 from tkamb.scene.emg import EmgTable
 from tkamb.scene.si import in_si
 
@@ -160,7 +160,7 @@ def test_each_frame_of_a_knee_has_its_own_envelope():
 def test_agreement_finds_correlation_error_and_lag():
     """Frames at 30 Hz of an activation that is half the envelope, 60 ms later."""
     own = np.exp(-(((TIME - 2.0) / 0.3) ** 2))
-    envelopes = Envelopes(None, TIME, {"VL": own}, {"vaslat": "VL"})
+    envelopes = Envelopes(None, TIME, {"VL": own}, {"vaslat": "VL"}, {"VL": 1.0})
     time = np.arange(0.5, 3.5, 1 / 30)
     activation = 0.5 * envelopes.at("vaslat", time - 0.06)
     activation[[3, 40]] = np.nan
@@ -173,11 +173,27 @@ def test_agreement_finds_correlation_error_and_lag():
     assert (found["frames_compared"], found["frames_left_out"]) == (len(time) - 2, 2)
 
 
+def test_the_fitted_normalisation_makes_the_envelope_the_activation():
+    """Two muscles of one channel at 0.3 and 0.5 of it: 0.4 of it fits both; one runs against it."""
+    own = np.exp(-(((TIME - 2.0) / 0.3) ** 2))
+    names = {"vaslat": "VL", "vasint": "VL", "soleus": "SO"}
+    both = {"VL": own, "SO": own}
+    envelopes = Envelopes(None, TIME, both, names, {"VL": 2e-4, "SO": 1.0})
+    time = np.arange(0.5, 3.5, 1 / 30)
+    course = envelopes.at("vaslat", time)
+    columns = {"activation_vaslat": 0.3 * course, "activation_vasint": 0.5 * course}
+    columns |= {"time_s": time, "activation_soleus": np.full_like(time, np.nan)}
+    columns["activation_vaslat"][[7]] = columns["activation_vasint"][[7]] = np.nan
+    found = fitted_normalisation(envelopes, columns)
+    assert found["VL"] == pytest.approx(2e-4 / 0.4)
+    assert found["SO"] is None
+
+
 @pytest.mark.parametrize("shape", [lambda t: np.exp(-((t - 2.5) ** 2)), lambda t: 3 * t])
 def test_a_lag_beyond_the_window_is_none(shape):
     """An activation half a second late, and a ramp, which correlates alike at every lag."""
     own = {"VL": TIME if shape(1.0) == 3.0 else np.exp(-((TIME - 2.0) ** 2))}
-    envelopes = Envelopes(None, TIME, own, {"vaslat": "VL"})
+    envelopes = Envelopes(None, TIME, own, {"vaslat": "VL"}, {"VL": 1.0})
     time = np.arange(1.0, 3.0, 1 / 30)
     columns = {"time_s": time, "activation_vaslat": shape(time)}
     assert np.isnan(compare_emg(envelopes, columns)["vaslat"]["lag_s"])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tkamb.body.joint_equilibrium import external_wrench
+from tkamb.body.knee import unsolved
 from tkamb.body.load import total_wrench
 from tkamb.contact.probe import condyle_wrenches
 from tkamb.equilibrium.balance import BalanceStatus
@@ -14,6 +15,7 @@ from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.equilibrium.released_forces import SCALE
 from tkamb.geometry.frames import knee_pose
+from tkamb.run.frames import FrameSolver
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
 
@@ -173,3 +175,25 @@ def test_a_femur_beside_the_insert_fails_with_the_reason(bend):
     assert contact.result is None
     assert "over the insert" in contact.problem
     assert body.loads.problems == (contact.problem,)
+
+
+def test_a_frame_at_rest_whose_equations_fail_has_no_numbers(monkeypatch):
+    """Nothing is left but what was recorded and what the search itself says.
+
+    The slip is the recorded motion's, which released coordinates leave.
+    """
+    overrides = COARSE | {"contact.released": ALL}
+    solver = FrameSolver(load_case(load_scene(BEND, overrides)))
+    monkeypatch.setattr(
+        "tkamb.equilibrium.contact_side.solve_knee", lambda *_: unsolved(["no signs are right"])
+    )
+    _, row, arrays = solver.solve(60)
+    assert row["status"].startswith("failed: no signs are right")
+    known = {name for name, value in row.items() if name != "status" and np.isfinite(value)}
+    recorded = {"time_s", "cycle_percent", "flexion_deg", "adduction_deg", "axial_rotation_deg"}
+    recorded |= {f"ground_reaction_{axis}_N" for axis in ("ap", "si", "ml")}
+    assert known - recorded == {
+        *("body_seconds", "query_seconds", "contact_seconds", "contact_trials"),
+        *("coupling_iterations", "coupling_change_N", "smallest_stiffness_N_per_mm"),
+    }
+    assert arrays is None

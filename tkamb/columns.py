@@ -28,6 +28,8 @@ class Column:
 
 _GROUND = "[ground_reaction]"
 _IMPLANT = "[implant.femoral], [implant.insert]"
+_SLIP = f"{_IMPLANT}; not with [contact] released"
+_PRESSED = "[contact]; not with released"
 _CONTACT = "[contact]"
 _MUSCLE = "[quadriceps], [patellar_ligament], [patella]"
 _COUPLED = "[contact] coupling or released"
@@ -120,8 +122,8 @@ COLUMNS: tuple[Column, ...] = (
         _GROUND,
     ),
     Column(LIGAMENT, "tension of the ligament bundle <name>", "[[ligament]]"),
-    Column("medial_slip_mm", "slip of the medial condyle since the first frame", _IMPLANT),
-    Column("lateral_slip_mm", "slip of the lateral condyle since the first frame", _IMPLANT),
+    Column("medial_slip_mm", "slip of the medial condyle since the first frame", _SLIP),
+    Column("lateral_slip_mm", "slip of the lateral condyle since the first frame", _SLIP),
     Column("adjust_translation_mm", "femoral adjustment along insert y", _ADJUST),
     Column("adjust_coronal_deg", "femoral adjustment in the coronal plane", _ADJUST),
     Column("adjust_restored", "1: the adjustment was undone after the contact", _ADJUST, "integer"),
@@ -152,9 +154,9 @@ COLUMNS: tuple[Column, ...] = (
     *(
         Column(f"{side}_{name}_velocity_mm_per_s", meaning.replace("<side>", side), needs)
         for name, meaning, needs in (
-            ("slip", "rate of <side>_slip_mm, by arcs; positive: femur slides forwards", _IMPLANT),
-            ("sliding", "the same by rigid-body velocity at the <side> contact point", _CONTACT),
-            ("normal", "<side> contact point leaves the insert; zero: touch is kept", _CONTACT),
+            ("slip", "rate of <side>_slip_mm, by arcs; positive: femur slides forwards", _SLIP),
+            ("sliding", "the same by rigid-body velocity at the <side> contact point", _PRESSED),
+            ("normal", "<side> contact point leaves the insert; zero: touch is kept", _PRESSED),
         )
         for side in ("medial", "lateral")
     ),

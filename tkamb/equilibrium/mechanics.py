@@ -244,11 +244,15 @@ class Mechanics:
     def slips(self, last: int) -> "dict[str, CondyleSlip]":
         """Return side -> rolling and slipping up to a frame; empty without the two surfaces.
 
+        It is the recorded motion's: empty too where released coordinates make another one.
+
         Args:
             last: the last frame whose slip and its rate are wanted: the rate takes one more.
         """
-        case = self.case
+        case, contact = self.case, self.case.scene.contact
         if self.query is None or case.femoral is None or case.insert is None:
+            return {}
+        if contact and contact.released:
             return {}
         from tkamb.body.slip import condyle_slip
 

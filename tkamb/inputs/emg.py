@@ -33,12 +33,14 @@ class Envelopes:
         time: (n,) s.
         values: channel -> (n,), 1 at the normalising value.
         channel_of: muscle -> channel.
+        normalised_by: channel -> the normalising value, in the file's unit.
     """
 
     path: Path
     time: Array
     values: dict[str, Array]
     channel_of: dict[str, str]
+    normalised_by: dict[str, float]
 
     def at(self, muscle: str, time: Array) -> Array:
         """Return a muscle's envelope (f,) at times (f,) s; NaN outside the recording."""
@@ -58,7 +60,7 @@ def load_envelopes(source: EmgRecording) -> Envelopes:
     if len(step) < 2 or np.abs(step - np.median(step)).max() > UNEVEN * np.median(step):
         raise InputError("has EMG that is not sampled evenly", source.file, "resample it")
     rate = len(step) / (time[-1] - time[0])
-    values = {}
+    values, normalised_by = {}, {}
     for channel, signal in signals.items():
         try:
             found = envelope(signal, rate, source.cutoff, source.high_pass)
@@ -66,12 +68,13 @@ def load_envelopes(source: EmgRecording) -> Envelopes:
             raise InputError(
                 error.what, f"{source.file}: channel '{channel}'", error.mend
             ) from None
-        by = found.max() if source.normalised_by == "recording" else source.normalised_by[channel]
+        own = source.normalised_by == "recording"
+        normalised_by[channel] = float(found.max() if own else source.normalised_by[channel])
         if not found.max() > 0.0:
             raise InputError(f"channel '{channel}' holds no signal", source.file, "leave it out")
-        values[channel] = found / by
+        values[channel] = found / normalised_by[channel]
     muscles = {muscle: channel for channel, own in source.channels.items() for muscle in own}
-    return Envelopes(source.file, time + source.offset, values, muscles)
+    return Envelopes(source.file, time + source.offset, values, muscles, normalised_by)
 
 
 def envelope(

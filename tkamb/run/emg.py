@@ -1,4 +1,4 @@
-"""How recorded EMG and predicted activations agree, muscle by muscle."""
+"""How recorded EMG and predicted activations agree, muscle by muscle, and what scale fits."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -47,6 +47,32 @@ def compare_emg(envelopes: "Envelopes", columns: Mapping[str, Any]) -> dict[str,
             "rmse": float(np.sqrt((error**2).mean())) if both.any() else np.nan,
             "lag_s": _lag(envelopes, muscle, time[both], activation[both]),
         }
+    return found
+
+
+def fitted_normalisation(
+    envelopes: "Envelopes", columns: Mapping[str, Any]
+) -> dict[str, float | None]:
+    """Return each channel's normalising value with which its envelope e fits the activations a.
+
+    That is v / s, v the value that e is over, and s the scale of least Σ (a - s e)² over the
+    computed frames and the muscles of the channel, Σ a e / Σ e². Without a maximal contraction
+    no better one is known: it takes the course from the EMG, and how strong from the sharing.
+    None where s is not above zero.
+
+    Args:
+        envelopes: of the muscles.
+        columns: of results.csv of a run that the EMG did not guide.
+    """
+    time, found = np.asarray(columns["time_s"]), {}
+    for channel, value in envelopes.normalised_by.items():
+        own = [name for name, one in envelopes.channel_of.items() if one == channel]
+        lost = np.full_like(time, np.nan)
+        a = np.array([columns.get(family_column(ACTIVATION, name), lost) for name in own])
+        e = np.array([envelopes.at(name, time) for name in own])
+        both = np.isfinite(a) & np.isfinite(e)
+        along = float(a[both] @ e[both])
+        found[channel] = value * float(e[both] @ e[both]) / along if along > 0.0 else None
     return found
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from tkamb.columns import ENVELOPE, family_column
-from tkamb.run.emg import compare_emg
+from tkamb.run.emg import compare_emg, fitted_normalisation
 from tkamb.run.measured import compare_measured, measured_column
 from tkamb.scene.case import Case
 
@@ -32,6 +32,11 @@ def compare_recorded(case: Case, columns: Mapping[str, Any]) -> dict[str, Any]:
         found["measured"] = compare_measured(columns, case.measured.force, case.body_weight)
     if case.emg is not None:
         assert case.scene.muscles is not None and case.scene.muscles.emg is not None
-        settings = case.scene.muscles.emg.model_dump(mode="json", exclude_none=True)
-        found["emg"] = {"settings": settings, "muscles": compare_emg(case.emg, columns)}
+        table = case.scene.muscles.emg
+        found["emg"] = {
+            "settings": table.model_dump(mode="json", exclude_none=True),
+            "muscles": compare_emg(case.emg, columns),
+        }
+        if table.use == "report":
+            found["emg"]["fitted_normalised_by"] = fitted_normalisation(case.emg, columns)
     return found

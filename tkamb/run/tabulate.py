@@ -51,7 +51,7 @@ def frame_row(
         k: frame of the motion.
         body: its body side.
         contact: its contact side; None when not modelled.
-        slips: side -> slip over the frames up to k and one more; empty without the two surfaces.
+        slips: side -> slip over the frames up to k and one more, see `Mechanics.slips`.
         status: text.
     """
     row = _motion_row(case, k) | _body_row(case, body)
