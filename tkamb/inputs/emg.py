@@ -68,8 +68,8 @@ def load_envelopes(source: EmgRecording) -> Envelopes:
             raise InputError(
                 error.what, f"{source.file}: channel '{channel}'", error.mend
             ) from None
-        own = source.normalised_by == "recording"
-        normalised_by[channel] = float(found.max() if own else source.normalised_by[channel])
+        by = found.max() if source.normalised_by == "recording" else source.normalised_by[channel]
+        normalised_by[channel] = float(by)
         if not found.max() > 0.0:
             raise InputError(f"channel '{channel}' holds no signal", source.file, "leave it out")
         values[channel] = found / normalised_by[channel]
