@@ -23,6 +23,8 @@ ESTIMATE_ERROR = 1e-4
 """m; how far the quick estimate of a gap may be out on coarse meshes."""
 ABOVE = 1e-6
 """m; a point that far above a bound of the insert's height is outside it, rounding included."""
+NEARLY_AS_CLOSE = ESTIMATE_ERROR + 5 * FACET_DEPTH
+"""m; by how much the estimated gap of a sample may differ that has a weight."""
 _ROUNDS = 3
 _KEPT = 8
 _BATCH = 64
@@ -249,7 +251,8 @@ class _CloseRegion:
         here = self._normals[self._tree.query(own)[1]]
         near = near[self._normals[near] @ here > 0.5]
         points = transform(pose, self._samples[near])
-        within = np.abs(other.heights(points) - gap) < ESTIMATE_ERROR + 5 * FACET_DEPTH
+        heights = other.heights(points, abs(gap) + NEARLY_AS_CLOSE)
+        within = np.abs(heights - gap) < NEARLY_AS_CLOSE
         near, points = near[within], points[within]
         found = other.at(np.concatenate([points, closest[None]]))
         facing = -np.einsum("ij,ij->i", rotate(pose, self._normals[near]), found.normals[:-1])

@@ -115,14 +115,25 @@ class NearestPoints:
         edges = ww - _gain(wu, uu), ww - _gain(wv, vv), ww - 2 * wu + uu - _gain(across, length)
         return np.where(within, ww - second * wu - third * wv, np.minimum.reduce(edges))
 
-    def heights(self, points: Array) -> Array:
+    @cached_property
+    def _spacing(self) -> float:
+        """The longest edge of the parts of triangles that samples are the centres of, m."""
+        cuts = np.sqrt(np.bincount(self._faces))
+        return float((self.surface.longest_edges / cuts).max())
+
+    def heights(self, points: Array, reach: float) -> Array:
         """Return the heights (n,) of points (n, 3) above the surface's nearest sample, m.
 
         A quick estimate of the signed distance for points near a smooth part: the error is
-        of second order in the spacing of the samples.
+        of second order in the spacing of the samples. Infinite where the surface is sure to be
+        farther away than `reach`, m, which the tree says ten times as fast.
         """
-        sample = self._tree.query(points)[1]
-        return _dot(points - self._samples[sample], self._sample_normals[sample])
+        bound = reach + self._spacing
+        distance, sample = self._tree.query(points, distance_upper_bound=bound)
+        near, heights = np.isfinite(distance), np.full(len(points), np.inf)
+        sample = sample[near]
+        heights[near] = _dot(points[near] - self._samples[sample], self._sample_normals[sample])
+        return heights
 
     @cached_property
     def _sample_normals(self) -> Array:
