@@ -244,7 +244,7 @@ def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
     own_lengths = {
         knee: ("RESIDUAL_SHIFT",),
         patellofemoral: ("PATCH_DEPTH", "SAMPLE_SPACING", "REACH"),
-        closest: ("FACET_DEPTH", "REGION_RADIUS", "SAMPLE_SPACING", "ESTIMATE_ERROR"),
+        closest: ("FACET_DEPTH", "REGION_RADIUS", "SAMPLE_SPACING", "NEARLY_AS_CLOSE"),
         condyles: ("NOTCH_DEPTH", "STRIP_WIDTH", "_DEEPEST"),
     }
     for module, names in own_lengths.items():
