@@ -178,10 +178,7 @@ def test_a_femur_beside_the_insert_fails_with_the_reason(bend):
 
 
 def test_a_frame_at_rest_whose_equations_fail_has_no_numbers(monkeypatch):
-    """Nothing is left but what was recorded and what the search itself says.
-
-    The slip is the recorded motion's, which released coordinates leave.
-    """
+    """Nothing is left but what was recorded, and what the search says of itself."""
     overrides = COARSE | {"contact.released": ALL}
     solver = FrameSolver(load_case(load_scene(BEND, overrides)))
     monkeypatch.setattr(
@@ -190,10 +187,8 @@ def test_a_frame_at_rest_whose_equations_fail_has_no_numbers(monkeypatch):
     _, row, arrays = solver.solve(60)
     assert row["status"].startswith("failed: no signs are right")
     known = {name for name, value in row.items() if name != "status" and np.isfinite(value)}
-    recorded = {"time_s", "cycle_percent", "flexion_deg", "adduction_deg", "axial_rotation_deg"}
-    recorded |= {f"ground_reaction_{axis}_N" for axis in ("ap", "si", "ml")}
-    assert known - recorded == {
-        *("body_seconds", "query_seconds", "contact_seconds", "contact_trials"),
-        *("coupling_iterations", "coupling_change_N", "smallest_stiffness_N_per_mm"),
+    assert known == {
+        *("time_s", "flexion_deg", "body_seconds", "query_seconds", "contact_seconds"),
+        *("contact_trials", "coupling_iterations", "smallest_stiffness_N_per_mm"),
     }
     assert arrays is None

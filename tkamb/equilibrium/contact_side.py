@@ -231,8 +231,7 @@ class ContactSide:
         )
         body = self._equilibrium_loads(k, knee, contact, points)
         if body.loads.problems:
-            problem = body.loads.problems[0]
-            return _nowhere(body), replace(contact, result=None, post=None, problem=problem)
+            return body, replace(contact, result=None, problem=body.loads.problems[0])
         return body, contact
 
     def _equilibrium_loads(
@@ -295,12 +294,6 @@ def _doubts(knee: "KneeEquilibrium") -> tuple[str, ...]:
         f"how the knee yields to the muscles does not settle ({100 * knee.doubt:.0f} % of it is "
         "open): with another start the forces come out a few per cent elsewhere",
     )
-
-
-def _nowhere(body: FrameLoads) -> FrameLoads:
-    """Return a failed frame without what holds at its pose alone, which is not known."""
-    lost = dict.fromkeys(body.geometry.tensions, NAN)
-    return replace(body, geometry=replace(body.geometry, condyles={}, extensor=None, tensions=lost))
 
 
 def _points(body: FrameLoads) -> dict[str, Array]:

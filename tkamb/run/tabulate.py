@@ -32,6 +32,11 @@ if TYPE_CHECKING:
     from tkamb.inputs.marker_motion import MarkerKinematics
 
 NAN = float("nan")
+WHY_IT_FAILED = (
+    *("body_seconds", "query_seconds", "contact_seconds", "condition_number", "contact_trials"),
+    *("coupling_iterations", "smallest_stiffness_N_per_mm"),
+)
+"""Columns that say of a frame that failed how far it came."""
 
 Columns = dict[str, Any]
 
@@ -45,6 +50,8 @@ def frame_row(
     status: str,
 ) -> dict[str, Any]:
     """Return the row of results.csv of frame k: column -> number, and the status.
+
+    A frame that failed keeps its motion, and `WHY_IT_FAILED`, alone.
 
     Args:
         case: the case.
@@ -63,6 +70,9 @@ def frame_row(
         row["medial_force_per_adduction_N_per_deg"] = contact.sensitivity * DEGREE
         row["split_determined"] = split_determined(body, contact)
     row |= {"body_seconds": body.seconds, "query_seconds": body.query_seconds}
+    if status.startswith(FAILED):
+        kept = {*_motion_row(case, k), *WHY_IT_FAILED}
+        row = {name: value if name in kept else NAN for name, value in row.items()}
     return {name: float(value) for name, value in row.items()} | {"status": status}
 
 
