@@ -100,9 +100,10 @@ def factor_memory(
         later = np.unique(np.concatenate([rank[joined[own].indices], *children]))
         boundary = later[later >= stop]
         k, m = UNKNOWNS * len(own), UNKNOWNS * len(boundary)
-        # W in 8 bytes twice (its parts, then joined), the update (m, m), and those not taken yet.
-        peak = max(peak, itemsize * kept + 8.0 * (live + 2.0 * (k + m) * k + float(m) * m))
-        kept += float(k + m) * k
+        # W in 8 bytes and as it is kept, the update (m, m), and those not taken yet.
+        block = float(k + m) * k
+        kept += block
+        peak = max(peak, itemsize * kept + 8.0 * (live + block + float(m) * m))
         live += float(m) * m - sum((UNKNOWNS * len(child)) ** 2.0 for child in children)
         columns[member] += UNKNOWNS * touched[own].sum()
         response += k * columns[member]

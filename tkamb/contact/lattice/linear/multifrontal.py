@@ -257,21 +257,26 @@ def fronts_of(
         ComputationError: the matrix is not positive definite.
     """
     order = np.concatenate(unknowns)
-    matrix = matrix[order][:, order].T  # symmetric: its rows are its columns
-    matrix.sort_indices()
+    matrix = _lower_columns(matrix[order][:, order])
     updates: dict[int, list[tuple[Index, Array]]] = {}
     row = np.empty(len(order), np.int64)
     start = 0
     for member, own in enumerate(unknowns):
         stop = start + len(own)
-        front, update = _eliminate(
-            matrix, start, stop, updates.pop(member, []), row, tree.parent[member]
-        )
-        if len(front.boundary):
-            updates.setdefault(front.parent, []).append((front.boundary, update))
-        block = np.ascontiguousarray(front.block, dtype=precision)
-        yield replace(front, block=block, scale=front.scale.astype(precision))
+        children = updates.pop(member, [])
+        boundary, block, update = _eliminate(matrix, start, stop, children, row, precision)
+        if len(boundary):
+            updates.setdefault(tree.parent[member], []).append((boundary, update))
+        scale = np.ones(len(block), precision)
+        yield Front(start, stop, boundary, tree.parent[member], block, scale)
         start = stop
+
+
+def _lower_columns(matrix: sparse.csr_matrix) -> sparse.csc_matrix:
+    """Return the lower half of a symmetric matrix by columns: by rows, its upper half."""
+    half = sparse.triu(matrix, format="csr").T
+    half.sort_indices()
+    return half
 
 
 def _eliminate(
@@ -280,9 +285,9 @@ def _eliminate(
     stop: int,
     children: list[tuple[Index, Array]],
     row: Index,
-    parent: int,
-) -> tuple[Front, Array]:
-    """Return a member's front and the update for its parent."""
+    precision: type[np.floating],
+) -> tuple[Index, NDArray[Any], Array]:
+    """Return a member's boundary, its W, and the update for its parent."""
     k = stop - start
     first, last = matrix.indptr[start], matrix.indptr[stop]
     rows, values = matrix.indices[first:last], matrix.data[first:last]
@@ -293,7 +298,7 @@ def _eliminate(
     ).astype(np.int64)
     m = len(boundary)
     own, mixed, rest = (np.zeros(size, order="F") for size in ((k, k), (m, k), (m, m)))
-    inside = (rows >= start) & ~below
+    inside = ~below
     own[rows[inside] - start, columns[inside]] = values[inside]
     row[boundary] = np.arange(m)
     mixed[row[rows[below]], columns[below]] = values[below]
@@ -312,8 +317,9 @@ def _eliminate(
         mixed = blas.dtrmm(1.0, inverse, mixed, side=1, lower=1, trans_a=1, overwrite_b=1)
         rest = blas.dsyrk(-1.0, mixed, 1.0, rest, lower=1, overwrite_c=1)
         mixed = blas.dtrmm(1.0, inverse, mixed, side=1, lower=1, overwrite_b=1)
-    block = np.concatenate([inverse, mixed])
-    return Front(start, stop, boundary, parent, block, np.ones(len(block))), rest
+    block = np.empty((k + m, k), precision)
+    block[:k], block[k:] = inverse, mixed
+    return boundary, block, rest
 
 
 @compiled
