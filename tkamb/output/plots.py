@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import (
     LogLocator,
@@ -50,22 +51,46 @@ BAND_OPACITY = 0.16
 SPAN = "#e2e2e2"
 
 
-def draw_panel(
-    panel: Panel, results: "Results", axis: HorizontalAxis, width: float = WIDTH
-) -> Figure:
-    """Return one plot with its flagged and failed frames marked along the bottom.
+class Sheet:
+    """A figure on which the plots of a run are drawn one after the other.
 
-    Each curve's id in the picture is its line's name; the width is in inches.
+    Axes and ticks are most of what a plot takes to make: they stay, all that is drawn goes.
+
+    Args:
+        results: of the run.
+        axis: horizontal, of every plot.
+        width: inches.
     """
-    with settings():
-        figure = new_figure(width, HEIGHT)
-        axes = figure.add_subplot()
-        _draw_lines(axes, panel, axis)
-        _label_axes(axes, panel, axis)
-        mark_frames(axes, results, axis)
-        legend_above(axes, _legend_columns(panel))
-        _place_alone(axes, panel)
-    return figure
+
+    def __init__(self, results: "Results", axis: HorizontalAxis, width: float = WIDTH) -> None:
+        self._results, self._axis = results, axis
+        with settings():
+            self._figure = new_figure(width, HEIGHT)
+            self._axes = self._figure.add_subplot()
+
+    def draw(self, panel: Panel) -> Figure:
+        """Return one plot with its flagged and failed frames marked along the bottom.
+
+        Each curve's id in the picture is its line's name. It stands until the next is drawn.
+        """
+        with settings():
+            self._clear()
+            _draw_lines(self._axes, panel, self._axis)
+            _label_axes(self._axes, panel, self._axis)
+            mark_frames(self._axes, self._results, self._axis)
+            legend_above(self._axes, _legend_columns(panel))
+            _place_alone(self._axes, panel)
+        return self._figure
+
+    def _clear(self) -> None:
+        axes = self._axes
+        for drawn in (*axes.lines, *axes.patches, *axes.collections, *axes.texts, *axes.child_axes):
+            drawn.remove()
+        axes.set_yscale("linear")
+        axes.relim()
+        axes.autoscale()
+        axes.set_in_layout(True)
+        self._figure.set_layout_engine("constrained")
 
 
 def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = None) -> Figure:
@@ -107,24 +132,26 @@ def _place_alone(axes: Axes, panel: Panel) -> None:
     """Give a plot that stands alone the room that its labels need.
 
     The places are those that matplotlib's constrained layout finds, which looks at everything
-    four times; it still places what is not simple: a second axis, a factor over the vertical
-    axis, a legend that is too wide.
+    four times; it still places what is not simple: a factor over a vertical axis, a legend that
+    is too wide.
     """
-    formatter, (low, high) = axes.yaxis.get_major_formatter(), sorted(axes.get_ylim())
-    ticks = axes.yaxis.get_majorticklocs()
-    labels = formatter.format_ticks(list(ticks))
-    shown = [label for tick, label in zip(ticks, labels, strict=True) if low <= tick <= high]
-    if panel.second or formatter.get_offset():
+    for second in axes.child_axes:
+        second.apply_aspect()  # takes its range from the first
+    sides = [one.yaxis for one in (axes, *axes.child_axes)]
+    widths = [_label_width(side) for side in sides]
+    if any(side.get_major_formatter().get_offset() for side in sides):
         return
-    beside = max((text_width(one, TICK_LABEL) for one in shown), default=0.0)
-    left = EDGE + TICKS + beside + (AXIS_LABEL if axes.get_ylabel() else 0.0)
+    left, *others = (
+        EDGE + TICKS + width + (AXIS_LABEL if side.get_label_text() else 0.0)
+        for side, width in zip(sides, widths, strict=True)
+    )
     words = [one[-1] for one in (panel.level, panel.span) if one]
     lines = [line for one in words for line in one.split(" ", 1)]
     outside = max((text_width(line, SIDE_LABEL) for line in lines), default=0.0)
     figure = axes.get_figure(root=True)
     assert figure is not None
     width, height = 72 * figure.get_size_inches()
-    right = max(EDGE + outside + SIDE_GAP * width, OVERHANG)
+    right = max(EDGE + outside + SIDE_GAP * width, OVERHANG, *others)
     columns = _legend_columns(panel)
     if _legend_width(panel, columns) > width - left - EDGE:
         return
@@ -134,6 +161,15 @@ def _place_alone(axes: Axes, panel: Panel) -> None:
     axes.set_position(
         (left / width, FOOT / height, 1 - (left + right) / width, 1 - (FOOT + top) / height)
     )
+
+
+def _label_width(axis: Axis) -> float:
+    """Return the width (points) of a vertical axis' labels."""
+    low, high = sorted(axis.get_view_interval())
+    ticks = axis.get_majorticklocs()
+    labels = axis.get_major_formatter().format_ticks(list(ticks))
+    shown = [label for tick, label in zip(ticks, labels, strict=True) if low <= tick <= high]
+    return max((text_width(one, TICK_LABEL) for one in shown), default=0.0)
 
 
 def _legend_width(panel: Panel, columns: int) -> float:
