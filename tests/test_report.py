@@ -534,3 +534,8 @@ def test_nothing_of_a_plot_is_cut_off_and_it_fills_its_picture(bend, gait, width
         assert (inked.max < size + 1.0).all(), panel.name
         assert inked.width > 0.93 * size[0], panel.name
         assert inked.height > 0.93 * size[1], panel.name
+        for second in figure.axes[0].child_axes:
+            low, high = second.get_ylim()
+            numbers = zip(second.get_yticks(), second.get_yticklabels(), strict=True)
+            ends = [one.get_window_extent().x1 for at, one in numbers if low <= at <= high]
+            assert second.yaxis.label.get_window_extent().x0 > max(ends), panel.name

@@ -42,6 +42,8 @@ TICKS, AXIS_LABEL = 6.5, 13.0
 """Points that ticks with their gap and the vertical axis' label take."""
 TICK_LABEL, SIDE_LABEL, LEGEND = 9.0, 8.0, 8.5
 """Points, sizes of letters."""
+LABEL = 12.0
+"""Points from a plot's edge to the near side of an axis' label."""
 SIDE_GAP = 0.01
 """Of the width, between the axes and what is written beside them."""
 HANDLE, COLUMN_GAP = 2.7, 1.4
@@ -54,7 +56,8 @@ SPAN = "#e2e2e2"
 class Sheet:
     """A figure on which the plots of a run are drawn one after the other.
 
-    Axes and ticks are most of what a plot takes to make: they stay, all that is drawn goes.
+    Axes and ticks are most of what a plot takes to make: they stay, all that is drawn goes. A plot
+    that `_place_alone` has no place for has a figure of its own.
 
     Args:
         results: of the run.
@@ -63,10 +66,8 @@ class Sheet:
     """
 
     def __init__(self, results: "Results", axis: HorizontalAxis, width: float = WIDTH) -> None:
-        self._results, self._axis = results, axis
-        with settings():
-            self._figure = new_figure(width, HEIGHT)
-            self._axes = self._figure.add_subplot()
+        self._results, self._axis, self._width = results, axis, width
+        self._axes = self._new_axes()
 
     def draw(self, panel: Panel) -> Figure:
         """Return one plot with its flagged and failed frames marked along the bottom.
@@ -75,12 +76,24 @@ class Sheet:
         """
         with settings():
             self._clear()
-            _draw_lines(self._axes, panel, self._axis)
-            _label_axes(self._axes, panel, self._axis)
-            mark_frames(self._axes, self._results, self._axis)
-            legend_above(self._axes, _legend_columns(panel))
-            _place_alone(self._axes, panel)
-        return self._figure
+            self._draw_on(self._axes, panel)
+            axes = self._axes
+            if not _place_alone(axes, panel):
+                axes = self._new_axes()
+                self._draw_on(axes, panel)
+        figure = axes.get_figure(root=True)
+        assert figure is not None
+        return figure
+
+    def _new_axes(self) -> Axes:
+        with settings():
+            return new_figure(self._width, HEIGHT).add_subplot()
+
+    def _draw_on(self, axes: Axes, panel: Panel) -> None:
+        _draw_lines(axes, panel, self._axis)
+        _label_axes(axes, panel, self._axis)
+        mark_frames(axes, self._results, self._axis)
+        legend_above(axes, _legend_columns(panel))
 
     def _clear(self) -> None:
         axes = self._axes
@@ -89,8 +102,6 @@ class Sheet:
         axes.set_yscale("linear")
         axes.relim()
         axes.autoscale()
-        axes.set_in_layout(True)
-        self._figure.set_layout_engine("constrained")
 
 
 def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = None) -> Figure:
@@ -128,19 +139,19 @@ def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = Non
     return figure
 
 
-def _place_alone(axes: Axes, panel: Panel) -> None:
-    """Give a plot that stands alone the room that its labels need.
+def _place_alone(axes: Axes, panel: Panel) -> bool:
+    """Give a plot that stands alone the room that its labels need; say whether that was possible.
 
     The places are those that matplotlib's constrained layout finds, which looks at everything
-    four times; it still places what is not simple: a factor over a vertical axis, a legend that
-    is too wide.
+    four times; it still has to place what is not simple: a factor over a vertical axis, a legend
+    that is too wide.
     """
     for second in axes.child_axes:
         second.apply_aspect()  # takes its range from the first
     sides = [one.yaxis for one in (axes, *axes.child_axes)]
     widths = [_label_width(side) for side in sides]
     if any(side.get_major_formatter().get_offset() for side in sides):
-        return
+        return False
     left, *others = (
         EDGE + TICKS + width + (AXIS_LABEL if side.get_label_text() else 0.0)
         for side, width in zip(sides, widths, strict=True)
@@ -154,13 +165,16 @@ def _place_alone(axes: Axes, panel: Panel) -> None:
     right = max(EDGE + outside + SIDE_GAP * width, OVERHANG, *others)
     columns = _legend_columns(panel)
     if _legend_width(panel, columns) > width - left - EDGE:
-        return
+        return False
     rows = -(-len(panel.lines) // columns)
     top = EDGE + LEGEND * (1.0 + rows + 0.5 * (rows - 1))
     figure.set_layout_engine("none")
-    axes.set_position(
-        (left / width, FOOT / height, 1 - (left + right) / width, 1 - (FOOT + top) / height)
-    )
+    wide, tall = width - left - right, height - FOOT - top
+    axes.set_position((left / width, FOOT / height, wide / width, tall / height))
+    axes.xaxis.set_label_coords(0.5, (LABEL - FOOT) / tall)
+    for side, place in zip(sides, (LABEL, width - LABEL), strict=False):
+        side.set_label_coords((place - left) / wide, 0.5, axes.transAxes)
+    return True
 
 
 def _label_width(axis: Axis) -> float:
