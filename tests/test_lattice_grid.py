@@ -68,9 +68,9 @@ def test_spring_counts_of_blocks(cells, springs):
     lattice = build_grid(box(1e-3 * np.array(cells)), 1e-3)
     assert len(lattice.cells) == np.prod(cells)
     nodes = np.array(cells) + 1
-    assert len(lattice.springs) == sum(np.prod(nodes - np.abs(way)) for way in DIRECTIONS)
+    assert len(lattice.springs.ends) == sum(np.prod(nodes - np.abs(way)) for way in DIRECTIONS)
     if springs:
-        assert len(lattice.springs) == springs
+        assert len(lattice.springs.ends) == springs
 
 
 def test_a_block_gives_the_exact_regular_grid():
@@ -429,20 +429,20 @@ def check_invariants(lattice, surface):
     used = np.zeros(len(lattice.nodes), bool)
     used[lattice.cells] = True
     assert used.all(), "orphan node"
-    ends = np.sort(lattice.springs, axis=1)
+    ends = np.sort(lattice.springs.ends, axis=1)
     assert len(np.unique(ends, axis=0)) == len(ends), "duplicate spring"
     length = np.linalg.norm(lattice.nodes[ends[:, 1]] - lattice.nodes[ends[:, 0]], axis=1)
     assert length.min() > 0.1 * lattice.spacing.min(), "spring without length"
     of_cells = np.sort(lattice.cells[:, PAIRS], axis=2)
-    np.testing.assert_array_equal(ends[lattice.cell_springs], of_cells)
-    owners = np.bincount(lattice.cell_springs.ravel(), minlength=len(ends))
-    np.testing.assert_array_equal(owners, lattice.spring_owners)
-    share = FAMILY_SHARE[lattice.spring_family] * owners
+    np.testing.assert_array_equal(ends[lattice.springs.of_cell], of_cells)
+    owners = np.bincount(lattice.springs.of_cell.ravel(), minlength=len(ends))
+    np.testing.assert_array_equal(owners, lattice.springs.owners)
+    share = FAMILY_SHARE[lattice.springs.family] * owners
     assert share.max() <= 1.0
-    internal = lattice.node_class[lattice.springs] == INTERNAL
+    internal = lattice.node_class[lattice.springs.ends] == INTERNAL
     np.testing.assert_array_equal(share[internal.any(axis=1)], 1.0)
-    step = lattice.index[lattice.springs[:, 1]] - lattice.index[lattice.springs[:, 0]]
-    np.testing.assert_array_equal(step, DIRECTIONS[lattice.spring_family])
+    step = lattice.index[lattice.springs.ends[:, 1]] - lattice.index[lattice.springs.ends[:, 0]]
+    np.testing.assert_array_equal(step, DIRECTIONS[lattice.springs.family])
     graph = coo_array((np.ones(len(ends)), tuple(ends.T)), shape=(len(used), len(used)))
     label = connected_components(graph, directed=False)[1]
     assert set(label[lattice.contact_nodes]) <= set(label[lattice.bottom_nodes]), "not reachable"

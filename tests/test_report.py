@@ -17,7 +17,7 @@ from tkamb.output.axis import horizontal_axis, round_step
 from tkamb.output.headline import cards
 from tkamb.output.metrics import map_rows
 from tkamb.output.panels import Line, Panel, panels
-from tkamb.output.plots import WIDTH, draw_panel
+from tkamb.output.plots import WIDTH, Sheet
 from tkamb.output.pressure_maps import draw_maps, mapped_frames, top_view
 from tkamb.output.report import THIRD, report_html, write_report
 from tkamb.output.style import BLACK, svg_text
@@ -441,11 +441,20 @@ def with_bands(run):
     return Results(run.columns, summary, run.maps, bands=bands)
 
 
+def test_a_plot_is_the_same_whatever_was_drawn_before_it(bend):
+    axis, shown = horizontal_axis(bend), panels(bend)
+    assert {True, False} == {one.logarithmic for one in shown} and any(one.second for one in shown)
+    sheet = Sheet(bend, axis)
+    again = {one.name: svg_text(sheet.draw(one), one.name) for one in (*shown, *shown[::-1])}
+    for one in shown:
+        assert again[one.name] == svg_text(Sheet(bend, axis).draw(one), one.name)
+
+
 def test_bands_are_drawn_at_their_percentiles_and_told_in_words(bend, page):
     run = with_bands(bend)
     axis = horizontal_axis(run)
     found = "".join(
-        f'<figure id="figure-{one.name}">{svg_text(draw_panel(one, run, axis), one.name)}'
+        f'<figure id="figure-{one.name}">{svg_text(Sheet(run, axis).draw(one), one.name)}'
         for one in panels(run)
         if one.name in ("forces", "pressures")
     )
@@ -516,7 +525,7 @@ def test_nothing_of_a_plot_is_cut_off_and_it_fills_its_picture(bend, gait, width
     drawn = [(run, panel) for run in (bend, gait) for panel in panels(run)]
     drawn = (drawn if scale == 1.0 and width == WIDTH else []) + [(bend, one) for one in made]
     for run, panel in drawn:
-        figure = draw_panel(panel, run, horizontal_axis(run), width)
+        figure = Sheet(run, horizontal_axis(run), width).draw(panel)
         canvas = FigureCanvasSVG(figure)
         canvas.draw()
         inked = figure.axes[0].get_tightbbox(figure._get_renderer())
@@ -525,3 +534,8 @@ def test_nothing_of_a_plot_is_cut_off_and_it_fills_its_picture(bend, gait, width
         assert (inked.max < size + 1.0).all(), panel.name
         assert inked.width > 0.93 * size[0], panel.name
         assert inked.height > 0.93 * size[1], panel.name
+        for second in figure.axes[0].child_axes:
+            low, high = second.get_ylim()
+            numbers = zip(second.get_yticks(), second.get_yticklabels(), strict=True)
+            ends = [one.get_window_extent().x1 for at, one in numbers if low <= at <= high]
+            assert second.yaxis.label.get_window_extent().x0 > max(ends), panel.name

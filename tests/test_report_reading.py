@@ -14,7 +14,7 @@ from tkamb.output.axis import horizontal_axis
 from tkamb.output.levels import PageGrid, pressure_levels
 from tkamb.output.pages import asset
 from tkamb.output.panels import panels
-from tkamb.output.plots import draw_panel
+from tkamb.output.plots import Sheet
 from tkamb.output.reading import conclusions
 from tkamb.results import Results
 
@@ -52,7 +52,7 @@ def test_the_in_vivo_peaks_of_the_activity_lie_behind_the_force(bend):
     (panel,) = (one for one in panels(run) if one.name == "forces")
     assert panel.span[:2] == (2.1, 2.53)
     assert "Kutzner 2010" in panel.note and "D'Lima 2007" in panel.note
-    axes = draw_panel(panel, run, horizontal_axis(run)).axes[0]
+    axes = Sheet(run, horizontal_axis(run)).draw(panel).axes[0]
     (shade,) = [one for one in axes.patches if one.get_gid() == "span"]
     assert (shade.get_y(), shade.get_y() + shade.get_height()) == pytest.approx((2.1, 2.53))
 

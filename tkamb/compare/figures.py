@@ -167,5 +167,5 @@ def _map_figure(
             axes.set_title(f"{words}{run.axis.at(frame)}", fontsize=8.5)
         for axes in grid[len(comparison.runs) :]:
             axes.set_axis_off()
-        pressure_bar(figure, list(grid), scale)
+        pressure_bar(figure, scale, ax=list(grid), fraction=0.02, pad=0.01, aspect=30)
     return figure

@@ -18,7 +18,7 @@ from PIL import Image
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.output.levels import pressure_levels
 from tkamb.output.metrics import map_rows
-from tkamb.output.pressure_maps import TopView, pressure_bar
+from tkamb.output.pressure_maps import TopView, place_maps, pressure_bar
 from tkamb.output.style import PRESSURE_MAP, new_figure, settings
 from tkamb.units import MEGAPASCAL
 
@@ -38,10 +38,10 @@ def draw_insert(view: TopView, largest: float) -> Figure:
     """Return the bare insert, over which the page draws, and the colours up to `largest`, MPa."""
     with settings():
         figure = new_figure(5.4, 3.7)
-        axes = figure.add_subplot()
+        (axes,), beside = place_maps(figure, 1, 1, 4.0)
         view.draw_insert(axes)
         view.draw_labels(axes)
-        pressure_bar(figure, [axes], Normalize(0.0, largest))
+        pressure_bar(figure, Normalize(0.0, largest), cax=beside)
     return figure
 
 

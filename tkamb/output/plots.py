@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import (
     LogLocator,
@@ -41,6 +42,8 @@ TICKS, AXIS_LABEL = 6.5, 13.0
 """Points that ticks with their gap and the vertical axis' label take."""
 TICK_LABEL, SIDE_LABEL, LEGEND = 9.0, 8.0, 8.5
 """Points, sizes of letters."""
+LABEL = 12.0
+"""Points from a plot's edge to the near side of an axis' label."""
 SIDE_GAP = 0.01
 """Of the width, between the axes and what is written beside them."""
 HANDLE, COLUMN_GAP = 2.7, 1.4
@@ -50,22 +53,55 @@ BAND_OPACITY = 0.16
 SPAN = "#e2e2e2"
 
 
-def draw_panel(
-    panel: Panel, results: "Results", axis: HorizontalAxis, width: float = WIDTH
-) -> Figure:
-    """Return one plot with its flagged and failed frames marked along the bottom.
+class Sheet:
+    """A figure on which the plots of a run are drawn one after the other.
 
-    Each curve's id in the picture is its line's name; the width is in inches.
+    Axes and ticks are most of what a plot takes to make: they stay, all that is drawn goes. A plot
+    that `_place_alone` has no place for has a figure of its own.
+
+    Args:
+        results: of the run.
+        axis: horizontal, of every plot.
+        width: inches.
     """
-    with settings():
-        figure = new_figure(width, HEIGHT)
-        axes = figure.add_subplot()
-        _draw_lines(axes, panel, axis)
-        _label_axes(axes, panel, axis)
-        mark_frames(axes, results, axis)
+
+    def __init__(self, results: "Results", axis: HorizontalAxis, width: float = WIDTH) -> None:
+        self._results, self._axis, self._width = results, axis, width
+        self._axes = self._new_axes()
+
+    def draw(self, panel: Panel) -> Figure:
+        """Return one plot with its flagged and failed frames marked along the bottom.
+
+        Each curve's id in the picture is its line's name. It stands until the next is drawn.
+        """
+        with settings():
+            self._clear()
+            self._draw_on(self._axes, panel)
+            axes = self._axes
+            if not _place_alone(axes, panel):
+                axes = self._new_axes()
+                self._draw_on(axes, panel)
+        figure = axes.get_figure(root=True)
+        assert figure is not None
+        return figure
+
+    def _new_axes(self) -> Axes:
+        with settings():
+            return new_figure(self._width, HEIGHT).add_subplot()
+
+    def _draw_on(self, axes: Axes, panel: Panel) -> None:
+        _draw_lines(axes, panel, self._axis)
+        _label_axes(axes, panel, self._axis)
+        mark_frames(axes, self._results, self._axis)
         legend_above(axes, _legend_columns(panel))
-        _place_alone(axes, panel)
-    return figure
+
+    def _clear(self) -> None:
+        axes = self._axes
+        for drawn in (*axes.lines, *axes.patches, *axes.collections, *axes.texts, *axes.child_axes):
+            drawn.remove()
+        axes.set_yscale("linear")
+        axes.relim()
+        axes.autoscale()
 
 
 def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = None) -> Figure:
@@ -103,37 +139,51 @@ def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = Non
     return figure
 
 
-def _place_alone(axes: Axes, panel: Panel) -> None:
-    """Give a plot that stands alone the room that its labels need.
+def _place_alone(axes: Axes, panel: Panel) -> bool:
+    """Give a plot that stands alone the room that its labels need; say whether that was possible.
 
     The places are those that matplotlib's constrained layout finds, which looks at everything
-    four times; it still places what is not simple: a second axis, a factor over the vertical
-    axis, a legend that is too wide.
+    four times; it still has to place what is not simple: a factor over a vertical axis, a legend
+    that is too wide.
     """
-    formatter, (low, high) = axes.yaxis.get_major_formatter(), sorted(axes.get_ylim())
-    ticks = axes.yaxis.get_majorticklocs()
-    labels = formatter.format_ticks(list(ticks))
-    shown = [label for tick, label in zip(ticks, labels, strict=True) if low <= tick <= high]
-    if panel.second or formatter.get_offset():
-        return
-    beside = max((text_width(one, TICK_LABEL) for one in shown), default=0.0)
-    left = EDGE + TICKS + beside + (AXIS_LABEL if axes.get_ylabel() else 0.0)
+    for second in axes.child_axes:
+        second.apply_aspect()  # takes its range from the first
+    sides = [one.yaxis for one in (axes, *axes.child_axes)]
+    widths = [_label_width(side) for side in sides]
+    if any(side.get_major_formatter().get_offset() for side in sides):
+        return False
+    left, *others = (
+        EDGE + TICKS + width + (AXIS_LABEL if side.get_label_text() else 0.0)
+        for side, width in zip(sides, widths, strict=True)
+    )
     words = [one[-1] for one in (panel.level, panel.span) if one]
     lines = [line for one in words for line in one.split(" ", 1)]
     outside = max((text_width(line, SIDE_LABEL) for line in lines), default=0.0)
     figure = axes.get_figure(root=True)
     assert figure is not None
     width, height = 72 * figure.get_size_inches()
-    right = max(EDGE + outside + SIDE_GAP * width, OVERHANG)
+    right = max(EDGE + outside + SIDE_GAP * width, OVERHANG, *others)
     columns = _legend_columns(panel)
     if _legend_width(panel, columns) > width - left - EDGE:
-        return
+        return False
     rows = -(-len(panel.lines) // columns)
     top = EDGE + LEGEND * (1.0 + rows + 0.5 * (rows - 1))
     figure.set_layout_engine("none")
-    axes.set_position(
-        (left / width, FOOT / height, 1 - (left + right) / width, 1 - (FOOT + top) / height)
-    )
+    wide, tall = width - left - right, height - FOOT - top
+    axes.set_position((left / width, FOOT / height, wide / width, tall / height))
+    axes.xaxis.set_label_coords(0.5, (LABEL - FOOT) / tall)
+    for side, place in zip(sides, (LABEL, width - LABEL), strict=False):
+        side.set_label_coords((place - left) / wide, 0.5, axes.transAxes)
+    return True
+
+
+def _label_width(axis: Axis) -> float:
+    """Return the width (points) of a vertical axis' labels."""
+    low, high = sorted(axis.get_view_interval())
+    ticks = axis.get_majorticklocs()
+    labels = axis.get_major_formatter().format_ticks(list(ticks))
+    shown = [label for tick, label in zip(ticks, labels, strict=True) if low <= tick <= high]
+    return max((text_width(one, TICK_LABEL) for one in shown), default=0.0)
 
 
 def _legend_width(panel: Panel, columns: int) -> float:

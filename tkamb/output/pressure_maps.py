@@ -34,6 +34,11 @@ STEP_MM = 0.3
 """Between the points of the grid that pressures are drawn on."""
 LABEL_GAP_MM, LABEL_STEP_MM = 4.0, 2.6
 """From a path to its labels, and between two of them."""
+EDGE, ABOVE, BELOW, BETWEEN = 3.0, 17.0, 18.0, 6.0
+"""Points: left of maps, over each for its title, under each for its scale, between two beside each
+other."""
+BAR_LABELS, BAR_RATIO = 41.0, 30.0
+"""Points right of a colour bar for its labels; its height over its width."""
 RIM = 0.03
 """Share of the scale over which a map fades at its rim, so that no steps are seen there."""
 
@@ -129,13 +134,13 @@ def draw_maps(
     ratio = np.ptp(view.up) / np.ptp(view.across)
     with settings():
         figure = new_figure(11.0, down * (10.0 / 4 * ratio + 0.75))
-        grid = figure.subplots(down, across, squeeze=False).ravel()
+        grid, beside = place_maps(figure, down, across, 26.0)
         for axes, frame in zip(grid, frames, strict=False):
             draw_map(axes, view, results, frame, scale)
             axes.set_title(_caption(results, axis, frame), fontsize=8.5)
         for axes in grid[len(frames) :]:
             axes.set_axis_off()
-        bar = pressure_bar(figure, list(grid), scale)
+        bar = pressure_bar(figure, scale, cax=beside)
         stress = results.summary.get("yield_stress_MPa")
         if stress is not None and stress < float(scale.vmax or 1.0):
             bar.ax.axhline(stress, color="white", linewidth=1.5)
@@ -159,10 +164,33 @@ def draw_map(
     view.draw_labels(axes)
 
 
-def pressure_bar(figure: Figure, axes: Sequence[Axes], scale: Normalize) -> Colorbar:
-    """Return the colour bar of pressure maps on one scale (MPa)."""
-    mappable = ScalarMappable(scale, PRESSURE_MAP)
-    bar = figure.colorbar(mappable, ax=list(axes), fraction=0.02, pad=0.01, aspect=30)
+def place_maps(figure: Figure, down: int, across: int, gap: float) -> tuple[list[Axes], Axes]:
+    """Return axes for maps, row by row, and for their colour bar, `gap` points beside them.
+
+    What stands around maps is known, so that no layout need look for it.
+    """
+    figure.set_layout_engine("none")
+    width, height = 72 * figure.get_size_inches()
+    tall = height / down - ABOVE - BELOW
+    long = height - ABOVE - BELOW
+    thick = long / BAR_RATIO
+    right = gap + thick + BAR_LABELS
+    wide = (width - EDGE - right + BETWEEN) / across - BETWEEN
+
+    def place(x: float, y: float, across: float, up: float) -> Axes:
+        return figure.add_axes((x / width, y / height, across / width, up / height))
+
+    maps = [
+        place(EDGE + k * (wide + BETWEEN), (down - 1 - row) * height / down + BELOW, wide, tall)
+        for row in range(down)
+        for k in range(across)
+    ]
+    return maps, place(width - BAR_LABELS - thick, BELOW, thick, long)
+
+
+def pressure_bar(figure: Figure, scale: Normalize, **place: Any) -> Colorbar:
+    """Return the colour bar of pressure maps on one scale (MPa), in a place of `colorbar`."""
+    bar = figure.colorbar(ScalarMappable(scale, PRESSURE_MAP), **place)
     bar.set_label("contact pressure (MPa)")
     return bar
 

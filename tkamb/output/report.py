@@ -18,7 +18,7 @@ from tkamb.output.headline import cards, run_title
 from tkamb.output.metrics import body_weight, failed, flagged
 from tkamb.output.pages import asset, policy_sources, render
 from tkamb.output.panels import Panel, centre_panel, panels
-from tkamb.output.plots import WIDTH, draw_panel
+from tkamb.output.plots import WIDTH, Sheet
 from tkamb.output.pressure_maps import draw_maps, draw_paths, mapped_frames, top_view
 from tkamb.output.reading import conclusions
 from tkamb.output.style import svg_text
@@ -71,7 +71,8 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
     axis = horizontal_axis(results)
     style = asset(PACKAGE, "report.css")
     script = "\n".join(asset(PACKAGE, name) for name in SCRIPTS)
-    maps, force = _maps(results, axis), results["force_total_N"]
+    sheet = Sheet(results, axis)
+    maps, force = _maps(results, axis, sheet), results["force_total_N"]
     return render(
         PACKAGE,
         "report.html",
@@ -85,7 +86,7 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
         sentences=_sentences(results.summary),
         maps=maps,
         legend=_legend(results),
-        plots=[_plot(panel, results, axis) for panel in progress(panels(results))],
+        plots=[_plot(panel, sheet) for panel in progress(panels(results))],
         muscles=_muscles(results, axis),
         wear=wear_section(results),
         motion=motion_table(results, axis),
@@ -134,7 +135,7 @@ def _contact_words(contact: dict[str, Any]) -> str:
     return words
 
 
-def _maps(results: "Results", axis: HorizontalAxis) -> dict[str, Any] | None:
+def _maps(results: "Results", axis: HorizontalAxis, sheet: Sheet) -> dict[str, Any] | None:
     """Return the pictures of pressure on the insert; None without maps."""
     view, frames = top_view(results), mapped_frames(results, axis)
     if view is None or not frames:
@@ -144,7 +145,7 @@ def _maps(results: "Results", axis: HorizontalAxis) -> dict[str, Any] | None:
         "frames": frame_maps(results, view),
         "pictures": svg_text(draw_maps(results, view, axis, frames), "maps"),
         "paths": svg_text(draw_paths(results, view, axis, frames), "paths"),
-        "centres": _plot(centre_panel(results), results, axis),
+        "centres": _plot(centre_panel(results), sheet),
         "side": view.side,
     }
 
@@ -155,20 +156,18 @@ def _muscles(results: "Results", axis: HorizontalAxis) -> dict[str, Any] | None:
         return None
     from tkamb.output.muscles import HELD, draw_activations, muscle_panels, reserve_words
 
-    figure = draw_activations(results, axis)
+    figure, sheet = draw_activations(results, axis), Sheet(results, axis, THIRD)
     return {
         "activations": None if figure is None else svg_text(figure, "activations"),
         "emg": bool(results.summary.get("emg")),
-        "plots": [_plot(panel, results, axis, THIRD) for panel in muscle_panels(results)],
+        "plots": [_plot(panel, sheet) for panel in muscle_panels(results)],
         "held": HELD,
         "reserves": reserve_words(results.summary),
     }
 
 
-def _plot(
-    panel: Panel, results: "Results", axis: HorizontalAxis, width: float = WIDTH
-) -> dict[str, Any]:
-    return {"panel": panel, "svg": svg_text(draw_panel(panel, results, axis, width), panel.name)}
+def _plot(panel: Panel, sheet: Sheet) -> dict[str, Any]:
+    return {"panel": panel, "svg": svg_text(sheet.draw(panel), panel.name)}
 
 
 def _legend(results: "Results") -> list[str]:

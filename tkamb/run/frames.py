@@ -1,6 +1,7 @@
 """Frames of a case, one by one: both sides of the equilibrium in, a row of the results out."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from tkamb.equilibrium.mechanics import Mechanics
@@ -63,17 +64,29 @@ class FrameSolver:
             from tkamb.run.recall import contact_arrays
 
             body, contact = self.side.frame(k, self.before)
-            self.before.append(contact)
-            del self.before[:-LAST_FRAMES]
+            self._keep(contact)
             arrays = contact_arrays(contact, body.geometry)
         doubts = self.plausibility.flags(k, body)
         status = frame_status(self._case, k, body, contact, doubts)
         return k, frame_row(self._case, k, body, contact, self._slips, status), arrays
 
+    def _keep(self, contact: "FrameContact") -> None:
+        """Keep a contact as a guess; only the last that was found says where a solver begins."""
+        if contact.result is not None:
+            self.before = [_without_warm_start(earlier) for earlier in self.before]
+        self.before.append(contact)
+        del self.before[:-LAST_FRAMES]
+
     def _contact_side(self) -> "ContactSide":
         from tkamb.equilibrium.contact_side import ContactSide
 
         return ContactSide(self._case, self.mechanics)
+
+
+def _without_warm_start(contact: "FrameContact") -> "FrameContact":
+    if contact.result is None:
+        return contact
+    return replace(contact, result=replace(contact.result, warm_start=None), turned=None)
 
 
 class ChunkSolver:

@@ -3,11 +3,11 @@
 The key is the SHA-256 of everything that the operator depends on: nodes, cells, held unknowns,
 contact nodes, elastic constants, kind of solid, and the code that makes it. A file is
 
-    magic (16 bytes) | SHA-256 of all that follows | length of the header | header (JSON) | arrays
+    magic (16 bytes) | CRC-32 of all that follows | length of the header | header (JSON) | arrays
 
 and is written beside its place and moved there in one step, so that two processes at once see a
 whole file or none. A file is used only if it is a regular one of the user's own that nobody else
-may write, its size is what its header says, its SHA-256 and key are right, and its operator
+may write, its size is what its header says, its CRC-32 and key are right, and its operator
 inverts the stiffness that is assembled afresh (`operator_error`). Any other is made again, with
 one notice. The least recently used go when the folder outgrows its limit, and with them what a
 killed process left half written.
@@ -25,6 +25,7 @@ import os
 import stat
 import tempfile
 import time as clock
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -41,7 +42,9 @@ from tkamb.errors import InputError
 from tkamb.files import open_regular
 from tkamb.geometry.frames import Index, Mask
 
-MAGIC = b"tkamb operator 5"
+MAGIC = b"tkamb operator 6"
+PREFIX = len(MAGIC) + 4 + 8
+"""Bytes before the header."""
 BOUNDARY = 64
 """Bytes; every array begins at a multiple of it."""
 LONGEST_HEADER = 1_000_000
@@ -159,20 +162,21 @@ def write_operator(path: Path, key: str, operator: ElasticOperator) -> None:
             "arrays": [[array.dtype.str, list(array.shape)] for array in arrays],
         }
     ).encode()
-    header += b" " * _padding(len(MAGIC) + 40 + len(header))
-    digest = hashlib.sha256(len(header).to_bytes(8, "little") + header)
+    header += b" " * _padding(PREFIX + len(header))
+    start = len(header).to_bytes(8, "little") + header
+    checksum = zlib.crc32(start)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=".tkamb-", suffix=".part")
     try:
         with os.fdopen(handle, "wb") as file:
             fcntl.flock(file, fcntl.LOCK_EX)  # says that somebody is at it, until he closes or dies
-            file.write(MAGIC + bytes(32) + len(header).to_bytes(8, "little") + header)
+            file.write(MAGIC + bytes(4) + start)
             for array in arrays:
                 content = np.ascontiguousarray(array).data.cast("B") if array.size else b""
                 for part in (content, bytes(_padding(array.nbytes))):
-                    digest.update(part)
+                    checksum = zlib.crc32(part, checksum)
                     file.write(part)
             file.seek(len(MAGIC))
-            file.write(digest.digest())
+            file.write(checksum.to_bytes(4, "little"))
         os.replace(name, path)
     except BaseException:
         Path(name).unlink(missing_ok=True)
@@ -225,10 +229,10 @@ def read_operator(path: Path, key: str, limit: float = SIZE_LIMIT) -> ElasticOpe
 
 
 def _arrays(file: BinaryIO, size: int, key: str) -> Iterator[NDArray[Any]]:
-    """Yield the arrays of a file of that size, after a look at its key and its SHA-256."""
-    start = file.read(len(MAGIC) + 40)
+    """Yield the arrays of a file of that size, after a look at its key and its CRC-32."""
+    start = file.read(PREFIX)
     length = int.from_bytes(start[-8:], "little")
-    if len(start) < len(MAGIC) + 40 or start[: len(MAGIC)] != MAGIC or length > LONGEST_HEADER:
+    if len(start) < PREFIX or start[: len(MAGIC)] != MAGIC or length > LONGEST_HEADER:
         raise ValueError("no such header")
     text = file.read(length)
     header = json.loads(text)
@@ -242,10 +246,9 @@ def _arrays(file: BinaryIO, size: int, key: str) -> Iterator[NDArray[Any]]:
     # Mapped, not read: nothing is copied, and processes share it. A file is never written in
     # place; what is written to a mapped array stays this process's own.
     content = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY))
-    digest = hashlib.sha256(start[-8:] + text)
-    digest.update(content[firsts[0] :])
-    if digest.digest() != start[len(MAGIC) : len(MAGIC) + 32]:
-        raise ValueError("another SHA-256")
+    checksum = zlib.crc32(content[firsts[0] :], zlib.crc32(start[-8:] + text))
+    if checksum.to_bytes(4, "little") != start[len(MAGIC) : -8]:
+        raise ValueError("another CRC-32")
     for (kind, shape), first, n in zip(shapes, firsts, sizes, strict=False):
         yield np.frombuffer(content[first : first + n], kind).reshape(shape)
 

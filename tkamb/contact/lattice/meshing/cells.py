@@ -25,6 +25,14 @@ CORNERS = np.array(
 )
 """Corner offsets (i, j, k) of a cell in the order of VTK's hexahedron."""
 
+NEIGHBOURS = np.array(
+    [
+        [np.argmax((np.abs(o - e) == CORNERS).all(axis=1)) for e in np.eye(3, dtype=int)]
+        for o in CORNERS
+    ]
+)
+"""The corner (8, 3) at the other end of the edge along x, y and z of each corner."""
+
 PAIRS = np.array([(a, b) for a in range(8) for b in range(a + 1, 8)])
 """The 28 pairs of a cell's corners that are joined by springs."""
 
@@ -109,27 +117,24 @@ def join_springs(cells: Index, node_count: int) -> Springs:
     return Springs(ends, (used % len(DIRECTIONS)).astype(np.int8), owners[used], of_cell)
 
 
+@compiled
 def scaled_jacobians(points: Array) -> Array:
     """Return the least scaled Jacobian (c,) of cells (c, 8, 3): 1 for a box, <= 0 inverted."""
-    result = np.full(len(points), np.inf)
-    for corner, offset in enumerate(CORNERS):
-        x, y, z = _edges_at(points, corner, offset)
-        lengths = np.prod([np.linalg.norm(e, axis=1) for e in (x, y, z)], axis=0)
-        volume = np.einsum("ci,ci->c", np.cross(x, y), z)
-        result = np.minimum(result, np.divide(volume, lengths, where=lengths > 0, out=-lengths))
+    result, edges, lengths = np.full(len(points), np.inf), np.empty((3, 3)), np.empty(3)
+    for cell in range(len(points)):
+        for corner in range(8):
+            for axis in range(3):
+                sign = 1 - 2 * CORNERS[corner, axis]
+                for d in range(3):
+                    beside = points[cell, NEIGHBOURS[corner, axis], d]
+                    edges[axis, d] = sign * (beside - points[cell, corner, d])
+                lengths[axis] = np.sqrt((edges[axis] ** 2).sum())
+            length, volume = lengths[0] * lengths[1] * lengths[2], 0.0
+            for d in range(3):
+                e, f = (d + 1) % 3, (d + 2) % 3
+                volume += edges[2, d] * (edges[0, e] * edges[1, f] - edges[0, f] * edges[1, e])
+            result[cell] = min(result[cell], volume / length if length > 0 else 0.0)
     return result
-
-
-def _edges_at(points: Array, corner: int, offset: Index) -> list[Array]:
-    """Return the edges along +x, +y and +z of the cell that meet at one corner."""
-    edges = []
-    for axis in range(3):
-        other = offset.copy()
-        other[axis] = 1 - other[axis]
-        neighbour = int((other == CORNERS).all(axis=1).argmax())
-        sign = 1.0 if offset[axis] == 0 else -1.0
-        edges.append(sign * (points[:, neighbour] - points[:, corner]))
-    return edges
 
 
 def shortest_edges(points: Array) -> Array:

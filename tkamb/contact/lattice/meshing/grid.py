@@ -6,6 +6,7 @@ rays along its lines; nodes moved onto the surface by at most half a cell; class
 
 import logging
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,10 +58,6 @@ class Lattice:
         spacing: (3,) m, of the undistorted grid.
         origin: (3,) m, of the grid's node (0, 0, 0).
         cells: (c, 8) nodes in the order of VTK's hexahedron.
-        springs: (s, 2) nodes, every spring once.
-        spring_family: (s,) row of `cells.DIRECTIONS`.
-        spring_owners: (s,) number of cells that own the spring.
-        cell_springs: (c, 28) spring of each of a cell's `cells.PAIRS`.
         contact_triangles: (k, 3) nodes, outward, over the contact nodes.
         dropped_nodes: members of the part that belong to no cell, left out.
         dropped_cells: cells left out (inverted, bridging a gap, or loose).
@@ -75,10 +72,6 @@ class Lattice:
     spacing: Array
     origin: Array
     cells: Index
-    springs: Index
-    spring_family: NDArray[np.int8]
-    spring_owners: Index
-    cell_springs: Index
     contact_triangles: Index
     dropped_nodes: int
     dropped_cells: int
@@ -97,6 +90,11 @@ class Lattice:
             (self.dropped_nodes, "{} nodes left out that no cell holds"),
         )
         return tuple(phrase.format(count) for count, phrase in counts if count)
+
+    @cached_property
+    def springs(self) -> Springs:
+        """Springs that join each cell's nodes, each once."""
+        return join_springs(self.cells, len(self.nodes))
 
     @property
     def contact_nodes(self) -> Index:
@@ -218,7 +216,6 @@ def _assemble(field: NodeField, cells: Index, dropped_cells: int) -> Lattice:
     used[cells] = True
     number = np.cumsum(used) - 1
     flat = np.flatnonzero(used)
-    springs: Springs = join_springs(number[cells], len(flat))
     node_class = _classes(field, cells)[flat]
     index = np.column_stack(np.unravel_index(flat, shape))
     return Lattice(
@@ -228,10 +225,6 @@ def _assemble(field: NodeField, cells: Index, dropped_cells: int) -> Lattice:
         spacing=field.spacing,
         origin=np.array([field.lines[0][0], 0.0, field.lines[1][0]]),
         cells=number[cells],
-        springs=springs.ends,
-        spring_family=springs.family,
-        spring_owners=springs.owners,
-        cell_springs=springs.of_cell,
         contact_triangles=_contact_triangles(index, node_class, shape),
         dropped_nodes=int(field.member.sum() - len(flat)),
         dropped_cells=dropped_cells,

@@ -68,7 +68,7 @@ def measure_quality(lattice: Lattice, insert: Surface) -> LatticeQuality:
     return LatticeQuality(
         nodes=len(lattice.nodes),
         cells=len(lattice.cells),
-        springs=len(lattice.springs),
+        springs=len(lattice.springs.ends),
         volume=float(cell_volumes(points).sum()),
         mesh_volume=float(np.einsum("kj,kj->", *_volume_terms(insert))),
         edge_ratio=_spread(_edge_ratios(points)),

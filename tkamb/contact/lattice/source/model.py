@@ -71,7 +71,7 @@ class SourceLattice(CellContact):
         if self.law == "linear":
             material = replace(material, law=LinearElastic())
         return SourceNetwork(
-            lattice.nodes, lattice.cells, lattice.spacing, material, lattice.springs
+            lattice.nodes, lattice.cells, lattice.spacing, material, lattice.springs.ends
         )
 
     def _solution(
