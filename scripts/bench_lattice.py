@@ -6,6 +6,7 @@ thread, as the command line does; OMP_NUM_THREADS says otherwise. The approach s
 is found when it is read: `approach_s` is what that takes.
 
     scripts/bench_lattice.py --cases two-condyles dm30 jw --data FOLDER --resolutions 2 1.5 1
+    scripts/bench_lattice.py --cases shipped --contacts lattice --resolutions 1 0.75 0.5
 """
 
 import argparse

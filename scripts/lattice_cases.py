@@ -9,7 +9,10 @@ from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.geometry.frames import knee_pose, pose
 from tkamb.geometry.surface import Surface
+from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
+BEND = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
 AXES = np.diag([-1.0, 1.0, -1.0])
 """Subjects DM and JW: mesh x posterior, y superior, z medial."""
 
@@ -86,12 +89,21 @@ def jw_centred(data: Path):
     return femoral, insert, pose(np.eye(3), shift)
 
 
+def shipped():
+    """Return the shipped knee's bodies and its recorded pose in the middle of the bend."""
+    case = load_case(load_scene(BEND))
+    middle = len(case.motion.time) // 2
+    return case.femoral, case.insert, knee_pose(case.motion.coordinates[middle])
+
+
 def bodies(case: str, data: Path | None):
     """Return the femoral component, the insert and the pose of a named case."""
     if case == "two-condyles":
         return two_condyles()
     if case == "two-condyles-varus":
         return two_condyles(0.3)
+    if case == "shipped":
+        return shipped()
     if data is None:
         raise SystemExit(f"case {case} needs --data")
     return jw_centred(data) if case == "jw" else dm_stance(data, int(case.removeprefix("dm")))
