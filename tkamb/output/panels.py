@@ -363,7 +363,7 @@ def _hip_force(results: "Results") -> Panel:
 
 def _hip_moment(results: "Results") -> Panel:
     lines = _components(results, "hip_moment", "Nm")
-    note = "About the axes named; stands for the muscles across the hip, which are not modelled."
+    note = "About the axes named; what muscles across the hip do is in it."
     return Panel("hip_moment", "Intersegmental moment on the femur at the hip", "N·m", lines, note)
 
 
