@@ -345,11 +345,15 @@ class Mechanics:
     def recorded_poses(self) -> dict[str, Array]:
         """Link -> pose_link_in_insert (f, 4, 4) as recorded, of links with attachments."""
         recorded, ligament = self.case.motion.coordinates, self.case.patellar_ligament
-        states = [self.case.chain.at(self._chain_motion(k, x)) for k, x in enumerate(recorded)]
         links = self._attachment_links()
         if ligament is not None:
             links |= {ligament.proximal.link, ligament.distal.link}
-        return {link: np.stack([state.pose(link) for state in states]) for link in links}
+        poses = {link: np.empty((len(recorded), 4, 4)) for link in links}
+        for k, coordinates in enumerate(recorded):  # one at a time: a state is a quarter of a MB
+            state = self.case.chain.at(self._chain_motion(k, coordinates))
+            for link in links:
+                poses[link][k] = state.pose(link)
+        return poses
 
     def _attachment_links(self) -> set[str]:
         bundles = self.case.ligaments
