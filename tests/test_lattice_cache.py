@@ -1,5 +1,6 @@
 """Prepared operators on disk: the same answers, whole files only, a limit that holds."""
 
+import errno
 import fcntl
 import os
 from dataclasses import replace
@@ -212,6 +213,27 @@ def test_limit_drops_the_least_recently_used(folder):
     cached((5, 3, 7), limit=1.5 * size)
     assert sum(p.stat().st_size for p in folder.iterdir()) <= 1.5 * size
     assert cached(limit=1.5 * size)[1]
+
+
+def test_an_operator_that_another_process_removes_meanwhile_is_used(folder, monkeypatch):
+    cached()
+    check = cache._operator_of
+
+    def removed_meanwhile(arrays):
+        next(folder.iterdir()).unlink()
+        return check(arrays)
+
+    monkeypatch.setattr(cache, "_operator_of", removed_meanwhile)
+    assert not cached()[1]
+
+
+def test_an_operator_on_a_disk_that_nobody_writes_to_is_used(folder, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    cached()
+    monkeypatch.setattr(cache.os, "utime", refuse)
+    assert not cached()[1]
 
 
 def test_operator_larger_than_the_limit_is_not_kept(folder):

@@ -285,6 +285,15 @@ def test_check_lists_defects(tmp_path):
     assert any("small hole" in phrase for phrase in health.repairs)
 
 
+def test_what_has_no_area_is_not_said_to_be_closed(tmp_path):
+    line = trimesh.Trimesh([[0, 0, 0], [60, 0, 0]], [[0, 0, 1]] * 4, process=False)
+    path = tmp_path / "line.stl"
+    line.export(path)
+    health = check_mesh(path)
+    assert not health.closed_after_repair
+    assert "4 degenerate faces removed" in health.repairs
+
+
 def test_several_bodies_are_named_refused_and_taken_apart(tmp_path, capsys):
     insert, tray = two_dishes(), sphere(0.015, 3, (0.0, -0.03, 0.0))
     void = sphere(0.002, 1, (0.0, 0.003, 0.0))

@@ -181,6 +181,8 @@ def test_how_the_knee_yields_settles_where_it_hangs_on_itself(steepness):
         found = np.full(6, 3.0) if held is None else 1.0 + steepness * (held - 1.0)
         held = mixing.yielding(found)
     np.testing.assert_allclose(held, 1.0, atol=0.25)
+    assert mixing.doubt == pytest.approx(np.abs(found - held).max() / np.abs(held).max())
+    assert mixing.yielding(None) is None
     assert mixing.doubt == 0.0
 
 

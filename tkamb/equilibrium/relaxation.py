@@ -11,8 +11,8 @@ d and d' the last two f' - f: Aitken's secant for a vector. At the end f' itself
 How the knee yields to the muscles decides their arms, and hangs itself on where the knee rests. It
 is taken as found in the first passes; then it goes only half of the way to what is found, so that
 it comes to rest where the contact's stiffness changes fast with the pose. Where even that goes on
-and on (a condyle about to lift, whose pose jumps), it is kept at last, and `doubt` says what of it
-is left open.
+and on (a condyle about to lift, whose pose jumps), it is kept at last. `doubt` says what of it is
+left open.
 
 References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.1620010306;
 Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
@@ -47,8 +47,8 @@ class Relaxation:
 
     Attributes:
         settled: what was asked for last agrees with what was held, and is held now.
-        doubt: share of how the knee yields that was still to change when it was kept; 0: it is
-            as found.
+        doubt: share by which the knee yields otherwise, as last found, than it is taken to; 0:
+            it is as found.
     """
 
     def __init__(self) -> None:
@@ -64,16 +64,16 @@ class Relaxation:
         Args:
             found: how it does where it rests, see `ReleasedForces.tension_per_wrench`.
         """
-        self._passes += 1
-        last = self._yields
+        self._passes, self.doubt = self._passes + 1, 0.0
+        last, self._yields = self._yields, found
         if last is None or found is None or self._passes <= FRESH:
-            self._yields = found
-        elif self._passes <= MIXED:
-            self._yields = last + HALF * (found - last)
-        else:
-            away = (found - last) * TURNS
-            self.doubt = float(np.linalg.norm(away) / np.linalg.norm(last * TURNS))
-        return self._yields
+            return found
+        taken = last + HALF * (found - last) if self._passes <= MIXED else last
+        away, size = (float(np.linalg.norm(part * TURNS)) for part in (found - taken, taken))
+        if away > 0.0:
+            self.doubt = away / size if size > 0.0 else np.inf
+        self._yields = taken
+        return taken
 
     def mixed(self, asked: "MuscleShare") -> "MuscleShare":
         """Return the forces to hold next.

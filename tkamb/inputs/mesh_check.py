@@ -190,7 +190,8 @@ def check_mesh(path: str | Path) -> MeshHealth:
         components=int(connected_parts(corners).max()) + 1,
         bodies=_bodies(mended, scale),
         watertight=watertight,
-        closed_after_repair=not (mended.holes or len(mended.forks) or mended.one_sided),
+        closed_after_repair=len(mended.faces) > 0
+        and not (mended.holes or len(mended.forks) or mended.one_sided),
         repairs=mended.notices,
         holes=tuple(_hole(loop, 1.0) for loop in boundary_loops(merged, corners)),
         remaining_holes=tuple(_hole(loop, scale) for loop in mended.holes),

@@ -1,7 +1,8 @@
 """A frame's contact as arrays, and back: what a resumed run starts its next frame from.
 
-It stands in for the frame before as a guess, as good as the frame itself but for its warm
-start, which is not kept: answers stay within the solver's tolerance.
+It stands in for the frame before as a guess, as good as the frame itself but for what is not
+kept: the warm start, the contact and muscle forces that a released knee begins from, and the
+turned contact. Answers stay within the solver's tolerance.
 """
 
 from collections.abc import Mapping

@@ -27,6 +27,7 @@ import tempfile
 import time as clock
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -224,7 +225,9 @@ def read_operator(path: Path, key: str, limit: float = SIZE_LIMIT) -> ElasticOpe
             operator = _operator_of(arrays)
         except (OSError, ValueError, KeyError, TypeError, IndexError, MemoryError) as error:
             raise DamagedOperator(f"is damaged ({error})") from None
-    os.utime(path)
+        # Says when it was last used. Another process may have removed it, or nobody may say so.
+        with suppress(OSError):
+            os.utime(file.fileno())
     return operator
 
 
