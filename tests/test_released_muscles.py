@@ -16,7 +16,7 @@ from tkamb.body.load import total_wrench
 from tkamb.contact.foundation import ElasticFoundation
 from tkamb.equilibrium.contact_side import ContactSide
 from tkamb.equilibrium.mechanics import Mechanics
-from tkamb.equilibrium.relaxation import MIXED, Relaxation
+from tkamb.equilibrium.relaxation import Relaxation
 from tkamb.equilibrium.released_forces import SCALE, ReleasedForces
 from tkamb.equilibrium.shared_muscles import SharedMuscles
 from tkamb.geometry.frames import MIRROR
@@ -198,22 +198,13 @@ def test_how_the_knee_yields_is_kept_at_last_and_what_is_open_told():
 @needs_jw
 @pytest.mark.parametrize(("contact", "cell"), [("foundation", 1.5), ("lattice", 2.0)])
 def test_frames_of_gait_run_alone_come_out_as_in_the_whole(contact, cell):
-    """og3's frames 46 to 52 as calibrated, and from 40 on: where the search began is forgotten.
-
-    Where how the knee yields was kept at last, up to 2 % of that may be open, and of the force
-    a part.
-    """
+    """og3's frames 46 to 52 as calibrated, and from 40 on: where the search began is forgotten."""
     changes = {"contact.model": contact, "contact.resolution_mm": cell}
     scene = load_scene(OG3.with_name("ngait_og3_measured.toml"), changes)
     alone, longer = (simulate(scene, frames=slice(start, 53)) for start in (46, 40))
     force, expected = (run.columns["force_total_N"] for run in (alone, longer))
     assert np.isfinite(force).all()
-    passes = [run.columns["coupling_iterations"] for run in (alone, longer)]
-    settled = np.maximum(passes[0], passes[1][6:]) <= MIXED
-    assert settled.sum() > 2
-    away = np.abs(force / expected[6:] - 1)
-    assert away[settled].max() < 5e-4
-    assert away.max() < 5e-3
+    np.testing.assert_allclose(force, expected[6:], rtol=5e-4)
 
 
 @pytest.mark.slow

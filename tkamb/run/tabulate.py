@@ -61,7 +61,8 @@ def frame_row(
         slips: side -> slip over the frames up to k and one more, see `Mechanics.slips`.
         status: text.
     """
-    row = _motion_row(case, k) | _body_row(case, body)
+    motion = _motion_row(case, k)
+    row = motion | _body_row(case, body)
     for side, slip in slips.items():
         row |= _slip_row(case, k, side, slip, body.geometry.condyles.get(side))
     if contact is not None:
@@ -71,7 +72,7 @@ def frame_row(
         row["split_determined"] = split_determined(body, contact)
     row |= {"body_seconds": body.seconds, "query_seconds": body.query_seconds}
     if status.startswith(FAILED):
-        kept = {*_motion_row(case, k), *WHY_IT_FAILED}
+        kept = {*motion, *WHY_IT_FAILED}
         row = {name: value if name in kept else NAN for name, value in row.items()}
     return {name: float(value) for name, value in row.items()} | {"status": status}
 
