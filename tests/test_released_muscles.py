@@ -188,7 +188,7 @@ def test_how_the_knee_yields_settles_where_it_hangs_on_itself(steepness):
 
 def test_how_the_knee_yields_is_kept_at_last_and_what_is_open_told():
     mixing, held = Relaxation(), None
-    for k in range(14):
+    for k in range(20):
         held = mixing.yielding(np.full(6, 1.0 if k % 2 else 2.0))
     assert mixing.doubt > 0.1
     np.testing.assert_array_equal(held, mixing.yielding(np.full(6, 9.0)))

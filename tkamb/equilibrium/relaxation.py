@@ -9,10 +9,10 @@ circle. So the forces go only a part omega of the way from those held, f, to tho
 d and d' the last two f' - f: Aitken's secant for a vector. At the end f' itself is held.
 
 How the knee yields to the muscles decides their arms, and hangs itself on where the knee rests. It
-is taken as found in the first passes; then it goes only half of the way to what is found, so that
-it comes to rest where the contact's stiffness changes fast with the pose. Where even that goes on
-and on (a condyle about to lift, whose pose jumps), it is kept at last. `doubt` says what of it is
-left open.
+is taken as found in the first passes; then it goes only half of the way to what is found, and a
+quarter, so that it comes to rest where the contact's stiffness changes fast with the pose. Where
+even that goes on and on (a condyle about to lift, whose pose jumps), it is kept at last. `doubt`
+says what of it is left open.
 
 References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.1620010306;
 Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
@@ -35,9 +35,8 @@ LEAST, MOST = 0.05, 1.0
 """The limits of omega."""
 
 
-FRESH, MIXED = 4, 10
-"""So many passes take how the knee yields as found, and half-way until that many are made."""
-HALF = 0.5
+STEPS = ((4, 1.0), (8, 0.5), (16, 0.25))
+"""Until so many passes are made, how the knee yields goes that part of the way to what is found."""
 TURNS = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
 """Makes answers to forces and to moments comparable."""
 
@@ -66,9 +65,10 @@ class Relaxation:
         """
         self._passes, self.doubt = self._passes + 1, 0.0
         last, self._yields = self._yields, found
-        if last is None or found is None or self._passes <= FRESH:
+        step = next((part for until, part in STEPS if self._passes <= until), 0.0)
+        if last is None or found is None or step == 1.0:
             return found
-        taken = last + HALF * (found - last) if self._passes <= MIXED else last
+        taken = last + step * (found - last)
         away, size = (float(np.linalg.norm(part * TURNS)) for part in (found - taken, taken))
         if away > 0.0:
             self.doubt = away / size if size > 0.0 else np.inf
