@@ -65,6 +65,17 @@ def test_a_foreseen_turned_press_tells_the_same_to_a_hundredth(tmp_path):
     assert before[-1].turned.iterations < split_sensitivity(probe, results[-1])[1].iterations
 
 
+def test_a_frame_far_away_foretells_no_turned_press(tmp_path):
+    """Where --frames leaves frames out, the column is that of a press of its own."""
+    scene = write_scene(tmp_path, contact__model="lattice", contact__resolution_mm=2.0)
+    case = load_case(load_scene(scene))
+    side = ContactSide(case, Mechanics(case))
+    before = [side.frame(50)[1]]
+    contact = side.frame(56, before)[1]
+    alone, _ = split_sensitivity(side.model.probe(side.state), contact.result)
+    assert contact.sensitivity == alone
+
+
 @pytest.mark.parametrize("name", ["foundation-linear", "lattice-linear"])
 def test_two_spheres_share_by_their_stiffness(name):
     """A layer carries F = c d^2 under a sphere: dF/dd = 2F/d, half the width apart per radian.

@@ -15,14 +15,19 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tkamb.contact.lattice.problem import ContactProblem, LatticeState
 from tkamb.contact.probe import Probe, ProbedContact, condyle_wrenches
 from tkamb.contact.result import ContactResult, medial_points
 from tkamb.geometry.frames import Array, Index
+from tkamb.units import DEGREE
 
 TURN_STEP = 5e-5
 """m: between the places where femoral normals are compared; well below a cell."""
+FORETOLD = 2.0 * DEGREE
+"""Farthest turn between two poses of which one's step of pose foretells the other's: beyond it what
+the foretold step leaves open (1 %) grows to some per cent of what the step changes."""
 
 
 class Sketches(Protocol):
@@ -79,7 +84,7 @@ class LatticeProbe(Probe):
     ) -> ContactResult:
         """Return the forces under a load; see `Probe`."""
         here, *step = (result.warm_start for result in (guess, *(like or ())))
-        if here is None or None in step or not step:
+        if here is None or None in step or not like or _turn(like[0].pose, pose) > FORETOLD:
             return self._sketches.press(self._state, load, pose, guess, sketch=True)
         guess = replace(guess, warm_start=here.going_as(*step, pose))
         return self._rough.press(self._state, load, pose, guess, sketch=True)
@@ -101,6 +106,11 @@ class LatticeProbe(Probe):
                 stiffness = np.vstack([part.sum(axis=0), moment.sum(axis=0)])
                 condyles[side] = replace(condyles[side], stiffness=stiffness)
         return ProbedContact(condyles, tangent=True, exact=exact, accuracy=self._accuracy)
+
+
+def _turn(first: Array, second: Array) -> float:
+    """Return the angle (rad) between the rotations of two poses."""
+    return float(Rotation.from_matrix(first[:3, :3].T @ second[:3, :3]).magnitude())
 
 
 def force_changes(state: LatticeState, result: ContactResult, nodes: Index) -> Array:
