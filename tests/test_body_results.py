@@ -13,6 +13,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import knee_pose
 from tkamb.output.tables import strain_table
+from tkamb.run.tabulate import WHY_IT_FAILED
 from tkamb.scene.case import load_case
 
 FEW = {"motion.frames": 26}
@@ -148,3 +149,22 @@ def test_a_long_motion_keeps_no_state_of_every_frame(monkeypatch):
     assert mechanics.ligaments
     assert len(seen) >= 26
     assert sum(one() is not None for one in seen) <= 1
+
+
+def test_a_contact_out_of_range_leaves_no_load_of_the_body(tmp_path):
+    """At a recorded pose: the body has its forces, but the insert cannot carry them."""
+    path = write_scene(tmp_path)
+    file = path.parent / "ground_reaction.csv"
+    header = file.read_text(encoding="utf-8").split("\n", 1)[0]
+    rows = np.loadtxt(file, delimiter=",", skiprows=1)
+    forces = [header.split(",").index(f"force_{axis}_N") for axis in "xyz"]
+    rows[60:, forces] *= 30.0
+    np.savetxt(file, rows, "%.9g", ",", header=header, comments="")
+    results = simulate(path, frames=slice(40, 71, 30))
+    carried, crushed = results.columns["status"]
+    assert not carried.startswith("failed")
+    assert crushed.startswith("failed: contact out of range")
+    motion = {"time_s", "flexion_deg", "adduction_deg", "axial_rotation_deg"}
+    told = {name for name, v in results.columns.items() if name != "status" and np.isfinite(v[1])}
+    assert motion <= told <= {*motion, *WHY_IT_FAILED}
+    assert np.isfinite(results["force_total_N"][0])
