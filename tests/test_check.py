@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from tkamb.check.command import check_html
 from tkamb.check.leg_picture import leg_frame, shown_frames
-from tkamb.check.page import check_html
 from tkamb.check.scene_check import check_scene
 from tkamb.cli import main
 from tkamb.starter import lay_out
