@@ -39,7 +39,7 @@ class Page:
         self.problems, self.requests = [], []
         self._page = browser.new_page(viewport={"width": 1400, "height": 900})
         self._page.on("request", lambda request: self.requests.append(request.url))
-        self._page.on("requestfailed", lambda request: self.problems.append(request.failure))
+        self._page.on("requestfailed", lambda r: self.problems.append(f"{r.failure} {r.url}"))
         self._page.on("pageerror", lambda error: self.problems.append(str(error)))
         self._page.on("console", self._console)
         self.evaluate, self.close = self._page.evaluate, self._page.close
@@ -56,6 +56,12 @@ class Page:
             "new Promise((done) => { const t = setInterval(() => {"
             f"if ({ready}) {{ clearInterval(t); done(true); }} }}, 20); }})"
         )
+
+    def forgive(self, words):
+        """Wait for a console error that holds these words, and forget it."""
+        while not (awaited := [one for one in self.problems if words in one]):
+            self._page.wait_for_event("console")
+        self.problems.remove(awaited[0])
 
     def saved(self, selector):
         """Click on something and return the bytes of the file that it saves."""

@@ -130,7 +130,7 @@ class Live {
     clearTimeout(this.timer);
     this.choice.value = tkamb.views[0].contact;
     this.frameChanged();
-    await this.ask("cancel", {});
+    await (await this.ask("cancel", {})).text();  // unread, the browser calls it aborted
     document.getElementById("answer").textContent = "cancelled";
   }
 
@@ -139,10 +139,11 @@ class Live {
     this.watch(number, `asking ${model}`);
     const response = await this.ask("contact", {frame, model});
     const packed = response.ok && new Uint8Array(await response.arrayBuffer());
+    const refusal = packed ? "" : await response.text();
     if (number !== this.latest) return;
     this.rest();
     if (!packed) {
-      answer.textContent = await response.text();
+      answer.textContent = refusal;
       return;
     }
     const found = await tkamb.unpack(packed);
