@@ -6,7 +6,7 @@ import numpy as np
 
 from synthetic_run import MASS_KG, WEIGHT_N, make_run
 from tkamb.results import Results
-from tkamb.run.measured import compare_measured
+from tkamb.run.recorded import compare_measured
 
 GROUPS = {
     "knee extensors": ("recfem", "vasint", "vaslat", "vasmed"),

@@ -13,8 +13,8 @@ from tkamb.errors import InputError
 from tkamb.inputs.emg import Envelopes, envelope, load_envelopes
 from tkamb.muscles.emg import EmgGuide
 from tkamb.muscles.sharing import KKT_LIMIT
-from tkamb.run.emg import compare_emg, fitted_normalisation
-from tkamb.scene.emg import EmgTable
+from tkamb.run.recorded import compare_emg, fitted_normalisation
+from tkamb.scene.measured import EmgTable
 from tkamb.scene.si import in_si
 
 RATE = 1200.0

@@ -121,6 +121,15 @@ def test_laboratory_axes_and_left_foot(tmp_path):
         np.testing.assert_allclose(other.moment, right.moment, atol=1e-10)
 
 
+def test_a_force_beyond_any_foot_is_told_by_its_column_and_row(tmp_path):
+    """Also where the laboratory's axes turn it to another direction."""
+    force, point, moment = step(STAMPS)
+    force[1200, 0] = -3e4
+    file = write(tmp_path / "g.csv", force, point, moment)
+    with pytest.raises(InputError, match=r"column 'force_1' runs from -3e\+04 .* row 1201\)"):
+        load_ground_reaction(plate(file, laboratory_axes="-z,+y,+x"), AT, "right")
+
+
 def test_force_on_the_plate_is_the_opposite_of_that_on_the_foot(tmp_path):
     """Newton's third law: three signs of the force and the moment's turn, the point stays."""
     force, point, moment = step(STAMPS)

@@ -12,7 +12,7 @@ from tkamb.output.comparison import comparison_words
 from tkamb.output.headline import cards
 from tkamb.output.panels import panels
 from tkamb.results import Results
-from tkamb.run.measured import compare_measured, measured_column
+from tkamb.run.recorded import compare_measured, measured_column
 from tkamb.scene.measured import MeasuredTable
 from tkamb.scene.si import in_si
 

@@ -21,11 +21,10 @@ from tkamb.scene.uncertainty import CorrelationTable
 from tkamb.uncertainty.bands import influences
 from tkamb.uncertainty.correlation import correlation_root
 from tkamb.uncertainty.inputs import AXES, Draw, VariedInput, varied_inputs
-from tkamb.uncertainty.marker_errors import displaced_by_markers
 from tkamb.uncertainty.run import estimate_uncertainty
 from tkamb.uncertainty.sample import Sampler
 from tkamb.uncertainty.sampling import Point, normal_samples, one_at_a_time
-from tkamb.uncertainty.varied_case import varied_case, varied_muscles
+from tkamb.uncertainty.varied_case import displaced_by_markers, varied_case, varied_muscles
 
 NAMES = ["a", "b", "c"]
 

@@ -15,11 +15,11 @@ from tkamb.output.metrics import JUMP
 from tkamb.output.style import PRESSURE_MAP
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
-from tkamb.view import colours, shapes
+from tkamb.view import colours
 from tkamb.view.draw import draw
 from tkamb.view.run import open_run
 from tkamb.view.shading import MOST_TRIANGLES, decimate, shade
-from tkamb.view.solids import floor_and_foot, solids
+from tkamb.view.solids import box, floor_and_foot, hull, revolved, solids, sphere_points
 from tkamb.view.strands import path_strands
 from viewed import MODELS, shipped_run
 
@@ -165,9 +165,9 @@ def test_stand_ins_are_closed_and_as_large_as_their_shapes():
     cones = np.diff(height) * (radius[1:] ** 2 + radius[1:] * radius[:-1] + radius[:-1] ** 2) / 3
     share = 28 / (2 * np.pi) * np.sin(2 * np.pi / 28)  # a polygon's of its circle
     for made, volume, rel in (
-        (shapes.box(np.array([0.3, 0.1, 0.2]), "box"), 6e-3, 1e-12),
-        (shapes.hull(shapes.sphere_points(), "ball"), 4 / 3 * np.pi, 0.01),
-        (shapes.revolved(radius, height, "shaft"), np.pi * share * cones.sum(), 1e-9),
+        (box(np.array([0.3, 0.1, 0.2]), "box"), 6e-3, 1e-12),
+        (hull(sphere_points(), "ball"), 4 / 3 * np.pi, 0.01),
+        (revolved(radius, height, "shaft"), np.pi * share * cones.sum(), 1e-9),
     ):
         mesh = trimesh.Trimesh(made.vertices, made.faces, process=False)
         assert mesh.is_watertight

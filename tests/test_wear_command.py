@@ -17,10 +17,10 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_coordinates
 from tkamb.wear import run as wear_run
 from tkamb.wear.kept import STATE_NAME
+from tkamb.wear.laws import law_names, wear_law
 from tkamb.wear.materials import material_names, wear_material
 from tkamb.wear.motion import CycleMotion
 from tkamb.wear.profile import read_profile
-from tkamb.wear.registry import law_names, wear_law
 from tkamb.wear.setup import wear_setup
 from wear_bodies import balls_scene
 

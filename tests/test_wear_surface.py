@@ -5,8 +5,7 @@ import pytest
 
 import shapes
 from contact_bodies import dished_insert, flat_insert
-from tkamb.wear.refine import refined
-from tkamb.wear.worn_surface import ArticularSurface, volume
+from tkamb.wear.worn_surface import ArticularSurface, refined, volume
 
 MM = 1e-3
 

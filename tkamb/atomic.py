@@ -6,12 +6,14 @@ kill before the journal leaves the old files, one after it the journal, from whi
 command that opens the folder finishes (`finish_replacement`): the old state or the new one.
 """
 
+import csv
+import io
 import json
 import os
 import re
 import secrets
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -77,6 +79,13 @@ def write_synced(path: Path, text: str) -> None:
         file.write(text)
         file.flush()
         os.fsync(file.fileno())
+
+
+def write_rows(path: Path, rows: Iterable[Iterable[object]]) -> None:
+    """Write rows of cells as CSV and see it to the disk."""
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows(rows)
+    write_synced(path, buffer.getvalue())
 
 
 class Replacement:

@@ -1,4 +1,4 @@
-"""`tkamb check`: arguments in, exit status out."""
+"""`tkamb check`: arguments in; out come lines, a picture or a page, and the exit status."""
 
 import argparse
 import json
@@ -9,9 +9,16 @@ from tkamb.errors import InputError
 from tkamb.scene_options import add_set
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from tkamb.check.scene_check import SceneCheck
 
 PICTURES = (".png", ".html")
+POLICY = (
+    "default-src 'none'; style-src-elem {style}; style-src-attr 'unsafe-inline'; "
+    "img-src data:; base-uri 'none'; form-action 'none'"
+)
+"""Content security of the page, which stands by itself."""
 
 
 def add_check(commands: Any) -> None:
@@ -47,7 +54,6 @@ def _check(options: argparse.Namespace) -> int:
 def _write_picture(found: "SceneCheck", path: Path) -> None:
     from tkamb.atomic import replaced_file, write_text
     from tkamb.check.leg_picture import draw_leg
-    from tkamb.check.page import check_html
 
     figure = draw_leg(found.mechanics)
     if path.suffix.lower() == ".html":
@@ -55,3 +61,20 @@ def _write_picture(found: "SceneCheck", path: Path) -> None:
         return
     with replaced_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=130)
+
+
+def check_html(found: "SceneCheck", figure: "Figure") -> str:
+    """Return the page: questions first, then the picture, then what each file gave."""
+    from tkamb.output.pages import asset, policy_sources, render
+    from tkamb.output.style import svg_text
+
+    style = asset("tkamb.output", "report.css")
+    return render(
+        "tkamb.check",
+        "check.html",
+        policy=POLICY.format(style=policy_sources(style)),
+        style=style,
+        title=f"Check of {found.scene.resolve().parent.name}/{found.scene.name}",
+        found=found,
+        picture=svg_text(figure, "leg"),
+    )

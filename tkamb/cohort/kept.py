@@ -1,7 +1,5 @@
 """What a cohort writes: one table, its runs, its groups, its provenance and its report."""
 
-import csv
-import io
 import json
 import sys
 from collections.abc import Mapping, Sequence
@@ -11,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tkamb.atomic import replaced_together, write_synced
+from tkamb.atomic import replaced_together, write_rows, write_synced
 from tkamb.cohort.outcome import Outcome
 from tkamb.cohort.plan import GROUP_AXES, Cohort, CohortRun
 from tkamb.cohort.report import cohort_html
@@ -45,8 +43,8 @@ def write_cohort(
         table = frame_table(cohort, outcomes, identity)
         with open(files.path(TABLE_NAME), "wb") as file:
             pq.write_table(table, file, compression="zstd")
-        write_synced(files.path(RUNS_NAME), _csv(runs))
-        write_synced(files.path(GROUPS_NAME), _csv(group_rows(groups, cohort.group_by)))
+        write_rows(files.path(RUNS_NAME), runs)
+        write_rows(files.path(GROUPS_NAME), group_rows(groups, cohort.group_by))
         write_synced(files.path(REPORT_NAME), cohort_html(cohort, outcomes, groups))
         names = (TABLE_NAME, RUNS_NAME, GROUPS_NAME, REPORT_NAME)
         summary = {
@@ -137,9 +135,3 @@ def run_rows(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> list[list[str]]
             ]
         )
     return rows
-
-
-def _csv(rows: Sequence[Sequence[str]]) -> str:
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows(rows)
-    return buffer.getvalue()

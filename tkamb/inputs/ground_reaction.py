@@ -30,10 +30,9 @@ DIRECTIONS = ("forward", "upward", "rightward")
 """The laboratory's axes, for the reader: a file's own may be others."""
 LEVEL_TOLERANCE = 0.01
 """m; a centre of pressure that rises by more than this is not on a level plate."""
-LARGEST_FORCE = 20000.0
-"""N, twice what a triple jumper's foot bears."""
-LARGEST_MOMENT = 1000.0
-"""N·m, many times any free moment; plates that give it about their own origin stay below it."""
+LARGEST = {"force": (20000.0, "N"), "moment": (1000.0, "N·m")}
+"""Twice what a triple jumper's foot bears; many times any free moment, and plates that give it
+about their own origin stay below it."""
 ODD_FORCE, LEAST_ODD_FORCE, ODD_POINT = 0.05, 0.01, 5e-3
 """Of a component's own peak, of the whole force's, and m: as near to its neighbours' curve as the
 larger of the forces, or as the last, no sample is odd."""
@@ -177,21 +176,19 @@ def _read_columns(source: ForceRecording, recorded: Table) -> tuple[Array, Array
             columns.append(recorded.column(column))  # undefined while unloaded
         elif role.startswith("force") or given:
             columns.append(recorded.complete_column(column))
+            _check_size(recorded.path, role[:-2], column, columns[-1])
         else:
             columns.append(np.zeros_like(columns[0]))
     values = np.stack(columns, axis=1).reshape(-1, 3, 3) @ rotation.T
     scale = recorded.unit_scale(source.length_unit, "length_unit")
-    force, point = source.sign * values[:, 0], values[:, 1] * scale
-    moment = source.sign * values[:, 2]
-    for kind, found, largest, unit in (
-        ("force", force, LARGEST_FORCE, "N"),
-        ("moment", moment, LARGEST_MOMENT, "N·m"),
-    ):
-        for axis in range(3):
-            what, limits = f"foot: {kind}_{axis + 1}", (-largest, largest)
-            question = f"is a cell mistyped, or the {kind} not in {unit}?"
-            check_range(recorded.path, what, found[:, axis], limits, unit, question)
-    return force, point, moment
+    return source.sign * values[:, 0], values[:, 1] * scale, source.sign * values[:, 2]
+
+
+def _check_size(path: Path, kind: str, column: str, values: Array) -> None:
+    """Raise an InputError where a column (n,) of a kind holds more than a foot exerts."""
+    largest, unit = LARGEST[kind]
+    question = f"is a cell mistyped, or the {kind} not in {unit}?"
+    check_range(path, f"foot: column '{column}'", values, (-largest, largest), unit, question)
 
 
 def _read_plates(source: ForceRecording) -> tuple[Array, Array, Array, Array, bool]:

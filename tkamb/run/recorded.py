@@ -1,15 +1,35 @@
-"""What was recorded beside a run and enters none of its equations: measured force, EMG.
+"""What was recorded beside a run held against what it predicts: measured force, EMG.
 
 Nothing of this is imported unless the scene has [measured] or [muscles.emg].
 """
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 
-from tkamb.columns import ENVELOPE, family_column
-from tkamb.run.emg import compare_emg, fitted_normalisation
-from tkamb.run.measured import compare_measured, measured_column
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.columns import ACTIVATION, ENVELOPE, family_column
+from tkamb.geometry.frames import Array
+from tkamb.run.status import FAILED
 from tkamb.scene.case import Case
+
+if TYPE_CHECKING:
+    from tkamb.inputs.emg import Envelopes
+
+
+PREDICTED = {
+    "total": ("force_si_N",),
+    "medial": ("medial_force_N", "medial_force_equilibrium_N"),
+    "lateral": ("lateral_force_N", "lateral_force_equilibrium_N"),
+}
+"""What is measured -> the columns that predict it, the first that holds a number."""
+LAGS = np.arange(-40, 41) * 0.005
+"""s: where the largest cross-correlation is sought, 0.2 s to either side."""
+FLAT = 1e-6
+"""By how much the largest correlation exceeds those at the ends, where it is a maximum."""
+FEWEST_FRAMES = 8
+"""Frames below which nothing is said of correlation and lag."""
 
 
 def recorded_row(case: Case, k: int) -> dict[str, float]:
@@ -40,3 +60,153 @@ def compare_recorded(case: Case, columns: Mapping[str, Any]) -> dict[str, Any]:
         if table.use == "report":
             found["emg"]["fitted_normalised_by"] = fitted_normalisation(case.emg, columns)
     return found
+
+
+def measured_column(name: str) -> str:
+    """Return the column of results.csv that holds what was measured of a force."""
+    return f"measured_{name}_N"
+
+
+def compare_measured(
+    columns: Mapping[str, Any], names: Iterable[str], body_weight: float
+) -> dict[str, dict[str, Any]]:
+    """Return how far a run is from what was measured, of each force that was.
+
+    Over the n frames that have both, with predicted p and measured m,
+
+        RMSE = sqrt(mean((p - m)²)),  bias = mean(p - m),  R² = 1 - Σ(p - m)²/Σ(m - mean(m))²,
+
+    Pearson's r and the peaks. Every frame is counted: compared, failed, without measurement or
+    (not failed, but NaN) without prediction.
+
+    Args:
+        columns: of results.csv, `measured_<name>_N` among them.
+        names: of the forces that were measured: total, medial, lateral.
+        body_weight: N.
+    """
+    failed = np.array([status.startswith(FAILED) for status in columns["status"]], bool)
+    missing = np.full(len(failed), np.nan)
+    found = {}
+    for name in names:
+        predicted = {column: columns.get(column, missing) for column in PREDICTED[name]}
+        known = [column for column, values in predicted.items() if np.isfinite(values).any()]
+        column = next(iter(known or predicted))
+        measured = columns[measured_column(name)]
+        counted = _frame_counts(predicted[column], measured, failed)
+        error = _force_errors(columns["time_s"], predicted[column], measured, body_weight)
+        found[name] = {"predicted": column} | counted | error
+    return found
+
+
+def _frame_counts(predicted: Array, measured: Array, failed: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return how many frames are compared, why others are not, and what was measured there."""
+    both = np.isfinite(predicted) & np.isfinite(measured)
+    without = np.isnan(measured) & ~failed
+    left_out = measured[np.isfinite(measured) & ~both]
+    return {
+        "frames_compared": int(both.sum()),
+        "frames_failed": int((failed & ~both).sum()),
+        "frames_without_measurement": int(without.sum()),
+        "frames_without_prediction": int((~both & ~failed & ~without).sum()),
+        "measured_where_not_compared_N": [left_out.min(), left_out.max()] if len(left_out) else [],
+    }
+
+
+def _force_errors(
+    time: Array, predicted: Array, measured: Array, body_weight: float
+) -> dict[str, float]:
+    """Return the errors over the frames that have both; NaN where they say nothing."""
+    both = np.isfinite(predicted) & np.isfinite(measured)
+    if not both.any():
+        return {}
+    p, m, t = predicted[both], measured[both], time[both]
+    error = p - m
+    rmse, bias = float(np.sqrt((error**2).mean())), float(error.mean())
+    spread = m - m.mean()
+    varied = len(m) > 2 and np.ptp(m) > 0 and np.ptp(p) > 0
+    return {
+        "rmse_N": rmse,
+        "rmse_BW": rmse / body_weight,
+        "bias_N": bias,
+        "bias_BW": bias / body_weight,
+        "r_squared": 1.0 - float(error @ error / (spread @ spread)) if varied else np.nan,
+        "pearson_r": float(np.corrcoef(m, p)[0, 1]) if varied else np.nan,
+        "peak_predicted_N": float(p.max()),
+        "peak_predicted_time_s": float(t[p.argmax()]),
+        "peak_measured_N": float(m.max()),
+        "peak_measured_time_s": float(t[m.argmax()]),
+    }
+
+
+def compare_emg(envelopes: "Envelopes", columns: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return how each muscle's activation a and envelope e agree over the computed frames.
+
+    Pearson's r and RMSE of a(t) and e(t), and the lag L of the largest r of a(t) and e(t - L):
+    positive where the activation comes after the envelope. The lag is that of frames whose
+    envelope is known 0.2 s to either side; none is given where the largest r lies at an end.
+
+    Args:
+        envelopes: of the muscles.
+        columns: of results.csv.
+    """
+    time = np.asarray(columns["time_s"])
+    found = {}
+    for muscle, channel in envelopes.channel_of.items():
+        activation = np.asarray(
+            columns.get(family_column(ACTIVATION, muscle), np.full_like(time, np.nan))
+        )
+        own = envelopes.at(muscle, time)
+        both = np.isfinite(activation) & np.isfinite(own)
+        error = activation[both] - own[both]
+        found[muscle] = {
+            "channel": channel,
+            "frames_compared": int(both.sum()),
+            "frames_left_out": int((~both).sum()),
+            "pearson_r": _pearson(activation[both], own[both]),
+            "rmse": float(np.sqrt((error**2).mean())) if both.any() else np.nan,
+            "lag_s": _lag(envelopes, muscle, time[both], activation[both]),
+        }
+    return found
+
+
+def fitted_normalisation(
+    envelopes: "Envelopes", columns: Mapping[str, Any]
+) -> dict[str, float | None]:
+    """Return each channel's normalising value with which its envelope e fits the activations a.
+
+    That is v / s, v the value that e is over, and s the scale of least Σ (a - s e)² over the
+    computed frames and the muscles of the channel, Σ a e / Σ e². Without a maximal contraction
+    no better one is known: it takes the course from the EMG, and how strong from the sharing.
+    None where s is not above zero.
+
+    Args:
+        envelopes: of the muscles.
+        columns: of results.csv of a run that the EMG did not guide.
+    """
+    time, found = np.asarray(columns["time_s"]), {}
+    for channel, value in envelopes.normalised_by.items():
+        own = [name for name, one in envelopes.channel_of.items() if one == channel]
+        lost = np.full_like(time, np.nan)
+        a = np.array([columns.get(family_column(ACTIVATION, name), lost) for name in own])
+        e = np.array([envelopes.at(name, time) for name in own])
+        both = np.isfinite(a) & np.isfinite(e)
+        along = float(a[both] @ e[both])
+        found[channel] = value * float(e[both] @ e[both]) / along if along > 0.0 else None
+    return found
+
+
+def _pearson(a: Array, b: Array) -> float:
+    """Return Pearson's r; NaN where one of them does not vary or there are few values."""
+    if len(a) < FEWEST_FRAMES or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
+        return np.nan
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def _lag(envelopes: "Envelopes", muscle: str, time: Array, activation: Array) -> float:
+    """Return the lag (s) of the largest correlation; NaN where it has no maximum inside."""
+    shifted = np.array([envelopes.at(muscle, time - lag) for lag in LAGS])
+    known = np.isfinite(shifted).all(axis=0)
+    r = np.array([_pearson(activation[known], row[known]) for row in shifted])
+    if not r.max() > max(r[0], r[-1]) + FLAT:  # NaN too
+        return np.nan
+    return float(LAGS[r.argmax()])

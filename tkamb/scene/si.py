@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from tkamb.inputs import recordings
-from tkamb.scene import emg, measured, recording_tables, tables
+from tkamb.scene import measured, recording_tables, tables
 from tkamb.scene.table import SceneTable
 from tkamb.units import DEGREE, MILLIMETRE
 
@@ -23,7 +23,7 @@ CLASSES: dict[type[SceneTable], type] = {
     recording_tables.JointCentreTable: recordings.JointCentre,
     recording_tables.GroundReactionTable: recordings.ForceRecording,
     measured.MeasuredTable: recordings.ForceMeasurement,
-    emg.EmgTable: recordings.EmgRecording,
+    measured.EmgTable: recordings.EmgRecording,
 }
 
 NAMES = {"neutral_mm": "neutral_translation", "neutral_deg": "neutral_rotation"}

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from tkamb.activities import Activity
 from tkamb.defaults import CONTACT_MODEL
-from tkamb.scene.emg import EmgTable
+from tkamb.scene.measured import EmgTable
 from tkamb.scene.table import (
     Axes,
     KneeFreedom,

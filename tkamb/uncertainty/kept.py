@@ -1,7 +1,5 @@
 """What an uncertainty run writes beside its nominal results, all of it or none."""
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
+from tkamb.atomic import write_rows
 from tkamb.results_folder import (
     BANDS_NAME,
     INDICES_NAME,
@@ -41,21 +40,21 @@ def write_uncertainty(found: "Uncertainty", folder: Path) -> None:
                 file.create_dataset(name, data=content, compression="gzip")
 
     more = {
-        BANDS_NAME: lambda path: path.write_text(_table_text(found.bands), encoding="utf-8"),
-        TORNADO_NAME: lambda path: path.write_text(_tornado_text(found), "utf-8"),
+        BANDS_NAME: lambda path: write_rows(path, _band_rows(found.bands)),
+        TORNADO_NAME: lambda path: write_rows(path, _tornado_rows(found)),
         SAMPLES_NAME: write_samples,
     }
     if found.indices:
-        more[INDICES_NAME] = lambda path: path.write_text(_indices_text(found.indices), "utf-8")
+        more[INDICES_NAME] = lambda path: write_rows(path, _index_rows(found.indices))
     write_results(found.results, folder, more=more)
 
 
-def _table_text(columns: Mapping[str, Any]) -> str:
+def _band_rows(columns: Mapping[str, Any]) -> list[Sequence[str]]:
     rows = zip(*(map(_cell, values) for values in columns.values()), strict=True)
-    return _csv([list(columns), *rows])
+    return [list(columns), *rows]
 
 
-def _tornado_text(found: "Uncertainty") -> str:
+def _tornado_rows(found: "Uncertainty") -> list[Sequence[str]]:
     known = {one.name: one for one in found.inputs}
     rows: list[Sequence[str]] = [
         ("result", "input", "standard_deviation", "unit", "variance_share", "change_per_sd")
@@ -64,22 +63,16 @@ def _tornado_text(found: "Uncertainty") -> str:
         given = known.get(one.name)
         deviation, unit = (_cell(given.deviation), given.unit) if given else ("", "")
         rows.append((one.result, one.name, deviation, unit, _cell(one.share), _cell(one.change)))
-    return _csv(rows)
+    return rows
 
 
-def _indices_text(indices: "Sequence[SobolIndex]") -> str:
+def _index_rows(indices: "Sequence[SobolIndex]") -> list[Sequence[str]]:
     head = ("result", "input", "first_order", "first_order_se", "total", "total_se", "rows")
     rows: list[Sequence[str]] = [head]
     for one in indices:
         numbers = (one.first, one.first_error, one.total, one.total_error)
         rows.append((one.result, one.name, *map(_cell, numbers), str(one.rows)))
-    return _csv(rows)
-
-
-def _csv(rows: Sequence[Sequence[str]]) -> str:
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows(rows)
-    return buffer.getvalue()
+    return rows
 
 
 def _cell(value: float) -> str:

@@ -11,8 +11,7 @@ from typing import Any
 from tkamb.errors import InputError, names_near
 from tkamb.files import read_text
 from tkamb.wear.creep import LogarithmicCreep
-from tkamb.wear.laws import WearLaw
-from tkamb.wear.registry import law_class, wear_law
+from tkamb.wear.laws import WearLaw, law_class, wear_law
 
 DENSITY_RANGE = (500.0, 3000.0)
 """kg/m³ that a bearing polymer may have."""

@@ -1,7 +1,5 @@
 """What a wear simulation writes: table, summary, maps, the worn insert, a picture."""
 
-import csv
-import io
 import json
 import math
 from collections.abc import Sequence
@@ -12,7 +10,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from tkamb.atomic import replaced_together, write_synced
+from tkamb.atomic import replaced_together, write_rows, write_synced
 from tkamb.code_identity import code_identity
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.geometry.surface import Surface
@@ -204,7 +202,7 @@ class WearReport:
 
         surface, maps = self._worn(), self._maps()
         with replaced_together(folder) as files:
-            write_synced(files.path("wear.csv"), _table(self._rows()))
+            write_rows(files.path("wear.csv"), _table(self._rows()))
             write_synced(files.path("wear.json"), json.dumps(self.as_dict(), indent=2) + "\n")
             write_triangles(files.path("wear.vtp"), surface.vertices, surface.faces, maps)
             in_mm = trimesh.Trimesh(surface.vertices / MILLIMETRE, surface.faces, process=False)
@@ -244,14 +242,10 @@ class WearReport:
         return float(weight @ self.last.history.cross_shear) / total if total else math.nan
 
 
-def _table(rows: Sequence[dict[str, float]]) -> str:
-    """Return the rows as CSV; NaN is an empty cell."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(rows[0])
-    for row in rows:
-        writer.writerow(["" if math.isnan(value) else repr(value) for value in row.values()])
-    return buffer.getvalue()
+def _table(rows: Sequence[dict[str, float]]) -> list[list[str]]:
+    """Return names, then the rows as cells; NaN is an empty one."""
+    cells = [["" if math.isnan(value) else repr(value) for value in row.values()] for row in rows]
+    return [list(rows[0]), *cells]
 
 
 def _known(value: float) -> float | None:

@@ -122,7 +122,7 @@ def prepare_wear(
         path: a scene file, or a folder that `tkamb run` wrote.
         cycles: how many.
         updates: how often the insert's geometry follows.
-        law: a name of `tkamb.wear.registry`; None: the material's own.
+        law: a name of `tkamb.wear.laws`; None: the material's own.
         material: a name of `tkamb.wear.materials`, or a material file.
         wear_factor: mm³/(N m), in place of the material's.
         samples: for bands, at least 20; 0: none; None: 32 where the scene has [uncertainty].

@@ -12,11 +12,10 @@ from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 from tkamb.wear.creep import LogarithmicCreep
-from tkamb.wear.engine import CycleMaps
+from tkamb.wear.engine import CycleMaps, carried, interpolation
 from tkamb.wear.laws import WearLaw
 from tkamb.wear.motion import CycleMotion
 from tkamb.wear.sliding import SlidingHistory
-from tkamb.wear.transfer import carried, interpolation
 from tkamb.wear.worn_surface import ArticularSurface, volume
 
 MOST_CYCLES = 10**9
