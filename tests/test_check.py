@@ -7,6 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from tkamb.check.command import check_html
+from tkamb.check.inventory import _listed
 from tkamb.check.leg_picture import leg_frame, shown_frames
 from tkamb.check.scene_check import check_scene
 from tkamb.cli import main
@@ -42,6 +43,21 @@ def test_it_says_what_each_file_gave_and_writes_the_picture_alone(scene, capfd):
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert sorted(scene.parent.iterdir()) == sorted([*before, picture])
     picture.unlink()
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["a1", "a2", "a3", "b"], "a1–3, b"),
+        (["a1", "a2"], "a1, a2"),
+        (["a1", "a3", "a4"], "a1, a3, a4"),
+        (["a", "a1", "a2"], "a, a1, a2"),
+        (["a2", "a1", "a"], "a2, a1, a"),
+        (["a09", "a10", "a11", "a12"], "a09, a10, a11, a12"),
+    ],
+)
+def test_names_that_count_up_are_one_word(names, words):
+    assert _listed(names) == words
 
 
 def test_a_ground_reaction_in_the_wrong_unit_is_asked_about(scene, checked):

@@ -11,6 +11,7 @@ from synthetic_run import make_run
 from tkamb.cli import main
 from tkamb.compare import page
 from tkamb.compare.comparison import compare_folders
+from tkamb.compare.figures import shown_frame
 from tkamb.results import Results
 
 
@@ -86,6 +87,17 @@ def test_other_frames_are_interpolated_to_second_order(folders, tmp_path):
         assert not found.runs[1].pairing.exact
         errors.append(of(found, "quadriceps_N").rms)
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.25)
+
+
+def test_the_maps_shown_are_at_a_frame_that_both_runs_have(folders, tmp_path):
+    """The largest force of those frames, not of frames that one run alone computed."""
+    some = chosen(make_run("bend", frames=21), list(range(0, 17, 4)))
+    kept = keep(replace(some, maps=make_run("bend", frames=21).maps), tmp_path / "part")
+    force = make_run("bend", frames=21)["force_total_BW"]
+    assert shown_frame(compare_folders([folders[0], folders[0]])) == np.argmax(force)
+    found = compare_folders([folders[0], kept])
+    assert np.argmax(force) not in range(0, 17, 4)
+    assert shown_frame(found) == max(range(0, 17, 4), key=lambda k: force[k])
 
 
 def test_a_place_with_two_answers_is_not_compared(folders, tmp_path):

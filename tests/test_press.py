@@ -12,8 +12,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
-from tkamb import press
+from scenes import write_scene
+from tkamb import press, simulate
 from tkamb.cli import main
+from tkamb.contact.registry import contact_class, contact_names
 from tkamb.errors import InputError
 from tkamb.geometry.surface import Surface
 from tkamb.mesh_command import add_mesh, add_press
@@ -200,6 +202,31 @@ def test_single_sphere_is_medial_and_lateral_is_null(tmp_path):
     assert found["lateral"] is None
     assert found["medial"]["force_N"] == pytest.approx(500, rel=1e-6)
     assert found["medial"]["cop_mm"] == pytest.approx([0, 10, 0], abs=0.02)
+
+
+@pytest.mark.parametrize("model", contact_names())
+def test_a_bearing_that_slides_yields_more_or_the_press_says_that_it_does_not(meshes, model):
+    """With its bottom free in its plane a body is compressed more by the same load."""
+    fixed, mobile = (
+        press.press_meshes(*meshes(), 500.0, contact=model, resolution_mm=3.0, bearing=bearing)
+        for bearing in ("fixed", "mobile")
+    )
+    assert not any("bearing" in flag for flag in fixed.as_dict()["flags"])
+    said = any("like a fixed one" in line for line in mobile.lines())
+    if contact_class(model).mobile_bearing:
+        assert not said and mobile.result.approach > 1.01 * fixed.result.approach
+    else:
+        assert said and mobile.result.approach == fixed.result.approach
+
+
+def test_a_run_says_that_its_model_does_not_let_the_bearing_slide(tmp_path):
+    def notes(**changes):
+        scene = write_scene(tmp_path, implant__insert__bearing="mobile", **changes)
+        return simulate(scene, frames=slice(50, 51)).summary["assumptions"]
+
+    assert any("mobile, but foundation presses it" in note for note in notes())
+    lattice = {"contact__model": "lattice-linear", "contact__resolution_mm": 3.0}
+    assert not any("bearing" in note for note in notes(**lattice))
 
 
 def test_zero_load_and_too_great_a_load(meshes):

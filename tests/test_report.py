@@ -3,6 +3,7 @@
 import json
 import re
 import warnings
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -176,6 +177,23 @@ def test_headline_numbers_are_those_of_the_columns(bend, gait):
     assert "6 to be read with care" in shown["Frames computed"].detail
 
 
+def test_the_post_s_force_and_pressure_are_told_beside_the_condyles(bend):
+    """The largest pressure on an insert may be its post's, not a condyle's."""
+    force, pressure = np.zeros(len(bend)), np.full(len(bend), np.nan)
+    axis, title = horizontal_axis(bend), "Peak force on the post"
+
+    def told():
+        columns = bend.columns | {"post_force_N": force, "post_peak_pressure_MPa": pressure}
+        (card,) = (c for c in cards(replace(bend, columns=columns), axis) if c.title == title)
+        return card.value, card.detail
+
+    assert title not in {card.title for card in cards(bend, axis)}
+    assert told() == ("none", "cam and post stay apart")
+    force[80], pressure[80] = 0.5 * metrics.body_weight(bend), 32.9
+    value, detail = told()
+    assert value == "0.50 BW" and f"{force[80]:.0f} N at " in detail and "32.9\u00a0MPa" in detail
+
+
 def test_residuals_of_a_released_pose_are_none_only_where_they_are(bend):
     """What is released needs none; a search that left some must not be said to have left none."""
 
@@ -190,6 +208,17 @@ def test_residuals_of_a_released_pose_are_none_only_where_they_are(bend):
 
     assert shown(0.0) == "none"
     assert shown(1.0).endswith("%")
+
+
+def test_several_questions_are_told_apart(bend):
+    def asked(*questions):
+        summary = bend.summary | {"questions": list(questions)}
+        (card,) = (c for c in cards(replace(bend, summary=summary), axis) if c.title == title)
+        return card.detail
+
+    title, axis = "Questions to answer", horizontal_axis(bend)
+    assert asked("is it?") == "is it?"
+    assert asked("is it", "or not?") == "(1) is it (2) or not?"
 
 
 def test_residuals_are_relative_to_the_superior_inferior_force(bend):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import tkamb
 from scenes import fast_scene, write_scene
 from tkamb import load_scene, simulate
 from tkamb.body.patellofemoral import PatellofemoralContact
@@ -38,6 +39,13 @@ def test_every_frame_has_numbers(bend):
     assert not any(status.startswith("failed") for status in bend.status)
     for name in ("force_total_N", "quadriceps_N", "patellofemoral_N", "medial_area_mm2"):
         assert np.isfinite(bend[name]).all(), name
+
+
+def test_the_maps_say_of_what_they_are(bend):
+    told = bend.maps.attributes
+    assert told["model"] == "foundation" and told["frame"].startswith("insert: x anterior")
+    assert told["version"] == tkamb.__version__ and told["units"].startswith("SI")
+    assert told["scene_sha256"] == bend.summary["scene_sha256"]
 
 
 def test_the_parts_of_the_time_are_parts_of_the_whole(timed_bend):

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -57,6 +58,23 @@ def test_rows_table_and_advice():
         assert any(f" in {key}" in line or f"{key} (L2)" in line for line in advice), key
     assert any("5 % in peak pressure" in line and "lattice at 2 mm" in line for line in advice)
     assert picture(rows).axes
+
+
+def test_numbers_of_a_short_axis_do_not_lie_on_each_other():
+    """Times of 8 to 70 ms, as those of the quick study."""
+    rows = [
+        replace(row, measure=replace(row.measure, warm_seconds=8e-3 * 1.25**k))
+        for k, row in enumerate(made_up_rows()[:10])
+    ]
+    figure = picture(rows)
+    figure.draw_without_rendering()
+    for axis in figure.axes:
+        ticks = [*axis.xaxis.get_major_ticks(), *axis.xaxis.get_minor_ticks()]
+        low, high = axis.get_xlim()
+        labels = [t.label1 for t in ticks if low <= t.get_loc() <= high and t.label1.get_text()]
+        boxes = sorted((label.get_window_extent() for label in labels), key=lambda box: box.x0)
+        assert len(boxes) > 1
+        assert all(a.x1 < b.x0 for a, b in pairwise(boxes))
 
 
 def test_a_limit_that_nothing_keeps_names_the_nearest():

@@ -104,7 +104,9 @@ def test_inputs_that_changed_are_named(finished, tmp_path, capfd):
 def test_other_code_is_a_note(run, capfd, monkeypatch):
     monkeypatch.setattr("tkamb.results_folder.code_identity", lambda: "other")
     status, said = verified(run[1], capfd)
+    code = json.loads((run[1] / "summary.json").read_text())["identity"]["code of tkamb"]
     assert status == 0 and "computed by other code" in said
+    assert f", {code[:12]}; this is " in said and ", other)" in said
 
 
 def test_other_code_is_not_resumed(run, capfd, monkeypatch):

@@ -288,6 +288,12 @@ def test_bad_options_are_one_line_before_anything_is_drawn(
     assert not page.exists()
 
 
+def test_what_was_written_is_said(folder, tmp_path, capsys):
+    page = tmp_path / "knee.html"
+    assert main(["view", str(folder), "--html", str(page)]) == 0
+    assert capsys.readouterr().out == f"page: {page}\n"
+
+
 def test_a_missing_folder_is_one_line(tmp_path, capsys):
     assert main(["view", str(tmp_path)]) == 2
     assert "results.csv" in capsys.readouterr().err

@@ -122,8 +122,18 @@ COLUMNS: tuple[Column, ...] = (
         _GROUND,
     ),
     Column(LIGAMENT, "tension of the ligament bundle <name>", "[[ligament]]"),
-    Column("medial_slip_mm", "slip of the medial condyle since the first frame", _SLIP),
-    Column("lateral_slip_mm", "slip of the lateral condyle since the first frame", _SLIP),
+    Column(
+        "medial_slip_mm",
+        "slip of the medial condyle since the first frame, by arcs, without what axial rotation "
+        "alone would do",
+        _SLIP,
+    ),
+    Column(
+        "lateral_slip_mm",
+        "slip of the lateral condyle since the first frame, by arcs, without what axial rotation "
+        "alone would do",
+        _SLIP,
+    ),
     Column("adjust_translation_mm", "femoral adjustment along insert y", _ADJUST),
     Column("adjust_coronal_deg", "femoral adjustment in the coronal plane", _ADJUST),
     Column("adjust_restored", "1: the adjustment was undone after the contact", _ADJUST, "integer"),

@@ -1,8 +1,9 @@
-"""By how much each contact model is known to err: the trade-off study's largest errors.
+"""By how much each contact model is known to err, and what it leaves out of a bearing.
 
-`known_errors.json` is written by `scripts/make_tradeoff_table` from the same rows as the table
-of docs/studies.md. Errors are relative, against converged references, the largest over the cases on
-which a setting was measured. What was not measured is said to be so, never interpolated.
+The errors are the trade-off study's largest. `known_errors.json` is written by
+`scripts/make_tradeoff_table` from the same rows as the table of docs/studies.md. They are
+relative, against converged references, the largest over the cases on which a setting was
+measured. What was not measured is said to be so, never interpolated.
 """
 
 import json
@@ -71,6 +72,15 @@ def known_error(
     if material != MEASURED_MATERIAL:
         return None
     return known_errors().get((setting_label(model, options or {}), float(resolution_mm)))
+
+
+def left_out(model: str, bearing: str) -> tuple[str, ...]:
+    """Return in words what a contact model leaves out of a bearing, "fixed" or "mobile"."""
+    from tkamb.contact.registry import contact_class  # only where contact is modelled
+
+    if bearing == "fixed" or contact_class(model).mobile_bearing:
+        return ()
+    return (f"The bearing is mobile, but {model} presses it like a fixed one.",)
 
 
 def as_json(error: KnownError | None) -> dict[str, float] | str:

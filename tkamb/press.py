@@ -28,7 +28,7 @@ from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import Array, Index, mirrored_pose
 from tkamb.geometry.frames import pose as pose_matrix
 from tkamb.inputs.meshes import axes_rotation, load_surface, mirrored
-from tkamb.known_errors import KnownError, as_json, known_error, known_error_words
+from tkamb.known_errors import KnownError, as_json, known_error, known_error_words, left_out
 from tkamb.memory import peak_rss
 from tkamb.units import DEGREE, LENGTH, MEGAPASCAL, MILLIMETRE
 
@@ -123,7 +123,7 @@ class PressReport:
                 f"{done.coronal_angle / DEGREE:.3f} deg coronal{restored}"
             )
         lines.append(known_error_words(found["known_error"], _ERRORS_TOLD))
-        lines += [f"note: {flag}" for flag in self.result.flags]
+        lines += [f"note: {flag}" for flag in found["flags"]]
         took = f"prepared in {self.prepare_seconds:.3g} s, solved in {self.solve_seconds:.3g} s"
         return [*lines, f"{took}, {self.result.iterations} iterations"]
 
@@ -148,7 +148,7 @@ class PressReport:
             "iterations": result.iterations,
             "residual": _known(result.residual),
             "status": result.status.value,
-            "flags": list(result.flags),
+            "flags": [*left_out(self.contact, self.pair.bearing), *result.flags],
             "known_error": as_json(self.known_error),
         }
 

@@ -226,7 +226,7 @@ def verify_results(directory: str | Path) -> Verdict:
         raise InputError("was not written by tkamb run", directory / SUMMARY_NAME)
     found = differences(directory, summary)
     if not isinstance(summary.get("files"), Mapping):
-        found.append("carries no SHA-256: written by an earlier tkamb, nothing can be messages")
+        found.append("carries no SHA-256: written by an earlier tkamb, nothing can be checked")
     try:
         read_results(directory, check=False)
     except InputError as error:
@@ -250,8 +250,12 @@ def _notes(summary: Mapping[str, Any]) -> list[str]:
     identity = summary.get("identity")
     identity = identity if isinstance(identity, Mapping) else {}
     notes, made_by = [], identity.get("version of tkamb")
-    if made_by != version("tkamb") or identity.get("code of tkamb") != code_identity():
-        notes.append(f"computed by other code (tkamb {made_by}; this is {version('tkamb')})")
+    code, this = str(identity.get("code of tkamb")), code_identity()
+    if made_by != version("tkamb") or code != this:
+        notes.append(
+            f"computed by other code (tkamb {made_by}, {code[:12]}; "
+            f"this is {version('tkamb')}, {this[:12]})"
+        )
     contact = summary.get("contact")
     if CONTACT_CODE in identity and isinstance(contact, Mapping):
         notes += _plug_in_note(str(contact.get("model")), identity[CONTACT_CODE])

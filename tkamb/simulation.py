@@ -165,6 +165,7 @@ class _Run:
         labels = {
             "frame": "insert: x anterior, y superior, z lateral",
             "model": side.table.model,
+            "version": str(self.identity["version of tkamb"]),
             "scene_sha256": scene_hash(self.case),
         }
         self.recorder.begin_maps(side.state.points, side.state.triangles, labels)

@@ -1,6 +1,8 @@
 """What each file of a scene gave, in a line: frames, durations, ranges, sizes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -149,11 +151,22 @@ def _ligaments(mechanics: Mechanics) -> Entry:
         for flexion, value in zip(STRAIN_FLEXIONS, values, strict=True)
         if value > TORN
     ]
-    text = f"{len(mechanics.ligaments)} bundles: {', '.join(b.name for b in mechanics.ligaments)}"
+    text = f"{len(mechanics.ligaments)} bundles: {_listed([b.name for b in mechanics.ligaments])}"
     known = np.array([v for values in strains.values() for v in values if np.isfinite(v)])
     if len(known):
         text += f"; {_range('strain', 100 * known, '%', 1)} at the recorded pose"
     return Entry("ligaments", None, text + (f"; over 10 %: {', '.join(torn)}" if torn else ""))
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return names by commas; three or more that count up one by one as first–last."""
+    said: list[str] = []
+    for stem, group in groupby(names, lambda name: name.rstrip("0123456789")):
+        own = list(group)
+        first, last = own[0][len(stem) :], own[-1][len(stem) :]
+        counted = [f"{stem}{k}" for k in range(int(first), int(last) + 1)] if first and last else []
+        said += [f"{own[0]}–{last}"] if len(own) > 2 and own == counted else own
+    return ", ".join(said)
 
 
 def _extensor(case: Case) -> Entry:

@@ -10,7 +10,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from tkamb.compare.comparison import Comparison, Run
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 from tkamb.output.metrics import failed, map_rows, medial_share, residual_share, tension_ratio
 from tkamb.output.pressure_maps import draw_map, pressure_bar, top_view
 from tkamb.output.style import CYCLE, new_figure, settings
@@ -111,9 +111,24 @@ def _draw_curve(axes: Axes, number: int, run: Run, values: Array) -> None:
 
 
 def shown_frame(comparison: Comparison) -> int:
-    """Return the frame of the first run with the largest contact force, 0 without any."""
+    """Return the first run's frame of the largest contact force, where most runs have a map.
+
+    0 where no frame has a force.
+    """
     force = comparison.runs[0].results["force_total_BW"]
-    return int(np.nanargmax(force)) if np.isfinite(force).any() else 0
+    known = np.isfinite(force)
+    if not known.any():
+        return 0
+    maps = np.sum([_mapped(run, len(force)) for run in comparison.runs], axis=0)
+    return int(np.nanargmax(np.where(maps == maps[known].max(), force, np.nan)))
+
+
+def _mapped(run: Run, frames: int) -> Index:
+    """Return (f,) 1 for every frame of the first run at which this run has a map, else 0."""
+    if run.pairing is None:
+        return np.zeros(frames, np.int64)
+    rows = map_rows(run.results)
+    return np.array([run.pairing.nearest(frame) in rows for frame in range(frames)], np.int64)
 
 
 def draw_maps(comparison: Comparison, frame: int) -> Figure | None:

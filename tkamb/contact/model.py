@@ -23,12 +23,15 @@ class ContactModel(ABC):
 
     A subclass is a frozen dataclass whose fields are its options; every model takes
     `resolution` (m), the spacing of its map points. `guess` may change the time that an
-    answer takes, never the answer beyond tolerance.
+    answer takes, never the answer beyond tolerance. `mobile_bearing`: whether a mobile
+    bearing's bottom slides; a model that presses it like a fixed one leaves False, and every
+    press and run says so.
     """
 
     name: ClassVar[str]
     assumes: ClassVar[str]
     needs: ClassVar[str]
+    mobile_bearing: ClassVar[bool] = False
 
     resolution: float
 

@@ -66,6 +66,7 @@ def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
         _measured(results),
         _shares(results),
         _peak_pressure(results, axis),
+        _post(results, axis),
         _extensor(results, axis),
         _residuals(results),
         _frames(results),
@@ -85,7 +86,8 @@ def _questions(results: "Results") -> Card | None:
     questions = results.summary.get("questions") or []
     if not questions:
         return None
-    detail = " ".join(map(str, questions))
+    many = len(questions) > 1
+    detail = " ".join(f"({k}) {q}" if many else str(q) for k, q in enumerate(questions, 1))
     return Card("Questions to answer", str(len(questions)), detail, True)
 
 
@@ -207,6 +209,21 @@ def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
         detail += f"; {_model(results)} {known_error_words(error, PRESSURE_AND_AREA)}"
     large = error is not None and is_large(error, PRESSURE_AND_AREA)
     return Card("Peak contact pressure", f"{found.value:.1f} MPa", detail, large)
+
+
+def _post(results: "Results", axis: HorizontalAxis) -> Card | None:
+    """Return the cam's largest force on the post and the pressure there, with [contact] post."""
+    found = metrics.peak(results, "post_force_N") if "post_force_N" in results.columns else None
+    if found is None:
+        return None
+    if found.value <= 0:
+        return Card("Peak force on the post", "none", "cam and post stay apart")
+    pressure = metrics.peak(results, "post_peak_pressure_MPa")
+    detail = f"{found.value:.0f} N {_where(results, axis, found.frame)}"
+    if pressure is not None:
+        detail += f"; up to {pressure.value:.1f}\u00a0MPa there, error not measured"
+    value = f"{found.value / metrics.body_weight(results):.2f} BW"
+    return Card("Peak force on the post", value, detail)
 
 
 def _model(results: "Results") -> str:

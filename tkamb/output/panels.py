@@ -379,7 +379,11 @@ def _motion(results: "Results") -> Panel:
 
 
 def _slip(results: "Results") -> Panel:
-    return Panel("slip", "Slip since the first frame", "mm", _both_sides(results, "slip_mm"))
+    note = (
+        "By arcs, without the part that axial rotation alone would do: condyles of one radius "
+        "slip alike."
+    )
+    return Panel("slip", "Slip since the first frame", "mm", _both_sides(results, "slip_mm"), note)
 
 
 def _adjustment(results: "Results") -> Panel:

@@ -15,10 +15,11 @@ from tkamb.code_identity import code_identity
 from tkamb.columns import JOINT_MOMENT, RESERVE, belongs, family_column, name_in
 from tkamb.equilibrium.mechanics import STRAIN_FLEXIONS
 from tkamb.files import sha256_of
-from tkamb.known_errors import as_json, known_error
+from tkamb.known_errors import as_json, known_error, left_out
 from tkamb.plug_ins import CONTACT_CODE, contact_code
 from tkamb.run.status import FAILED
 from tkamb.scene.case import Case
+from tkamb.scene.scene import Scene
 from tkamb.scene.tables import ContactTable, MusclesTable
 from tkamb.units import DEGREE, MILLIMETRE
 
@@ -243,6 +244,7 @@ def assumptions(case: Case) -> list[str]:
             sentences.append(scene.muscles.emg.sentence)
     if scene.contact:
         sentences.append(_agreement(scene.contact))
+        sentences += _bearing(scene)
     if case.post is not None:
         sentences.append(POST_HELD)
     if scene.patient.side == "left":
@@ -287,6 +289,14 @@ def _agreement(table: ContactTable) -> str:
     if table.coupling == "points":
         return sentence + "the deformed contact's resultants act in the body's equations."
     return sentence + "it does not feed back into the body."
+
+
+def _bearing(scene: Scene) -> tuple[str, ...]:
+    """Return what the contact model leaves out of the insert's bearing."""
+    insert = scene.implant.insert
+    if scene.contact is None or insert is None:
+        return ()
+    return left_out(scene.contact.model, insert.bearing)
 
 
 def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:

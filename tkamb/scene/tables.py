@@ -70,7 +70,11 @@ class InsertImplantTable(SceneTable):
     mesh: Path
     unit: LengthUnit
     axes: Axes = "+x,+y,+z"
-    bearing: Literal["fixed", "mobile"] = "fixed"
+    bearing: Literal["fixed", "mobile"] = Field(
+        "fixed",
+        description="mobile: the bottom slides on the tray without friction, by lattices and fe; "
+        "other contact models press it like a fixed one, and the run says so",
+    )
 
 
 class PatellarImplantTable(SceneTable):

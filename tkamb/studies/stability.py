@@ -258,7 +258,8 @@ def picture(verdicts: Sequence[Verdict]) -> Figure:
             )
         axis.axvline(WRONG, color=GREY, lw=1, ls="--")
         top = len(groups) - 0.3
-        axis.text(WRONG, top, "wrong beyond 2 % ", color=GREY, fontsize=7.5, ha="right")
+        words = "wrong beyond 2 %; closed forms beyond their own bound "
+        axis.text(WRONG, top, words, color=GREY, fontsize=7.5, ha="right")
         axis.text(1.0, top, "no answer", color=GREY, fontsize=7.5, ha="center")
         axis.set(xscale="log", xlim=(1e-9, 3.0), xlabel="largest distance from the reference")
         axis.set_yticks(range(len(groups)), groups, fontsize=7.5)

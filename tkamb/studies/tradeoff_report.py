@@ -6,6 +6,7 @@ from statistics import median
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from tkamb.output.style import CYCLE, GREY, new_figure, settings
 from tkamb.studies.quantities import SIDES
@@ -15,6 +16,8 @@ from tkamb.studies.row import FRONT_ERRORS, KEYS, TIMING_NOISE, Row
 MARKERS = "osD^vPX*<>"
 UNLABELLED_MM = 2.0
 """The cell size at which most points lie."""
+SHORT_AXIS = 30.0
+"""Largest over smallest value up to which a logarithmic axis has numbers within its decades."""
 LIMITS = {
     "approach": (0.05,),
     "force": (0.03,),
@@ -91,6 +94,7 @@ def picture(rows: Sequence[Row]) -> Figure:
             axis.set_title(case, loc="left")
         for axis in axes.ravel()[len(cases) :]:
             axis.set_visible(False)
+        _plain_ticks(axes[0, 0])
         for axis in axes[:, 0]:
             axis.set_ylabel("largest error, %")
         for number, axis in enumerate(axes.ravel()[: len(cases)]):
@@ -139,6 +143,15 @@ def _panel(axis: Axes, rows: Sequence[Row], labels: Sequence[str]) -> None:
     if rows:
         axis.axhline(100 * rows[0].floor, color=GREY, lw=0.8, ls=":", label="reference known to")
     axis.set(xscale="log", yscale="log")
+
+
+def _plain_ticks(axis: Axes) -> None:
+    """Write 1, 2, 5, 10 and so on where a logarithmic axis is short; of all panels that share."""
+    for side, (low, high) in ((axis.xaxis, axis.get_xlim()), (axis.yaxis, axis.get_ylim())):
+        if high < SHORT_AXIS * low:
+            side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            side.set_major_formatter("{x:g}")
+            side.set_minor_formatter(NullFormatter())
 
 
 def _legend(axis: Axes) -> list[tuple[Artist, str]]:

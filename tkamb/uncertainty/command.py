@@ -91,7 +91,8 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     if frames is None:
         step = -(-len(load_case(scene).motion.time) // QUICK_FRAMES)
         frames = slice(None, None, step)
-        said.append(f"frames ::{step}; --frames chooses others")
+        if step > 1:
+            said.append(f"frames ::{step}; --frames chooses others")
     rows = screen(
         scene,
         frames=frames,

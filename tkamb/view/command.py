@@ -69,13 +69,16 @@ def _view(options: argparse.Namespace) -> int:
     )
     if options.html:
         show.write_html(options.html)
+        print(f"page: {options.html}")
     if options.png:
         show.write_png(options.png)
+        print(f"picture: {options.png}")
     films = [path for path in (options.gif, options.mp4) if path]
     for path in films:
         from tkamb.view.film import write_film
 
         write_film(show, path, lambda frames: tqdm(frames, "filming", unit="frame", disable=None))
+        print(f"film: {path}")
     if not (options.html or options.png or films):
         show.open(say, options.port)
     return 0

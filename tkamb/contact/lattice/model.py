@@ -77,6 +77,8 @@ class CellContact(ContactModel):
         cache: keep prepared operators on disk, see `tkamb.contact.lattice.linear.cache`.
     """
 
+    mobile_bearing: ClassVar[bool] = True
+
     resolution: float = 1e-3
     tolerance: float = 1e-3
     pressure_rule: PressureRule = "tributary"
