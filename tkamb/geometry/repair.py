@@ -136,7 +136,7 @@ def _without_duplicates(faces: Index) -> tuple[Index, int]:
         members = np.flatnonzero((group == g) & agrees)
         keep[first[g]] = False
         keep[members[0]] = True
-    return faces[keep], int((count - 1).sum())
+    return faces[keep], int((~keep).sum())
 
 
 def _wound(vertices: Array, faces: Index) -> tuple[Index, int, bool]:
