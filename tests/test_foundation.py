@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
+from tkamb.contact import neighbourhood
 from tkamb.contact.foundation import (
     ElasticFoundation,
     LinearFoundation,
@@ -16,7 +17,7 @@ from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import LOAD_TOLERANCE, press_by_search, search_load
 from tkamb.contact.result import ContactStatus
-from tkamb.contact.samples import sample_surface
+from tkamb.contact.samples import gaps_and_facets, sample_surface
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, knee_pose, pose
 from tkamb.geometry.surface import Surface
@@ -245,6 +246,71 @@ def test_where_the_range_ends_the_near_columns_say_what_the_whole_bed_does(share
     assert found.flags == whole.flags
     np.testing.assert_allclose(found.approach, whole.approach, rtol=1e-6)
     assert few <= 2 < len(looked) - few  # the bed at the end, and once where the range ends
+
+
+@pytest.mark.parametrize("aside", [0.0, 1.0e-3, 3.0e-3, 12.0e-3])
+def test_a_guess_spares_the_bed_and_changes_nothing(aside, monkeypatch):
+    """Near by, 1.5 mm the most, the guess says which columns count; from afar the bed does."""
+    model = ElasticFoundation(1e-3)
+    state = model.prepare(sphere_on_block(material("polyethylene")))
+    alone = model.press(state, 1500.0, lowered(0))
+    before = model.press(state, 1500.0, lowered(0, x=-aside))
+    looked = []
+
+    def counted(samples, *arguments):
+        looked.append(len(samples.points))
+        return gaps_and_facets(samples, *arguments)
+
+    monkeypatch.setattr(neighbourhood, "gaps_and_facets", counted)
+    found = model.press(state, 1500.0, lowered(0), before)
+    assert found.status is ContactStatus.OK
+    assert found.residual <= LOAD_TOLERANCE
+    np.testing.assert_allclose(found.approach, alone.approach, rtol=1e-6)
+    assert (looked[0] < len(state.points)) == (aside < neighbourhood.NEARBY)
+
+
+def test_a_guess_that_failed_or_stands_on_another_bed_is_not_looked_at():
+    model = ElasticFoundation(1e-3)
+    bodies = sphere_on_block(material("polyethylene"))
+    state, coarse = model.prepare(bodies), ElasticFoundation(2e-3).prepare(bodies)
+    alone = model.press(state, 1500.0, lowered(0))
+    failed = model.evaluate(state, lowered(0.9 * HEIGHT))
+    assert failed.status is ContactStatus.OUT_OF_RANGE
+    for guess in (failed, model.press(coarse, 1500.0, lowered(0))):
+        found = model.press(state, 1500.0, lowered(0), guess)
+        np.testing.assert_allclose(found.approach, alone.approach, rtol=1e-6)
+
+
+def test_columns_that_the_neighbourhood_left_out_are_found_by_the_whole_bed(monkeypatch):
+    """With the bound broken the search misses columns; the bed at its end tells."""
+    model = ElasticFoundation(1e-3)
+    state = model.prepare(sphere_on_block(material("polyethylene")))
+    alone = model.press(state, 1500.0, lowered(0))
+    before = model.press(state, 1500.0, lowered(0, x=-12e-3))
+    monkeypatch.setattr(neighbourhood, "NEARBY", 0.1e-3)
+    monkeypatch.setattr(neighbourhood.Neighbourhood, "_covers", lambda *_: True)
+    found = model.press(state, 1500.0, lowered(0), before)
+    np.testing.assert_allclose(found.approach, alone.approach, rtol=1e-6)
+
+
+def test_a_probe_far_from_where_it_looked_looks_anew():
+    model = ElasticFoundation(1e-3)
+    state = model.prepare(sphere_on_block())
+    probe, depth = model.probe(state), 0.2e-3
+    for x in (0.0, 1e-3, 12e-3):
+        expected = model.evaluate(state, lowered(depth, x=x)).wrench_on_insert
+        np.testing.assert_allclose(probe.at(lowered(depth, x=x)).wrench, expected, 1e-9, 1e-12)
+
+
+def test_what_a_probe_sees_of_a_result_is_what_it_finds_there():
+    model = ElasticFoundation(1e-3)
+    state = model.prepare(ContactPair(two_spheres(), flat_insert(HEIGHT, half_z=28e-3), LINEAR))
+    result = model.press(state, 1500.0, np.eye(4))
+    seen, found = model.probe(state).seen(result), model.probe(state).at(result.pose)
+    assert set(seen.condyles) == set(found.condyles) == {"medial", "lateral"}
+    for side, condyle in seen.condyles.items():
+        np.testing.assert_allclose(condyle.wrench, found.condyles[side].wrench, rtol=1e-12)
+        np.testing.assert_allclose(condyle.stiffness, found.condyles[side].stiffness, rtol=1e-9)
 
 
 def test_first_touch_of_crossed_cylinders_is_found_on_their_edges():

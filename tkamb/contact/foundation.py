@@ -7,6 +7,7 @@ import numpy as np
 
 from tkamb.contact.materials import Material
 from tkamb.contact.model import ContactModel
+from tkamb.contact.neighbourhood import Neighbourhood
 from tkamb.contact.pressing import LOAD_TOLERANCE, press_by_search
 from tkamb.contact.probe import CondyleWrench, ProbedContact
 from tkamb.contact.result import ContactResult, ContactStatus, medial_points
@@ -21,7 +22,7 @@ from tkamb.geometry.frames import Array, Index, Mask, cross, inverse, rotate, tr
 
 Law = Literal["nonlinear", "linear"]
 
-NEAR = 1e-3
+NEAR = 3e-4
 """m; columns nearer than this take part in the search for a load."""
 THINNEST = 1e-6
 """m; a layer thinner than this, at the insert's rim, counts as this thick."""
@@ -32,8 +33,6 @@ SMALL_LOAD = 1.0
 """N; a reaction below that share of a load, less this, does not reach the load within `NARROW`."""
 WIDEST_EDGE = 3e-4
 """m: no gap is taken to change by more across a column."""
-NEARBY = 1.5e-3
-"""m; the columns nearer than this are looked at while the femur moves by less."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ class ElasticFoundation(ContactModel):
         The search looks only at the columns near the femoral component; the whole bed is
         evaluated at its end, and searched again if that finds another reaction.
         """
-        nearby = _NearColumns(self.law, state, pose)
+        nearby = _NearColumns(self.law, state, pose, guess)
         result = press_by_search(self, state, load, pose, guess, nearby.reaction)
         if result.status is ContactStatus.OK and result.residual <= LOAD_TOLERANCE:
             return result
@@ -152,9 +151,13 @@ class _NearColumns:
         beyond: m, the smallest that is not; inf: none.
     """
 
-    def __init__(self, law: Law, state: SampledContact, pose: Array) -> None:
+    def __init__(
+        self, law: Law, state: SampledContact, pose: Array, guess: ContactResult | None
+    ) -> None:
         self._law, self.state, self.pose = law, state, pose
-        self._reach, self._near = -np.inf, state.surface
+        self._reach, self._near, self._around = -np.inf, state.surface, Neighbourhood(state)
+        if guess is not None and guess.points is state.points and not np.isnan(guess.gap).any():
+            self._around.take(guess.pose, guess.gap)
         self.within, self.beyond, self._last = -np.inf, np.inf, 0.0
 
     def reaction(self, approach: float) -> float:
@@ -165,13 +168,15 @@ class _NearColumns:
         """
         if self.within < approach < self.beyond <= self.within + NARROW:
             return self._last
-        samples, pair = self.state.surface, self.state.pair
+        pair = self.state.pair
         pose = pair.pose_at_approach(self.pose, approach)
         if approach > self._reach:
-            gap = gaps_along_normals(samples, pair.femoral, pose)
-            self._near, self._reach = samples.part(gap < NEAR), approach + NEAR / 2
+            samples, (gap, _, _) = self._around.at(pose)
+            close = gap < NEAR
+            self._near, self._reach, gap = samples.part(close), approach + NEAR / 2, gap[close]
+        else:
+            gap = gaps_along_normals(self._near, pair.femoral, pose)
         near = self._near
-        gap = gaps_along_normals(near, pair.femoral, pose)
         strain = np.maximum(-gap, 0.0) / np.maximum(near.thickness, THINNEST)
         if (strain >= DEEPEST).any():
             self.beyond = min(self.beyond, approach)
@@ -224,23 +229,35 @@ class FoundationProbe:
 
     def __init__(self, law: Law, state: SampledContact) -> None:
         self._law, self._state = law, state
-        self._corners = _corners(state.pair.femoral.bounds)
-        self._near, self._centre = state.surface, np.full((4, 4), np.nan)
-        self._seen: tuple[Array, tuple[Array, Array, Index]] | None = None
+        self._around = Neighbourhood(state)
+        self._seen: tuple[Array, SurfaceSamples, tuple[Array, Array, Index]] | None = None
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4), with its stiffness."""
         pose = np.asarray(pose, float)
         samples, (gap, femoral_normal, _) = self._columns(pose)
         loaded = gap < 0
-        if not loaded.any():
+        return self._of(samples.part(loaded), gap[loaded], femoral_normal[loaded], pose)
+
+    def seen(self, result: ContactResult) -> ProbedContact:
+        """Return what `at` does at a result's pose, from the columns that it says are loaded."""
+        if np.isnan(result.gap).any():
+            return self.at(result.pose)
+        samples = self._state.surface.part(result.gap < 0)
+        gap, femoral_normal, _ = gaps_and_facets(samples, self._state.pair.femoral, result.pose)
+        return self._of(samples, gap, femoral_normal, result.pose)
+
+    def _of(
+        self, samples: SurfaceSamples, gap: Array, femoral_normal: Array, pose: Array
+    ) -> ProbedContact:
+        """Return the contact of the loaded columns, with gaps (n,) and femoral normals (n, 3)."""
+        if not len(gap):
             return ProbedContact({}, tangent=True)
-        samples, gap = samples.part(loaded), gap[loaded]
         strain = -gap / np.maximum(samples.thickness, THINNEST)
         if not (strain < DEEPEST).all():
             return ProbedContact({}, known=False)
         force = layer_pressure(self._law, self._state.pair.material, strain) * samples.area
-        push, stiffness = self._stiffness(samples, gap, femoral_normal[loaded])
+        push, stiffness = self._stiffness(samples, gap, femoral_normal)
         condyles = {}
         for side, own in self._sides(samples, pose):
             if own.any():
@@ -250,16 +267,6 @@ class FoundationProbe:
                     push[own].T @ stiffness[own],
                 )
         return ProbedContact(condyles, tangent=True)
-
-    def seen(self, result: ContactResult) -> ProbedContact:
-        """Return what `at` does at a result's pose, without a look at the whole bed.
-
-        The result's gaps are the whole bed's already, by the same rays: they say which columns
-        are near by. A failed result has none.
-        """
-        if not np.isnan(result.gap).any():
-            self._look_at(result.pose, result.gap)
-        return self.at(result.pose)
 
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
         """Return the contact with its stiffness averaged over a column's width; see `Probe`.
@@ -289,18 +296,9 @@ class FoundationProbe:
 
     def _columns(self, pose: Array) -> tuple[SurfaceSamples, tuple[Array, Array, Index]]:
         """Return the columns near by, and their gaps and facets."""
-        femoral = self._state.pair.femoral
-        if not self._covers(pose):
-            gap = gaps_and_facets(self._state.surface, femoral, pose)[0]
-            self._look_at(pose, gap)
         if self._seen is None or not np.array_equal(self._seen[0], pose):
-            self._seen = pose.copy(), gaps_and_facets(self._near, femoral, pose)
-        return self._near, self._seen[1]
-
-    def _look_at(self, pose: Array, gap: Array) -> None:
-        """Take the columns that are near by at a pose, by the gaps (n,) of the whole bed."""
-        self._near, self._centre = self._state.surface.part(gap < 2 * NEARBY), pose.copy()
-        self._seen = None
+            self._seen = pose.copy(), *self._around.at(pose)
+        return self._seen[1:]
 
     def _stiffness(
         self, samples: SurfaceSamples, gap: Array, femoral_normal: Array
@@ -317,19 +315,7 @@ class FoundationProbe:
         medial = medial_points(samples.points, pose, self._state.pair.split)
         return ("medial", medial), ("lateral", ~medial)
 
-    def _covers(self, pose: Array) -> bool:
-        """Return whether no femoral point has come nearer than the chosen columns reach."""
-        if np.isnan(self._centre).any():
-            return False
-        moved = transform(pose, self._corners) - transform(self._centre, self._corners)
-        return bool(np.linalg.norm(moved, axis=1).max() < NEARBY)
-
 
 def screws(points: Array, directions: Array) -> Array:
     """Return direction and moment about the origin (n, 6) of lines through points (n, 3)."""
     return np.hstack([directions, cross(points, directions)])
-
-
-def _corners(bounds: Array) -> Array:
-    """Return the corners (8, 3) of a box."""
-    return np.array([[x, y, z] for x in bounds[:, 0] for y in bounds[:, 1] for z in bounds[:, 2]])
