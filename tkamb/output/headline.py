@@ -112,7 +112,8 @@ def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
     low, middle, high = band[:, peak.frame]
     parts = [f"5 to 95 % of {table['samples']} samples, median {middle:.2f} BW"]
     if not np.isfinite(low):
-        parts = [f"no band {_where(results, axis, peak.frame)}: too many samples failed"]
+        why = results.why_no_band(peak.frame)
+        parts = [f"no band {_where(results, axis, peak.frame)}: {why}"]
     parts += [
         f"{words} varies most with {_largest(table, name)}"
         for name, words in BANDED.items()
