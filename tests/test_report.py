@@ -194,6 +194,23 @@ def test_the_post_s_force_and_pressure_are_told_beside_the_condyles(bend):
     assert value == "0.50 BW" and f"{force[80]:.0f} N at " in detail and "32.9\u00a0MPa" in detail
 
 
+def test_where_wrapping_begins_is_told_as_well_as_the_frames_know_it(bend):
+    """The made-up quadriceps wraps beyond 75 deg, whatever frames were computed."""
+
+    def told(every):
+        columns = {name: values[::every] for name, values in bend.columns.items()}
+        wrapped = columns["flexion_deg"][columns["quadriceps_wrap_deg"] > 0]
+        summary = bend.summary | {"first_wrapping_flexion_deg": wrapped.min()}
+        run = Results(columns, summary)
+        (card,) = [c for c in cards(run, horizontal_axis(run)) if "quadriceps" in c.title]
+        return [float(number) for number in re.findall(r"([\d.]+)°", card.detail.split("wrap")[1])]
+
+    (first,) = told(1)
+    assert 75 <= first < 77
+    low, high = told(25)
+    assert low <= 75 < high
+
+
 def test_why_there_is_no_band_says_what_to_do(bend):
     """Failed poses and too few samples are mended differently."""
     frame = int(bend["force_total_BW"].argmax())
