@@ -120,6 +120,33 @@ def test_a_mix_of_axes_is_refused_unless_one_is_chosen(folders, tmp_path, capfd)
     assert any("Not the same side. a: right; gait: left" in note for note in notes)
 
 
+def test_what_each_run_released_is_said_whole_and_in_any_order(folders, tmp_path):
+    """A run that released less has not released nothing."""
+
+    def notes(*released):
+        bend, runs = make_run("bend", frames=21, maps=False), []
+        for k, names in enumerate(released):
+            contact = bend.summary["contact"] | {"released": list(names)}
+            runs.append(written(tmp_path / f"{len(names)}{k}{names[0]}", bend, contact=contact))
+        return [note for note in compare_folders(runs).notes if "released" in note]
+
+    (note,) = notes(["adduction"], ["ml", "adduction", "ap"])
+    assert ": adduction;" in note and ": adduction, ap, ml." in note
+    assert notes(["ap", "ml"], ["ml", "ap"]) == []
+
+
+def test_computing_times_are_no_results(tmp_path):
+    """A slower computer has not found another knee."""
+    runs = []
+    for k in range(2):
+        run = make_run("bend", frames=21, maps=False)
+        for name in run.columns:
+            if "seconds" in name:
+                run.columns[name] = np.full(21, 0.1 + k)
+        runs.append(written(tmp_path / str(k), run))
+    assert not [one for one in compare_folders(runs).differences if one.max_abs > 0]
+
+
 def test_the_page_stands_by_itself_and_holds_both_maps(folders, tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(page, "QUANTITIES", page.QUANTITIES[:4])
     out = tmp_path / "out"

@@ -23,7 +23,7 @@ from tkamb.output.pressure_maps import draw_maps, mapped_frames, top_view
 from tkamb.output.report import THIRD, report_html, write_report
 from tkamb.output.style import BLACK, svg_text
 from tkamb.output.tables import flag_rows, motion_table, reasons
-from tkamb.results import Results
+from tkamb.results import PERCENTILES, Results
 
 VOID = {"meta", "br", "input", "img", "link", "hr"}
 
@@ -192,6 +192,38 @@ def test_the_post_s_force_and_pressure_are_told_beside_the_condyles(bend):
     force[80], pressure[80] = 0.5 * metrics.body_weight(bend), 32.9
     value, detail = told()
     assert value == "0.50 BW" and f"{force[80]:.0f} N at " in detail and "32.9\u00a0MPa" in detail
+
+
+def test_where_wrapping_begins_is_told_as_well_as_the_frames_know_it(bend):
+    """The made-up quadriceps wraps beyond 75 deg, whatever frames were computed."""
+
+    def told(every):
+        columns = {name: values[::every] for name, values in bend.columns.items()}
+        wrapped = columns["flexion_deg"][columns["quadriceps_wrap_deg"] > 0]
+        summary = bend.summary | {"first_wrapping_flexion_deg": wrapped.min()}
+        run = Results(columns, summary)
+        (card,) = [c for c in cards(run, horizontal_axis(run)) if "quadriceps" in c.title]
+        return [float(number) for number in re.findall(r"([\d.]+)°", card.detail.split("wrap")[1])]
+
+    (first,) = told(1)
+    assert 75 <= first < 77
+    low, high = told(25)
+    assert low <= 75 < high
+
+
+def test_why_there_is_no_band_says_what_to_do(bend):
+    """Failed poses and too few samples are mended differently."""
+    frame = int(bend["force_total_BW"].argmax())
+    table = {"samples": 20, "largest_failed_share": 0.15, "not_varied": [], "varied": []}
+
+    def told(share):
+        lost = {f"force_total_BW_{end}": np.full(len(bend), np.nan) for end in PERCENTILES}
+        bands = lost | {"failed_share": np.where(np.arange(len(bend)) == frame, share, 0.0)}
+        run = replace(bend, bands=bands, summary=bend.summary | {"uncertainty": table})
+        return next(c.detail for c in cards(run, horizontal_axis(run)) if "sure" in c.title)
+
+    assert "fewer than 20 samples have it, take more" in told(0.15)
+    assert "more than half of the samples failed" in told(0.6)
 
 
 def test_residuals_of_a_released_pose_are_none_only_where_they_are(bend):

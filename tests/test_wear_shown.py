@@ -70,6 +70,7 @@ def put_wear(folder, summary):
     content = WEAR | {
         "scene_sha256": ["another's", summary["scene_sha256"]],
         "files_sha256": summary["identity"]["content of a file"],
+        "run_frames": summary["identity"]["choice of frames"],
     }
     (folder / "wear.json").write_text(json.dumps(content), encoding="utf-8")
     (folder / "wear.png").write_bytes(PIXEL)
@@ -82,7 +83,7 @@ def put_wear(folder, summary):
 def worn(tmp_path):
     """Results with wear of their scene beside them."""
     results = make_run("bend")
-    identity = {"content of a file": "these"}
+    identity = {"content of a file": "these", "choice of frames": [0, 101, 1]}
     summary = results.summary | {"scene_sha256": "this", "identity": identity}
     put_wear(tmp_path, summary)
     return replace(results, directory=tmp_path, summary=summary)
@@ -112,6 +113,16 @@ def test_wear_of_another_scene_is_not_shown_and_that_is_said(worn):
         wear_section(worn)
     (folder / "wear.json").unlink()
     assert wear_section(worn) is None
+
+
+def test_wear_of_other_frames_of_the_run_is_not_shown(worn):
+    """A part of the motion wears otherwise; the whole motion's wear holds beside any frames."""
+    path = worn.directory / "wear.json"
+    content = json.loads(path.read_text(encoding="utf-8"))
+    for frames, there in (([0, 101, 1], True), ([20, 101, 40], False), (None, True)):
+        path.write_text(json.dumps(content | {"run_frames": frames}), encoding="utf-8")
+        assert (wear_section(worn) != {"other": OTHER}) == there
+        assert bool(worn_insert(worn, "right")) == there
 
 
 def test_the_viewers_layer_has_the_depths_of_the_file_and_a_left_knee_is_turned_back(worn):

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 
 PERCENTILES = {"p05": 5.0, "p50": 50.0, "p95": 95.0}
 """Ending of a column of bands.csv -> per cent of the samples below it."""
+FEWEST = 20
+"""Numbers below which a 5th percentile is not even between the two smallest of them."""
+MOST_FAILED = 0.5
+"""Share of samples: where more fail, the rest says too little."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +100,12 @@ class Results:
         ends = [self.bands.get(f"{name}_{end}") for end in PERCENTILES]
         found = [end for end in ends if end is not None]
         return np.array(found) if len(found) == len(ends) else None
+
+    def why_no_band(self, frame: int) -> str:
+        """Return why a frame's results have no band, in words."""
+        if self.bands["failed_share"][frame] > MOST_FAILED:
+            return "more than half of the samples failed"
+        return f"fewer than {FEWEST} samples have it, take more"
 
     def to_dataframe(self) -> "DataFrame":
         """Return the columns as a pandas DataFrame, frames as rows; NaN where there is no number.

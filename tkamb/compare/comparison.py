@@ -16,7 +16,7 @@ from tkamb.plug_ins import CONTACT_CODE
 from tkamb.results import Results
 from tkamb.results_folder import read_results
 
-NOT_COMPARED = ("time_s", "body_seconds", "contact_seconds")
+NOT_COMPARED = ("time_s", "body_seconds", "query_seconds", "contact_seconds")
 SETTINGS = {
     "scene": "scene file",
     "scene_sha256": "scene (SHA-256 of all its keys)",
@@ -210,7 +210,7 @@ def _notes(runs: Sequence[Run]) -> list[str]:
         notes += _unlike(runs, words, [run.results.summary.get(key) for run in runs])
     tables = [run.results.summary.get("contact") or {} for run in runs]
     for key in sorted({key for table in tables for key in table}):
-        notes += _unlike(runs, f"contact, {key}", [table.get(key) for table in tables])
+        notes += _unlike(runs, f"contact, {key}", [_whole(table.get(key)) for table in tables])
     for code in ("code of tkamb", CONTACT_CODE):
         codes = [(run.results.summary.get(VERSIONS) or {}).get(code) for run in runs]
         notes += _unlike(runs, code, codes)
@@ -228,6 +228,11 @@ def _unlike(runs: Sequence[Run], words: str, values: Sequence[Any]) -> list[str]
         values = [[item for item in value if item not in shared] for value in values]
     listed = "; ".join(f"{run.label}: {_shown(v)}" for run, v in zip(runs, values, strict=True))
     return [f"Not the same {words}. {listed}."]
+
+
+def _whole(value: Any) -> Any:
+    """Return a list of names as one text, in an order of its own: all of it is said."""
+    return (", ".join(sorted(value)) or "nothing") if isinstance(value, list) else value
 
 
 def _shown(value: Any) -> str:

@@ -24,6 +24,8 @@ NOTABLE_FAILED = 0.05
 """Share of samples: where more fail, the bands leave out a whole tail."""
 AT_REST = 0.05
 """%, of the SI contact force: what a search for equilibrium may leave of residuals."""
+FRAMES_APART = 5.0
+"""deg: what begins between frames farther apart is said with both."""
 PRESSURE_AND_AREA = ("peak_pressure", "mean_pressure", "area")
 
 
@@ -112,7 +114,8 @@ def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
     low, middle, high = band[:, peak.frame]
     parts = [f"5 to 95 % of {table['samples']} samples, median {middle:.2f} BW"]
     if not np.isfinite(low):
-        parts = [f"no band {_where(results, axis, peak.frame)}: too many samples failed"]
+        why = results.why_no_band(peak.frame)
+        parts = [f"no band {_where(results, axis, peak.frame)}: {why}"]
     parts += [
         f"{words} varies most with {_largest(table, name)}"
         for name, words in BANDED.items()
@@ -242,12 +245,21 @@ def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:
     detail += f"{ligament}, patellofemoral force (PF/Q) {patella}"
     if "first_wrapping_flexion_deg" in results.summary:
         first = results.summary["first_wrapping_flexion_deg"]
-        detail += "; wraps nowhere" if first is None else f"; wraps the femur from {first:.0f}°"
+        detail += "; wraps nowhere" if first is None else f"; {_wraps_from(results, first)}"
     slope = results.columns.get("quadriceps_per_dome_mm_N")
     if slope is not None and np.isfinite(slope[found.frame]) and found.value > 0:
         percent = 100 * abs(slope[found.frame]) / found.value
         detail += f"; ± {percent:.1f} % per mm of the button's height on the patella"
     return Card("Peak quadriceps tension", f"{value:.2f} BW", detail)
+
+
+def _wraps_from(results: "Results", first: float) -> str:
+    """Return where the quadriceps begins to wrap, as well as the frames tell it."""
+    flexion, wrap = results["flexion_deg"], results["quadriceps_wrap_deg"]
+    last = max(flexion[(wrap == 0.0) & (flexion < first)], default=first)
+    if first - last > FRAMES_APART:
+        return f"begins to wrap the femur between {last:.0f}° and {first:.0f}°"
+    return f"wraps the femur from {first:.0f}°"
 
 
 def _residuals(results: "Results") -> Card | None:

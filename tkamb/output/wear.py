@@ -25,15 +25,15 @@ ROWS = (
 )
 """What is shown, and its key."""
 OTHER = (
-    "The wear.json in this folder is of another scene or other meshes, or of a tkamb that did not "
-    "say which: it is not shown."
+    "The wear.json in this folder is of another scene, other frames or other meshes, or of a tkamb "
+    "that did not say which: it is not shown."
 )
 
 
 def wear_section(results: "Results") -> dict[str, Any] | None:
     """Return what the section shows; None where the folder holds no wear.
 
-    Wear of another scene than the run's is not shown, and that is said.
+    Wear of another scene or of other frames than the run's is not shown, and that is said.
 
     Raises:
         InputError: wear.json or its picture cannot be read.
@@ -68,7 +68,9 @@ def _shown(found: dict[str, Any], picture: str) -> dict[str, Any]:
 
 
 def wear_of_run(results: "Results") -> dict[str, Any] | None:
-    """Return wear.json beside a run; empty where scene or files are others, None without one.
+    """Return wear.json beside a run; empty where scene, files or frames are others, None without.
+
+    Wear of a scene's whole motion, or of a simulator's, holds beside any frames of a run.
 
     Raises:
         InputError: it cannot be read.
@@ -80,8 +82,11 @@ def wear_of_run(results: "Results") -> dict[str, Any] | None:
     if not isinstance(found, dict) or not found.get("files_sha256"):
         return {}
     summary, scenes = results.summary, found.get("scene_sha256")
-    files = (summary.get("identity") or {}).get("content of a file")
+    identity = summary.get("identity") or {}
+    files = identity.get("content of a file")
     same = isinstance(scenes, list) and summary.get("scene_sha256") in scenes
+    if found.get("run_frames", ()) not in (None, identity.get("choice of frames")):
+        return {}
     return found if same and files == found["files_sha256"] else {}
 
 

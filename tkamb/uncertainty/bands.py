@@ -8,13 +8,9 @@ from typing import Any
 import numpy as np
 
 from tkamb.geometry.frames import SIDES, Array
-from tkamb.results import PERCENTILES
+from tkamb.results import FEWEST, MOST_FAILED, PERCENTILES
 
 ENDS = ("p05", "p95")
-FEWEST = 20
-"""Numbers below which a 5th percentile is not even between the two smallest of them."""
-MOST_FAILED = 0.5
-"""Share of samples: where more fail, the rest says too little."""
 SAMPLES_PER_INPUT = 6
 """Fewer per input leave a regression undetermined: its shares would be those of chance."""
 

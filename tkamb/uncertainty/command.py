@@ -119,7 +119,7 @@ def headline(found: "Uncertainty") -> list[str]:
     flexion = found.results["flexion_deg"][peak]
     band = f"5 to 95 %: {low:.2f} to {high:.2f}, median {middle:.2f}"
     if not isfinite(low):
-        band = "no band: too many samples failed"
+        band = f"no band: {found.results.why_no_band(peak)}"
     lines = [f"peak total force {total[peak]:.2f} BW at {flexion:.0f} deg ({band})"]
     for result in ("force_total_N", "medial_force_N"):
         rows = [row for row in found.tornado if row.result == result][:SHOWN]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tkamb.geometry.frames import Array
-from tkamb.uncertainty.bands import FEWEST
+from tkamb.results import FEWEST
 
 RESAMPLED = 200
 """Bootstrap samples for the standard errors."""

@@ -12,14 +12,13 @@ from tkamb.claim import claimed_directory
 from tkamb.columns import KINDS
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.results import Results
+from tkamb.results import FEWEST, Results
 from tkamb.run.shards import Shard, Shards
 from tkamb.run.workers import Crew, Progress, Task, Team
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.case import Case, load_case
 from tkamb.simulation import chosen_frames, simulate
 from tkamb.uncertainty.bands import (
-    FEWEST,
     Influence,
     band_columns,
     influences,

@@ -88,6 +88,7 @@ class WearReport:
             "source": self.setup.source,
             "scene_sha256": self.setup.scene_sha256,
             "files_sha256": self.setup.files_sha256,
+            "run_frames": self.setup.run_frames,
             "side": self.setup.side,
             "frames": len(self.case.motion),
             "passes_per_cycle": self.case.motion.passes,

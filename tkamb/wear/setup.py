@@ -44,6 +44,8 @@ class WearSetup:
         scene_sha256: of the scene as it was given and with the contact that was asked for; a
             run's summary has one of them.
         files_sha256: of the files that the scene names, likewise.
+        run_frames: first, last and step of the frames of the run whose maps are worn; None: the
+            motion is the scene's or a simulator's.
         uncertainty: the scene's table; None: it has none.
         simulated: the motion is a simulator's.
     """
@@ -57,6 +59,7 @@ class WearSetup:
     source: str
     scene_sha256: tuple[str, ...]
     files_sha256: str
+    run_frames: tuple[int, ...] | None = None
     uncertainty: UncertaintyTable | None = None
     simulated: bool = False
 
@@ -93,8 +96,9 @@ def wear_setup(
     if springs is not None and simulator is None:
         raise InputError("springs without a simulator", "--springs", "give --simulator too")
     motion: CycleMotion | None = None
+    run_frames: tuple[int, ...] | None = None
     if os.path.isdir(path) and simulator is None:
-        case, motion = _of_results(path)
+        case, motion, run_frames = _of_results(path)
         hashes = _hashes(case, case.scene)
     else:
         if os.path.isdir(path):
@@ -123,6 +127,7 @@ def wear_setup(
         source=str(simulator or path),
         scene_sha256=hashes,
         files_sha256=files_hash(case),
+        run_frames=run_frames,
         uncertainty=case.scene.uncertainty,
         simulated=simulator is not None,
     )
@@ -164,8 +169,8 @@ def _of_scene(scene: Scene, path: Path, most: int, progress: Progress) -> CycleM
     return replace(motion, notes=(*motion.notes, note))
 
 
-def _of_results(folder: Path) -> tuple[Case, CycleMotion]:
-    """Return the case and the cycle of a folder of results."""
+def _of_results(folder: Path) -> tuple[Case, CycleMotion, tuple[int, ...]]:
+    """Return the case, the cycle and the choice of frames of a folder of results."""
     results = read_results(folder)
     if results.maps is None:
         raise InputError("has no contact maps", folder, "run the scene with [contact]")
@@ -177,7 +182,8 @@ def _of_results(folder: Path) -> tuple[Case, CycleMotion]:
     if scene_hash(case) != results.summary.get("scene_sha256"):
         what = "was run with another scene than its file says now"
         raise InputError(what, folder, "run it again, or give the scene")
-    return case, _of_maps(results.maps)
+    chosen = (results.summary.get("identity") or {}).get("choice of frames") or ()
+    return case, _of_maps(results.maps), tuple(chosen)
 
 
 def _scene_of(summary: dict[str, Any], folder: Path) -> Path:
