@@ -242,6 +242,19 @@ def test_residuals_of_a_released_pose_are_none_only_where_they_are(bend):
     assert shown(1.0).endswith("%")
 
 
+def test_an_axial_rotation_kept_as_recorded_shows_the_moment_that_keeps_it(bend):
+    """Without residual forces, too: AP and ML released, 7.6 N·m about the axis are left."""
+    columns = dict(bend.columns)
+    for name in ("residual_ap_N", "residual_ml_N"):
+        columns[name] = np.zeros(len(bend))
+    columns["residual_axial_Nm"] = np.linspace(-7.6, 3.0, len(bend))
+    summary = bend.summary | {"contact": {"released": ["ap", "ml"]}}
+    results = Results(columns, summary, None)
+    (card,) = [c for c in cards(results, horizontal_axis(results)) if "Residual" in c.title]
+    assert card.value == "0.0 %"
+    assert "residual axial moment of up to 7.6" in card.detail
+
+
 def test_several_questions_are_told_apart(bend):
     def asked(*questions):
         summary = bend.summary | {"questions": list(questions)}

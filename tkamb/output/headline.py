@@ -276,6 +276,9 @@ def _residuals(results: "Results") -> Card | None:
     if np.isfinite(change).any():
         largest = np.nanmax(change)
         detail += f"; acting 10 mm higher or lower changes the total by ≤ {largest:.1f} %"
+    axial = np.abs(results["residual_axial_Nm"])
+    if np.isfinite(axial).any():
+        detail += f"; and a residual axial moment of up to {np.nanmax(axial):.1f}\u00a0N·m"
     return Card("Residual force", middle, detail, bool(np.nanmax(share) > 100 * LARGE_RESIDUAL))
 
 
