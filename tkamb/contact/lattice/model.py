@@ -53,8 +53,7 @@ TOUCHING = 1e-13
 COARSE = 1e-3
 """From this tolerance on the factor is kept in 16 bits: they leave an imbalance of 3e-4."""
 ROUGH = 3.0
-"""Times the tolerance, for a step whose end is foreseen: what it changes is known to 1 %, from a
-frame six degrees of flexion away to 2 %."""
+"""Times the tolerance, for a step whose end is foreseen: what it changes is known to 1 %."""
 REACH = 1.08
 """Candidates must cover this many times the approach that was found."""
 
