@@ -266,7 +266,8 @@ def test_a_guess_spares_the_bed_and_changes_nothing(aside, monkeypatch):
     assert found.status is ContactStatus.OK
     assert found.residual <= LOAD_TOLERANCE
     np.testing.assert_allclose(found.approach, alone.approach, rtol=1e-6)
-    assert (looked[0] < len(state.points)) == (aside < neighbourhood.NEARBY)
+    nearer_than = neighbourhood.FARTHEST / neighbourhood.OBLIQUE
+    assert (looked[0] < len(state.points)) == (aside < nearer_than)
 
 
 def test_a_guess_that_failed_or_stands_on_another_bed_is_not_looked_at():
@@ -287,8 +288,7 @@ def test_columns_that_the_neighbourhood_left_out_are_found_by_the_whole_bed(monk
     state = model.prepare(sphere_on_block(material("polyethylene")))
     alone = model.press(state, 1500.0, lowered(0))
     before = model.press(state, 1500.0, lowered(0, x=-12e-3))
-    monkeypatch.setattr(neighbourhood, "NEARBY", 0.1e-3)
-    monkeypatch.setattr(neighbourhood.Neighbourhood, "_covers", lambda *_: True)
+    monkeypatch.setattr(neighbourhood, "OBLIQUE", 0.0)
     found = model.press(state, 1500.0, lowered(0), before)
     np.testing.assert_allclose(found.approach, alone.approach, rtol=1e-6)
 
@@ -297,7 +297,7 @@ def test_a_probe_far_from_where_it_looked_looks_anew():
     model = ElasticFoundation(1e-3)
     state = model.prepare(sphere_on_block())
     probe, depth = model.probe(state), 0.2e-3
-    for x in (0.0, 1e-3, 12e-3):
+    for x in (0.0, 0.2e-3, 0.4e-3, 1.6e-3, 12e-3):
         expected = model.evaluate(state, lowered(depth, x=x)).wrench_on_insert
         np.testing.assert_allclose(probe.at(lowered(depth, x=x)).wrench, expected, 1e-9, 1e-12)
 

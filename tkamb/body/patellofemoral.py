@@ -170,6 +170,8 @@ class PatellofemoralContact:
         """Return whether a few of the samples lie in the femur: a quick look for searches."""
         few = self._samples[:: max(1, len(self._samples) // COARSE)]
         here = transform(self.pose(np.asarray(coordinates, float)), few)
+        low, high = self._nearest.surface.bounds
+        here = here[((here >= low) & (here <= high)).all(axis=1)]  # beside its box none is in it
         near = self._nearest.at(here)
         apart = np.einsum("ij,ij->i", here - near.points, near.normals)
         return bool((apart < 0.0).any())

@@ -7,7 +7,7 @@ import numpy as np
 
 from tkamb.contact.materials import Material
 from tkamb.contact.model import ContactModel
-from tkamb.contact.neighbourhood import Neighbourhood
+from tkamb.contact.neighbourhood import NEAR, Neighbourhood
 from tkamb.contact.pressing import LOAD_TOLERANCE, press_by_search
 from tkamb.contact.probe import CondyleWrench, ProbedContact
 from tkamb.contact.result import ContactResult, ContactStatus, medial_points
@@ -22,8 +22,6 @@ from tkamb.geometry.frames import Array, Index, Mask, cross, inverse, rotate, tr
 
 Law = Literal["nonlinear", "linear"]
 
-NEAR = 3e-4
-"""m; columns nearer than this take part in the search for a load."""
 THINNEST = 1e-6
 """m; a layer thinner than this, at the insert's rim, counts as this thick."""
 NARROW = 1e-9
@@ -31,7 +29,7 @@ NARROW = 1e-9
 WELL_BELOW = 0.99
 SMALL_LOAD = 1.0
 """N; a reaction below that share of a load, less this, does not reach the load within `NARROW`."""
-WIDEST_EDGE = 3e-4
+WIDEST_EDGE = NEAR
 """m: no gap is taken to change by more across a column."""
 
 
@@ -144,7 +142,7 @@ class LinearFoundation(ElasticFoundation):
 
 
 class _NearColumns:
-    """The reaction of the columns that lie near the femoral component.
+    """The reaction of the columns that lie near the femoral component, by less than `NEAR`.
 
     Attributes:
         within: m, the greatest approach so far that is in their range; -inf: none.

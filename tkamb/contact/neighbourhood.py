@@ -3,14 +3,22 @@
 import numpy as np
 
 from tkamb.contact.samples import SampledContact, SurfaceSamples, gaps_and_facets
-from tkamb.geometry.frames import Array, Index, Mask, transform
+from tkamb.geometry.frames import Array, Index, inverse, transform
 
-NEARBY = 1.5e-3
-"""m; the columns nearer than this are looked at while the femur moves by less."""
+NEAR = 3e-4
+"""m; every column with a smaller gap is looked at."""
+OBLIQUE = 2.0
+"""By so much may a gap, along the column, close faster than the femoral component moves."""
+FARTHEST = 3e-3
+"""m; a greater gap counts as this: another part of the femoral component may come from aside."""
 
 
 class Neighbourhood:
-    """The columns that the femoral component may reach while it moves by less than `NEARBY`.
+    """The columns that the femoral component may reach, by where they were seen last.
+
+    A column that was seen with the gap g, and past which the femoral component has moved by m
+    since, has no gap below g - 2 m as long as its normal and the femoral surface's are less than
+    60 deg apart: where that is above `NEAR` it is not looked at.
 
     Args:
         state: what the model's `prepare` returned.
@@ -18,33 +26,23 @@ class Neighbourhood:
 
     def __init__(self, state: SampledContact) -> None:
         self._bed, self._femoral = state.surface, state.pair.femoral
-        self._corners = _corners(self._femoral.bounds)
-        self._columns, self._centre = self._bed, np.full((4, 4), np.nan)
+        self._gap = np.full(len(self._bed.points), -np.inf)
+        self._seen_at = np.zeros_like(self._bed.points)
+        """(n, 3) m, femoral frame: where the columns were then."""
 
     def take(self, pose: Array, gap: Array) -> None:
-        """Take what is near by at a pose (4, 4), by the gaps (n,) of the bed there."""
-        self._columns, self._centre = self._bed.part(self._close(gap)), pose.copy()
+        """Take the gaps (n,) of the whole bed at a pose (4, 4)."""
+        self._gap, self._seen_at = np.minimum(gap, FARTHEST), self._places(pose)
 
     def at(self, pose: Array) -> tuple[SurfaceSamples, tuple[Array, Array, Index]]:
         """Return the columns near by at a pose (4, 4), and their gaps and facets."""
-        if self._covers(pose):
-            return self._columns, gaps_and_facets(self._columns, self._femoral, pose)
-        gap, normals, faces = gaps_and_facets(self._bed, self._femoral, pose)
-        self.take(pose, gap)
-        near = self._close(gap)
-        return self._columns, (gap[near], normals[near], faces[near])
+        here = self._places(pose)
+        moved = np.linalg.norm(here - self._seen_at, axis=1)
+        near = np.flatnonzero(self._gap - OBLIQUE * moved < NEAR)
+        columns = self._bed.part(near)
+        found = gaps_and_facets(columns, self._femoral, pose)
+        self._gap[near], self._seen_at[near] = np.minimum(found[0], FARTHEST), here[near]
+        return columns, found
 
-    def _close(self, gap: Array) -> Mask:
-        return np.asarray(gap < 2 * NEARBY)
-
-    def _covers(self, pose: Array) -> bool:
-        """Return whether no femoral point has come nearer than the chosen columns reach."""
-        if np.isnan(self._centre).any():
-            return False
-        moved = transform(pose, self._corners) - transform(self._centre, self._corners)
-        return bool(np.linalg.norm(moved, axis=1).max() < NEARBY)
-
-
-def _corners(bounds: Array) -> Array:
-    """Return the corners (8, 3) of a box."""
-    return np.array([[x, y, z] for x in bounds[:, 0] for y in bounds[:, 1] for z in bounds[:, 2]])
+    def _places(self, pose: Array) -> Array:
+        return transform(inverse(pose), self._bed.points)

@@ -39,8 +39,8 @@ class SurfaceSamples(ContactSurface):
     depth: Array
     resolution: float
 
-    def part(self, chosen: Mask) -> "SurfaceSamples":
-        """Return the chosen points (n,) without triangles."""
+    def part(self, chosen: Mask | Index) -> "SurfaceSamples":
+        """Return the chosen points, by mask or index, without triangles."""
         return SurfaceSamples(
             self.points[chosen],
             self.normals[chosen],

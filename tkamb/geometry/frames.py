@@ -14,6 +14,7 @@ flexion about the femoral ML axis (positive in flexion), adduction about the flo
 Reference: Grood & Suntay, J Biomech Eng 105:136 (1983), doi:10.1115/1.3138397.
 """
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -81,9 +82,21 @@ def cross(a: Array, b: Array) -> Array:
 
 def knee_pose(coordinates: ArrayLike) -> Array:
     """Return pose_femoral_in_insert (..., 4, 4) from knee coordinates (..., 6), m and rad."""
+    c: Any = np.asarray(coordinates, float)
+    if c.ndim == 1:
+        return _pose_of_knee(c.tobytes()).copy()
+    return _poses_of_knee(c)
+
+
+@lru_cache(maxsize=32)
+def _pose_of_knee(coordinates: bytes) -> Array:
+    """Return the pose of one place: a search asks for the same again and again."""
+    return _poses_of_knee(np.frombuffer(coordinates))
+
+
+def _poses_of_knee(c: Any) -> Array:
     from scipy.spatial.transform import Rotation  # slow to import, and not all need it
 
-    c: Any = np.asarray(coordinates, float)
     angles = np.stack([-c[..., 3], -c[..., 4], c[..., 5]], axis=-1)
     rotation = Rotation.from_euler("YXZ", angles.reshape(-1, 3)).as_matrix()
     return pose(rotation.reshape(*c.shape[:-1], 3, 3), c[..., :3])
