@@ -166,7 +166,9 @@ noise = rng.normal(size=n)
 with MapWriter(sys.argv[1], np.zeros((n, 3)), [[0, 1, 2]], {"model": "kill"}) as writer:
     for k in range(1_000_000):
         writer.append(k, noise + k, noise - k, np.full((n, 3), k), np.eye(4) * k)
-        print(k, flush=True)
+        if k % 3 == 0:
+            writer.flush()
+        print(k - k % 3, flush=True)
 """
 
 
@@ -176,13 +178,12 @@ def test_a_kill_leaves_a_readable_part(tmp_path, frames):
     process = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, cwd=ROOT
     )
-    for _ in range(frames):
-        process.stdout.readline()
+    flushed = [int(process.stdout.readline()) for _ in range(frames)]
     process.send_signal(signal.SIGKILL)
     process.wait()
     process.stdout.close()
     maps = read_maps(path)
-    assert len(maps) >= frames
+    assert len(maps) >= flushed[-1] + 1
     k = np.arange(len(maps))
     assert np.array_equal(maps.time_s, k)
     assert np.allclose(maps.pressure_Pa - maps.pressure_Pa[0], k[:, None])

@@ -158,7 +158,8 @@ class _Run:
         if workers == 1:
             yield from (self.solver.solve(k) for k in progress(left))
             return
-        frames = finished_in_order(self.case.scene, self.indices, left, workers)
+        scene, slips = self.case.scene, self.solver.slips
+        frames = finished_in_order(scene, slips, self.indices, left, workers)
         yield from (frame for _, frame in zip(progress(left), frames, strict=True))
 
     def _begin_maps(self, side: "ContactSide") -> None:

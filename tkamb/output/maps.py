@@ -1,7 +1,7 @@
-"""The pressure maps of a run: contact.h5, written frame by frame, or kept in memory.
+"""The pressure maps of a run: contact.h5, written a few frames at a time, or kept in memory.
 
-Per frame: the maps are appended and flushed, then the time. `/time_s` is therefore as long
-as the number of whole frames, also when the run was killed. Compressed chunks of one frame
+The maps of some frames are appended and flushed, then their times. `/time_s` is therefore as
+long as the number of whole frames, also when the run was killed. Compressed chunks of one frame
 keep what earlier frames wrote untouched.
 """
 
@@ -32,8 +32,12 @@ PER_FRAME = (
 )
 
 
+WAITING = 4e6
+"""Bytes of maps that wait to be written together: a write costs as much as the maps of a frame."""
+
+
 class MapWriter:
-    """Grows contact.h5 by one frame at a time; a kill leaves the frames before it readable.
+    """Grows contact.h5 frame by frame; a kill leaves what was flushed readable.
 
     Args:
         path: the file; an older one is replaced. None: the file is in memory alone.
@@ -53,6 +57,7 @@ class MapWriter:
         attributes: Mapping[str, Any],
     ) -> None:
         self.path = None if path is None else Path(path)
+        self._written_frames, self._waiting = 0, list[tuple[Array, ...]]()
         points = np.asarray(points, float)
         options: dict[str, Any] = {} if path else {"driver": "core", "backing_store": False}
         with self._written():
@@ -94,7 +99,7 @@ class MapWriter:
         contact_points: ArrayLike = np.nan,
         contact_normals: ArrayLike = np.nan,
     ) -> None:
-        """Add one frame and flush it.
+        """Add one frame; it is written with the next ones, by `flush` or by `close`.
 
         Args:
             time: s.
@@ -106,29 +111,52 @@ class MapWriter:
                 and the patella the femoral component; NaN where that is not known.
             contact_normals: (3, 3) unit, there: out of the insert, into the patella.
         """
-        values = (pressure, gap, nodal_force, femoral_pose, contact_points, contact_normals)
+        values = (pressure, gap, nodal_force, femoral_pose, contact_points, contact_normals, time)
+        shapes = (dataset.shape[1:] for dataset in self._datasets)
+        frame = tuple(
+            np.array(np.broadcast_to(value, shape), float)
+            for value, shape in zip(values, shapes, strict=True)
+        )
+        self._waiting.append(frame)
+        if len(self._waiting) * sum(values.nbytes for values in frame) > WAITING:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the frames that were appended, the times last.
+
+        Raises:
+            InputError: they cannot be written.
+        """
+        if not self._waiting:
+            return
+        begin, end = self._written_frames, len(self)
         with self._written():
-            frame = len(self)
-            for name, value in zip(PER_FRAME, values, strict=False):
-                dataset = self._file[name]
-                dataset.resize(frame + 1, axis=0)
-                dataset[frame] = value
+            for dataset, values in zip(
+                self._datasets, zip(*self._waiting, strict=True), strict=True
+            ):
+                if dataset is self._datasets[-1]:
+                    self._file.flush()
+                dataset.resize(end, axis=0)
+                dataset[begin:] = np.array(values)
             self._file.flush()
-            self._file["time_s"].resize(frame + 1, axis=0)
-            self._file["time_s"][frame] = time
-            self._file.flush()
+        self._written_frames, self._waiting = end, []
 
     def append_failed(self, time: float) -> None:
         """Add a frame without a result: NaN everywhere but the time."""
         nan = float("nan")
         self.append(time, nan, nan, nan, nan)
 
+    @cached_property
+    def _datasets(self) -> list[Any]:
+        return [self._file[name] for name in PER_FRAME]
+
     def __len__(self) -> int:
-        return int(self._file["time_s"].shape[0])
+        return self._written_frames + len(self._waiting)
 
     @property
     def maps(self) -> "ContactMaps":
-        """What was written so far."""
+        """What was appended so far."""
+        self.flush()
         if self.path is not None:
             return ContactMaps(self.path)
         arrays = {name: dataset[()] for name, dataset in self._file.items()}
@@ -141,7 +169,10 @@ class MapWriter:
             InputError: what was appended could not be written.
         """
         with self._written():
-            self._file.close()
+            try:
+                self.flush()
+            finally:
+                self._file.close()
 
     @contextmanager
     def _written(self) -> Iterator[None]:

@@ -15,6 +15,7 @@ from tkamb.scene import Scene
 from tkamb.scene.case import Case, load_case
 
 if TYPE_CHECKING:
+    from tkamb.body.slip import CondyleSlip
     from tkamb.equilibrium.contact_side import ContactSide
     from tkamb.equilibrium.frame_contact import FrameContact
 
@@ -37,9 +38,11 @@ class FrameSolver:
     Args:
         case: the scene with its files read.
         frames: those that are asked for; None: any may be.
+        slips: those of another solver of this case, which spares finding them anew.
 
     Attributes:
         mechanics: the body side.
+        slips: side -> rolling and slipping of the recorded motion.
         side: the contact side; None without [contact].
         before: contacts of the last frames, guesses for the next.
 
@@ -47,11 +50,14 @@ class FrameSolver:
         InputError: whatever is wrong with the input.
     """
 
-    def __init__(self, case: Case, frames: range | None = None) -> None:
+    def __init__(
+        self, case: Case, frames: range | None = None, slips: "dict[str, CondyleSlip] | None" = None
+    ) -> None:
         self._case = case
         self.mechanics = Mechanics(case)
         self.plausibility = Plausibility(self.mechanics)
-        self._slips = self.mechanics.slips(max(frames or range(len(case.motion.time))))
+        last = max(frames or range(len(case.motion.time)))
+        self.slips = self.mechanics.slips(last) if slips is None else slips
         self.side = self._contact_side() if case.scene.contact else None
         self.before: list[FrameContact] = []
 
@@ -68,7 +74,7 @@ class FrameSolver:
             arrays = contact_arrays(contact, body.geometry)
         doubts = self.plausibility.flags(k, body)
         status = frame_status(self._case, k, body, contact, doubts)
-        return k, frame_row(self._case, k, body, contact, self._slips, status), arrays
+        return k, frame_row(self._case, k, body, contact, self.slips, status), arrays
 
     def _keep(self, contact: "FrameContact") -> None:
         """Keep a contact as a guess; only the last that was found says where a solver begins."""
@@ -92,8 +98,8 @@ def _without_warm_start(contact: "FrameContact") -> "FrameContact":
 class ChunkSolver:
     """What a worker does: reads the scene once, and computes chunk after chunk."""
 
-    def __init__(self, scene: Scene, indices: range) -> None:
-        self._solver = FrameSolver(load_case(scene), indices)
+    def __init__(self, scene: Scene, slips: "dict[str, CondyleSlip]") -> None:
+        self._solver = FrameSolver(load_case(scene), slips=slips)
 
     def __call__(self, number: int, frames: Sequence[int]) -> list[Finished]:
         """Return the frames of a chunk."""
@@ -102,12 +108,17 @@ class ChunkSolver:
 
 
 def finished_in_order(
-    scene: Scene, indices: range, left: Sequence[int], workers: int
+    scene: Scene,
+    slips: "dict[str, CondyleSlip]",
+    indices: range,
+    left: Sequence[int],
+    workers: int,
 ) -> Iterator[Finished]:
     """Yield frames over worker processes, in order.
 
     Args:
         scene: for each worker to read.
+        slips: of the recorded motion, see `FrameSolver`.
         indices: all frames of the run, which make its chunks.
         left: those that are still to do.
         workers: processes.
@@ -120,7 +131,7 @@ def finished_in_order(
         chunks.setdefault(indices.index(k) // CHUNK, []).append(k)
     early: dict[int, list[Finished]] = {}
     turn = iter(chunks)
-    answers = Crew(workers).answers(Task(ChunkSolver, (scene, indices)), list(chunks.items()))
+    answers = Crew(workers).answers(Task(ChunkSolver, (scene, slips)), list(chunks.items()))
     expected: Any = next(turn, None)
     for number, frames in answers:
         early[number] = frames

@@ -169,6 +169,7 @@ class FolderRecorder(Recorder):
         start = clock.perf_counter()
         with interrupt_later(), replaced_together(self._directory) as files:
             if self._writer is not None:
+                self._writer.flush()
                 shutil.copyfile(self._shards.folder / MAPS_NAME, files.path(MAPS_NAME))
             put_numbers(results, files)
             files.remove(REPORT_NAME)
