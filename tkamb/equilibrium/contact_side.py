@@ -292,7 +292,8 @@ def _doubts(knee: "KneeEquilibrium") -> tuple[str, ...]:
         return ()
     return (
         f"how the knee yields to the muscles does not settle ({100 * knee.doubt:.0f} % of it is "
-        "open): with another start the forces come out a few per cent elsewhere",
+        "open): begun elsewhere, such frames came out up to 3 % apart in the total force and "
+        "60 N in a condyle's (docs/muscles.md)",
     )
 
 
