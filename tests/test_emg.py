@@ -71,12 +71,12 @@ def test_channels_of_a_c3d_stand_on_its_clock_over_their_largest_value(tmp_path)
     path = write_c3d(
         tmp_path / "a.c3d", markers, first_frame=50, ratio=12, analog={"VL": 3e-4 * burst(1.5)}
     )
-    found = load_envelopes(in_si(table(path, offset_s=0.04)))
+    found = load_envelopes(in_si(table(path, offset_s=0.04)), TIME)
     values = found.values["VL"]
     assert values.max() == pytest.approx(1.0)
     assert found.time[values.argmax()] == pytest.approx(0.5 + 0.04 + 1.5, abs=0.01)
     assert np.isnan(found.at("vaslat", np.array([0.5, 4.6]))).all()
-    given = load_envelopes(in_si(table(path, normalised_by={"VL": 3e-4})))
+    given = load_envelopes(in_si(table(path, normalised_by={"VL": 3e-4})), TIME)
     assert given.values["VL"].max() < 2 / np.pi
 
 
@@ -84,10 +84,12 @@ def test_a_table_serves_as_well(tmp_path):
     path = tmp_path / "emg.csv"
     rows = [f"{t:.6f},{v:.9f}," for t, v in zip(TIME, burst(2.0), strict=True)]
     path.write_text("\n".join(["clock,VL,", *rows]).replace("VL,", "VL"), encoding="utf-8")
-    found = load_envelopes(in_si(table(path, time="clock")))
+    found = load_envelopes(in_si(table(path, time="clock")), TIME)
     assert found.time[found.values["VL"].argmax()] == pytest.approx(2.0, abs=0.01)
+    with pytest.raises(InputError, match=r"from 9 to 12.9992 s, the motion lasts from 0 to .*offset_s"):
+        load_envelopes(in_si(table(path, time="clock", offset_s=9.0)), TIME)
     with pytest.raises(InputError, match="no column 'VM'"):
-        load_envelopes(in_si(table(path, time="clock", channels={"VM": ("vasmed",)})))
+        load_envelopes(in_si(table(path, time="clock", channels={"VM": ("vasmed",)})), TIME)
 
 
 @pytest.mark.parametrize(

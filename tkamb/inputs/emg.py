@@ -16,6 +16,7 @@ from scipy.signal import butter, sosfiltfilt
 from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array
 from tkamb.inputs.recordings import EmgRecording
+from tkamb.inputs.samples import check_overlap
 from tkamb.inputs.tables import read_table
 
 ORDER = 2
@@ -48,17 +49,23 @@ class Envelopes:
         return np.interp(time, self.time, values, left=np.nan, right=np.nan)
 
 
-def load_envelopes(source: EmgRecording) -> Envelopes:
+def load_envelopes(source: EmgRecording, motion: Array) -> Envelopes:
     """Read EMG and return its envelopes.
 
+    Args:
+        source: file, channels, filters.
+        motion: (f,) s, times of the motion; the two must overlap.
+
     Raises:
-        InputError: no such file or channel, a gap, uneven samples, a cut-off that they do not
-            carry, too short a recording, a channel without signal.
+        InputError: no such file or channel, nothing measured during the motion, a gap, uneven
+            samples, a cut-off that they do not carry, too short a recording, a channel without
+            signal.
     """
     time, signals = _signals(source)
     step = np.diff(time)
     if len(step) < 2 or np.abs(step - np.median(step)).max() > UNEVEN * np.median(step):
         raise InputError("has EMG that is not sampled evenly", source.file, "resample it")
+    check_overlap(source.file, time + source.offset, motion, "[muscles.emg]")
     rate = len(step) / (time[-1] - time[0])
     values, normalised_by = {}, {}
     for channel, signal in signals.items():

@@ -8,6 +8,7 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.inputs.recordings import ForceMeasurement
+from tkamb.inputs.samples import check_overlap
 from tkamb.inputs.tables import Table, read_table
 
 FORCE = {"N": 1.0, "kN": 1e3, "lbf": 4.4482216152605}
@@ -69,13 +70,7 @@ def load_measured_force(source: ForceMeasurement, time: Array) -> MeasuredForce:
         for role, column in source.columns.items()
         if role != "time"
     }
-    if clock[-1] < time[0] or clock[0] > time[-1]:
-        raise InputError(
-            f"was measured from {clock[0]:g} to {clock[-1]:g} s, the motion lasts from "
-            f"{time[0]:g} to {time[-1]:g} s",
-            source.file,
-            "state [measured] offset_s, or another file",
-        )
+    check_overlap(source.file, clock, time, "[measured]")
     return MeasuredForce(source.file, clock, _with_third(force))
 
 

@@ -102,6 +102,24 @@ def check_spacing(path: Path, time: Array) -> None:
         )
 
 
+def check_overlap(path: Path, clock: Array, time: Array, table: str) -> None:
+    """Raise an InputError if nothing was measured during the motion.
+
+    Args:
+        path: of the file.
+        clock: (n,) s, of its samples on the motion's clock.
+        time: (f,) s, of the motion.
+        table: of the scene that names the file, like "[measured]".
+    """
+    if clock[-1] < time[0] or clock[0] > time[-1]:
+        raise InputError(
+            f"was measured from {clock[0]:g} to {clock[-1]:g} s, the motion lasts from "
+            f"{time[0]:g} to {time[-1]:g} s",
+            path,
+            f"state {table} offset_s, or another file",
+        )
+
+
 def check_steps(
     path: Path, what: str, time: Array, values: Array, fastest: float, scale: float, unit: str
 ) -> None:

@@ -157,7 +157,7 @@ def load_case(scene: Scene) -> Case:
         muscles,
         patellar_ligament,
         _measured(scene, motion),
-        _emg(scene),
+        _emg(scene, motion),
         parts.post,
     )
     if scene.patient.scale == 1.0:
@@ -195,12 +195,12 @@ def _measured(scene: Scene, motion: KneeMotion) -> "MeasuredForce | None":
     return load_measured_force(in_si(scene.measured), motion.time)
 
 
-def _emg(scene: Scene) -> "Envelopes | None":
+def _emg(scene: Scene, motion: KneeMotion) -> "Envelopes | None":
     if scene.muscles is None or scene.muscles.emg is None:
         return None
     from tkamb.inputs.emg import load_envelopes
 
-    return load_envelopes(in_si(scene.muscles.emg))
+    return load_envelopes(in_si(scene.muscles.emg), motion.time)
 
 
 def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, ...]":
