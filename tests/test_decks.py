@@ -14,6 +14,7 @@ from tkamb.contact.materials import material
 from tkamb.decks.febio import contact_quads
 from tkamb.decks.frame import frame_press
 from tkamb.errors import InputError
+from tkamb.results_folder import read_results
 from tkamb.simulation import simulate
 from tkamb.starter import lay_out
 from tkamb.studies.calculix import run_calculix
@@ -38,6 +39,20 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def pressed(folder):
     return frame_press(folder, 0)
+
+
+def test_a_deck_says_what_the_post_carries_beside_it(folder, pressed, tmp_path, capsys):
+    assert not any("post" in line for line in pressed.comments())
+    results = read_results(folder)
+    post = {"post_force_N": np.array([412.0]), "post_peak_pressure_MPa": np.array([33.0])}
+    with_post = keep(replace(results, columns=results.columns | post), tmp_path / "run")
+    beside = frame_press(with_post, 0)
+    for kind in ("ccx", "feb"):
+        assert "the cam, which in the run presses the post with 412 N, at most 33 MPa." in (
+            beside.deck(kind)
+        )
+    assert main(["export", str(with_post), "--vtp", "--out", str(tmp_path / "vtk")]) == 0
+    assert "the post's pressure is not among them" in capsys.readouterr().out
 
 
 @WITH_CALCULIX

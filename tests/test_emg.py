@@ -86,7 +86,9 @@ def test_a_table_serves_as_well(tmp_path):
     path.write_text("\n".join(["clock,VL,", *rows]).replace("VL,", "VL"), encoding="utf-8")
     found = load_envelopes(in_si(table(path, time="clock")), TIME)
     assert found.time[found.values["VL"].argmax()] == pytest.approx(2.0, abs=0.01)
-    with pytest.raises(InputError, match=r"from 9 to 12.9992 s, the motion lasts from 0 to .*offset_s"):
+    with pytest.raises(
+        InputError, match=r"from 9 to 12.9992 s, the motion lasts from 0 to .*offset_s"
+    ):
         load_envelopes(in_si(table(path, time="clock", offset_s=9.0)), TIME)
     with pytest.raises(InputError, match="no column 'VM'"):
         load_envelopes(in_si(table(path, time="clock", channels={"VM": ("vasmed",)})), TIME)

@@ -79,6 +79,8 @@ def _export_maps(options: argparse.Namespace) -> int:
     with claimed_directory(options.out, options.force) as folder:
         names = write_map_series(results.maps, folder)
     left = "; a left knee's mirror image" if results.summary.get("side") == "left" else ""
+    if "post_force_N" in results.columns and (results["post_force_N"] > 0.0).any():
+        left += "; the post's pressure is not among them"
     frames = f"{len(names) - 1} of {len(results)} frames"
     print(f"{options.out / names[0]}: {frames}, m and Pa in the insert frame{left}")
     return 0

@@ -28,22 +28,31 @@ class FramePress:
         approach: m, of that pose.
         peak_pressure: Pa, of the map.
         origin: which frame of what, by which contact model.
+        post: N and Pa, force and peak pressure on the insert's post, which is not in the problem;
+            zero where nothing presses it.
     """
 
     problem: PressProblem
     approach: float
     peak_pressure: float
     origin: str
+    post: tuple[float, float] = (0.0, 0.0)
 
     def comments(self) -> tuple[str, ...]:
         """Return what whoever opens the deck must know."""
         problem, millimetres = self.problem, self.approach / MILLIMETRE
+        force, pressure = self.post
+        left = (
+            f"Not in it: the cam, which in the run presses the post with {force:.6g} N, at most "
+            f"{pressure / MEGAPASCAL:.6g} MPa.",
+        )
         return (
             f"{self.origin}; written by tkamb; mm, N, MPa.",
             "Insert frame: x anterior, y superior, z lateral; no friction; the bottom is held.",
             f"{len(problem.lattice.cells)} hexahedra; load {problem.load:.6g} N along -y.",
             f"The run found: approach since first touch {millimetres:.6g} mm, peak pressure "
             f"{self.peak_pressure / MEGAPASCAL:.6g} MPa.",
+            *(left if force > 0.0 else ()),
         )
 
     def deck(self, kind: str) -> str:
@@ -97,7 +106,16 @@ def frame_press(folder: Path, frame: int, resolution_mm: float | None = None) ->
     problem = press_problem(pair, load, pose, resolution_mm or spacing)
     model = (results.summary.get("contact") or {}).get("model")
     origin = f"Frame {frame} of {folder} by {model} at {spacing:g} mm"
-    return FramePress(problem, pair.approach(pose), float(maps.pressure_Pa[row].max()), origin)
+    peak = float(maps.pressure_Pa[row].max())
+    return FramePress(problem, pair.approach(pose), peak, origin, _post(results, frame))
+
+
+def _post(results: Results, frame: int) -> tuple[float, float]:
+    """Return force and peak pressure on the post in a frame, N and Pa; zero without."""
+    if "post_force_N" not in results.columns or not results["post_force_N"][frame] > 0.0:
+        return 0.0, 0.0
+    force, peak = results["post_force_N"][frame], results["post_peak_pressure_MPa"][frame]
+    return float(force), float(peak) * MEGAPASCAL
 
 
 def _pair(results: Results) -> tuple[ContactPair, float]:
