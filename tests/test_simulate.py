@@ -15,6 +15,7 @@ from tkamb.contact.foundation import ElasticFoundation
 from tkamb.contact.result import ContactStatus
 from tkamb.errors import InputError
 from tkamb.geometry.condyles import LowestPoints
+from tkamb.scene.case import load_case
 
 EVERY_TENTH = slice(0, 101, 10)
 
@@ -39,6 +40,15 @@ def test_every_frame_has_numbers(bend):
     assert not any(status.startswith("failed") for status in bend.status)
     for name in ("force_total_N", "quadriceps_N", "patellofemoral_N", "medial_area_mm2"):
         assert np.isfinite(bend[name]).all(), name
+
+
+def test_a_case_is_run_as_it_was_read(bend):
+    case = load_case(load_scene(fast_scene()))
+    again = simulate(case, frames=EVERY_TENTH)
+    for name in set(bend.columns) - CLOCKS:
+        np.testing.assert_array_equal(again.columns[name], bend.columns[name], err_msg=name)
+    with pytest.raises(InputError, match="read already"):
+        simulate(case, resolution_mm=2.0)
 
 
 def test_the_maps_say_of_what_they_are(bend):

@@ -16,6 +16,8 @@ from tkamb.cli import main
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.surface import Surface
 from tkamb.output.maps import ContactMaps
+from tkamb.results_folder import read_results
+from tkamb.scene.case import load_case
 from tkamb.view import CAMERAS
 from tkamb.view.colours import SLACK, TENDON, rgb
 from tkamb.view.drawing import PressureMap
@@ -286,6 +288,28 @@ def test_bad_options_are_one_line_before_anything_is_drawn(
     assert main(["view", str(folder), "--html", str(page), *options]) == 2
     assert word in capsys.readouterr().err.strip().splitlines()[-1]
     assert not page.exists()
+
+
+def test_a_scene_that_is_run_for_the_viewer_is_read_once(folder, tmp_path, monkeypatch):
+    results = read_results(folder)
+    read, run = [], []
+
+    def counted(scene):
+        read.append(load_case(scene))
+        return read[-1]
+
+    def simulated(case, **given):
+        run.append(case)
+        return results
+
+    monkeypatch.chdir(tmp_path)  # no results of the scene stand there
+    for module in ("tkamb.view.run", "tkamb.simulation"):
+        monkeypatch.setattr(f"{module}.load_case", counted)
+    monkeypatch.setattr("tkamb.view.run.simulate", simulated)
+    page = tmp_path / "x.html"
+    scene = results.summary["scene"]
+    assert main(["view", str(scene), "--frame", "1", "--html", str(page)]) == 0
+    assert len(read) == 1 and run == read
 
 
 def test_what_was_written_is_said(folder, tmp_path, capsys):

@@ -25,7 +25,7 @@ Progress = Callable[[Sequence[int]], Iterable[int]]
 
 
 def simulate(
-    scene: Scene | str | Path,
+    scene: Scene | Case | str | Path,
     *,
     contact: str | None = None,
     resolution_mm: float | None = None,
@@ -41,7 +41,7 @@ def simulate(
     """Run a scene and return its results.
 
     Args:
-        scene: a scene, or the path of its file.
+        scene: a scene, the path of its file, or its case, read already.
         contact: contact model, instead of the scene's.
         resolution_mm: spacing of the map points, instead of the scene's.
         frames: which frames; default all.
@@ -57,9 +57,9 @@ def simulate(
             a guess from the one before, which moves answers within the solver's tolerance.
 
     Raises:
-        InputError: the scene or a file that it names cannot be used, the run to resume is
-            another one, the folder cannot be claimed (`tkamb.claim`), or no such number of
-            workers.
+        InputError: the scene or a file that it names cannot be used, a case is given another
+            contact model or resolution, the run to resume is another one, the folder cannot be
+            claimed (`tkamb.claim`), or no such number of workers.
         ComputationError: a worker was killed.
         KeyboardInterrupt: with a folder, what was finished is written there first.
     """
@@ -68,7 +68,7 @@ def simulate(
         scene_path, scene = scene, load_scene(scene)
     start = clock.perf_counter()
     stage("reading scene and recordings")
-    case = load_case(_with_contact(scene, contact, resolution_mm))
+    case = _case_with_contact(scene, contact, resolution_mm)
     indices = chosen_frames(frames, len(case.motion.time))
     identity = run_identity(case, indices)
     if directory is None and resume:
@@ -182,14 +182,20 @@ class _Run:
         self.solver.before = [recalled(side, mechanics, k, arrays) for k, arrays in last]
 
 
-def _with_contact(scene: Scene, model: str | None, resolution_mm: float | None) -> Scene:
+def _case_with_contact(scene: Scene | Case, model: str | None, resolution_mm: float | None) -> Case:
+    """Return the case of a scene with another contact model or resolution, where one is given."""
     changes = {"model": model, "resolution_mm": resolution_mm}
     changes = {key: value for key, value in changes.items() if value is not None}
-    if not changes:
+    if isinstance(scene, Case):
+        if changes:
+            raise InputError("a case has been read already", "contact", "give its scene instead")
         return scene
+    if not changes:
+        return load_case(scene)
     if scene.contact is None:
         raise InputError("the scene has no [contact]", "contact", "add the table to the scene")
-    return scene.model_copy(update={"contact": scene.contact.model_copy(update=changes)})
+    table = scene.contact.model_copy(update=changes)
+    return load_case(scene.model_copy(update={"contact": table}))
 
 
 def chosen_frames(frames: slice | None, count: int) -> range:

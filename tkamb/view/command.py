@@ -47,19 +47,17 @@ def _view(options: argparse.Namespace) -> int:
     say(f"reading {', '.join(map(str, options.runs))}")
     from tqdm import tqdm
 
-    from tkamb.view.run import check_frame, open_run
+    from tkamb.view.run import check_frame, read_source
     from tkamb.view.show import Show
-
-    check_frame(options.runs, options.frame)
 
     def progress(frames: Any) -> Any:
         return tqdm(frames, "drawing", unit="frame", disable=None)
 
-    runs = [
-        open_run(path, contact=contact, progress=progress, announce=say)
-        for path in options.runs
-        for contact in options.contact or [None]
+    sources = [
+        read_source(path, contact) for path in options.runs for contact in options.contact or [None]
     ]
+    check_frame(sources, options.frame)
+    runs = [source.open(progress, say) for source in sources]
     show = Show(
         runs,
         frame=options.frame,

@@ -88,22 +88,57 @@ class CaseResults:
         return replace(mechanics.geometry(k, patella=patella), condyles=condyles)
 
 
-def open_run(
-    path: str | Path,
-    *,
-    contact: str | None = None,
-    progress: Progress = lambda frames: frames,
-    announce: Callable[[str], None] = lambda line: None,
-) -> CaseResults:
-    """Return the run behind a results folder or a scene file.
+@dataclass(frozen=True, eq=False)
+class Source:
+    """What a path names, its files read once: results and their case, or a case to be run.
 
-    A scene whose results stand in its output folder is not run again.
+    Args:
+        path: a folder that `tkamb run` wrote, or a scene file.
+        case: the scene with its files read.
+        results: of the case; None where it has not been run.
+        kept: the folder in which a scene's own results were found.
+    """
+
+    path: Path
+    case: Case
+    results: Results | None
+    kept: Path | None = None
+
+    def __len__(self) -> int:
+        """Return the number of frames that there are to see."""
+        return len(self.case.motion.time if self.results is None else self.results)
+
+    def open(
+        self,
+        progress: Progress = lambda frames: frames,
+        announce: Callable[[str], None] = lambda line: None,
+    ) -> CaseResults:
+        """Return the run, computed first where there are no results.
+
+        Args:
+            progress: wraps the frame indices of a run.
+            announce: takes a line for the user.
+
+        Raises:
+            InputError: the scene cannot be run, or is no longer what was run.
+        """
+        if self.kept is not None:
+            announce(f"results of this scene found in {self.kept}")
+        results = self.results
+        if results is None:
+            announce("running the scene (keep its results with `tkamb run`)")
+            results = simulate(self.case, scene_path=self.path, progress=progress)
+        return match_frames(self.case, results)
+
+
+def read_source(path: str | Path, contact: str | None = None) -> Source:
+    """Return what stands behind a results folder or a scene file; nothing is run.
+
+    A scene whose results stand in its output folder need not be run again.
 
     Args:
         path: a folder that `tkamb run` wrote, or a scene file.
         contact: contact model, instead of the scene's; a scene only.
-        progress: wraps the frame indices of a run.
-        announce: takes a line for the user.
 
     Raises:
         InputError: nothing to see there, or the scene is no longer what was run.
@@ -112,9 +147,11 @@ def open_run(
     if os.path.isdir(path):
         if contact:
             raise InputError("has its own contact model", path, "give the scene to choose another")
-        return _from_folder(path)
-    overrides = {"contact.model": contact} if contact else {}
-    scene = load_scene(path, overrides)
+        results = read_results(path)
+        if not len(results):
+            raise InputError("holds no frame", path, RUN_AGAIN)
+        return Source(path, case_of_results(results), results)
+    scene = load_scene(path, {"contact.model": contact} if contact else {})
     case = load_case(scene)
     folder = scene.output.directory or Path("out") / path.resolve().parent.name
     if (folder / SUMMARY_NAME).exists():
@@ -122,30 +159,35 @@ def open_run(
         same = results.summary.get("scene_sha256") == scene_hash(case)
         same = same and same_files(case, results.summary)
         if same and len(results) and not results.summary.get("unfinished_frames"):
-            announce(f"results of this scene found in {folder}")
-            return match_frames(case, results)
-    announce("running the scene (keep its results with `tkamb run`)")
-    return match_frames(case, simulate(scene, scene_path=path, progress=progress))
+            return Source(path, case, results, folder)
+    return Source(path, case, None)
 
 
-def check_frame(paths: Sequence[Path], frame: int) -> None:
+def open_run(
+    path: str | Path,
+    *,
+    contact: str | None = None,
+    announce: Callable[[str], None] = lambda line: None,
+) -> CaseResults:
+    """Return the run behind a results folder or a scene file; see `read_source` and `Source`.
+
+    Raises:
+        InputError: nothing to see there, or the scene is no longer what was run.
+    """
+    return read_source(path, contact).open(announce=announce)
+
+
+def check_frame(sources: Sequence[Source], frame: int) -> None:
     """Refuse a frame that none of the runs has, before any is run or drawn.
 
     Args:
-        paths: folders that `tkamb run` wrote, or scene files.
+        sources: of the runs.
         frame: row of the results; negative ones count from the end.
 
     Raises:
-        InputError: no run has it, or one cannot be read.
+        InputError: no run has it.
     """
-    if frame in (0, -1):
-        return
-    most = 0
-    for path in paths:
-        if os.path.isdir(path):
-            most = max(most, len(read_results(path)))
-        else:
-            most = max(most, len(load_case(load_scene(path)).motion.time))
+    most = max(map(len, sources))
     if not -most <= frame < most:
         raise no_frame(frame, most)
 
@@ -178,10 +220,3 @@ def run_of_results(results: Results) -> CaseResults:
         InputError: the scene is not there, or no longer what was run.
     """
     return match_frames(case_of_results(results), results)
-
-
-def _from_folder(folder: Path) -> CaseResults:
-    results = read_results(folder)
-    if not len(results):
-        raise InputError("holds no frame", folder, RUN_AGAIN)
-    return run_of_results(results)

@@ -271,13 +271,14 @@ def _operator_of(arrays: list[NDArray[Any]]) -> ElasticOperator:
         raise ValueError("another number of blocks")
     unknowns, edge, last, fronts = len(order), 0, 0, []
     _check(order, 0, unknowns)
+    _check(boundaries, 0, unknowns)
+    _check(np.concatenate([sizes[:, 0], sizes[:, 1] - 1]), 0, unknowns)
+    _check(sizes[:, 2], -1, len(sizes))
     for (start, stop, parent, touched), block in zip(sizes.tolist(), values, strict=False):
         boundary = boundaries[edge : edge + touched]
         scale = scales[last : last + stop - start + touched]
         if block.shape != (len(scale), stop - start) or len(boundary) != touched:
             raise ValueError("a block of another shape")
-        _check(np.array([start, stop - 1, *boundary]), 0, unknowns)
-        _check(np.array([parent]), -1, len(sizes))
         fronts.append(Front(start, stop, boundary, parent, block, scale))
         edge, last = edge + touched, last + len(scale)
     blocks = []
