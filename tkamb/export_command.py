@@ -76,7 +76,7 @@ def _export_maps(options: argparse.Namespace) -> int:
     results = read_results(options.folder)
     if results.maps is None:
         raise InputError("holds no contact.h5", options.folder, "run the scene with [contact]")
-    with claimed_directory(options.out, options.force) as folder:
+    with claimed_directory(options.out, options.force, "export --vtp") as folder:
         names = write_map_series(results.maps, folder)
     left = "; a left knee's mirror image" if results.summary.get("side") == "left" else ""
     frames = f"{len(names) - 1} of {len(results)} frames"

@@ -129,7 +129,8 @@ def estimate_uncertainty(
     with ExitStack() as stack:
         folder = None
         if directory is not None:
-            folder = stack.enter_context(claimed_directory(directory, force))
+            claim = claimed_directory(directory, force, "uncertainty")
+            folder = stack.enter_context(claim)
         task = Task(BandWorker, (case.scene, chosen))
         team = stack.enter_context(crew.team(task, len(points)))  # prepares meanwhile
         nominal = simulate(scene, frames=frames, scene_path=scene_path)
