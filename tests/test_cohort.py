@@ -142,6 +142,32 @@ def test_group_statistics_count_each_run_once(file):
     assert group.bins["force_total_BW"][1, 3] == pytest.approx(mean, rel=1e-12)
 
 
+def by_hand(file, **columns):
+    """Return the group of one run of five frames, of which the fourth failed."""
+    status = ["ok", "ok", "ok", "failed: no contact", "ok"]
+    columns = {"time_s": np.arange(5.0), "flexion_deg": np.arange(5.0)} | columns
+    columns = {name: np.array(values, float) for name, values in columns.items()}
+    (group,) = groups_of(load_cohort(file), {0: Outcome("", columns, status)})
+    return group
+
+
+def test_a_failed_frames_recorded_motion_is_not_averaged_with_the_solved_one(file):
+    """Where adduction is released, a frame that failed holds the recording's."""
+    group = by_hand(file, adduction_deg=[1.0, 2.0, 3.0, 90.0, 4.0])
+    assert group.bins["adduction_deg"] == pytest.approx(np.array([[2.5]]))
+    assert group.peaks["adduction_deg"] == pytest.approx([4.0])
+
+
+def test_the_end_of_a_cycle_is_in_its_last_bin(file):
+    """100 % made a bin of its own, "from 100 to 110 %"."""
+    group = by_hand(
+        file, cycle_percent=[0.0, 45.0, 90.0, 95.0, 100.0], force_total_BW=[1, 2, 3, np.nan, 5]
+    )
+    assert (group.axis, group.edges[-1]) == ("cycle_percent", 100.0)
+    expected = [1, *[np.nan] * 3, 2, *[np.nan] * 4, 4]
+    np.testing.assert_array_equal(group.bins["force_total_BW"], [expected])
+
+
 def test_the_map_is_that_of_the_frame_asked_for_and_the_page_shows_one_per_group(file):
     one = outcome(1.0)
     assert one.columns["flexion_deg"][one.chosen.frame] == pytest.approx(60.0, abs=1.5)
