@@ -16,8 +16,8 @@ from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
 from tkamb.simulation import simulate
 from tkamb.uncertainty.bands import band_columns, influences, measured_inside, percentiles
+from tkamb.uncertainty.folder import write_uncertainty
 from tkamb.uncertainty.inputs import Draw
-from tkamb.uncertainty.kept import write_uncertainty
 from tkamb.uncertainty.run import estimate_uncertainty
 from tkamb.uncertainty.sample import Sampler
 from tkamb.uncertainty.sampling import Point, noise, normal_samples

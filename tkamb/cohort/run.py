@@ -10,7 +10,7 @@ from typing import Any
 
 from tkamb.claim import claimed_directory, is_ours
 from tkamb.code_identity import code_identity
-from tkamb.cohort.kept import write_cohort
+from tkamb.cohort.folder import write_cohort
 from tkamb.cohort.outcome import CohortWorker, Outcome
 from tkamb.cohort.plan import Cohort, load_cohort
 from tkamb.errors import InputError

@@ -292,7 +292,8 @@ def _doubts(knee: "KneeEquilibrium") -> tuple[str, ...]:
         return ()
     return (
         f"how the knee yields to the muscles does not settle ({100 * knee.doubt:.0f} % of it is "
-        "open): with another start the forces come out a few per cent elsewhere",
+        "open): with another start the forces come out elsewhere, by 1 to 3 % in the frames where "
+        "that was measured",
     )
 
 

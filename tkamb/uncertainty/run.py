@@ -25,9 +25,9 @@ from tkamb.uncertainty.bands import (
     measured_inside,
 )
 from tkamb.uncertainty.correlation import correlation_root
+from tkamb.uncertainty.folder import write_uncertainty
 from tkamb.uncertainty.indices import SobolIndex, sobol_indices
 from tkamb.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
-from tkamb.uncertainty.kept import write_uncertainty
 from tkamb.uncertainty.sample import BandWorker, Sample
 from tkamb.uncertainty.sampling import Point, crossed_points, normal_samples
 
