@@ -3,6 +3,7 @@
 import http.client
 import json
 import re
+import shlex
 import shutil
 import socket
 from importlib.resources import files
@@ -227,6 +228,24 @@ def test_a_client_that_says_nothing_is_cut_off(server, monkeypatch):
 def test_a_bad_question_gets_one_line(server, body, word):
     status, answer = ask(server, "POST", "/contact", body)
     assert status == 400 and word in answer.decode() and b"\n" not in answer
+
+
+def test_a_run_with_set_is_seen_as_it_was_run_and_the_advice_names_its_keys(tmp_path, capsys):
+    """The scene was read without --set: refused, with advice that led to another run."""
+    scene, out = copied_scene(tmp_path / "knee"), tmp_path / "out"
+    given = {"motion.frames": 11, "patient.mass_kg": 80.5, "contact.released": ["ap"]}
+    words = [word for k, v in given.items() for word in ("--set", f"{k}={json.dumps(v)}")]
+    assert main(["run", str(scene), "--frames", "0:11:10", *words, "--out", str(out)]) == 0
+    assert open_run(out).case.body_mass == 80.5
+    assert open_run(out).frames == (0, 10)
+    assert main(["view", str(out), "--html", str(tmp_path / "x.html")]) == 0
+    text, changed = re.subn(r'(height_mm"? = )1750', r"\g<1>1760", scene.read_text())
+    assert changed == 1
+    scene.write_text(text)
+    capsys.readouterr()
+    assert main(["view", str(out), "--html", str(tmp_path / "y.html")]) == 2
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert line.endswith(shlex.join([str(scene), *words]))
 
 
 def test_results_of_a_changed_scene_are_refused(tmp_path, capsys):
