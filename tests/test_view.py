@@ -6,6 +6,7 @@ import re
 import shlex
 import shutil
 import socket
+from dataclasses import replace
 from importlib.resources import files
 
 import h5py
@@ -24,7 +25,7 @@ from tkamb.view.payload import LEVELS, Block, _insert_transform, map_levels
 from tkamb.view.run import open_run
 from tkamb.view.shading import shade
 from tkamb.view.show import Show, serve_in_background
-from tkamb.view.strands import _tendon
+from tkamb.view.strands import _tendon, ligament_strands
 from viewed import copied_scene, shipped_run, short_results
 
 
@@ -132,6 +133,28 @@ def test_a_failed_frame_shows_no_pressure():
     nothing = np.full((1, 3), np.nan)
     found = map_levels(PressureMap(np.eye(3), np.array([[0, 1, 2]]), nothing, nothing), 10.0)
     assert (found < 0).all()
+
+
+def test_a_failed_frame_sets_no_strain_scale(folder):
+    """Its pose may tear a ligament in two; the other frames' strains were one colour then."""
+    run = open_run(folder)
+    states = [one.state for one in run.geometries()]
+    strands, limit = ligament_strands(run.mechanics, states, run.results)
+    strains = {}
+    for one in run.mechanics.ligaments:
+        poses = {
+            end.link: np.stack([s.pose(end.link) for s in states])
+            for end in (one.proximal, one.distal)
+        }
+        strains[one.name] = one.strain(one.length(poses))
+    assert limit == pytest.approx(max(map(np.max, strains.values())))
+    worst = int(np.argmax(np.max(list(strains.values()), axis=0)))
+    columns = dict(run.results.columns)
+    columns["status"] = ["failed: x" if k == worst else "ok" for k in range(len(states))]
+    strands, limit = ligament_strands(run.mechanics, states, replace(run.results, columns=columns))
+    left = [np.max(np.delete(one, worst)) for one in strains.values()]
+    assert limit == pytest.approx(max(left))
+    assert all((strand.colours[worst] == rgb(SLACK)).all() for strand in strands)
 
 
 def test_shading_keeps_every_triangle_and_doubles_sharp_edges():
