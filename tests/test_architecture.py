@@ -9,7 +9,8 @@ PACKAGE = Path(__file__).parents[1] / "tkamb"
 
 KNOWN_TO_ALL = {
     *("atomic", "claim", "code_identity", "defaults", "errors", "files", "guard"),
-    *("activities", "known_errors", "memory", "named_classes", "scene_options", "units"),
+    *("activities", "known_errors", "memory", "named_classes", "occupants", "scene_options"),
+    "units",
 }
 """Modules without knees: numbers, files, memory, messages."""
 KNEE = {"body", "contact", "equilibrium", "geometry", "scene"}

@@ -16,7 +16,7 @@ from interrupted_runs import broken_off, held_elsewhere
 from synthetic_run import make_run
 from tkamb.claim import claimed_directory, settle
 from tkamb.cli import main
-from tkamb.cohort.kept import frame_table, write_cohort
+from tkamb.cohort.folder import frame_table, write_cohort
 from tkamb.cohort.outcome import Outcome, chosen_map
 from tkamb.cohort.plan import CohortTable, load_cohort
 from tkamb.cohort.report import _told_apart, cohort_html, draw_groups
@@ -91,7 +91,7 @@ def test_a_cohort_is_its_runs_one_by_one_and_lists_what_failed(file, tmp_path, c
 
 
 def test_parts_and_workers_and_an_interrupt_change_nothing(file, tmp_path, monkeypatch):
-    monkeypatch.setattr("tkamb.cohort.kept.cohort_html", lambda *_: "page")
+    monkeypatch.setattr("tkamb.cohort.folder.cohort_html", lambda *_: "page")
     whole, parted = tmp_path / "whole", tmp_path / "parted"
 
     with pytest.raises(KeyboardInterrupt, match="1 of 6 runs are kept"):
@@ -140,6 +140,32 @@ def test_group_statistics_count_each_run_once(file):
     mean = 1.2 * make_run("bend", 201)["force_total_BW"][chosen].mean()
     assert group.edges[3] == 30.0
     assert group.bins["force_total_BW"][1, 3] == pytest.approx(mean, rel=1e-12)
+
+
+def by_hand(file, **columns):
+    """Return the group of one run of five frames, of which the fourth failed."""
+    status = ["ok", "ok", "ok", "failed: no contact", "ok"]
+    columns = {"time_s": np.arange(5.0), "flexion_deg": np.arange(5.0)} | columns
+    columns = {name: np.array(values, float) for name, values in columns.items()}
+    (group,) = groups_of(load_cohort(file), {0: Outcome("", columns, status)})
+    return group
+
+
+def test_a_failed_frames_recorded_motion_is_not_averaged_with_the_solved_one(file):
+    """Where adduction is released, a frame that failed holds the recording's."""
+    group = by_hand(file, adduction_deg=[1.0, 2.0, 3.0, 90.0, 4.0])
+    assert group.bins["adduction_deg"] == pytest.approx(np.array([[2.5]]))
+    assert group.peaks["adduction_deg"] == pytest.approx([4.0])
+
+
+def test_the_end_of_a_cycle_is_in_its_last_bin(file):
+    """100 % made a bin of its own, "from 100 to 110 %"."""
+    group = by_hand(
+        file, cycle_percent=[0.0, 45.0, 90.0, 95.0, 100.0], force_total_BW=[1, 2, 3, np.nan, 5]
+    )
+    assert (group.axis, group.edges[-1]) == ("cycle_percent", 100.0)
+    expected = [1, *[np.nan] * 3, 2, *[np.nan] * 4, 4]
+    np.testing.assert_array_equal(group.bins["force_total_BW"], [expected])
 
 
 def test_the_map_is_that_of_the_frame_asked_for_and_the_page_shows_one_per_group(file):
@@ -232,7 +258,7 @@ def test_two_into_one_folder_and_another_cohort_to_resume_are_refused(file, tmp_
 @pytest.mark.slow
 def test_a_full_disk_leaves_no_table_or_the_whole_of_it(file, tmp_path, monkeypatch):
     cohort, outcomes = load_cohort(file), {n: outcome(1.0, 5) for n in range(4)}
-    monkeypatch.setattr("tkamb.cohort.kept.cohort_html", lambda *_: "page")
+    monkeypatch.setattr("tkamb.cohort.folder.cohort_html", lambda *_: "page")
 
     def write(place, number=None):
         place.mkdir()

@@ -41,20 +41,6 @@ def pressed(folder):
     return frame_press(folder, 0)
 
 
-def test_a_deck_says_what_the_post_carries_beside_it(folder, pressed, tmp_path, capsys):
-    assert not any("post" in line for line in pressed.comments())
-    results = read_results(folder)
-    post = {"post_force_N": np.array([412.0]), "post_peak_pressure_MPa": np.array([33.0])}
-    with_post = keep(replace(results, columns=results.columns | post), tmp_path / "run")
-    beside = frame_press(with_post, 0)
-    for kind in ("ccx", "feb"):
-        assert "the cam, which in the run presses the post with 412 N, at most 33 MPa." in (
-            beside.deck(kind)
-        )
-    assert main(["export", str(with_post), "--vtp", "--out", str(tmp_path / "vtk")]) == 0
-    assert "the post's pressure is not among them" in capsys.readouterr().out
-
-
 @WITH_CALCULIX
 def test_calculix_runs_the_deck_and_carries_the_load(pressed):
     result, balance = peer_result(pressed.problem, run_calculix(pressed.deck("ccx")))
@@ -109,6 +95,26 @@ def test_febio_s_file_holds_the_same_bodies_and_the_travel(pressed):
     up = np.cross(c - a, d - b)[:, 1]
     assert len(quads) > 50 and (up > 0).all()  # outward of an articular surface
     assert set(np.unique(lattice.contact_triangles)) == set(np.unique(quads))
+
+
+def test_a_deck_says_what_its_answer_differs_from_the_runs_by(folder, pressed, tmp_path, capsys):
+    (line,) = pressed.notes
+    assert "Material 'polyethylene-linear', linear: E 561.5 MPa, nu 0.45" in line
+    assert "the run's model assumes finite elements" in line
+    results = read_results(folder)
+    post = {"post_force_N": 123.0, "post_peak_pressure_MPa": 9.5}
+    columns = results.columns | {name: np.array([value]) for name, value in post.items()}
+    summary = results.summary | {"side": "left", "lateral_axis": "-z"}
+    other = keep(replace(results, columns=columns, summary=summary), tmp_path / "other")
+    for kind, suffix in (("ccx", "inp"), ("feb", "feb")):
+        out = tmp_path / f"frame.{suffix}"
+        assert main(["export", str(other), "--deck", kind, "--frame", "0", "--out", str(out)]) == 0
+        said = capsys.readouterr().out
+        for words in ("neither load nor peak: 123 N, peak 9.5 MPa", "left knee's mirror image"):
+            assert words in out.read_text() and words in said
+        assert "z medial" in out.read_text()
+    assert main(["export", str(other), "--vtp", "--out", str(tmp_path / "vtp")]) == 0
+    assert "without the post's pressure" in capsys.readouterr().out
 
 
 def test_what_febio_s_deck_does_not_hold_is_refused(pressed):

@@ -94,6 +94,16 @@ def test_a_table_serves_as_well(tmp_path):
         load_envelopes(in_si(table(path, time="clock", channels={"VM": ("vasmed",)})), TIME)
 
 
+@pytest.mark.parametrize("level", [0.0, 0.3, -1e-4])
+@pytest.mark.parametrize("high_pass", [20.0, "none"])
+def test_an_electrode_that_gave_one_value_throughout_is_no_signal(tmp_path, level, high_pass):
+    """The round-off of 0.3 less its mean, over its own largest value, was an envelope of 1."""
+    path = tmp_path / "flat.csv"
+    path.write_text("\n".join(["time,VL", *(f"{t:.6f},{level}" for t in TIME)]), encoding="utf-8")
+    with pytest.raises(InputError, match="'VL' holds no signal"):
+        load_envelopes(in_si(table(path, high_pass_Hz=high_pass)))
+
+
 @pytest.mark.parametrize(
     "changes",
     [

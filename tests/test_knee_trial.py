@@ -5,14 +5,17 @@ import pytest
 from scipy.optimize import minimize
 
 from jw_gait import JW, gait, needs_jw
-from tkamb.geometry.frames import inverse, transform
+from opensim_models import PUBLISHED, model
+from tkamb.geometry.frames import MIRROR, inverse, transform
 from tkamb.importing.anatomy import find_leg
 from tkamb.importing.links import find_links
 from tkamb.inputs.meshes import load_surface
 from tkamb.muscles import Sharing
 from tkamb.muscles.knee_trial import knee_trial
+from tkamb.muscles.recording import LegRecording, load_knee_trial
 from tkamb.muscles.trial import trial_problems
 from tkamb.opensim.motion import CoordinateMotion
+from tkamb.output.storage import write_storage
 
 EXTENSORS = {"recfem", "vasint", "vaslat", "vasmed"}
 CROSSING = {"bflh", "bfsh", "gaslat", "gasmed", "grac", "sart", "semimem", "semiten", "tfl"}
@@ -80,3 +83,45 @@ def test_slsqp_finds_the_same_forces_in_gait(jw):
         assert problem.cost(activation) <= problem.cost(other.x) * (1 + 1e-9)
         np.testing.assert_allclose(activation, other.x, atol=2e-4)
         np.testing.assert_allclose(problem.others(other.x), reserve, atol=0.02)
+
+
+def walked(names, time, left):
+    """Return coordinate -> (n,) of a made-up stride, or of its image in the sagittal plane."""
+    reflected = {"pelvis_list", "pelvis_rotation", "pelvis_tz"}
+    swing = {"hip_flexion": 0.3, "hip_adduction": 0.1, "hip_rotation": 0.1, "ankle_angle": 0.15}
+    found = {name: np.zeros_like(time) for name in names}
+    for own, phase in (("r", 0.0), ("l", 1.3)):
+        at = {"r": "l", "l": "r"}[own] if left else own
+        for k, (name, size) in enumerate(swing.items()):
+            found[f"{name}_{at}"] = size * np.sin(6 * time + phase + k)
+        found[f"knee_angle_{at}"] = 0.5 + 0.25 * np.sin(6 * time + phase)
+    for k, name in enumerate(("pelvis_tilt", *sorted(reflected))):
+        sign = -1.0 if left and name in reflected else 1.0
+        found[name] = sign * (0.02 + 0.05 * np.sin((4 + k) * time))
+    return found | {"pelvis_tx": 1.2 * time, "pelvis_ty": 0.95 + 0.02 * np.sin(9 * time)}
+
+
+def test_the_left_leg_of_a_symmetric_model_is_the_mirror_image_of_the_right(tmp_path):
+    """Mirrored motion: the same moments, arms and strengths by name, mirrored lines at the knee."""
+    time, found = np.linspace(0.0, 1.0, 41), {}
+    names = list(model("Rajagopal2016").coordinates)
+    for side in ("right", "left"):
+        path = tmp_path / f"{side}.mot"
+        columns = {"time": time} | walked(names, time, side == "left")
+        write_storage(path, columns, in_degrees=False)
+        mesh = {"insert": None, "mesh_unit": "m", "mesh_axes": "+x,+y,+z"}
+        given = {"markers": None, "laboratory_axes": "+x,+y,+z", "cutoff": 6.0, "ground": None}
+        recording = LegRecording(
+            PUBLISHED["Rajagopal2016"], side, path, **given, **mesh, sharing=Sharing()
+        )
+        found[side] = load_knee_trial(recording, time[5:36:5])
+    (links, right), (mirrored_links, left) = found["right"], found["left"]
+    assert [name[:-2] for name in right.muscles] == [name[:-2] for name in left.muscles]
+    assert all(name.endswith("_l") for name in left.muscles) and len(left.muscles) == 40
+    for name in ("moment", "arms", "active", "passive"):
+        one, other = getattr(right.problems, name), getattr(left.problems, name)
+        np.testing.assert_allclose(other, one, atol=1e-9 * np.abs(one).max(initial=1.0))
+    np.testing.assert_allclose(left.shank @ MIRROR, right.shank, atol=1e-12)
+    np.testing.assert_allclose(left.thigh @ MIRROR, right.thigh, atol=1e-12)
+    np.testing.assert_allclose(mirrored_links.hip @ MIRROR, links.hip, atol=1e-12)
+    np.testing.assert_array_equal(left.extensor, right.extensor)

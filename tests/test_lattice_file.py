@@ -29,9 +29,11 @@ def test_json_holds_the_measures(capsys):
     assert report["out"] is None
 
 
-def test_left_is_the_mirror_image():
+def test_left_is_the_mirror_image(tmp_path):
     right = lattice_of_file(INSERT, 3.0)
-    left = lattice_of_file(INSERT, 3.0, side="left")
+    left = lattice_of_file(INSERT, 3.0, side="left", out=tmp_path / "left.vtu")
+    assert left.lines()[-1].endswith("the left insert's mirror image")
+    assert left.as_dict()["mirrored"]
     assert left.quality.volume == pytest.approx(right.quality.volume, rel=1e-3)
 
 

@@ -27,3 +27,10 @@ def test_the_wheel_made_from_the_sdist_holds_the_whole_package(tmp_path):
         assert any(name.endswith("licenses/LICENSE") for name in names)
     held = {name for name in names if ".dist-info/" not in name}
     assert held == {name for name in listed if (ROOT / name).is_file()}
+
+
+def test_python_m_tkamb_is_the_command():
+    ran = subprocess.run(
+        [sys.executable, "-m", "tkamb", "--version"], capture_output=True, text=True, check=True
+    )
+    assert ran.stdout.startswith("tkamb ")

@@ -18,9 +18,10 @@ from tkamb.cli import main
 from tkamb.contact.registry import contact_class, contact_names
 from tkamb.errors import InputError
 from tkamb.geometry.surface import Surface
+from tkamb.inputs.vtp import read_vtp
 from tkamb.mesh_command import add_mesh, add_press
 from tkamb.press import read_pose
-from tkamb.units import LENGTH
+from tkamb.units import LENGTH, MILLIMETRE
 
 FOUNDATION = ["--contact", "foundation"]
 press_meshes = partial(press.press_meshes, contact="foundation")
@@ -115,10 +116,7 @@ def test_text_names_both_condyles_and_the_map_is_written(meshes, capsys, tmp_pat
     femoral, insert = meshes()
     pressing = ["press", str(femoral), str(insert), "--load", "900", *FOUNDATION]
     assert main([*pressing, "--out", str(tmp_path / "map.vtp")]) == 0
-    arrays = ElementTree.parse(tmp_path / "map.vtp").getroot().iter("DataArray")
-    (text,) = (one.text for one in arrays if one.get("Name") == "nodal_force_N")
-    force = np.frombuffer(base64.b64decode(text)[8:]).reshape(-1, 3)
-    assert force[:, 1].sum() == pytest.approx(-900, rel=1e-6)
+    assert nodal_forces(tmp_path / "map.vtp")[:, 1].sum() == pytest.approx(-900, rel=1e-6)
     assert main([*pressing, "--out", str(tmp_path / "map.stl")]) == 2
     text = capsys.readouterr().out
     assert "medial" in text
@@ -172,6 +170,32 @@ def test_a_left_knee_is_the_mirror_image(meshes):
     assert np.allclose(left[:, :-1], right[:, :-1], rtol=1e-6, atol=1e-6)
     assert np.allclose(left[:, -1], -right[:, -1], atol=1e-6)
     assert right[0, -1] < 0 < right[1, -1]
+
+
+def nodal_forces(path):
+    """Return the nodal forces (n, 3) N of a .vtp that `press` wrote."""
+    arrays = ElementTree.parse(path).getroot().iter("DataArray")
+    (text,) = (one.text for one in arrays if one.get("Name") == "nodal_force_N")
+    return np.frombuffer(base64.b64decode(text)[8:]).reshape(-1, 3)
+
+
+def test_a_left_knee_s_map_lies_on_its_own_insert(meshes, tmp_path):
+    """Its forces have the printed centres of pressure; it is the right one's mirror image."""
+    pose, path, forces = np.array([2.0, 30.0, 0.4, 0.03, 1.0, 15.0]), tmp_path / "map.vtp", {}
+    for side, flip in (("right", 1), ("left", -1)):
+        turned = pose * [1, 1, flip, flip, flip, 1]
+        report = press_meshes(*meshes(mirror=flip < 0), 2000.0, pose=turned, side=side)
+        report.write_map(path)
+        (points, faces), forces[side] = read_vtp(path), nodal_forces(path)
+        for name, place in (("medial", -flip), ("lateral", flip)):
+            load = np.where(points[:, 2] * place > 0, -forces[side][:, 1], 0.0)
+            centre = load @ points / load.sum() / MILLIMETRE
+            assert centre[::2] == pytest.approx(report.as_dict()[name]["cop_mm"][::2], abs=0.02)
+        edges = (points[faces[:, k]] - points[faces[:, 0]] for k in (1, 2))
+        assert (np.cross(*edges)[:, 1] > 0).all()  # they look up, as outer faces do
+    right, left = (forces[side].sum(axis=0) for side in ("right", "left"))
+    assert abs(right[2]) > 1.0
+    assert left == pytest.approx(right * [1, 1, -1], abs=1e-3)
 
 
 def test_the_pose_places_the_femoral_mesh_in_the_insert_s_axes(meshes):

@@ -8,7 +8,7 @@ import pytest
 from joints import demand, dished_joint, push
 from jw_gait import JW, needs_jw
 from mirrored_patient import write_mirrored_patient
-from scenes import MODEL
+from scenes import MODEL, write_scene
 from shared_trials import two_flexors
 from tkamb.body.crossing import CrossingLines, MuscleShare
 from tkamb.body.joint_equilibrium import external_wrench
@@ -226,3 +226,30 @@ def test_activations_in_gait_are_continuous_at_100_Hz():
     assert np.median(columns["coupling_iterations"]) <= 5
     heads = sum(columns[f"muscle_{name}_N"] for name in ("recfem", "vasint", "vaslat", "vasmed"))
     np.testing.assert_allclose(heads, columns["quadriceps_N"], atol=2.0)
+
+
+def test_all_results_of_a_left_leg_with_muscles_are_the_right_ones(tmp_path, monkeypatch):
+    """From mirrored files to columns and map: forces by name, moments, parts, pressure."""
+
+    def given(case):
+        left = case.scene.patient.side == "left"
+        trial = two_flexors(len(case.motion.time), least=0.02)
+        if left:
+            trial = replace(trial, shank=trial.shank @ MIRROR, thigh=trial.thigh @ MIRROR)
+        return SharedMuscles(trial, left)
+
+    monkeypatch.setattr("tkamb.equilibrium.shared_muscles.load_muscles", given)
+    settings = CONTACT | {"muscles.model": "patient.urdf"}  # read by what is replaced here
+    left_scene = write_mirrored_patient(tmp_path / "left")
+    right, left = (
+        simulate(load_scene(path, settings), frames=slice(40, 101, 30))
+        for path in (write_scene(tmp_path / "right"), left_scene)
+    )
+    assert right.status == left.status == ["ok"] * 3
+    assert set(right.columns) == set(left.columns) >= {"muscle_hamstring_N", "hip_moment_ap_Nm"}
+    assert "lateral_from_gastrocnemius_N" in right.columns
+    for name in set(right.columns) - {"status"}:
+        if not name.endswith("_seconds"):
+            size = np.nanmax(np.abs(right[name]), initial=1e-3)
+            np.testing.assert_allclose(left[name], right[name], atol=1e-6 * size, err_msg=name)
+    np.testing.assert_allclose(left.maps.pressure_Pa, right.maps.pressure_Pa, atol=1.0)

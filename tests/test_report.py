@@ -271,8 +271,18 @@ def test_residuals_are_relative_to_the_superior_inferior_force(bend):
     assert np.allclose(metrics.residual_share(bend), expected)
     drawn = {line.name: line for p in panels(bend) if p.name == "residuals" for line in p.lines}
     assert np.allclose(drawn["size"].values, 100 * expected)
-    sensitivity = 100 * bend["residual_sensitivity_N"] / bend["force_si_N"]
-    assert np.allclose(drawn["residual_sensitivity_N"].values, sensitivity)
+    effect = 100 * bend["residual_sensitivity_N"] / bend["force_si_N"]
+    assert np.allclose(drawn["effect"].values, effect)
+    (card,) = (c for c in cards(bend, horizontal_axis(bend)) if c.title == "Residual force")
+    assert f"changes the total by ≤ {effect.max():.1f} % of it" in card.detail
+
+
+def test_no_band_in_newtons_is_drawn_among_shares_of_the_force(bend):
+    """The effect of the residuals' place is in per cent; its band in bands.csv is in N."""
+    ends = (("p05", 10.0), ("p50", 20.0), ("p95", 30.0))
+    bands = {f"residual_sensitivity_N_{end}": np.full(len(bend), n) for end, n in ends}
+    (panel,) = (p for p in panels(replace(bend, bands=bands)) if p.name == "residuals")
+    assert [line.name for line in panel.lines if line.band is not None] == []
 
 
 def test_the_known_error_stands_beside_pressure_and_area_in_colour_where_it_is_large(

@@ -7,6 +7,8 @@ from scipy.stats import sobol_indices as scipy_indices
 
 from test_uncertainty import SCENE, SLOPES, bodies_alone
 from tkamb.cli import main
+from tkamb.uncertainty.bands import influences
+from tkamb.uncertainty.command import headline
 from tkamb.uncertainty.indices import sobol_indices
 from tkamb.uncertainty.run import estimate_uncertainty
 from tkamb.uncertainty.sampling import crossed_points, noise, noise_of_point, normal_samples
@@ -70,6 +72,26 @@ def test_rows_with_a_failed_sample_are_left_out_and_a_constant_has_no_index():
     assert sobol_indices(["y"], ["a", "b"], np.ones((1024, 1, 1)), 256, 1) == []
 
 
+@pytest.mark.parametrize("level", [1.0, 0.1, 2310.4567, -1e6 / 3])
+def test_a_result_that_no_input_moves_has_no_rows(level):
+    """The round-off of its mean was a variance, all of it "rest"."""
+    assert sobol_indices(["y"], ["a", "b"], np.full((1024, 1, 1), level), 256, 1) == []
+    errors = np.random.default_rng(1).standard_normal((256, 1, 2))
+    assert influences(["y"], ["a", "b"], np.full((256, 1, 1), level), errors) == []
+    assert influences(["y"], ["a", "b"], level + 1e-6 * level * errors[:, None, :, 0], errors)
+
+
+@pytest.mark.parametrize("count", [60, 240])
+def test_an_input_without_effect_has_the_share_that_chance_gives(count):
+    """2/n of what the others leave, as the command line says: here noise alone, n samples."""
+    random, shares = np.random.default_rng(2), []
+    for _ in range(100):
+        errors = random.standard_normal((count, 1, 3))
+        rows = influences(["y"], list("abc"), random.standard_normal((count, 1, 1)), errors)
+        shares += [one.share for one in rows if one.name != "rest"]
+    assert np.mean(shares) == pytest.approx(2 / count, rel=0.15)
+
+
 def test_the_noise_of_a_crossed_column_is_that_of_the_sample_it_comes_from():
     time, columns = np.linspace(0.0, 1.0, 5), [0, 1]
     points = crossed_points(np.zeros((3, 2)), np.ones((3, 2)))
@@ -107,6 +129,10 @@ def test_indices_of_a_scene_add_up_where_loads_add_up(tmp_path, monkeypatch):
     assert sum(one.first for one in total.values()) == pytest.approx(1.0, abs=0.15)
     assert total["ground_reaction"].total > total["segment_mass"].total
     assert (folder / "indices.csv").read_text().count("\n") > 2
+    first = total["ground_reaction"]
+    line = f"ground_reaction {first.first:.2f} ± {first.first_error:.2f} alone, {first.total:.2f} ±"
+    assert line in "\n".join(headline(found))
+    assert "up to 2% each is chance" in "\n".join(headline(found))  # 2 of 128 samples
     assert main(["verify", str(folder)]) == 0
 
 

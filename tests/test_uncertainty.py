@@ -16,8 +16,8 @@ from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
 from tkamb.simulation import simulate
 from tkamb.uncertainty.bands import band_columns, influences, measured_inside, percentiles
+from tkamb.uncertainty.folder import write_uncertainty
 from tkamb.uncertainty.inputs import Draw
-from tkamb.uncertainty.kept import write_uncertainty
 from tkamb.uncertainty.run import estimate_uncertainty
 from tkamb.uncertainty.sample import Sampler
 from tkamb.uncertainty.sampling import Point, noise, normal_samples
@@ -199,7 +199,9 @@ def test_interrupted_and_resumed_by_two_workers_it_is_what_one_worker_finds(tmp_
         np.testing.assert_array_equal(mine.values, other.values)
         np.testing.assert_array_equal(mine.errors, other.errors)
     assert main(["verify", str(folder)]) == 0
-    write_results(one.results, folder)  # another run: its bands go
+    with pytest.raises(InputError, match="holds what `tkamb uncertainty` wrote"):
+        write_results(one.results, folder)
+    write_results(one.results, folder, force=True)  # another run: its bands go
     assert not any((folder / name).exists() for name in UNCERTAINTY_NAMES)
 
 

@@ -3,8 +3,10 @@
 import http.client
 import json
 import re
+import shlex
 import shutil
 import socket
+from dataclasses import replace
 from importlib.resources import files
 
 import h5py
@@ -25,7 +27,7 @@ from tkamb.view.payload import LEVELS, Block, _insert_transform, map_levels
 from tkamb.view.run import open_run
 from tkamb.view.shading import shade
 from tkamb.view.show import Show, serve_in_background
-from tkamb.view.strands import _tendon
+from tkamb.view.strands import _tendon, ligament_strands
 from viewed import copied_scene, shipped_run, short_results
 
 
@@ -135,6 +137,28 @@ def test_a_failed_frame_shows_no_pressure():
     assert (found < 0).all()
 
 
+def test_a_failed_frame_sets_no_strain_scale(folder):
+    """Its pose may tear a ligament in two; the other frames' strains were one colour then."""
+    run = open_run(folder)
+    states = [one.state for one in run.geometries()]
+    strands, limit = ligament_strands(run.mechanics, states, run.results)
+    strains = {}
+    for one in run.mechanics.ligaments:
+        poses = {
+            end.link: np.stack([s.pose(end.link) for s in states])
+            for end in (one.proximal, one.distal)
+        }
+        strains[one.name] = one.strain(one.length(poses))
+    assert limit == pytest.approx(max(map(np.max, strains.values())))
+    worst = int(np.argmax(np.max(list(strains.values()), axis=0)))
+    columns = dict(run.results.columns)
+    columns["status"] = ["failed: x" if k == worst else "ok" for k in range(len(states))]
+    strands, limit = ligament_strands(run.mechanics, states, replace(run.results, columns=columns))
+    left = [np.max(np.delete(one, worst)) for one in strains.values()]
+    assert limit == pytest.approx(max(left))
+    assert all((strand.colours[worst] == rgb(SLACK)).all() for strand in strands)
+
+
 def test_shading_keeps_every_triangle_and_doubles_sharp_edges():
     import trimesh
 
@@ -229,6 +253,24 @@ def test_a_client_that_says_nothing_is_cut_off(server, monkeypatch):
 def test_a_bad_question_gets_one_line(server, body, word):
     status, answer = ask(server, "POST", "/contact", body)
     assert status == 400 and word in answer.decode() and b"\n" not in answer
+
+
+def test_a_run_with_set_is_seen_as_it_was_run_and_the_advice_names_its_keys(tmp_path, capsys):
+    """The scene was read without --set: refused, with advice that led to another run."""
+    scene, out = copied_scene(tmp_path / "knee"), tmp_path / "out"
+    given = {"motion.frames": 11, "patient.mass_kg": 80.5, "contact.released": ["ap"]}
+    words = [word for k, v in given.items() for word in ("--set", f"{k}={json.dumps(v)}")]
+    assert main(["run", str(scene), "--frames", "0:11:10", *words, "--out", str(out)]) == 0
+    assert open_run(out).case.body_mass == 80.5
+    assert open_run(out).frames == (0, 10)
+    assert main(["view", str(out), "--html", str(tmp_path / "x.html")]) == 0
+    text, changed = re.subn(r'(height_mm"? = )1750', r"\g<1>1760", scene.read_text())
+    assert changed == 1
+    scene.write_text(text)
+    capsys.readouterr()
+    assert main(["view", str(out), "--html", str(tmp_path / "y.html")]) == 2
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert line.endswith(shlex.join([str(scene), *words]))
 
 
 def test_results_of_a_changed_scene_are_refused(tmp_path, capsys):

@@ -27,6 +27,7 @@ from tkamb.atomic import (
 )
 from tkamb.errors import InputError
 from tkamb.files import TABLE_LIMIT, read_json, read_text
+from tkamb.occupants import check_occupants
 
 CHOOSE = "choose another folder with --out"
 LONGEST_WAIT = 5.0
@@ -37,7 +38,7 @@ _held: set[tuple[int, int, int]] = set()
 
 
 @contextmanager
-def claimed_directory(path: str | Path, force: bool = False) -> Iterator[Path]:
+def claimed_directory(path: str | Path, force: bool = False, command: str = "") -> Iterator[Path]:
     """Hold an output folder: it is there, can be written, is tkamb's, and nobody else's now.
 
     What a killed process left unfinished in it is finished or removed. After bad input the
@@ -46,11 +47,13 @@ def claimed_directory(path: str | Path, force: bool = False) -> Iterator[Path]:
 
     Args:
         path: of the folder; made if it is not there.
-        force: take it even if it holds things that are not tkamb's; they are left alone.
+        force: take it even if it holds things that are not tkamb's, which are left alone, or
+            another command's output.
+        command: of tkamb that writes there; without one any output of tkamb's may be there.
 
     Raises:
-        InputError: it cannot be made or written, is not tkamb's, or another process holds it;
-            or from the block.
+        InputError: it cannot be made or written, is not tkamb's, holds another command's output
+            (`tkamb.occupants`), or another process holds it; or from the block.
     """
     path = Path(path)
     made = [folder for folder in (path, *path.parents) if not _exists(folder)]
@@ -70,6 +73,8 @@ def claimed_directory(path: str | Path, force: bool = False) -> Iterator[Path]:
                 _mark(path)
                 finish_replacement(path)
                 _remove_temporaries(path)
+                if command and not force:
+                    check_occupants(path, command)
                 yield path
             except InputError:
                 if fresh:

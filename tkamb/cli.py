@@ -127,7 +127,7 @@ def _run(options: argparse.Namespace) -> int:
 
     scene = _scene_of(options)
     directory = options.out or scene.output.directory or _default_directory(options.scene)
-    with Stages(4) as stages, claimed_directory(directory, options.force):
+    with Stages(4) as stages, claimed_directory(directory, options.force, "run"):
         results = simulate(
             scene,
             frames=options.frames,

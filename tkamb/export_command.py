@@ -76,11 +76,10 @@ def _export_maps(options: argparse.Namespace) -> int:
     results = read_results(options.folder)
     if results.maps is None:
         raise InputError("holds no contact.h5", options.folder, "run the scene with [contact]")
-    with claimed_directory(options.out, options.force) as folder:
+    with claimed_directory(options.out, options.force, "export --vtp") as folder:
         names = write_map_series(results.maps, folder)
-    left = "; a left knee's mirror image" if results.summary.get("side") == "left" else ""
-    if "post_force_N" in results.columns and (results["post_force_N"] > 0.0).any():
-        left += "; the post's pressure is not among them"
+    more = "; a left knee's mirror image" if results.summary.get("side") == "left" else ""
+    more += "; without the post's pressure" if "post_force_N" in results.columns else ""
     frames = f"{len(names) - 1} of {len(results)} frames"
-    print(f"{options.out / names[0]}: {frames}, m and Pa in the insert frame{left}")
+    print(f"{options.out / names[0]}: {frames}, m and Pa in the insert frame{more}")
     return 0

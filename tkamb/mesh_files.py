@@ -30,15 +30,19 @@ class LatticeReport:
         lattice: in the insert frame.
         quality: its measures.
         out: the .vtu file, None when none was asked for.
+        side: of the knee; a left insert's lattice is its mirror image.
     """
 
     lattice: Lattice
     quality: LatticeQuality
     out: Path | None
+    side: str
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
-        return [*self.quality.lines(), *([] if self.out is None else [f"written to {self.out}"])]
+        left = "; the left insert's mirror image" if self.side == "left" else ""
+        written = [] if self.out is None else [f"written to {self.out}{left}"]
+        return [*self.quality.lines(), *written]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report for JSON; SI units, angles in rad."""
@@ -47,6 +51,7 @@ class LatticeReport:
             **values,
             "volume_error": self.quality.volume_error,
             "out": self.out and str(self.out),
+            "mirrored": self.side == "left",
         }
 
 
@@ -86,7 +91,7 @@ def lattice_of_file(
     if out is not None:
         write_lattice(lattice, out)
     return LatticeReport(
-        lattice, measure_quality(lattice, surface), None if out is None else Path(out)
+        lattice, measure_quality(lattice, surface), None if out is None else Path(out), side
     )
 
 

@@ -25,7 +25,7 @@ from tkamb.geometry.adjustment import adjust as adjusted
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.flat_bottom import insert_placement
-from tkamb.geometry.frames import Array, Index, mirrored_pose
+from tkamb.geometry.frames import MIRROR, Array, Index, mirrored_pose
 from tkamb.geometry.frames import pose as pose_matrix
 from tkamb.inputs.meshes import axes_rotation, load_surface, mirrored
 from tkamb.known_errors import KnownError, as_json, known_error, known_error_words, left_out
@@ -90,17 +90,22 @@ class PressReport:
         return self.result.status is ContactStatus.OK
 
     def write_map(self, path: Path) -> None:
-        """Write the pressure map as .vtp (metres, insert frame; a left knee's mirror image).
+        """Write the pressure map as .vtp: metres, insert frame, z to the subject's right.
+
+        A left knee's is mirrored back: it lies on the insert that was given, as the centres of
+        pressure do.
 
         Raises:
             InputError: another format, or a place that cannot be written.
         """
         from tkamb.output.vtk import write_triangles
 
-        result = self.result
-        data = {"pressure_Pa": result.pressure, "gap_m": result.gap}
-        data |= {"nodal_force_N": result.nodal_force}
-        write_triangles(path, result.points, self.triangles, data)
+        result, triangles = self.result, self.triangles
+        points, force = result.points, result.nodal_force
+        if self.side == "left":
+            points, force, triangles = points @ MIRROR, force @ MIRROR, triangles[:, ::-1]
+        data = {"pressure_Pa": result.pressure, "gap_m": result.gap, "nodal_force_N": force}
+        write_triangles(path, points, triangles, data)
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""

@@ -123,7 +123,7 @@ def write_results(
 
     if BANDS_NAME not in (more or {}):
         results = replace(results, bands={})  # the page shows none that stand beside it nowhere
-    with claimed_directory(directory, force) as folder:
+    with claimed_directory(directory, force, "run") as folder:
         with replaced_together(folder) as files:
             _put_maps(results.maps, files)
             for name, write in (more or {}).items():

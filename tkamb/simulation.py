@@ -84,7 +84,7 @@ def simulate(
     with ExitStack() as stack:
         recorder = Recorder()
         if directory is not None:
-            folder = stack.enter_context(claimed_directory(directory, force))
+            folder = stack.enter_context(claimed_directory(directory, force, "run"))
             recorder = FolderRecorder(folder, identity, resume)
         stack.callback(recorder.close)
         return run.compute(recorder, progress, crew.workers)

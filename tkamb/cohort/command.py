@@ -40,7 +40,7 @@ def _part(text: str) -> tuple[int, int]:
 def _cohort(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
-    from tkamb.cohort.kept import REPORT_NAME
+    from tkamb.cohort.folder import REPORT_NAME
     from tkamb.cohort.plan import load_cohort
     from tkamb.cohort.run import Part, run_cohort
     from tkamb.run.workers import Crew

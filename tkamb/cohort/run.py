@@ -10,7 +10,7 @@ from typing import Any
 
 from tkamb.claim import claimed_directory, is_ours
 from tkamb.code_identity import code_identity
-from tkamb.cohort.kept import write_cohort
+from tkamb.cohort.folder import write_cohort
 from tkamb.cohort.outcome import CohortWorker, Outcome
 from tkamb.cohort.plan import Cohort, load_cohort
 from tkamb.errors import InputError
@@ -95,7 +95,7 @@ def run_cohort(
     directory = Path(directory)
     folder = directory if part is None else directory / part.folder
     force = force or (part is None and _holds_parts_alone(directory))
-    with claimed_directory(folder, force), _parts(directory, part, resume) as parts:
+    with claimed_directory(folder, force, "cohort"), _parts(directory, part, resume) as parts:
         shards = Shards(folder, identity, resume)
         others = [Shards(one, identity, True) for one in parts]
         wanted = [run.number for run in cohort.runs if part is None or part.holds(run.number)]
@@ -133,7 +133,7 @@ def _parts(directory: Path, part: Part | None, resume: bool) -> Iterator[list[Pa
         if part is None and resume:
             found = sorted(directory.glob(SHARD_NAME.format("*", "*")))
         for one in found:
-            stack.enter_context(claimed_directory(one))
+            stack.enter_context(claimed_directory(one, command="cohort"))
         yield found
 
 

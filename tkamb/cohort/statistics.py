@@ -9,16 +9,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tkamb.cohort.outcome import Outcome
 from tkamb.cohort.plan import Cohort
 from tkamb.geometry.frames import Array
+from tkamb.run.status import FAILED
 
 PEAK = "largest of the run"
 UNITS = ("_N", "_BW", "_MPa", "_mm2", "_mm", "_deg", "_Nm", "_equilibrium", "_yield")
 """Endings of the columns that are averaged."""
 CYCLE = "cycle_percent"
-CYCLE_BIN = 10.0
+CYCLE_BIN, WHOLE_CYCLE = 10.0, 100.0
+AXES = ("flexion_deg", CYCLE)
 ROUNDING = 1e-9
 """Of a bin: 60 deg, which radians make 59.99999999999999, begins the bin from 60 on."""
 
@@ -103,10 +106,10 @@ def _group(
     labels: dict[str, str], numbers: list[int], outcomes: Mapping[int, Outcome], width: float
 ) -> Group:
     good = [n for n in numbers if not outcomes[n].reason]
-    columns = [outcomes[n].columns for n in good]
+    columns = [_computed(outcomes[n]) for n in good]
     cycle = bool(columns) and all(CYCLE in one for one in columns)
     axis, width = (CYCLE, CYCLE_BIN) if cycle else ("flexion_deg", width)
-    places = [np.floor(one[axis] / width + ROUNDING).astype(int) for one in columns]
+    places = [_places(one[axis], axis, width) for one in columns]
     first, last = (
         (min(p.min() for p in places), max(p.max() for p in places)) if places else (0, -1)
     )
@@ -119,6 +122,25 @@ def _group(
         bins[name] = np.array([_means(v, p - first, len(edges) - 1) for v, p in pairs])
         peaks[name] = np.array([np.nanmax(v) if np.isfinite(v).any() else np.nan for v in missing])
     return Group(labels, tuple(good), len(numbers) - len(good), axis, edges, bins, peaks)
+
+
+def _computed(outcome: Outcome) -> dict[str, Array]:
+    """Return a run's columns; NaN in frames that failed, but for the bins' axes.
+
+    Such a frame holds its motion as it was recorded, where that of the others may be solved.
+    """
+    lost = np.array([status.startswith(FAILED) for status in outcome.status], bool)
+    return {
+        name: values if name in ("time_s", *AXES) else np.where(lost, np.nan, values)
+        for name, values in outcome.columns.items()
+    }
+
+
+def _places(values: Array, axis: str, width: float) -> NDArray[np.int64]:
+    """Return the bin of each frame; a cycle's last moment, 100 %, is in its last bin."""
+    found = np.floor(values / width + ROUNDING).astype(int)
+    end = axis == CYCLE and np.isclose(values, WHOLE_CYCLE, rtol=0, atol=ROUNDING * width)
+    return np.where(end, found - 1, found)
 
 
 def _means(values: Array, place: Array, count: int) -> Array:

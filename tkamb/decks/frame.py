@@ -1,15 +1,18 @@
 """The deck of one frame of a run, with what the run found for comparison."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
+from tkamb.contact.registry import contact_class
 from tkamb.decks.calculix import Deck
 from tkamb.decks.febio import febio_text
 from tkamb.decks.problem import PressProblem, press_problem
 from tkamb.errors import InputError
 from tkamb.output.metrics import map_rows
+from tkamb.output.panels import lateral_axis_name
 from tkamb.results import Results
 from tkamb.results_folder import read_results
 from tkamb.run.rerun import case_of_results
@@ -28,31 +31,28 @@ class FramePress:
         approach: m, of that pose.
         peak_pressure: Pa, of the map.
         origin: which frame of what, by which contact model.
-        post: N and Pa, force and peak pressure on the insert's post, which is not in the problem;
-            zero where nothing presses it.
+        lateral: what insert z points to, "lateral" or "medial".
+        notes: what else of the run whoever compares must know.
     """
 
     problem: PressProblem
     approach: float
     peak_pressure: float
     origin: str
-    post: tuple[float, float] = (0.0, 0.0)
+    lateral: str = "lateral"
+    notes: tuple[str, ...] = ()
 
     def comments(self) -> tuple[str, ...]:
         """Return what whoever opens the deck must know."""
         problem, millimetres = self.problem, self.approach / MILLIMETRE
-        force, pressure = self.post
-        left = (
-            f"Not in it: the cam, which in the run presses the post with {force:.6g} N, at most "
-            f"{pressure / MEGAPASCAL:.6g} MPa.",
-        )
         return (
             f"{self.origin}; written by tkamb; mm, N, MPa.",
-            "Insert frame: x anterior, y superior, z lateral; no friction; the bottom is held.",
+            f"Insert frame: x anterior, y superior, z {self.lateral}; no friction; the bottom is "
+            "held.",
             f"{len(problem.lattice.cells)} hexahedra; load {problem.load:.6g} N along -y.",
             f"The run found: approach since first touch {millimetres:.6g} mm, peak pressure "
             f"{self.peak_pressure / MEGAPASCAL:.6g} MPa.",
-            *(left if force > 0.0 else ()),
+            *self.notes,
         )
 
     def deck(self, kind: str) -> str:
@@ -63,7 +63,11 @@ class FramePress:
         """
         problem, said = self.problem, self.comments()
         if kind == "feb":
-            return febio_text(problem, self.approach, (*said, "Compare Fy of femur.csv with it."))
+            return febio_text(
+                problem,
+                self.approach,
+                (*said, "Compare the size of Fy of femur.csv with the load."),
+            )
         start = problem.depth / MILLIMETRE
         more = (
             f"The femoral patch begins {start:.6g} mm below first touch and is let go: its",
@@ -107,15 +111,26 @@ def frame_press(folder: Path, frame: int, resolution_mm: float | None = None) ->
     model = (results.summary.get("contact") or {}).get("model")
     origin = f"Frame {frame} of {folder} by {model} at {spacing:g} mm"
     peak = float(maps.pressure_Pa[row].max())
-    return FramePress(problem, pair.approach(pose), peak, origin, _post(results, frame))
+    lateral, notes = lateral_axis_name(results), tuple(_notes(results, frame, pair))
+    return FramePress(problem, pair.approach(pose), peak, origin, lateral, notes)
 
 
-def _post(results: Results, frame: int) -> tuple[float, float]:
-    """Return force and peak pressure on the post in a frame, N and Pa; zero without."""
-    if "post_force_N" not in results.columns or not results["post_force_N"][frame] > 0.0:
-        return 0.0, 0.0
-    force, peak = results["post_force_N"][frame], results["post_peak_pressure_MPa"][frame]
-    return float(force), float(peak) * MEGAPASCAL
+def _notes(results: Results, frame: int, pair: ContactPair) -> Iterator[str]:
+    """Yield what a deck's answer differs from the run's by, beside the discretisation."""
+    law, contact = pair.material, results.summary.get("contact") or {}
+    yield (
+        f"Material '{law.name}', {'linear' if law.is_linear else 'nonlinear'}: "
+        f"E {law.young_modulus / MEGAPASCAL:.6g} MPa, nu {law.poisson_ratio:g}; the run's model "
+        f"assumes {contact_class(contact['model']).assumes}."
+    )
+    if results.summary.get("side") == "left":
+        yield "A left knee's mirror image, a right one, as the run's files are."
+    if "post_force_N" in results.columns:
+        force, peak = (results[name][frame] for name in ("post_force_N", "post_peak_pressure_MPa"))
+        yield (
+            f"Without the cam's contact with the post, which is in neither load nor peak: "
+            f"{force:.6g} N, peak {peak:.6g} MPa in the run."
+        )
 
 
 def _pair(results: Results) -> tuple[ContactPair, float]:

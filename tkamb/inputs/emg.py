@@ -21,6 +21,8 @@ from tkamb.inputs.tables import read_table
 
 ORDER = 2
 """Of either filter, in each direction."""
+FLAT = 1e-9
+"""Of the largest value: a signal that departs less from its mean is the mean's round-off."""
 UNEVEN = 0.01
 """Of the median step: by how much steps between samples may differ from it."""
 
@@ -77,7 +79,7 @@ def load_envelopes(source: EmgRecording, motion: Array) -> Envelopes:
             ) from None
         by = found.max() if source.normalised_by == "recording" else source.normalised_by[channel]
         normalised_by[channel] = float(by)
-        if not found.max() > 0.0:
+        if not found.max() > FLAT * np.abs(signal).max():
             raise InputError(f"channel '{channel}' holds no signal", source.file, "leave it out")
         values[channel] = found / normalised_by[channel]
     muscles = {muscle: channel for channel, own in source.channels.items() for muscle in own}

@@ -272,10 +272,10 @@ def _residuals(results: "Results") -> Card | None:
         return Card("Residual force", "none", at_rest)
     middle = f"{np.nanmedian(share):.1f} %"
     detail = f"median over the frames, at most {np.nanmax(share):.1f} %, of the SI contact force"
-    change = 100 * results["residual_sensitivity_N"] / results["force_total_N"]
+    change = 100 * metrics.residual_effect(results)
     if np.isfinite(change).any():
         largest = np.nanmax(change)
-        detail += f"; acting 10 mm higher or lower changes the total by ≤ {largest:.1f} %"
+        detail += f"; acting 10 mm higher or lower changes the total by ≤ {largest:.1f} % of it"
     axial = np.abs(results["residual_axial_Nm"])
     if np.isfinite(axial).any():
         detail += f"; and a residual axial moment of up to {np.nanmax(axial):.1f}\u00a0N·m"

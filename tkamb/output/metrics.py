@@ -113,6 +113,15 @@ def residual_share(results: "Results") -> Array:
         return residual_force(results) / np.abs(results["force_si_N"])
 
 
+def residual_effect(results: "Results") -> Array:
+    """Return how much the total force hangs on where the residuals act (f,), same ratio.
+
+    It is the change of the total by 10 mm higher or lower over the SI contact force.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return results["residual_sensitivity_N"] / np.abs(results["force_si_N"])
+
+
 def failed(results: "Results") -> NDArray[np.bool_]:
     """Return which frames (f,) say that they failed, or are not ok and have no contact force."""
     marked = np.array([status.startswith("failed") for status in results.status], bool)

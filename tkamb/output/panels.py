@@ -13,6 +13,7 @@ from tkamb.known_errors import is_large, known_error_words
 from tkamb.output.metrics import (
     body_weight,
     medial_share,
+    residual_effect,
     residual_share,
     split_undetermined,
     tension_ratio,
@@ -331,14 +332,17 @@ def _bundle(results: "Results", bundle: str, strands: Sequence[str], position: i
 def _residuals(results: "Results") -> Panel:
     with np.errstate(divide="ignore", invalid="ignore"):
         percent = 100 / np.abs(results["force_si_N"])
-        sensitivity = _line(
-            results, "residual_sensitivity_N", "effect of ±10 mm on the total", GREY, True
-        )
         lines = (
             Line("size", "magnitude", 100 * residual_share(results), BLACK),
             Line("ap", "anterior", results["residual_ap_N"] * percent, ANTERIOR),
             Line("ml", lateral_axis_name(results), results["residual_ml_N"] * percent, RIGHT),
-            replace(sensitivity, values=sensitivity.values * percent),
+            Line(
+                "effect",
+                "effect of ±10 mm on the total",
+                100 * residual_effect(results),
+                GREY,
+                True,
+            ),
         )
     note = (
         "Forces that balance needs beyond the modelled loads; an exact model has none. "

@@ -1,5 +1,7 @@
 """The case that results came from: their scene read anew, if it is still what was run."""
 
+import json
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,12 +26,25 @@ def case_of_results(results: "Results") -> Case:
     summary = results.summary
     case, scene = load_case(_scene_of(summary)), summary.get("scene")
     if scene_hash(case) != summary.get("scene_sha256"):
-        what = "has changed since these results were computed, or was run with --set"
-        raise InputError(what, scene, f"{RUN_AGAIN} {scene}")
+        known = "overrides" in summary
+        what = "has changed since these results were computed"
+        what += "" if known else ", or was run with --set"
+        raise InputError(what, scene, run_again(summary))
     if not same_files(case, summary):
         what = "a mesh or table that it names has changed since these results were computed"
-        raise InputError(what, scene, f"{RUN_AGAIN} {scene}")
+        raise InputError(what, scene, run_again(summary))
     return case
+
+
+def overrides_of_run(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Return dotted key -> value that the run's scene had in the place of its file's."""
+    return dict(summary.get("overrides") or {})
+
+
+def run_again(summary: Mapping[str, Any]) -> str:
+    """Return the command that computes results like these, for a shell."""
+    given = (f"{key}={json.dumps(value)}" for key, value in overrides_of_run(summary).items())
+    return " ".join([RUN_AGAIN, str(summary["scene"]), *(f"--set {shlex.quote(g)}" for g in given)])
 
 
 def same_files(case: Case, summary: Mapping[str, Any]) -> bool:
@@ -48,5 +63,5 @@ def _scene_of(summary: Mapping[str, Any]) -> Scene:
         what = "the scene of these results is not there"
         raise InputError(what, path, "put it back, or run it again")
     contact = summary.get("contact") or {}
-    overrides = {f"contact.{key}": value for key, value in contact.items() if value is not None}
-    return load_scene(path, overrides)
+    used = {f"contact.{key}": value for key, value in contact.items() if value is not None}
+    return load_scene(path, overrides_of_run(summary) | used)

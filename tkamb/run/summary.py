@@ -92,6 +92,7 @@ def _origin(case: Case, path: Path | None) -> dict[str, Any]:
     return {
         "scene": None if path is None else str(path.absolute()),
         "scene_sha256": scene_hash(case),
+        "overrides": case.scene.overrides,
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": " ".join(["tkamb", *sys.argv[1:]]),
         "versions": _versions(),

@@ -10,7 +10,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, Self, get_args
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, PrivateAttr, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from tkamb.errors import InputError, names_near
@@ -60,6 +60,12 @@ class Scene(SceneTable):
     measured: MeasuredTable | None = None
     output: OutputTable = OutputTable()
     uncertainty: UncertaintyTable | None = None
+    _overrides: dict[str, Any] = PrivateAttr(default_factory=dict)
+
+    @property
+    def overrides(self) -> dict[str, Any]:
+        """Return dotted key -> value that `load_scene` put in the place of the file's."""
+        return dict(self._overrides)
 
     def __repr__(self) -> str:
         """Return in a line whose knee it is, what moves and what presses."""
@@ -129,7 +135,9 @@ def load_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> Sce
         scene = Scene.model_validate(content)
     except ValidationError as error:
         raise _complaint(error, path, overrides or {}) from None
-    return _resolve_paths(scene, path.parent)
+    resolved: Scene = _resolve_paths(scene, path.parent)
+    resolved._overrides = dict(overrides or {})
+    return resolved
 
 
 def _content(path: Path) -> dict[str, Any]:

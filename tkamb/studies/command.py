@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+NOT_OURS = "write into a folder that is not tkamb's, or another command's"
 
 
 def add_tradeoff(commands: Any) -> None:
@@ -23,6 +24,7 @@ def add_tradeoff(commands: Any) -> None:
     tradeoff.add_argument("--recompute", action="store_true", help="the references too (slow)")
     tradeoff.add_argument("--resume", action="store_true", help="go on with a stopped study")
     tradeoff.add_argument("--out", type=Path, default=Path("out/tradeoff"), metavar="DIR")
+    tradeoff.add_argument("--force", action="store_true", help=NOT_OURS)
     tradeoff.add_argument("--json", action="store_true")
     tradeoff.set_defaults(command=_tradeoff)
 
@@ -34,7 +36,7 @@ def _tradeoff(options: argparse.Namespace) -> int:
         from tkamb.studies.calculix import find_program
 
         find_program()
-    with claimed_directory(options.out) as directory:
+    with claimed_directory(options.out, options.force, "tradeoff") as directory:
         return _study_tradeoff(options, directory)
 
 
@@ -90,6 +92,7 @@ def add_stability(commands: Any) -> None:
     stability.add_argument("--resume", action="store_true", help="go on with a stopped study")
     stability.add_argument("--workers", type=int, default=2, metavar="N", help="cases at a time")
     stability.add_argument("--out", type=Path, default=Path("out/stability"), metavar="DIR")
+    stability.add_argument("--force", action="store_true", help=NOT_OURS)
     stability.add_argument("--json", action="store_true")
     stability.set_defaults(command=_stability)
 
@@ -97,7 +100,7 @@ def add_stability(commands: Any) -> None:
 def _stability(options: argparse.Namespace) -> int:
     from tkamb.claim import claimed_directory
 
-    with claimed_directory(options.out) as directory:
+    with claimed_directory(options.out, options.force, "stability") as directory:
         return _study_stability(options, directory)
 
 

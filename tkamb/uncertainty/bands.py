@@ -11,8 +11,15 @@ from tkamb.geometry.frames import SIDES, Array
 from tkamb.results import FEWEST, MOST_FAILED, PERCENTILES
 
 ENDS = ("p05", "p95")
+ROUND_OFF = 1e-9
+"""Standard deviation over magnitude: a result that varies less does not vary."""
 SAMPLES_PER_INPUT = 6
 """Fewer per input leave a regression undetermined: its shares would be those of chance."""
+
+
+def varies(variance: float, square: float) -> bool:
+    """Say whether a variance is more than round-off of values of this mean square."""
+    return variance > ROUND_OFF**2 * square
 
 
 def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Array]:
@@ -110,8 +117,9 @@ def influences(
     either flank. An input's part of var(y) is cov(b_i x_i + c_i x_i², y), for independent inputs
     b_i² var(x_i) + c_i² var(x_i²); that of an input which errs with others has what it does with
     them in it, and may be negative (Li et al. 2010). Parts and variances are summed
-    over the frames. What is left is the rest: kinks, interactions and chance. Empty with fewer
-    than `SAMPLES_PER_INPUT` samples per input.
+    over the frames. What is left is the rest: kinks, interactions and chance. A result that does
+    not vary beyond round-off has no rows. Empty with fewer than `SAMPLES_PER_INPUT` samples per
+    input.
 
     Args:
         results: (m,) names.
@@ -126,7 +134,8 @@ def influences(
         of_frames = [_regression(values[:, index, k], errors[:, k]) for k in range(errors.shape[1])]
         frames = [(k, *one) for k, one in enumerate(of_frames) if one is not None]
         total = sum(variance for _, _, _, variance in frames)
-        if not frames or not total > 0:
+        square = sum(float(np.nanmean(values[:, index, k] ** 2)) for k, *_ in frames)
+        if not varies(total, square):
             continue
         explained = np.sum([parts for _, _, parts, _ in frames], axis=0) / total
         medians = [np.nanmedian(values[:, index, k]) for k, *_ in frames]

@@ -15,6 +15,10 @@ SHOWN = 5
 QUICK_CONTACT = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
 QUICK_FRAMES = 11
 """What a screening takes where nothing else is asked for."""
+LEAST_SHOWN = 0.01
+"""Share of a result's variance."""
+TERMS = 2
+"""Of each input in the regression, its value and its square: each explains 1/n by chance."""
 NOTABLE_FAILED = 0.05
 """Share of samples: where more fail, the bands leave out a whole tail."""
 
@@ -121,11 +125,13 @@ def headline(found: "Uncertainty") -> list[str]:
     if not isfinite(low):
         band = f"no band: {found.results.why_no_band(peak)}"
     lines = [f"peak total force {total[peak]:.2f} BW at {flexion:.0f} deg ({band})"]
+    of_chance = TERMS / found.results.summary["uncertainty"]["samples"]
+    chance = f"; up to {of_chance:.0%} each is chance" if of_chance >= LEAST_SHOWN else ""
     for result in ("force_total_N", "medial_force_N"):
         rows = [row for row in found.tornado if row.result == result][:SHOWN]
-        parts = ", ".join(f"{row.name} {row.share:.0%}" for row in rows if row.share >= 0.01)
+        parts = ", ".join(f"{row.name} {row.share:.0%}" for row in rows if row.share >= LEAST_SHOWN)
         if parts:
-            lines.append(f"{result} varies by {parts} (shares of variance, by regression)")
+            lines.append(f"{result} varies by {parts} (shares of variance, by regression{chance})")
     for name, one in found.results.summary["uncertainty"].get("measured_inside", {}).items():
         lines.append(
             f"the measured {name} force lies within 5 to 95 % in {one['share']:.0%} of "
@@ -133,12 +139,17 @@ def headline(found: "Uncertainty") -> list[str]:
         )
     for result in ("force_total_N", "medial_force_N"):
         parts = ", ".join(
-            f"{one.name} {one.first:.2f} alone, {one.total:.2f} in all"
+            f"{one.name} {_with_error(one.first, one.first_error)} alone, "
+            f"{_with_error(one.total, one.total_error)} in all"
             for one in [row for row in found.indices if row.result == result][:SHOWN]
         )
         if parts:
-            lines.append(f"{result}, Sobol' indices: {parts}")
+            lines.append(f"{result}, Sobol' indices and standard errors: {parts}")
     return lines
+
+
+def _with_error(value: float, error: float) -> str:
+    return f"{value:.2f} ± {error:.2f}".replace("-", "−")
 
 
 def warnings_of(found: "Uncertainty") -> list[str]:

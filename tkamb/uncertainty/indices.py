@@ -7,6 +7,7 @@ import numpy as np
 
 from tkamb.geometry.frames import Array
 from tkamb.results import FEWEST
+from tkamb.uncertainty.bands import varies
 
 RESAMPLED = 200
 """Bootstrap samples for the standard errors."""
@@ -88,10 +89,11 @@ def _index(
     if not kept.any():
         return None
     there = there[:, kept]
+    square = np.where(there, 0.5 * (a[:, kept] ** 2 + b[:, kept] ** 2), 0.0).sum()
     middle = np.where(there, a[:, kept] + b[:, kept], 0.0).sum(axis=0) / (2 * there.sum(axis=0))
     a, b, crossed = (np.where(there, one[:, kept] - middle, 0.0) for one in (a, b, crossed))
     variance = weights @ (0.5 * (a**2 + b**2)).sum(axis=1)
-    if not variance[0] > 0:
+    if not varies(variance[0], square):
         return None
     first = weights @ (b * (crossed - a)).sum(axis=1) / variance
     total = weights @ (0.5 * (a - crossed) ** 2).sum(axis=1) / variance

@@ -25,9 +25,9 @@ from tkamb.uncertainty.bands import (
     measured_inside,
 )
 from tkamb.uncertainty.correlation import correlation_root
+from tkamb.uncertainty.folder import write_uncertainty
 from tkamb.uncertainty.indices import SobolIndex, sobol_indices
 from tkamb.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
-from tkamb.uncertainty.kept import write_uncertainty
 from tkamb.uncertainty.sample import BandWorker, Sample
 from tkamb.uncertainty.sampling import Point, crossed_points, normal_samples
 
@@ -129,7 +129,8 @@ def estimate_uncertainty(
     with ExitStack() as stack:
         folder = None
         if directory is not None:
-            folder = stack.enter_context(claimed_directory(directory, force))
+            claim = claimed_directory(directory, force, "uncertainty")
+            folder = stack.enter_context(claim)
         task = Task(BandWorker, (case.scene, chosen))
         team = stack.enter_context(crew.team(task, len(points)))  # prepares meanwhile
         nominal = simulate(scene, frames=frames, scene_path=scene_path)

@@ -49,7 +49,7 @@ def draw(
     contact = case.scene.contact
     floor, centre = floor_and_foot(case, geometries, run.frames)
     others = floor + worn_insert(results, case.scene.patient.side)
-    bundles, limit = ligament_strands(mechanics, states)
+    bundles, limit = ligament_strands(mechanics, states, results)
     muscles, most_active = muscle_strands(geometries)
     strands = [*bundles, *extensor_strands(mechanics, states, results), *muscles]
     markers = [*contact_markers(geometries), *centre]

@@ -12,7 +12,7 @@ from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, Mask, transform
 from tkamb.geometry.surface import Surface
-from tkamb.output.metrics import stretches
+from tkamb.output.metrics import failed, stretches
 from tkamb.output.style import SIDE_COLOURS
 from tkamb.units import MILLIMETRE
 from tkamb.view.colours import (
@@ -42,16 +42,20 @@ MANY_BUNDLES = 20
 
 
 def ligament_strands(
-    mechanics: Mechanics, states: Sequence[ChainState]
+    mechanics: Mechanics, states: Sequence[ChainState], results: "Results"
 ) -> tuple[tuple[Strand, ...], float]:
-    """Return the bundles coloured by strain, and the upper limit of the colour scale."""
+    """Return the bundles coloured by strain, and the upper limit of the colour scale.
+
+    A frame that failed has no numbers: its bundles are grey, and no scale ends at them.
+    """
     bundles = mechanics.ligaments
     if not bundles:
         return (), 0.0
     links = {link for one in bundles for link in (one.proximal.link, one.distal.link)}
     poses = {link: np.stack([state.pose(link) for state in states]) for link in links}
-    strains = [one.strain(one.length(poses)) for one in bundles]
-    limit = max(float(np.nanmax(strains)), 0.01)
+    lost = failed(results)
+    strains = [np.where(lost, np.nan, one.strain(one.length(poses))) for one in bundles]
+    limit = float(np.nanmax(strains, initial=0.01))
     radius = BUNDLE * (0.5 if len(bundles) > MANY_BUNDLES else 1.0)
     strands = []
     for bundle, strain in zip(bundles, strains, strict=True):

@@ -69,9 +69,9 @@ def _wear(options: argparse.Namespace) -> int:
     from tkamb.claim import claimed_directory
     from tkamb.run.workers import Crew
 
-    crew, run = Crew(options.workers), _prepared(options)
     folder = options.out or Path("out") / f"{_stem(options.case)}_wear"
-    with claimed_directory(folder, options.force) as claimed:
+    with claimed_directory(folder, options.force, "wear") as claimed:
+        crew, run = Crew(options.workers), _prepared(options)
         with tqdm(total=options.cycles, desc="wearing", unit="cycle", disable=None) as bar:
             report = run.compute(
                 claimed,

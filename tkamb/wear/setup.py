@@ -13,6 +13,7 @@ from tkamb.contact.registry import contact_model, contact_options
 from tkamb.errors import InputError
 from tkamb.output.maps import ContactMaps
 from tkamb.results_folder import read_results
+from tkamb.run.rerun import overrides_of_run
 from tkamb.run.summary import files_hash, scene_hash
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.case import Case, load_case
@@ -101,9 +102,11 @@ def wear_setup(
         case, motion, run_frames = _of_results(path)
         hashes = _hashes(case, case.scene)
     else:
+        overrides: dict[str, Any] = {}
         if os.path.isdir(path):
-            path = _scene_of(read_results(path).summary, path)
-        given = load_scene(path)
+            summary = read_results(path).summary
+            path, overrides = _scene_of(summary, path), overrides_of_run(summary)
+        given = load_scene(path, overrides)
         case = load_case(_with_contact(given, contact, resolution_mm, path))
         hashes = _hashes(case, given)
     table = _with_contact(case.scene, contact, resolution_mm, path).contact
@@ -174,7 +177,7 @@ def _of_results(folder: Path) -> tuple[Case, CycleMotion, tuple[int, ...]]:
     results = read_results(folder)
     if results.maps is None:
         raise InputError("has no contact maps", folder, "run the scene with [contact]")
-    scene = load_scene(_scene_of(results.summary, folder))
+    scene = load_scene(_scene_of(results.summary, folder), overrides_of_run(results.summary))
     table = results.summary.get("contact")
     if isinstance(table, dict):
         scene = scene.model_copy(update={"contact": ContactTable.model_validate(table)})

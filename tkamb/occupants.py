@@ -1,0 +1,77 @@
+"""Which commands' output a folder holds, so that none writes over or among another's."""
+
+import re
+from pathlib import Path
+
+from tkamb.errors import InputError
+from tkamb.files import TABLE_LIMIT, read_json, read_text
+
+WRITTEN = {
+    "uncertainty": ("bands.csv",),
+    "run": ("results.csv",),
+    "compare": ("compare.html",),
+    "tradeoff": ("tradeoff.json",),
+    "stability": ("stability.json",),
+    "cohort": ("cohort.json",),
+    "wear": ("wear.json", ".wear.npz"),
+    "export --vtp": ("contact.pvd",),
+}
+"""Command -> files that only it leaves; results.csv is of `uncertainty` where bands.csv is."""
+BESIDE = {"wear": {"run", "uncertainty"}, "run": {"wear"}, "uncertainty": {"wear"}}
+"""Command -> those whose output it may join: no name is both's, and a run's page shows its wear."""
+
+
+def occupants(folder: Path) -> dict[str, str]:
+    """Return command -> the file that says that its output, finished or under way, is there."""
+    found = {
+        command: name
+        for command, names in WRITTEN.items()
+        for name in names
+        if (folder / name).is_file()
+    }
+    for command, name in (_frames_of(folder), _rows_of(folder)):
+        if command:
+            found.setdefault(command, name)
+    if "uncertainty" in found:
+        found.pop("run", None)
+    return found
+
+
+def check_occupants(folder: Path, command: str) -> None:
+    """Raise an InputError where a folder holds another command's output than may be beside this."""
+    foreign = {
+        other: name
+        for other, name in occupants(folder).items()
+        if other != command and other not in BESIDE.get(command, ())
+    }
+    for other, name in foreign.items():
+        what = f"holds what `tkamb {other}` wrote ({name})"
+        raise InputError(what, folder, "choose another folder with --out, or give --force")
+
+
+def _frames_of(folder: Path) -> tuple[str, str]:
+    """Return whose finished frames or samples a run under way keeps, and where."""
+    name = ".frames/run.json"
+    try:
+        found = read_json(folder / name)
+    except InputError:
+        return "", name
+    if not isinstance(found, dict):
+        return "", name
+    if "table of runs" in found:
+        return "cohort", name
+    return ("uncertainty" if "method of sampling" in found else "run"), name
+
+
+def _rows_of(folder: Path) -> tuple[str, str]:
+    """Return whose rows a study under way keeps, and where: a verdict has a kind."""
+    name = "rows.jsonl"
+    if any((folder / done).is_file() for done in ("tradeoff.json", "stability.json")):
+        return "", name
+    try:
+        first = read_text(folder / name, TABLE_LIMIT).partition("\n")[0]
+    except InputError:
+        return "", name
+    if not first.startswith('{"key": '):
+        return "", name
+    return ("stability" if re.search(r'"row": \{[^{}]*"kind": ', first) else "tradeoff"), name
