@@ -101,7 +101,7 @@ def test_an_electrode_that_gave_one_value_throughout_is_no_signal(tmp_path, leve
     path = tmp_path / "flat.csv"
     path.write_text("\n".join(["time,VL", *(f"{t:.6f},{level}" for t in TIME)]), encoding="utf-8")
     with pytest.raises(InputError, match="'VL' holds no signal"):
-        load_envelopes(in_si(table(path, high_pass_Hz=high_pass)))
+        load_envelopes(in_si(table(path, high_pass_Hz=high_pass)), TIME)
 
 
 @pytest.mark.parametrize(
