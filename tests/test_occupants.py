@@ -18,12 +18,10 @@ SCENE = str(fast_scene())
 COMMANDS = {
     "run": ["run", SCENE, "--frames", "50:51"],
     "uncertainty": ["uncertainty", SCENE, "--frames", "50:51", "--samples", "20"],
-    "compare": ["compare", "{run}", "{run}"],
     "tradeoff": ["tradeoff", "--quick"],
     "stability": ["stability", "--quick"],
     "wear": ["wear", SCENE],
     "cohort": ["cohort", "{cohort}"],
-    "export --vtp": ["export", "{run}", "--vtp"],
 }
 
 
@@ -31,16 +29,10 @@ def content(folder):
     return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A folder of results that `tkamb compare` and `tkamb export` can read."""
-    return keep(make_run("bend"), tmp_path_factory.mktemp("kept") / "run")
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("occupant", WRITTEN)
 def test_a_command_is_refused_anothers_folder_and_nothing_changes(
-    command, occupant, run, tmp_path, capsys
+    command, occupant, tmp_path, capsys
 ):
     if command == occupant or occupant in BESIDE.get(command, ()):
         return
@@ -49,7 +41,7 @@ def test_a_command_is_refused_anothers_folder_and_nothing_changes(
         (out / WRITTEN[occupant][0]).write_text("hours of work")
     before = content(out)
     (cohort := tmp_path / "c.toml").write_text(f'[[trial]]\nname = "a"\nscene = "{SCENE}"')
-    words = [word.format(run=run, cohort=cohort) for word in COMMANDS[command]]
+    words = [word.format(cohort=cohort) for word in COMMANDS[command]]
     assert main([*words, "--out", str(out)]) == 2
     error = capsys.readouterr().err
     (line,) = [one for one in error.splitlines() if one.startswith("tkamb: ")]
@@ -95,10 +87,20 @@ def test_own_output_is_replaced_and_force_takes_anothers(tmp_path):
     write_results(make_run("bend"), tmp_path)
     write_results(make_run("bend"), tmp_path)
     refused = pytest.raises(InputError, match="holds what `tkamb run` wrote")
-    with refused, claimed_directory(tmp_path, command="compare"):
+    with refused, claimed_directory(tmp_path, command="tradeoff"):
         pass
-    with claimed_directory(tmp_path, force=True, command="compare"):
+    with claimed_directory(tmp_path, force=True, command="tradeoff"):
         pass
+
+
+def test_a_page_and_maps_with_names_of_their_own_stand_beside_a_run(tmp_path, capsys):
+    run = keep(make_run("bend"), tmp_path / "run")
+    before = content(run)
+    for words in (["compare", run, run], ["export", run, "--vtp"]):
+        assert main([*map(str, words), "--out", str(run)]) == 0
+    after = content(run)
+    assert {"compare.html", "contact.pvd"} <= set(after)
+    assert {name: after[name] for name in before} == before
 
 
 def test_wear_stands_beside_its_run_and_the_run_may_be_run_again(tmp_path):

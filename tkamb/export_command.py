@@ -76,7 +76,7 @@ def _export_maps(options: argparse.Namespace) -> int:
     results = read_results(options.folder)
     if results.maps is None:
         raise InputError("holds no contact.h5", options.folder, "run the scene with [contact]")
-    with claimed_directory(options.out, options.force, "export --vtp") as folder:
+    with claimed_directory(options.out, options.force) as folder:
         names = write_map_series(results.maps, folder)
     more = "; a left knee's mirror image" if results.summary.get("side") == "left" else ""
     more += "; without the post's pressure" if "post_force_N" in results.columns else ""

@@ -9,14 +9,15 @@ from tkamb.files import TABLE_LIMIT, read_json, read_text
 WRITTEN = {
     "uncertainty": ("bands.csv",),
     "run": ("results.csv",),
-    "compare": ("compare.html",),
     "tradeoff": ("tradeoff.json",),
     "stability": ("stability.json",),
     "cohort": ("cohort.json",),
     "wear": ("wear.json", ".wear.npz"),
-    "export --vtp": ("contact.pvd",),
 }
-"""Command -> files that only it leaves; results.csv is of `uncertainty` where bands.csv is."""
+"""Command -> files that only it leaves; results.csv is of `uncertainty` where bands.csv is.
+
+The page of `compare` and the maps of `export --vtp` have names of their own: they go anywhere.
+"""
 BESIDE = {"wear": {"run", "uncertainty"}, "run": {"wear"}, "uncertainty": {"wear"}}
 """Command -> those whose output it may join: no name is both's, and a run's page shows its wear."""
 

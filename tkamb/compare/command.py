@@ -42,7 +42,7 @@ def _compare(options: argparse.Namespace) -> int:
     found = compare_folders(options.folders, options.axis)
     html = comparison_html(found, options.frame)
     place = options.out or Path("out") / "compare"
-    with claimed_directory(place, options.force, "compare") as folder:
+    with claimed_directory(place, options.force) as folder:
         write_text(folder / PAGE_NAME, html)
     lines = [*table_lines(found), f"page: {folder / PAGE_NAME}"]
     print(json.dumps(found.as_dict(), indent=2) if options.json else "\n".join(lines))
