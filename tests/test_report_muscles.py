@@ -1,5 +1,7 @@
 """The report's section on muscles: what is drawn where, and that its parts sum up."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -57,6 +59,16 @@ def test_the_plots_hold_activation_and_envelope(run):
     assert medial.get_title("right") == "r 0.81"
     assert len(titles["gaslat"].collections) == 0
     assert titles["GM (2)"].get_title("right") == "r −0.20 to 0.81"
+
+
+def test_an_envelope_that_leaves_the_plot_is_said(run):
+    """The axis of the activations ends at 1; EMG over a given value may go beyond."""
+    envelope = run["envelope_gasmed"]
+    high = run.columns | {"envelope_gasmed": 1.5 * envelope / np.nanmax(envelope)}
+    figure = draw_activations(replace(run, columns=high), horizontal_axis(run))
+    titles = {axes.get_title("left"): axes.get_title("right") for axes in figure.axes}
+    assert titles["gasmed"] == "r 0.81, EMG to 1.5"
+    assert "EMG" not in titles["GM (2)"]
 
 
 def test_reserves_stand_in_words(run):

@@ -41,6 +41,8 @@ HELD = (
     "equilibrium. What a muscle alone leaves unbalanced in flexion is carried by a moment. "
     "External loads: weight, inertia and ground. Muscles are grouped by the bones that they end on."
 )
+HIGHEST = 1.02
+"""Of the activations' axis."""
 CELL, CELLS_ACROSS, MARGIN = (2.16, 1.12), 5, 0.3
 """Inches: width and height of a small plot; how many stand beside each other; for the labels."""
 SHADE = "#c4c4c4"
@@ -152,7 +154,7 @@ def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
                 continue
             _draw_cell(axes, cells[k], results, axis)
             axes.tick_params(labelbottom=k + CELLS_ACROSS >= len(cells))
-        grid[0, 0].set_ylim(0, 1.02)
+        grid[0, 0].set_ylim(0, HIGHEST)
         grid[0, 0].set_yticks([0, 0.5, 1])
         figure.supxlabel(axis.label, fontsize=9)
     return figure
@@ -166,9 +168,18 @@ def _draw_cell(axes: Axes, cell: Cell, results: "Results", axis: HorizontalAxis)
         x, activation = axis.broken(results[family_column(ACTIVATION, name)])
         axes.plot(x, activation, color=BLACK, linewidth=1.3)
     axes.set_title(cell.title, loc="left", fontsize=8.5, pad=2)
-    r = _agreement(results, cell)
-    if r:
-        axes.set_title(r, loc="right", fontsize=7.5, color=GREY, pad=2)
+    said = ", ".join(filter(None, (_agreement(results, cell), _beyond(results, cell))))
+    if said:
+        axes.set_title(said, loc="right", fontsize=7.5, color=GREY, pad=2)
+
+
+def _beyond(results: "Results", cell: Cell) -> str:
+    """Return in words how far an envelope goes beyond the plot: above its normalising value."""
+    if cell.envelope is None:
+        return ""
+    envelope = results[family_column(ENVELOPE, cell.envelope)]
+    largest = float(np.nan_to_num(envelope).max(initial=0.0))
+    return f"EMG to {largest:.2g}" if largest > HIGHEST else ""
 
 
 def _agreement(results: "Results", cell: Cell) -> str:
