@@ -6,11 +6,13 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from scenes import fast_scene
+from scenes import fast_scene, write_scene
 from tkamb.cli import main
 from tkamb.columns import KINDS
+from tkamb.errors import InputError
 from tkamb.results_folder import read_results
 from tkamb.run.workers import Crew, Task
+from tkamb.scene import load_scene
 from tkamb.simulation import simulate
 
 SCENE = fast_scene()
@@ -74,3 +76,28 @@ def test_a_team_prepares_before_it_is_asked_and_ends_with_its_block():
     assert all(process.poll() is not None for process in team.processes)
     with Crew(1).team(task, len(wanted)) as team:
         assert not team.processes and dict(team.answers(wanted)) == found
+
+
+def test_what_a_worker_cannot_use_is_the_callers_error(tmp_path, capfd):
+    missing = tmp_path / "scene.toml"
+    with pytest.raises(InputError, match="no such scene file") as caught:
+        list(Crew(2).answers(Task(load_scene, (missing,)), [(0, None), (1, None)]))
+    assert caught.value.where == missing
+    assert capfd.readouterr().err == ""
+
+
+def test_what_a_job_refuses_is_the_callers_error():
+    with pytest.raises(InputError, match="0 is not within"):
+        list(Crew(2).answers(Task(functools.partial, (Crew,)), [(0, None), (0, None)]))
+
+
+def test_workers_do_not_repeat_what_was_said(tmp_path, caplog, capfd):
+    scene = write_scene(tmp_path / "knee")
+    mesh = scene.parent / "insert.stl"
+    content, record = mesh.read_bytes(), 50
+    count = int.from_bytes(content[80:84], "little") + 1
+    again = content[84 : 84 + record]
+    mesh.write_bytes(content[:80] + count.to_bytes(4, "little") + content[84:] + again)
+    simulate(scene, frames=slice(0, 96, 8), workers=2)
+    assert [message for message in caplog.messages if "duplicate" in message]
+    assert "duplicate" not in capfd.readouterr().err

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ from tkamb.cohort.command import add_cohort
 from tkamb.compare.command import add_compare
 from tkamb.datasets.command import add_data
 from tkamb.export_command import add_export
-from tkamb.guard import guarded
+from tkamb.guard import guarded, log_to_stderr
 from tkamb.importing.command import add_import
 from tkamb.mesh_command import add_contact, add_mesh, add_no_cache, add_press, without_cache
 from tkamb.scene_options import add_scene_options, overrides_of
@@ -36,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def command() -> int:
         _parser().parse_args(arguments, options)
-        logging.basicConfig(format="tkamb: %(levelname)s: %(message)s", level=logging.WARNING)
+        log_to_stderr()
         return int(options.command(options))
 
     return guarded(command, options)

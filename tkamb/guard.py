@@ -64,6 +64,11 @@ def say(line: str) -> None:
         print(f"tkamb: {plain}", file=sys.stderr, flush=True)
 
 
+def log_to_stderr() -> None:
+    """Have warnings printed on standard error, as tkamb's."""
+    logging.basicConfig(format="tkamb: %(levelname)s: %(message)s", level=logging.WARNING)
+
+
 def open_streams() -> None:
     """Have the three standard streams there, whatever the process was started with.
 

@@ -1,5 +1,6 @@
 """The whole pipeline on one page: scene, body, contact, results."""
 
+import math
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
@@ -10,11 +11,18 @@ from typing import TYPE_CHECKING, Any
 from tkamb.claim import claimed_directory
 from tkamb.errors import InputError
 from tkamb.results import Results
-from tkamb.run.frames import LAST_FRAMES, Finished, FrameSolver, finished_in_order
+from tkamb.run.frames import (
+    CHUNK,
+    LAST_FRAMES,
+    ChunkSolver,
+    Finished,
+    FrameSolver,
+    finished_in_order,
+)
 from tkamb.run.recorder import FolderRecorder, Recorder, finished_results
 from tkamb.run.summary import input_hashes, run_identity, scene_hash, summary_of
 from tkamb.run.tabulate import join_rows
-from tkamb.run.workers import Crew
+from tkamb.run.workers import Crew, Task, Team
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.case import Case, load_case
 
@@ -79,15 +87,19 @@ def simulate(
             return done
     path = None if scene_path is None else Path(scene_path)
     run = _Run(case, indices, identity, input_hashes(case, path), path, start)
-    stage("preparing body and contact")
-    run.prepare()  # before the folder is touched: bad input leaves it as it was
     with ExitStack() as stack:
+        team, chunks = None, math.ceil(len(indices) / CHUNK)
+        if min(workers, chunks) > 1:
+            task = Task(ChunkSolver, (case.scene,))
+            team = stack.enter_context(crew.team(task, chunks))  # prepares meanwhile
+        stage("preparing body and contact")
+        run.prepare()  # before the folder is touched: bad input leaves it as it was
         recorder = Recorder()
         if directory is not None:
             folder = stack.enter_context(claimed_directory(directory, force, "run"))
             recorder = FolderRecorder(folder, identity, resume)
         stack.callback(recorder.close)
-        return run.compute(recorder, progress, crew.workers)
+        return run.compute(recorder, progress, team)
 
 
 @dataclass(eq=False)
@@ -104,12 +116,13 @@ class _Run:
     def prepare(self) -> None:
         """Build both sides of the equilibrium; whatever is wrong with the input shows here."""
         self.solver = FrameSolver(self.case, self.indices)
+        side = self.solver.side
         self.seconds = {"read": clock.perf_counter() - self.start}
-        if self.solver.side is not None:
-            self.seconds["prepare contact"] = self.solver.side.prepare_seconds
-            self.seconds["read"] -= self.solver.side.prepare_seconds
+        if side is not None:
+            self.seconds["prepare contact"] = side.prepare_seconds
+            self.seconds["read"] -= side.prepare_seconds
 
-    def compute(self, recorder: Recorder, progress: Progress, workers: int) -> Results:
+    def compute(self, recorder: Recorder, progress: Progress, team: Team | None) -> Results:
         """Compute every frame that is not there yet and return the results."""
         self.recorder = recorder
         if self.solver.side is not None:
@@ -118,20 +131,18 @@ class _Run:
         self.resumed = len(self.recorder.rows)
         left = [k for k in self.indices if k not in self.recorder.rows]
         try:
-            for frame in self._finished(left, progress, workers):
+            for frame in self._finished(left, progress, team):
                 self.recorder.record(*frame)
                 if self.recorder.due() and len(self.recorder.rows) < len(self.indices):
-                    self.recorder.publish(self.results())
+                    self.recorder.publish(self.results)
         except KeyboardInterrupt:
             if not self.recorder.keeps_files or not self.recorder.rows:
                 raise
-            self.recorder.publish(self.results())
+            self.recorder.publish(self.results)
             done = f"{len(self.recorder.rows)} of {len(self.indices)} frames"
             raise KeyboardInterrupt(f"{done} are kept; go on with --resume") from None
         self.recorder.finish()
-        results = self.results()
-        self.recorder.publish(results)
-        return results
+        return self.recorder.publish(self.results)
 
     def results(self) -> Results:
         """Return the results so far; frames that are still to do are failed ones."""
@@ -152,14 +163,13 @@ class _Run:
         return Results(columns, summary, self.recorder.maps)
 
     def _finished(
-        self, left: Sequence[int], progress: Progress, workers: int
+        self, left: Sequence[int], progress: Progress, team: Team | None
     ) -> Iterator[Finished]:
         """Yield the frames that are left, in order, as they are finished."""
-        if workers == 1:
+        if team is None:
             yield from (self.solver.solve(k) for k in progress(left))
             return
-        scene, slips = self.case.scene, self.solver.slips
-        frames = finished_in_order(scene, slips, self.indices, left, workers)
+        frames = finished_in_order(team, self.solver.slips, self.indices, left)
         yield from (frame for _, frame in zip(progress(left), frames, strict=True))
 
     def _begin_maps(self, side: "ContactSide") -> None:

@@ -1,5 +1,6 @@
 """Where a femoral component parts into two condyles, and the lowest point of each."""
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -16,6 +17,9 @@ STRIP_WIDTH = 1e-3
 """m; of the strips along z in which the notch is looked for."""
 SAMPLE_SPACING = 1e-3
 """m; between the samples of a condyle's surface."""
+HIGHEST_SAMPLE = 10 * FACET_DEPTH
+"""m above the lowest vertex; higher samples weigh nothing."""
+SAMPLES_IN_A_BOX = 32
 _FLEXIONS = np.radians(np.arange(0.0, 121.0, 15.0))
 _DEEPEST = 15e-3
 
@@ -97,8 +101,7 @@ class LowestPoints:
         for faces in condyle_faces(femoral, split):
             if len(faces):
                 part = Surface(femoral.vertices, femoral.faces[faces], femoral.name)
-                samples, _, areas = sampled(part, SAMPLE_SPACING)
-                self._condyles.append((femoral.vertices[np.unique(part.faces)], samples, areas))
+                self._condyles.append(_SampledCondyle.of(part))
 
     def at(self, pose_femoral_in_insert: Array) -> tuple[Array, Array | None]:
         """Return the points (3,) m, insert frame, of the medial and the lateral condyle.
@@ -106,18 +109,57 @@ class LowestPoints:
         The lateral one is None where there is no split.
         """
         pose = np.asarray(pose_femoral_in_insert, float)
-        points = [_lowest(pose, *condyle) for condyle in self._condyles]
+        points = [condyle.lowest(pose) for condyle in self._condyles]
         return points[0], points[1] if len(points) > 1 else None
 
 
-def _lowest(pose: Array, vertices: Array, samples: Array, areas: Array) -> Array:
-    heights = vertices @ pose[1, :3]
-    lowest = vertices[np.argmin(heights)]
-    above = samples @ pose[1, :3] - heights.min()
-    near = above < 10 * FACET_DEPTH
-    weights = np.append(areas[near], areas.mean()) * np.exp(
-        -np.append(above[near], 0) / FACET_DEPTH
-    )
-    across = rotate(pose, np.vstack([samples[near], lowest]) - lowest)
-    step = weights @ across / weights.sum()
-    return transform(pose, lowest) + step * np.array([1.0, 0.0, 1.0])
+@dataclass(frozen=True, eq=False)
+class _SampledCondyle:
+    """A condyle's samples, in boxes about each few of them that spare most from being looked at.
+
+    Args:
+        vertices: (v, 3) m, femoral frame.
+        samples: (n, 3) m.
+        areas: (n,) m².
+        centres: (b, 3) m, of the boxes.
+        halves: (b, 3) m, half their edges.
+    """
+
+    vertices: Array
+    samples: Array
+    areas: Array
+    centres: Array
+    halves: Array
+
+    @classmethod
+    def of(cls, condyle: Surface) -> "_SampledCondyle":
+        """Return the samples of a condyle's surface."""
+        samples, _, areas = sampled(condyle, SAMPLE_SPACING)
+        begin = np.arange(0, len(samples), SAMPLES_IN_A_BOX)
+        low = np.minimum.reduceat(samples, begin)
+        high = np.maximum.reduceat(samples, begin)
+        vertices = condyle.vertices[np.unique(condyle.faces)]
+        return cls(vertices, samples, areas, (low + high) / 2, (high - low) / 2)
+
+    def lowest(self, pose: Array) -> Array:
+        """Return the lowest point (3,) m, insert frame."""
+        heights = self.vertices @ pose[1, :3]
+        lowest, bottom = self.vertices[np.argmin(heights)], heights.min()
+        looked_at = self._low_samples(pose[1, :3], bottom + HIGHEST_SAMPLE)
+        above = self.samples[looked_at] @ pose[1, :3] - bottom
+        near = above < HIGHEST_SAMPLE
+        looked_at, above = looked_at[near], above[near]
+        weights = np.append(self.areas[looked_at], self.areas.mean()) * np.exp(
+            -np.append(above, 0) / FACET_DEPTH
+        )
+        across = rotate(pose, np.vstack([self.samples[looked_at], lowest]) - lowest)
+        step = weights @ across / weights.sum()
+        return transform(pose, lowest) + step * np.array([1.0, 0.0, 1.0])
+
+    def _low_samples(self, up: Array, height: float) -> Index:
+        """Return the samples in boxes that reach down to a height, m along up (3,)."""
+        least = self.centres @ up - self.halves @ np.abs(up)
+        # a box's rounding is far below the weight's reach
+        boxes = np.flatnonzero(least < height)
+        chosen = boxes[:, None] * SAMPLES_IN_A_BOX + np.arange(SAMPLES_IN_A_BOX)
+        return chosen[chosen < len(self.samples)]

@@ -1,7 +1,10 @@
 """Frames of a case, one by one: both sides of the equilibrium in, a row of the results out."""
 
+import logging
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from tkamb.equilibrium.mechanics import Mechanics
@@ -10,7 +13,7 @@ from tkamb.plausibility.plausibility import Plausibility
 from tkamb.run.shards import Row
 from tkamb.run.status import frame_status
 from tkamb.run.tabulate import frame_row
-from tkamb.run.workers import Crew, Task
+from tkamb.run.workers import Team
 from tkamb.scene import Scene
 from tkamb.scene.case import Case, load_case
 
@@ -43,7 +46,6 @@ class FrameSolver:
     Attributes:
         mechanics: the body side.
         slips: side -> rolling and slipping of the recorded motion.
-        side: the contact side; None without [contact].
         before: contacts of the last frames, guesses for the next.
 
     Raises:
@@ -58,7 +60,6 @@ class FrameSolver:
         self.plausibility = Plausibility(self.mechanics)
         last = max(frames or range(len(case.motion.time)))
         self.slips = self.mechanics.slips(last) if slips is None else slips
-        self.side = self._contact_side() if case.scene.contact else None
         self.before: list[FrameContact] = []
 
     def solve(self, k: int) -> Finished:
@@ -83,7 +84,11 @@ class FrameSolver:
         self.before.append(contact)
         del self.before[:-LAST_FRAMES]
 
-    def _contact_side(self) -> "ContactSide":
+    @cached_property
+    def side(self) -> "ContactSide | None":
+        """The contact side, prepared when it is first asked for; None without [contact]."""
+        if self._case.scene.contact is None:
+            return None
         from tkamb.equilibrium.contact_side import ContactSide
 
         return ContactSide(self._case, self.mechanics)
@@ -95,45 +100,62 @@ def _without_warm_start(contact: "FrameContact") -> "FrameContact":
     return replace(contact, result=replace(contact.result, warm_start=None), turned=None)
 
 
+Chunk = tuple[list[int], "dict[str, CondyleSlip]"]
+"""Frames in a row, and the slips of the recorded motion (`FrameSolver`)."""
+
+
+@contextmanager
+def _said_already() -> Iterator[None]:
+    """Print no warnings: the process that hands out the work reads the same scene."""
+    log = logging.getLogger("tkamb")
+    usual = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(usual)
+
+
 class ChunkSolver:
-    """What a worker does: reads the scene once, and computes chunk after chunk."""
+    """What a worker does: reads the scene once, and computes chunk after chunk.
 
-    def __init__(self, scene: Scene, slips: "dict[str, CondyleSlip]") -> None:
-        self._solver = FrameSolver(load_case(scene), slips=slips)
+    Its contact side waits for the first chunk: by then the process that hands out the work has
+    prepared its own, and what takes long is found where that kept it.
+    """
 
-    def __call__(self, number: int, frames: Sequence[int]) -> list[Finished]:
+    @_said_already()
+    def __init__(self, scene: Scene) -> None:
+        self._solver = FrameSolver(load_case(scene), slips={})
+
+    @_said_already()
+    def __call__(self, number: int, chunk: Chunk) -> list[Finished]:
         """Return the frames of a chunk."""
+        frames, self._solver.slips = chunk
         self._solver.before.clear()
         return [self._solver.solve(k) for k in frames]
 
 
 def finished_in_order(
-    scene: Scene,
-    slips: "dict[str, CondyleSlip]",
-    indices: range,
-    left: Sequence[int],
-    workers: int,
+    team: Team, slips: "dict[str, CondyleSlip]", indices: range, left: Sequence[int]
 ) -> Iterator[Finished]:
     """Yield frames over worker processes, in order.
 
     Args:
-        scene: for each worker to read.
+        team: of workers whose task is a `ChunkSolver`.
         slips: of the recorded motion, see `FrameSolver`.
         indices: all frames of the run, which make its chunks.
         left: those that are still to do.
-        workers: processes.
 
     Raises:
         ComputationError: a worker was killed.
     """
-    chunks: dict[int, list[int]] = {}
+    chunks: dict[int, Chunk] = {}
     for k in left:
-        chunks.setdefault(indices.index(k) // CHUNK, []).append(k)
+        chunks.setdefault(indices.index(k) // CHUNK, ([], slips))[0].append(k)
     early: dict[int, list[Finished]] = {}
     turn = iter(chunks)
-    answers = Crew(workers).answers(Task(ChunkSolver, (scene, slips)), list(chunks.items()))
     expected: Any = next(turn, None)
-    for number, frames in answers:
+    for number, frames in team.answers(list(chunks.items())):
         early[number] = frames
         while expected in early:
             yield from early.pop(expected)

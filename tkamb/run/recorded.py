@@ -197,16 +197,24 @@ def fitted_normalisation(
 
 def _pearson(a: Array, b: Array) -> float:
     """Return Pearson's r; NaN where one of them does not vary or there are few values."""
-    if len(a) < FEWEST_FRAMES or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
-        return np.nan
-    return float(np.corrcoef(a, b)[0, 1])
+    return float(_correlations(a, b[None])[0])
+
+
+def _correlations(a: Array, rows: Array) -> Array:
+    """Return Pearson's r (m,) of a (n,) and each row (m, n); NaN as `_pearson`."""
+    if len(a) < FEWEST_FRAMES:
+        return np.full(len(rows), np.nan)
+    varied = (np.ptp(rows, axis=1) > 0.0) & (np.ptp(a) > 0.0)
+    own, others = a - a.mean(), rows - rows.mean(axis=1, keepdims=True)
+    size = np.sqrt((own @ own) * (others**2).sum(axis=1))
+    return np.divide(others @ own, size, out=np.full(len(rows), np.nan), where=varied)
 
 
 def _lag(envelopes: "Envelopes", muscle: str, time: Array, activation: Array) -> float:
     """Return the lag (s) of the largest correlation; NaN where it has no maximum inside."""
-    shifted = np.array([envelopes.at(muscle, time - lag) for lag in LAGS])
+    shifted = envelopes.at(muscle, time - LAGS[:, None])
     known = np.isfinite(shifted).all(axis=0)
-    r = np.array([_pearson(activation[known], row[known]) for row in shifted])
+    r = _correlations(activation[known], shifted[:, known])
     if not r.max() > max(r[0], r[-1]) + FLAT:  # NaN too
         return np.nan
     return float(LAGS[r.argmax()])

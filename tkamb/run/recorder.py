@@ -9,7 +9,7 @@ import shutil
 import signal
 import threading
 import time as clock
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -77,8 +77,13 @@ class Recorder:
         """Say whether what is finished should be shown to the outside."""
         return False
 
-    def publish(self, results: "Results") -> None:
-        """Show what is finished to the outside."""
+    def publish(self, made: "Callable[[], Results]") -> "Results":
+        """Show what is finished to the outside, and return it.
+
+        Args:
+            made: makes the results.
+        """
+        return made()
 
     def finish(self) -> None:
         """Close the maps: every frame is there."""
@@ -163,10 +168,10 @@ class FolderRecorder(Recorder):
         with interrupt_later():
             self.close()
 
-    def publish(self, results: "Results") -> None:
+    def publish(self, made: "Callable[[], Results]") -> "Results":
         """Put results.csv, summary.json and contact.h5 in their places together; a report goes."""
-
         start = clock.perf_counter()
+        results = made()
         with interrupt_later(), replaced_together(self._directory) as files:
             if self._writer is not None:
                 self._writer.flush()
@@ -175,6 +180,7 @@ class FolderRecorder(Recorder):
             files.remove(REPORT_NAME)
         self._shown = clock.perf_counter()
         self._pause = max(SHORTEST_PAUSE, (self._shown - start) / DEAREST_SHARE)
+        return results
 
 
 @contextmanager

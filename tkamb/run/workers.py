@@ -17,7 +17,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import IO, Any
 
-from tkamb.errors import ComputationError, InputError
+from tkamb.errors import ComputationError, InputError, TkambError
+from tkamb.guard import log_to_stderr
 
 MOST_WORKERS = 256
 Numbered = tuple[int, Any]
@@ -121,7 +122,7 @@ class Team:
     def __init__(self, crew: Crew, task: Task, count: int) -> None:
         self._crew, self._task = crew, task
         self._jobs: queue.SimpleQueue[Numbered | None] = queue.SimpleQueue()
-        self._answers: queue.SimpleQueue[Numbered | None] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[Numbered | TkambError] = queue.SimpleQueue()
         self.processes = [_start() for _ in range(count)]
         for process in self.processes:
             threading.Thread(
@@ -135,6 +136,7 @@ class Team:
             wanted: numbers and contents of the jobs.
 
         Raises:
+            InputError: what the workers prepare cannot be used.
             ComputationError: a worker was killed, or the scheduler is gone.
         """
         if self._crew.dask is not None and wanted:
@@ -149,10 +151,8 @@ class Team:
             self._jobs.put(job)
         for _ in wanted:
             answer = self._answers.get()
-            if answer is None:
-                raise ComputationError(
-                    ENDED, "--workers", f"is there memory for so many? {KEPT.capitalize()}"
-                )
+            if isinstance(answer, TkambError):
+                raise answer
             yield answer
 
     def stop(self) -> None:
@@ -177,9 +177,9 @@ def _attend(
     process: "subprocess.Popen[bytes]",
     task: Task,
     jobs: "queue.SimpleQueue[Numbered | None]",
-    answers: "queue.SimpleQueue[Numbered | None]",
+    answers: "queue.SimpleQueue[Numbered | TkambError]",
 ) -> None:
-    """Hand one worker its jobs until None comes; None among the answers says that it is gone."""
+    """Hand one worker its jobs until None comes; an error among the answers ends it."""
     assert process.stdin is not None and process.stdout is not None
     try:
         # as plain values: the worker's Task is that of the module it was started as
@@ -188,7 +188,8 @@ def _attend(
             _send(process.stdin, job)
             answers.put(pickle.load(process.stdout))
     except (OSError, EOFError, ValueError, pickle.UnpicklingError):
-        answers.put(None)
+        again = f"is there memory for so many? {KEPT.capitalize()}"
+        answers.put(ComputationError(ENDED, "--workers", again))
 
 
 def _send(stream: IO[bytes], value: object) -> None:
@@ -199,16 +200,34 @@ def _send(stream: IO[bytes], value: object) -> None:
 def serve() -> None:
     """Be a worker until the standard input ends; whatever else is printed goes to stderr."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    log_to_stderr()
     jobs = os.fdopen(os.dup(0), "rb")
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    work = Task(*pickle.load(jobs)).prepared()
+    work = _prepared(Task(*pickle.load(jobs)))
     while True:
         try:
             number, job = pickle.load(jobs)
         except EOFError:
             return
-        _send(answers, (number, work(number, job)))
+        try:
+            answer: Numbered | TkambError = number, work(number, job)
+        except TkambError as error:  # the parent's to tell
+            answer = error
+        _send(answers, answer)
+
+
+def _prepared(task: Task) -> Callable[[int, Any], Any]:
+    """Return what does the jobs; it refuses them all where the preparation fails."""
+    try:
+        return task.prepared()
+    except TkambError as error:
+        wrong = error
+
+        def refuse(number: int, job: object) -> None:
+            raise wrong
+
+        return refuse
 
 
 if __name__ == "__main__":
