@@ -50,7 +50,7 @@ def scene(tmp_path_factory):
 def written(tmp_path_factory, profile, scene):
     out = tmp_path_factory.mktemp("wear") / "out"
     worn = ["wear", str(scene), "--simulator", str(profile), *QUICK]
-    assert main([*worn, "--cycles", "100000", "--out", str(out)]) == 0
+    assert main([*worn, "--cycles", "1e5", "--out", str(out)]) == 0
     return out
 
 
@@ -157,6 +157,9 @@ def test_bad_input_is_one_line_and_leaves_no_folder(capsys, tmp_path, profile, s
         said = refused(capsys, scene, "--simulator", profile, *options, "--out", out)
         assert words in said, options
         assert not out.exists()
+    with pytest.raises(SystemExit, match="2"):
+        main(["wear", str(scene), "--cycles", "1.5"])
+    assert "'1.5' is no whole number" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """`tkamb wear`: arguments in, exit status out."""
 
 import argparse
+import math
 import os
 import sys
 from pathlib import Path
@@ -28,7 +29,9 @@ def add_wear(commands: Any) -> None:
     wear.add_argument(
         "--springs", type=Path, metavar="F", help="the simulator's springs (.toml): force control"
     )
-    wear.add_argument("--cycles", type=int, default=CYCLES, metavar="N")
+    wear.add_argument(
+        "--cycles", type=_count, default=CYCLES, metavar="N", help=f"default {CYCLES:.0e}"
+    )
     wear.add_argument(
         "--updates", type=int, default=UPDATES, metavar="M", help="of the geometry; default 10"
     )
@@ -61,6 +64,17 @@ def add_wear(commands: Any) -> None:
     wear.add_argument("--resume", action="store_true", help="go on with an interrupted simulation")
     wear.add_argument("--json", action="store_true", help="print wear.json")
     wear.set_defaults(command=_wear)
+
+
+def _count(text: str) -> int:
+    """Return a whole number, which may be written like 5e6."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not value.is_integer():
+        raise argparse.ArgumentTypeError(f"'{text}' is no whole number")
+    return int(value)
 
 
 def _wear(options: argparse.Namespace) -> int:
