@@ -1,6 +1,6 @@
-"""All questions of a case, the implant's own among them, and what they say about a frame."""
+"""All questions of a case, and what they say about a frame."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,10 +12,10 @@ from tkamb.plausibility.ground import (
     load_questions,
     posture_questions,
 )
+from tkamb.plausibility.implant import implant_questions
 from tkamb.plausibility.movement import motion_questions, sample_questions
 from tkamb.plausibility.question import Question, some
 from tkamb.plausibility.segments import segment_questions
-from tkamb.scene.case import Case
 
 if TYPE_CHECKING:
     from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
@@ -23,11 +23,6 @@ if TYPE_CHECKING:
 ANSWERS = "[output] answers"
 FORCE_BW = 8.0
 """BW: instrumented knees measured 5 to 6 at most, in stumbling (Bergmann et al. 2014)."""
-FLANGE_TOP = 0.15
-"""Of the component's height: the anterior flange ends there, above the posterior condyles."""
-FLANGE_FORWARD = 0.35
-"""Of its length, from behind: eleven components have their top at 0.92 to 0.97, one without a
-flange at 0.5, one back to front below 0.1."""
 
 
 class Plausibility:
@@ -55,7 +50,7 @@ class Plausibility:
             *foot_questions(case),
             *direction_questions(case),
             *posture_questions(case),
-            *_implant_questions(case),
+            *implant_questions(case),
         ]
         if case.ligaments or case.muscles:
             found += _line_questions(mechanics)
@@ -113,19 +108,3 @@ def _line_questions(mechanics: "Mechanics") -> list[Question]:
         strains = {b.name: b.strain(b.length(poses)) for b in mechanics.ligaments}
         found += lines.strain_questions(mechanics.ligaments, strains, case.motion.time)
     return found
-
-
-def _implant_questions(case: Case) -> Iterator[Question]:
-    """Whether the femoral component's flange lies in front."""
-    if case.femoral is None:
-        return
-    low, high = case.femoral.bounds
-    vertices = case.femoral.vertices
-    top = vertices[:, 1] > high[1] - FLANGE_TOP * (high[1] - low[1])
-    place = float((vertices[top, 0].mean() - low[0]) / (high[0] - low[0]))
-    if place < FLANGE_FORWARD:
-        yield Question(
-            "the top of the femoral component lies behind, where the posterior condyles end: is it "
-            "back to front? see [implant.femoral] axes",
-            "femoral component may be back to front",
-        )
