@@ -167,6 +167,8 @@ FLAGGED = {
     "centimetres": (key("patient.height_mm", 1200.0), "of the body height"),
     "lean's sign": (cells("tibia.csv", "lean_deg", lambda v: -v), "the hip is # mm behind .*lean"),
     "back to front": (key("implant.femoral.axes", "-x,+y,-z"), "is it back to front"),
+    "insertion in centimetres": (key("quadriceps.insertion.point_mm", [0.8, 2.0, 0.0]),
+                                 "# mm above the patellar ligament's"),
     "upside down": (key("implant.femoral.axes", "+x,-y,-z"), "opens downward.* is it turned"),
     "opening backward": (key("implant.femoral.axes", "-y,+x,+z"), "opens backward.* is it turned"),
     "insert back to front": (key("implant.insert.axes", "-x,+y,-z"), "insert is cut out in front"),

@@ -35,6 +35,9 @@ TUBEROSITY = (0.01, 0.11)
 """m, of the patellar ligament's distal end from the insert's centre; it lies below and ahead."""
 ON_PATELLA = 0.06
 """m, of both lines' ends from the patella's origin: the patella is 0.045 long."""
+PATELLA_HEIGHT, PATELLA_ASIDE = 0.025, 0.025
+"""m: the lines end at least so far apart along it (0.039 to 0.045 in three models), and within
+half its breadth."""
 TENDON_CHANGE = 0.15
 """Of its mean, the change of the patellar ligament's length between recorded ends: it strains by
 a few per cent."""
@@ -157,19 +160,24 @@ def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Quest
     ligament = case.patellar_ligament
     if ligament is None:
         return
-    off, on_patella = [], [("[patellar_ligament] proximal", ligament.proximal, -1.0)]
+    _, tip = _on_carrier(case, ligament.proximal)
+    off, on_patella = [], [("[patellar_ligament] proximal", tip, -1.0)]
     for muscle in case.muscles:
         _, origin = _on_carrier(case, muscle.points[0])
         if not ORIGIN[0] <= origin[1] <= ORIGIN[1] or np.hypot(origin[0], origin[2]) > 0.12:
             off.append(f"[{muscle.name}] origin")
-        on_patella.insert(-1, (f"[{muscle.name}] insertion", muscle.points[-1], 1.0))
+        _, base = _on_carrier(case, muscle.points[-1])
+        on_patella.insert(-1, (f"[{muscle.name}] insertion", base, 1.0))
+        if 0.0 <= base[1] < tip[1] + PATELLA_HEIGHT and tip[1] < 0.0:
+            above = (base - tip)[1] / MILLIMETRE
+            off.append(f"[{muscle.name}] insertion, {above:.0f} mm above the patellar ligament's,")
     _, distal = _on_carrier(case, ligament.distal)
     away = float(np.linalg.norm(distal))
     if not TUBEROSITY[0] <= away <= TUBEROSITY[1] or distal[0] < 0 or distal[1] > 0.01:
         off.append("[patellar_ligament] distal")
-    for name, end, sign in on_patella:
-        _, place = _on_carrier(case, end)
-        if np.linalg.norm(place) > ON_PATELLA or sign * place[1] < 0.0:
+    for name, place, sign in on_patella:
+        beyond = np.linalg.norm(place) > ON_PATELLA or abs(place[2]) > PATELLA_ASIDE
+        if beyond or sign * place[1] < 0.0:
             off.append(name)
     if off:
         yield Question(
