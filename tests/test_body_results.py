@@ -112,6 +112,15 @@ def test_keys_that_do_not_go_together(changes, words):
         load_scene(fast_scene(), changes)
 
 
+@pytest.mark.parametrize("table", ["quadriceps", "patellar_ligament"])
+@pytest.mark.parametrize(("key", "value"), [("half_thickness_mm", 0.0035), ("band_mm", 0.005)])
+def test_a_tendon_in_metres_is_refused(table, key, value):
+    """It ran as ok: at 120 deg a string of a quadriceps pulls 0.7 % more than a tendon."""
+    with pytest.raises(InputError, match=f"{value:g} is neither 0 nor within .* in millimetres"):
+        load_scene(fast_scene(), {f"{table}.{key}": value})
+    load_scene(fast_scene(), {f"{table}.{key}": 0.0})  # a string, or its own plane, as before
+
+
 def test_a_reference_pose_that_was_not_recorded_is_refused(tmp_path):
     changes = {"ligament": [], "generic_ligaments.ligaments": ["LCL"]}
     path = write_scene(tmp_path)

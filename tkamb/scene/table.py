@@ -38,6 +38,21 @@ def within(low: float, high: float, question: str) -> Any:
     return AfterValidator(checked)
 
 
+def zero_or_within(low: float, high: float, question: str) -> Any:
+    """Return the annotation of a number that is zero or must lie in a range."""
+
+    def checked(value: float) -> float:
+        if value != 0 and not low <= value <= high:
+            raise ValueError(f"{value:g} is neither 0 nor within {low:g} to {high:g}; {question}")
+        return value
+
+    return AfterValidator(checked)
+
+
+HalfThickness = Annotated[Number, zero_or_within(0.2, 20, "is it in millimetres?")]
+"""Of a tendon, off the outline that it wraps; zero is a string."""
+Band = Annotated[Number, zero_or_within(0.1, 50, "is it in millimetres?")]
+"""Of the sections that a tendon wraps; zero is its own sagittal plane."""
 Point = Annotated[Vector, within(-1000, 1000, "is it in millimetres?")]
 """A bone's length (0.6 m at most) and a frame's origin beside it are less than a metre."""
 Offset = Annotated[Vector, within(-600, 600, "is it in millimetres?")]

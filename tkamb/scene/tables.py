@@ -14,6 +14,8 @@ from tkamb.defaults import CONTACT_MODEL
 from tkamb.scene.measured import EmgTable
 from tkamb.scene.table import (
     Axes,
+    Band,
+    HalfThickness,
     KneeFreedom,
     LengthUnit,
     Number,
@@ -180,8 +182,8 @@ class MuscleWrapTable(SceneTable):
     """
 
     bone: BoneTable | None = None
-    half_thickness_mm: Number = Field(3.5, ge=0, le=20, description=HALF_THICKNESS)
-    band_mm: Number = Field(5.0, ge=0, le=50, description=BAND)
+    half_thickness_mm: HalfThickness = Field(3.5, description=HALF_THICKNESS)
+    band_mm: Band = Field(5.0, description=BAND)
 
 
 class MuscleTable(SceneTable):
@@ -213,8 +215,8 @@ class QuadricepsTable(SceneTable):
     insertion: Attachment
     wrap: Switch = True
     bone: BoneTable | None = None
-    half_thickness_mm: Number = Field(3.5, ge=0, le=20, description=HALF_THICKNESS)
-    band_mm: Number = Field(5.0, ge=0, le=50, description=BAND)
+    half_thickness_mm: HalfThickness = Field(3.5, description=HALF_THICKNESS)
+    band_mm: Band = Field(5.0, description=BAND)
 
 
 class MusclesTable(SceneTable):
@@ -265,8 +267,8 @@ class PatellarLigamentTable(SceneTable):
         None, description="its constant length; needed where the patella is solved"
     )
     wrap: Switch = True
-    half_thickness_mm: Number = Field(2.5, ge=0, le=20)
-    band_mm: Number = Field(5.0, ge=0, le=50, description="likewise, of the insert's lip")
+    half_thickness_mm: HalfThickness = Field(2.5)
+    band_mm: Band = Field(5.0, description="likewise, of the insert's lip")
 
 
 class PatellaTable(SceneTable):
