@@ -169,6 +169,7 @@ FLAGGED = {
     "back to front": (key("implant.femoral.axes", "-x,+y,-z"), "is it back to front"),
     "insertion in centimetres": (key("quadriceps.insertion.point_mm", [0.8, 2.0, 0.0]),
                                  "# mm above the patellar ligament's"),
+    "friction": (key("contact.friction", 0.5), "friction of # is more than metal"),
     "upside down": (key("implant.femoral.axes", "+x,-y,-z"), "opens downward.* is it turned"),
     "opening backward": (key("implant.femoral.axes", "-y,+x,+z"), "opens backward.* is it turned"),
     "insert back to front": (key("implant.insert.axes", "-x,+y,-z"), "insert is cut out in front"),

@@ -29,6 +29,15 @@ HIP_AWAY = 0.6
 and squats stay within 0.41."""
 AT_ANKLE = 0.015
 """m: who stands has it 0.04 ahead; a path as near as this to the ankle is in another unit."""
+WALKS, STANDS = 1.0, 0.3
+"""m/s, of the ankle: it swings faster than the first (a walk's 4, a slow one's 1.5) and in stance
+is slower than the second, from the foot's landing to the heel's rising."""
+STANCE = 0.15
+"""s: in four walks no foot stands unloaded for longer than 0.02; on a plate left out, for 0.4."""
+UNLOADED = 0.05
+"""BW: less, and the foot bears nothing."""
+STEPS_APART = 1.6
+"""Times: between one foot's peaks in a walk, 1.1 in three recordings."""
 
 
 def load_questions(case: Case) -> Iterator[Question]:
@@ -44,6 +53,52 @@ def load_questions(case: Case) -> Iterator[Question]:
             "unit than N, or mass_kg in pounds?",
             "ground reaction unlike the body's weight",
         )
+
+
+def step_questions(case: Case) -> Iterator[Question]:
+    """Whether a walking foot is measured wherever it stands, and alike in every step."""
+    ground, tibia, time = case.ground, case.tibia, case.motion.time
+    if ground is None or tibia is None:
+        return
+    speed = np.linalg.norm(tibia.velocity[:, :3], axis=1)
+    if speed.max() < WALKS:
+        return
+    upward = ground.force[:, 1]
+    bears = upward > UNLOADED * case.body_weight
+    still = [
+        (first, last)
+        for first, last in _runs(~bears & (speed < STANDS))
+        if time[last] - time[first] > STANCE
+    ]
+    if still:
+        frames = np.zeros(len(time), bool)
+        for first, last in still:
+            frames[first : last + 1] = True
+        first, last = still[0]
+        yield Question(
+            f"the ankle stands from {time[first]:.4g} to {time[last]:.4g} s while the ground bears "
+            "nothing: did the foot stand beside the plates, or is one of them left out?",
+            "foot stands on nothing that was measured",
+            frames,
+        )
+    ends = (0, len(time) - 1)
+    peaks = [first + int(upward[first : last + 1].argmax()) for first, last in _runs(bears)]
+    peaks = [k for k in peaks if k not in ends]  # not cut off on its way up or down
+    if len(peaks) > 1:
+        low, high = min(peaks, key=upward.__getitem__), max(peaks, key=upward.__getitem__)
+        if upward[high] > STEPS_APART * upward[low]:
+            yield Question(
+                f"one step loads the foot with {upward[low]:.0f} N at {time[low]:.4g} s, another "
+                f"with {upward[high]:.0f} N at {time[high]:.4g} s: does one plate have another "
+                "gain, or bear only part of the foot?",
+                "steps of one foot loaded unlike each other",
+            )
+
+
+def _runs(mask: Mask) -> list[tuple[int, int]]:
+    """Return the first and the last frame of each unbroken stretch."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(first), int(end) - 1) for first, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def direction_questions(case: Case) -> Iterator[Question]:

@@ -1,4 +1,4 @@
-"""Questions about the implant: whether its parts are turned as their axes say."""
+"""Questions about the implant: whether its parts are turned as their axes say, and slide freely."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -30,19 +30,28 @@ FLATTER = 2.0
 NOTCH = 0.02
 """Of an insert's length, by which it is cut out more in front than behind; in ten inserts it is
 cut out more behind, by 0.05 to 0.3."""
+FRICTION = 0.25
+"""Coulomb's, of metal on polyethylene: lubricated joints have 0.01 to 0.1, dry ones 0.2."""
 AT_HEIGHTS = (0.15, 0.3, 0.45)
 ASIDE = 0.25
 """Where an insert's outline is looked at: of its height; of its width, under the condyles."""
 
 
 def implant_questions(case: Case) -> Iterator[Question]:
-    """Whether femoral component, insert and patellar button are turned."""
+    """Whether femoral component, insert and patellar button are turned, and rub too much."""
     if case.femoral is not None:
         yield from _of_femoral(case.femoral)
     if case.insert is not None and case.scene.contact:
         yield from _of_insert(case.insert)
     if case.patella is not None:
         yield from _of_button(case.patella)
+    contact = case.scene.contact
+    if contact and contact.friction > FRICTION:
+        yield Question(
+            f"a friction of {contact.friction:g} is more than metal on polyethylene has, even dry "
+            "(0.2): is it a tenth of that?",
+            "friction above any of metal on polyethylene",
+        )
 
 
 def _of_femoral(femoral: "Surface") -> Iterator[Question]:

@@ -11,6 +11,7 @@ from tkamb.plausibility.ground import (
     foot_questions,
     load_questions,
     posture_questions,
+    step_questions,
 )
 from tkamb.plausibility.implant import implant_questions
 from tkamb.plausibility.movement import motion_questions, sample_questions
@@ -50,6 +51,7 @@ class Plausibility:
             *foot_questions(case),
             *direction_questions(case),
             *posture_questions(case),
+            *step_questions(case),
             *implant_questions(case),
         ]
         if case.ligaments or case.muscles:
