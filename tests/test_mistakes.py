@@ -1,6 +1,7 @@
 """No mistake passes for an answer: refused with the right words, flagged, or without effect."""
 
 import csv
+import itertools
 import json
 
 import numpy as np
@@ -220,6 +221,25 @@ def test_no_random_mistake_passes(knee):
 @needs_dm
 def test_no_random_mistake_passes_on_dm(dm):
     assert_none_passes(dm, np.random.default_rng(1), (6, 6))
+
+
+def turned_axes():
+    """Yield the 23 wrong right-handed axes of a part."""
+    for names in itertools.permutations(range(3)):
+        for signs in itertools.product((1, -1), repeat=3):
+            rotation = np.diag(signs) @ np.eye(3)[list(names)]
+            words = ",".join(f"{'+-'[s < 0]}{'xyz'[n]}" for s, n in zip(signs, names, strict=True))
+            if np.linalg.det(rotation) > 0 and words != "+x,+y,+z":
+                yield words
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", ["femoral", "insert", "patella"])
+def test_a_part_turned_any_other_way_is_noticed(knee, part):
+    ways = [axes for axes in turned_axes() if part != "patella" or not axes.startswith("+x")]
+    assert len(ways) == (20 if part == "patella" else 23)  # about its own axis a dome is the same
+    outcomes = {axes: knee.outcome(key(f"implant.{part}.axes", axes)) for axes in ways}
+    assert [axes for axes, found in outcomes.items() if not found.notices(knee.untouched)] == []
 
 
 @pytest.mark.slow
