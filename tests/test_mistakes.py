@@ -166,6 +166,7 @@ FLAGGED = {
                    "off its neighbours' curve"),
     "URDF in pounds": (urdf("10.620000", "23.413"), "pounds?"),
     "centimetres": (key("patient.height_mm", 1200.0), "of the body height"),
+    "lean in radians": (cells("tibia.csv", "lean_deg", np.deg2rad), "angle in radians?"),
     "lean's sign": (cells("tibia.csv", "lean_deg", lambda v: -v), "the hip is # mm behind .*lean"),
     "back to front": (key("implant.femoral.axes", "-x,+y,-z"), "is it back to front"),
     "insertion in centimetres": (key("quadriceps.insertion.point_mm", [0.8, 2.0, 0.0]),

@@ -13,6 +13,9 @@ from tkamb.units import DEGREE
 
 FLEXION_RADIANS = 3.3
 """deg: a bend of more than 10 deg, in radians and called degrees, stays below this."""
+LEAN_RADIANS, DEEP = 2.6, 60.0
+"""deg: a shank that leans by up to 150 deg, in radians and called degrees, stays below the first;
+whoever bends the knee by the second leans by ten times as much."""
 USUAL_DEG = {"flexion": (-15, 160), "adduction": (-12, 12), "axial_rotation": (-40, 40)}
 """A kneeling, a dislocated and a rotating-platform knee reach these."""
 USUAL_RATE = {"flexion": 20.0, "adduction": 6.0, "axial_rotation": 10.0}
@@ -32,6 +35,17 @@ def motion_questions(case: Case) -> Iterator[Question]:
             f"flexion runs from {flexion.min():.2g} to {flexion.max():.2g} deg: is it in radians?",
             "flexion hardly changes",
         )
+    table = case.scene.tibia
+    if case.tibia is not None and table is not None and table.kind != "markers":
+        forward, up = case.tibia.pose[:, 0, 1], case.tibia.pose[:, 1, 1]
+        lean = np.arctan2(forward, up) / DEGREE
+        moves = np.ptp(lean) > 0.1 and np.ptp(flexion) > DEEP
+        if moves and np.abs(lean).max() < LEAN_RADIANS:
+            yield Question(
+                f"the shank leans from {lean.min():.2g} to {lean.max():.2g} deg in a bend of "
+                f"{np.ptp(flexion):.0f} deg: is [tibia]'s angle in radians?",
+                "shank hardly leans",
+            )
     for name, (low, high) in USUAL_DEG.items():
         angle = angles[name] / DEGREE
         far = (angle < low) | (angle > high)
