@@ -4,10 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
 from tkamb.contact import neighbourhood
 from tkamb.contact.foundation import (
+    OVER_THE_EDGE,
     ElasticFoundation,
     LinearFoundation,
     layer_pressure,
@@ -224,6 +226,42 @@ def test_out_of_range_is_nan_and_says_why():
     assert beside.status is ContactStatus.OUT_OF_RANGE
     assert "does not lie over the insert" in beside.flags[0]
     assert beside.medial is None
+
+
+def test_a_rim_column_that_starts_under_the_dish_lets_the_femur_in_there():
+    """Half-way along a steep chamfer's normal lies under the flat top, in the ball."""
+    radius, depth = 6e-3, 3e-3
+    outline = [(-15, 0), (15.5, 0), (15, 8), (14, 10), (-15, 10)]  # z, y in mm
+    corners = [(x, y, z) for x in (-15, 15) for z, y in outline]
+    hull = trimesh.convex.convex_hull(np.array(corners) * 1e-3).subdivide_to_size(1e-3)
+    insert = Surface(np.asarray(hull.vertices), np.asarray(hull.faces), "insert")
+    model, femoral = LinearFoundation(0.5e-3), graded_sphere(radius)
+    state = model.prepare(ContactPair(femoral, insert, LINEAR))
+    at = pose(np.eye(3), [0, HEIGHT + radius - depth, 8.5e-3])
+    within = state.surface.points - 5e-3 * state.surface.normals
+    steep = (state.surface.normals[:, 1] < 0.5) & (
+        np.linalg.norm(within - at[:3, 3], axis=1) < radius
+    )
+    assert steep.any()
+    volume = np.pi * depth**2 * (radius - depth / 3)
+    assert reaction(model, state, at) == pytest.approx(M / HEIGHT * volume, rel=8e-3)
+
+
+def test_an_edge_that_is_run_over_is_not_called_half_the_thickness():
+    """A slope of 45 deg ends in a crest, 31 mm high and less than 1 thick along its normal."""
+    outline = [(-15, 0), (15, 0), (15, 32), (-15, 2)]  # z, y in mm
+    corners = [(x, y, z) for x in (-15, 15) for z, y in outline]
+    hull = trimesh.convex.convex_hull(np.array(corners) * 1e-3)
+    insert = Surface(np.asarray(hull.vertices), np.asarray(hull.faces), "insert")
+    model = LinearFoundation(0.5e-3)
+    state = model.prepare(ContactPair(graded_sphere(6e-3), insert, LINEAR))
+    out = np.array([0, 1, -1]) / np.sqrt(2)
+
+    def at(depth, z):
+        return model.evaluate(state, pose(np.eye(3), [0, 17e-3 + z, z] + (6e-3 - depth) * out))
+
+    assert at(0.5e-3, 10e-3).status is at(0.05e-3, 14.5e-3).status is ContactStatus.OK
+    assert at(0.5e-3, 14.5e-3).flags == (OVER_THE_EDGE,)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.999, 1.05, 3.0])

@@ -175,8 +175,9 @@ class CamPost:
         gap = self.clearance(pose)
         result = self.model.evaluate(self.state, self.in_turned @ pose)
         if result.status is not ContactStatus.OK:
-            words = (flag.replace("insert's thickness", "post's depth") for flag in result.flags)
-            reason = "; ".join((result.status.value.replace("_", " "), *words))
+            words = "; ".join((result.status.value.replace("_", " "), *result.flags))
+            reason = words.replace("insert's thickness", "post's depth")
+            reason = reason.replace("insert's edge", "post's edge")
             overlap = f", overlap {-gap / MILLIMETRE:.1f} mm" if gap < 0 else ""
             return PostContact(None, gap, problem=f"cam-post contact {reason}{overlap}")
         if result.medial is None:

@@ -26,6 +26,10 @@ THINNEST = 1e-6
 """m; a layer thinner than this, at the insert's rim, counts as this thick."""
 NARROW = 1e-9
 """m; with a stiffness of some 1e8 N/m a reaction rises by 0.1 N between approaches this near."""
+TOO_DEEP = "the penetration exceeds half the insert's thickness"
+OVER_THE_EDGE = (
+    "the femoral component reaches over the insert's edge, deeper than half of what is there"
+)
 WELL_BELOW = 0.99
 SMALL_LOAD = 1.0
 """N; a reaction below that share of a load, less this, does not reach the load within `NARROW`."""
@@ -58,8 +62,9 @@ class ElasticFoundation(ContactModel):
     Blankevoort's law p = -M ln(1 - d/h).
 
     Limits: neighbours do not help to carry, so that pressure ends at the edge of the
-    overlap and peaks at rims are too high; d >= h/2 is OUT_OF_RANGE. Walls parallel
-    to y carry nothing. A mobile bearing is pressed like a fixed one.
+    overlap and peaks at rims are too high; d >= h/2 is OUT_OF_RANGE, and so is half of what
+    an edge has along the normal. Walls parallel to y carry nothing. A mobile bearing is
+    pressed like a fixed one.
 
     Args:
         resolution: m, spacing of the map points.
@@ -89,10 +94,9 @@ class ElasticFoundation(ContactModel):
         samples = state.surface
         gap = gaps_along_normals(samples, state.pair.femoral, pose)
         strain = np.maximum(-gap, 0.0) / np.maximum(samples.thickness, THINNEST)
-        if (strain >= DEEPEST).any():
-            return ContactResult.failed(
-                state, pose, "the penetration exceeds half the insert's thickness"
-            )
+        if (deep := strain >= DEEPEST).any():
+            whole = (samples.depth >= samples.thickness)[deep].any()
+            return ContactResult.failed(state, pose, TOO_DEEP if whole else OVER_THE_EDGE)
         pressure = layer_pressure(self.law, state.pair.material, strain)
         return ContactResult.of(state, pose, pressure, gap)
 

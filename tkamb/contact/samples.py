@@ -18,6 +18,8 @@ RIM_RAYS = 8
 """Rays per edge of a cell at the rim, to find how much of it is covered."""
 STEEPEST = 0.1
 """Smallest n_y taken for a tributary area: 84 deg from the horizontal."""
+SIDEWAYS = 0.5
+"""n_y below which a column starts well beside its point, seen from above: 60 deg."""
 SKIN = 1e-6
 """m; rays into the insert start so far below its surface."""
 MOST_CELLS = 4_000_000
@@ -94,7 +96,9 @@ def gaps_along_normals(samples: SurfaceSamples, femoral: Surface, pose: Array) -
 
     Rays start half-way through the insert, outside the femoral component, and go up along
     the normal; the first crossing counts. inf where no femoral surface lies above, -inf
-    where the femoral component reaches deeper than where the rays start.
+    where the femoral component reaches deeper than where the rays start. Columns of a steep rim
+    start beside it, under the dish, where the femoral component may be although it leaves the
+    rim alone: theirs counts only where it holds their point of the surface.
     """
     return gaps_and_facets(samples, femoral, pose)[0]
 
@@ -110,11 +114,22 @@ def gaps_and_facets(
     normals = rotate(back, samples.normals)
     below = DEEPEST * np.minimum(samples.thickness, samples.depth)
     origins = transform(back, samples.points) - below[:, None] * normals
-    distance, face = femoral.rays.first(origins, normals)
-    met = femoral.face_normals[face]
-    facing = np.einsum("ij,ij->i", normals, met)
-    gap = np.where((face >= 0) & (facing > 0), -np.inf, distance - below)
-    return gap, rotate(pose, met), face
+    gap, face = _first_entry(femoral, origins, normals)
+    gap -= below
+    aside = np.flatnonzero((gap < 0) & (samples.normals[:, 1] < SIDEWAYS))
+    if len(aside):
+        rim = origins[aside] + below[aside, None] * normals[aside]
+        above, onto = _first_entry(femoral, rim, normals[aside])
+        free = above > 0
+        gap[aside[free]], face[aside[free]] = above[free], onto[free]
+    return gap, rotate(pose, femoral.face_normals[face]), face
+
+
+def _first_entry(femoral: Surface, origins: Array, directions: Array) -> tuple[Array, Index]:
+    """Return where rays (n, 3) enter the femur first (n,), m, -inf: they start in it; the facet."""
+    distance, face = femoral.rays.first(origins, directions)
+    facing = np.einsum("ij,ij->i", directions, femoral.face_normals[face])
+    return np.where((face >= 0) & (facing > 0), -np.inf, distance), face
 
 
 def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:
