@@ -2,6 +2,7 @@
 
 import csv
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -100,6 +101,25 @@ def test_a_simulators_place_varies_only_where_the_table_says_so():
     nothing = UncertaintyTable.model_validate({"wear_factor": 0.0})
     with pytest.raises(InputError, match="nothing of a wear simulation varies"):
         varied_wear_inputs(nothing, case.motion, None, True)
+
+
+def test_inputs_that_err_together_do_so_in_a_wear_simulation():
+    """Those of the table that a wear simulation varies; the other pairs are a run's."""
+    both = [
+        {"between": ["ap", "wear_factor"], "coefficient": 0.6},
+        {"between": ["ap", "tuberosity.ap"], "coefficient": 0.9},
+    ]
+    table = UncertaintyTable.model_validate({"ap_mm": 0.5, "correlation": both})
+    case = small_case()
+    found = Sampling.of(SimpleNamespace(uncertainty=table, simulated=True), case, 20)
+    covariance = dict(zip(("ap", "wear_factor"), found.root @ found.root.T, strict=True))
+    assert covariance["ap"] == pytest.approx([1.0, 0.6])
+    assert covariance["wear_factor"] == pytest.approx([0.6, 1.0])
+
+
+def test_a_creep_laws_factor_multiplies_its_strain():
+    law = LogarithmicCreep(1e-3, 2e-4, 10.0)
+    assert law.times(1.3).strain_per_pascal(5e5) == pytest.approx(1.3 * law.strain_per_pascal(5e5))
 
 
 def test_interrupted_samples_go_on_to_the_same_band(tmp_path):

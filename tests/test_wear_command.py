@@ -10,11 +10,12 @@ import time
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from scenes import write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.geometry.frames import knee_coordinates
+from tkamb.geometry.frames import knee_coordinates, pose
 from tkamb.wear import run as wear_run
 from tkamb.wear.kept import STATE_NAME
 from tkamb.wear.laws import law_names, wear_law
@@ -217,10 +218,15 @@ def test_frames_whose_ends_meet_are_a_closed_cycle_and_failed_ones_are_said():
     load = np.full(9, 100.0)
     closed = CycleMotion.of_frames(np.linspace(0, 0.8, 9), poses, load)
     assert (closed.passes, len(closed), closed.duration) == (1, 10, pytest.approx(0.9))
+    rising = CycleMotion.of_frames(np.linspace(0, 0.8, 9), poses, 10.0 * np.arange(9) + 100.0)
+    assert rising.load[[0, -1]] == pytest.approx(100.0)
     open_ = CycleMotion.of_frames(np.linspace(0, 0.4, 5), poses[:5] * [1, 1, 1, 2], load[:5])
     assert open_.passes == 1  # a half sine returns to where it began
     bend = CycleMotion.of_frames(np.linspace(0, 0.2, 3), poses[:3], load[:3])
     assert (bend.passes, bend.duration) == (2, pytest.approx(0.4))
+    turned = pose(Rotation.from_euler("z", 5.0, degrees=True).as_matrix(), [0.0] * 3)
+    swung = CycleMotion.of_frames(np.array([0.0, 0.1]), np.array([np.eye(4), turned]), load[:2])
+    assert swung.passes == 2  # what only turns does not close either
     load[4] = np.nan
     assert "1 of 9 frames failed" in CycleMotion.of_frames(np.arange(9.0), poses, load).notes[0]
 

@@ -19,7 +19,7 @@ from tkamb.wear.engine import ContactEngine
 from tkamb.wear.force_control import ForceDrive, RestingPoses
 from tkamb.wear.laws import Archard
 from tkamb.wear.motion import CycleMotion
-from tkamb.wear.profile import read_profile
+from tkamb.wear.profile import read_profile, zero_at
 from tkamb.wear.simulation import WearCase, simulate_wear
 from tkamb.wear.springs import Spring, Springs, read_springs
 from tkamb.wear.worn_surface import ArticularSurface
@@ -105,6 +105,21 @@ def test_a_force_that_nothing_holds_is_no_pose():
     drive = machine([60.0, -500.0, 0, 0, 0, 0], (AP, SI))
     _, why = rest(flat_insert(10 * MM), ball(), drive, 500.0)
     assert "no equilibrium" in why or "search begins" in why
+
+
+def test_the_dwell_position_is_where_the_ball_lies_deepest():
+    """A ball over a dish whose bottom lies ahead and to the left; the profile's zero is there."""
+    bottom = (6 * MM, -3 * MM)
+
+    def height(x, z):
+        return 10 * MM + 8.0 * ((x - bottom[0]) ** 2 + (z - bottom[1]) ** 2)
+
+    femoral = graded_sphere(12 * MM)
+    engine = ContactEngine(contact_model("foundation", 2.0), femoral, material("polyethylene"))
+    found = engine.dwell(dished_insert(height), np.eye(3))
+    assert found == pytest.approx(bottom, abs=0.2 * MM)
+    assert zero_at(found)[[0, 2]] == pytest.approx(found)
+    assert not zero_at(found)[[1, 3, 4, 5]].any()
 
 
 def dish_case(applied):

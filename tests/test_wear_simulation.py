@@ -30,6 +30,7 @@ def test_a_plate_under_a_block_loses_k_p_s_everywhere():
     assert state.wear == pytest.approx(depth * MM, rel=1e-9)
     assert row["volume_mm3"] == pytest.approx(depth * PLATE, rel=1e-9)
     assert row["mass_mg"] == pytest.approx(depth * PLATE * DENSITY * 1e-3, rel=1e-9)
+    assert (row["mean_depth_mm"], row["worn_area_mm2"]) == pytest.approx((depth, PLATE), rel=1e-9)
     assert row["mesh_volume_lost_mm3"] == pytest.approx(row["volume_mm3"], rel=1e-9)
 
 
@@ -139,6 +140,7 @@ def test_too_long_blocks_are_taken_back():
     forced = last(case, 1_000_000, 1, most_change=1.0)[1]["max_depth_mm"]
     state, row = last(case, 1_000_000, 1)
     assert len(state.rows) > 4
+    assert row["cycles"] == 1_000_000  # the last block is as long as what is left
     assert row["max_depth_mm"] < 0.8 * forced
 
 
@@ -156,6 +158,21 @@ def test_a_contact_that_is_lost_ends_the_simulation_and_keeps_what_is_done():
     state, row = last(case, 10_000_000, 10)
     assert "it is gone" in state.end
     assert 0.3 < row["max_depth_mm"] <= 0.5
+
+
+def test_a_block_that_loses_the_contact_at_once_is_tried_shorter():
+    """One block would take 1 mm off a plate that carries down to 0.5 mm less."""
+    one = Archard(1e-6 / (1000.0 * 24e-3) * PLATE)  # mm off by 10^6 cycles
+    case = plate_case(stroke(12 * MM, 3, 1000.0), one, fails_below=9.5 * MM)
+    state, row = last(case, 1_000_000, 1)
+    assert "it is gone" in state.end
+    assert 0.49 < row["max_depth_mm"] <= 0.5
+
+
+def test_a_contact_that_is_lost_in_the_shortest_first_block_is_bad_input():
+    case = plate_case(stroke(12 * MM, 3, 1000.0), Archard(1e-3), fails_below=9.999 * MM)
+    with pytest.raises(InputError, match=r"after 391 cycles: .*it is gone"):
+        simulate_wear(case, 1_000_000, 10)
 
 
 def test_no_contact_at_the_beginning_is_bad_input():

@@ -188,6 +188,17 @@ def test_slow_is_the_relaxed_lattice_and_fast_the_fresh_one(ball, rolled):
         assert found.pose[1, 3] == pytest.approx(expected.pose[1, 3], abs=5e-3 * 1e-4)
 
 
+def test_a_load_is_found_from_any_height(ball):
+    """The pose's height begins the search and says nothing more, above the block or in it."""
+    found = []
+    for height in (1e-3, 0.0, -0.5e-3):
+        block = ViscoelasticLattice(*ball, PAIR_SERIES)
+        found.append(block.press(200.0, pose(np.eye(3), [0, height, 0]), 0.1))
+    for other in found[1:]:
+        assert np.abs(other.pressure - found[0].pressure).max() < 1e-6 * found[0].pressure.max()
+        assert other.pose[1, 3] == pytest.approx(found[0].pose[1, 3], abs=1e-10)
+
+
 def test_on_the_lattice_too_the_pressure_leads_at_middling_speeds_only(rolled):
     slow, middling, fast = (lead for _, lead, _ in rolled.values())
     assert middling > 1e-4

@@ -34,6 +34,7 @@ FEWEST_ROWS = 0.5
 """Share of a force-controlled profile's rows without which there is no cycle."""
 HELPS = 1.1
 """Halving a block has to lessen the change by at least this factor to be done again."""
+MEND = "check load and poses, or another contact model"
 
 
 class Maps(Protocol):
@@ -156,11 +157,11 @@ def simulate_wear(
 
     A block takes the maps of the insert as it is at the block's begin and adds their depth per
     cycle times the block's cycles (explicit Euler, first order in the block). No block is longer
-    than cycles / updates. One after which more than `most_change` of the worn volume lies
-    elsewhere is taken back and tried at half its length: where a block wears off more than the
-    contact is compressed by, the pressure leaves the place that it wore, and returns to it in
-    the next. The simulation ends early, with the reason in `end`, where the insert is worn
-    through or its contact is lost.
+    than cycles / updates. One after which there is no contact, or more than `most_change` of the
+    worn volume lies elsewhere, is taken back and tried at half its length: where a block wears
+    off more than the contact is compressed by, the pressure leaves the place that it wore, and
+    returns to it in the next. The simulation ends early, with the reason in `end`, where the
+    insert is worn through or its contact is lost.
 
     Args:
         case: what is worn.
@@ -171,13 +172,13 @@ def simulate_wear(
         most_change: 0.5 of the sum of absolute changes over the sum; 1 never takes back.
 
     Raises:
-        InputError: impossible numbers, or no contact before the first cycle.
+        InputError: impossible numbers, or no contact before or after the shortest first block.
     """
     check_blocks(cycles, updates)
     state = state or WearState.unworn(len(case.articular.vertices), cycles / updates)
     now = _cycle(case, state)
     if isinstance(now, str):
-        raise InputError(now, "wear", "check load and poses, or another contact model")
+        raise InputError(now, "wear", MEND)
     if not state.rows:
         state = replace(state, rows=(_row(case, state, now),))
     before = math.inf
@@ -185,12 +186,15 @@ def simulate_wear(
         step = min(state.step, cycles - state.cycles)
         tried = _worn(case, state, now, step)
         after = _cycle(case, tried)
+        lost = isinstance(after, str)
         change = math.inf if isinstance(after, str) else now.change_to(after)
         shorter = step / 2 >= cycles / updates / MOST_HALVINGS
-        if change > most_change and shorter and not before <= change * HELPS:
+        if shorter and (lost or (change > most_change and not before <= change * HELPS)):
             state, before = replace(state, step=step / 2), change
             continue
         if isinstance(after, str):
+            if not state.cycles:
+                raise InputError(f"after {step:.3g} cycles: {after}", "wear", MEND)
             return replace(state, end=f"after {state.cycles:.6g} cycles: {after}"), now
         # the next block may be longer again where this one changed little
         longer = step * min(2.0, 0.8 * most_change / max(change, 1e-9))
