@@ -215,6 +215,7 @@ def test_why_there_is_no_band_says_what_to_do(bend):
     """Failed poses and too few samples are mended differently."""
     frame = int(bend["force_total_BW"].argmax())
     table = {"samples": 20, "largest_failed_share": 0.15, "not_varied": [], "varied": []}
+    table["causes_of_failure"] = {"no ellipse": 0.9}
 
     def told(share):
         lost = {f"force_total_BW_{end}": np.full(len(bend), np.nan) for end in PERCENTILES}
@@ -223,6 +224,7 @@ def test_why_there_is_no_band_says_what_to_do(bend):
         return next(c.detail for c in cards(run, horizontal_axis(run)) if "sure" in c.title)
 
     assert "fewer than 20 samples have it, take more" in told(0.15)
+    assert "most often: no ellipse" in told(0.15)
     assert "more than half of the samples failed" in told(0.6)
 
 
@@ -518,6 +520,7 @@ def with_bands(run):
     table = {
         "samples": 256,
         "largest_failed_share": 0.125,
+        "causes_of_failure": {"no ellipse": 0.9},
         "not_varied": ["segment_mass"],
         "shares_of_variance": {"force_total_N": {"ml": 0.61, "adduction": 0.2, "rest": 0.19}},
     }

@@ -15,7 +15,13 @@ from tkamb.results_folder import BANDS_NAME, UNCERTAINTY_NAMES, write_results
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
 from tkamb.simulation import simulate
-from tkamb.uncertainty.bands import band_columns, influences, measured_inside, percentiles
+from tkamb.uncertainty.bands import (
+    band_columns,
+    causes,
+    influences,
+    measured_inside,
+    percentiles,
+)
 from tkamb.uncertainty.folder import write_uncertainty
 from tkamb.uncertainty.inputs import Draw
 from tkamb.uncertainty.run import estimate_uncertainty
@@ -256,3 +262,27 @@ def test_a_full_disk_leaves_no_bands_or_all_of_them(tmp_path, monkeypatch):
     assert written == wanted
     for number in range(len(calls)):
         assert write(tmp_path / f"full{number}", number)[2] in (set(), wanted)
+
+
+def test_why_samples_fail_is_counted_whatever_the_numbers_in_it():
+    problems = np.array(
+        [
+            ["", "contact out of range; a load of 800 N cannot be reached; no ellipse"],
+            ["contact out of range; a load of 1.5e3 N cannot be reached; no ellipse", ""],
+            ["", "a load of 900.25 N cannot be reached"],
+        ]
+    )
+    assert causes(problems) == {
+        "no ellipse": pytest.approx(2 / 3),
+        "a load of … N cannot be reached": pytest.approx(1 / 3),
+    }
+    assert causes(np.full((2, 3), "")) == {}
+
+
+def test_a_sample_says_why_it_fails(monkeypatch):
+    """60 deviations to the side: both condyles touch the insert at one of its walls."""
+    sampler = Sampler(knee(), range(60, 61), ["force_total_N"])
+    monkeypatch.setattr(sampler, "draw", lambda point: draw_of(sampler, ml=60.0))
+    found = sampler(0, Point.of(0, np.zeros(0)))
+    assert found.failed.tolist() == [True] and np.isnan(found.values).all()
+    assert found.problems[0].startswith("condyles apart by ")

@@ -129,7 +129,8 @@ def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
             )
     worst, held = table["largest_failed_share"], table["not_varied"]
     if worst > NOTABLE_FAILED:
-        parts.append(f"in up to {worst:.0%} of the samples a frame failed")
+        why = "".join(f", most often: {text}" for text in [*table.get("causes_of_failure", ())][:1])
+        parts.append(f"in up to {worst:.0%} of the samples a frame failed{why}")
     if held:
         names = ", ".join(name.replace("_", " ") for name in held)
         parts.append(f"not varied, and so not in the band: {names}")

@@ -46,9 +46,7 @@ def frame_status(
         contact: its contact side; None when not modelled.
         doubts: flags of the questions that concern it (`tkamb.plausibility`).
     """
-    failures = list(body.loads.problems)
-    if contact and contact.problem and not failures:
-        failures.append(contact.problem)
+    failures = failures_of(body, contact)
     words = [*_motion_flags(case, k), *_flank_flags(body), *_adjustment_flags(case, body)]
     released = contact is not None and contact.equilibrium is not None
     words += [_lift_off(body, side, released) for side in sorted(body.loads.lifted)]
@@ -62,6 +60,14 @@ def frame_status(
     if failures:
         return FAILED + "; ".join([*failures, *words])
     return "; ".join(words) or "ok"
+
+
+def failures_of(body: FrameLoads, contact: "FrameContact | None") -> list[str]:
+    """Return why a frame has no force, in words; empty if it has."""
+    found = list(body.loads.problems)
+    if contact and contact.problem and not found:
+        found.append(contact.problem)
+    return found
 
 
 def _lift_off(body: FrameLoads, side: str, released: bool) -> str:

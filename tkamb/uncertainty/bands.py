@@ -1,6 +1,8 @@
 """From samples to bands and to which input moves what."""
 
+import re
 import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +17,8 @@ ROUND_OFF = 1e-9
 """Standard deviation over magnitude: a result that varies less does not vary."""
 SAMPLES_PER_INPUT = 6
 """Fewer per input leave a regression undetermined: its shares would be those of chance."""
+NUMBER = re.compile(r"[-−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+MOST_CAUSES = 3
 
 
 def varies(variance: float, square: float) -> bool:
@@ -63,6 +67,18 @@ def band_columns(
         for ending, found in percentiles(values[:, index], failed).items():
             columns[f"{name}_{ending}"] = found
     return columns
+
+
+def causes(problems: np.ndarray) -> dict[str, float]:
+    """Return why frames failed: cause -> its share of those that did, the most frequent first.
+
+    Args:
+        problems: text, why a frame failed; empty where it did not. The last of its clauses says
+            most; numbers in it differ from frame to frame and are left out.
+    """
+    last = [text.rsplit("; ", 1)[-1] for text in problems.ravel() if text]
+    count = Counter(NUMBER.sub("…", text) for text in last)
+    return {text: times / len(last) for text, times in count.most_common(MOST_CAUSES)}
 
 
 def measured_inside(

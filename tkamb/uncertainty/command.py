@@ -160,10 +160,12 @@ def warnings_of(found: "Uncertainty") -> list[str]:
         lines.append(f"not varied, so the bands are too narrow for them: {names}")
     share = found.bands["failed_share"]
     if (share > NOTABLE_FAILED).any():
+        causes = summary["causes_of_failure"].items()
+        why = ", ".join(f"{text} ({part:.0%} of the failures)" for text, part in causes)
         lines.append(
             f"in {(share > NOTABLE_FAILED).sum()} of {len(share)} frames more than "
-            f"{NOTABLE_FAILED:.0%} of the samples failed (at most {share.max():.0%}): their bands "
-            "hold for the poses that are possible, see failed_share"
+            f"{NOTABLE_FAILED:.0%} of the samples failed (at most {share.max():.0%}), most often: "
+            f"{why}; their bands hold for the poses that are possible, see failed_share"
         )
     if not found.tornado:
         lines.append("too few samples for tornado.csv: give 6 per input or more")

@@ -38,6 +38,9 @@ def write_uncertainty(found: "Uncertainty", folder: Path) -> None:
             for name, dtype in (("values", float), ("failed", bool), ("errors", float)):
                 content = np.array([getattr(one, name) for one in found.samples], dtype)
                 file.create_dataset(name, data=content, compression="gzip")
+            problems = [one.problems.tolist() for one in found.samples]
+            text = h5py.string_dtype()
+            file.create_dataset("problems", data=problems, dtype=text, compression="gzip")
 
     more = {
         BANDS_NAME: lambda path: write_rows(path, _band_rows(found.bands)),

@@ -21,6 +21,7 @@ from tkamb.simulation import chosen_frames, simulate
 from tkamb.uncertainty.bands import (
     Influence,
     band_columns,
+    causes,
     influences,
     measured_inside,
 )
@@ -213,19 +214,21 @@ class _Job:
             found = sobol_indices(wanted, input_names, every, self.crossed, seed)
         plain = samples[: 2 * self.crossed or len(samples)]  # those that are independent
         values = np.array([one.values for one in plain])
-        failed = np.array([one.failed for one in plain])
+        problems = np.array([one.problems for one in plain])
+        failed = problems != ""
         errors = np.array([one.errors for one in plain])
         bands = band_columns(self.nominal["time_s"], names, values, failed)
         tornado = influences(wanted, input_names, values[:, rows], errors)
         summary = self.nominal.summary
-        summary["uncertainty"] = self._summary(failed, tornado)
+        summary["uncertainty"] = self._summary(problems, tornado)
         if summary.get("measured"):
             inside = measured_inside(self.nominal.columns, bands, summary["measured"])
             summary["uncertainty"]["measured_inside"] = inside
         results = replace(self.nominal, bands=bands)
         return Uncertainty(results, bands, tornado, names, self.inputs, samples, found)
 
-    def _summary(self, failed: np.ndarray, tornado: list[Influence]) -> dict[str, Any]:
+    def _summary(self, problems: np.ndarray, tornado: list[Influence]) -> dict[str, Any]:
+        failed = problems != ""
         return {
             "samples": len(failed),
             "method": self.method,
@@ -234,6 +237,7 @@ class _Job:
             "not_varied": held_inputs(self.case),
             "failed_share": float(failed.mean()),
             "largest_failed_share": float(failed.mean(axis=0).max()),
+            "causes_of_failure": causes(problems),
             "shares_of_variance": shares_of_variance(tornado),
         }
 

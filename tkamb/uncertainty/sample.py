@@ -17,7 +17,7 @@ from tkamb.equilibrium.known import Known
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array
-from tkamb.run.status import FAILED, frame_status
+from tkamb.run.status import failures_of, frame_status
 from tkamb.run.tabulate import frame_row
 from tkamb.scene import Scene
 from tkamb.scene.case import Case, load_case
@@ -39,13 +39,18 @@ class Sample:
 
     Args:
         values: (names, frames) in the order asked for; NaN where a frame failed or has no number.
-        failed: (frames,) whether the frame failed.
+        problems: (frames,) text, why the frame failed; empty where it did not.
         errors: (frames, d) the inputs' errors in their standard deviations.
     """
 
     values: Array
-    failed: np.ndarray
+    problems: np.ndarray
     errors: Array
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Whether each frame failed (frames,)."""
+        return self.problems != ""
 
 
 class Sampler:
@@ -104,20 +109,20 @@ class Sampler:
         draw = self.draw(point)
         errors = draw.standardised()[list(self._frames)]
         values = np.full((len(self.names), len(self._frames)), np.nan)
-        failed = np.ones(len(self._frames), bool)
         try:
             case = self._varied(draw)
             mechanics = Mechanics(case, self._known(draw))
             side = self._contact(case, mechanics, draw)
-        except TkambError:  # the moved inputs cannot be used: no frame has a number
-            return Sample(values, failed, errors)
+        except TkambError as error:  # the moved inputs cannot be used: no frame has a number
+            return Sample(values, np.full(len(self._frames), str(error)), errors)
+        problems: list[str] = []
         before: list[FrameContact] = []
         for column, k in enumerate(self._frames):
-            row = _frame(case, mechanics, side, k, before)
-            failed[column] = row["status"].startswith(FAILED)
-            if not failed[column]:
+            row, problem = _frame(case, mechanics, side, k, before)
+            problems.append(problem)
+            if not problem:
                 values[:, column] = [row.get(name, np.nan) for name in self.names]
-        return Sample(values, failed, errors)
+        return Sample(values, np.array(problems), errors)
 
     def _known(self, draw: Draw) -> Known:
         nominal = self._mechanics
@@ -170,8 +175,8 @@ def _frame(
     side: ContactSide | None,
     k: int,
     before: list[FrameContact],
-) -> dict[str, Any]:
-    """Return the row of results.csv of frame k; its contact joins those before it."""
+) -> tuple[dict[str, Any], str]:
+    """Return frame k's row of results.csv and why it failed; its contact joins those before it."""
     contact = None
     if side is None:
         body = mechanics.frame(k)
@@ -179,4 +184,5 @@ def _frame(
         body, contact = side.frame(k, before)
         before.append(contact)
         del before[:-2]
-    return frame_row(case, k, body, contact, {}, frame_status(case, k, body, contact))
+    row = frame_row(case, k, body, contact, {}, frame_status(case, k, body, contact))
+    return row, "; ".join(failures_of(body, contact))
