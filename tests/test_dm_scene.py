@@ -17,6 +17,7 @@ from tkamb.inputs.meshes import axes_rotation, load_surface
 from tkamb.inputs.motion import load_motion
 from tkamb.inputs.tables import read_table
 from tkamb.inputs.tibia import load_tibia
+from tkamb.plausibility.movement import marker_questions
 from tkamb.scene import load_scene
 from tkamb.scene.case import Case, load_case
 from tkamb.scene.si import in_si
@@ -231,3 +232,13 @@ def test_hip_is_above_the_knee():
     hip = transform(case().chain.link_in("hip", "femur"), np.zeros(3))
     assert np.linalg.norm(hip) == pytest.approx(0.418, abs=2e-3)
     assert hip[1] > 0.41
+
+
+def test_a_shank_marker_that_stands_elsewhere_is_asked_about():
+    """The scene's own fit leaves 8 mm; a marker moved by 87 mm more than skin ever does."""
+    assert not list(marker_questions(case()))
+    scene = load_scene(SCENE)
+    places = scene.tibia.markers_mm
+    places["R_Shank_Inferior"] = tuple(np.array(places["R_Shank_Inferior"]) + 50.0)
+    (question,) = marker_questions(load_case(scene))
+    assert question.text.startswith("the shank's markers lie ")

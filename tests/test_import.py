@@ -22,7 +22,9 @@ from tkamb.inputs.meshes import load_surface
 from tkamb.inputs.tables import read_table
 from tkamb.opensim.read import read_osim
 from tkamb.output.storage import write_storage, write_trc
+from tkamb.plausibility.movement import marker_questions
 from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data"
@@ -52,6 +54,24 @@ def test_a_run_on_markers_holds_both_readings_frame_by_frame(tmp_path):
     assert results["knee_centre_distance_mm"].max() < 1e-2
     np.testing.assert_allclose(results["time_s"], np.arange(60)[::2] / 60.0, atol=1e-8)
     assert "skin markers" in " ".join(results.summary["assumptions"])
+
+
+@pytest.mark.parametrize(("off", "asked"), [(10.0, 0), (14.0, 1)])
+def test_markers_of_another_subject_are_asked_about(tmp_path, off, asked):
+    """Clusters made larger by c: a rigid fit leaves c times their radius, rms over all markers."""
+    assert main(recorded_leg(tmp_path)) == 0
+    scene = load_scene(tmp_path / "out" / "scene.toml")
+    segments = scene.motion.markers.segment[:2]
+    assert {one.name for one in segments} == {"shank", "thigh"}
+    clusters = [np.array(list(one.markers_mm.values())) for one in segments]
+    radii = np.concatenate([cluster - cluster.mean(axis=0) for cluster in clusters])
+    larger = 1 + off / np.sqrt((radii**2).sum(axis=1).mean())
+    for one in segments:
+        for name, place in one.markers_mm.items():
+            one.markers_mm[name] = tuple(larger * np.array(place))
+    questions = [str(one) for one in marker_questions(load_case(scene))]
+    assert len(questions) == asked
+    assert all("thigh's markers lie 14 mm (rms)" in one for one in questions)
 
 
 def test_what_is_inferred_stands_in_the_scene(tmp_path):
@@ -171,6 +191,10 @@ MISTAKES = {
     "left-handed laboratory": (lambda a, d: changed(a, laboratory_axes="+x,+y,-z"), "left-handed"),
     "laboratory axes of two letters": (lambda a, d: changed(a, laboratory_axes="+x,+y"), "axes"),
     "interval outside": (lambda a, d: changed(a, interval="5:6"), "--interval"),
+    "interval that ends after the recording": (
+        lambda a, d: changed(a, interval="0.5:1.5"),
+        "not within the recording, 0.0000 to 0.9833 s",
+    ),
     "interval backwards": (lambda a, d: changed(a, interval="0.9:0.1"), "--interval"),
     "interval of words": (lambda a, d: changed(a, interval="start:end"), "interval"),
     "plates of words": (lambda a, d: changed(a, plates="left"), "plates"),

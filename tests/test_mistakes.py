@@ -171,6 +171,11 @@ FLAGGED = {
     "back to front": (key("implant.femoral.axes", "-x,+y,-z"), "is it back to front"),
     "insertion in centimetres": (key("quadriceps.insertion.point_mm", [0.8, 2.0, 0.0]),
                                  "# mm above the patellar ligament's"),
+    "patella in centimetres": (
+        both(*(cells("motion.csv", f"patella_{a}_mm", lambda v: v / 10) for a in ("ap", "si"))),
+        "patella lies # to # mm from the flexion axis"),
+    "origin behind the femur": (key("quadriceps.origin.point_mm", [-32.0, 205.0, 0.0]),
+                                "quadriceps. origin lies where no such line ends"),
     "friction": (key("contact.friction", 0.5), "friction of # is more than metal"),
     "upside down": (key("implant.femoral.axes", "+x,-y,-z"), "opens downward.* is it turned"),
     "opening backward": (key("implant.femoral.axes", "-y,+x,+z"), "opens backward.* is it turned"),

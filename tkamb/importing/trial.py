@@ -172,6 +172,14 @@ def _thinned(
     The frames are every k-th of the recording, at its own times.
     """
     start, end = interval or (float(time[0]), float(time[-1]))
+    frame = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if start < time[0] - frame or end > time[-1] + frame:
+        raise InputError(
+            f"{start:g} to {end:g} s is not within the recording, "
+            f"{time[0]:.4f} to {time[-1]:.4f} s",
+            "--interval",
+            "give it on the recording's own clock",
+        )
     inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
     if len(inside) < 2:
         raise InputError(

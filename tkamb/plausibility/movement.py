@@ -9,7 +9,7 @@ from tkamb.inputs.samples import OddSample
 from tkamb.plausibility.question import Question
 from tkamb.scene.case import Case
 from tkamb.scene.recording_tables import GroundReactionTable
-from tkamb.units import DEGREE
+from tkamb.units import DEGREE, MILLIMETRE
 
 FLEXION_RADIANS = 3.3
 """deg: a bend of more than 10 deg, in radians and called degrees, stays below this."""
@@ -20,6 +20,10 @@ USUAL_DEG = {"flexion": (-15, 160), "adduction": (-12, 12), "axial_rotation": (-
 """A kneeling, a dislocated and a rotating-platform knee reach these."""
 USUAL_RATE = {"flexion": 20.0, "adduction": 6.0, "axial_rotation": 10.0}
 """rad/s: a kick's flexion; the others in a pivoting jump."""
+PATELLA_AWAY = (15.0 * MILLIMETRE, 80.0 * MILLIMETRE)
+"""Of a recorded patella's origin from the flexion axis: 26 to 57 mm in eight designs' bends."""
+MARKERS_OFF = 12.0 * MILLIMETRE
+"""rms, in the median frame: skin moves by up to 10 mm in a cluster, 5 mm on subject JW's stairs."""
 BRIEFEST = 0.15
 """s: no movement of a leg is over sooner."""
 
@@ -66,10 +70,38 @@ def motion_questions(case: Case) -> Iterator[Question]:
                 f"{name} changes too fast",
                 fast,
             )
+    if motion.patella is not None:
+        away = np.hypot(motion.patella[:, 0], motion.patella[:, 1])
+        far = (away < PATELLA_AWAY[0]) | (away > PATELLA_AWAY[1])
+        if far.any():
+            nearest, farthest = away.min() / MILLIMETRE, away.max() / MILLIMETRE
+            yield Question(
+                f"the patella lies {nearest:.3g} to {farthest:.3g} mm from the flexion axis: are "
+                "its ap and si in millimetres, of the femoral component's origin, of their sign?",
+                "patella where none is",
+                far,
+            )
     lasting = float(motion.time[-1] - motion.time[0])
     if lasting < BRIEFEST:
         yield Question(
             f"the motion lasts {lasting:.3g} s: is its time in seconds?", "motion too brief"
+        )
+
+
+def marker_questions(case: Case) -> Iterator[Question]:
+    """How far markers lie from their places on the segments that a rigid fit of them gives."""
+    if case.motion.markers is not None:
+        whose, rms = "shank's and thigh's markers", case.motion.markers.rms["segments"]
+    elif case.tibia is not None and case.tibia.residual is not None:
+        whose, rms = "the shank's markers", case.tibia.residual
+    else:
+        return
+    known = rms[np.isfinite(rms)]
+    if len(known) and (middle := float(np.median(known))) > MARKERS_OFF:
+        yield Question(
+            f"{whose} lie {middle / MILLIMETRE:.0f} mm (rms) from their places: is markers_mm "
+            "another subject's or trial's, or are two of them exchanged?",
+            "markers do not fit their segments",
         )
 
 

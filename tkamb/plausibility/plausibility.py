@@ -14,7 +14,7 @@ from tkamb.plausibility.ground import (
     step_questions,
 )
 from tkamb.plausibility.implant import implant_questions
-from tkamb.plausibility.movement import motion_questions, sample_questions
+from tkamb.plausibility.movement import marker_questions, motion_questions, sample_questions
 from tkamb.plausibility.question import Question, some
 from tkamb.plausibility.segments import segment_questions
 
@@ -46,6 +46,7 @@ class Plausibility:
         found = [
             *segment_questions(case),
             *motion_questions(case),
+            *marker_questions(case),
             *sample_questions(case),
             *load_questions(case),
             *foot_questions(case),
