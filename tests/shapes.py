@@ -88,3 +88,39 @@ def bicondylar(kind: str = "sphere", apart: float = 0.044) -> Surface:
     else:
         parts = [torus_condyle(0.024, 0.01, side * apart / 2) for side in (-1, 1)]
     return joined(*parts, anterior)
+
+
+def nearest_on_triangles(triangles, points):
+    """Return for each point (n, 3) the nearest one (n, 3) of its own triangle (n, 3, 3).
+
+    The foot on the triangle's plane where that lies inside, else the nearest of the feet on
+    the three edges. Free of absolute tolerances, so right for triangles of any size.
+    """
+    weights = _plane_weights(triangles, points)
+    feet = np.einsum("ij,ijk->ik", weights, triangles)
+    outside = ~(weights >= 0).all(axis=1)
+    start, target = triangles[outside], points[outside, None]
+    along = np.roll(start, -1, axis=1) - start
+    length = np.einsum("ijk,ijk->ij", along, along)
+    part = np.einsum("ijk,ijk->ij", target - start, along)
+    part = np.clip(np.divide(part, length, out=np.zeros_like(part), where=length > 0), 0, 1)
+    on_edges = start + part[:, :, None] * along
+    nearest = ((on_edges - target) ** 2).sum(axis=2).argmin(axis=1)
+    feet[outside] = on_edges[np.arange(len(start)), nearest]
+    return feet
+
+
+def _plane_weights(triangles, points):
+    """Return barycentric coordinates (n, 3) of the feet on the planes; NaN without area."""
+    a = triangles[:, 0]
+    u, v, w = triangles[:, 1] - a, triangles[:, 2] - a, points - a
+    uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)
+    wu, wv = _dot(w, u), _dot(w, v)
+    scale = uu * vv - uv * uv
+    scale = np.where(scale > 1e-14 * uu * vv, scale, np.nan)
+    second, third = (vv * wu - uv * wv) / scale, (uu * wv - uv * wu) / scale
+    return np.stack([1 - second - third, second, third], axis=1)
+
+
+def _dot(a, b):
+    return np.einsum("ij,ij->i", a, b)

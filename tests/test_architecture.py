@@ -8,7 +8,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "tkamb"
 
 KNOWN_TO_ALL = {
-    *("atomic", "claim", "code_identity", "defaults", "errors", "files", "guard"),
+    *("atomic", "claim", "code_identity", "compiled", "defaults", "errors", "files", "guard"),
     *("activities", "known_errors", "memory", "named_classes", "occupants", "scene_options"),
     "units",
 }

@@ -8,12 +8,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from shapes import bicondylar, plate, sphere, trough, two_dishes
+from shapes import bicondylar, nearest_on_triangles, plate, sphere, trough, two_dishes
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.condyles import LowestPoints, condyle_faces, condyle_split
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
-from tkamb.geometry.nearest import NearestPoints, nearest_on_triangles, sampled
+from tkamb.geometry.nearest import NearestPoints, sampled
 from tkamb.geometry.surface import Surface
 from tkamb.inputs.meshes import axes_rotation, load_surface
 
@@ -41,7 +41,7 @@ def part(subject, name):
 # nearest points
 
 
-def test_nearest_on_triangles_of_any_size_or_shape():
+def test_nearest_points_of_triangles_of_any_size_or_shape():
     """Against dense samples; slivers and points without area among them."""
     rng = np.random.default_rng(0)
     triangles = rng.normal(size=(200, 3, 3))
@@ -54,8 +54,11 @@ def test_nearest_on_triangles_of_any_size_or_shape():
     dense = np.einsum("sj,kjc->ksc", weights, triangles)
     sampled_distance = np.linalg.norm(dense - points[:, None], axis=2).min(axis=1)
     for scale in (1.0, 1e-3, 1e-5):
-        feet = nearest_on_triangles(triangles * scale, points * scale) / scale
-        distance = np.linalg.norm(feet - points, axis=1)
+        distance = np.empty(len(points))
+        for k, (corners, point) in enumerate(zip(triangles * scale, points * scale, strict=True)):
+            found = NearestPoints(Surface(corners, np.arange(3)[None])).at(point)
+            distance[k] = found.distance[0] / scale
+            assert np.linalg.norm(found.points[0] - point) / scale == pytest.approx(distance[k])
         assert (distance <= sampled_distance + 1e-9).all()
         assert np.allclose(distance, sampled_distance, atol=6e-3)
 
@@ -67,7 +70,20 @@ def test_nearest_points_miss_nothing():
     found = NearestPoints(insert).at(points)
     for point, distance in zip(points, found.distance, strict=True):
         all_feet = nearest_on_triangles(insert.triangles, np.tile(point, (len(insert.faces), 1)))
-        assert distance == pytest.approx(np.linalg.norm(all_feet - point, axis=1).min(), abs=2e-7)
+        assert distance == pytest.approx(np.linalg.norm(all_feet - point, axis=1).min(), abs=1e-15)
+
+
+def test_nearest_points_within_reach_are_those_of_all():
+    insert = two_dishes()
+    rng = np.random.default_rng(2)
+    points = rng.uniform([-0.02, -0.002, -0.04], [0.02, 0.03, 0.04], (400, 3))
+    every = insert.nearest.at(points)
+    near, found = insert.nearest.within(points, 2e-3)
+    assert np.array_equal(near, np.flatnonzero(every.distance <= 2e-3)) and 20 < len(near) < 380
+    assert np.array_equal(found.distance, every.distance[near])
+    assert np.array_equal(found.faces, every.faces[near])
+    back = insert.nearest.at(points[::-1])  # another way through the tree
+    assert np.array_equal(back.faces[::-1], every.faces)
 
 
 def test_samples_carry_the_area():

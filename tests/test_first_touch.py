@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
-from tkamb.geometry.bounds import HeightBound, Patches
+from tkamb.geometry.bounds import HeightBound
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import knee_pose, pose, transform
 from tkamb.geometry.surface import Surface
@@ -84,53 +84,32 @@ def test_travel_moves_with_the_pose_and_not_with_the_femoral_frame():
 
 def test_the_ceiling_is_above_the_surface_everywhere():
     _, insert = bodies()
-    lift = np.random.default_rng(0).uniform(0, 1e-3, len(insert.vertices))
-    ceiling = HeightBound(insert, lift)
     points = insert.triangles.mean(axis=1)
-    above = ceiling.over(points) - points[:, 1]
+    above = HeightBound(insert).over(points) - points[:, 1]
     assert (above >= -1e-15).all()
     assert np.median(above[insert.face_normals[:, 1] > 0.5]) < 0.2e-3
-    rng = np.random.default_rng(1)
-    low = rng.uniform(-30e-3, 25e-3, (60, 2))
-    high = low + rng.uniform(0, 20e-3, (60, 2))
-    marked = ceiling.vertices_in_rectangles(low, high)
-    top = np.zeros(len(insert.vertices), bool)
-    top[insert.faces[insert.face_normals[:, 1] > 0]] = True
-    for a, b, plane in zip(low, high, ceiling.planes(low, high), strict=True):
-        xz = insert.vertices[:, ::2]
-        inside = ((xz >= a) & (xz <= b)).all(axis=1)
-        assert np.isin(np.flatnonzero(inside), marked).all()
-        inside &= top
-        height = insert.vertices[inside, 1] - xz[inside] @ plane[:2]
-        assert (height <= plane[2] + 1e-15).all()
-        assert (height + lift[inside] <= plane[3] + 1e-15).all()
 
 
-def test_patches_stay_in_their_boxes():
+def test_triangles_that_cross_touch_where_their_edges_do():
+    """A roof's ridge across a ridge: no vertex of either lies over the other's edge."""
+    ridge = np.array([[-1.0, 0, 0], [1, 0, 0], [0, -0.5, 1], [0, -0.5, -1]]) * 1e-2
+    below = Surface(ridge, np.array([[0, 2, 1], [0, 1, 3]]), "ridge")
+    above = Surface(ridge[:, [2, 1, 0]] * [1, -1, 1], np.array([[0, 1, 2], [0, 3, 1]]), "roof")
+    at = pose(np.eye(3), [1e-3, 4e-3, 2e-3])
+    found = FirstTouch(above, below).either(at)
+    assert found.travel == pytest.approx(4e-3, abs=1e-15)
+    assert found.point == pytest.approx([1e-3, 0, 0], abs=1e-15)
+
+
+def test_supports_and_boxes_hold_their_triangles():
     femoral, _ = bodies()
-    reach = np.linspace(0, 1, len(femoral.vertices))
-    patches = Patches(femoral, reach)
-    at = knee_pose([1e-3, 5e-3, 0.5e-3, 0.3, 0.1, 1.2])
-    low, high = patches.extent(at)
-    directions = np.random.default_rng(2).normal(size=low.shape)
-    least = patches.least(at, np.arange(len(low)), directions)
-    seen = []
-    for patch in range(len(low)):
-        faces = patches.faces(np.array([patch]))
-        corners = femoral.faces[faces].ravel()
-        points = transform(at, femoral.vertices[corners])
-        assert (points >= low[patch] - 1e-15).all() and (points <= high[patch] + 1e-15).all()
-        assert (points @ directions[patch]).min() >= least[patch] - 1e-15
-        assert patches.reach[patch] == reach[corners].max()
-        seen.append(faces)
-    assert np.array_equal(np.sort(np.concatenate(seen)), np.arange(len(femoral.faces)))
-
-
-def test_a_flat_face_along_the_bounding_box_makes_patches():
-    """The mean of three equal heights may be rounded below the lowest of them."""
-    plate = flat_insert(10e-3, 24e-3, 24e-3)
-    for height in np.linspace(0.1, 0.7, 50):
-        surface = Surface(plate.vertices + np.array([0.0, height, 0.0]), plate.faces, "plate")
-        low, high = Patches(surface, np.zeros(len(surface.vertices))).extent(np.eye(4))
-        assert (low.min(axis=0) < surface.bounds[0] + 1e-9).all()
-        assert (high.max(axis=0) > surface.bounds[1] - 1e-9).all()
+    tree = femoral.tree
+    count = len(tree.boxes) // 2
+    assert np.array_equal(np.unique(tree.faces), np.arange(len(femoral.faces)))
+    while count:
+        points = tree.corners.reshape(count, -1, 3)
+        boxes, planes = tree.boxes[count : 2 * count], tree.supports[count : 2 * count]
+        assert (points > boxes[:, None, :3]).all() and (points < boxes[:, None, 3:]).all()
+        along = np.einsum("pij,pj->pi", points, planes[:, :3])
+        assert (along <= planes[:, 3:] + 1e-15).all()
+        count //= 2

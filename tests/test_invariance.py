@@ -16,7 +16,6 @@ from tkamb.body.chain import Chain
 from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.geometry import closest, condyles
 from tkamb.geometry.frames import pose
-from tkamb.geometry.nearest import NearestPoints
 from tkamb.geometry.surface import Surface
 from tkamb.inputs.patient import load_urdf
 from tkamb.scene import Scene, lines, load_scene
@@ -250,8 +249,6 @@ def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
     for module, names in own_lengths.items():
         for name in names:
             monkeypatch.setattr(module, name, getattr(module, name) * LENGTH)
-    search = NearestPoints.__init__
-    monkeypatch.setattr(search, "__defaults__", (search.__defaults__[0] * LENGTH,))
     patella = patellofemoral.PatellofemoralContact.__init__
     ml, lateral_yield, tilt_yield = patella.__defaults__
     scaled = (ml, lateral_yield * LENGTH, tilt_yield / LENGTH)

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from inserts import dished, raised, real_insert, shipped_insert, volume
 from lattice_bodies import box_insert
+from shapes import nearest_on_triangles
 from tkamb.contact.lattice.meshing.cells import (
     DIRECTIONS,
     FAMILY_SHARE,
@@ -40,7 +41,6 @@ from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import pose
 from tkamb.geometry.height_field import Intervals
-from tkamb.geometry.nearest import nearest_on_triangles
 from tkamb.geometry.repair import repair
 from tkamb.geometry.surface import Surface
 from tkamb.inputs.meshes import axes_rotation

@@ -145,7 +145,7 @@ def test_intervals_on_a_grid_are_exact_and_closed():
 
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10**6))
-def test_intervals_agree_with_embree_on_random_grids(seed):
+def test_intervals_agree_with_rays_on_random_grids(seed):
     rng = np.random.default_rng(seed)
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     turn[:, 0] *= np.sign(np.linalg.det(turn))

@@ -175,13 +175,6 @@ def test_stand_ins_are_closed_and_as_large_as_their_shapes():
         assert mesh.volume == pytest.approx(volume, rel=rel)
 
 
-def test_the_farthest_point_is_that_of_all_distances():
-    rng = np.random.default_rng(3)
-    points = rng.normal(scale=0.03, size=(3000, 3))
-    nearest = ball().nearest
-    assert nearest.farthest(points) == nearest.at(points).distance.max()
-
-
 @pytest.mark.parametrize(
     ("scale", "name", "lowest"),
     [

@@ -31,8 +31,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.compiled import compiled_as_written
 from tkamb.errors import ComputationError, InputError
-from tkamb.geometry.frames import Array, pose, transform
+from tkamb.geometry.frames import Array, Index, pose, transform
 from tkamb.geometry.normals import sharp_edges
 from tkamb.geometry.surface import Surface
 
@@ -112,19 +113,19 @@ class PatellofemoralContact:
     ) -> None:
         self.ml, self._yield = ml, np.array([lateral_yield, tilt_yield])
         self._nearest = femoral.nearest
-        self._corner_normals, self._sharp = femoral.corner_normals, sharp_edges(femoral)
+        normals = femoral.corner_normals, self._nearest.corner_normals
+        self._facets = femoral.triangles, *normals, sharp_edges(femoral)
         self._samples = _joint_side(patellar)
         self._left: NDArray[np.bool_] = np.asarray(self._samples[:, 2] < 0.0)
-        self._sides = (self._left, ~self._left)
         self._forget()
 
     def _forget(self) -> None:
         """Have no distance carried over."""
         count = len(self._samples)
-        self._seen_at = np.full((count, 3), np.inf)
-        self._distance = np.zeros(count)
-        self._foot, self._normal = np.zeros((count, 3)), np.zeros((count, 3))
-        self._on_edge = np.zeros(count)
+        never, nothing = np.full((count, 3), np.inf), np.zeros(count)
+        places = np.zeros((count, 3)), np.zeros((count, 3))
+        # where each was seen, its distance, nearest point, normal there, and whether on an edge
+        self._seen = never, nothing, *places, np.zeros(count)
 
     def unused(self) -> "PatellofemoralContact":
         """Return the same contact as it was before any position was looked at."""
@@ -144,9 +145,8 @@ class PatellofemoralContact:
         Raises:
             ComputationError: it pushes straight sideways, which no line in the plane can balance.
         """
-        self._measure(transform(self.pose(np.asarray(coordinates, float)), self._samples))
-        sides = [self._side(side) for side in self._sides]
-        gaps, points, normals, edges = (np.array(part) for part in zip(*sides, strict=True))
+        sides = self._sides_at(coordinates)
+        gaps, points, normals, edges = sides[:, 0], sides[:, 1:4], sides[:, 4:7], sides[:, 7]
         out_of_plane = np.stack([normals[:, 2], points[:, 2] - self.ml])
         left = _share_left(gaps, out_of_plane, self._yield)
         weights = np.array([left, 1.0 - left])
@@ -176,43 +176,148 @@ class PatellofemoralContact:
         apart = np.einsum("ij,ij->i", here - near.points, near.normals)
         return bool((apart < 0.0).any())
 
-    def _measure(self, here: Array) -> None:
-        """Bring the distances up to date wherever they could matter.
+    def _sides_at(self, coordinates: Array) -> Array:
+        """Return gap, point, normal and share on edges (2, 8) of both sides, distances renewed."""
+        here = transform(self.pose(np.asarray(coordinates, float)), self._samples)
+        seen_at, distance = self._seen[:2]
+        which = _which_matter(here, self._left, REACH, seen_at, distance)
+        if len(which):
+            found = self._nearest.at(here[which])
+            _take(
+                which, here, found.distance, found.faces, found.weights, *self._facets, *self._seen
+            )
+        sides = np.empty((2, 8))
+        _mean_over_sides(self._left, PATCH_DEPTH, REACH, *self._seen[1:], sides)
+        return sides
 
-        A sample that has moved by m since it was seen at distance d lies between d - m and d + m:
-        what cannot come within `REACH` of its side's nearest keeps what was seen.
-        """
-        moved = np.linalg.norm(here - self._seen_at, axis=1)
-        new = ~np.isfinite(moved)
-        farthest = np.where(new, np.inf, self._distance + moved)
-        nearest = np.where(new, -np.inf, self._distance - moved)
-        reach = np.where(self._left, *(farthest[side].min() + REACH for side in self._sides))
-        self._look(here, np.flatnonzero((moved > 0.0) & (nearest < reach)))
 
-    def _look(self, here: Array, which: NDArray[np.int64]) -> None:
-        if len(which) == 0:
-            return
-        near = self._nearest.at(here[which])
-        weights = self._nearest.surface.barycentric(near.points, near.faces)
-        on_edge = np.asarray((self._sharp[near.faces] & (weights < EDGE_MARGIN)).any(axis=1))
-        smooth = np.einsum("ij,ijk->ik", weights, self._corner_normals[near.faces])
-        outward = np.where(on_edge[:, None], near.normals, smooth)
-        apart = here[which] - near.points
-        sign = np.where(np.einsum("ij,ij->i", apart, outward) < 0.0, -1.0, 1.0)
-        self._seen_at[which], self._foot[which] = here[which], near.points
-        self._distance[which] = sign * near.distance
-        self._normal[which] = outward / np.linalg.norm(outward, axis=1, keepdims=True)
-        self._on_edge[which] = on_edge
+@compiled_as_written
+def _which_matter(
+    here: Array, left: NDArray[np.bool_], reach: float, seen_at: Array, distance: Array
+) -> Index:
+    """Return the samples whose distances are out of date and could matter.
 
-    def _side(self, side: NDArray[np.bool_]) -> tuple[float, Array, Array, float]:
-        """Return g, p, n and the share on edges of one side."""
-        distance = self._distance[side]
-        behind = distance - distance.min()
-        weights = np.where(behind < REACH, np.exp(-behind / PATCH_DEPTH), 0.0)
-        weights /= weights.sum()
-        gap = float(weights @ distance) - PATCH_DEPTH
-        edge = float(weights @ self._on_edge[side])
-        return gap, weights @ self._foot[side], weights @ self._normal[side], edge
+    A sample that has moved by m since it was seen at distance d lies between d - m and d + m:
+    what cannot come within reach of its side's nearest keeps what was seen.
+
+    Args:
+        here: (n, 3) m, samples at their place.
+        left: (n,) whether they are on the -z side.
+        reach: m, behind the nearest one, beyond which a sample does not matter.
+        seen_at: (n, 3) m, where each was when it was looked at; inf: never.
+        distance: (n,) m, signed, there.
+    """
+    count, nearest = len(here), np.full(2, np.inf)
+    moved, which, number = np.full(count, np.inf), np.empty(count, np.int64), 0
+    for n in range(count):
+        if seen_at[n, 0] < np.inf:
+            moved[n] = np.sqrt(np.sum((here[n] - seen_at[n]) ** 2))
+            side = 0 if left[n] else 1
+            nearest[side] = min(nearest[side], distance[n] + moved[n])
+    for n in range(count):
+        if moved[n] > 0.0 and distance[n] - moved[n] < nearest[0 if left[n] else 1] + reach:
+            which[number] = n
+            number += 1
+    return which[:number]
+
+
+@compiled_as_written
+def _take(
+    which: Index,
+    here: Array,
+    apart: Array,
+    faces: Index,
+    weights: Array,
+    triangles: Array,
+    smooth_normals: Array,
+    vertex_normals: Array,
+    sharp: NDArray[np.bool_],
+    seen_at: Array,
+    distance: Array,
+    foot: Array,
+    normal: Array,
+    on_edge: Array,
+) -> None:
+    """Write what the nearest points of samples say.
+
+    Args:
+        which: (m,) samples.
+        here: (n, 3) m, where all of them are.
+        apart: (m,) m, their distances.
+        faces: (m,) triangles of their nearest points.
+        weights: (m, 3) barycentrics there.
+        triangles: (k, 3, 3) m, of the femoral component.
+        smooth_normals: (k, 3, 3) at the corners, sharp edges kept.
+        vertex_normals: (k, 3, 3) likewise, means over each vertex.
+        sharp: (k, 3) whether the edge opposite each corner is sharp or open.
+        seen_at: (n, 3) m, to be written, as what follows.
+        distance: (n,) m, signed.
+        foot: (n, 3) m, nearest point.
+        normal: (n, 3) unit, there.
+        on_edge: (n,) 1 where that is on a sharp or open edge.
+    """
+    outward = np.empty(3)
+    for m in range(len(which)):
+        n, face, edge = which[m], faces[m], False
+        for corner in range(3):
+            edge |= sharp[face, corner] and weights[m, corner] < EDGE_MARGIN
+        normals = vertex_normals[face] if edge else smooth_normals[face]
+        along, length = 0.0, 0.0
+        for k in range(3):
+            foot[n, k], outward[k], seen_at[n, k] = 0.0, 0.0, here[n, k]
+            for corner in range(3):
+                foot[n, k] += weights[m, corner] * triangles[face, corner, k]
+                outward[k] += weights[m, corner] * normals[corner, k]
+            along += (here[n, k] - foot[n, k]) * outward[k]
+            length += outward[k] ** 2
+        for k in range(3):
+            normal[n, k] = outward[k] / np.sqrt(length)
+        distance[n] = -apart[m] if along < 0.0 else apart[m]
+        on_edge[n] = 1.0 if edge else 0.0
+
+
+@compiled_as_written
+def _mean_over_sides(
+    left: NDArray[np.bool_],
+    depth: float,
+    reach: float,
+    distance: Array,
+    foot: Array,
+    normal: Array,
+    on_edge: Array,
+    found: Array,
+) -> None:
+    """Write g, p, n and the share on edges (2, 8), left and right.
+
+    Args:
+        left: (n,) see `_look`, as of the others.
+        depth: m, tau of the module's equation.
+        reach: m.
+        distance: (n,) m.
+        foot: (n, 3) m.
+        normal: (n, 3).
+        on_edge: (n,).
+        found: (2, 8) to be written.
+    """
+    for side in range(2):
+        nearest, total = np.inf, 0.0
+        for n in range(len(left)):
+            if left[n] == (side == 0):
+                nearest = min(nearest, distance[n])
+        found[side] = 0.0
+        for n in range(len(left)):
+            behind = distance[n] - nearest
+            if left[n] != (side == 0) or behind >= reach:
+                continue
+            weight = np.exp(-behind / depth)
+            total += weight
+            found[side, 0] += weight * distance[n]
+            found[side, 7] += weight * on_edge[n]
+            for k in range(3):
+                found[side, 1 + k] += weight * foot[n, k]
+                found[side, 4 + k] += weight * normal[n, k]
+        found[side] /= total
+        found[side, 0] -= depth
 
 
 def _joint_side(patellar: Surface) -> Array:

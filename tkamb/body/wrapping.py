@@ -18,8 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tkamb.compiled import compiled_as_written
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, transform
+
+NEITHER, START, END = 0, 1, 2
+"""Which end of a line lies inside the outline."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,24 +86,16 @@ def taut_path(start: Array, end: Array, outline: Array) -> TautPath:
         ComputationError: start or end lies inside the outline.
     """
     start, end = np.asarray(start, float), np.asarray(end, float)
-    above, below = _height(start[:2], outline), _height(end[:2], outline)
-    for name, heights in (("start", above), ("end", below)):
-        if (heights >= 0.0).all():
-            raise ComputationError(f"the {name} of a wrapping line lies inside the bone's outline")
-    if _passes_freely(start[:2], end[:2], outline, above, below):
-        return straight_path(start, end)
-    corners, turn = _wrapped_corners(start[:2], end[:2], outline, above, below)
-    plane = np.concatenate([start[None, :2], corners, end[None, :2]])
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(plane, axis=0), axis=1))])
-    z = start[2] + (end[2] - start[2]) * along / along[-1]
-    return TautPath(
-        np.column_stack([plane, z]), float(np.hypot(along[-1], end[2] - start[2])), turn
-    )
+    points, length, turn, inside = _taut(start, end, outline)
+    if inside:
+        name = "start" if inside == START else "end"
+        raise ComputationError(f"the {name} of a wrapping line lies inside the bone's outline")
+    return TautPath(points, length, turn)
 
 
 def is_inside(point: Array, outline: Array) -> bool:
     """Say whether a point (3,) lies within an outline (n, 2) of its own frame."""
-    return bool((_height(point[:2], outline) >= 0.0).all())
+    return bool(_is_inside(np.asarray(point, float), outline))
 
 
 def path_in_link(
@@ -121,54 +117,83 @@ def path_in_link(
     return path.moved(pose_link_in_here)
 
 
-def _cross(a: Array, b: Array) -> Array:
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+@compiled_as_written
+def _height(point: Array, outline: Array, edge: int) -> float:
+    """Return twice the area that an edge spans with a point: negative if it is seen from there."""
+    there = (edge + 1) % len(outline)
+    x, y = point[0] - outline[edge, 0], point[1] - outline[edge, 1]
+    return float(x * (point[1] - outline[there, 1]) - y * (point[0] - outline[there, 0]))
 
 
-def _height(point: Array, outline: Array) -> Array:
-    """Return twice the area (n,) that each edge spans with a point: negative if it is seen."""
-    offset = point - outline
-    ahead = np.concatenate([offset[1:], offset[:1]])
-    return np.asarray(offset[:, 0] * ahead[:, 1] - offset[:, 1] * ahead[:, 0])
+@compiled_as_written
+def _is_inside(point: Array, outline: Array) -> bool:
+    lowest = np.inf
+    for edge in range(len(outline)):
+        lowest = min(lowest, _height(point, outline, edge))
+    return lowest >= 0.0
 
 
-def _passes_freely(start: Array, end: Array, outline: Array, above: Array, below: Array) -> bool:
-    """Whether the straight segment leaves the outline on its right, or never comes to it.
+@compiled_as_written
+def _sweep(start: Array, end: Array, outline: Array) -> float:
+    """Return the clockwise angle (rad) from start to end about the outline's centre."""
+    x, y = np.mean(outline[:, 0]), np.mean(outline[:, 1])
+    ax, ay, bx, by = start[0] - x, start[1] - y, end[0] - x, end[1] - y
+    return float(-np.arctan2(ax * by - ay * bx, ax * bx + ay * by))
+
+
+@compiled_as_written
+def _crosses(start: Array, end: Array, outline: Array) -> bool:
+    """Clip the straight segment by the outline's half planes (Cyrus-Beck)."""
+    entered, left = 0.0, 1.0
+    for edge in range(len(outline)):
+        above, below = _height(start, outline, edge), _height(end, outline, edge)
+        if above <= 0.0 and below <= 0.0:
+            return False
+        if above < 0.0 and below > 0.0:
+            entered = max(entered, above / (above - below))
+        elif above > 0.0 and below < 0.0:
+            left = min(left, above / (above - below))
+    return entered < left
+
+
+@compiled_as_written
+def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float, int]:
+    """Return the taut path's points (m, 3), length and turn, and which end is inside.
+
+    It is straight where the segment leaves the outline on its right, or never comes to it. Else
+    the edges seen from the start begin (counter-clockwise) at the corner whose tangent has the
+    outline on its right; those seen from the end stop at the corner of the other tangent.
 
     Args:
-        start: (2,) m.
-        end: (2,) m.
+        start: (3,) m.
+        end: (3,) m.
         outline: (n, 2) m.
-        above: (n,) heights of the start over the edges.
-        below: (n,) heights of the end.
     """
-    centre = outline.mean(axis=0)
-    a, b = start - centre, end - centre
-    clockwise_sweep = -np.arctan2(_cross(a, b), a @ b)
-    return bool(clockwise_sweep >= -0.5 * np.pi) and not _crosses(above, below)
-
-
-def _crosses(above: Array, below: Array) -> bool:
-    """Clip the segment by the outline's half planes (Cyrus-Beck), given its ends' heights."""
-    if ((above <= 0.0) & (below <= 0.0)).any():
-        return False
-    enters, leaves = (above < 0.0) & (below > 0.0), (above > 0.0) & (below < 0.0)
-    share = above / np.where(enters | leaves, above - below, 1.0)
-    return bool(np.max(share[enters], initial=0.0) < np.min(share[leaves], initial=1.0))
-
-
-def _wrapped_corners(
-    start: Array, end: Array, outline: Array, above: Array, below: Array
-) -> tuple[Array, float]:
-    """Return the corners touched, in order, and the angle turned.
-
-    The edges seen from the start begin (counter-clockwise) at the corner whose tangent has
-    the outline on its right; those seen from the end stop at the corner of the other tangent.
-    """
-    seen_from_start, seen_from_end = above < 0.0, below < 0.0
-    first = int(np.flatnonzero(seen_from_start & ~np.roll(seen_from_start, 1))[0])
-    last = int(np.flatnonzero(seen_from_end & ~np.roll(seen_from_end, -1))[0]) + 1
-    corners = outline[(first - np.arange((first - last) % len(outline) + 1)) % len(outline)]
-    steps = np.diff(np.concatenate([start[None], corners, end[None]]), axis=0)
-    turns = -np.arctan2(_cross(steps[:-1], steps[1:]), (steps[:-1] * steps[1:]).sum(axis=1))
-    return corners, float(turns.sum())
+    ends, straight = np.stack((start, end)), np.sqrt(np.sum((end - start) ** 2))
+    if _is_inside(start, outline):
+        return ends, straight, 0.0, START
+    if _is_inside(end, outline):
+        return ends, straight, 0.0, END
+    if _sweep(start, end, outline) >= -0.5 * np.pi and not _crosses(start, end, outline):
+        return ends, straight, 0.0, NEITHER
+    count, first, last = len(outline), -1, -1
+    for edge in range(count):
+        before, after = (edge - 1) % count, (edge + 1) % count
+        if first < 0 and _height(start, outline, edge) < 0.0 <= _height(start, outline, before):
+            first = edge
+        if last < 0 and _height(end, outline, edge) < 0.0 <= _height(end, outline, after):
+            last = edge + 1
+    corners = (first - last) % count + 1
+    points, turn, along = np.empty((corners + 2, 3)), 0.0, np.zeros(corners + 2)
+    points[0], points[-1] = start, end
+    for corner in range(corners):
+        points[corner + 1, :2] = outline[(first - corner) % count]
+    for k in range(1, corners + 2):
+        x, y = points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1]
+        along[k] = along[k - 1] + np.hypot(x, y)
+        if k <= corners:
+            ahead = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
+            turn -= np.arctan2(x * ahead[1] - y * ahead[0], x * ahead[0] + y * ahead[1])
+    for k in range(1, corners + 1):
+        points[k, 2] = start[2] + (end[2] - start[2]) * along[k] / along[-1]
+    return points, np.hypot(along[-1], end[2] - start[2]), turn, NEITHER

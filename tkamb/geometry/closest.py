@@ -19,12 +19,10 @@ REGION_RADIUS = 1.6e-2
 """m; the close region ends this far from the closest point."""
 FACING_COSINE = 0.7
 """Cosine of the angle between the surfaces, above which they face each other."""
-ESTIMATE_ERROR = 1e-4
-"""m; how far the quick estimate of a gap may be out on coarse meshes."""
 ABOVE = 1e-6
 """m; a point that far above a bound of the insert's height is outside it, rounding included."""
-NEARLY_AS_CLOSE = ESTIMATE_ERROR + 5 * FACET_DEPTH
-"""m; by how much the estimated gap of a sample may differ that has a weight."""
+NEARLY_AS_CLOSE = 10 * FACET_DEPTH
+"""m; by how much the gap of a sample may exceed the smallest: it then weighs 5e-5 of that."""
 _ROUNDS = 3
 _KEPT = 8
 _BATCH = 64
@@ -250,11 +248,9 @@ class _CloseRegion:
         near = np.array(self._tree.query_ball_point(own, REGION_RADIUS), dtype=int)
         here = self._normals[self._tree.query(own)[1]]
         near = near[self._normals[near] @ here > 0.5]
-        points = transform(pose, self._samples[near])
-        heights = other.heights(points, abs(gap) + NEARLY_AS_CLOSE)
-        within = np.abs(heights - gap) < NEARLY_AS_CLOSE
-        near, points = near[within], points[within]
-        found = other.at(np.concatenate([points, closest[None]]))
+        points = np.concatenate([transform(pose, self._samples[near]), closest[None]])
+        within, found = other.within(points, abs(gap) + NEARLY_AS_CLOSE)
+        near, points = near[within[:-1]], points[within[:-1]]
         facing = -np.einsum("ij,ij->i", rotate(pose, self._normals[near]), found.normals[:-1])
         above = np.einsum("ij,ij->i", points - found.points[:-1], found.normals[:-1])
         excess = np.where(above < 0, -1, 1) * found.distance[:-1] - gap

@@ -1,26 +1,28 @@
 """How far the femoral component must travel along -y until it first touches the insert."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tkamb.geometry.bounds import HeightBound, Patches
-from tkamb.geometry.frames import Array, Index, Mask, inverse, rotate, transform
-from tkamb.geometry.ragged import Ragged
+from tkamb.compiled import compiled_as_written
+from tkamb.geometry.condyles import condyle_faces
+from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface
-from tkamb.geometry.topology import each_edge
+from tkamb.geometry.tree import TriangleTree
 
-UP = np.array([0.0, 1.0, 0.0])
-EDGE_BAND = 0.03
-"""Edges whose ends lie within this share of their length of the smallest clearance are tried
-against each other: the sagitta of a chord over a radius of four chords."""
-MOST_EDGES = 1500
-FIRST_PATCHES = 12
-FIRST_LOOK = 64
-"""So many promising vertices of so many patches give the bound that spares the others a ray."""
-CLEARANCE_ROUNDING = 1e-12
-"""m; what a bound may be wrong by."""
+STEEP = 1e-9
+"""Share of its area that a triangle shows from above, below which it is a wall: its rim counts, by
+its neighbours."""
+FACING = 0.2
+"""Up or down component of a mean normal, below which its plane says nothing of heights."""
+ROUNDING = 1e-12
+"""m; what a plane's height may be wrong by."""
+MOST_WAITING = 256
+"""Pairs of boxes that wait at one time: two for each level of both trees."""
+MOST_CORNERS = 8
+"""Of one triangle cut by another: six, and what rounding adds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,26 +41,31 @@ class Touch:
 class FirstTouch:
     """Vertical clearance between two triangulated surfaces, exact for their triangles.
 
-    The clearance of two piecewise linear surfaces over x and z is smallest where a vertex of
-    one meets the other, or where two edges cross in the projection. The boxes about small
-    patches of the femoral component and the insert's largest height under each of them bound
-    the clearance from below; vertices are tried only where that does not rule them out, and
-    the edges near the smallest clearance. The insert is taken as seen from above, the femoral
-    component as seen from below.
+    It is the least, over all pairs of triangles that lie over each other, of the difference of
+    their heights: linear over the polygon that both cover in the projection, so least at one of
+    its corners. Pairs of boxes, and of triangles, that cannot have a smaller one than what is
+    found are left out.
 
     Args:
         femoral: in the femoral frame.
         insert: in the insert frame.
-        split: z between the condyles in the femoral frame, m; None: one condyle (medial).
+        split: z between the condyles in the femoral frame, m; None: one condyle (medial). A
+            triangle belongs to the side that its middle lies on.
     """
 
     def __init__(self, femoral: Surface, insert: Surface, split: float | None = None) -> None:
-        self._femoral, self._insert, self._split = femoral, insert, split
-        self._insert_tops = _with_face_towards(insert, UP)
-        self._femoral_edges = _Edges(femoral, np.ones(len(femoral.vertices), bool))
-        self._insert_edges = _Edges(insert, self._insert_tops)
-        self._height_bound = HeightBound(insert, self._insert_edges.reach)
-        self._patches = Patches(femoral, self._femoral_edges.reach)
+        self._femoral, self._split = femoral, split
+        self._insert = _arrays(insert.tree)
+
+    @cached_property
+    def _whole(self) -> tuple[Array, Array, Array]:
+        return _arrays(self._femoral.tree)
+
+    @cached_property
+    def _condyles(self) -> list[tuple[Array, Array, Array]]:
+        """Medial and lateral."""
+        sides = condyle_faces(self._femoral, self._split)
+        return [_arrays(TriangleTree(self._femoral, faces)) for faces in sides if len(faces)]
 
     def at(self, pose: ArrayLike) -> tuple[Touch | None, Touch | None]:
         """Return the touch of the medial and of the lateral condyle.
@@ -70,8 +77,9 @@ class FirstTouch:
         """
         pose = np.asarray(pose, float)
         if self._split is None:
-            return self._touch(pose, None), None
-        return self._touch(pose, 0), self._touch(pose, 1)
+            return self._touch(pose, self._whole), None
+        medial, lateral = self._condyles
+        return self._touch(pose, medial), self._touch(pose, lateral)
 
     def travel(self, pose: ArrayLike) -> float:
         """Return the travel (m) until either condyle touches; NaN if none lies over the insert."""
@@ -80,176 +88,241 @@ class FirstTouch:
 
     def either(self, pose: ArrayLike) -> Touch | None:
         """Return the first touch of either condyle; None if none lies over the insert."""
-        return self._touch(np.asarray(pose, float), None)
+        return self._touch(np.asarray(pose, float), self._whole)
 
-    def _touch(self, pose: Array, side: int | None) -> Touch | None:
-        """Return the touch of one condyle, 0 (medial) or 1 (lateral), or of either."""
-        patches, least = self._near_patches(pose)
-        look, _ = self._bottoms(pose, patches[np.argsort(least)[:FIRST_PATCHES]], side)
-        look = look[np.argsort(self._at_least(pose, look))[:FIRST_LOOK]]
-        bound = self._over_insert(self._placed(pose, look)).min(initial=np.inf)
-        near = patches[least <= bound + self._patches.reach[patches]]
-        bottoms, faces = self._bottoms(pose, near, side)
-        reach = self._femoral_edges.reach[bottoms]
-        bottoms = bottoms[self._at_least(pose, bottoms) <= bound + reach]
-        clearance = self._over_insert(self._placed(pose, bottoms))
-        bound = clearance.min(initial=np.inf)
-        tops = self._near_tops(pose, faces, bound, side)
-        under = self._under_femoral(pose, self._insert.vertices[tops])
-        return self._lowest(pose, (bottoms, clearance), (tops, under))
-
-    def _near_patches(self, pose: Array) -> tuple[Index, Array]:
-        """Return the femoral patches over the insert and lower bounds of their clearance."""
-        low, high = self._patches.extent(pose)
-        planes = self._height_bound.planes(low[:, ::2], high[:, ::2])
-        over = np.flatnonzero(np.isfinite(planes[:, 2]))
-        least = self._patches.least(pose, over, _normals_of(planes[over]))
-        return over, least - planes[over, 2] - CLEARANCE_ROUNDING
-
-    def _placed(self, pose: Array, vertices: Index) -> Array:
-        return transform(pose, self._femoral.vertices[vertices])
-
-    def _bottoms(self, pose: Array, patches: Index, side: int | None) -> tuple[Index, Index]:
-        """Return the vertices of a side and all triangles in the patches that face down."""
-        faces = self._patches.faces(patches)
-        faces = faces[self._femoral.face_normals[faces] @ rotate(pose.T, -UP) > 0]
-        vertices = np.unique(self._femoral.faces[faces])
-        if side is not None and self._split is not None:
-            lateral = self._femoral.vertices[vertices, 2] >= self._split
-            vertices = vertices[lateral == bool(side)]
-        return vertices, faces
-
-    def _at_least(self, pose: Array, vertices: Index) -> Array:
-        """Return a lower bound (n,) of the clearance of femoral vertices; inf beside the insert."""
-        points = self._placed(pose, vertices)
-        least = points[:, 1] - self._height_bound.over(points) - CLEARANCE_ROUNDING
-        return np.where(_within(points, self._insert.bounds), least, np.inf)
-
-    def _near_tops(self, pose: Array, faces: Index, bound: float, side: int | None) -> Index:
-        """Return the insert's vertices over which one of the triangles may be low enough."""
-        corners = [transform(pose, self._femoral.triangles[faces, corner]) for corner in range(3)]
-        low, high = np.minimum.reduce(corners)[:, ::2], np.maximum.reduce(corners)[:, ::2]
-        planes = self._height_bound.planes(low, high)
-        normals = _normals_of(planes)
-        above = np.minimum.reduce([np.einsum("ij,ij->i", c, normals) for c in corners])
-        near = above - planes[:, 3] - CLEARANCE_ROUNDING <= bound
-        tops = self._height_bound.vertices_in_rectangles(low[near], high[near])
-        tops = tops[self._insert_tops[tops]]
-        if side is not None and self._split is not None:
-            z = transform(inverse(pose), self._insert.vertices[tops])[:, 2]
-            tops = tops[(z >= self._split) == bool(side)]
-        return tops
-
-    def _over_insert(self, points: Array) -> Array:
-        start = points.copy()
-        start[:, 1] = self._insert.bounds[1, 1] + 1e-3
-        distance, _ = self._insert.rays.first(start, -UP)
-        return points[:, 1] - start[:, 1] + distance
-
-    def _under_femoral(self, pose: Array, points: Array) -> Array:
-        start, back = points.copy(), inverse(pose)
-        radius = float(np.abs(self._femoral.bounds).max())
-        start[:, 1] = pose[1, 3] - 2 * radius - 1e-3
-        distance, _ = self._femoral.rays.first(transform(back, start), rotate(back, UP))
-        return start[:, 1] + distance - points[:, 1]
-
-    def _lowest(
-        self, pose: Array, bottoms: tuple[Index, Array], tops: tuple[Index, Array]
-    ) -> Touch | None:
-        """Return the lowest of the vertices' clearances and the edges' near them."""
-        points = self._placed(pose, bottoms[0])
-        f, i = (int(np.argmin(c)) if len(c) else -1 for _, c in (bottoms, tops))
-        lowest = [float(c[k]) if k >= 0 else np.inf for (_, c), k in ((bottoms, f), (tops, i))]
-        if not np.isfinite(min(lowest)):
-            return None
-        if lowest[0] < lowest[1]:
-            best = Touch(lowest[0], points[f] - lowest[0] * UP)
-        else:
-            best = Touch(lowest[1], self._insert.vertices[tops[0][i]].copy())
-        a = self._femoral_edges.near(*bottoms, best.travel)
-        b = self._insert_edges.near(*tops, best.travel)
-        upper = self._placed(pose, a.ravel()).reshape(-1, 2, 3)
-        crossing = _crossing(upper, self._insert.vertices[b])
-        return best if crossing is None or crossing.travel >= best.travel else crossing
+    def _touch(self, pose: Array, part: tuple[Array, Array, Array]) -> Touch | None:
+        rotation, translation = np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy()
+        travel, point = _least_clearance(*part, *self._insert, rotation, translation)
+        return Touch(travel, point) if np.isfinite(travel) else None
 
 
-class _Edges:
-    """The edges of a surface between chosen vertices (n,), by the vertices that they join.
+def _arrays(tree: TriangleTree) -> tuple[Array, Array, Array]:
+    return tree.boxes, tree.supports, tree.corners
 
-    Attributes:
-        reach: (n,) m, how far above the smallest clearance a vertex may be whose edges count.
+
+@compiled_as_written
+def _turned_box(box: Array, rotation: Array, translation: Array, turned: Array) -> None:
+    """Write the box (6,) about a box at another place."""
+    for i in range(3):
+        middle, half = translation[i], 0.0
+        for j in range(3):
+            middle += 0.5 * rotation[i, j] * (box[j] + box[j + 3])
+            half += 0.5 * abs(rotation[i, j]) * (box[j + 3] - box[j])
+        turned[i], turned[i + 3] = middle - half, middle + half
+
+
+@compiled_as_written
+def _bound(
+    upper: Array,
+    lower: Array,
+    upper_support: Array,
+    lower_support: Array,
+    rotation: Array,
+    translation: Array,
+) -> float:
+    """Return a lower bound of the clearance of what two boxes hold, inf if not over each other.
+
+    That of the boxes or, over the rectangle that both cover, of the planes that bound their
+    triangles' heights.
+
+    Args:
+        upper: (6,) m, at its place.
+        lower: (6,) m.
+        upper_support: (4,) see `TriangleTree.supports`, own frame.
+        lower_support: (4,) likewise.
+        rotation: (3, 3) of the upper one's frame.
+        translation: (3,) m, likewise.
     """
-
-    def __init__(self, surface: Surface, chosen: Mask) -> None:
-        edges = each_edge(surface.faces)
-        self._ends = edges[chosen[edges].all(axis=1)]
-        ends = surface.vertices[self._ends]
-        self._band = EDGE_BAND * np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-        self._band += np.median(self._band) if len(self._band) else 0.0
-        corner = self._ends.ravel()
-        self._at_vertex = Ragged.by_key(corner, len(surface.vertices))
-        self.reach = np.zeros(len(surface.vertices))
-        np.maximum.at(self.reach, corner, np.repeat(self._band, 2))
-
-    def near(self, vertices: Index, clearance: Array, smallest: float) -> Index:
-        """Return the edges (k, 2) with an end close to the smallest clearance (m).
-
-        Args:
-            vertices: (n,) whose clearance is known.
-            clearance: (n,) m.
-            smallest: m.
-        """
-        above = clearance - smallest
-        close = np.flatnonzero(above <= self.reach[vertices])
-        vertex, corner = self._at_vertex.of(vertices[close])
-        edges = corner // 2
-        beyond = above[close][vertex] - self._band[edges]
-        order = np.argsort(beyond, kind="stable")
-        edges = edges[order[beyond[order] <= 0]]
-        return self._ends[np.unique(edges[: 2 * MOST_EDGES])]
+    x0, x1 = max(upper[0], lower[0]), min(upper[3], lower[3])
+    z0, z1 = max(upper[2], lower[2]), min(upper[5], lower[5])
+    if x0 > x1 or z0 > z1:
+        return np.inf
+    bound, offset = upper[1] - lower[4], upper_support[3]
+    nx, ny, nz = 0.0, 0.0, 0.0
+    for k in range(3):
+        nx += rotation[0, k] * upper_support[k]
+        ny += rotation[1, k] * upper_support[k]
+        nz += rotation[2, k] * upper_support[k]
+    if ny < -FACING and lower_support[1] > FACING:
+        offset += nx * translation[0] + ny * translation[1] + nz * translation[2]
+        mx, my, mz = lower_support[0], lower_support[1], lower_support[2]
+        a, b = mx / my - nx / ny, mz / my - nz / ny
+        between = offset / ny - lower_support[3] / my
+        between += min(a * x0, a * x1) + min(b * z0, b * z1) - ROUNDING
+        bound = max(bound, between)
+    return bound
 
 
-def _with_face_towards(surface: Surface, direction: Array) -> Mask:
-    """Say which vertices (n,) belong to a triangle that faces `direction`."""
-    facing = surface.faces[surface.face_normals @ direction > 0]
-    mask = np.zeros(len(surface.vertices), bool)
-    mask[facing.ravel()] = True
-    return mask
+@compiled_as_written
+def _plane(corners: Array) -> tuple[float, float, float, float]:
+    """Return height and slopes (y = h + a x + b z) of a triangle (9,), and its area from above."""
+    ux, uy, uz = corners[3] - corners[0], corners[4] - corners[1], corners[5] - corners[2]
+    vx, vy, vz = corners[6] - corners[0], corners[7] - corners[1], corners[8] - corners[2]
+    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    if abs(y) <= STEEP * np.sqrt(x * x + y * y + z * z):
+        return np.nan, np.nan, np.nan, 0.0
+    a, b = -x / y, -z / y
+    return corners[1] - a * corners[0] - b * corners[2], a, b, y
 
 
-def _normals_of(planes: Array) -> Array:
-    """Return d (n, 3) with d . x the height of x over the slopes of planes (n, 4)."""
-    return np.stack([-planes[:, 0], np.ones(len(planes)), -planes[:, 1]], axis=1)
+@compiled_as_written
+def _beyond(upper: Array, plane: tuple[float, float, float, float]) -> float:
+    """Return the least height of a triangle's corners above another's plane, m."""
+    least = np.inf
+    for corner in range(0, 9, 3):
+        height = plane[0] + plane[1] * upper[corner] + plane[2] * upper[corner + 2]
+        least = min(least, upper[corner + 1] - height)
+    return least
 
 
-def _within(points: Array, bounds: Array) -> Mask:
-    """Say which points (n, 3) lie within bounds (2, 3) in x and z."""
-    x, z, (low, high) = points[:, 0], points[:, 2], bounds
-    return (x >= low[0]) & (x <= high[0]) & (z >= low[2]) & (z <= high[2])
+@compiled_as_written
+def _cut(
+    polygon: Array, count: int, kept: Array, ax: float, az: float, bx: float, bz: float, way: float
+) -> int:
+    """Write the part of a polygon (n, 3) of x, z, clearance on one side of an edge; return n."""
+    number = 0
+    for here in range(count):
+        there = (here + 1) % count
+        first = way * ((bx - ax) * (polygon[here, 1] - az) - (bz - az) * (polygon[here, 0] - ax))
+        second = way * ((bx - ax) * (polygon[there, 1] - az) - (bz - az) * (polygon[there, 0] - ax))
+        if first >= 0.0:
+            kept[number] = polygon[here]
+            number += 1
+        if (first > 0.0 and second < 0.0) or (first < 0.0 and second > 0.0):
+            share = first / (first - second)
+            for k in range(3):
+                kept[number, k] = polygon[here, k] + share * (polygon[there, k] - polygon[here, k])
+            number += 1
+    return number
 
 
-def _crossing(upper: Array, lower: Array) -> Touch | None:
-    """Return the lowest crossing in projection of edges (m, 2, 3) over edges (n, 2, 3)."""
-    pairs = _overlapping(upper[:, :, ::2], lower[:, :, ::2])
-    p, q = upper[pairs[0], 0], lower[pairs[1], 0]
-    u, v = upper[pairs[0], 1] - p, lower[pairs[1], 1] - q
-    w = q - p
-    determinant = u[:, 0] * v[:, 2] - u[:, 2] * v[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        s = (w[:, 0] * v[:, 2] - w[:, 2] * v[:, 0]) / determinant
-        t = (w[:, 0] * u[:, 2] - w[:, 2] * u[:, 0]) / determinant
-        inside = (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
-        clearance = np.where(inside, p[:, 1] + s * u[:, 1] - q[:, 1] - t * v[:, 1], np.inf)
-    if not np.isfinite(clearance.min(initial=np.inf)):
-        return None
-    k = int(clearance.argmin())
-    return Touch(float(clearance[k]), q[k] + t[k] * v[k])
+@compiled_as_written
+def _over_each_other(
+    upper: Array,
+    lower: Array,
+    plane: tuple[float, float, float, float],
+    best: float,
+    polygon: Array,
+    kept: Array,
+    point: Array,
+) -> float:
+    """Return the least clearance of two triangles (9,) where it is below the best so far.
+
+    Args:
+        upper: m, at its place.
+        lower: m.
+        plane: of the lower one, not a wall.
+        best: m.
+        polygon: (8, 3) to work in.
+        kept: (8, 3) likewise.
+        point: (3,) m, written where a smaller clearance is found: on the lower triangle.
+    """
+    height, a, b, area = plane
+    for corner in range(3):
+        x, y, z = upper[3 * corner], upper[3 * corner + 1], upper[3 * corner + 2]
+        polygon[corner, 0], polygon[corner, 1] = x, z
+        polygon[corner, 2] = y - (height + a * x + b * z)
+    count, way = 3, -1.0 if area > 0.0 else 1.0
+    for first in range(3):
+        second = (first + 1) % 3
+        ax, az = lower[3 * first], lower[3 * first + 2]
+        bx, bz = lower[3 * second], lower[3 * second + 2]
+        count = _cut(polygon, count, kept, ax, az, bx, bz, way)
+        polygon, kept = kept, polygon
+    for corner in range(count):
+        x, z, clearance = polygon[corner, 0], polygon[corner, 1], polygon[corner, 2]
+        if clearance < best:
+            best = clearance
+            point[0], point[1], point[2] = x, height + a * x + b * z, z
+    return best
 
 
-def _overlapping(upper: Array, lower: Array) -> tuple[Index, Index]:
-    """Return the pairs (k,), (k,) of edges (m, 2, 2) and (n, 2, 2) whose boxes overlap."""
-    first, last = upper.min(axis=1), upper.max(axis=1)
-    low, high = lower.min(axis=1), lower.max(axis=1)
-    i, j = np.nonzero((first[:, None, 0] <= high[:, 0]) & (last[:, None, 0] >= low[:, 0]))
-    both = (first[i, 1] <= high[j, 1]) & (last[i, 1] >= low[j, 1])
-    return i[both], j[both]
+@compiled_as_written
+def _least_clearance(
+    upper_boxes: Array,
+    upper_supports: Array,
+    upper_corners: Array,
+    lower_boxes: Array,
+    lower_supports: Array,
+    lower_corners: Array,
+    rotation: Array,
+    translation: Array,
+) -> tuple[float, Array]:
+    """Return the least clearance (m) of one surface over another, and where on the lower one.
+
+    Args:
+        upper_boxes: (2 p, 6) m, own frame.
+        upper_supports: (2 p, 4) see `TriangleTree.supports`, own frame.
+        upper_corners: (p c, 9) m, of the triangles of its leaves, own frame.
+        lower_boxes: (2 q, 6) m.
+        lower_supports: (2 q, 4).
+        lower_corners: (q d, 9) m.
+        rotation: (3, 3) of the upper one in the lower one's frame.
+        translation: (3,) m, likewise.
+
+    Returns:
+        Clearance, inf where nothing lies over each other; point (3,).
+    """
+    best, point = np.inf, np.full(3, np.nan)
+    uppers, lowers = len(upper_boxes) // 2, len(lower_boxes) // 2
+    upper_held, lower_held = len(upper_corners) // uppers, len(lower_corners) // lowers
+    waiting, least = np.empty((MOST_WAITING, 2), np.int64), np.empty(MOST_WAITING)
+    box, upper = np.empty(6), np.empty((upper_held, 9))
+    polygon, kept = np.empty((MOST_CORNERS, 3)), np.empty((MOST_CORNERS, 3))
+    waiting[0, 0], waiting[0, 1], least[0], size = 1, 1, -np.inf, 1
+    while size > 0:
+        size -= 1
+        one, other = waiting[size, 0], waiting[size, 1]
+        if least[size] >= best:
+            continue
+        if one >= uppers and other >= lowers:
+            for place in range(upper_held):
+                corners = upper_corners[(one - uppers) * upper_held + place]
+                for corner in range(0, 9, 3):
+                    for i in range(3):
+                        upper[place, corner + i] = (
+                            translation[i]
+                            + rotation[i, 0] * corners[corner]
+                            + rotation[i, 1] * corners[corner + 1]
+                            + rotation[i, 2] * corners[corner + 2]
+                        )
+            for below in range((other - lowers) * lower_held, (other - lowers + 1) * lower_held):
+                lower = lower_corners[below]
+                plane = _plane(lower)
+                if plane[3] == 0.0:
+                    continue
+                for place in range(upper_held):
+                    if _beyond(upper[place], plane) < best:
+                        best = _over_each_other(
+                            upper[place], lower, plane, best, polygon, kept, point
+                        )
+            continue
+        # the larger of the two boxes is halved
+        _turned_box(upper_boxes[one], rotation, translation, box)
+        wide = box[3] - box[0] + box[5] - box[2]
+        below_box = lower_boxes[other]
+        halve = one < uppers and (
+            other >= lowers or wide > below_box[3] - below_box[0] + below_box[5] - below_box[2]
+        )
+        begin = size
+        for child in range(2):
+            first, second = (2 * one + child, other) if halve else (one, 2 * other + child)
+            if halve:
+                _turned_box(upper_boxes[first], rotation, translation, box)
+            bound = _bound(
+                box,
+                lower_boxes[second],
+                upper_supports[first],
+                lower_supports[second],
+                rotation,
+                translation,
+            )
+            if bound >= best:
+                continue
+            waiting[size, 0], waiting[size, 1], least[size] = first, second, bound
+            size += 1
+        if size == begin + 2 and least[begin] < least[begin + 1]:  # the lower one comes first
+            for k in range(2):
+                waiting[begin, k], waiting[begin + 1, k] = waiting[begin + 1, k], waiting[begin, k]
+            least[begin], least[begin + 1] = least[begin + 1], least[begin]
+    return best, point

@@ -66,8 +66,12 @@ def interpolated(surface: "Surface", normals: Array, points: Array, faces: Index
         points: (n, 3) m.
         faces: (n,) the triangle of each point.
     """
-    weights = surface.barycentric(points, faces)
-    return _unit(np.einsum("ij,ijk->ik", weights, normals[faces]))
+    return mean_normals(surface.barycentric(points, faces), normals[faces])
+
+
+def mean_normals(weights: Array, normals: Array) -> Array:
+    """Return the unit means (n, 3) of three normals (n, 3, 3), by barycentric weights (n, 3)."""
+    return _unit(np.einsum("ij,ijk->ik", weights, normals))
 
 
 def sharp_edges(surface: "Surface", sharp: float = SHARP_EDGE) -> Mask:

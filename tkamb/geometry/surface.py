@@ -9,13 +9,14 @@ import numpy as np
 from tkamb.geometry.frames import Array, Index, transform
 from tkamb.geometry.normals import SHARP_EDGE, corner_angles, corner_normals, interpolated
 from tkamb.geometry.ragged import Ragged
-from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.topology import same_places
 
 if TYPE_CHECKING:
     import trimesh
 
     from tkamb.geometry.nearest import NearestPoints
+    from tkamb.geometry.rays import RayCaster
+    from tkamb.geometry.tree import TriangleTree
 
 SMOOTH_WITHIN = np.radians(30.0)
 """rad; triangles that meet at a larger angle belong to different smooth surfaces."""
@@ -140,16 +141,25 @@ class Surface:
         return interpolated(self, self._smooth_corner_normals, points, faces)
 
     @cached_property
-    def rays(self) -> RayCaster:
+    def tree(self) -> "TriangleTree":
+        """Boxes over its triangles, in its own frame."""
+        from tkamb.geometry.tree import TriangleTree  # numba, which not all need
+
+        return TriangleTree(self)
+
+    @cached_property
+    def rays(self) -> "RayCaster":
         """Rays against the surface, in its own frame."""
-        return RayCaster(self)
+        from tkamb.geometry.rays import RayCaster
+
+        return RayCaster(self, self.tree)
 
     @cached_property
     def nearest(self) -> "NearestPoints":
         """The surface's nearest points, in its own frame."""
-        from tkamb.geometry.nearest import NearestPoints  # scipy too
+        from tkamb.geometry.nearest import NearestPoints
 
-        return NearestPoints(self)
+        return NearestPoints(self, self.tree)
 
     def moved(self, pose_here_in_there: Array) -> "Surface":
         """Return the surface in another frame; where that is the same, itself."""
@@ -158,5 +168,5 @@ class Surface:
         return Surface(transform(pose_here_in_there, self.vertices), self.faces, self.name)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what is derived: rays cannot be sent to another process."""
+        """Leave out what is derived: larger by far, and made again where it is needed."""
         return {"vertices": self.vertices, "faces": self.faces, "name": self.name}

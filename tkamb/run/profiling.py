@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from tkamb.results import Results
 
-HEAVY = ("pinocchio", "trimesh", "scipy", "fcl", "embreex", "h5py", "matplotlib", "pydantic")
+HEAVY = ("pinocchio", "trimesh", "scipy", "fcl", "numba", "h5py", "matplotlib", "pydantic")
 """Libraries worth naming."""
 CLOCKS = {
     "closest points": "query_seconds",

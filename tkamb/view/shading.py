@@ -73,7 +73,7 @@ def decimate(surface: Surface, most_triangles: int) -> tuple[Surface, float]:
 def _distance(one: Surface, other: Surface) -> float:
     """Return the largest distance (m) of vertices and triangle centres to the other surface."""
     return max(
-        to.nearest.farthest(points)
+        float(to.nearest.at(points).distance.max())
         for of, to in ((one, other), (other, one))
         for points in (of.vertices, of.triangles.mean(axis=1))
     )

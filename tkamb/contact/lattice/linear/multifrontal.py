@@ -23,7 +23,7 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-from tkamb.contact.lattice.compiled import compiled
+from tkamb.compiled import compiled
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, Index
 

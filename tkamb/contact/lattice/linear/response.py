@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.compiled import compiled
+from tkamb.compiled import compiled
 from tkamb.contact.lattice.linear.multifrontal import Front
 from tkamb.geometry.frames import Array, Index
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tkamb.contact.lattice.compiled import compiled
+from tkamb.compiled import compiled
 from tkamb.contact.lattice.meshing.cells import PAIRS
 from tkamb.contact.lattice.solids.curve import LEAST_STRAIN
 from tkamb.geometry.frames import Array, Index

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
-from tkamb.contact.lattice.compiled import compiled
+from tkamb.compiled import compiled
 from tkamb.contact.lattice.meshing.cells import mean_gradient
 from tkamb.contact.materials import Material
 from tkamb.errors import InputError

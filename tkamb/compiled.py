@@ -1,0 +1,50 @@
+"""Loops compiled by numba when they are first called, and kept on disk for the next process.
+
+Import it only where meshes or a lattice are: it takes 0.1 to 0.4 s. The compiled code lies beside
+the module or, where that folder cannot be written, in the user's cache (`NUMBA_CACHE_DIR` says
+where). Indices are not held against bounds. A compiled function calls none of another file: what
+is kept would not notice that one changed.
+"""
+
+import logging
+from collections.abc import Callable
+from functools import cache
+from typing import Any, TypeVar, cast
+
+from numba import njit
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+_log = logging.getLogger("tkamb")
+
+
+def compiled(function: Function) -> Function:
+    """Return the function compiled; it lets other threads run.
+
+    Sums may be taken in another order, as vector registers do; nothing else of IEEE arithmetic is
+    given up.
+    """
+    return _compiled(function, {"reassoc", "contract", "nsz"})
+
+
+def compiled_as_written(function: Function) -> Function:
+    """Return the function compiled without that freedom: equal numbers stay equal."""
+    return _compiled(function, set())
+
+
+def _compiled(function: Function, fastmath: set[str]) -> Function:
+    options: dict[str, Any] = {"nogil": True, "fastmath": fastmath or False}
+    compiler: Any = njit
+    try:
+        return cast(Function, compiler(cache=True, **options)(function))
+    except RuntimeError:  # numba finds no folder that it may write to
+        _say_once()
+        return cast(Function, compiler(**options)(function))
+
+
+@cache
+def _say_once() -> None:
+    _log.warning(
+        "compiled loops are not kept: every process compiles them anew, ten seconds or more; let "
+        "NUMBA_CACHE_DIR name a folder that can be written to"
+    )
