@@ -166,6 +166,17 @@ def _plane(corners: Array) -> tuple[float, float, float, float]:
 
 
 @compiled_as_written
+def _over(upper: Array, lower: Array) -> bool:
+    """Say whether the rectangles about two triangles (9,) overlap, seen from above."""
+    for axis in (0, 2):
+        a, b, c = upper[axis], upper[axis + 3], upper[axis + 6]
+        d, e, f = lower[axis], lower[axis + 3], lower[axis + 6]
+        if max(a, b, c) < min(d, e, f) or max(d, e, f) < min(a, b, c):
+            return False
+    return True
+
+
+@compiled_as_written
 def _beyond(upper: Array, plane: tuple[float, float, float, float]) -> float:
     """Return the least height of a triangle's corners above another's plane, m."""
     least = np.inf
@@ -222,7 +233,7 @@ def _over_each_other(
         x, y, z = upper[3 * corner], upper[3 * corner + 1], upper[3 * corner + 2]
         polygon[corner, 0], polygon[corner, 1] = x, z
         polygon[corner, 2] = y - (height + a * x + b * z)
-    count, way = 3, -1.0 if area > 0.0 else 1.0
+    count, way = np.int64(3), -1.0 if area > 0.0 else 1.0
     for first in range(3):
         second = (first + 1) % 3
         ax, az = lower[3 * first], lower[3 * first + 2]
@@ -292,7 +303,7 @@ def _least_clearance(
                 if plane[3] == 0.0:
                     continue
                 for place in range(upper_held):
-                    if _beyond(upper[place], plane) < best:
+                    if _over(upper[place], lower) and _beyond(upper[place], plane) < best:
                         best = _over_each_other(
                             upper[place], lower, plane, best, polygon, kept, point
                         )

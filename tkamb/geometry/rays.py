@@ -62,7 +62,7 @@ class RayCaster:
         Returns:
             distance (n,) m, face (n,), barycentric coordinates (n, 3), NaN where nothing is hit.
         """
-        rays = _unit_rays(origins, directions)
+        rays = _rows(origins), _rows(directions)
         return first_crossings(*self._tree, *rays, -self._same, EDGE_TOLERANCE)
 
     def all(self, origins: ArrayLike, directions: ArrayLike) -> tuple[Index, Array, Index]:
@@ -78,7 +78,7 @@ class RayCaster:
         Returns:
             ray (m,), distance (m,) m and face (m,), sorted by ray, then by distance.
         """
-        rays = _unit_rays(origins, directions)
+        rays = _rows(origins), _rows(directions)
         number, room = USUAL * len(rays[0]), -1
         while number > room:
             room = number
@@ -92,7 +92,8 @@ class RayCaster:
         self, ray: Index, t: Array, face: Index, directions: Array
     ) -> tuple[Index, Array, Index]:
         """Return the crossings sorted, one per place and facing."""
-        entering = np.einsum("ij,ij->i", directions[ray], self.surface.face_normals[face]) < 0.0
+        along = directions[ray] if len(directions) > 1 else directions
+        entering = (along * self.surface.face_normals[face]).sum(axis=1) < 0.0
         order = np.lexsort((face, t, entering, ray))
         ray, t, face, entering = ray[order], t[order], face[order], entering[order]
         same = (np.diff(ray) == 0) & (np.diff(t) <= self._same)
@@ -103,9 +104,6 @@ class RayCaster:
         return ray[order], t[order], face[order]
 
 
-def _unit_rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Array, Array]:
-    """Return origins (n, 3) and unit directions (n, 3), each row by itself in memory."""
-    origins = np.ascontiguousarray(np.atleast_2d(np.asarray(origins, float)))
-    directions = np.asarray(directions, float)
-    directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    return origins, np.ascontiguousarray(np.broadcast_to(directions, origins.shape))
+def _rows(vectors: ArrayLike) -> Array:
+    """Return vectors (n, 3), row after row in memory; one (3,) as (1, 3)."""
+    return np.ascontiguousarray(vectors, np.float64).reshape(-1, 3)

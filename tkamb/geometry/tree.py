@@ -96,16 +96,64 @@ def _halved(centres: Array) -> Index:
     leaves = 1
     while leaves * LEAF < len(centres):
         leaves *= 2
-    places = leaves * -(-len(centres) // leaves)
-    order = (np.arange(places) % len(centres))[None]
-    while len(order) < leaves:
-        here = centres[order]
-        axis = np.argmax(np.ptp(here, axis=1), axis=1)
-        along = np.take_along_axis(here, axis[:, None, None], axis=2)[:, :, 0]
-        half = order.shape[1] // 2
-        split = np.argpartition(along, half, axis=1)
-        order = np.take_along_axis(order, split, axis=1).reshape(-1, half)
-    return order
+    order = np.arange(leaves * -(-len(centres) // leaves)) % len(centres)
+    _halve(np.ascontiguousarray(centres), order, leaves)
+    return order.reshape(leaves, -1)
+
+
+@compiled_as_written
+def _halve(centres: Array, order: Index, leaves: int) -> None:
+    """Order triangles: halves, quarters, eighths ... each parted along its longest side.
+
+    Args:
+        centres: (n, 3) m.
+        order: (m,) triangles, to be sorted; m a multiple of the leaves.
+        leaves: how many parts there are at last, a power of two.
+    """
+    parts = 1
+    while parts < leaves:
+        held = len(order) // parts
+        for first in range(0, len(order), held):
+            longest, axis = -1.0, 0
+            for k in range(3):
+                low, high = np.inf, -np.inf
+                for n in range(first, first + held):
+                    low, high = min(low, centres[order[n], k]), max(high, centres[order[n], k])
+                if high - low > longest:
+                    longest, axis = high - low, k
+            _part(centres, order, axis, first, first + held - 1, first + held // 2)
+        parts *= 2
+
+
+@compiled_as_written
+def _part(centres: Array, order: Index, axis: int, first: int, last: int, middle: int) -> None:
+    """Bring the smaller ones of a part before its middle, the larger ones after (Hoare 1961).
+
+    Args:
+        centres: (n, 3) m.
+        order: (m,).
+        axis: by which they are compared.
+        first: place of the first in the order.
+        last: of the last.
+        middle: of the one that is to stand where it would if all were sorted.
+    """
+    while first < last:
+        pivot = centres[order[(first + last) // 2], axis]
+        left, right = first, last
+        while left <= right:
+            while centres[order[left], axis] < pivot:
+                left += 1
+            while centres[order[right], axis] > pivot:
+                right -= 1
+            if left <= right:
+                order[left], order[right] = order[right], order[left]
+                left, right = left + 1, right - 1
+        if middle <= right:
+            last = right
+        elif middle >= left:
+            first = left
+        else:
+            return
 
 
 @compiled_as_written
@@ -149,10 +197,12 @@ def _entry(box: Array, origin: Array, slowness: Array) -> float:
 
 
 @compiled_as_written
-def _set_slowness(direction: Array, slowness: Array) -> None:
-    """Write one over a direction (3,); a number, not infinity, where it does not go at all."""
+def _set_direction(vector: Array, direction: Array, slowness: Array) -> None:
+    """Write a vector (3,) at unit length, and one over that; a number where it does not go."""
+    length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
     for axis in range(3):
-        along = direction[axis]
+        along = vector[axis] / length
+        direction[axis] = along
         slowness[axis] = 1.0 / along if abs(along) > STILL else 1.0 / STILL
 
 
@@ -173,7 +223,7 @@ def first_crossings(
         faces: (p c,) triangles of the leaves.
         planes: (p c, 12) theirs, see `_crossing`.
         origins: (n, 3) m.
-        directions: (n, 3) unit.
+        directions: (n, 3) of any length, or (1, 3) for all.
         least: m, the smallest distance that counts.
         outside: barycentric units; so far outside its triangle a crossing still counts.
 
@@ -184,10 +234,12 @@ def first_crossings(
     held = len(faces) // leaves
     distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)
     weights = np.full((count, 3), np.nan)
-    waiting, enters, slowness = np.empty(DEEPEST, np.int64), np.empty(DEEPEST), np.empty(3)
+    waiting, enters = np.empty(DEEPEST, np.int64), np.empty(DEEPEST)
+    direction, slowness = np.empty(3), np.empty(3)
     for n in range(count):
-        origin, direction = origins[n], directions[n]
-        _set_slowness(direction, slowness)
+        origin = origins[n]
+        if n < len(directions):
+            _set_direction(directions[n], direction, slowness)
         best, found, size = np.inf, NO_TRIANGLE, 1
         waiting[0], enters[0] = 1, _entry(boxes[1], origin, slowness)
         while size > 0:
@@ -238,7 +290,7 @@ def all_crossings(
         faces: (p c,).
         planes: (p c, 12).
         origins: (n, 3) m.
-        directions: (n, 3) unit.
+        directions: (n, 3) of any length, or (1, 3) for all.
         least: m.
         outside: barycentric units.
         ray: (m,) the ray of each crossing, to be written.
@@ -247,10 +299,11 @@ def all_crossings(
     """
     leaves, number = len(boxes) // 2, 0
     held = len(faces) // leaves
-    waiting, slowness = np.empty(DEEPEST, np.int64), np.empty(3)
+    waiting, direction, slowness = np.empty(DEEPEST, np.int64), np.empty(3), np.empty(3)
     for n in range(len(origins)):
-        origin, direction = origins[n], directions[n]
-        _set_slowness(direction, slowness)
+        origin = origins[n]
+        if n < len(directions):
+            _set_direction(directions[n], direction, slowness)
         waiting[0], size = 1, 1
         while size > 0:
             size -= 1
@@ -406,7 +459,7 @@ def nearest_points(
     count = len(points)
     distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)
     weights = np.full((count, 3), np.nan)
-    waiting, apart, guess = np.empty(DEEPEST, np.int64), np.empty(DEEPEST), NO_TRIANGLE
+    waiting, apart, guess = np.empty(DEEPEST, np.int64), np.empty(DEEPEST), np.int64(NO_TRIANGLE)
     for n in range(count):
         place, square, s, t = _nearest_place(
             boxes, faces, corners, points[n], reach, guess, waiting, apart
