@@ -108,16 +108,18 @@ class Chain:
     def _take(self, model: pin.Model) -> None:
         """Make another model this chain's, and remember where the insert and the tibia are."""
         self.model = model
+        frames = enumerate(model.frames)
+        self._frames = {frame.name: k for k, frame in frames if frame.type == pin.FrameType.BODY}
         base = model.getJointId(KNEE_JOINT_NAMES[0])
         self._insert_in_root = model.jointPlacements[base].homogeneous
         self._tibia_in_root = model.frames[self.frame_id("tibia")].placement.homogeneous
 
     def frame_id(self, link: str) -> int:
         """Return Pinocchio's id of a link's frame, or raise InputError naming the links."""
-        if not self.model.existFrame(link, pin.FrameType.BODY):
+        if link not in self._frames:
             names = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
             raise InputError(f"no link '{link}' in the URDF", None, names_near(link, names))
-        return int(self.model.getFrameId(link, pin.FrameType.BODY))
+        return self._frames[link]
 
     @property
     def insert_in_tibia(self) -> Array:
@@ -217,12 +219,12 @@ class ChainState:
         if not loads:
             return total
         acting = wrenches(loads)
-        links = np.array([load.link for load in loads])
-        for link in np.unique(links):
-            own = links == link
+        links = [load.link for load in loads]
+        for link in sorted(set(links)):
+            own = [n for n, name in enumerate(links) if name == link]
             on_link = np.zeros((len(groups), 6))
             np.add.at(on_link, column[own], acting[own])
-            total += self._jacobian(str(link)).T @ on_link.T
+            total += self._jacobian(link).T @ on_link.T
         return total
 
     def ground_reaction(self, force: Array, point: Array, moment: Array) -> PointForces:

@@ -43,7 +43,7 @@ class CrossingLines:
         along = np.einsum("...ij,cj->...ci", femur[..., :3, :3], self.thigh)
         along = along + femur[..., None, :3, 3] - start
         along = along / np.linalg.norm(along, axis=-1, keepdims=True)
-        return wrench_of(np.broadcast_to(start, along.shape), along)
+        return wrench_of(start, along)
 
     def unit_loads(self, state: "ChainState") -> list[tuple[PointForces, ...]]:
         """Return what one newton of each does to tibia and femur, insert frame."""

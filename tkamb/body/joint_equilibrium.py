@@ -130,10 +130,11 @@ class JointEquilibrium:
 
     def _columns(self, poses: Array) -> Array:
         """Return B (..., 6, 6 - n) at poses (..., 4, 4)."""
+        line = None if self.line is None else self.line.wrench(poses)[..., None]
+        if line is not None and not self.keeping.size:
+            return line
         columns = np.broadcast_to(self.keeping, (*poses.shape[:-2], *self.keeping.shape))
-        if self.line is None:
-            return columns
-        return np.concatenate([columns, self.line.wrench(poses)[..., None]], axis=-1)
+        return columns if line is None else np.concatenate([columns, line], axis=-1)
 
 
 def _magnitudes(rows: Array, columns: Array, wrench: Array) -> Array:

@@ -40,7 +40,6 @@ class PointForces:
 
 def wrench_of(points: Array, forces: Array) -> Array:
     """Return force and moment (..., 6) about the origin of forces (..., 3) at points (..., 3)."""
-    points = np.broadcast_to(points, forces.shape)
     return np.concatenate([forces, cross(points, forces)], axis=-1)
 
 

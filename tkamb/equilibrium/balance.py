@@ -22,6 +22,7 @@ doi:10.1007/978-0-387-40065-5.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import lru_cache
 
 import numpy as np
 
@@ -344,5 +345,12 @@ def smallest_eigenvalues(stiffness: Array) -> tuple[float, float]:
     Loads that follow the motion make a stiffness unsymmetric: a state is then stable against
     divergence as long as the second is positive.
     """
+    return _smallest_eigenvalues(stiffness.tobytes(), len(stiffness))
+
+
+@lru_cache(maxsize=4)
+def _smallest_eigenvalues(entries: bytes, count: int) -> tuple[float, float]:
+    """Return those of one stiffness: each step of a search asks more than once."""
+    stiffness = np.frombuffer(entries).reshape(count, count)
     symmetric = float(np.linalg.eigvalsh(0.5 * (stiffness + stiffness.T))[0])
     return symmetric, float(np.linalg.eigvals(stiffness).real.min())

@@ -233,7 +233,7 @@ def _over_each_other(
         x, y, z = upper[3 * corner], upper[3 * corner + 1], upper[3 * corner + 2]
         polygon[corner, 0], polygon[corner, 1] = x, z
         polygon[corner, 2] = y - (height + a * x + b * z)
-    count, way = np.int64(3), -1.0 if area > 0.0 else 1.0
+    count, way = 3, -1.0 if area > 0.0 else 1.0
     for first in range(3):
         second = (first + 1) % 3
         ax, az = lower[3 * first], lower[3 * first + 2]

@@ -37,6 +37,9 @@ SIDES = ("medial", "lateral")
 """The condyles."""
 
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+_ALONG = np.eye(3)
+_TURNS = np.array([-1.0, -1.0, 1.0])
+"""Signs of axial rotation, adduction and flexion as turns about y, x and z."""
 
 
 def pose(rotation: ArrayLike, translation: ArrayLike) -> Array:
@@ -95,11 +98,17 @@ def _pose_of_knee(coordinates: bytes) -> Array:
 
 
 def _poses_of_knee(c: Any) -> Array:
-    from scipy.spatial.transform import Rotation  # slow to import, and not all need it
-
-    angles = np.stack([-c[..., 3], -c[..., 4], c[..., 5]], axis=-1)
-    rotation = Rotation.from_euler("YXZ", angles.reshape(-1, 3)).as_matrix()
-    return pose(rotation.reshape(*c.shape[:-1], 3, 3), c[..., :3])
+    """Return the product of the three rotations, written out."""
+    (sa, sb, sg), (ca, cb, cg) = (
+        np.moveaxis(f(_TURNS * c[..., 3:]), -1, 0) for f in (np.sin, np.cos)
+    )
+    result = np.zeros((*c.shape[:-1], 4, 4))
+    result[..., 0, 0], result[..., 0, 1] = ca * cg + sa * sb * sg, sa * sb * cg - ca * sg
+    result[..., 1, 0], result[..., 1, 1] = cb * sg, cb * cg
+    result[..., 2, 0], result[..., 2, 1] = ca * sb * sg - sa * cg, sa * sg + ca * sb * cg
+    result[..., 0, 2], result[..., 1, 2], result[..., 2, 2] = sa * cb, -sb, ca * cb
+    result[..., :3, 3], result[..., 3, 3] = c[..., :3], 1.0
+    return result
 
 
 def knee_coordinates(pose_femoral_in_insert: ArrayLike) -> Array:
@@ -156,8 +165,18 @@ def knee_axes(coordinates: ArrayLike) -> Array:
         angular velocity, insert frame, for a unit rate of coordinate i.
     """
     c = np.asarray(coordinates, float)
+    return _axes_of_knee(c.tobytes()).copy() if c.ndim == 1 else _axes_of_knees(c)
+
+
+@lru_cache(maxsize=32)
+def _axes_of_knee(coordinates: bytes) -> Array:
+    """Return the axes of one place: a search asks for the same again and again."""
+    return _axes_of_knees(np.frombuffer(coordinates))
+
+
+def _axes_of_knees(c: Array) -> Array:
     axes = np.zeros((*c.shape[:-1], 6, 6))
-    axes[..., [0, 1, 2], [0, 1, 2]] = 1.0
+    axes[..., :3, :3] = _ALONG
     turn, tilt = c[..., 3], c[..., 4]
     axes[..., 3, 4] = -1.0
     axes[..., 4, 3], axes[..., 4, 5] = -np.cos(turn), -np.sin(turn)

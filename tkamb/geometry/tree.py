@@ -459,7 +459,7 @@ def nearest_points(
     count = len(points)
     distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)
     weights = np.full((count, 3), np.nan)
-    waiting, apart, guess = np.empty(DEEPEST, np.int64), np.empty(DEEPEST), np.int64(NO_TRIANGLE)
+    waiting, apart, guess = np.empty(DEEPEST, np.int64), np.empty(DEEPEST), int(NO_TRIANGLE)
     for n in range(count):
         place, square, s, t = _nearest_place(
             boxes, faces, corners, points[n], reach, guess, waiting, apart
