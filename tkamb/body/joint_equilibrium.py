@@ -96,21 +96,22 @@ class JointEquilibrium:
         through = np.eye(6) - columns @ np.linalg.solve(rows @ columns, rows)
         return np.asarray(-axes[list(self.released)] @ through)
 
-    def whole(self, coordinates: Array, contact: Array, kept: Array) -> Array:
-        """Return (..., 6): generalised forces on all coordinates, with what keeps some of them.
+    def kept_and_left(self, coordinates: Array, contact: Array) -> tuple[Array, Array]:
+        """Return what `kept` does and R (6,), the wrench on the insert that is left over then."""
+        axes, columns, wrench = self._sum_loads(coordinates, contact)
+        kept = _magnitudes(axes[self._prescribed], columns, wrench)
+        return kept, wrench + columns @ kept
+
+    def whole(self, coordinates: Array, contact: Array) -> Array:
+        """Return (m, 6): generalised forces on all coordinates, kept as at the last of m places.
 
         Args:
-            coordinates: (..., 6) knee coordinates.
+            coordinates: (m, 6) knee coordinates.
             contact: (6,) w_contact on the insert.
-            kept: (6 - n,) y.
         """
-        left = self.unbalanced(coordinates, contact, kept)
-        return -np.einsum("...ij,...j->...i", knee_axes(coordinates), left)
-
-    def unbalanced(self, coordinates: Array, contact: Array, kept: Array) -> Array:
-        """Return R (..., 6), the wrench on the insert that is left over; see `whole`."""
-        _, columns, wrench = self._sum_loads(coordinates, contact)
-        return np.asarray(wrench + columns @ kept)
+        axes, columns, wrench = self._sum_loads(coordinates, contact)
+        kept = _magnitudes(axes[-1, self._prescribed], columns[-1], wrench[-1])
+        return -np.einsum("mij,mj->mi", axes, wrench + columns @ kept)
 
     def columns(self, coordinates: Array) -> Array:
         """Return B (6, 6 - n) at coordinates (6,)."""

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.body.joint_equilibrium import joint_equilibrium
+from tkamb.body.joint_equilibrium import JointEquilibrium, joint_equilibrium
 from tkamb.body.knee import KneeGeometry
 from tkamb.equilibrium.balance import Balance, BalanceStatus
 from tkamb.equilibrium.mechanics import Mechanics
@@ -203,13 +203,16 @@ class ReleasedKnee:
         """Return the knee at rest with the patella as at `place`, and whether it would push."""
         patella = self._patella(k, place, before.patella if before else None)
         geometry = self._mechanics.geometry(k, place, patella)
+        joint = self._joint(geometry, middle, slack)
         muscles = self._mechanics.muscles
         if muscles is not None and not geometry.problems:
             held = None if touch is None or before is None else before.geometry.share
             held = None if held is None else muscles.at(k, held)
-            share = mixing.mixed(self._share(k, geometry, middle, touch, held, mixing))
-            geometry, slack = replace(geometry, share=share), muscles.tension(share) < SLACK
-        forces = self._forces(k, geometry, middle, slack, touch)
+            share = mixing.mixed(self._share(k, geometry, joint, touch, held, mixing))
+            geometry, joint = replace(geometry, share=share), replace(joint, share=share)
+            if slack := muscles.tension(share) < SLACK:
+                joint = self._joint(geometry, middle, slack)
+        forces = self._forces(k, joint, place, touch)
         stiffness = before.balance.stiffness if before else None
         balance = forces.balance(stiffness, *((LEFT, reach) if muscles else ()))
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
@@ -236,7 +239,7 @@ class ReleasedKnee:
         self,
         k: int,
         geometry: KneeGeometry,
-        middle: Array,
+        joint: JointEquilibrium,
         touch: "ProbedContact | None",
         held: "MuscleShare | None",
         mixing: Relaxation,
@@ -250,7 +253,7 @@ class ReleasedKnee:
         Args:
             k: frame.
             geometry: the frame without its contact.
-            middle: (3,) m, where residual forces act.
+            joint: its equations, the extensor mechanism taut.
             touch: the contact there; None where the search begins without one like the last
                 frame's.
             held: what was held last, in this frame or the one before.
@@ -265,7 +268,7 @@ class ReleasedKnee:
         here = self._probe.at(knee_pose(place)) if touch is None else touch
         gain = None
         if held is not None:
-            forces = self._forces(k, replace(geometry, share=held), middle, False)
+            forces = self._forces(k, replace(joint, share=held), place)
             smooth = self._probe.smoothed(knee_pose(place), here)
             gain = mixing.yielding(forces.tension_per_wrench(smooth))
         if held is not None and gain is not None:
@@ -294,25 +297,19 @@ class ReleasedKnee:
             return None
         return extensor.patella(k, knee_pose(place), guess)
 
+    def _joint(self, geometry: KneeGeometry, middle: Array, slack: bool) -> JointEquilibrium:
+        ligaments, place = self._mechanics.ligaments, geometry.coordinates
+        return joint_equilibrium(geometry, ligaments, place, self.released, middle, slack)
+
     def _forces(
         self,
         k: int,
-        geometry: KneeGeometry,
-        middle: Array,
-        slack: bool,
+        joint: JointEquilibrium,
+        place: Array,
         touch: "ProbedContact | None" = None,
     ) -> "ReleasedForces":
-        mechanics = self._mechanics
-        joint = joint_equilibrium(
-            geometry,
-            mechanics.ligaments,
-            geometry.coordinates,
-            self.released,
-            middle,
-            slack,
-        )
-        sliding = partial(mechanics.sliding, k)
-        place, friction = geometry.coordinates, mechanics.friction
+        sliding = partial(self._mechanics.sliding, k)
+        friction = self._mechanics.friction
         return ReleasedForces(joint, self._probe, place, friction, sliding, touch)
 
 

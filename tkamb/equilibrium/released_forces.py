@@ -160,10 +160,9 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
         wrench, stiffness = self._with_friction(place, contact)
         if stiffness is None:
             return None
-        kept = self._joint.kept(place, wrench)
         steps = np.zeros((len(self._rows) + 1, 6))
         steps[np.arange(len(self._rows)), self._rows] = TINY / self._scale
-        forces = self._joint.whole(place + steps, wrench, kept)
+        forces = self._joint.whole(place + steps, wrench)
         axes = knee_axes(place)
         twists = axes[self._rows] / self._scale[:, None]
         change = (forces[:-1] - forces[-1]).T / TINY - axes @ stiffness @ twists.T
@@ -180,8 +179,8 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
             per_wrench: (6,), see `tension_per_wrench`.
         """
         wrench, _ = self._with_friction(self._place, contact)
-        kept = self._joint.kept(self._place, wrench)
-        return float(kept[-1] + per_wrench @ self._joint.unbalanced(self._place, wrench, kept))
+        kept, left = self._joint.kept_and_left(self._place, wrench)
+        return float(kept[-1] + per_wrench @ left)
 
     def pushes(self, balance: Balance) -> bool:
         """Return whether the patellar ligament, where it is taut, would have to push."""
