@@ -55,7 +55,9 @@ class FirstTouch:
 
     def __init__(self, femoral: Surface, insert: Surface, split: float | None = None) -> None:
         self._femoral, self._split = femoral, split
-        self._insert = _arrays(insert.tree)
+        # what faces down or aside is never the topmost but at an edge of what faces up
+        upward = np.flatnonzero(insert.face_normals[:, 1] > 0.0)
+        self._insert = _arrays(TriangleTree(insert, upward) if len(upward) else insert.tree)
 
     @cached_property
     def _whole(self) -> tuple[Array, Array, Array]:
