@@ -5,7 +5,7 @@ import pytest
 import scipy.sparse.linalg as linalg
 
 from lattice_blocks import block, uniform_strain
-from tkamb.contact.lattice.meshing.cells import gauss_gradients, mean_gradient
+from tkamb.contact.lattice.meshing.cells import PAIRS, gauss_gradients, mean_gradient
 from tkamb.contact.lattice.solids.bbar import BbarHexahedra
 from tkamb.contact.lattice.solids.calibrated import (
     CalibratedNetwork,
@@ -33,7 +33,7 @@ def cell_of(corners, edges):
     """Return K_d (s, 24, 24), g (s, 24) and V (s,) of cells in a lattice of boxes."""
     gradients, volume = mean_gradient(corners)
     springs = spring_families(edges, body_diagonal_stiffness(edges))
-    matrices = deviatoric_matrices(corners, gradients, volume, springs)
+    matrices = deviatoric_matrices(corners, gradients, volume, springs, PAIRS)
     return matrices, gradients.reshape(-1, 24), volume
 
 

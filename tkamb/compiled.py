@@ -2,8 +2,8 @@
 
 Import it only where meshes or a lattice are: it takes 0.1 to 0.4 s. The compiled code lies beside
 the module or, where that folder cannot be written, in the user's cache (`NUMBA_CACHE_DIR` says
-where). Indices are not held against bounds. A compiled function calls none of another file: what
-is kept would not notice that one changed.
+where). Indices are not held against bounds. A compiled function uses nothing of another file:
+what is kept would not notice that one changed.
 """
 
 import logging

@@ -30,7 +30,7 @@ from tkamb.contact.lattice.solids.cell_loops import (
     shear_forces,
     softened_forces,
 )
-from tkamb.contact.lattice.solids.curve import ShearCurve
+from tkamb.contact.lattice.solids.curve import LEAST_STRAIN, ShearCurve
 from tkamb.contact.lattice.solids.solid import Solid, chunks
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array, Index
@@ -121,7 +121,7 @@ class CalibratedNetwork(Solid):
     def _deviatoric(self, cells: slice) -> Array:
         """Return K_d of some cells (k, 24, 24), m per unit shear modulus."""
         measures = self.gradients[cells], self.volume[cells]
-        return deviatoric_matrices(self.corners(cells), *measures, self.springs)
+        return deviatoric_matrices(self.corners(cells), *measures, self.springs, PAIRS)
 
     @property
     def stiffness(self) -> sparse.csr_matrix:
@@ -141,7 +141,7 @@ class CalibratedNetwork(Solid):
         cells = np.arange(len(self.cells)) if chosen is None else chosen
         if self.curve.spline is None:
             return np.zeros((len(cells), 24))
-        curve = (self.curve.shear_modulus, self.curve.spline.x, self.curve.spline.c)
+        curve = self.curve.shear_modulus, self.curve.spline.x, self.curve.spline.c, LEAST_STRAIN
         return softened_forces(*self._shapes, *curve, self.cells, cells, displacement)
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:

@@ -3,13 +3,13 @@
 import numpy as np
 
 from tkamb.compiled import compiled
-from tkamb.contact.lattice.meshing.cells import PAIRS
-from tkamb.contact.lattice.solids.curve import LEAST_STRAIN
 from tkamb.geometry.frames import Array, Index
 
 
 @compiled
-def deviatoric_matrices(corners: Array, gradients: Array, volumes: Array, springs: Array) -> Array:
+def deviatoric_matrices(
+    corners: Array, gradients: Array, volumes: Array, springs: Array, pairs: Index
+) -> Array:
     """Return K_d = V B̄ᵀ (2 I_dev) B̄ + Pᵀ K_spr P of cells (c, 24, 24), m per unit shear modulus.
 
     Between nodes i and j the first part is V (g_i·g_j I + g_j g_iᵀ - 2/3 g_i g_jᵀ). A spring
@@ -21,10 +21,11 @@ def deviatoric_matrices(corners: Array, gradients: Array, volumes: Array, spring
         gradients: (c, 8, 3) mean gradients g, 1/m.
         volumes: (c,) m³.
         springs: (28,) m, `spring_families` of the nominal box.
+        pairs: (28, 2) corners that they join.
     """
     result = np.zeros((len(corners), 24, 24))
     rest = np.empty((8, 8))
-    pulled, force = np.empty((len(PAIRS), 24)), np.empty((len(PAIRS), 24))
+    pulled, force = np.empty((len(pairs), 24)), np.empty((len(pairs), 24))
     for cell in range(len(corners)):
         x, g, matrix = corners[cell], gradients[cell], result[cell]
         for i in range(8):
@@ -37,8 +38,8 @@ def deviatoric_matrices(corners: Array, gradients: Array, volumes: Array, spring
                     matrix[3 * i + a, 3 * j + a] += volumes[cell] * product
                 rest[i, j] = -(x[i, 0] * g[j, 0] + x[i, 1] * g[j, 1] + x[i, 2] * g[j, 2])
             rest[i, i] += 1.0
-        for spring in range(len(PAIRS)):
-            first, second = PAIRS[spring, 0], PAIRS[spring, 1]
+        for spring in range(len(pairs)):
+            first, second = pairs[spring, 0], pairs[spring, 1]
             line = x[second] - x[first]
             stiffness = springs[spring] / (line[0] ** 2 + line[1] ** 2 + line[2] ** 2)
             for i in range(8):
@@ -162,6 +163,7 @@ def softened_forces(
     shear_modulus: float,
     knots: Array,
     cubic: Array,
+    least: float,
     nodes: Index,
     chosen: Index,
     displacement: Array,
@@ -176,6 +178,7 @@ def softened_forces(
         shear_modulus: mu, Pa.
         knots: (q,) e between which 3 mu_s e is cubic.
         cubic: (4, q - 1) its coefficients, the highest power first.
+        least: the smallest e that is told from none.
         nodes: (c, 8) of the cells.
         chosen: (k,) cells.
         displacement: (n, 3) m.
@@ -186,7 +189,7 @@ def softened_forces(
         cell, force = chosen[k], forces[k].reshape(8, 3)
         x, g, volume = corners[cell], gradients[cell], volumes[cell]
         energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, rest, force)
-        strain = min(max(np.sqrt(energy / (3 * volume)), LEAST_STRAIN), knots[-1])
+        strain = min(max(np.sqrt(energy / (3 * volume)), least), knots[-1])
         part = min(np.searchsorted(knots, strain, side="right") - 1, len(knots) - 2)
         y = strain - knots[part]
         stress = ((cubic[0, part] * y + cubic[1, part]) * y + cubic[2, part]) * y + cubic[3, part]
