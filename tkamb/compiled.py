@@ -28,12 +28,15 @@ def compiled(function: Function) -> Function:
 
 
 def compiled_as_written(function: Function) -> Function:
-    """Return the function compiled without that freedom: equal numbers stay equal."""
-    return _compiled(function, set())
+    """Return the function compiled without that freedom: equal numbers stay equal.
+
+    What is divided by zero is inf or NaN, as with numpy.
+    """
+    return _compiled(function, set(), error_model="numpy")
 
 
-def _compiled(function: Function, fastmath: set[str]) -> Function:
-    options: dict[str, Any] = {"nogil": True, "fastmath": fastmath or False}
+def _compiled(function: Function, fastmath: set[str], **more: str) -> Function:
+    options: dict[str, Any] = {"nogil": True, "fastmath": fastmath or False, **more}
     compiler: Any = njit
     try:
         return cast(Function, compiler(cache=True, **options)(function))

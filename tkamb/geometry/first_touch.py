@@ -21,8 +21,9 @@ ROUNDING = 1e-12
 """m; what a plane's height may be wrong by."""
 MOST_WAITING = 256
 """Pairs of boxes that wait at one time: two for each level of both trees."""
-MOST_CORNERS = 8
-"""Of one triangle cut by another: six, and what rounding adds."""
+MOST_CORNERS = 9
+"""Of one triangle cut by another: six, and what rounding adds. A cut that crosses c of n sides
+leaves at most n + c / 2 corners, and c is even: 4, 6 and 9 after the three cuts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,15 +65,17 @@ class FirstTouch:
         return _arrays(self._femoral.tree)
 
     @cached_property
-    def _condyles(self) -> list[tuple[Array, Array, Array]]:
-        """Medial and lateral."""
+    def _condyles(self) -> list[tuple[Array, Array, Array] | None]:
+        """Medial and lateral; None for one without a triangle."""
         sides = condyle_faces(self._femoral, self._split)
-        return [_arrays(TriangleTree(self._femoral, faces)) for faces in sides if len(faces)]
+        return [
+            _arrays(TriangleTree(self._femoral, faces)) if len(faces) else None for faces in sides
+        ]
 
     def at(self, pose: ArrayLike) -> tuple[Touch | None, Touch | None]:
         """Return the touch of the medial and of the lateral condyle.
 
-        None where no part of that condyle lies over the insert.
+        None where no part of that condyle lies over the insert, or the pose is not finite.
 
         Args:
             pose: (4, 4) pose_femoral_in_insert; its y is where the travel starts.
@@ -92,7 +95,9 @@ class FirstTouch:
         """Return the first touch of either condyle; None if none lies over the insert."""
         return self._touch(np.asarray(pose, float), self._whole)
 
-    def _touch(self, pose: Array, part: tuple[Array, Array, Array]) -> Touch | None:
+    def _touch(self, pose: Array, part: tuple[Array, Array, Array] | None) -> Touch | None:
+        if part is None or not np.isfinite(pose).all():
+            return None
         rotation, translation = np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy()
         travel, point = _least_clearance(*part, *self._insert, rotation, translation)
         return Touch(travel, point) if np.isfinite(travel) else None
@@ -226,8 +231,8 @@ def _over_each_other(
         lower: m.
         plane: of the lower one, not a wall.
         best: m.
-        polygon: (8, 3) to work in.
-        kept: (8, 3) likewise.
+        polygon: (`MOST_CORNERS`, 3) to work in.
+        kept: likewise.
         point: (3,) m, written where a smaller clearance is found: on the lower triangle.
     """
     height, a, b, area = plane

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.normals import NO_CREASE, corner_normals, mean_normals
-from tkamb.geometry.tree import TriangleTree, nearest_points
+from tkamb.geometry.tree import TriangleTree, nearest_points, rows
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
@@ -64,17 +64,20 @@ class NearestPoints:
         return corner_normals(self.surface, NO_CREASE, area)
 
     def at(self, points: ArrayLike) -> Nearest:
-        """Return the nearest points to `points` (n, 3), m, in the surface's frame."""
-        return self._found(np.ascontiguousarray(points, float).reshape(-1, 3), np.inf)
+        """Return the nearest points to `points` (n, 3), m, in the surface's frame.
+
+        NaN, infinitely far, in the triangle -1, for a point that is not finite.
+        """
+        return self._found(points, np.inf)
 
     def within(self, points: Array, reach: float) -> tuple[Index, Nearest]:
         """Return which points (n, 3) have one within `reach`, m, and what `at` says of those."""
-        found = self._found(np.ascontiguousarray(points), reach)
+        found = self._found(points, reach)
         near = np.flatnonzero(found.faces >= 0)
         return near, Nearest(found.distance[near], found.faces[near], found.weights[near], self)
 
-    def _found(self, points: Array, reach: float) -> Nearest:
-        return Nearest(*nearest_points(*self._tree, points, reach), self)
+    def _found(self, points: ArrayLike, reach: float) -> Nearest:
+        return Nearest(*nearest_points(*self._tree, rows(points), float(reach)), self)
 
 
 def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tkamb.geometry.frames import Array, Index
-from tkamb.geometry.tree import TriangleTree, all_crossings, first_crossings
+from tkamb.geometry.tree import TriangleTree, all_crossings, first_crossings, rows
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
@@ -62,7 +62,7 @@ class RayCaster:
         Returns:
             distance (n,) m, face (n,), barycentric coordinates (n, 3), NaN where nothing is hit.
         """
-        rays = _rows(origins), _rows(directions)
+        rays = _rays(origins, directions)
         return first_crossings(*self._tree, *rays, -self._same, EDGE_TOLERANCE)
 
     def all(self, origins: ArrayLike, directions: ArrayLike) -> tuple[Index, Array, Index]:
@@ -78,7 +78,7 @@ class RayCaster:
         Returns:
             ray (m,), distance (m,) m and face (m,), sorted by ray, then by distance.
         """
-        rays = _rows(origins), _rows(directions)
+        rays = _rays(origins, directions)
         number, room = USUAL * len(rays[0]), -1
         while number > room:
             room = number
@@ -104,6 +104,9 @@ class RayCaster:
         return ray[order], t[order], face[order]
 
 
-def _rows(vectors: ArrayLike) -> Array:
-    """Return vectors (n, 3), row after row in memory; one (3,) as (1, 3)."""
-    return np.ascontiguousarray(vectors, np.float64).reshape(-1, 3)
+def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Array, Array]:
+    """Return origins (n, 3) and directions (n, 3), or (1, 3) for all."""
+    rays = rows(origins), rows(directions)
+    if len(rays[1]) not in (1, len(rays[0])):
+        raise ValueError(f"{len(rays[1])} directions for {len(rays[0])} rays")
+    return rays

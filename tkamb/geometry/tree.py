@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tkamb.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
@@ -31,6 +32,14 @@ STILL = 1e-200
 PARALLEL = 1e-9
 """Sine of the angle to a triangle's plane below which a ray does not cross it."""
 NO_TRIANGLE = -1
+
+
+def rows(vectors: ArrayLike) -> Array:
+    """Return vectors (n, 3) as the loops take them; one (3,) as (1, 3).
+
+    Double precision, row after row, to be written: for others they would be compiled anew.
+    """
+    return np.require(vectors, np.float64, ["C", "W", "E"]).reshape(-1, 3)
 
 
 class TriangleTree:
@@ -96,7 +105,8 @@ def _halved(centres: Array) -> Index:
     leaves = 1
     while leaves * LEAF < len(centres):
         leaves *= 2
-    order = np.arange(leaves * -(-len(centres) // leaves)) % len(centres)
+    room = leaves * -(-len(centres) // leaves)
+    order = np.arange(room) * len(centres) // room  # sorted ones stay sorted, and quickly parted
     _halve(np.ascontiguousarray(centres), order, leaves)
     return order.reshape(leaves, -1)
 
@@ -198,7 +208,10 @@ def _entry(box: Array, origin: Array, slowness: Array) -> float:
 
 @compiled_as_written
 def _set_direction(vector: Array, direction: Array, slowness: Array) -> None:
-    """Write a vector (3,) at unit length, and one over that; a number where it does not go."""
+    """Write a vector (3,) at unit length, and one over that; a number where it does not go.
+
+    One of no length makes a direction of NaN, which meets nothing.
+    """
     length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
     for axis in range(3):
         along = vector[axis] / length
@@ -240,6 +253,8 @@ def first_crossings(
         origin = origins[n]
         if n < len(directions):
             _set_direction(directions[n], direction, slowness)
+        if not np.isfinite(origin[0] + origin[1] + origin[2]):
+            continue
         best, found, size = np.inf, NO_TRIANGLE, 1
         waiting[0], enters[0] = 1, _entry(boxes[1], origin, slowness)
         while size > 0:
@@ -304,6 +319,8 @@ def all_crossings(
         origin = origins[n]
         if n < len(directions):
             _set_direction(directions[n], direction, slowness)
+        if not np.isfinite(origin[0] + origin[1] + origin[2]):
+            continue
         waiting[0], size = 1, 1
         while size > 0:
             size -= 1
@@ -454,15 +471,19 @@ def nearest_points(
         reach: m.
 
     Returns:
-        Distance (n,) m, inf for none; triangle (n,), -1; barycentrics (n, 3), NaN.
+        Distance (n,) m, inf for none and for points that are not finite; triangle (n,), -1;
+        barycentrics (n, 3), NaN.
     """
     count = len(points)
     distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)
     weights = np.full((count, 3), np.nan)
     waiting, apart, guess = np.empty(DEEPEST, np.int64), np.empty(DEEPEST), int(NO_TRIANGLE)
     for n in range(count):
+        point = points[n]
+        if not np.isfinite(point[0] + point[1] + point[2]):
+            continue
         place, square, s, t = _nearest_place(
-            boxes, faces, corners, points[n], reach, guess, waiting, apart
+            boxes, faces, corners, point, reach, guess, waiting, apart
         )
         if place >= 0:
             guess = place  # the next point may lie beside this one

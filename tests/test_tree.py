@@ -1,0 +1,126 @@
+"""The tree of boxes and what asks it: sorted triangles, numbers that are none, other arrays."""
+
+import numpy as np
+import pytest
+
+from shapes import plate, sphere
+from tkamb.geometry import first_touch, tree
+from tkamb.geometry.first_touch import MOST_CORNERS, FirstTouch
+from tkamb.geometry.frames import pose
+from tkamb.geometry.surface import Surface
+
+DOWN = (0.0, -1.0, 0.0)
+NONE = np.array([[np.nan, 0.0, 0.0], [0.0, np.nan, 0.0], [0.0, 0.0, np.inf], [-np.inf, 0.0, 0.0]])
+"""Points that are none."""
+WALL = [
+    -0.013631006651548021,
+    0.0031447617921752657,
+    -0.02176825365033125,
+    -0.00838428271569204,
+    0.021726416192594522,
+    -0.022365226031762588,
+    -0.009741992311259998,
+    0.0038915233313396138,
+    -0.022210745799818354,
+]
+SLIVER = [
+    -0.0020669894239509334,
+    0.009999999999999998,
+    -0.023084007821442487,
+    -0.022784576370504496,
+    0.009999999999999998,
+    -0.020726760257400948,
+    -0.016221770321141592,
+    0.009999999999999998,
+    -0.021473476494820253,
+]
+"""Corners, m: both upright and level along one line, to within the rounding of coordinates."""
+
+
+def ribbon(count):
+    """So many triangles in a row along x, in this order."""
+    x = np.arange(count + 2.0)
+    corners = np.stack([x, 0.0 * x, x % 2], axis=1)
+    first = np.arange(count)[:, None]
+    return Surface(corners, first + np.arange(3))
+
+
+def test_no_point_lies_nearest_to_one_that_is_none():
+    ball = sphere(0.02, 2)
+    found = ball.nearest.at(np.concatenate([NONE, [[0.0, 0.03, 0.0]]]))
+    assert np.isinf(found.distance[:-1]).all() and (found.faces[:-1] == -1).all()
+    assert np.isnan(found.points[:-1]).all()
+    assert found.points[-1] == pytest.approx([0.0, 0.02, 0.0])
+
+
+def test_rays_from_or_along_what_is_none_meet_nothing():
+    rays = sphere(0.02, 2).rays
+    start = np.array([[0.0, 0.05, 0.0]])
+    for origins, directions in [(NONE, DOWN), (np.tile(start, (4, 1)), NONE), (start, np.zeros(3))]:
+        distance, face, weights = rays.first_in_face(origins, directions)
+        assert np.isinf(distance).all() and (face == -1).all() and np.isnan(weights).all()
+        assert len(rays.all(origins, directions)[0]) == 0
+    after, _ = rays.first(np.concatenate([NONE, start]), DOWN)
+    assert after[-1] == pytest.approx(0.03)
+
+
+def test_rays_have_one_direction_or_each_its_own():
+    rays = sphere(0.02, 2).rays
+    for count, directions in [(3, 2), (3, 0), (1, 2)]:
+        with pytest.raises(ValueError, match=f"{directions} directions for {count} rays"):
+            rays.first(np.zeros((count, 3)), np.ones((directions, 3)))
+
+
+def test_a_condyle_is_not_looked_for_at_a_pose_that_is_none(monkeypatch):
+    """Each comparison with NaN is false: every triangle would be held against every other."""
+    touch = FirstTouch(sphere(0.02, 2), plate())
+    monkeypatch.setattr(first_touch, "_least_clearance", None)
+    for place in [(0, 0), (0, 3), (1, 3)]:
+        at = np.eye(4)
+        at[place] = np.nan
+        assert np.isnan(touch.travel(at))
+
+
+def test_a_side_without_a_triangle_does_not_touch():
+    medial, lateral = FirstTouch(sphere(0.02, 2), plate(), -1.0).at(pose(np.eye(3), [0, 0.05, 0]))
+    assert medial is None
+    assert lateral.travel == pytest.approx(0.02)
+
+
+def test_triangles_cut_to_shreds_by_rounding_stay_in_their_room():
+    """A wall along a sliver, whose corners lie on either side of each of its edges by rounding."""
+    wall, sliver = np.ravel(WALL), np.ravel(SLIVER)
+    room = np.full((2, MOST_CORNERS + 8, 3), np.pi)
+    plane = first_touch._plane(sliver)
+    work = room[0, :MOST_CORNERS], room[1, :MOST_CORNERS]
+    first_touch._over_each_other(wall, sliver, plane, np.inf, *work, np.empty(3))
+    assert (room[:, MOST_CORNERS - 1] != np.pi).any(), "not as many corners as there can be"
+    assert (room[:, MOST_CORNERS:] == np.pi).all()
+
+
+def test_what_is_asked_in_other_arrays_is_not_compiled_anew():
+    ball = sphere(0.02, 2)
+    points = np.zeros((4, 3))
+    asked = [lambda p: ball.rays.first(p, DOWN), lambda p: ball.rays.all(p, DOWN)]
+    asked += [lambda p: ball.rays.first(points, p), ball.nearest.at]
+    asked += [lambda p: ball.nearest.within(p, 1)]
+    loops = tree.first_crossings, tree.all_crossings, tree.nearest_points
+    fixed = points + 0.0
+    fixed.setflags(write=False)
+    others = fixed, points.astype(np.float32), np.asfortranarray(points), points.tolist()
+    for ask in asked:
+        ask(points)
+    known = [set(loop.signatures) for loop in loops]
+    for ask in asked:
+        for other in others:
+            ask(other)
+    assert [set(loop.signatures) for loop in loops] == known
+
+
+def test_sorted_triangles_are_parted_as_they_come(monkeypatch):
+    """Some twice, to fill the leaves: the first ones after the last made it quadratic."""
+    orders = []
+    monkeypatch.setattr(tree, "_halve", lambda centres, order, leaves: orders.append(order))
+    for count in (5, 63, 100):
+        assert np.array_equal(np.unique(ribbon(count).tree.faces), np.arange(count))
+    assert len(orders) == 3 and all((np.diff(order) >= 0).all() for order in orders)
