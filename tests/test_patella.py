@@ -257,6 +257,17 @@ def test_a_prepared_contact_that_is_used_again_remembers_nothing() -> None:
     np.testing.assert_array_equal(again.normal, fresh.normal)
 
 
+def test_a_place_that_is_none_has_no_gap_and_is_forgotten() -> None:
+    contact = PatellofemoralContact(cylinder(), dome())
+    touching = np.array([TROCHLEA + DOME - CENTRE[0], 0.0, 0.0])
+    gap = contact.at(touching).gap
+    for axis in range(3):
+        nowhere = touching.copy()
+        nowhere[axis] = np.nan
+        assert np.isnan(contact.at(nowhere).gap)
+        assert contact.at(touching).gap == gap
+
+
 def test_gap_is_smooth_through_touch() -> None:
     contact = PatellofemoralContact(cylinder(), dome())
     x = TROCHLEA + DOME - 0.004 + np.linspace(-5e-4, 5e-4, 21)

@@ -8,7 +8,7 @@ import trimesh
 
 from tkamb.body.load import LinkPoint, total_wrench
 from tkamb.body.muscles import Line, Wrap
-from tkamb.body.wrapping import taut_path
+from tkamb.body.wrapping import is_inside, taut_path
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
 from tkamb.geometry.sections import convex_outline, sagittal_outline, sagittal_section
@@ -173,6 +173,14 @@ def test_moment_arm_has_no_jump_when_wrapping_starts() -> None:
 def test_inside_start_is_refused() -> None:
     with pytest.raises(ComputationError, match="inside"):
         taut_path(np.zeros(3), np.array([0.1, 0.0, 0.0]), CIRCLE)
+
+
+def test_a_point_that_is_none_is_not_inside_and_has_no_length() -> None:
+    for axis in range(2):
+        start = np.array([0.0, 0.1, 0.0])
+        start[axis] = np.nan
+        assert not is_inside(start, CIRCLE)
+        assert np.isnan(taut_path(start, np.array([0.0, -0.1, 0.0]), CIRCLE).length)
 
 
 def test_section_of_a_cylinder_is_its_circle() -> None:

@@ -215,7 +215,8 @@ def _which_matter(
             side = 0 if left[n] else 1
             nearest[side] = min(nearest[side], distance[n] + moved[n])
     for n in range(count):
-        if moved[n] > 0.0 and distance[n] - moved[n] < nearest[0 if left[n] else 1] + reach:
+        beyond = distance[n] - moved[n] >= nearest[0 if left[n] else 1] + reach
+        if moved[n] != 0.0 and not beyond:  # nor where it is NaN
             which[number] = n
             number += 1
     return which[:number]
@@ -290,7 +291,7 @@ def _mean_over_sides(
     """Write g, p, n and the share on edges (2, 8), left and right.
 
     Args:
-        left: (n,) see `_look`, as of the others.
+        left: (n,) see `_which_matter`.
         depth: m, tau of the module's equation.
         reach: m.
         distance: (n,) m.

@@ -127,10 +127,10 @@ def _height(point: Array, outline: Array, edge: int) -> float:
 
 @compiled_as_written
 def _is_inside(point: Array, outline: Array) -> bool:
-    lowest = np.inf
+    outside = False
     for edge in range(len(outline)):
-        lowest = min(lowest, _height(point, outline, edge))
-    return lowest >= 0.0
+        outside |= not _height(point, outline, edge) >= 0.0  # NaN is not inside
+    return not outside
 
 
 @compiled_as_written
