@@ -2,6 +2,9 @@
 
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from shapes import plate, sphere
 from tkamb.geometry import first_touch, tree
@@ -124,3 +127,44 @@ def test_sorted_triangles_are_parted_as_they_come(monkeypatch):
     for count in (5, 63, 100):
         assert np.array_equal(np.unique(ribbon(count).tree.faces), np.arange(count))
     assert len(orders) == 3 and all((np.diff(order) >= 0).all() for order in orders)
+
+
+def heights_over(points, triangle):
+    """Height of a triangle's plane at the x and z of points (n, 3); NaN beside the triangle."""
+    a, b, c = triangle
+    weights = np.linalg.solve(np.stack([b - a, c - a])[:, [0, 2]].T, (points - a)[:, [0, 2]].T).T
+    inside = (weights >= 0.0).all(axis=1) & (weights.sum(axis=1) <= 1.0)
+    return np.where(inside, a[1] + weights @ [b[1] - a[1], c[1] - a[1]], np.nan)
+
+
+def clearance(upper, lower):
+    """Least clearance of two triangles: at corners, and where edges cross, seen from above."""
+    apart = [*(upper[:, 1] - heights_over(upper, lower))]
+    apart += [*(heights_over(lower, upper) - lower[:, 1])]
+    for i, j in np.ndindex(3, 3):
+        (p, q), (r, s) = upper[[i, i - 1]], lower[[j, j - 1]]
+        along, across = np.linalg.solve(np.stack([q - p, r - s], axis=1)[[0, 2]], (r - p)[[0, 2]])
+        if min(along, across) >= 0.0 and max(along, across) <= 1.0:
+            apart.append(p[1] + along * (q - p)[1] - r[1] - across * (s - r)[1])
+    return np.nan_to_num(apart, nan=np.inf).min()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([1e-6, 0.03, 1e3]))
+def test_first_touch_is_the_least_clearance_of_any_two_triangles(seed, scale):
+    rng = np.random.default_rng(seed)
+    counts = rng.integers(1, 12, 2)
+    femoral, insert = (
+        Surface(rng.normal(size=(3 * n, 3)) * scale, np.arange(3 * n).reshape(-1, 3))
+        for n in counts
+    )
+    at = pose(Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3) * scale)
+    upper = femoral.moved(at).triangles
+    upward = insert.triangles[insert.face_normals[:, 1] > 0.0]
+    assume(len(upward))
+    expected = min(clearance(one, other) for one in upper for other in upward)
+    found = FirstTouch(femoral, insert).travel(at)
+    if np.isinf(expected):
+        assert np.isnan(found)
+    else:
+        assert found == pytest.approx(expected, abs=1e-9 * scale)
