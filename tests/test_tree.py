@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from shapes import plate, sphere
-from tkamb.geometry import first_touch, tree
+from tkamb.geometry import first_touch, nearest, rays, tree
 from tkamb.geometry.first_touch import MOST_CORNERS, FirstTouch
 from tkamb.geometry.frames import pose
 from tkamb.geometry.surface import Surface
@@ -107,7 +107,7 @@ def test_what_is_asked_in_other_arrays_is_not_compiled_anew():
     asked = [lambda p: ball.rays.first(p, DOWN), lambda p: ball.rays.all(p, DOWN)]
     asked += [lambda p: ball.rays.first(points, p), ball.nearest.at]
     asked += [lambda p: ball.nearest.within(p, 1)]
-    loops = tree.first_crossings, tree.all_crossings, tree.nearest_points
+    loops = rays._first_crossings, rays._all_crossings, nearest._nearest_points
     fixed = points + 0.0
     fixed.setflags(write=False)
     others = fixed, points.astype(np.float32), np.asfortranarray(points), points.tolist()

@@ -7,15 +7,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tkamb.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.normals import NO_CREASE, corner_normals, mean_normals
-from tkamb.geometry.tree import TriangleTree, nearest_points, rows
+from tkamb.geometry.tree import TriangleTree, rows
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
 
 
 _MOST_SAMPLES = 150_000
+FLAT = 1e-14
+"""A triangle whose squared area is less, relative to its edges', has no plane."""
+DEEPEST = 64
+"""Boxes that wait at one time: one of each level."""
+NO_TRIANGLE = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +83,7 @@ class NearestPoints:
         return near, Nearest(found.distance[near], found.faces[near], found.weights[near], self)
 
     def _found(self, points: ArrayLike, reach: float) -> Nearest:
-        return Nearest(*nearest_points(*self._tree, rows(points), float(reach)), self)
+        return Nearest(*_nearest_points(*self._tree, rows(points), float(reach)), self)
 
 
 def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
@@ -110,3 +116,154 @@ def _centres(n: int) -> Array:
     first = np.concatenate([i[upright] + 1 / 3, i[inverted] + 2 / 3]) / n
     second = np.concatenate([j[upright] + 1 / 3, j[inverted] + 2 / 3]) / n
     return np.stack([1 - first - second, first, second], axis=1)
+
+
+@compiled_as_written
+def _apart(box: Array, point: Array) -> float:
+    """Return the squared distance of a point from a box, m²."""
+    total = 0.0
+    for axis in range(3):
+        beside = max(box[axis] - point[axis], point[axis] - box[axis + 3], 0.0)
+        total += beside * beside
+    return total
+
+
+@compiled_as_written
+def _on_edge(along: float, length: float) -> float:
+    """Return where on an edge the nearest point lies, 0 to 1."""
+    return min(max(along / length, 0.0), 1.0) if length > 0.0 else 0.0
+
+
+@compiled_as_written
+def _foot(corners: Array, point: Array) -> tuple[float, float, float]:
+    """Return the squared distance of a triangle's nearest point and its barycentrics 2 and 3.
+
+    The foot on the triangle's plane where that lies inside, else the nearest of the feet on the
+    three edges. Free of absolute tolerances, so right for triangles of any size.
+
+    Args:
+        corners: (9,) m.
+        point: (3,) m.
+    """
+    ux, uy, uz = corners[3] - corners[0], corners[4] - corners[1], corners[5] - corners[2]
+    vx, vy, vz = corners[6] - corners[0], corners[7] - corners[1], corners[8] - corners[2]
+    wx, wy, wz = point[0] - corners[0], point[1] - corners[1], point[2] - corners[2]
+    uu, uv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz
+    vv = vx * vx + vy * vy + vz * vz
+    wu, wv = wx * ux + wy * uy + wz * uz, wx * vx + wy * vy + wz * vz
+    area = uu * vv - uv * uv
+    least, second, third = np.inf, 0.0, 0.0
+    if area > FLAT * uu * vv:
+        s, t = (vv * wu - uv * wv) / area, (uu * wv - uv * wu) / area
+        if s >= 0.0 and t >= 0.0 and s + t <= 1.0:
+            x, y, z = wx - s * ux - t * vx, wy - s * uy - t * vy, wz - s * uz - t * vz
+            return x * x + y * y + z * z, s, t
+    for edge in range(3):
+        if edge == 0:
+            s, t = _on_edge(wu, uu), 0.0
+        elif edge == 1:
+            s, t = 0.0, _on_edge(wv, vv)
+        else:
+            t = _on_edge(uu - uv + wv - wu, uu - 2.0 * uv + vv)
+            s = 1.0 - t
+        x, y, z = wx - s * ux - t * vx, wy - s * uy - t * vy, wz - s * uz - t * vz
+        square = x * x + y * y + z * z
+        if square < least:
+            least, second, third = square, s, t
+    return least, second, third
+
+
+@compiled_as_written
+def _nearest_place(
+    boxes: Array,
+    faces: Index,
+    corners: Array,
+    point: Array,
+    reach: float,
+    guess: int,
+    waiting: Index,
+    apart: Array,
+) -> tuple[int, float, float, float]:
+    """Return where the triangle lies that is nearest to a point, -1 for none within reach.
+
+    Of equally near ones that of the lowest number.
+
+    Args:
+        boxes: (2 p, 6) m.
+        faces: (p c,) triangles of the leaves.
+        corners: (p c, 9) m, theirs.
+        point: (3,) m.
+        reach: m.
+        guess: the place of a triangle that may be near, and spares looks then; -1: none.
+        waiting: (`DEEPEST`,) to work in.
+        apart: likewise.
+
+    Returns:
+        Place in `faces`, squared distance (m²), barycentrics 2 and 3 of the nearest point.
+    """
+    leaves, place, size = len(boxes) // 2, NO_TRIANGLE, 1
+    held = len(faces) // leaves
+    best, second, third = reach * reach, 0.0, 0.0
+    if guess >= 0:
+        square, s, t = _foot(corners[guess], point)
+        if square <= best:
+            place, best, second, third = guess, square, s, t
+    waiting[0], apart[0] = 1, 0.0
+    while size > 0:
+        size -= 1
+        box = waiting[size]
+        if apart[size] > best:
+            continue
+        if box >= leaves:
+            for here in range((box - leaves) * held, (box - leaves + 1) * held):
+                square, s, t = _foot(corners[here], point)
+                if square > best or (square == best and place >= 0 and faces[place] <= faces[here]):
+                    continue
+                place, best, second, third = here, square, s, t
+            continue
+        one, other = 2 * box, 2 * box + 1
+        near, far = _apart(boxes[one], point), _apart(boxes[other], point)
+        if far < near:
+            one, other, near, far = other, one, far, near
+        if far <= best:
+            waiting[size], apart[size] = other, far
+            size += 1
+        if near <= best:
+            waiting[size], apart[size] = one, near
+            size += 1
+    return place, best, second, third
+
+
+@compiled_as_written
+def _nearest_points(
+    boxes: Array, faces: Index, corners: Array, points: Array, reach: float
+) -> tuple[Array, Index, Array]:
+    """Return the nearest point to each of many, see `_nearest_place`.
+
+    Args:
+        boxes: (2 p, 6) m.
+        faces: (p c,).
+        corners: (p c, 9) m.
+        points: (n, 3) m.
+        reach: m.
+
+    Returns:
+        Distance (n,) m, inf for none and for points that are not finite; triangle (n,), -1;
+        barycentrics (n, 3), NaN.
+    """
+    count = len(points)
+    distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)
+    weights = np.full((count, 3), np.nan)
+    waiting, apart, guess = np.empty(DEEPEST, np.int64), np.empty(DEEPEST), int(NO_TRIANGLE)
+    for n in range(count):
+        point = points[n]
+        if not np.isfinite(point[0] + point[1] + point[2]):
+            continue
+        place, square, s, t = _nearest_place(
+            boxes, faces, corners, point, reach, guess, waiting, apart
+        )
+        if place >= 0:
+            guess = place  # the next point may lie beside this one
+            distance[n], face[n] = np.sqrt(square), faces[place]
+            weights[n, 0], weights[n, 1], weights[n, 2] = 1.0 - s - t, s, t
+    return distance, face, weights

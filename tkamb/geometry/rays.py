@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tkamb.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
-from tkamb.geometry.tree import TriangleTree, all_crossings, first_crossings, rows
+from tkamb.geometry.tree import TriangleTree, rows
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
@@ -18,6 +19,13 @@ SAME_CROSSING = 1e-10
 """Crossings of one ray nearer than this, relative to the part's radius, are one crossing."""
 USUAL = 4
 """Crossings of a ray that there is room for at first."""
+STILL = 1e-200
+"""A smaller part of a direction is none; its inverse times a length is still a number."""
+PARALLEL = 1e-9
+"""Sine of the angle to a triangle's plane below which a ray does not cross it."""
+DEEPEST = 64
+"""Boxes that wait at one time: one of each level."""
+NO_TRIANGLE = -1
 
 
 class RayCaster:
@@ -63,7 +71,7 @@ class RayCaster:
             distance (n,) m, face (n,), barycentric coordinates (n, 3), NaN where nothing is hit.
         """
         rays = _rays(origins, directions)
-        return first_crossings(*self._tree, *rays, -self._same, EDGE_TOLERANCE)
+        return _first_crossings(*self._tree, *rays, -self._same, EDGE_TOLERANCE)
 
     def all(self, origins: ArrayLike, directions: ArrayLike) -> tuple[Index, Array, Index]:
         """Return every crossing of every ray at or beyond its origin.
@@ -83,7 +91,7 @@ class RayCaster:
         while number > room:
             room = number
             ray, distance, face = (np.empty(room, kind) for kind in (np.int64, float, np.int64))
-            number = all_crossings(
+            number = _all_crossings(
                 *self._tree, *rays, -self._same, EDGE_TOLERANCE, ray, distance, face
             )
         return self._merged(ray[:number], distance[:number], face[:number], rays[1])
@@ -110,3 +118,178 @@ def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Array, Array]:
     if len(rays[1]) not in (1, len(rays[0])):
         raise ValueError(f"{len(rays[1])} directions for {len(rays[0])} rays")
     return rays
+
+
+@compiled_as_written
+def _crossing(plane: Array, origin: Array, direction: Array) -> tuple[float, float, float]:
+    """Return the distance at which a ray meets a triangle's plane, and its barycentrics 2 and 3.
+
+    Args:
+        plane: (12,) first corner, unit normal and `Surface.barycentric_rows`.
+        origin: (3,) m.
+        direction: (3,) unit.
+
+    Returns:
+        Distance (m), inf where the ray runs along the plane or the triangle has none.
+    """
+    x, y, z = origin[0] - plane[0], origin[1] - plane[1], origin[2] - plane[2]
+    slope = direction[0] * plane[3] + direction[1] * plane[4] + direction[2] * plane[5]
+    if not abs(slope) >= PARALLEL:
+        return np.inf, np.nan, np.nan
+    t = -(x * plane[3] + y * plane[4] + z * plane[5]) / slope
+    x, y, z = x + t * direction[0], y + t * direction[1], z + t * direction[2]
+    u = plane[6] * x + plane[7] * y + plane[8] * z
+    v = plane[9] * x + plane[10] * y + plane[11] * z
+    return t, u, v
+
+
+@compiled_as_written
+def _entry(box: Array, origin: Array, slowness: Array) -> float:
+    """Return the distance at which a ray enters a box (6,), inf where it misses it, m.
+
+    Args:
+        box: (6,) m.
+        origin: (3,) m.
+        slowness: (3,) one over the unit direction.
+    """
+    enters, leaves = -np.inf, np.inf
+    for axis in range(3):
+        first = (box[axis] - origin[axis]) * slowness[axis]
+        last = (box[axis + 3] - origin[axis]) * slowness[axis]
+        enters, leaves = max(enters, min(first, last)), min(leaves, max(first, last))
+    return enters if enters <= leaves and leaves >= 0.0 else np.inf
+
+
+@compiled_as_written
+def _set_direction(vector: Array, direction: Array, slowness: Array) -> None:
+    """Write a vector (3,) at unit length, and one over that; a number where it does not go.
+
+    One of no length makes a direction of NaN, which meets nothing.
+    """
+    length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    for axis in range(3):
+        along = vector[axis] / length
+        direction[axis] = along
+        slowness[axis] = 1.0 / along if abs(along) > STILL else 1.0 / STILL
+
+
+@compiled_as_written
+def _first_crossings(
+    boxes: Array,
+    faces: Index,
+    planes: Array,
+    origins: Array,
+    directions: Array,
+    least: float,
+    outside: float,
+) -> tuple[Array, Index, Array]:
+    """Return the first crossing of each ray; of equally near ones that of the lowest number.
+
+    Args:
+        boxes: (2 p, 6) m.
+        faces: (p c,) triangles of the leaves.
+        planes: (p c, 12) theirs, see `_crossing`.
+        origins: (n, 3) m.
+        directions: (n, 3) of any length, or (1, 3) for all.
+        least: m, the smallest distance that counts.
+        outside: barycentric units; so far outside its triangle a crossing still counts.
+
+    Returns:
+        Distance (n,) m, inf for none; triangle (n,), -1; barycentrics (n, 3), NaN.
+    """
+    count, leaves = len(origins), len(boxes) // 2
+    held = len(faces) // leaves
+    distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)
+    weights = np.full((count, 3), np.nan)
+    waiting, enters = np.empty(DEEPEST, np.int64), np.empty(DEEPEST)
+    direction, slowness = np.empty(3), np.empty(3)
+    for n in range(count):
+        origin = origins[n]
+        if n < len(directions):
+            _set_direction(directions[n], direction, slowness)
+        if not np.isfinite(origin[0] + origin[1] + origin[2]):
+            continue
+        best, found, size = np.inf, NO_TRIANGLE, 1
+        waiting[0], enters[0] = 1, _entry(boxes[1], origin, slowness)
+        while size > 0:
+            size -= 1
+            box = waiting[size]
+            if enters[size] > best or enters[size] == np.inf:
+                continue
+            if box >= leaves:
+                for place in range((box - leaves) * held, (box - leaves + 1) * held):
+                    t, u, v = _crossing(planes[place], origin, direction)
+                    if t < least or t > best or not min(u, v, 1.0 - u - v) >= -outside:
+                        continue
+                    if t < best or faces[place] < found:
+                        best, found = t, faces[place]
+                        weights[n, 0], weights[n, 1], weights[n, 2] = 1.0 - u - v, u, v
+                continue
+            one, other = 2 * box, 2 * box + 1
+            near, far = _entry(boxes[one], origin, slowness), _entry(boxes[other], origin, slowness)
+            if far < near:
+                one, other, near, far = other, one, far, near
+            if far < np.inf and far <= best:
+                waiting[size], enters[size] = other, far
+                size += 1
+            if near < np.inf and near <= best:
+                waiting[size], enters[size] = one, near
+                size += 1
+        distance[n], face[n] = best, found
+    return distance, face, weights
+
+
+@compiled_as_written
+def _all_crossings(
+    boxes: Array,
+    faces: Index,
+    planes: Array,
+    origins: Array,
+    directions: Array,
+    least: float,
+    outside: float,
+    ray: Index,
+    distance: Array,
+    face: Index,
+) -> int:
+    """Count every crossing of every ray, and write as many as there is room for.
+
+    Args:
+        boxes: see `_first_crossings`, as all but the following.
+        faces: (p c,).
+        planes: (p c, 12).
+        origins: (n, 3) m.
+        directions: (n, 3) of any length, or (1, 3) for all.
+        least: m.
+        outside: barycentric units.
+        ray: (m,) the ray of each crossing, to be written.
+        distance: (m,) m, likewise.
+        face: (m,), likewise.
+    """
+    leaves, number = len(boxes) // 2, 0
+    held = len(faces) // leaves
+    waiting, direction, slowness = np.empty(DEEPEST, np.int64), np.empty(3), np.empty(3)
+    for n in range(len(origins)):
+        origin = origins[n]
+        if n < len(directions):
+            _set_direction(directions[n], direction, slowness)
+        if not np.isfinite(origin[0] + origin[1] + origin[2]):
+            continue
+        waiting[0], size = 1, 1
+        while size > 0:
+            size -= 1
+            box = waiting[size]
+            if _entry(boxes[box], origin, slowness) == np.inf:
+                continue
+            if box < leaves:
+                waiting[size], waiting[size + 1] = 2 * box, 2 * box + 1
+                size += 2
+                continue
+            for place in range((box - leaves) * held, (box - leaves + 1) * held):
+                t, u, v = _crossing(planes[place], origin, direction)
+                if t < least or t == np.inf or not min(u, v, 1.0 - u - v) >= -outside:
+                    continue
+                if number < len(ray):
+                    ray[number], distance[number], face[number] = n, t, faces[place]
+                number += 1
+    return number
