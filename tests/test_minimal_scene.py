@@ -27,7 +27,7 @@ print(json.dumps({
 SHOWN = """
 import sys
 import tkamb.output.report, tkamb.results_folder
-print([n for n in ("scipy", "trimesh", "pinocchio", "pydantic", "fcl") if n in sys.modules])
+print([n for n in ("scipy", "trimesh", "pinocchio", "pydantic", "fcl", "numba") if n in sys.modules])
 """
 
 MUSCLES = ("quadriceps", "patellar_ligament", "patella")

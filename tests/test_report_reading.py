@@ -34,14 +34,26 @@ def test_a_grid_over_the_insert_is_linear_between_its_points_and_ends_at_its_rim
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
     grid = PageGrid(points, triangles, -1.0, 1.0)
     x, z = np.meshgrid(grid.up, grid.across, indexing="ij")
-    values = grid.sample(points @ [200.0, 0.0, -300.0])
+    values = grid.sample(points @ [200.0, 0.0, -300.0] + 5.0)
     over = values != -1.0
     inside = (x > 0.1) & (x < 9.9) & (z < -0.1) & (z > -9.9)
     assert over[inside].all()
-    np.testing.assert_allclose(values[over], (0.2 * x + 0.3 * z)[over], atol=1e-9)
+    np.testing.assert_allclose(values[over], (0.2 * x + 0.3 * z)[over] + 5.0, atol=1e-9)
     outside = np.array([0.0, 0, np.inf, np.inf])  # nothing lies above: still one map
     level = pressure_levels(np.array([[2.0, 2, 0, 0]]), outside[None], triangles, 4.0)[0]
     assert list(level) == [0.5, 0.5, -0.5, -0.5]
+
+
+def test_of_what_lies_over_each_other_the_grid_shows_the_highest():
+    """A ledge over a floor, a wall between them, seen from above; coarse and fine triangles."""
+    ledge = np.array([[0.0, 2e-3, 0], [0.004, 2e-3, 0], [0.004, 2e-3, 0.01], [0, 2e-3, 0.01]])
+    floor = ledge * [2.5, 0, 1]
+    triangles = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7], [1, 2, 6], [1, 6, 5]])
+    points = np.concatenate([floor, ledge])[[4, 5, 6, 7, 0, 1, 2, 3]]
+    grid = PageGrid(points, np.concatenate([triangles[2:4], triangles[:2]]), 1.0, 1.0)
+    x = np.meshgrid(grid.up, grid.across, indexing="ij")[0]
+    seen = grid.sample(points[:, 1] * 1e3)
+    assert (seen[x <= 4.0] == pytest.approx(2.0)) and (seen[x > 4.5] == pytest.approx(0.0))
 
 
 def test_the_in_vivo_peaks_of_the_activity_lie_behind_the_force(bend):

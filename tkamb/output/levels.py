@@ -6,9 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array
-from tkamb.geometry.surface import Surface
+from tkamb.geometry.ragged import counted
 from tkamb.units import MILLIMETRE
 
+ON_EDGE = 1e-9
+"""Barycentric distance by which a grid point may lie outside a triangle and still on its edge."""
 FAR = 10 * MILLIMETRE
 """A gap above this, infinite where nothing lies above, counts as this."""
 
@@ -63,7 +65,7 @@ class PageGrid:
     def __init__(
         self, points: Array, triangles: NDArray[np.int64], sign: float, step_mm: float
     ) -> None:
-        self._surface, self._sign = Surface(points, triangles, "map"), sign
+        self._points, self._triangles, self._sign = points, triangles, sign
         across, up = sign * points[:, 2] / MILLIMETRE, points[:, 0] / MILLIMETRE
         self.across = np.arange(across.min(), across.max() + step_mm, step_mm)
         self.up = np.arange(up.max(), up.min() - step_mm, -step_mm)
@@ -78,14 +80,21 @@ class PageGrid:
     @cached_property
     def _hits(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
         """Which grid points (rows, columns) lie over the insert, its points there, weights."""
-        x, z = np.meshgrid(
-            self.up * MILLIMETRE, self._sign * self.across * MILLIMETRE, indexing="ij"
-        )
-        above = np.full(x.size, self._surface.bounds[1, 1] + MILLIMETRE)
-        origins = np.column_stack([x.ravel(), above, z.ravel()])
-        _, face, weights = self._surface.rays.first_in_face(origins, (0.0, -1.0, 0.0))
-        over = face >= 0
-        return over.reshape(x.shape), self._surface.faces[face[over]], weights[over]
+        step = self.across[1] - self.across[0]
+        row = (self.up[0] - self._points[:, 0] / MILLIMETRE) / step
+        column = (self._sign * self._points[:, 2] / MILLIMETRE - self.across[0]) / step
+        corners = np.stack([row, column], axis=1)[self._triangles]
+        face, place, weights = _covered(corners, (len(self.up), len(self.across)))
+        height = (weights * self._points[self._triangles[face], 1]).sum(axis=1)
+        order = np.argsort(
+            height, kind="stable"
+        )  # of triangles over each other the highest is seen
+        seen = np.full(len(self.up) * len(self.across), -1)
+        seen[place[order]] = order
+        over = seen >= 0
+        chosen = seen[over]
+        shape = len(self.up), len(self.across)
+        return over.reshape(shape), self._triangles[face[chosen]], weights[chosen]
 
     def sample(self, values: Array, every: int = 1) -> Array:
         """Return values (..., n) of the points on the grid (..., rows, columns).
@@ -106,3 +115,32 @@ class PageGrid:
         for here in np.ndindex(values.shape[:-1]):
             found[here][over] = np.einsum("ij,ij->i", weights, values[here][corners])
         return found
+
+
+def _covered(
+    corners: Array, shape: tuple[int, int]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Return which points of a grid triangles cover: triangle, flat place and weights of each pair.
+
+    Args:
+        corners: (k, 3, 2) rows and columns, in steps of the grid.
+        shape: rows and columns of the grid.
+    """
+    first = np.maximum(np.ceil(corners.min(axis=1) - ON_EDGE), 0.0).astype(np.int64)
+    last = np.minimum(np.floor(corners.max(axis=1) + ON_EDGE), np.array(shape) - 1)
+    size = np.maximum(last.astype(np.int64) - first + 1, 0)
+    face, rank = counted(size.prod(axis=1))
+    row, column = first[face, 0] + rank // size[face, 1], first[face, 1] + rank % size[face, 1]
+    a, b, c = np.moveaxis(corners[face], 1, 0)
+    point = np.stack([row, column], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # one seen from its side covers nothing
+        second, third = _area(a, point, c) / _area(a, b, c), _area(a, b, point) / _area(a, b, c)
+    weights = np.stack([1.0 - second - third, second, third], axis=1)
+    inside = weights.min(axis=1) >= -ON_EDGE
+    return face[inside], (row * shape[1] + column)[inside], weights[inside]
+
+
+def _area(a: Array, b: Array, c: Array) -> Array:
+    """Return twice the signed areas (n,) of triangles of points (n, 2)."""
+    u, v = b - a, c - a
+    return np.asarray(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
