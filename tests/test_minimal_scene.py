@@ -27,7 +27,8 @@ print(json.dumps({
 SHOWN = """
 import sys
 import tkamb.output.report, tkamb.results_folder
-print([n for n in ("scipy", "trimesh", "pinocchio", "pydantic", "fcl", "numba") if n in sys.modules])
+heavy = ("scipy", "trimesh", "pinocchio", "pydantic", "fcl", "numba")
+print([name for name in heavy if name in sys.modules])
 """
 
 MUSCLES = ("quadriceps", "patellar_ligament", "patella")
