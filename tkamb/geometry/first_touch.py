@@ -56,9 +56,7 @@ class FirstTouch:
 
     def __init__(self, femoral: Surface, insert: Surface, split: float | None = None) -> None:
         self._femoral, self._split = femoral, split
-        # what faces down or aside is never the topmost but at an edge of what faces up
-        upward = np.flatnonzero(insert.face_normals[:, 1] > 0.0)
-        self._insert = _arrays(TriangleTree(insert, upward) if len(upward) else insert.tree)
+        self._insert = _arrays(insert.upward_tree)
 
     @cached_property
     def _whole(self) -> tuple[Array, Array, Array]:

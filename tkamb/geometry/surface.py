@@ -148,6 +148,17 @@ class Surface:
         return TriangleTree(self)
 
     @cached_property
+    def upward_tree(self) -> "TriangleTree":
+        """The same over its triangles that face up (+y); over all where none does.
+
+        What faces down or aside is never the topmost but at an edge of what faces up.
+        """
+        from tkamb.geometry.tree import TriangleTree
+
+        upward = np.flatnonzero(self.face_normals[:, 1] > 0.0)
+        return TriangleTree(self, upward) if len(upward) else self.tree
+
+    @cached_property
     def rays(self) -> "RayCaster":
         """Rays against the surface, in its own frame."""
         from tkamb.geometry.rays import RayCaster
