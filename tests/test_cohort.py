@@ -1,8 +1,10 @@
 """Cohorts: the runs that a file makes, one table, groups, parts, resuming, and what fails."""
 
+import gc
 import json
 import shutil
 import tomllib
+import weakref
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +25,7 @@ from tkamb.cohort.report import _told_apart, cohort_html, draw_groups
 from tkamb.cohort.run import run_cohort
 from tkamb.cohort.statistics import Group, groups_of, spread
 from tkamb.errors import InputError
+from tkamb.memory import give_back
 from tkamb.run.workers import Crew
 from tkamb.simulation import simulate
 
@@ -292,3 +295,18 @@ def test_groups_too_many_for_one_plot_are_divided_by_a_label_and_keep_one_scale(
     assert whole[0] == "" and list(whole[1])[:2] == ["d0, one", "d0, two"]
     lonely = [group(f"d{k}", "one", 1.0) for k in range(11)]  # no label divides them
     assert [len(part) for _, part in _told_apart(lonely)] == [8, 3]
+
+
+def test_what_only_refers_to_itself_is_freed_between_runs():
+    """A knee's surfaces and trees hold each other: no reference is left, and none is counted."""
+    ring = [np.zeros(4)]
+    ring.append(ring)
+    kept = weakref.ref(ring[0])
+    gc.disable()
+    try:
+        del ring
+        assert kept() is not None
+        give_back()
+        assert kept() is None
+    finally:
+        gc.enable()
