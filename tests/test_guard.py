@@ -12,6 +12,7 @@ from tkamb import files
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.files import read_bytes, read_xml
+from tkamb.guard import interrupt_as_such
 from tkamb.inputs.tables import read_table
 
 ROOT = Path(__file__).parents[1]
@@ -170,3 +171,18 @@ def test_version(capsys):
         main(["--version"])
     assert ended.value.code == 0
     assert capsys.readouterr().out.startswith("tkamb ")
+
+
+def test_an_interrupt_within_a_compiled_loop_is_an_interrupt():
+    """Python tells of it as SystemErrors, one caused by the other."""
+
+    def loop(cause):
+        try:
+            raise SystemError("returned a result with an exception set") from cause
+        except SystemError as first:
+            raise SystemError("returned a result with an exception set") from first
+
+    with pytest.raises(KeyboardInterrupt), interrupt_as_such():
+        loop(KeyboardInterrupt())
+    with pytest.raises(SystemError), interrupt_as_such():
+        loop(ValueError())

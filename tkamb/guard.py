@@ -12,8 +12,8 @@ import sys
 import tempfile
 import traceback
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -35,7 +35,8 @@ def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
             if not sys.warnoptions:
                 warnings.simplefilter("ignore")  # they are for whoever writes the code
             try:
-                return command()
+                with interrupt_as_such():
+                    return command()
             finally:  # also when argparse exits: what it printed must have arrived
                 sys.stdout.flush()
     except TkambError as error:
@@ -51,6 +52,23 @@ def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
         return 130
     except Exception as error:
         return _unforeseen(error, options)
+
+
+@contextmanager
+def interrupt_as_such() -> Iterator[None]:
+    """Raise what an interrupt within a compiled loop becomes as the KeyboardInterrupt that it was.
+
+    Python tells of it where the loop hands back its result, as a SystemError caused by it.
+    """
+    try:
+        yield
+    except SystemError as error:
+        cause: BaseException | None = error
+        while isinstance(cause, SystemError):  # one for each layer that it passes
+            cause = cause.__cause__
+        if isinstance(cause, KeyboardInterrupt):
+            raise KeyboardInterrupt from None
+        raise
 
 
 class StreamError(TkambError):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tkamb.claim import claimed_directory
 from tkamb.errors import InputError
+from tkamb.guard import interrupt_as_such
 from tkamb.results import Results
 from tkamb.run.frames import (
     CHUNK,
@@ -131,10 +132,11 @@ class _Run:
         self.resumed = len(self.recorder.rows)
         left = [k for k in self.indices if k not in self.recorder.rows]
         try:
-            for frame in self._finished(left, progress, team):
-                self.recorder.record(*frame)
-                if self.recorder.due() and len(self.recorder.rows) < len(self.indices):
-                    self.recorder.publish(self.results)
+            with interrupt_as_such():
+                for frame in self._finished(left, progress, team):
+                    self.recorder.record(*frame)
+                    if self.recorder.due() and len(self.recorder.rows) < len(self.indices):
+                        self.recorder.publish(self.results)
         except KeyboardInterrupt:
             if not self.recorder.keeps_files or not self.recorder.rows:
                 raise

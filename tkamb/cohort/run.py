@@ -14,6 +14,7 @@ from tkamb.cohort.folder import write_cohort
 from tkamb.cohort.outcome import CohortWorker, Outcome
 from tkamb.cohort.plan import Cohort, load_cohort
 from tkamb.errors import InputError
+from tkamb.guard import interrupt_as_such
 from tkamb.plug_ins import CONTACT_CODE, contact_code
 from tkamb.run.shards import Shards, remove_shards
 from tkamb.run.workers import Crew, Progress, Task
@@ -104,9 +105,10 @@ def run_cohort(
         task = Task(CohortWorker, (cohort.frames, cohort.table.map_flexion_deg))
         answers = crew.answers(task, left)
         try:
-            for number, outcome in progress(answers, len(left)):
-                shards.put(number, outcome.shard())
-                done[number] = outcome
+            with interrupt_as_such():
+                for number, outcome in progress(answers, len(left)):
+                    shards.put(number, outcome.shard())
+                    done[number] = outcome
         except KeyboardInterrupt:
             kept = f"{len(done)} of {len(wanted)} runs are kept; go on with --resume"
             raise KeyboardInterrupt(kept) from None

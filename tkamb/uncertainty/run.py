@@ -12,6 +12,7 @@ from tkamb.claim import claimed_directory
 from tkamb.columns import KINDS
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
+from tkamb.guard import interrupt_as_such
 from tkamb.results import FEWEST, Results
 from tkamb.run.shards import Shard, Shards
 from tkamb.run.workers import Crew, Progress, Task, Team
@@ -192,10 +193,11 @@ class _Job:
         left = [n for n in range(count) if n not in done]
         new = self.team.answers([(n, (self.points[n], names)) for n in left])
         try:
-            for number, sample in self.progress(new, len(left)):
-                done[number] = sample
-                if shards is not None:
-                    shards.put(number, Shard({}, dict(vars(sample))))
+            with interrupt_as_such():
+                for number, sample in self.progress(new, len(left)):
+                    done[number] = sample
+                    if shards is not None:
+                        shards.put(number, Shard({}, dict(vars(sample))))
         except KeyboardInterrupt:
             if shards is None or not done:
                 raise

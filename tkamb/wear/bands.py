@@ -12,6 +12,7 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
+from tkamb.guard import interrupt_as_such
 from tkamb.run.shards import Shard, Shards
 from tkamb.run.workers import Crew, Numbered, Task
 from tkamb.scene.uncertainty import UncertaintyTable
@@ -151,10 +152,11 @@ class Sampling:
         left = [(n, normal[n]) for n in range(count) if n not in done]
         task = Task(WearSampler, (simulation, self.inputs, self.constant_share))
         try:
-            for number, sample in progress((crew or Crew()).answers(task, left), len(left)):
-                done[number] = sample
-                if shards is not None:
-                    shards.put(number, Shard({}, dict(sample)))
+            with interrupt_as_such():
+                for number, sample in progress((crew or Crew()).answers(task, left), len(left)):
+                    done[number] = sample
+                    if shards is not None:
+                        shards.put(number, Shard({}, dict(sample)))
         except KeyboardInterrupt:
             if shards is None or not done:
                 raise

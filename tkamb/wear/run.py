@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tkamb.errors import InputError
+from tkamb.guard import interrupt_as_such
 from tkamb.run.shards import Shards
 from tkamb.run.workers import Crew
 from tkamb.wear.bands import SAMPLES, Progress, Sampling, check_samples
@@ -92,7 +93,8 @@ class WearRun:
 
         state = kept_state(folder, identity) if folder is not None and resume else None
         try:
-            return simulate_wear(self.case, self.cycles, self.updates, state=state, keep=keep)
+            with interrupt_as_such():
+                return simulate_wear(self.case, self.cycles, self.updates, state=state, keep=keep)
         except KeyboardInterrupt:
             kept = None
             if folder is not None:
