@@ -38,14 +38,6 @@ def edge_use(faces: Index) -> tuple[Index, Index]:
     return edge.reshape(-1), count
 
 
-def each_edge(faces: Index) -> Index:
-    """Return the undirected edges (m, 2) of the faces, each once."""
-    edge, count = edge_use(faces)
-    ends = np.empty((len(count), 2), np.int64)
-    ends[edge] = np.sort(half_edges(faces), axis=1)
-    return ends
-
-
 def is_closed(faces: Index) -> bool:
     """Say whether two faces meet in every edge, and run through it in opposite directions."""
     edge, count = edge_use(faces)
