@@ -26,6 +26,19 @@ def test_a_run_says_what_it_touched(tmp_path, capsys):
     assert abs(sum(parts.values()) - found["seconds"]["all"]) < 1e-6
 
 
+def test_files_outside_the_scenes_folder_count(tmp_path, capsys):
+    out, scene = tmp_path / "out", write_scene(tmp_path / "scene")
+    (tmp_path / "elsewhere").mkdir()
+    (scene.parent / "insert.stl").rename(tmp_path / "elsewhere" / "insert.stl")
+    scene.write_text(scene.read_text().replace('"insert.stl"', '"../elsewhere/insert.stl"'))
+    run = ["run", str(scene), "--out", str(out), "--frames", "0:1", "--profile", "--json"]
+    assert main([*run, "--contact", "foundation"]) == 0
+    found = json.loads(capsys.readouterr().out)["profile"]["files"]
+    assert str(tmp_path / "elsewhere" / "insert.stl") in found
+    assert len(found) == len(set(found))
+    assert all(path.startswith(str(tmp_path)) for path in found)
+
+
 def test_a_minimal_scene_touches_nothing_more(tmp_path, capsys):
     muscles = ("quadriceps", "patellar_ligament", "patella")
     drop = ("contact", "implant", "ligament", "tibia", "ground_reaction", *muscles)

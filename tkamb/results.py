@@ -3,7 +3,7 @@
 import csv
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -204,20 +204,23 @@ def csv_text(columns: Mapping[str, Any]) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(columns)
-    cells = [[_cell(name, value) for value in values] for name, values in columns.items()]
+    cells = [_cells(KINDS.get(name, "number"), values) for name, values in columns.items()]
     writer.writerows(zip(*cells, strict=True))
     return buffer.getvalue()
 
 
-def _cell(name: str, value: Any) -> str:
-    kind = KINDS.get(name, "number")
+def _cells(kind: str, values: Iterable[Any]) -> list[str]:
+    """Return the cells of a column."""
     if kind == "text":
-        return str(value)
-    if math.isnan(value):
-        return ""
-    if kind == "integer" and float(value).is_integer():
-        return str(int(value))
-    return repr(float(value))
+        return [str(value) for value in values]
+    numbers = [float(value) for value in values]
+    if kind == "integer":
+        return ["" if math.isnan(number) else _integer(number) for number in numbers]
+    return ["" if math.isnan(number) else repr(number) for number in numbers]
+
+
+def _integer(number: float) -> str:
+    return str(int(number)) if number.is_integer() else repr(number)
 
 
 def _parse(name: str, cells: tuple[str, ...], path: Path) -> Any:

@@ -43,8 +43,9 @@ PATCH_DEPTH = 5e-5
 SAMPLE_SPACING = 1e-3
 """m: spacing of the samples of the button, in the patella's coronal plane."""
 
-REACH = 20.0 * PATCH_DEPTH
-"""m: samples farther than this behind the nearest one weigh nothing (exp(-20) = 2e-9)."""
+REACH = 14.0 * PATCH_DEPTH
+"""m: samples farther than this behind the nearest one weigh nothing (exp(-14) = 8e-7, by which the
+gap of a patch of twenty samples jumps by 3e-11 m)."""
 
 COARSE = 60
 """Samples that a quick look takes."""

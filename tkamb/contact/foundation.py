@@ -5,6 +5,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from tkamb.compiled import compiled_as_written
 from tkamb.contact.materials import Material
 from tkamb.contact.model import ContactModel
 from tkamb.contact.neighbourhood import NEAR, Neighbourhood
@@ -18,7 +19,7 @@ from tkamb.contact.samples import (
     gaps_along_normals,
     gaps_and_facets,
 )
-from tkamb.geometry.frames import Array, Index, Mask, cross, inverse, rotate, transform
+from tkamb.geometry.frames import SIDES, Array, Index, Mask, inverse, rotate, transform
 
 Law = Literal["nonlinear", "linear"]
 
@@ -35,6 +36,8 @@ SMALL_LOAD = 1.0
 """N; a reaction below that share of a load, less this, does not reach the load within `NARROW`."""
 WIDEST_EDGE = NEAR
 """m: no gap is taken to change by more across a column."""
+SUMS = 46
+"""Numbers that the columns of one condyle add up to."""
 
 
 @dataclass(frozen=True)
@@ -259,14 +262,12 @@ class FoundationProbe:
         if not (strain < DEEPEST).all():
             return ProbedContact({}, known=False)
         force = layer_pressure(self._law, self._state.pair.material, strain) * samples.area
-        push, stiffness = self._stiffness(samples, gap, femoral_normal)
+        rate = self._rate(samples, gap)
         condyles = {}
-        for side, own in self._sides(samples, pose):
-            if own.any():
+        for side, sums in self._sums(samples, gap, femoral_normal, force, rate, pose).items():
+            if sums[0] > 0.0:
                 condyles[side] = CondyleWrench(
-                    -force[own] @ push[own],
-                    force[own] @ samples.points[own] / force[own].sum(),
-                    push[own].T @ stiffness[own],
+                    -sums[4:10], sums[1:4] / sums[0], sums[10:].reshape(6, 6)
                 )
         return ProbedContact(condyles, tangent=True)
 
@@ -287,12 +288,12 @@ class FoundationProbe:
         change = samples.resolution * np.sqrt(np.maximum(1.0 - cosine**2, 0.0)) / cosine
         edge = np.clip(change, NARROW, WIDEST_EDGE)
         share = np.clip(0.5 - gap / edge, 0.0, 1.0)
-        push, stiffness = self._stiffness(samples, np.minimum(gap, 0.0), normals)
-        stiffness *= share[:, None]
+        gap = np.minimum(gap, 0.0)
+        rate = self._rate(samples, gap) * share
+        sums = self._sums(samples, gap, normals, np.zeros_like(gap), rate, pose)
         condyles = {
-            side: replace(contact.condyles[side], stiffness=push[own].T @ stiffness[own])
-            for side, own in self._sides(samples, pose)
-            if side in contact.condyles
+            side: replace(condyle, stiffness=sums[side][10:].reshape(6, 6))
+            for side, condyle in contact.condyles.items()
         }
         return replace(contact, condyles=condyles)
 
@@ -302,22 +303,66 @@ class FoundationProbe:
             self._seen = pose.copy(), *self._around.at(pose)
         return self._seen[1:]
 
-    def _stiffness(
-        self, samples: SurfaceSamples, gap: Array, femoral_normal: Array
-    ) -> tuple[Array, Array]:
-        """Return the screws (n, 6) of the columns' normals, and of what changes their force."""
+    def _rate(self, samples: SurfaceSamples, gap: Array) -> Array:
+        """Return the slope (n,) of the columns' forces by their penetrations, N/m."""
         thickness = np.maximum(samples.thickness, THINNEST)
         slope = layer_slope(self._law, self._state.pair.material, -gap / thickness)
-        push = screws(samples.points, samples.normals)
-        along = np.einsum("ij,ij->i", femoral_normal, samples.normals)
-        met = screws(samples.points + gap[:, None] * samples.normals, femoral_normal)
-        return push, met * (slope / thickness * samples.area / along)[:, None]
+        return slope * samples.area / thickness
 
-    def _sides(self, samples: SurfaceSamples, pose: Array) -> tuple[tuple[str, Mask], ...]:
+    def _sums(
+        self,
+        samples: SurfaceSamples,
+        gap: Array,
+        femoral_normal: Array,
+        force: Array,
+        rate: Array,
+        pose: Array,
+    ) -> dict[str, Array]:
+        """Return side -> what its columns add up to (`SUMS`,), see `_add_up`."""
         medial = medial_points(samples.points, pose, self._state.pair.split)
-        return ("medial", medial), ("lateral", ~medial)
+        sums = np.zeros((2, SUMS))
+        _add_up(samples.points, samples.normals, femoral_normal, gap, force, rate, medial, sums)
+        return dict(zip(SIDES, sums, strict=True))
 
 
-def screws(points: Array, directions: Array) -> Array:
-    """Return direction and moment about the origin (n, 6) of lines through points (n, 3)."""
-    return np.hstack([directions, cross(points, directions)])
+@compiled_as_written
+def _add_up(
+    points: Array,
+    normals: Array,
+    femoral_normals: Array,
+    gap: Array,
+    force: Array,
+    rate: Array,
+    medial: Mask,
+    sums: Array,
+) -> None:
+    """Add up what columns carry, and how that changes as the femoral component moves.
+
+    Args:
+        points: (n, 3) m, on the insert.
+        normals: (n, 3) unit, there.
+        femoral_normals: (n, 3) unit, where the columns meet the femoral component.
+        gap: (n,) m.
+        force: (n,) N, of each.
+        rate: (n,) N/m, its slope by the penetration along the insert's normal.
+        medial: (n,) whether the medial condyle's.
+        sums: (2, `SUMS`) zeros, to be written, medial and lateral: force (N), force times point
+            (N·m), wrench on the femoral component (6,), stiffness of that on the insert (6, 6).
+    """
+    push, met = np.empty(6), np.empty(6)
+    for n in range(len(points)):
+        own, along = sums[0 if medial[n] else 1], 0.0
+        for i in range(3):
+            push[i], met[i] = normals[n, i], femoral_normals[n, i]
+            along += push[i] * met[i]
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            y, z = points[n, j], points[n, k]
+            push[3 + i] = y * push[k] - z * push[j]
+            met[3 + i] = (y + gap[n] * push[j]) * met[k] - (z + gap[n] * push[k]) * met[j]
+            own[1 + i] += force[n] * points[n, i]
+        own[0] += force[n]
+        for i in range(6):
+            own[4 + i] += force[n] * push[i]
+            for j in range(6):
+                own[10 + 6 * i + j] += push[i] * met[j] * (rate[n] / along)

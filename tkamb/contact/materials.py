@@ -14,9 +14,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 
+from tkamb.compiled import compiled_as_written
 from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array
 from tkamb.units import MEGAPASCAL
+
+MOST_STEPS = 60
+"""Of Newton's method for one strain; most need five."""
+ROUNDING = 2e-16
+"""Share of the solution that a last step may have."""
 
 
 class StressStrainLaw(Protocol):
@@ -87,16 +93,27 @@ class RambergOsgood:
         elastic = np.abs(strain) * (young_modulus / self.reference_stress)
         if self.alpha == 0:
             return elastic
-        with np.errstate(over="ignore"):
-            plastic = (elastic / self.alpha) ** (1 / self.exponent)
-        ratio = np.minimum(elastic, plastic)
-        for _ in range(60):
-            power = self.alpha * ratio ** (self.exponent - 1)
-            step = (ratio + power * ratio - elastic) / (1 + self.exponent * power)
-            ratio = np.maximum(ratio - step, 0.0)
-            if not np.any(np.abs(step) > 2e-16 * ratio):
+        ratio = np.empty(elastic.size)
+        _solve_ratio(elastic.ravel(), float(self.alpha), float(self.exponent), ratio)
+        return ratio.reshape(elastic.shape)
+
+
+@compiled_as_written
+def _solve_ratio(elastic: Array, alpha: float, exponent: float, ratio: Array) -> None:
+    """Write the solutions u (n,) of u + alpha u^n = elastic (n,), not negative."""
+    for k in range(len(elastic)):
+        u, plastic = elastic[k], (elastic[k] / alpha) ** (1.0 / exponent)
+        if plastic < u:
+            u = plastic
+        for _ in range(MOST_STEPS):
+            power = alpha * u ** (exponent - 1.0)
+            step = (u + power * u - elastic[k]) / (1.0 + exponent * power)
+            u -= step
+            if u < 0.0:
+                u = 0.0
+            if not abs(step) > ROUNDING * u:  # also where it is NaN
                 break
-        return ratio
+        ratio[k] = u
 
 
 @dataclass(frozen=True)

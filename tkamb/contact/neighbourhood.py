@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from tkamb.compiled import compiled_as_written
 from tkamb.contact.samples import SampledContact, SurfaceSamples, gaps_and_facets
 from tkamb.geometry.frames import Array, Index, inverse, transform
 
@@ -36,13 +37,39 @@ class Neighbourhood:
 
     def at(self, pose: Array) -> tuple[SurfaceSamples, tuple[Array, Array, Index]]:
         """Return the columns near by at a pose (4, 4), and their gaps and facets."""
-        here = self._places(pose)
-        moved = np.linalg.norm(here - self._seen_at, axis=1)
-        near = np.flatnonzero(self._gap - OBLIQUE * moved < NEAR)
+        near, here = np.empty(len(self._gap), np.int64), np.empty_like(self._seen_at)
+        number = _near(self._bed.points, inverse(pose), self._seen_at, self._gap, near, here)
+        near = near[:number]
         columns = self._bed.part(near)
         found = gaps_and_facets(columns, self._femoral, pose)
-        self._gap[near], self._seen_at[near] = np.minimum(found[0], FARTHEST), here[near]
+        self._gap[near], self._seen_at[near] = np.minimum(found[0], FARTHEST), here[:number]
         return columns, found
 
     def _places(self, pose: Array) -> Array:
         return transform(inverse(pose), self._bed.points)
+
+
+@compiled_as_written
+def _near(points: Array, pose: Array, seen_at: Array, gap: Array, near: Index, here: Array) -> int:
+    """Write which columns the femoral component may reach, and return how many.
+
+    Args:
+        points: (n, 3) m, insert frame.
+        pose: (4, 4) of the insert in the femoral frame.
+        seen_at: (n, 3) m, femoral frame, where the columns were seen last.
+        gap: (n,) m, with what gap.
+        near: (n,) to be written.
+        here: (n, 3) m, likewise: where those are.
+    """
+    number = 0
+    for n in range(len(points)):
+        square = 0.0
+        for i in range(3):
+            here[number, i] = pose[i, 3]
+            for j in range(3):
+                here[number, i] += pose[i, j] * points[n, j]
+            square += (here[number, i] - seen_at[n, i]) ** 2
+        if gap[n] - OBLIQUE * np.sqrt(square) < NEAR:
+            near[number] = n
+            number += 1
+    return number

@@ -6,6 +6,7 @@
 import math
 import os
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,7 +42,7 @@ class Profile:
 
         Args:
             results: of the run.
-            scene: its file; files beside or below it count as the scene's.
+            scene: its file; files beside or below it count as the scene's, as what it names does.
         """
         seconds = dict(results.summary["seconds"])
         whole = seconds.pop("all")
@@ -55,15 +56,16 @@ class Profile:
             "seconds": seconds | {"all": whole},
             "frames": len(results),
             "not_modelled": results.summary["not_modelled"],
-            "files": [str(path) for path in self._of_scene(scene)],
+            "files": [str(path) for path in self._of_scene(scene, results.summary["inputs"])],
             "modules": [name for name in modules if name.startswith("tkamb")],
             "libraries": [name for name in HEAVY if name in sys.modules],
         }
 
-    def _of_scene(self, scene: Path) -> list[Path]:
-        folder = scene.resolve().parent
-        inside = [path for path in self.opened if path.resolve().is_relative_to(folder)]
-        return list(dict.fromkeys(path for path in inside if path.is_file()))
+    def _of_scene(self, scene: Path, named: Iterable[str]) -> list[Path]:
+        folder, elsewhere = scene.resolve().parent, {Path(name).resolve() for name in named}
+        opened = dict.fromkeys(path.resolve() for path in self.opened)
+        own = [path for path in opened if path.is_relative_to(folder) or path in elsewhere]
+        return [path for path in own if path.is_file()]
 
     def _hear(self, event: str, given: tuple[Any, ...]) -> None:
         if event != "open" or not isinstance(given[0], str):

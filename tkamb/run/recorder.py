@@ -1,7 +1,7 @@
 """What takes the frames of a run as they are finished: memory, or a folder that survives a kill.
 
 In a folder every finished frame is a file of its own (`tkamb.run.shards`) before the next
-begins. contact.h5 grows beside them; about once a second a copy takes its place together with
+begins. contact.h5 grows beside them; every few seconds a copy takes its place together with
 results.csv, which calls the other frames not computed, and summary.json.
 """
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MAPS = ("pressure", "gap", "nodal_force", "pose", *CONTACT_PLACES)
 SHORTEST_PAUSE = 1.0
 """s between two copies of what is finished."""
-DEAREST_SHARE = 0.05
+DEAREST_SHARE = 0.02
 """Of the computing time that the copies may take."""
 
 
