@@ -59,6 +59,12 @@ TILT_YIELD = 10.0
 SIDEWAYS = 1e-9
 """Sagittal part of a unit normal below which there is none."""
 
+STRAIGHT = 1e-12
+"""m: where the share changes the gap by less through what yields, all goes to the nearer side."""
+
+FIELDS = 11
+"""Numbers that say where and how the patella is pressed."""
+
 EDGE_MARGIN = 0.02
 """Barycentric distance from a sharp edge within which a point lies on it."""
 
@@ -146,26 +152,12 @@ class PatellofemoralContact:
         Raises:
             ComputationError: it pushes straight sideways, which no line in the plane can balance.
         """
-        sides = self._sides_at(coordinates)
-        gaps, points, normals, edges = sides[:, 0], sides[:, 1:4], sides[:, 4:7], sides[:, 7]
-        out_of_plane = np.stack([normals[:, 2], points[:, 2] - self.ml])
-        left = _share_left(gaps, out_of_plane, self._yield)
-        weights = np.array([left, 1.0 - left])
-        force, sideways = weights @ normals, out_of_plane @ weights
-        sagittal = np.array([force[0], force[1], 0.0])
-        length = float(np.linalg.norm(sagittal))
+        found = np.empty(FIELDS)
+        length = _shared(self._sides_at(coordinates), self.ml, self._yield, found)
         if length < SIDEWAYS:
             raise ComputationError("the femur pushes the patella straight sideways")
-        shift, tilt = self._yield * sideways
-        return PatellarContact(
-            gap=float(weights @ gaps + 0.5 * self._yield @ sideways**2),
-            point=_on_line_of_action(weights, points, normals),
-            normal=sagittal / length,
-            share_left=left,
-            shift=float(shift),
-            tilt=float(tilt),
-            on_edge=float(weights @ edges),
-        )
+        gap, left, shift, tilt, on_edge = found[:5].tolist()
+        return PatellarContact(gap, found[5:8], found[8:], left, shift, tilt, on_edge)
 
     def touches(self, coordinates: Array) -> bool:
         """Return whether a few of the samples lie in the femur: a quick look for searches."""
@@ -322,6 +314,43 @@ def _mean_over_sides(
         found[side, 0] -= depth
 
 
+@compiled_as_written
+def _shared(sides: Array, middle: float, yields: Array, found: Array) -> float:
+    """Share the force by the module's equation, and return the sagittal part of its direction.
+
+    Args:
+        sides: (2, 8) gap, point, normal and share on edges, left and right.
+        middle: m, z of the patella's.
+        yields: (2,) c and d.
+        found: (`FIELDS`,) to be written: gap, share of the left, shift, tilt, share on edges,
+            point (3,) and normal (3,) of the line of action in the sagittal plane.
+    """
+    curvature, slope = 0.0, sides[0, 0] - sides[1, 0]
+    for k in range(2):
+        at, offset = (6, 0.0) if k == 0 else (3, middle)
+        change = sides[0, at] - sides[1, at]
+        curvature += yields[k] * change * change
+        slope += yields[k] * change * (sides[1, at] - offset)
+    if curvature < STRAIGHT:
+        left = 1.0 if sides[0, 0] < sides[1, 0] else 0.0
+    else:
+        left = min(max(-slope / curvature, 0.0), 1.0)
+    mean = left * sides[0] + (1.0 - left) * sides[1]
+    moment, length = 0.0, np.sqrt(mean[4] ** 2 + mean[5] ** 2)
+    for side in range(2):
+        part = left if side == 0 else 1.0 - left
+        moment += (sides[side, 1] - mean[1]) * part * sides[side, 5]
+        moment -= (sides[side, 2] - mean[2]) * part * sides[side, 4]
+    aside, lever = mean[6], mean[3] - middle
+    found[0] = mean[0] + 0.5 * (yields[0] * aside**2 + yields[1] * lever**2)
+    found[1], found[2], found[3], found[4] = left, yields[0] * aside, yields[1] * lever, mean[7]
+    # the mean point, moved in the sagittal plane onto the resultant's line
+    found[5] = mean[1] + moment / length**2 * mean[5]
+    found[6], found[7] = mean[2] - moment / length**2 * mean[4], mean[3]
+    found[8], found[9], found[10] = mean[4] / length, mean[5] / length, 0.0
+    return length
+
+
 def _joint_side(patellar: Surface) -> Array:
     """Return samples (n, 3) of the surface that a view along the patella's +x shows."""
     low, high = patellar.bounds
@@ -338,24 +367,3 @@ def _joint_side(patellar: Surface) -> Array:
             "check the mesh's unit, axes and position on the patella",
         )
     return samples
-
-
-def _share_left(gaps: Array, out_of_plane: Array, yields: Array) -> float:
-    """Return the minimiser lambda of the module's equation."""
-    slope = out_of_plane[:, 0] - out_of_plane[:, 1]
-    curvature = yields @ slope**2
-    difference = gaps[0] - gaps[1]
-    if curvature < 1e-12:
-        return float(difference < 0.0)
-    least = -(difference + (yields * slope) @ out_of_plane[:, 1]) / curvature
-    return float(np.clip(least, 0.0, 1.0))
-
-
-def _on_line_of_action(weights: Array, points: Array, normals: Array) -> Array:
-    """Return the mean point, moved in the sagittal plane onto the resultant's line."""
-    forces = weights[:, None] * normals
-    resultant, mean = forces.sum(axis=0)[:2], weights @ points
-    arms = points - mean
-    moment = (arms[:, 0] * forces[:, 1] - arms[:, 1] * forces[:, 0]).sum()
-    shift = moment / (resultant @ resultant) * np.array([resultant[1], -resultant[0]])
-    return np.asarray(mean + np.append(shift, 0.0))
