@@ -21,14 +21,10 @@ from tkamb.body.crossing import MuscleShare
 from tkamb.body.load import PointForces
 from tkamb.body.load_state import LoadState, contradictions, load_states, wrong_signs
 from tkamb.body.unknowns import Unknown, muscle_load, solve
-from tkamb.geometry.frames import Array
-from tkamb.units import MILLIMETRE
+from tkamb.geometry.frames import Array, cross
 
 RESIDUAL_SHIFT = 0.010
 """m: how far the residuals' point is moved along y for their sensitivity."""
-
-DOME_SHIFT = 0.5 * MILLIMETRE
-"""How far the patellofemoral force's line is moved along the patella for its sensitivity."""
 
 PATELLAR = ("patellar_ligament", "patellofemoral", "patellofemoral_tangential")
 
@@ -156,7 +152,9 @@ def unsolved(problems: Iterable[str]) -> KneeLoads:
     return KneeLoads({}, np.full(3, nan), nan, nan, nan, nan, *nothing, tuple(problems))
 
 
-def dome_sensitivity(geometry: KneeGeometry, friction: float) -> tuple[float, float] | None:
+def dome_sensitivity(
+    geometry: KneeGeometry, loads: KneeLoads, friction: float
+) -> tuple[float, float] | None:
     """Return the change of muscle and patellofemoral force as the button sits higher, N/m.
 
     The patellofemoral force passes through the button's contact with the femur, and muscle and
@@ -165,32 +163,38 @@ def dome_sensitivity(geometry: KneeGeometry, friction: float) -> tuple[float, fl
     the line across; one that sits deeper (x) moves it along itself and changes little. Nobody
     knows that place to a millimetre.
 
-    The line is moved by ±0.5 mm along the patella's y axis with the patella's place kept, and
-    the frame is solved again: central difference. Measured per millimetre on the shipped knee,
-    from extension to 120 deg: Q 1.6 to 5.6 % and PF 1.0 to 4.3 % along y; Q 0.1 to 2.2 % along
-    x. A patella that is free to find its balance anew turns by up to 1 deg per millimetre and
-    evens most of it out: along y Q then changes by at most 1.6 % and PF by 1.3 % (along x: PF
-    by 7 %, in extension). So this is the larger estimate for Q.
+    The line moves along the patella's y axis with the patella's place kept: with A x = b the
+    frame's equations, dx = -A⁻¹ dA x. Measured per millimetre on the shipped knee, from extension
+    to 120 deg: Q 1.6 to 5.6 % and PF 1.0 to 4.3 % along y; Q 0.1 to 2.2 % along x. A patella that
+    is free to find its balance anew turns by up to 1 deg per millimetre and evens most of it out:
+    along y Q then changes by at most 1.6 % and PF by 1.3 % (along x: PF by 7 %, in extension). So
+    this is the larger estimate for Q.
 
     Args:
-        geometry: the frame as it was solved.
+        geometry: the frame.
+        loads: what its equations say.
         friction: Coulomb coefficient of the femorotibial contact.
 
     Returns:
-        Of the extensor group's tension and of the patellofemoral force; NaN where a neighbour
-        has no solution. None without an extensor mechanism.
+        Of the extensor group's tension and of the patellofemoral force, zero where it is slack.
+        None without an extensor mechanism.
     """
-    extensor = geometry.extensor
+    extensor, state = geometry.extensor, geometry.state
     if extensor is None:
         return None
-    up = geometry.state.pose("patella")[:3, 1]
-    forces = []
-    for shift in (-DOME_SHIFT, DOME_SHIFT):
-        moved = replace(extensor, contact_point=extensor.contact_point + shift * up)
-        values = solve_knee(replace(geometry, extensor=moved), friction).values
-        forces.append([moved.tension(values), values.get("patellofemoral", np.nan)])
-    slopes = np.diff(forces, axis=0)[0] / (2 * DOME_SHIFT)
-    return float(slopes[0]), float(slopes[1])
+    if loads.slack:
+        return 0.0, 0.0
+    system = KneeSystem(geometry, friction, LoadState(loads.lifted, frozenset()))
+    femur_ml, up = state.pose("femur")[:3, 2], state.pose("patella")[:3, 1]
+    at_contact = unknowns.patellofemoral(extensor.contact_point, extensor.contact_normal, femur_ml)
+    turns = [
+        unknowns.moment_pair("patella", "femur", cross(up, unknown.loads[0].forces[0]))
+        for unknown in at_contact
+    ]
+    magnitudes = np.array([loads.values[unknown.name] for unknown in at_contact])
+    changes = system.response((state.generalised(turns) @ magnitudes)[:, None])[:, 0]
+    slopes = dict(zip(system.names, changes.tolist(), strict=True))
+    return extensor.tension(slopes), slopes["patellofemoral"]
 
 
 class KneeSystem:

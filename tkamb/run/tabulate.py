@@ -157,7 +157,7 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
     row["residual_coronal_Nm"] = values.get("residual_coronal", NAN)
     row["residual_flexion_Nm"] = values.get("residual_flexion", NAN)
     friction = case.scene.contact.friction if case.scene.contact else 0.0
-    dome = None if loads.problems else dome_sensitivity(frame.geometry, friction)
+    dome = None if loads.problems else dome_sensitivity(frame.geometry, loads, friction)
     for name, slope in zip(("quadriceps", "patellofemoral"), dome or (), strict=False):
         row[f"{name}_per_dome_mm_N"] = slope * MILLIMETRE
     if frame.geometry.ground:
