@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
+from tkamb.compiled import compiled
 from tkamb.geometry.frames import Array
 from tkamb.opensim.plane_strings import dot, planar_starts
 
@@ -153,7 +154,7 @@ class _Shot:
         ahead = (entry - self.start) / distance
         across = (np.cross(_normal(entry, self.axes)[0], ahead) * moved).sum(axis=1)
         state = np.column_stack([entry, ahead, across, across / distance[:, 0]])
-        state = _along_geodesic(state, pieces, self.axes)
+        _follow_geodesics(state, pieces, self.axes, DOP853.A, DOP853.B)
         leave, direction = state[:, :3], state[:, 3:6]
         field, rate = state[:, 6], state[:, 7]
         normal, slope = _normal(leave, self.axes)
@@ -188,32 +189,43 @@ def _normal(points: Array, axes: Array) -> tuple[Array, Array]:
     return gradient / slope[:, None], slope
 
 
-def _along_geodesic(state: Array, pieces: Array, axes: Array) -> Array:
-    """Return states (f, 8) = (x, v, j, j') at the geodesics' ends.
+@compiled
+def _follow_geodesics(
+    states: Array, pieces: Array, axes: Array, weights: Array, last_weights: Array
+) -> None:
+    """Carry states (f, 8) = (x, v, j, j') along to the ends of their geodesics.
 
     Args:
-        state: (f, 8) at their starts.
-        pieces: (f, STEPS) m, lengths of the steps of an 8th-order Runge-Kutta rule.
+        states: at the starts; written.
+        pieces: (f, STEPS) m, lengths of the steps of a Runge-Kutta rule.
         axes: (3,) m.
+        weights: (s, s) of the rule's stages before each stage.
+        last_weights: (s,) of all stages in a step.
     """
+    count = len(last_weights)
+    stages, here, gradient = np.empty((count, 8)), np.empty(8), np.empty(3)
     inverse_squares = 1.0 / axes**2
-    curvature = inverse_squares.prod()
-
-    def rate(y: Array, result: Array) -> None:
-        gradient, velocity = y[:3] * inverse_squares[:, None], y[3:6]
-        squared = np.einsum("if,if->f", gradient, gradient)
-        result[:3] = velocity
-        result[3:6] = gradient * (inverse_squares @ (velocity * velocity) / -squared)
-        result[6] = y[7]
-        result[7] = y[6] * (-curvature / (squared * squared))
-
-    # Components first and stages in one row each: a step's sums are products of small matrices.
-    y = np.ascontiguousarray(state.T)
-    stages = np.empty((DOP853.n_stages, *y.shape))
-    rows = stages.reshape(DOP853.n_stages, -1)
-    for step in pieces.T:
-        for k, weights in enumerate(DOP853.A):
-            moved = (weights[:k] @ rows[:k]).reshape(y.shape)
-            rate(y + step * moved, stages[k])
-        y = y + step * (DOP853.B @ rows).reshape(y.shape)
-    return y.T
+    curvature = inverse_squares[0] * inverse_squares[1] * inverse_squares[2]
+    for n in range(len(states)):
+        state = states[n]
+        for step in pieces[n]:
+            for k in range(count):
+                for i in range(8):
+                    here[i] = state[i]
+                for before in range(k):
+                    share = step * weights[k, before]
+                    for i in range(8):
+                        here[i] += share * stages[before, i]
+                squared = bend = 0.0
+                for i in range(3):
+                    gradient[i] = here[i] * inverse_squares[i]
+                    squared += gradient[i] * gradient[i]
+                    bend += here[3 + i] * here[3 + i] * inverse_squares[i]
+                for i in range(3):
+                    stages[k, i] = here[3 + i]
+                    stages[k, 3 + i] = -bend / squared * gradient[i]
+                stages[k, 6] = here[7]
+                stages[k, 7] = -curvature / (squared * squared) * here[6]
+            for k in range(count):
+                for i in range(8):
+                    state[i] += step * last_weights[k] * stages[k, i]
