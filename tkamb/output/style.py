@@ -3,7 +3,6 @@
 Colours: Okabe & Ito (2008), Color Universal Design. Pressure: viridis, perceptually uniform.
 """
 
-import io
 import re
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -103,13 +102,10 @@ def svg_text(figure: "Figure", name: str, dpi: int = 150) -> str:
     the values at its left and right end, `data-heights` at its foot and head, for whoever draws
     over it.
     """
-    buffer = io.StringIO()
-    with settings():
-        from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from tkamb.output.svg import written
 
-        figure.set_dpi(dpi)  # not savefig, which draws everything twice: once to lay it out
-        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
-    text = buffer.getvalue()
+    with settings():
+        text = written(figure, dpi)
     text = text[text.index("<svg") :]
     text = re.sub(r"<(metadata|style)\b.*?</\1>", "", text, flags=re.DOTALL)
     text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
