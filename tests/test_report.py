@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from matplotlib import colormaps
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 
 from headless import Page
@@ -21,7 +22,7 @@ from tkamb.output.panels import Line, Panel, panels
 from tkamb.output.plots import WIDTH, Sheet
 from tkamb.output.pressure_maps import draw_maps, mapped_frames, top_view
 from tkamb.output.report import THIRD, report_html, write_report
-from tkamb.output.style import BLACK, svg_text
+from tkamb.output.style import BLACK, PRESSURE_MAP, svg_text
 from tkamb.output.tables import flag_rows, motion_table, reasons
 from tkamb.results import PERCENTILES, Results
 
@@ -353,12 +354,15 @@ def test_maps_have_one_scale_to_the_largest_pressure(bend):
     assert len(frames) >= 4
     figure = draw_maps(bend, view, axis, frames)
     largest = bend.maps.pressure_Pa.max() / 1e6
-    for axes, frame in zip(figure.axes, frames, strict=False):
+    *maps, bar = figure.axes
+    assert bar.get_ylim() == pytest.approx((0.0, largest))
+    steps = {tuple(c): k for k, c in enumerate(colormaps[PRESSURE_MAP](range(256), bytes=True))}
+    for axes, frame in zip(maps, frames, strict=False):
         _, pressure = axes.images
-        assert pressure.norm.vmin == 0
-        assert pressure.norm.vmax == pytest.approx(largest)
+        colours = np.asarray(pressure.get_array()).reshape(-1, 4)
+        step = max(steps[tuple(colour)] for colour in colours if colour[3] == 255)
         highest = bend.maps.pressure_Pa[frame].max() / 1e6
-        assert 0.98 * highest < pressure.get_array().max() <= highest * (1 + 1e-9)
+        assert (step + 0.5) * largest / 256 == pytest.approx(highest, rel=0.02)
 
 
 @pytest.mark.parametrize(

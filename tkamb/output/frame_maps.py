@@ -4,8 +4,6 @@ A byte is `RIM_BYTE` where the contact ends, above it in contact (the run's larg
 255) and below it apart; the page draws between the bytes linearly and colours what lies above.
 """
 
-import base64
-import io
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,13 +11,13 @@ from matplotlib import colormaps
 from matplotlib.colors import Normalize, to_hex
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from PIL import Image
 
 from tkamb.geometry.frames import SIDES, Array
-from tkamb.output.levels import pressure_levels
+from tkamb.output.levels import pressure_levels, touched_part
 from tkamb.output.metrics import map_rows
 from tkamb.output.pressure_maps import TopView, place_maps, pressure_bar
 from tkamb.output.style import PRESSURE_MAP, new_figure, settings
+from tkamb.output.svg import png_address
 from tkamb.units import MEGAPASCAL
 
 if TYPE_CHECKING:
@@ -30,8 +28,6 @@ MOST_FRAMES = 250
 """A longer run shows, at each place of the slider, the nearest of so many maps."""
 COARSER = 2
 """The page's grid has every so-manieth point of the picture's."""
-MARGIN = 2
-"""Grid points kept around all contacts of the run."""
 
 
 def draw_insert(view: TopView, largest: float) -> Figure:
@@ -93,19 +89,11 @@ def _tiles(
     assert maps is not None
     levels = pressure_levels(maps.pressure_Pa[rows], maps.gap_m[rows], view.triangles, largest)
     found = view.grid.sample(levels, COARSER)
-    touched = (found > 0).any(axis=0)
-    down, over = (_range(np.any(touched, axis=k)) for k in (1, 0))
+    down, over = touched_part(found.max(axis=0) > 0)
     steps = np.clip(np.round(RIM_BYTE + (255 - RIM_BYTE) * found[:, down, over]), 0, 255)
     up, across = view.grid.up[::COARSER][down], view.grid.across[::COARSER][over]
     edges = [round(float(edge), 3) for edge in (across[0], across[-1], up[-1], up[0])]
     return steps.astype(np.uint8), edges
-
-
-def _range(touched: Any) -> slice:
-    """Return where something is touched with a margin; the first points where nothing is."""
-    there = np.flatnonzero(touched)
-    low, high = (there[0], there[-1]) if len(there) else (0, 1)
-    return slice(max(int(low) - MARGIN, 0), int(high) + MARGIN + 1)
 
 
 def _png(tiles: NDArray[np.uint8], across: int) -> str:
@@ -115,9 +103,7 @@ def _png(tiles: NDArray[np.uint8], across: int) -> str:
     whole = np.zeros((down * across, rows, columns), np.uint8)
     whole[:count] = tiles
     sheet = whole.reshape(down, across, rows, columns).swapaxes(1, 2)
-    buffer = io.BytesIO()
-    Image.fromarray(sheet.reshape(down * rows, across * columns)).save(buffer, "PNG")
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+    return png_address(sheet.reshape(down * rows, across * columns))
 
 
 def _centres(results: "Results", view: TopView, side: str) -> list[list[float] | None]:

@@ -5,7 +5,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Mask
 from tkamb.geometry.ragged import counted
 from tkamb.units import MILLIMETRE
 
@@ -13,6 +13,8 @@ ON_EDGE = 1e-9
 """Barycentric distance by which a grid point may lie outside a triangle and still on its edge."""
 FAR = 10 * MILLIMETRE
 """A gap above this, infinite where nothing lies above, counts as this."""
+MARGIN = 2
+"""Grid points kept around contacts."""
 
 
 def pressure_levels(
@@ -70,11 +72,12 @@ class PageGrid:
         self.across = np.arange(across.min(), across.max() + step_mm, step_mm)
         self.up = np.arange(up.max(), up.min() - step_mm, -step_mm)
 
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """Left, right, bottom and top edge of the outermost cells, mm."""
+    def extent(
+        self, rows: slice = slice(None), columns: slice = slice(None)
+    ) -> tuple[float, float, float, float]:
+        """Return left, right, bottom and top edge of a part's outermost cells, mm."""
         half = 0.5 * (self.across[1] - self.across[0])
-        across, up = self.across, self.up
+        across, up = self.across[columns], self.up[rows]
         return across[0] - half, across[-1] + half, up[-1] - half, up[0] + half
 
     @cached_property
@@ -115,6 +118,21 @@ class PageGrid:
         for here in np.ndindex(values.shape[:-1]):
             found[here][over] = np.einsum("ij,ij->i", weights, values[here][corners])
         return found
+
+
+def touched_part(touched: Mask) -> tuple[slice, slice]:
+    """Return the rows and columns of a grid that hold all that is touched, and a margin.
+
+    Args:
+        touched: (rows, columns); the first points where nothing is.
+    """
+    rows, columns = (_range(there) for there in np.nonzero(touched))
+    return rows, columns
+
+
+def _range(there: NDArray[np.int64]) -> slice:
+    low, high = (int(there.min()), int(there.max())) if len(there) else (0, 1)
+    return slice(max(low - MARGIN, 0), high + MARGIN + 1)
 
 
 def _covered(

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis
-from tkamb.output.levels import PageGrid, pressure_levels
+from tkamb.output.levels import PageGrid, pressure_levels, touched_part
 from tkamb.output.maps import ContactMaps
 from tkamb.output.metrics import map_rows, stretches
 from tkamb.output.panels import lateral_axis_name
@@ -79,16 +80,9 @@ class TopView:
     def draw_insert(self, axes: Axes) -> None:
         """Draw the insert in greys that show its dishes, and dress the axes."""
         over = self.grey >= 0
-        axes.imshow(
-            np.where(over, self.grey, self.grey.max()),
-            cmap="gray",
-            vmin=0,
-            vmax=1,
-            alpha=over.astype(float),
-            extent=self.grid.extent,
-            interpolation="bilinear",
-            zorder=1,
-        )
+        picture = colormaps["gray"](np.where(over, self.grey, self.grey.max()), bytes=True)
+        picture[..., 3] = 255 * over
+        _show(axes, picture, self.grid.extent(), 1.0)
         axes.set_xlim(self.across_limits)
         axes.set_ylim(self.up_limits)
         axes.set_aspect("equal")
@@ -253,16 +247,21 @@ def draw_pressure(
     apart = None if gap is None else gap[None]
     level = view.grid.sample(pressure_levels(pressure[None], apart, view.triangles, peak)[0])
     if (level > 0).any():
-        shown, opacity = peak * np.maximum(level, 0.0), np.clip(0.5 + level / RIM, 0.0, 1.0)
-        axes.imshow(
-            shown,
-            norm=scale,
-            cmap=PRESSURE_MAP,
-            alpha=opacity,
-            extent=view.grid.extent,
-            interpolation="bilinear",
-            zorder=1.5,
-        )
+        part = touched_part(level > 0)
+        level = level[part]
+        picture = colormaps[PRESSURE_MAP](np.maximum(level, 0.0), bytes=True)
+        picture[..., 3] = 255 * np.clip(0.5 + level / RIM, 0.0, 1.0)
+        _show(axes, picture, view.grid.extent(*part), 1.5)
+
+
+def _show(
+    axes: Axes,
+    picture: NDArray[np.uint8],
+    extent: tuple[float, float, float, float],
+    height: float,
+) -> None:
+    """Draw a picture (rows, columns, 4) of a grid's points as it is; the page smooths it."""
+    axes.imshow(picture, extent=extent, interpolation="none", zorder=height, clip_on=False)
 
 
 def _draw_centres(axes: Axes, view: TopView, results: "Results", frame: int) -> None:

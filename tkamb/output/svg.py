@@ -1,18 +1,56 @@
 """Figures written as SVG for a page: what they have in common is found once."""
 
+import base64
 import io
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
+from matplotlib.backend_bases import GraphicsContextBase
 from matplotlib.backends.backend_mixed import MixedModeRenderer
 from matplotlib.backends.backend_svg import FigureCanvasSVG, RendererSVG
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.textpath import text_to_path
+from matplotlib.transforms import Affine2DBase
+from numpy.typing import NDArray
+from PIL import Image
 
 
 class Renderer(RendererSVG):
-    """Draws as matplotlib's own does, but measures a text once for all figures."""
+    """Draws as matplotlib's own does, but measures a text once for all figures.
+
+    Pictures given point by point (`interpolation="none"`) are smoothed by whoever shows them and
+    stand once in a figure, however often they are drawn; they are not clipped.
+    """
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self._pictures: dict[bytes, str] = {}
+
+    def draw_image(
+        self,
+        gc: GraphicsContextBase,
+        x: float,
+        y: float,
+        im: Any,
+        transform: Affine2DBase | None = None,
+    ) -> None:
+        """Draw a picture (rows, columns, 4); with a transform (points) it is given by points."""
+        if transform is None:
+            return super().draw_image(gc, x, y, im)
+        content, (rows, columns) = im.tobytes(), im.shape[:2]
+        if content not in self._pictures:
+            self._pictures[content] = name = f"picture{len(self._pictures)}"
+            size = {"width": str(columns), "height": str(rows)}
+            self.writer.start("defs")
+            self.writer.element("image", id=name, href=png_address(im), **size)
+            self.writer.end("defs")
+        to_page = [[1.0, 0.0, x], [0.0, -1.0, self.height - y], [0.0, 0.0, 1.0]]
+        placed = to_page @ transform.get_matrix() @ np.diag([1 / columns, 1 / rows, 1.0])
+        matrix = " ".join(f"{value:.7g}" for value in placed[:2].T.ravel())
+        name = self._pictures[content]
+        self.writer.element("use", href=f"#{name}", transform=f"matrix({matrix})")
 
     def _get_font_height_metrics(self, prop: FontProperties) -> tuple[float, float, float]:
         """Return what matplotlib asks for since 3.11: ascent, descent and line gap, points."""
@@ -42,6 +80,15 @@ def written(figure: Figure, dpi: int) -> str:
     figure.draw(renderer)
     renderer.finalize()
     return buffer.getvalue()
+
+
+def png_address(picture: NDArray[np.uint8]) -> str:
+    """Return a picture, (rows, columns) of greys or (rows, columns, 4), as a PNG data address."""
+    image, buffer = Image.fromarray(picture), io.BytesIO()
+    if picture.ndim == 3 and (picture[..., :1] == picture[..., 1:3]).all():
+        image = image.convert("LA")
+    image.save(buffer, "PNG")
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
 @lru_cache(maxsize=4096)
