@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import (
     LogLocator,
@@ -18,6 +17,7 @@ from tkamb.errors import InputError
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
 from tkamb.output.metrics import failed, flagged
 from tkamb.output.panels import Line, Panel, centre_panel, panels
+from tkamb.output.places import EDGE, TICKS, label_width, leave_unmeasured, set_place
 from tkamb.output.style import (
     BLACK,
     GREY,
@@ -25,8 +25,8 @@ from tkamb.output.style import (
     legend_above,
     new_figure,
     settings,
-    text_width,
 )
+from tkamb.output.svg import text_width
 
 if TYPE_CHECKING:
     from tkamb.results import Results
@@ -35,12 +35,10 @@ WIDTH, HEIGHT = 5.4, 3.1
 DEFAULT = ("forces", "condyles", "ratios", "pressures")
 TITLE_PAD, LEGEND_ROW = 8.0, 14.0
 """Points between a plot and its title, for each row of the legend between them."""
-EDGE, FOOT, OVERHANG = 3.0, 31.5, 13.0
-"""Points around a plot: beside all its labels; for those of the horizontal axis; for half of its
-last label."""
-TICKS, AXIS_LABEL = 6.5, 13.0
-"""Points that ticks with their gap and the vertical axis' label take."""
-TICK_LABEL, SIDE_LABEL, LEGEND = 9.0, 8.0, 8.5
+FOOT, OVERHANG, AXIS_LABEL = 31.5, 13.0, 13.0
+"""Points around a plot: for the labels of the horizontal axis; for half of its last label; for the
+vertical axis' label."""
+SIDE_LABEL, LEGEND = 8.0, 8.5
 """Points, sizes of letters."""
 LABEL = 12.0
 """Points from a plot's edge to the near side of an axis' label."""
@@ -149,7 +147,7 @@ def _place_alone(axes: Axes, panel: Panel) -> bool:
     for second in axes.child_axes:
         second.apply_aspect()  # takes its range from the first
     sides = [one.yaxis for one in (axes, *axes.child_axes)]
-    widths = [_label_width(side) for side in sides]
+    widths = [label_width(side) for side in sides]
     if any(side.get_major_formatter().get_offset() for side in sides):
         return False
     left, *others = (
@@ -168,22 +166,14 @@ def _place_alone(axes: Axes, panel: Panel) -> bool:
         return False
     rows = -(-len(panel.lines) // columns)
     top = EDGE + LEGEND * (1.0 + rows + 0.5 * (rows - 1))
-    figure.set_layout_engine("none")
     wide, tall = width - left - right, height - FOOT - top
-    axes.set_position((left / width, FOOT / height, wide / width, tall / height))
+    set_place(axes, left, FOOT, wide, tall)
     axes.xaxis.set_label_coords(0.5, (LABEL - FOOT) / tall)
     for side, place in zip(sides, (LABEL, width - LABEL), strict=False):
         side.set_label_coords((place - left) / wide, 0.5, axes.transAxes)
+    for axis in (axes.xaxis, *sides):
+        leave_unmeasured(axis)
     return True
-
-
-def _label_width(axis: Axis) -> float:
-    """Return the width (points) of a vertical axis' labels."""
-    low, high = sorted(axis.get_view_interval())
-    ticks = axis.get_majorticklocs()
-    labels = axis.get_major_formatter().format_ticks(list(ticks))
-    shown = [label for tick, label in zip(ticks, labels, strict=True) if low <= tick <= high]
-    return max((text_width(one, TICK_LABEL) for one in shown), default=0.0)
 
 
 def _legend_width(panel: Panel, columns: int) -> float:

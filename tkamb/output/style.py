@@ -4,7 +4,6 @@ Colours: Okabe & Ito (2008), Color Universal Design. Pressure: viridis, perceptu
 """
 
 import re
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -81,16 +80,6 @@ def settings() -> Any:
     import matplotlib as mpl
 
     return mpl.rc_context(SETTINGS)
-
-
-@lru_cache(maxsize=1024)
-def text_width(text: str, size: float) -> float:
-    """Return the width of a line of text in letters of a size, points."""
-    from matplotlib.font_manager import FontProperties
-    from matplotlib.textpath import text_to_path
-
-    letters = FontProperties(family=SETTINGS["font.sans-serif"], size=size)
-    return float(text_to_path.get_text_width_height_descent(text, letters, ismath=False)[0])
 
 
 def svg_text(figure: "Figure", name: str, dpi: int = 150) -> str:

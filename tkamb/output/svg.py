@@ -91,6 +91,11 @@ def png_address(picture: NDArray[np.uint8]) -> str:
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
+def text_width(text: str, size: float) -> float:
+    """Return the width of a line of text in letters of a size, points; within `settings`."""
+    return _text_size(text, FontProperties(size=size), False)[0]
+
+
 @lru_cache(maxsize=4096)
 def _text_size(text: str, letters: FontProperties, ismath: Any) -> tuple[float, float, float]:
     return text_to_path.get_text_width_height_descent(text, letters, ismath)

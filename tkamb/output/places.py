@@ -1,0 +1,47 @@
+"""Where plots stand in their figures: what their labels need is known, no layout looks for it."""
+
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+
+from tkamb.output.svg import text_width
+
+EDGE = 3.0
+"""Points around all labels of a figure."""
+TICKS = 6.5
+"""Points that ticks with their gap take."""
+TICK_LABEL = 9.0
+"""Points, size of letters."""
+
+
+def set_place(axes: Axes, left: float, bottom: float, wide: float, tall: float) -> None:
+    """Put axes at a place in their figure (points), whose layout engine then rests."""
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    figure.set_layout_engine("none")
+    width, height = 72 * figure.get_size_inches()
+    axes.set_position((left / width, bottom / height, wide / width, tall / height))
+
+
+def leave_unmeasured(axis: Axis) -> None:
+    """Have an axis draw its labels without looking first how far they reach."""
+    for tick in axis.get_major_ticks(len(axis.get_majorticklocs())):
+        tick.label1.set_in_layout(False)
+        tick.label2.set_in_layout(False)
+
+
+def shown_labels(axis: Axis) -> list[tuple[float, float]]:
+    """Return an axis' labels: where each stands, 0 to 1 along the axis, and its width (points)."""
+    low, high = axis.get_view_interval()
+    ticks = axis.get_majorticklocs()
+    labels = axis.get_major_formatter().format_ticks(list(ticks))
+    places = [(tick - low) / (high - low) for tick in ticks]
+    return [
+        (place, text_width(label, TICK_LABEL))
+        for place, label in zip(places, labels, strict=True)
+        if 0.0 <= place <= 1.0
+    ]
+
+
+def label_width(axis: Axis) -> float:
+    """Return the width (points) of a vertical axis' labels."""
+    return max((width for _, width in shown_labels(axis)), default=0.0)
