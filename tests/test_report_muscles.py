@@ -1,12 +1,16 @@
 """The report's section on muscles: what is drawn where, and that its parts sum up."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.transforms import Bbox
 
 from muscle_run import ACROSS, CHANNELS, GROUPS, muscle_run
 from synthetic_run import WEIGHT_N
+from test_report import measure_labels
 from tkamb.output.axis import horizontal_axis
 from tkamb.output.muscles import activation_cells, draw_activations, muscle_panels, reserve_words
 from tkamb.output.report import report_html
@@ -82,3 +86,26 @@ def test_the_section_is_in_the_page(run):
     assert "<h2>Muscles</h2>" in page
     assert "figure-from_medial" in page
     assert "line-measured_medial_N" in page
+
+
+@pytest.mark.parametrize("kind", ["cycle", "time"])
+@pytest.mark.parametrize("count", [3, 5, 13, 15])
+def test_small_plots_stand_apart_and_within_their_picture(run, kind, count):
+    """With all labels, also over an empty place in the last row; nothing is left unused."""
+    groups = {"knee extensors": [*GROUPS["knee extensors"], *ACROSS, *CHANNELS][:count]}
+    summary = run.summary | {"muscle_groups": groups, "emg": None}
+    shown = replace(run, summary=summary)
+    figure = draw_activations(shown, horizontal_axis(shown, kind))
+    assert len(figure.axes) == count
+    canvas = FigureCanvasSVG(figure)
+    canvas.draw()
+    measure_labels(figure)
+    boxes = [axes.get_tightbbox() for axes in figure.axes]
+    (below,) = (text.get_window_extent() for text in figure.texts)
+    whole = Bbox.union([*boxes, below])
+    size = figure.dpi * figure.get_size_inches()
+    assert (whole.min > 0.0).all() and (whole.max < size).all()
+    assert whole.height > size[1] - 6.5
+    assert count < 5 or whole.width > size[0] - 6.5
+    for one, other in combinations([*boxes, below], 2):
+        assert not one.overlaps(other)

@@ -1,6 +1,6 @@
 """The report's section on muscles: activations beside EMG, forces, and what they do to the knee."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,15 @@ from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis
 from tkamb.output.metrics import body_weight
 from tkamb.output.panels import Line, Panel
+from tkamb.output.places import (
+    EDGE,
+    TICK_LABEL,
+    TICKS,
+    label_width,
+    leave_unmeasured,
+    overhang,
+    set_place,
+)
 from tkamb.output.style import (
     BLACK,
     GREY,
@@ -45,6 +54,11 @@ HIGHEST = 1.02
 """Of the activations' axis."""
 CELL, CELLS_ACROSS, MARGIN = (2.16, 1.12), 5, 0.3
 """Inches: width and height of a small plot; how many stand beside each other; for the labels."""
+BETWEEN, LABELS = (11.5, 20.0), 10.0
+"""Points between two small plots, beside each other at least and below each other; for the
+horizontal axis' labels over an empty place."""
+FOOT, TITLE = 33.5, 11.5
+"""Points under all small plots, and over them."""
 SHADE = "#c4c4c4"
 
 
@@ -147,17 +161,38 @@ def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
     rows = -(-len(cells) // CELLS_ACROSS)
     with settings():
         figure = new_figure(CELLS_ACROSS * CELL[0], rows * CELL[1] + MARGIN)
-        grid = figure.subplots(rows, CELLS_ACROSS, sharex=True, sharey=True, squeeze=False)
-        for k, axes in enumerate(grid.ravel()):
-            if k >= len(cells):
-                axes.set_visible(False)
-                continue
-            _draw_cell(axes, cells[k], results, axis)
-            axes.tick_params(labelbottom=k + CELLS_ACROSS >= len(cells))
-        grid[0, 0].set_ylim(0, HIGHEST)
-        grid[0, 0].set_yticks([0, 0.5, 1])
-        figure.supxlabel(axis.label, fontsize=9)
+        first = figure.add_axes((0, 0, 1, 1))
+        others = [figure.add_axes((0, 0, 1, 1), sharex=first, sharey=first) for _ in cells[1:]]
+        for k, (cell, axes) in enumerate(zip(cells, (first, *others), strict=True)):
+            _draw_cell(axes, cell, results, axis)
+            below = k + CELLS_ACROSS >= len(cells)
+            axes.tick_params(labelbottom=below, labelleft=k % CELLS_ACROSS == 0)
+        first.set_ylim(0, HIGHEST)
+        first.set_yticks([0, 0.5, 1])
+        low = EDGE / 72 / figure.get_figheight()
+        figure.supxlabel(axis.label, fontsize=TICK_LABEL, y=low, va="bottom")
+        _place_cells((first, *others), rows)
     return figure
+
+
+def _place_cells(cells: Sequence[Axes], rows: int) -> None:
+    """Put small plots beside and below each other, with room for what stands around them."""
+    width, height = 72 * CELLS_ACROSS * CELL[0], 72 * (rows * CELL[1] + MARGIN)
+    left = EDGE + TICKS + label_width(cells[0].yaxis)
+    beyond = overhang(cells[0].xaxis, width / CELLS_ACROSS - left)
+    left, right = max(left, EDGE + beyond[0]), EDGE + beyond[1]
+    gap = max(BETWEEN[0], sum(beyond) + 2 * EDGE)
+    labels_within = LABELS if len(cells) % CELLS_ACROSS and rows > 1 else 0.0
+    wide = (width - left - right + gap) / CELLS_ACROSS - gap
+    tall = (height - FOOT - TITLE - labels_within + BETWEEN[1]) / rows - BETWEEN[1]
+    for k, axes in enumerate(cells):
+        row, column = divmod(k, CELLS_ACROSS)
+        raised = labels_within if row < rows - 1 else 0.0
+        bottom = FOOT + (rows - 1 - row) * (tall + BETWEEN[1]) + raised
+        set_place(axes, left + column * (wide + gap), bottom, wide, tall)
+    for axes in cells:
+        leave_unmeasured(axes.xaxis)
+        leave_unmeasured(axes.yaxis)
 
 
 def _draw_cell(axes: Axes, cell: Cell, results: "Results", axis: HorizontalAxis) -> None:

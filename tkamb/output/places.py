@@ -45,3 +45,11 @@ def shown_labels(axis: Axis) -> list[tuple[float, float]]:
 def label_width(axis: Axis) -> float:
     """Return the width (points) of a vertical axis' labels."""
     return max((width for _, width in shown_labels(axis)), default=0.0)
+
+
+def overhang(axis: Axis, length: float) -> tuple[float, float]:
+    """Return how far labels of a horizontal axis reach beyond its left and right end, points."""
+    shown = shown_labels(axis)
+    left = max((0.5 * width - place * length for place, width in shown), default=0.0)
+    right = max((0.5 * width - (1.0 - place) * length for place, width in shown), default=0.0)
+    return max(left, 0.0), max(right, 0.0)
