@@ -35,8 +35,9 @@ def pressure_levels(
     """
     share = np.clip(np.nan_to_num(pressure) / (peak or 1.0), 0.0, 1.0)
     apart = np.ones_like(share) if gap is None else np.clip(np.nan_to_num(gap), 0.0, FAR)
+    touched = triangles[share.max(axis=0)[triangles].any(axis=1)]  # the others have no rim
     return np.stack(
-        [_frame_levels(one, far, triangles) for one, far in zip(share, apart, strict=True)]
+        [_frame_levels(one, far, touched) for one, far in zip(share, apart, strict=True)]
     )
 
 
