@@ -6,16 +6,20 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from matplotlib.colors import Normalize
 
 from synthetic_run import make_run
 from tkamb.activities import PEAKS_BW, Activity
 from tkamb.output import style
 from tkamb.output.axis import horizontal_axis
 from tkamb.output.levels import PageGrid, pressure_levels
+from tkamb.output.maps import ContactMaps
 from tkamb.output.pages import asset
 from tkamb.output.panels import panels
 from tkamb.output.plots import Sheet
+from tkamb.output.pressure_maps import STEP_MM, TopView, draw_pressure
 from tkamb.output.reading import conclusions
+from tkamb.output.style import new_figure
 from tkamb.results import Results
 
 
@@ -182,3 +186,24 @@ def test_what_may_be_concluded_follows_the_run(bend, gait):
     assert any("lateral force: its mean would be nearer" in words for words in bears_not)
     assert any("how far they are off is not measured" in words for words in bears_not)
     assert not any("no input was varied" in words for words in bears_not)
+
+
+def test_a_contact_s_rim_covers_of_each_grid_cell_what_lies_within():
+    """A round contact of 4 mm: its opacity sums up to its area, which hard steps miss."""
+    size, step = 12.0, 0.5
+    z, x = np.meshgrid(np.arange(-size, size + step, step), np.arange(-size, size + step, step))
+    n, across = x.size, x.shape[1]
+    corner = np.arange(n).reshape(x.shape)[:-1, :-1].ravel()
+    triangles = np.concatenate(
+        [corner[:, None] + [0, 1, across + 1], corner[:, None] + [0, across + 1, across]]
+    )
+    points = 1e-3 * np.stack([x.ravel(), np.zeros(n), z.ravel()], axis=1)
+    view = TopView(ContactMaps({"points_m": points, "triangles": triangles}), "right", "lateral")
+    for radius in (3.9, 4.0, 4.1):
+        gap = (x**2 + z**2).ravel() - radius**2
+        axes = new_figure(3.0, 3.0).add_subplot()
+        draw_pressure(axes, view, np.maximum(-gap, 0.0), Normalize(0.0, radius**2), 1e-3 * gap)
+        opacity = np.asarray(axes.images[0].get_array())[..., 3] / 255
+        assert opacity.sum() * STEP_MM**2 == pytest.approx(np.pi * radius**2, rel=0.02)
+        partly = (opacity > 0) & (opacity < 1)
+        assert partly.sum() * STEP_MM > 2 * np.pi * radius

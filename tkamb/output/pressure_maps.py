@@ -41,7 +41,8 @@ other."""
 BAR_LABELS, BAR_RATIO = 41.0, 30.0
 """Points right of a colour bar for its labels; its height over its width."""
 RIM = 0.03
-"""Share of the scale over which a map fades at its rim, so that no steps are seen there."""
+"""Share of the scale over which a map fades at its rim where it is flat; elsewhere it fades from
+one point of the grid to the next, so that no steps are seen there."""
 
 
 class TopView:
@@ -250,7 +251,8 @@ def draw_pressure(
         part = touched_part(level > 0)
         level = level[part]
         picture = colormaps[PRESSURE_MAP](np.maximum(level, 0.0), bytes=True)
-        picture[..., 3] = 255 * np.clip(0.5 + level / RIM, 0.0, 1.0)
+        change = np.hypot(*np.gradient(level))  # from point to point of the grid
+        picture[..., 3] = 255 * np.clip(0.5 + level / np.maximum(change, RIM), 0.0, 1.0)
         _show(axes, picture, view.grid.extent(*part), 1.5)
 
 
