@@ -164,6 +164,10 @@ class Chain:
         """Rows of the generalised force that belong to the six knee coordinates."""
         return self._columns[:6]
 
+    def patella_columns(self) -> list[int]:
+        """Those that belong to the three coordinates of the patella, none where it rides along."""
+        return self._columns[6:]
+
     def at(self, motion: ChainMotion) -> "ChainState":
         """Return the chain at one instant, with its inertial forces."""
         model = self.model

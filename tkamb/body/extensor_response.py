@@ -75,16 +75,15 @@ def flexion_row(
 
 
 def yielding_flexion_row(
-    geometry: KneeGeometry, lines: CrossingLines, friction: float, base: float, per_wrench: Array
+    geometry: KneeGeometry, lines: CrossingLines, base: float, per_wrench: Array
 ) -> FlexionRow:
     """Return the row at one frame whose released coordinates yield to the muscles.
 
-    Patella and patellar ligament tie the extensor group's tension to the ligament's: Q = a T + b.
+    The patella ties the extensor group's tension to the ligament's: Q = a T + b.
 
     Args:
         geometry: the frame, with an extensor mechanism; its contact is not looked at.
         lines: of the muscles that cross the knee.
-        friction: Coulomb coefficient, of no consequence without contact.
         base: N, tension of the patellar ligament without the other muscles.
         per_wrench: (6,) N per N and per N·m, what a wrench on the insert, about its origin,
             adds to it.
@@ -92,21 +91,31 @@ def yielding_flexion_row(
     Raises:
         ComputationError: the equations of the patella are singular.
     """
-    assert geometry.extensor is not None
-    alone = replace(geometry, share=None, condyles={})
-    system = KneeSystem(alone, friction, LoadState(frozenset(), frozenset()))
-    if not system.solution.regular:
-        raise ComputationError("singular equations", "muscles")
-    values, state = system.solution.values, geometry.state
-    names = (unknowns.muscle_load(geometry.extensor.muscles[0]), "patellar_ligament")
-    moment = unknowns.moment_pair("tibia", "femur", unknowns.AXES["ml"])
-    change = system.response(state.generalised([moment]))[:, 0]
-    quadriceps, ligament = (float(change[system.names.index(name)]) for name in names)
-    ratio = quadriceps / ligament
-    free = values[names[0]] - ratio * values[names[1]]
+    state = geometry.state
+    ratio, free = _tension_by_ligament(geometry)
     gains = ratio * lines.unit_wrenches(state.pose("tibia"), state.pose("femur")) @ per_wrench
     slope = ratio * float(per_wrench[3:] @ unknowns.AXES["ml"])
     return _solved_for_reserve(ratio * base + free, gains, slope)
+
+
+def _tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
+    """Return a and b (N) of the extensor group's tension Q = a T + b, T the ligament's.
+
+    They are the patella's own three equations, in which no other load of the leg is.
+    """
+    extensor, state = geometry.extensor, geometry.state
+    assert extensor is not None
+    femur_ml = state.pose("femur")[:3, 2]
+    pressed = unknowns.patellofemoral(extensor.contact_point, extensor.contact_normal, femur_ml)
+    held = [geometry.muscles[0], *pressed]
+    loads = [*(unknown.loads for unknown in held), extensor.patellar_ligament, geometry.ligaments]
+    columns = state.generalised(loads)[state.chain.patella_columns()]
+    matrix, ligament, known = columns[:, :3], columns[:, 3], columns[:, 4]
+    names = [unknown.name for unknown in held]
+    alone = unknowns.solve(names, matrix, state.inertial[state.chain.patella_columns()] - known)
+    if not alone.regular:
+        raise ComputationError("singular equations", "muscles")
+    return -float(np.linalg.solve(matrix, ligament)[0]), alone.values[names[0]]
 
 
 def _solved_for_reserve(alone: float, gains: Array, slope: float) -> FlexionRow:

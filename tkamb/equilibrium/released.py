@@ -274,7 +274,7 @@ class ReleasedKnee:
         if held is not None and gain is not None:
             pull = held.wrench(geometry.state.pose("tibia"), geometry.state.pose("femur"))
             base = forces.tension_at_rest(here, gain) - float(gain @ pull)
-            share = muscles.share_of_yielding_knee(k, geometry, friction, base, gain)
+            share = muscles.share_of_yielding_knee(k, geometry, base, gain)
         else:
             points = mechanics.resultants(k, place, here.condyles)
             geometry = replace(geometry, post=mechanics.post_loads(k, place, here.post))

@@ -79,20 +79,19 @@ class SharedMuscles:
             return self._failed(lines, f"failed: {error.what}")
 
     def share_of_yielding_knee(
-        self, k: int, geometry: KneeGeometry, friction: float, base: float, per_wrench: Array
+        self, k: int, geometry: KneeGeometry, base: float, per_wrench: Array
     ) -> MuscleShare:
         """Return what each muscle carries in frame k while released coordinates yield to it.
 
         Args:
             k: frame.
             geometry: the knee; its contact is not looked at.
-            friction: Coulomb coefficient.
             base: N, see `yielding_flexion_row`.
             per_wrench: (6,), likewise.
         """
         lines = self._lines(k)
         try:
-            row = yielding_flexion_row(geometry, lines, friction, base, per_wrench)
+            row = yielding_flexion_row(geometry, lines, base, per_wrench)
         except ComputationError as error:
             return self._failed(lines, f"failed: {error.what}")
         return self._shared(k, lines, row)
