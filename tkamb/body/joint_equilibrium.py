@@ -151,6 +151,7 @@ def joint_equilibrium(
     released: tuple[int, ...],
     middle: Array,
     slack: bool,
+    external: Array,
 ) -> JointEquilibrium:
     """Return what the body asks of the knee at one frame.
 
@@ -161,6 +162,7 @@ def joint_equilibrium(
         released: indices of the released coordinates; flexion is never among them.
         middle: (3,) m, where the residual forces act, insert frame.
         slack: the extensor mechanism carries nothing.
+        external: (6,) see `external_wrench`.
     """
     line = None if slack or geometry.extensor is None else patellar_line(geometry, coordinates)
     columns = [
@@ -169,7 +171,7 @@ def joint_equilibrium(
         if i not in released and not (name == "flexion" and line)
     ]
     return JointEquilibrium(
-        external_wrench(geometry, coordinates),
+        external,
         crossing_bundles(geometry, ligaments, coordinates),
         line,
         np.array(columns).reshape(-1, 6).T,
@@ -205,7 +207,10 @@ def patellar_line(geometry: KneeGeometry, coordinates: Array) -> PatellarLine:
 
 
 def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
-    """Return the wrench (6,) that ground, weight and inertia exert on the shank."""
+    """Return the wrench (6,) on the insert that ground, weight and inertia exert on the shank.
+
+    The same wherever the knee is in that frame.
+    """
     state = geometry.state
     hip = unknowns.hip(state.point("hip", np.zeros(3)))
     ground = [geometry.ground] if geometry.ground else []

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.body.joint_equilibrium import JointEquilibrium, joint_equilibrium
+from tkamb.body.joint_equilibrium import JointEquilibrium, external_wrench, joint_equilibrium
 from tkamb.body.knee import KneeGeometry
 from tkamb.equilibrium.balance import Balance, BalanceStatus
 from tkamb.equilibrium.mechanics import Mechanics
@@ -110,6 +110,8 @@ class ReleasedKnee:
         self._mechanics, self._probe = mechanics, probe
         self.muscles = mechanics.muscles is not None
         self.released = released_indices(names)
+        self._external: tuple[int, Array] | None = None
+        """Of the last frame, and which it was."""
 
     def find(
         self,
@@ -203,7 +205,7 @@ class ReleasedKnee:
         """Return the knee at rest with the patella as at `place`, and whether it would push."""
         patella = self._patella(k, place, before.patella if before else None)
         geometry = self._mechanics.geometry(k, place, patella)
-        joint = self._joint(geometry, middle, slack)
+        joint = self._joint(k, geometry, middle, slack)
         muscles = self._mechanics.muscles
         if muscles is not None and not geometry.problems:
             held = None if touch is None or before is None else before.geometry.share
@@ -211,7 +213,7 @@ class ReleasedKnee:
             share = mixing.mixed(self._share(k, geometry, joint, touch, held, mixing))
             geometry, joint = replace(geometry, share=share), replace(joint, share=share)
             if slack := muscles.tension(share) < SLACK:
-                joint = self._joint(geometry, middle, slack)
+                joint = self._joint(k, geometry, middle, slack)
         forces = self._forces(k, joint, place, touch)
         stiffness = before.balance.stiffness if before else None
         balance = forces.balance(stiffness, *((LEFT, reach) if muscles else ()))
@@ -297,9 +299,14 @@ class ReleasedKnee:
             return None
         return extensor.patella(k, knee_pose(place), guess)
 
-    def _joint(self, geometry: KneeGeometry, middle: Array, slack: bool) -> JointEquilibrium:
+    def _joint(
+        self, k: int, geometry: KneeGeometry, middle: Array, slack: bool
+    ) -> JointEquilibrium:
         ligaments, place = self._mechanics.ligaments, geometry.coordinates
-        return joint_equilibrium(geometry, ligaments, place, self.released, middle, slack)
+        if self._external is None or self._external[0] != k:
+            self._external = k, external_wrench(geometry, place)
+        external = self._external[1]
+        return joint_equilibrium(geometry, ligaments, place, self.released, middle, slack, external)
 
     def _forces(
         self,
