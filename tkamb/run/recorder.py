@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 MAPS = ("pressure", "gap", "nodal_force", "pose", *CONTACT_PLACES)
 SHORTEST_PAUSE = 1.0
-"""s between two copies of what is finished."""
+"""s to the first copy of what is finished, and between two."""
 DEAREST_SHARE = 0.02
 """Of the computing time that the copies may take."""
 
@@ -120,7 +120,7 @@ class FolderRecorder(Recorder):
         self._directory = directory
         self._shards = Shards(directory, identity, resume)
         self._maps_path = self._shards.folder / MAPS_NAME
-        self._pause, self._shown = 0.0, -SHORTEST_PAUSE
+        self._pause, self._shown = SHORTEST_PAUSE, clock.perf_counter()
         self._map_arguments: tuple[Any, ...] | None = None
 
     def begin_maps(self, points: Array, triangles: Array, labels: Mapping[str, Any]) -> None:
