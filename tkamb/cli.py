@@ -28,15 +28,16 @@ from tkamb.wear.command import add_wear
 if TYPE_CHECKING:
     from tkamb.scene import Scene
 
-COLLECTED_AT = 5000
-"""Objects more than before at which Python looks for those that refer to each other only. At its
-usual 700 it looks five times through all that the libraries made: 3 % of a run."""
+COLLECTED_AT = (20_000, 100)
+"""Objects more than before at which Python looks for those that refer to each other only, and looks
+before it goes back to older ones. At its usual 700 and 10 it looks five times through all that the
+libraries made: 3 % of a run."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `tkamb` and return its exit status: 0 done, 1 nothing computed, 2 bad input."""
     _keep_to_one_thread()
-    gc.set_threshold(COLLECTED_AT)
+    gc.set_threshold(*COLLECTED_AT)
     options = argparse.Namespace()
 
     def command() -> int:

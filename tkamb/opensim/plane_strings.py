@@ -24,8 +24,8 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 _FINE = (((2.0 * np.arange(STEPS) + 1.0)[:, None] + _NODES) / STEPS - 1.0).ravel()
 _FINE_WEIGHTS = _WEIGHTS / STEPS
 _NODES, _COARSE_WEIGHTS = np.polynomial.legendre.leggauss(6)
-_COARSE = np.concatenate([[-1.0], _NODES, [1.0]])
-"""Places on an arc, -1 to 1: for its length in each step, and for its whole with both ends."""
+_COARSE, _ENDS = _NODES, np.array([-1.0, 1.0])
+"""Places on an arc, -1 to 1: for its length in each step, for its whole, and its ends."""
 
 
 def planar_starts(
@@ -44,14 +44,14 @@ def planar_starts(
         on it in steps of equal angle; (f,) whether the second may turn out the shorter.
     """
     planes = _Planes.through(p, q)
-    points, speeds = planes.arc(_COARSE, axes)
-    arcs = speeds[..., 1:-1] @ _COARSE_WEIGHTS
+    points = planes.points(_ENDS)
+    arcs = planes.speeds(_COARSE, axes) @ _COARSE_WEIGHTS
     lengths = arcs + sum(
         np.linalg.norm((points[:, :, k] - end[:, None]) * axes, axis=-1)
-        for k, end in ((0, p), (-1, q))
+        for k, end in enumerate((p, q))
     )
     if half is not None:
-        touches = ((points[:, :, 0] + points[:, :, -1]) * axes) @ half > 0.0
+        touches = (points.sum(axis=2) * axes) @ half > 0.0
         lengths = np.where(touches, lengths, np.inf)
     rows = np.arange(len(p))
     best = lengths.argmin(axis=1)
@@ -61,7 +61,7 @@ def planar_starts(
     other = others.argmin(axis=1)
     rival = others[rows, other] - lengths[rows, best] < RIVAL * arcs[rows, other]
     chosen = np.column_stack([best, other])
-    _, speeds = planes.chosen(rows[:, None], chosen).arc(_FINE, axes)
+    speeds = planes.chosen(rows[:, None], chosen).speeds(_FINE, axes)
     pieces = speeds.reshape(len(p), 2, STEPS, -1) @ _FINE_WEIGHTS
     return points[rows[:, None], chosen, 0], pieces, rival
 
@@ -118,18 +118,32 @@ class _Planes:
             self.ends[:, rows, planes],
         )
 
-    def arc(self, places: Array, axes: Array) -> tuple[Array, Array]:
-        """Return points (f, k, n, 3) at places in -1…1 of the arcs, and m per unit of place."""
-        spread = 0.5 * (self.ends[1] - self.ends[0])
-        angle = 0.5 * (self.ends[0] + self.ends[1])[..., None] + spread[..., None] * places
-        cosine, sine = (
-            self.radius[..., None] * np.cos(angle),
-            self.radius[..., None] * np.sin(angle),
-        )
+    def points(self, places: Array) -> Array:
+        """Return points (f, k, n, 3) at places (n,) in -1…1 of the arcs."""
+        angle, radius = self._angles(places), self.radius[..., None]
+        cosine, sine = radius * np.cos(angle), radius * np.sin(angle)
         outward, along = self.outward[:, :, None], self.along[:, :, None]
-        points = cosine[..., None] * outward + sine[..., None] * along + self.centre[:, :, None]
-        speeds = (cosine[..., None] * along - sine[..., None] * outward) * axes
-        return points, spread[..., None] * np.linalg.norm(speeds, axis=-1)
+        return cosine[..., None] * outward + sine[..., None] * along + self.centre[:, :, None]
+
+    def speeds(self, places: Array, axes: Array) -> Array:
+        """Return by how many metres (f, k, n) a point at places (n,) moves per unit of place.
+
+        Args:
+            places: in -1…1 of the arcs.
+            axes: (3,) m, of the ellipsoid.
+        """
+        angle, along, outward = self._angles(places), self.along * axes, self.outward * axes
+        cosine, sine = np.cos(angle), np.sin(angle)
+        squared = cosine**2 * dot(along, along)[..., None]
+        squared += sine**2 * dot(outward, outward)[..., None]
+        squared -= 2.0 * cosine * sine * dot(along, outward)[..., None]
+        size = 0.5 * (self.ends[1] - self.ends[0]) * self.radius
+        return size[..., None] * np.sqrt(np.maximum(squared, 0.0))
+
+    def _angles(self, places: Array) -> Array:
+        """Return the angles (f, k, n), rad, of places (n,)."""
+        middle, half = 0.5 * (self.ends[0] + self.ends[1]), 0.5 * (self.ends[1] - self.ends[0])
+        return middle[..., None] + half[..., None] * places
 
 
 def dot(a: Array, b: Array) -> Array:
