@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from scipy.integrate import quad
+from scipy.signal import butter, sosfiltfilt
 
 from recordings import write_c3d
 from shared_trials import STRENGTHS, two_flexors
@@ -35,6 +36,28 @@ def test_the_envelope_has_no_phase_and_half_the_amplitude_at_the_cutoff():
     found = envelope(swing * np.sin(2 * np.pi * 151.7 * TIME), RATE, 5.0, 30.0)[INSIDE]
     expected = 2 / np.pi * (1 + 0.25 * np.sin(2 * np.pi * 5.0 * TIME[INSIDE]))
     np.testing.assert_allclose(found, expected, atol=0.01)
+
+
+@pytest.mark.parametrize("high_pass", [20.0, "none"])
+def test_the_envelope_is_that_of_filters_run_forwards_and_backwards(high_pass):
+    """The peer filters sample by sample."""
+    signal = np.random.default_rng(3).normal(size=len(TIME)) * (1.2 + np.sin(5.0 * TIME))
+    found, wanted = envelope(signal, RATE, 6.0, high_pass), signal - signal.mean()
+    if high_pass != "none":
+        wanted = sosfiltfilt(butter(2, high_pass, "highpass", fs=RATE, output="sos"), wanted)
+    wanted = sosfiltfilt(butter(2, 6.0, fs=RATE, output="sos"), np.abs(wanted))
+    middle = slice(1500, -1500)
+    np.testing.assert_allclose(found[middle], wanted[middle], atol=1e-6 * wanted.max())
+
+
+def test_an_envelope_ends_with_a_mean_as_it_has_elsewhere():
+    """Not with its last sample, which a point-wise reflection keeps."""
+    ends = [
+        envelope(np.random.default_rng(k).normal(size=len(TIME)), RATE, 6.0, "none")[[0, -1]]
+        for k in range(40)
+    ]
+    assert np.mean(ends) == pytest.approx(np.sqrt(2 / np.pi), rel=0.05)
+    assert np.std(ends) < 0.2
 
 
 def test_the_high_pass_takes_slow_movement_away():

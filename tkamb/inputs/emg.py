@@ -1,7 +1,13 @@
 """Envelopes of surface EMG: high-passed, rectified, low-passed without phase shift, normalised.
 
 Both filters are Butterworth filters of second order run forwards and backwards: no phase shift,
-and half the amplitude at the cut-off. What the low-pass leaves below zero is set to zero.
+and half the amplitude at the cut-off. At the rate 1/h that multiplies each frequency by
+
+    1 / (1 + r⁴),  r = tan(pi f h) / tan(pi f_c h),
+
+and by r⁴ / (1 + r⁴) where it is a high-pass. Beyond its ends a signal goes on mirrored, so that
+an envelope ends with a mean as it has elsewhere. What the low-pass leaves below zero is set to
+zero.
 
 Reference: Winter, Biomechanics and Motor Control of Human Movement, 4th ed., 2009, ch. 10.
 """
@@ -11,7 +17,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array
@@ -115,11 +120,19 @@ def envelope(
             raise InputError(f"is shorter than a period of the cut-off {cutoff:g} Hz", "EMG")
     centred = signal - signal.mean()
     if high_pass_Hz != "none":
-        centred = sosfiltfilt(
-            butter(ORDER, high_pass_Hz, "highpass", fs=rate_Hz, output="sos"), centred
-        )
-    low_pass = butter(ORDER, cutoff_Hz, fs=rate_Hz, output="sos")
-    return np.maximum(sosfiltfilt(low_pass, np.abs(centred)), 0.0)
+        centred -= _low_passed(centred, high_pass_Hz / rate_Hz)
+    return np.maximum(_low_passed(np.abs(centred), cutoff_Hz / rate_Hz), 0.0)
+
+
+def _low_passed(signal: Array, cutoff: float) -> Array:
+    """Return a signal (n,) low-passed at a cut-off, periods per sample.
+
+    By its spectrum: scipy.signal, which filters sample by sample, takes 0.3 s to import.
+    """
+    mirrored = np.concatenate([signal, signal[-2:0:-1]])
+    ratio = np.tan(np.pi * np.fft.rfftfreq(len(mirrored))) / np.tan(np.pi * cutoff)
+    spectrum = np.fft.rfft(mirrored) / (1.0 + ratio ** (2 * ORDER))
+    return np.fft.irfft(spectrum, len(mirrored))[: len(signal)]
 
 
 def _signals(source: EmgRecording) -> tuple[Array, dict[str, Array]]:
