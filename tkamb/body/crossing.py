@@ -47,14 +47,23 @@ class CrossingLines:
 
     def unit_loads(self, state: "ChainState") -> list[tuple[PointForces, ...]]:
         """Return what one newton of each does to tibia and femur, insert frame."""
+        return [
+            (PointForces("tibia", p[None], u[None]), PointForces("femur", q[None], -u[None]))
+            for p, q, u in zip(*self._ends(state), strict=True)
+        ]
+
+    def loads(self, state: "ChainState", force: Array) -> tuple[PointForces, PointForces]:
+        """Return what forces (c,), N, along them do to tibia and femur, insert frame."""
+        start, end, along = self._ends(state)
+        pulls = force[:, None] * along
+        return PointForces("tibia", start, pulls), PointForces("femur", end, -pulls)
+
+    def _ends(self, state: "ChainState") -> tuple[Array, Array, Array]:
+        """Return starts, ends and directions (c, 3), insert frame."""
         start = transform(state.pose("tibia"), self.shank)
         end = transform(state.pose("femur"), self.thigh)
         along = end - start
-        along /= np.linalg.norm(along, axis=-1, keepdims=True)
-        return [
-            (PointForces("tibia", p[None], u[None]), PointForces("femur", q[None], -u[None]))
-            for p, q, u in zip(start, end, along, strict=True)
-        ]
+        return start, end, along / np.linalg.norm(along, axis=-1, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +96,8 @@ class MuscleShare:
 
     def loads(self, state: "ChainState") -> tuple[PointForces, ...]:
         """Return what the crossing muscles and the knee's reserve do to tibia and femur."""
-        scaled = [
-            PointForces(load.link, load.points, force * load.forces)
-            for force, pair in zip(
-                self.force[self.crossing], self.lines.unit_loads(state), strict=True
-            )
-            for load in pair
-        ]
-        return (*scaled, *unknowns.moment_pair("tibia", "femur", self._knee_reserve))
+        both = self.lines.loads(state, self.force[self.crossing])
+        return (*both, *unknowns.moment_pair("tibia", "femur", self._knee_reserve))
 
     def wrench(self, tibia: Array, femur: Array) -> Array:
         """Return the wrench (..., 6) of the same on the insert, about its origin.

@@ -184,7 +184,8 @@ def dome_sensitivity(
         return None
     if loads.slack:
         return 0.0, 0.0
-    system = KneeSystem(geometry, friction, LoadState(loads.lifted, frozenset()))
+    bare = replace(geometry, share=None, ligaments=(), post=())  # known loads stay as they are
+    system = KneeSystem(bare, friction, LoadState(loads.lifted, frozenset()))
     femur_ml, up = state.pose("femur")[:3, 2], state.pose("patella")[:3, 1]
     at_contact = unknowns.patellofemoral(extensor.contact_point, extensor.contact_normal, femur_ml)
     turns = [
