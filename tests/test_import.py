@@ -11,6 +11,7 @@ from pendulum_leg import changed, moving_leg, pendulum_osim, recorded_leg
 from recordings import write_c3d
 from tkamb.cli import main
 from tkamb.errors import InputError
+from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import inverse
 from tkamb.importing.anatomy import find_leg
 from tkamb.importing.links import find_links, quarter_turn
@@ -18,7 +19,7 @@ from tkamb.importing.model_fit import ModelChain, fit_model
 from tkamb.importing.soft_tissue import soft_tissue
 from tkamb.importing.urdf import link_inertias, patient_urdf
 from tkamb.inputs.markers import matched_labels
-from tkamb.inputs.meshes import load_surface
+from tkamb.inputs.meshes import axes_rotation, load_surface
 from tkamb.inputs.tables import read_table
 from tkamb.opensim.read import read_osim
 from tkamb.output.storage import write_storage, write_trc
@@ -293,7 +294,8 @@ def test_widely_used_models_have_legs_too(name, side):
 def test_jws_links_are_where_the_data_page_says():
     model = read_osim(JW / "JW.osim")
     mesh = load_surface(JW / "geometry/tibial_insert.stl", "m", AXES, name="insert")
-    links = find_links(find_leg(model, "right"), mesh, AXES, {}, True)
+    placement = insert_placement(mesh, axes_rotation(AXES))
+    links = find_links(find_leg(model, "right"), placement, AXES, {}, True)
     np.testing.assert_allclose(links.hip * 1e3, [-23.0, 392.0, 23.0], atol=0.05)
     assert links.patella is not None  # x distal, y posterior, z medial
     np.testing.assert_array_equal(links.patella[:3, :3], [[0, -1, 0], [-1, 0, 0], [0, 0, -1]])

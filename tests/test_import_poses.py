@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 from contact_bodies import flat_insert
 from pendulum_leg import changed, moving_leg, pendulum_osim
 from tkamb.cli import main
+from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
 from tkamb.importing.anatomy import find_leg
 from tkamb.importing.links import find_links
 from tkamb.importing.model_fit import ModelChain
 from tkamb.importing.patient import import_patient
 from tkamb.importing.recorded_poses import ROLES, PoseRecording, read_poses
-from tkamb.inputs.meshes import load_surface
+from tkamb.inputs.meshes import axes_rotation, load_surface
 from tkamb.opensim.read import read_osim
 from tkamb.output.storage import write_storage, write_trc
 from tkamb.scene import load_scene
@@ -135,7 +136,7 @@ def test_poses_out_of_the_sagittal_plane_keep_their_side(block, tmp_path, side):
     leg = find_leg(read_osim(osim), side)
     insert = load_surface(block, "mm", AXES, name="insert")
     frames = {part: name.replace("_r", f"_{side[0]}") for part, name in FRAMES.items()}
-    links = find_links(leg, insert, AXES, frames, False)
+    links = find_links(leg, insert_placement(insert, axes_rotation(AXES)), AXES, frames, False)
     turns = Rotation.from_euler("XYZ", np.linspace([2, 5, 5], [-1, -4, 60], 11), degrees=True)
     poses = pose(turns.as_matrix(), np.linspace([1e-3, 0.01, 3e-3], [-2e-3, 0.012, 1e-3], 11))
     file = write_poses(tmp_path / "poses.sto", np.linspace(0, 1, 11), poses)

@@ -6,10 +6,11 @@ from scipy.optimize import minimize
 
 from jw_gait import JW, gait, needs_jw
 from opensim_models import PUBLISHED, model
+from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import MIRROR, inverse, transform
 from tkamb.importing.anatomy import find_leg
 from tkamb.importing.links import find_links
-from tkamb.inputs.meshes import load_surface
+from tkamb.inputs.meshes import axes_rotation, load_surface
 from tkamb.muscles import Sharing
 from tkamb.muscles.knee_trial import knee_trial
 from tkamb.muscles.recording import LegRecording, load_knee_trial
@@ -34,7 +35,8 @@ def jw():
     leg = find_leg(trial.kinematics.model, "right")
     mesh = JW / "geometry" / "tibial_insert.stl"
     insert = load_surface(mesh, "m", "-x,+y,-z", name="insert", closed=True)
-    links = find_links(leg, insert, "-x,+y,-z", {}, False)
+    placement = insert_placement(insert, axes_rotation("-x,+y,-z"))
+    links = find_links(leg, placement, "-x,+y,-z", {}, False)
     bones = trial_problems(leg, motion, loads, Sharing())[1]
     return links, knee_trial(links, motion, loads, Sharing()), bones
 
@@ -109,7 +111,7 @@ def test_the_left_leg_of_a_symmetric_model_is_the_mirror_image_of_the_right(tmp_
         path = tmp_path / f"{side}.mot"
         columns = {"time": time} | walked(names, time, side == "left")
         write_storage(path, columns, in_degrees=False)
-        mesh = {"insert": None, "mesh_unit": "m", "mesh_axes": "+x,+y,+z"}
+        mesh = {"insert_placement": None, "mesh_axes": "+x,+y,+z"}
         given = {"markers": None, "laboratory_axes": "+x,+y,+z", "cutoff": 6.0, "ground": None}
         recording = LegRecording(
             PUBLISHED["Rajagopal2016"], side, path, **given, **mesh, sharing=Sharing()

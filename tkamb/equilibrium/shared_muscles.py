@@ -198,8 +198,7 @@ def load_muscles(case: Case) -> SharedMuscles:
         laboratory_axes=markers.laboratory_axes if markers else "+x,+y,+z",
         cutoff=scene.motion.cutoff_Hz,
         ground=None if ground is None else in_si(ground),
-        insert=None if insert is None else insert.mesh,
-        mesh_unit="m" if insert is None else insert.unit,
+        insert_placement=case.insert_placement,
         mesh_axes="+x,+y,+z" if insert is None else insert.axes,
         sharing=sharing_of(table),
     )

@@ -1,6 +1,6 @@
 """A triangulated surface in SI units and one named frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -33,11 +33,13 @@ class Surface:
         vertices: (n, 3) m, in the frame that the owner states.
         faces: (k, 3) indices into the vertices.
         name: what to call it in messages.
+        merged: no two vertices lie at one place, as is known of a mesh that has been read.
     """
 
     vertices: Array
     faces: Index
     name: str = "surface"
+    merged: bool = False
 
     @cached_property
     def mesh(self) -> "trimesh.Trimesh":
@@ -111,7 +113,7 @@ class Surface:
     @cached_property
     def corner_vertices(self) -> Index:
         """The faces (k, 3) with vertices at the same place taken for one."""
-        return same_places(self.vertices)[1][self.faces]
+        return self.faces if self.merged else same_places(self.vertices)[1][self.faces]
 
     @cached_property
     def corners_at_vertices(self) -> Ragged:
@@ -176,8 +178,9 @@ class Surface:
         """Return the surface in another frame; where that is the same, itself."""
         if np.array_equal(pose_here_in_there, np.eye(4)):
             return self
-        return Surface(transform(pose_here_in_there, self.vertices), self.faces, self.name)
+        vertices = transform(pose_here_in_there, self.vertices)
+        return Surface(vertices, self.faces, self.name, self.merged)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what is derived: larger by far, and made again where it is needed."""
-        return {"vertices": self.vertices, "faces": self.faces, "name": self.name}
+        return {field.name: getattr(self, field.name) for field in fields(self)}

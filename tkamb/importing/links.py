@@ -5,9 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import Array, inverse, knee_coordinates, pose, transform
-from tkamb.geometry.surface import Surface
 from tkamb.importing.anatomy import Leg
 from tkamb.inputs.meshes import axes_rotation
 from tkamb.units import DEGREE
@@ -165,7 +163,7 @@ class Links:
 
 def find_links(
     leg: Leg,
-    insert: Surface | None,
+    placement: Array | None,
     axes: str,
     frames: dict[str, str | None],
     with_button: bool,
@@ -174,7 +172,8 @@ def find_links(
 
     Args:
         leg: the leg.
-        insert: the insert's mesh about its own origin, in anatomical axes; None without implant.
+        placement: (4, 4) of the insert's mesh, in anatomical axes about its own origin, in the
+            insert frame; None without implant.
         axes: the meshes' axes that point anterior, superior and right.
         frames: part -> frame of its mesh, where that is given.
         with_button: whether there is a patellar button.
@@ -184,21 +183,20 @@ def find_links(
     """
     turn = pose(axes_rotation(axes), np.zeros(3))
     said: list[str] = []
-    if insert is None:
+    if placement is None:
         femur = pose(np.eye(3), transform(inverse(leg.neutral[leg.femur[0]]), leg.knee_centre))
     else:
         found = mesh_frame(leg, "femoral component", frames.get("femoral component"))
         femur = _anatomical(leg, found, leg.femur[0], turn, "femoral component", said)
     body, centre = leg.ankle_centre
     tibia = pose(np.eye(3), transform(leg.in_body(body, leg.tibia[0]), centre))
-    if insert is None:
+    if placement is None:
         straight = inverse(leg.neutral[leg.tibia[0]] @ tibia) @ leg.neutral[leg.femur[0]] @ femur
         insert_in_tibia = pose(np.eye(3), straight[:3, 3])
         said.append("no implant: the 'insert' frame is the tibia's at the knee's centre")
     else:
         found = mesh_frame(leg, "insert", frames.get("insert"))
         mesh = _anatomical(leg, found, leg.tibia[0], turn, "insert", said)
-        placement = insert_placement(insert, axes_rotation(axes))
         insert_in_tibia = inverse(tibia) @ mesh @ inverse(placement)
     patella, button, error = _patella(leg, femur, turn, frames, with_button, said)
     return Links(leg, femur, tibia, patella, insert_in_tibia, button, error, tuple(said))

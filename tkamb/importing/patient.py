@@ -7,6 +7,7 @@ import numpy as np
 
 from tkamb.atomic import claim_directory, write_text
 from tkamb.errors import InputError
+from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.surface import Surface
 from tkamb.importing.anatomy import Leg, find_leg
 from tkamb.importing.links import Links, find_links
@@ -19,7 +20,7 @@ from tkamb.importing.soft_tissue import soft_tissue
 from tkamb.importing.standing import with_static_markers
 from tkamb.importing.trial import Trial, from_coordinates, from_markers, from_poses
 from tkamb.importing.urdf import patient_urdf
-from tkamb.inputs.meshes import load_surface
+from tkamb.inputs.meshes import axes_rotation, load_surface
 from tkamb.inputs.tables import read_table
 from tkamb.opensim.read import read_osim
 from tkamb.scene import load_scene
@@ -60,14 +61,13 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
     model = read_osim(request.model)
     leg = find_leg(model, request.side, request.knee)
     meshes = request.meshes
-    insert = (
-        load_surface(meshes.insert, meshes.unit, meshes.axes, name="insert", closed=True)
-        if meshes
-        else None
-    )
+    insert = placement = None
+    if meshes:
+        insert = load_surface(meshes.insert, meshes.unit, meshes.axes, name="insert", closed=True)
+        placement = insert_placement(insert, axes_rotation(meshes.axes))
     links = find_links(
         leg,
-        insert,
+        placement,
         meshes.axes if meshes else "+x,+y,+z",
         request.frames,
         bool(meshes and meshes.patella),

@@ -107,7 +107,7 @@ def load_surface(
         )
     if mended.notices:
         _log.warning("%s: %s mesh repaired: %s", path, name, "; ".join(mended.notices))
-    return Surface(mended.vertices @ rotation.T + 0.0, mended.faces, name)
+    return Surface(mended.vertices @ rotation.T + 0.0, mended.faces, name, merged=True)
 
 
 def mirrored(surface: Surface) -> Surface:
@@ -115,7 +115,8 @@ def mirrored(surface: Surface) -> Surface:
 
     It turns a part of a left knee, in anatomical axes, into that of a right one.
     """
-    return Surface(surface.vertices @ MIRROR + 0.0, surface.faces[:, ::-1].copy(), surface.name)
+    vertices, faces = surface.vertices @ MIRROR + 0.0, surface.faces[:, ::-1].copy()
+    return Surface(vertices, faces, surface.name, surface.merged)
 
 
 def read_triangles(path: str | Path) -> tuple[Array, Indices]:

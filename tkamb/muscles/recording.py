@@ -12,7 +12,6 @@ from tkamb.importing.links import Links, find_links
 from tkamb.importing.model_fit import fit_model
 from tkamb.inputs.filtering import Cutoff
 from tkamb.inputs.ground_reaction import load_ground_reaction
-from tkamb.inputs.meshes import load_surface
 from tkamb.inputs.recordings import ForceRecording, Side
 from tkamb.inputs.tables import read_table
 from tkamb.muscles.knee_trial import KneeTrial, knee_trial
@@ -35,9 +34,9 @@ class LegRecording:
         laboratory_axes: the markers' axes that point forward, up and right.
         cutoff: Hz, of the coordinates.
         ground: what the ground exerts on the foot; None: nothing.
-        insert: the insert's mesh; None without an implant.
-        mesh_unit: of length, of the mesh.
-        mesh_axes: its axes that point anterior, superior and right.
+        insert_placement: (4, 4) of the insert's mesh in the insert frame, see `find_links`; None
+            without an implant.
+        mesh_axes: the mesh's axes that point anterior, superior and right.
         sharing: options.
     """
 
@@ -48,8 +47,7 @@ class LegRecording:
     laboratory_axes: str
     cutoff: Cutoff
     ground: ForceRecording | None
-    insert: Path | None
-    mesh_unit: str
+    insert_placement: Array | None
     mesh_axes: str
     sharing: Sharing
 
@@ -66,12 +64,7 @@ def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial
     """
     model = read_osim(source.model)
     leg = find_leg(model, source.side)
-    insert = None
-    if source.insert is not None:
-        insert = load_surface(
-            source.insert, source.mesh_unit, source.mesh_axes, name="insert", closed=True
-        )
-    links = find_links(leg, insert, source.mesh_axes, {}, False)
+    links = find_links(leg, source.insert_placement, source.mesh_axes, {}, False)
     motion = _motion(source, Kinematics(model), time)
     loads = {}
     if source.ground is not None:

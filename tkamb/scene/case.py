@@ -49,6 +49,8 @@ class Case:
         measured: what an instrumented implant measured.
         emg: envelopes of the muscles' surface EMG.
         post: the insert's post, insert frame, where the scene asks for its contact.
+        insert_placement: (4, 4) of the insert's mesh, in anatomical axes about its own origin and
+            not mirrored, in the insert frame; None where nothing needs it.
     """
 
     scene: Scene
@@ -65,6 +67,7 @@ class Case:
     measured: "MeasuredForce | None" = None
     emg: "Envelopes | None" = None
     post: "Surface | None" = None
+    insert_placement: Array | None = None
 
     @cached_property
     def split(self) -> float | None:
@@ -159,6 +162,7 @@ def load_case(scene: Scene) -> Case:
         _measured(scene, motion),
         _emg(scene, motion),
         parts.post,
+        parts.insert_placement,
     )
     if scene.patient.scale == 1.0:
         return case
@@ -236,6 +240,7 @@ class _Parts:
         self.patella: Surface | None = None
         self.post: Surface | None = None
         self.insert_mesh_in_insert = self.femoral_mesh_in_femur = np.eye(4)
+        self.insert_placement: Array | None = None
         if wants_insert:
             if not implant.insert:
                 raise InputError(
@@ -243,6 +248,12 @@ class _Parts:
                     "[motion]",
                     "give [implant.insert] and [implant.femoral]",
                 )
+            self.insert = self._place_insert(scene)
+            if scene.contact is not None and scene.contact.post:
+                from tkamb.geometry.post import divide_insert
+
+                self.insert, self.post = divide_insert(self.insert)
+        elif implant.insert and scene.muscles is not None:  # where the model's insert lies
             self._place_insert(scene)
         if wants_femoral:
             if not implant.femoral:
@@ -255,7 +266,8 @@ class _Parts:
                 raise InputError("is missing", "[implant.patella]", "[patella] needs its mesh")
             self.patella, _ = self._place("patellar button", implant.patella)
 
-    def _place_insert(self, scene: Scene) -> None:
+    def _place_insert(self, scene: Scene) -> "Surface":
+        """Read the insert, keep where its mesh lies in its frame, and return it there."""
         from tkamb.geometry.flat_bottom import insert_placement
         from tkamb.inputs.meshes import axes_rotation, load_surface
 
@@ -270,11 +282,8 @@ class _Parts:
                 raise InputError(error.what, error.where, question) from None
             raise
         self.insert_mesh_in_insert = placement @ pose(axes_rotation(table.axes), np.zeros(3))
-        self.insert = self._right(surface.moved(placement))
-        if scene.contact is not None and scene.contact.post:
-            from tkamb.geometry.post import divide_insert
-
-            self.insert, self.post = divide_insert(self.insert)
+        self.insert_placement = placement
+        return self._right(surface.moved(placement))
 
     def _could_be_insert(self, table: FemoralImplantTable) -> bool:
         """Say whether the mesh that the scene calls femoral has an insert's flat bottom."""
