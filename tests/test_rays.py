@@ -171,6 +171,6 @@ def test_a_surface_builds_its_rays_and_normals_once_and_keeps_them_to_itself():
     assert ball.rays is ball.rays and ball.nearest is ball.nearest
     assert ball.corner_normals is ball.corner_normals
     sent = pickle.loads(pickle.dumps(ball))
-    assert set(vars(sent)) == {"vertices", "faces", "name"}
+    assert set(vars(sent)) == {"vertices", "faces", "name", "merged"}
     origins, up = np.array([[0.0, -1.0, 0.0]]), (0.0, 1.0, 0.0)
     assert sent.rays.first(origins, up)[0] == ball.rays.first(origins, up)[0]
