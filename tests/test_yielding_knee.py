@@ -1,12 +1,15 @@
 """What passes between muscles and knee are made of: smooth stiffness, rough passes, their end."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from joints import BALL, HEIGHT, LINEAR, flat_joint
 from tkamb.contact.foundation import LinearFoundation
+from tkamb.equilibrium import released
 from tkamb.equilibrium.balance import BalanceStatus, Trial, find_balance
-from tkamb.equilibrium.released import KNEE_CHANGE, ahead
+from tkamb.equilibrium.released import KNEE_CHANGE, ReleasedKnee, ahead
 from tkamb.equilibrium.released_forces import SCALE
 from tkamb.equilibrium.starts import FARTHEST_AHEAD, carried_on
 from tkamb.geometry.frames import knee_pose
@@ -85,3 +88,15 @@ def test_a_search_begins_where_steady_frames_go_on_and_no_farther():
     assert np.array_equal(carried_on([np.zeros(6), step, np.zeros(6)]), np.zeros(6))
     leap = carried_on([np.zeros(6), 50 * step, 100 * step]) - 100 * step
     assert np.linalg.norm(leap * SCALE) == pytest.approx(FARTHEST_AHEAD, rel=1e-9)
+
+
+def test_what_a_lost_patella_leaves_unknown_is_asked_for_again(monkeypatch):
+    """What the shank asks for is kept for a frame, but not where a lost patella made it NaN."""
+    asked = iter([np.full(6, np.nan), np.ones(6)])
+    monkeypatch.setattr(released, "external_wrench", lambda *given: next(asked))
+    monkeypatch.setattr(released, "joint_equilibrium", lambda *given: given[-1])
+    knee = ReleasedKnee(SimpleNamespace(muscles=None, ligaments=()), None, ())
+    geometry = SimpleNamespace(coordinates=np.zeros(6))
+    lost, found, again = (knee._joint(7, geometry, np.zeros(3), False) for _ in range(3))
+    assert np.isnan(lost).all()
+    assert np.array_equal(found, np.ones(6)) and found is again

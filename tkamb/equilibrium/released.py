@@ -306,6 +306,8 @@ class ReleasedKnee:
         if self._external is None or self._external[0] != k:
             self._external = k, external_wrench(geometry, place)
         external = self._external[1]
+        if not np.isfinite(external).all():  # of a patella that was lost: the next may not be
+            self._external = None
         return joint_equilibrium(geometry, ligaments, place, self.released, middle, slack, external)
 
     def _forces(
