@@ -3,6 +3,7 @@
 import json
 import runpy
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import pytest
 from scenes import MODEL, write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.geometry.frames import KNEE_COORDINATES, MIRROR
+from tkamb.geometry.frames import KNEE_COORDINATES, MIRROR, transform
+from tkamb.inputs.meshes import load_surface
 from tkamb.scene import lines, load_scene
 from tkamb.scene.case import load_case
 
@@ -35,6 +37,19 @@ def test_paths_are_relative_to_the_file(tmp_path):
     scene = load_scene(write_scene(tmp_path))
     assert scene.motion.file == tmp_path / "motion.csv"
     assert scene.implant.insert.mesh == tmp_path / "insert.stl"
+
+
+def test_muscles_know_where_the_inserts_mesh_lies_without_contact_too():
+    """Nothing else asks for the insert there: it is read for its place alone."""
+    scene = load_scene(MODEL / "scene.toml")
+    with_contact = load_case(scene)
+    muscles = {"contact": None, "muscles": SimpleNamespace(emg=None)}
+    found, none = (load_case(scene.model_copy(update=u)) for u in (muscles, {"contact": None}))
+    assert found.insert is None and none.insert is None and none.insert_placement is None
+    np.testing.assert_array_equal(found.insert_placement, with_contact.insert_placement)
+    bottom = load_surface(scene.implant.insert.mesh, "mm", name="insert").vertices
+    lowest = transform(found.insert_placement, bottom)[:, 1].min()
+    assert lowest == pytest.approx(0.0, abs=1e-6)
 
 
 def test_an_override_wins_and_may_make_a_table(tmp_path):
