@@ -11,7 +11,8 @@ either half of a solve is one product per member. Forces on few members need onl
 above them, and so do displacements of few.
 
 The products of a solve read every W once, without the zeros of L11⁻¹: memory is what they wait
-for. Compiled loops over a few rows at a time read faster than `einsum` and than BLAS.
+for. A compiled loop over one row after the other reads at two thirds of what memory gives, twice as
+fast as over four rows at a time, and faster than `einsum` and BLAS.
 """
 
 from collections.abc import Iterator
@@ -183,30 +184,14 @@ def _forward(block: NDArray[Any], scale: Array, boundary: Index, start: int, x: 
     rows, count = block.shape
     number = scale.dtype.type
     own = x[start : start + count].astype(scale.dtype)
-    for i in range(count):
-        total = number(0)
-        for j in range(i + 1):
-            total += number(block[i, j]) * own[j]
-        x[start + i] = scale[i] * total
-    i = count
-    while i + 4 <= rows:
-        a = b = c = d = number(0)
-        for j in range(count):
-            a += number(block[i, j]) * own[j]
-            b += number(block[i + 1, j]) * own[j]
-            c += number(block[i + 2, j]) * own[j]
-            d += number(block[i + 3, j]) * own[j]
-        x[boundary[i - count]] -= scale[i] * a
-        x[boundary[i - count + 1]] -= scale[i + 1] * b
-        x[boundary[i - count + 2]] -= scale[i + 2] * c
-        x[boundary[i - count + 3]] -= scale[i + 3] * d
-        i += 4
-    while i < rows:
-        total = number(0)
-        for j in range(count):
-            total += number(block[i, j]) * own[j]
-        x[boundary[i - count]] -= scale[i] * total
-        i += 1
+    for i in range(rows):
+        row, total = block[i], number(0)
+        for j in range(min(i + 1, count)):
+            total += number(row[j]) * own[j]
+        if i < count:
+            x[start + i] = scale[i] * total
+        else:
+            x[boundary[i - count]] -= scale[i] * total
 
 
 @compiled
@@ -214,27 +199,12 @@ def _backward(block: NDArray[Any], scale: Array, boundary: Index, start: int, x:
     """Take one front's step of L⁻ᵀ x: Wᵀ times its own unknowns and minus those below."""
     rows, count = block.shape
     number = scale.dtype.type
-    right = np.empty(rows, scale.dtype)
-    for i in range(count):
-        right[i] = scale[i] * x[start + i]
-    for i in range(count, rows):
-        right[i] = -scale[i] * x[boundary[i - count]]
     total = np.zeros(count, scale.dtype)
-    for i in range(count):
-        for j in range(i + 1):
-            total[j] += right[i] * number(block[i, j])
-    i = count
-    while i + 4 <= rows:
-        a, b, c, d = right[i], right[i + 1], right[i + 2], right[i + 3]
-        for j in range(count):
-            total[j] += (a * number(block[i, j]) + b * number(block[i + 1, j])) + (
-                c * number(block[i + 2, j]) + d * number(block[i + 3, j])
-            )
-        i += 4
-    while i < rows:
-        for j in range(count):
-            total[j] += right[i] * number(block[i, j])
-        i += 1
+    for i in range(rows):
+        row = block[i]
+        right = number(scale[i] * (x[start + i] if i < count else -x[boundary[i - count]]))
+        for j in range(min(i + 1, count)):
+            total[j] += right * number(row[j])
     for j in range(count):
         x[start + j] = total[j]
 
