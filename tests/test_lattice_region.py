@@ -1,5 +1,6 @@
 """Passes that look only where forces are lost: what they report holds for the whole solid."""
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from tkamb.contact.lattice.linear import compliance
 from tkamb.contact.lattice.linear.compliance import ComplianceCache
 from tkamb.contact.lattice.model import warm_start_of
 from tkamb.contact.lattice.problem import undeformed
+from tkamb.contact.lattice.solids.solid import SMALL_STRAIN
 from tkamb.contact.lattice.solver import Tolerance, elements_that_count, solve
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
@@ -104,6 +106,47 @@ def test_elements_are_left_out_up_to_the_bound():
     assert elements_that_count(size, 0.23).tolist() == [0, 2]
     assert elements_that_count(size, 0.0).tolist() == [0, 1, 2, 3]
     assert elements_that_count(size, 10.0).tolist() == []
+
+
+@pytest.fixture(scope="module")
+def pressed(state):
+    """The solid and what it was displaced by."""
+    return state.problem.solid, solved(state, 0.0, 1e-3).field
+
+
+@pytest.mark.parametrize("model", ["lattice"], indirect=True)
+@pytest.mark.parametrize("share", [1e-6, 1e-4, 1e-2])
+@pytest.mark.parametrize("scale", [1.0, 0.1, 10.0])
+def test_no_share_of_an_element_that_is_passed_over_exceeds_the_limit(pressed, share, scale):
+    """Pressed, turned, moved as a whole and shaken: the bound knows the strain whatever moves."""
+    solid, field = pressed
+    turned = np.cross([0.0, 1e-3, 2e-3], solid.nodes) + np.array([1e-3, 0.0, 2e-3])
+    shaken = 1e-7 * np.random.default_rng(3).normal(size=field.shape)
+    field = scale * (field + turned + shaken)
+    sizes = np.linalg.norm(solid.nonlinear_residual(field), axis=1)
+    noticed = solid.noticeable(field, share)
+    others = np.setdiff1d(np.arange(len(sizes)), noticed)
+    assert sizes[others].max(initial=0.0) <= share
+    strain = np.linalg.eigvalsh(solid.strain(field, others))
+    assert np.abs(strain).max(initial=0.0) < 2 * SMALL_STRAIN
+
+
+@pytest.mark.parametrize("model", ["lattice"], indirect=True)
+def test_the_calibrated_cells_pass_most_of_the_solid_over(pressed):
+    """What it is for; and with a tenth of the bound some share is lost."""
+    solid, field = pressed
+    sizes = np.linalg.norm(solid.nonlinear_residual(field), axis=1)
+    limit = 1e-2
+    assert (sizes > limit).any()
+    assert len(solid.noticeable(field, limit)) < 0.6 * len(sizes)
+    assert len(solid.noticeable(field, limit)) < 3 * (sizes > limit).sum()
+    wrong = copy(solid)
+    wrong.__dict__["_largest"] = solid._largest / 10
+    lost = np.setdiff1d(np.arange(len(sizes)), wrong.noticeable(field, limit))
+    assert sizes[lost].max() > limit
+    field = field.copy()
+    field[solid.cells[7, 3]] = np.nan
+    assert 7 in solid.noticeable(field, limit)
 
 
 def test_the_approach_is_that_of_the_pose(state):

@@ -126,7 +126,8 @@ def surrounded(triangles: Index, touched: Mask) -> Mask:
 def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ...], bool]:
     """Return the flags and whether the insert is compressed to nothing."""
     if solution.field is not None:
-        least = state.problem.solid.least_principal_strain(solution.field)
+        solid = state.problem.solid
+        least = solid.least_principal_strain(solution.field, solution.noticed)
         kind = "principal strain"
     else:
         sunk = solution.displacement[:, 1] / state.surface.thickness[solution.candidates]

@@ -28,6 +28,8 @@ DIVERGED = 100.0
 """The iteration is given up when the imbalance is this many times the smallest so far."""
 SHARE = 0.1
 """What elements left out may add to the imbalance, relative to the tolerance."""
+PASSED_OVER = 0.03
+"""And what those may that a bound of their strain passes over, when all are looked at."""
 SLOW = 0.7
 """When a pass leaves more than this share of the last distance, sliding steps are halved."""
 SMALLEST_SHARE = 0.125
@@ -62,6 +64,7 @@ class Solution:
             both relative.
         region: outside of which h is zero, or None.
         seen: all elements were looked at; else `field` is that of the region.
+        noticed: elements but which the bound passed over, or None (all).
     """
 
     candidates: Index
@@ -74,6 +77,7 @@ class Solution:
     residual: float
     region: Region | None = None
     seen: bool = True
+    noticed: Index | None = None
 
     @property
     def converged(self) -> bool:
@@ -118,7 +122,9 @@ def solve(
         forces = replace(forces, converged=done and forces.converged)
         field, h, region = balance.field, balance.h, balance.region
         seen = balance.size > guess.unseen
-        now = Solution(chosen, forces, planes, moved, field, h, passes, residual, region, seen)
+        now = Solution(
+            chosen, forces, planes, moved, field, h, passes, residual, region, seen, balance.noticed
+        )
         if done:
             return now
         best = now if best is None or residual < best.residual else best
@@ -202,12 +208,14 @@ class NonlinearBalance:
         field: (n, 3) m, displacement of the nodes looked at, 0 elsewhere.
         residual: imbalance of the elements looked at, relative to the contact forces.
         size: N, norm of the contact forces.
+        noticed: elements but which the bound passed over in the last look at all, or None.
     """
 
     def __init__(self, problem: ContactProblem, guess: InitialGuess, tolerance: float) -> None:
         self._problem, self._response, self._tolerance = problem, guess.response, tolerance
         self.region = problem.everywhere if guess.region is None else guess.region
         self.h = np.zeros_like(problem.solid.nodes)
+        self.noticed: Index | None = None
         if guess.nonlinear_residual is not None:
             self.h[self.region.nodes] = guess.nonlinear_residual[self.region.nodes]
         self._mixer = AndersonMixer()
@@ -252,20 +260,24 @@ class NonlinearBalance:
 
     def _look(self, region: Region) -> None:
         """Find the imbalance of a region; of the whole, also which elements count."""
-        solid = self._problem.solid
-        forces = solid.nonlinear_residual(self.field, None if region.whole else region.elements)
-        value = self._summed(forces, region)
+        solid, chosen = self._problem.solid, region.elements
+        if region.whole:
+            allowed = PASSED_OVER * self._tolerance * self.size
+            self.noticed = solid.noticeable(self.field, allowed / np.sqrt(len(chosen)))
+            chosen = chosen if self.noticed is None else self.noticed
+        forces = solid.nonlinear_residual(self.field, chosen)
+        value = self._summed(forces, chosen)
         self.residual = float(np.linalg.norm(value - self._taken)) / self.size
         if region.whole:
             size = np.sqrt(np.einsum("ij,ij->i", forces, forces))
             count = elements_that_count(size, SHARE * self._tolerance * self.size)
-            self.region = Region.of(self._problem, region.elements[count])
-            value = self._summed(forces[count], self.region)
+            self.region = Region.of(self._problem, chosen[count])
+            value = self._summed(forces[count], self.region.elements)
             self._narrowed = True
         self.h = value
 
-    def _summed(self, forces: Array, region: Region) -> Array:
-        value = self._problem.solid.scatter.sum(forces, region.elements)
+    def _summed(self, forces: Array, elements: Index) -> Array:
+        value = self._problem.solid.scatter.sum(forces, elements)
         value[self._problem.held.reshape(-1, 3)] = 0.0
         return value
 

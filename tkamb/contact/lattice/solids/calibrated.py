@@ -29,9 +29,10 @@ from tkamb.contact.lattice.solids.cell_loops import (
     deviatoric_matrices,
     shear_forces,
     softened_forces,
+    strained_cells,
 )
 from tkamb.contact.lattice.solids.curve import LEAST_STRAIN, ShearCurve
-from tkamb.contact.lattice.solids.solid import Solid, chunks
+from tkamb.contact.lattice.solids.solid import SMALL_STRAIN, Solid, chunks
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array, Index
 
@@ -106,6 +107,12 @@ def body_diagonal_stiffness(edges: Array) -> float:
     return float(candidates[np.linalg.eigvalsh(matrices)[:, 6].argmax()])
 
 
+def _square_norm(matrices: Array) -> Array:
+    """Return a bound (c,) of the squared spectral norm of matrices (c, 8, 3)."""
+    products = np.einsum("cik,cil->ckl", matrices, matrices)
+    return np.asarray(np.abs(products).sum(axis=2).max(axis=1))
+
+
 class CalibratedNetwork(Solid):
     """Cells mu_s K_d + K V g gᵀ, with mu_s from the cell's equivalent strain.
 
@@ -143,6 +150,36 @@ class CalibratedNetwork(Solid):
             return np.zeros((len(cells), 24))
         curve = self.curve.shear_modulus, self.curve.spline.x, self.curve.spline.c, LEAST_STRAIN
         return softened_forces(*self._shapes, *curve, self.cells, cells, displacement)
+
+    def noticeable(self, displacement: Array, share: float) -> Index | None:
+        """Return the cells whose share of h may exceed `share`, N; see `Solid`.
+
+        |(mu - mu_s) K_d u| <= (mu - mu_s) e (3 V lambda)^½, lambda the largest eigenvalue of K_d.
+        """
+        if self.curve.spline is None:
+            return None
+        corners, gradients, volume, _ = self._shapes
+        strain = min(self.curve.strain_that_softens(share / self._largest), SMALL_STRAIN)
+        shapes = corners, gradients, volume, self._stiffest
+        return strained_cells(*shapes, self.cells, displacement, strain, 3 * SMALL_STRAIN)
+
+    @cached_property
+    def _stiffest(self) -> float:
+        """Twice the largest sum of the springs of one node, m."""
+        return float(2 * np.bincount(PAIRS.ravel(), np.repeat(self.springs, 2)).max())
+
+    @cached_property
+    def _largest(self) -> float:
+        """Bound of (3 V lambda)^½ of all cells, m².
+
+        lambda <= 2 V |g|² + `_stiffest` |P|²; P = I - x gᵀ is a projection as x gᵀ is, whose norms
+        are the same and no larger than |x| |g|.
+        """
+        corners, gradients, volume, _ = self._shapes
+        shape = _square_norm(gradients)
+        size = _square_norm(corners - corners.mean(axis=1, keepdims=True))
+        stiffest = 2 * volume * shape + self._stiffest * size * shape
+        return float(np.sqrt(3 * volume * stiffest).max())
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n): mu_s K_d + mu_s'/(3 V e) (K_d u)(K_d u)ᵀ + bulk."""

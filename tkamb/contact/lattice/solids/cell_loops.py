@@ -51,6 +51,79 @@ def deviatoric_matrices(
 
 
 @compiled
+def _parted(
+    x: Array, g: Array, nodes: Index, displacement: Array, u: Array, rest: Array
+) -> tuple[float, float, float, float, float, float, float, float, float]:
+    """Part a cell's displacement into G x, G = sum u_i g_iᵀ, and a rest; return G, row by row.
+
+    G is held in nine registers: an array would be written and read in every line. The arguments
+    are those of `_shear_force`.
+    """
+    xx = xy = xz = yx = yy = yz = zx = zy = zz = 0.0
+    for i in range(8):
+        for a in range(3):
+            u[i, a] = displacement[nodes[i], a] - displacement[nodes[0], a]
+        xx, xy, xz = xx + u[i, 0] * g[i, 0], xy + u[i, 0] * g[i, 1], xz + u[i, 0] * g[i, 2]
+        yx, yy, yz = yx + u[i, 1] * g[i, 0], yy + u[i, 1] * g[i, 1], yz + u[i, 1] * g[i, 2]
+        zx, zy, zz = zx + u[i, 2] * g[i, 0], zy + u[i, 2] * g[i, 1], zz + u[i, 2] * g[i, 2]
+    for i in range(8):
+        rest[i, 0] = u[i, 0] - (xx * x[i, 0] + xy * x[i, 1] + xz * x[i, 2])
+        rest[i, 1] = u[i, 1] - (yx * x[i, 0] + yy * x[i, 1] + yz * x[i, 2])
+        rest[i, 2] = u[i, 2] - (zx * x[i, 0] + zy * x[i, 1] + zz * x[i, 2])
+    return xx, xy, xz, yx, yy, yz, zx, zy, zz
+
+
+@compiled
+def strained_cells(
+    corners: Array,
+    gradients: Array,
+    volumes: Array,
+    stiffest: float,
+    nodes: Index,
+    displacement: Array,
+    strain: float,
+    dilatation: float,
+) -> Index:
+    """Return the cells whose strain or dilatation may exceed its limit; of the others none does.
+
+    With the parts G x and r of the displacement, uᵀ K_d u is 2 V |dev sym G|² and what the springs
+    store of r. That is no more than `stiffest` |r|²: K_spr is no larger than the Laplacian of the
+    same springs without directions, and that no larger than twice its largest diagonal entry.
+
+    Args:
+        corners: (c, 8, 3) m.
+        gradients: (c, 8, 3) 1/m.
+        volumes: (c,) m³.
+        stiffest: m, twice the largest sum of the springs of one node.
+        nodes: (c, 8) of the cells.
+        displacement: (n, 3) m.
+        strain: limit of the equivalent strain e, e² = uᵀ K_d u / (3 V).
+        dilatation: limit of |tr G|.
+    """
+    found, count = np.empty(len(nodes), np.int64), 0
+    u, rest = np.empty((8, 3)), np.empty((8, 3))
+    for cell in range(len(nodes)):
+        xx, xy, xz, yx, yy, yz, zx, zy, zz = _parted(
+            corners[cell], gradients[cell], nodes[cell], displacement, u, rest
+        )
+        mean = (xx + yy + zz) / 3
+        shear = ((xy + yx) ** 2 + (xz + zx) ** 2 + (yz + zy) ** 2) / 2
+        shear += (xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2
+        size = 0.0
+        for a in range(3):
+            square = total = 0.0
+            for i in range(8):
+                square += rest[i, a] * rest[i, a]
+                total += rest[i, a]
+            size += square - total * total / 8
+        small = 2 * volumes[cell] * shear + stiffest * size <= 3 * volumes[cell] * strain**2
+        if not (small and abs(3 * mean) <= dilatation):  # NaN is not small
+            found[count] = cell
+            count += 1
+    return found[:count].copy()
+
+
+@compiled
 def _shear_force(
     x: Array,
     g: Array,
@@ -65,8 +138,8 @@ def _shear_force(
     """Put K_d u of a cell into force (8, 3); return uᵀ K_d u.
 
     K_d is never made: from G = sum u_i g_iᵀ follow the rests u_i - G x_i, from these the springs'
-    forces t_i, and with D = 2 V dev(sym G) - sum t_i x_iᵀ the nodes' forces t_i + D g_i. G and D
-    are held in nine registers: an array would be written and read in every line.
+    forces t_i, and with D = 2 V dev(sym G) - sum t_i x_iᵀ the nodes' forces t_i + D g_i. D is held
+    in nine registers as G is.
 
     Args:
         x: (8, 3) m, corners.
@@ -79,18 +152,8 @@ def _shear_force(
         rest: (8, 3).
         force: (8, 3) m².
     """
-    xx = xy = xz = yx = yy = yz = zx = zy = zz = 0.0
-    for i in range(8):
-        for a in range(3):
-            u[i, a] = displacement[nodes[i], a] - displacement[nodes[0], a]
-        xx, xy, xz = xx + u[i, 0] * g[i, 0], xy + u[i, 0] * g[i, 1], xz + u[i, 0] * g[i, 2]
-        yx, yy, yz = yx + u[i, 1] * g[i, 0], yy + u[i, 1] * g[i, 1], yz + u[i, 1] * g[i, 2]
-        zx, zy, zz = zx + u[i, 2] * g[i, 0], zy + u[i, 2] * g[i, 1], zz + u[i, 2] * g[i, 2]
-    for i in range(8):
-        rest[i, 0] = u[i, 0] - (xx * x[i, 0] + xy * x[i, 1] + xz * x[i, 2])
-        rest[i, 1] = u[i, 1] - (yx * x[i, 0] + yy * x[i, 1] + yz * x[i, 2])
-        rest[i, 2] = u[i, 2] - (zx * x[i, 0] + zy * x[i, 1] + zz * x[i, 2])
-        force[i, 0] = force[i, 1] = force[i, 2] = 0.0
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = _parted(x, g, nodes, displacement, u, rest)
+    force[:] = 0.0
     spring = 0
     for i in range(8):
         for j in range(i + 1, 8):

@@ -21,6 +21,8 @@ CHUNK = 2000
 DEVIATORIC = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 DEVIATORIC[:3, :3] -= 2 / 3
 """2 dev eps : dev eps as a form (6, 6) in [xx, yy, zz, 2xy, 2yz, 2zx]."""
+SMALL_STRAIN = 0.1
+"""Elements strained more are always noticed, whatever their law makes of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +188,19 @@ class Solid(ABC):
             chosen: (k,) elements; all by default.
         """
 
+    def noticeable(self, displacement: Array, share: float) -> Index | None:
+        """Return the elements whose share of h may matter; None: all may.
+
+        Of no other is the norm of `nonlinear_residual` above `share`, N, or a principal strain of
+        the mean gradient outside of ±2 `SMALL_STRAIN`.
+
+        Args:
+            displacement: (n, 3) m.
+            share: N.
+        """
+        del displacement, share
+        return None
+
     def residual_force(self, displacement: Array) -> Array:
         """Return h = K u - f(u), N, (n, 3): linear forces minus the material's own."""
         if self.material.is_linear:
@@ -205,13 +220,15 @@ class Solid(ABC):
     def linear_force(self, displacement: Array) -> Array:
         """Return K u, N, (n, 3), summed element by element: no matrix is assembled."""
 
-    def least_principal_strain(self, displacement: Array) -> float:
-        """Return the smallest principal strain of the cells' mean gradients.
+    def least_principal_strain(self, displacement: Array, chosen: Index | None = None) -> float:
+        """Return the smallest principal strain of the mean gradients of cells, by default of all.
 
         It is no smaller than minus the norm of its tensor: where the cell of largest norm is
         compressed, only cells whose norm exceeds that compression are looked at.
         """
-        strain = self.strain(displacement)
+        strain = self.strain(displacement, chosen)
+        if not len(strain):
+            return 0.0
         norm = np.linalg.norm(strain, axis=(1, 2))
         first = float(np.linalg.eigvalsh(strain[norm.argmax()])[0])
         return float(np.linalg.eigvalsh(strain[norm >= -first])[:, 0].min())
@@ -228,9 +245,10 @@ class Solid(ABC):
         dilatation = np.einsum("ci,ci->c", g, displacement[self.cells].reshape(-1, 24))
         return (self.material.bulk_modulus * self.volume * dilatation)[:, None] * g
 
-    def strain(self, displacement: Array) -> Array:
-        """Return each cell's mean strain (c, 3, 3)."""
-        return _mean_strains(self.cells, self.gradients, displacement)
+    def strain(self, displacement: Array, chosen: Index | None = None) -> Array:
+        """Return the mean strain (k, 3, 3) of cells, by default of all."""
+        cells, gradients = (elements_of(values, chosen) for values in (self.cells, self.gradients))
+        return _mean_strains(cells, gradients, displacement)
 
 
 def chunks(count: int) -> Iterator[slice]:
