@@ -8,8 +8,9 @@ import pytest
 
 from lattice_bodies import condyles, dished_insert, pair
 from tkamb.contact.lattice.initial_guess import WarmStart, initial_guess
-from tkamb.contact.lattice.linear import compliance
-from tkamb.contact.lattice.linear.compliance import ComplianceCache
+from tkamb.contact.lattice.linear import compliance, response
+from tkamb.contact.lattice.linear.compliance import ComplianceCache, by_component
+from tkamb.contact.lattice.linear.response import unknowns_of
 from tkamb.contact.lattice.model import warm_start_of
 from tkamb.contact.lattice.problem import undeformed
 from tkamb.contact.lattice.solids.solid import SMALL_STRAIN
@@ -180,7 +181,28 @@ def test_the_compliance_at_hand_stays_within_its_bound(state, monkeypatch):
         cache = ComplianceCache(state.problem.operator.half)
         cache.among(wanted, spare)
         assert cache.nodes.tolist() == kept.tolist()
-        assert cache.compliance.shape == (3, len(kept), 3, len(kept))
+        cache.among(np.array([9]), np.array([9, 10]))  # fits beside two, not beside seven
+        assert cache.nodes.tolist() == ([9, 10] if most == 7 else [3, 5, 9, 10])
+
+
+def test_the_compliance_grows_node_by_node(state, monkeypatch):
+    """In whatever order nodes come, and through every way of working it out."""
+    half = state.problem.operator.half
+    nodes = np.array([2, 3, 5, 8, 20, 21, 30])
+    whole = by_component(half.among(unknowns_of(nodes)).compliance())
+    monkeypatch.setattr(compliance, "SPACE", 2)
+    for few in (0, 100):
+        monkeypatch.setattr(response, "FEW", few)
+        cache = ComplianceCache(half)
+        for some in ([20], [5, 8], [2], [8, 21, 30], [3, 5]):
+            cache.among(np.array(some), np.array(some))
+        assert sorted(cache.nodes) == nodes.tolist() and cache.nodes.tolist() != nodes.tolist()
+        found = cache.among(nodes, nodes).compliance
+        assert found == pytest.approx(whole, rel=1e-5, abs=1e-6 * np.abs(whole).max())
+        force = np.random.default_rng(1).normal(size=(2, 3))
+        moved = cache.moved(nodes[[1, 3, 6]], nodes[[2, 3]], force)
+        mine = np.einsum("aibj,jb->ia", whole[:, [1, 3, 6]][..., [2, 3]], force)
+        assert moved == pytest.approx(mine, rel=1e-4, abs=1e-6 * np.abs(mine).max())
 
 
 def test_a_warm_start_of_another_insert_is_not_used(state):

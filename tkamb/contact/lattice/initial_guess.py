@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tkamb.contact.lattice.linear.compliance import MOST_STORED, ComplianceCache, ContactResponse
+from tkamb.contact.lattice.linear.compliance import ComplianceCache, ContactResponse
 from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes
 from tkamb.geometry.frames import Array, Index, Mask
 
@@ -165,9 +165,6 @@ def initial_guess(
     reach = lowest + (1 + MARGIN) * depth
     nodes = np.flatnonzero(gaps <= reach)
     spare = np.flatnonzero(gaps <= lowest + SPARE * depth)
-    if len(cache.nodes):
-        both = np.union1d(spare, cache.nodes)
-        spare = both if len(both) <= MOST_STORED else spare
     level = 0.0 if at_pose else lowest + 0.6 * depth
     active = gaps[nodes] < level
     if touched is not None and touched[nodes].any():

@@ -43,7 +43,7 @@ from tkamb.errors import InputError
 from tkamb.files import open_regular
 from tkamb.geometry.frames import Index, Mask
 
-MAGIC = b"tkamb operator 6"
+MAGIC = b"tkamb operator 7"
 PREFIX = len(MAGIC) + 4 + 8
 """Bytes before the header."""
 BOUNDARY = 64
@@ -283,9 +283,9 @@ def _operator_of(arrays: list[NDArray[Any]]) -> ElasticOperator:
         edge, last = edge + touched, last + len(scale)
     blocks = []
     for (start, stop, first, end), block in zip(rows.tolist(), values[len(sizes) :], strict=True):
-        if block.shape != (stop - start, end - first):
+        if block.shape != (end - first, stop - start):
             raise ValueError("a block of another shape")
-        blocks.append(Block(start, stop, first, end, block))
+        blocks.append(Block.of(start, stop, first, end, block))
     return ElasticOperator(
         free, CholeskyFactor(order, fronts), contact_nodes, HalfResponse(rank, blocks)
     )

@@ -10,6 +10,8 @@ from tkamb.geometry.frames import Array, Index
 
 MOST_STORED = 1500
 """Nodes of the stored compliance: 80 MB."""
+SPACE = 100
+"""Nodes that may come before the stored compliance has to grow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,28 +19,26 @@ class ContactResponse:
     """What forces on candidate nodes do.
 
     Args:
-        half: response of the candidates and perhaps of more nodes, p in all.
-        index: (m,) of the candidates among these.
+        half: response of the candidates.
         compliance: (3, m, 3, m) m/N, of the candidates: component and node moved, component
             and node pushed.
     """
 
     half: HalfResponse
-    index: Index
     compliance: Array
 
     @classmethod
     def of(cls, half: HalfResponse) -> "ContactResponse":
         """Return the response of candidates that are all of the nodes of `half`."""
-        return cls(half, np.arange(len(half.rank) // 3), by_component(half.compliance()))
+        return cls(half, by_component(half.compliance()))
 
     def push(self, force: Array, y: Array) -> None:
         """Add L⁻¹ of forces (m, 3), N, to y (in elimination order)."""
-        self.half.apply(self._spread(force).ravel(), y)
+        self.half.apply(force.ravel(), y)
 
     def displacement(self, y: Array) -> Array:
         """Return the candidates' displacement (m, 3), m, under the load whose L⁻¹ f is y."""
-        return self.half.project(y).reshape(-1, 3)[self.index]
+        return self.half.project(y).reshape(-1, 3)
 
     def along(self, normals: Array) -> tuple[Array, Array]:
         """Return the compliance along normals (m, 3), and all that forces along them move.
@@ -54,12 +54,6 @@ class ContactResponse:
         """Return the candidates' displacement (m, 3), m, under forces (m,), N, along normals."""
         return np.einsum("aij,j->ia", pushed, force.astype(pushed.dtype))
 
-    def _spread(self, values: Array) -> Array:
-        """Return candidates' values (m, 3) on all the nodes (p, 3)."""
-        spread = np.zeros((len(self.half.rank) // 3, 3))
-        spread[self.index] = values
-        return spread
-
 
 def by_component(matrix: Array) -> Array:
     """Return a compliance (3p, 3p), ordered by node, as (3, p, 3, p)."""
@@ -69,19 +63,17 @@ def by_component(matrix: Array) -> Array:
 
 @dataclass
 class ComplianceCache:
-    """The compliance among the nodes asked for last; what is at hand changes no answer.
+    """The compliance among the nodes asked for so far; what is at hand changes no answer.
 
     Args:
         whole: response of all contact nodes.
-        nodes: (p,) contact nodes at hand, increasing.
-        half: their response alone.
-        compliance: (3, p, 3, p) m/N: component and node moved, component and node pushed.
+        nodes: (p,) contact nodes at hand, in the order in which they came.
+        stored: (3, s, 3, s) m/N, s >= p: component and node moved, component and node pushed.
     """
 
     whole: HalfResponse
     nodes: Index = field(default_factory=lambda: np.zeros(0, np.int64))
-    half: HalfResponse | None = None
-    compliance: Array = field(default_factory=lambda: np.zeros((3, 0, 3, 0), SINGLE))
+    stored: Array = field(default_factory=lambda: np.zeros((3, 0, 3, 0), SINGLE))
     _lock: Lock = field(default_factory=Lock)
 
     def among(self, wanted: Index, spare: Index) -> ContactResponse:
@@ -92,12 +84,9 @@ class ComplianceCache:
             spare: a superset that is worked out when `wanted` is not at hand, if not too many.
         """
         with self._lock:
-            if self.half is None or not np.isin(wanted, self.nodes, assume_unique=True).all():
-                self._take(spare if len(spare) <= MOST_STORED else wanted)
-            nodes, half, compliance = self.nodes, self.half, self.compliance
-        assert half is not None
-        index = np.searchsorted(nodes, wanted)
-        return ContactResponse(half, index, _taken(_taken(compliance, index, 1), index, 3))
+            at = self._at(wanted, spare)
+            compliance = _taken(_taken(self.stored, at, 1), at, 3)
+        return ContactResponse(self.whole.among(unknowns_of(wanted)), compliance)
 
     def moved(self, nodes: Index, pushed: Index, force: Array) -> Array:
         """Return the displacement (m, 3), m, of contact nodes under forces on contact nodes.
@@ -108,27 +97,37 @@ class ComplianceCache:
             force: (k, 3) N.
         """
         with self._lock:
-            wanted = np.union1d(nodes, pushed)
-            if not np.isin(wanted, self.nodes, assume_unique=True).all():
-                both = np.union1d(wanted, self.nodes)
-                self._take(both if len(both) <= MOST_STORED else wanted)
-            here, there = np.searchsorted(self.nodes, nodes), np.searchsorted(self.nodes, pushed)
-            compliance = _taken(_taken(self.compliance, here, 1), there, 3)
+            both = self._at(np.concatenate([nodes, pushed]), np.union1d(nodes, pushed))
+            here, there = both[: len(nodes)], both[len(nodes) :]
+            compliance = _taken(_taken(self.stored, here, 1), there, 3)
         return np.einsum("aibj,jb->ia", compliance, force)
 
+    def _at(self, wanted: Index, spare: Index) -> Index:
+        """Return where nodes (m,) are stored; what is not at hand is worked out, spare and all."""
+        place = np.full(len(self.whole.rank) // 3, -1)
+        place[self.nodes] = np.arange(len(self.nodes))
+        if (place[wanted] < 0).any():
+            if len(spare) > MOST_STORED:
+                spare = np.unique(wanted)
+            if len(self.nodes) + np.count_nonzero(place[spare] < 0) > MOST_STORED:
+                self.nodes, place[:] = self.nodes[:0], -1
+            self._take(spare[place[spare] < 0])
+            place[self.nodes] = np.arange(len(self.nodes))
+        return place[wanted]
+
     def _take(self, nodes: Index) -> None:
-        """Take nodes, with what is known of their compliance already."""
-        half = self.whole.among(unknowns_of(nodes))
-        _, here, there = np.intersect1d(nodes, self.nodes, True, True)
-        new = np.setdiff1d(np.arange(len(nodes)), here, assume_unique=True)
-        compliance: Array = np.empty((3, len(nodes), 3, len(nodes)), SINGLE)
-        axes = np.arange(3)
-        known, had = ((axes, index, axes, index) for index in (here, there))
-        compliance[np.ix_(*known)] = self.compliance[np.ix_(*had)]
-        rows = half.compliance(unknowns_of(new)).reshape(len(new), 3, len(nodes), 3)
-        compliance[:, new] = rows.transpose(1, 0, 3, 2)
-        compliance[..., new] = rows.transpose(3, 2, 1, 0)
-        self.nodes, self.half, self.compliance = nodes, half, compliance
+        """Take more nodes."""
+        had, new = len(self.nodes), len(nodes)
+        count = had + new
+        if count > self.stored.shape[1]:
+            larger: Array = np.empty((3, count + SPACE, 3, count + SPACE), SINGLE)
+            larger[:, :had, :, :had] = self.stored[:, :had, :, :had]
+            self.stored = larger
+        self.nodes = np.concatenate([self.nodes, nodes])
+        half = self.whole.among(unknowns_of(self.nodes))
+        rows = half.compliance(unknowns_of(np.arange(had, count))).reshape(new, 3, count, 3)
+        self.stored[:, had:count, :, :count] = rows.transpose(1, 0, 3, 2)
+        self.stored[:, :count, :, had:count] = rows.transpose(3, 2, 1, 0)
 
 
 def _taken(values: Array, index: Index, axis: int) -> Array:

@@ -3,10 +3,13 @@
 With K = L Lᵀ and Z = L⁻¹ E (E picks the contact nodes' unknowns) the compliance between them
 is Eᵀ K⁻¹ E = Zᵀ Z: the backward half of the solves is never done. A column of Z is zero but on
 the path from its node to the root of the elimination tree, and the columns of one subtree
-follow each other, so Z is kept as one dense block per member of the tree.
+follow each other, so Z is kept as one dense block per member of the tree, column by column:
+what is asked of few nodes reads their columns alone.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -23,6 +26,10 @@ SINGLE: Precision = np.float32
 """What a stored operator is kept in: it halves what every solve has to read."""
 
 
+FEW = 12
+"""Columns up to which products with others are taken where these lie: no copy for BLAS."""
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """Rows [start, stop) of Z in its columns [first, last), the columns in sorted order.
@@ -32,7 +39,8 @@ class Block:
         stop: one past the last row.
         first: first column.
         last: one past the last column.
-        values: (stop - start, last - first), float64 or float32.
+        values: (v, stop - start) columns of Z, float64 or float32.
+        which: (last - first,) of these.
     """
 
     start: int
@@ -40,6 +48,12 @@ class Block:
     first: int
     last: int
     values: NDArray[Any]
+    which: Index
+
+    @classmethod
+    def of(cls, start: int, stop: int, first: int, last: int, values: NDArray[Any]) -> "Block":
+        """Return the block whose columns are all of `values`."""
+        return cls(start, stop, first, last, values, np.arange(last - first))
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +72,11 @@ class HalfResponse:
         """Add Z f to y (in elimination order), for forces (q,) on the unknowns."""
         ordered = np.zeros(self.columns)
         ordered[self.rank[self.rank >= 0]] = force[self.rank >= 0]
-        for block in self.blocks:
-            part = ordered[block.first : block.last]
-            if part.any():
-                _add_product(block.values, part, y[block.start : block.stop])
+        pushed = np.flatnonzero(ordered)
+        for block, a, b in self._parts(pushed):
+            columns = pushed[a:b]
+            which = block.which[columns - block.first]
+            _add_columns(block.values, which, ordered[columns], y[block.start : block.stop])
 
     def project(self, y: Array) -> Array:
         """Return Zᵀ y (q,): displacement of the unknowns under the load whose L⁻¹ f is y."""
@@ -69,34 +84,40 @@ class HalfResponse:
         for block in self.blocks:
             part = y[block.start : block.stop]
             if part.any():
-                _add_transposed_product(block.values, part, ordered[block.first : block.last])
+                _add_products(block.values, block.which, part, ordered[block.first : block.last])
         return np.where(self.rank >= 0, ordered[np.maximum(self.rank, 0)], 0.0)
 
     def among(self, unknowns: Index) -> "HalfResponse":
-        """Return the response of some of the unknowns (u,) alone."""
+        """Return the response of some of the unknowns (u,) alone; it shares the columns."""
         wanted = self.rank[unknowns]
         live = np.flatnonzero(wanted >= 0)
         order = live[np.argsort(wanted[live])]
         rank = np.full(len(unknowns), -1)
         rank[order] = np.arange(len(order))
-        blocks, columns = [], wanted[order]
-        for block in self.blocks:
-            a, b = (int(n) for n in np.searchsorted(columns, [block.first, block.last]))
-            if b > a:
-                values = np.take(block.values, columns[a:b] - block.first, axis=1)
-                blocks.append(Block(block.start, block.stop, a, b, values))
-        return HalfResponse(rank, blocks)
+        columns = wanted[order]
+        return HalfResponse(
+            rank,
+            [
+                Block(
+                    *(block.start, block.stop, a, b, block.values),
+                    block.which[columns[a:b] - block.first],
+                )
+                for block, a, b in self._parts(columns)
+            ],
+        )
 
     def compliance(self, some: Index | None = None) -> Array:
         """Return the compliance (s, q), m/N, of some unknowns, by default all, to all."""
         rank = self.rank if some is None else self.rank[some]
         rows, live = np.unique(rank[rank >= 0]), self.rank >= 0
         inner = np.zeros((len(rows), self.columns))
-        for block in self.blocks:
-            a, b = np.searchsorted(rows, [block.first, block.last])
-            if b > a:
-                part = block.values.astype(np.float64)
-                inner[a:b, block.first : block.last] += part[:, rows[a:b] - block.first].T @ part
+        for block, a, b in self._parts(rows):
+            few = block.values[block.which[rows[a:b] - block.first]]
+            if len(few) <= FEW:
+                product = _products(block.values, block.which, few)
+            else:
+                product = few @ block.values[block.which].T
+            inner[a:b, block.first : block.last] += product
         result = np.zeros((len(rank), len(self.rank)))
         index = np.searchsorted(rows, rank[rank >= 0])
         result[np.ix_(rank >= 0, live)] = inner[np.ix_(index, self.rank[live])]
@@ -112,29 +133,53 @@ class HalfResponse:
         """How many columns Z has."""
         return int((self.rank >= 0).sum())
 
+    def _parts(self, columns: Index) -> Iterator[tuple[Block, int, int]]:
+        """Yield the blocks of some sorted columns (u,), and which [a, b) of these are theirs."""
+        first, last = np.searchsorted(columns, self._spans)
+        for number in np.flatnonzero(last > first):
+            yield self.blocks[number], int(first[number]), int(last[number])
+
+    @cached_property
+    def _spans(self) -> Index:
+        """First column (row 0) and one past the last column (row 1) of each block."""
+        return np.array([(b.first, b.last) for b in self.blocks], np.int64).reshape(-1, 2).T
+
 
 @compiled
-def _add_product(values: Array, x: Array, y: Array) -> None:
-    """Add A x to y, worked out in the precision of A (m, n)."""
-    rows, columns = values.shape
-    own, zero = x.astype(values.dtype), values.dtype.type(0)
-    for i in range(rows):
-        total = zero
-        for j in range(columns):
-            total += values[i, j] * own[j]
-        y[i] += total
+def _add_columns(values: Array, which: Index, factors: Array, y: Array) -> None:
+    """Add the sum of some columns times factors to y, worked out in their precision."""
+    total = np.zeros(len(y), values.dtype)
+    for k in range(len(which)):
+        column, factor = values[which[k]], values.dtype.type(factors[k])
+        for i in range(len(total)):
+            total[i] += factor * column[i]
+    for i in range(len(y)):
+        y[i] += total[i]
 
 
 @compiled
-def _add_transposed_product(values: Array, x: Array, y: Array) -> None:
-    """Add Aᵀ x to y, worked out in the precision of A (m, n)."""
-    rows, columns = values.shape
-    own, total = x.astype(values.dtype), np.zeros(columns, values.dtype)
-    for i in range(rows):
-        for j in range(columns):
-            total[j] += own[i] * values[i, j]
-    for j in range(columns):
-        y[j] += total[j]
+def _add_products(values: Array, which: Index, y: Array, products: Array) -> None:
+    """Add some columns' products with y to `products`, worked out in their precision."""
+    own = y.astype(values.dtype)
+    for k in range(len(which)):
+        column, total = values[which[k]], values.dtype.type(0)
+        for i in range(len(own)):
+            total += column[i] * own[i]
+        products[k] += total
+
+
+@compiled
+def _products(values: Array, which: Index, few: Array) -> Array:
+    """Return the products (f, k) of a few columns (f, n) with some others, in their precision."""
+    result = np.empty((len(few), len(which)), values.dtype)
+    for k in range(len(which)):
+        column = values[which[k]]
+        for f in range(len(few)):
+            own, total = few[f], values.dtype.type(0)
+            for i in range(len(own)):
+                total += column[i] * own[i]
+            result[f, k] = total
+    return result
 
 
 def unknowns_of(nodes: Index) -> Index:
@@ -175,24 +220,24 @@ class HalfSolves:
         right = self._of(member)
         del self._waiting[member]
         a, b = np.searchsorted(self._rows, [front.start, front.stop])
-        right[self._rows[a:b] - front.start, np.arange(a, b) - first] += 1.0
-        product = front.block @ right
-        del right  # at the root as large as the rows that are kept
+        right[np.arange(a, b) - first, self._rows[a:b] - front.start] += 1.0
+        product = right @ front.block.T
+        del right  # at the root as large as the columns that are kept
         done = product
         if len(front.boundary):
-            self._pass_up(member, front.boundary, product[front.stop - front.start :])
-            done = product[: front.stop - front.start].copy()
-        self._blocks.append(Block(front.start, front.stop, first, last, done))
+            self._pass_up(member, front.boundary, product[:, front.stop - front.start :])
+            done = product[:, : front.stop - front.start].copy()
+        self._blocks.append(Block.of(front.start, front.stop, first, last, done))
 
     def response(self) -> HalfResponse:
         """Return what all fronts have made."""
         return HalfResponse(self._rank, self._blocks)
 
     def _of(self, member: int) -> NDArray[Any]:
-        """Return a front's right-hand side so far (own unknowns, its columns)."""
+        """Return a front's right-hand side so far (its columns, own unknowns)."""
         if member not in self._waiting:
             first, last = self._spans[member]
-            shape = (self._starts[member + 1] - self._starts[member], last - first)
+            shape = (last - first, self._starts[member + 1] - self._starts[member])
             self._waiting[member] = np.zeros(shape, self._precision)
         return self._waiting[member]
 
@@ -209,7 +254,7 @@ class HalfSolves:
         return spans
 
     def _pass_up(self, member: int, boundary: Index, passed: NDArray[Any]) -> None:
-        """Take a front's products (m, columns) from the right-hand sides of those above it."""
+        """Take a front's products (columns, m) from the right-hand sides of those above it."""
         above, at = self._parents[member], 0
         first, last = self._spans[member]
         while at < len(boundary):
@@ -217,5 +262,5 @@ class HalfSolves:
             if end > at:
                 start = self._spans[above][0]
                 local = boundary[at:end] - self._starts[above]
-                self._of(above)[local, first - start : last - start] -= passed[at:end]
+                self._of(above)[first - start : last - start, local] -= passed[:, at:end]
             above, at = self._parents[above], end
