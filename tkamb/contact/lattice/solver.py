@@ -228,7 +228,7 @@ class NonlinearBalance:
         self._response.push(pushed, self._x)
         operator.factor.backward(self._x, region.fronts)
         self.field = np.zeros_like(self.h)
-        self.field[region.nodes] = operator.nodal(self._x)[region.nodes]
+        self.field[region.nodes] = operator.nodal(self._x, region.nodes)
         self._look(region)
 
     def look_everywhere(self) -> None:

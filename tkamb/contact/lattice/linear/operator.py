@@ -45,17 +45,29 @@ class ElasticOperator:
             force: N; zero but on the nodes that the fronts are for.
             fronts: from `fronts_of`; all by default.
         """
-        y = force.ravel()[self.free][self.factor.order]
+        y = force.ravel()[self._unknown]
         self.factor.forward(y, fronts)
         return y
 
-    def nodal(self, x: Array) -> Array:
-        """Return nodal values (n, 3) of a vector in elimination order, 0 where held."""
-        inner = np.empty_like(x)
-        inner[self.factor.order] = x
-        result = np.zeros(len(self.free))
-        result[self.free] = inner
-        return result.reshape(-1, 3)
+    def nodal(self, x: Array, nodes: Index | None = None) -> Array:
+        """Return values (m, 3) of nodes, by default of all, from a vector in elimination order.
+
+        They are 0 where held.
+        """
+        place = self._place if nodes is None else self._place[nodes]
+        return np.where(place >= 0, x[place], 0.0)
+
+    @cached_property
+    def _unknown(self) -> Index:
+        """Which of the 3n unknowns each in elimination order is."""
+        return np.flatnonzero(self.free)[self.factor.order]
+
+    @cached_property
+    def _place(self) -> Index:
+        """Place of each node's unknowns (n, 3) in elimination order, -1 where held."""
+        place = np.full(len(self.free), -1)
+        place[self._unknown] = np.arange(len(self._unknown))
+        return place.reshape(-1, 3)
 
     def fronts_of(self, nodes: Index) -> Index:
         """Return the fronts of the factor that eliminate the nodes, and all above them."""
@@ -77,9 +89,8 @@ class ElasticOperator:
         """Front (n,) that eliminates each node; -1 for a node that is held."""
         fronts = self.factor.fronts
         member = np.repeat(np.arange(len(fronts)), [f.stop - f.start for f in fronts])
-        unknown = np.flatnonzero(self.free)[self.factor.order]
         result = np.full(len(self.free) // 3, -1)
-        result[unknown // 3] = member
+        result[self._unknown // 3] = member
         return result
 
 
