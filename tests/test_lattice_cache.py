@@ -145,7 +145,7 @@ def test_sizes_are_checked_before_anything_is_read(folder, caplog):
     cached()
     path = only_file(folder)
     whole = bytearray(path.read_bytes())
-    whole[20:28] = (800_000_000_000).to_bytes(8, "little")
+    whole[32:40] = (800_000_000_000).to_bytes(8, "little")
     path.write_bytes(whole)
     check_made_again_with_one_notice(folder, caplog, "no such header")
     os.truncate(path, 800_000_000_000)

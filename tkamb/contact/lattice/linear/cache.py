@@ -3,14 +3,16 @@
 The key is the SHA-256 of everything that the operator depends on: nodes, cells, held unknowns,
 contact nodes, elastic constants, kind of solid, and the code that makes it. A file is
 
-    magic (16 bytes) | CRC-32 of all that follows | length of the header | header (JSON) | arrays
+    magic (16 bytes) | two sums (16) | length of the header (8) | header (JSON) | arrays
 
-and is written beside its place and moved there in one step, so that two processes at once see a
-whole file or none. A file is used only if it is a regular one of the user's own that nobody else
-may write, its size is what its header says, its CRC-32 and key are right, and its operator
-inverts the stiffness that is assembled afresh (`operator_error`). Any other is made again, with
-one notice. The least recently used go when the folder outgrows its limit, and with them what a
-killed process left half written.
+The sums are those of all 64-bit words that follow, plain and times their number, modulo 2^64: they
+tell any one bit, and words that changed places, in an eighth of the time of CRC-32. It is written
+beside its place and moved there in one step, so that two processes at once see a whole file or
+none. A file is used only if it is a regular one of the user's own that nobody else may write, its
+size is what its header says, its sums and key are right, and its operator inverts the stiffness
+that is assembled afresh (`operator_error`). Any other is made again, with one notice. The least
+recently used go when the folder outgrows its limit, and with them what a killed process left half
+written.
 
 The folder is $TKAMB_CACHE_DIR, else $XDG_CACHE_HOME/tkamb, else ~/.cache/tkamb. Operators that
 are made again in about a second are not kept.
@@ -25,7 +27,6 @@ import os
 import stat
 import tempfile
 import time as clock
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -35,6 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.code_identity import code_identity
+from tkamb.compiled import compiled
 from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor, Front
 from tkamb.contact.lattice.linear.operator import ElasticOperator, operator_error
 from tkamb.contact.lattice.linear.response import SINGLE, Block, HalfResponse
@@ -43,8 +45,10 @@ from tkamb.errors import InputError
 from tkamb.files import open_regular
 from tkamb.geometry.frames import Index, Mask
 
-MAGIC = b"tkamb operator 7"
-PREFIX = len(MAGIC) + 4 + 8
+MAGIC = b"tkamb operator 8"
+SUMS = 16
+"""Bytes of the two sums."""
+PREFIX = len(MAGIC) + SUMS + 8
 """Bytes before the header."""
 BOUNDARY = 64
 """Bytes; every array begins at a multiple of it."""
@@ -164,20 +168,23 @@ def write_operator(path: Path, key: str, operator: ElasticOperator) -> None:
         }
     ).encode()
     header += b" " * _padding(PREFIX + len(header))
-    start = len(header).to_bytes(8, "little") + header
-    checksum = zlib.crc32(start)
+    parts = [_words(len(header).to_bytes(8, "little") + header)]
+    for array in arrays:
+        content = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+        whole = len(content) // BOUNDARY * BOUNDARY
+        rest = content[whole:].tobytes()
+        parts += [content[:whole].view(np.uint64), _words(rest + bytes(_padding(len(rest))))]
+    sums, count = np.zeros(2, np.uint64), 0
+    for words in parts:
+        _add_sums(words, count, sums)
+        count += len(words)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=".tkamb-", suffix=".part")
     try:
         with os.fdopen(handle, "wb") as file:
             fcntl.flock(file, fcntl.LOCK_EX)  # says that somebody is at it, until he closes or dies
-            file.write(MAGIC + bytes(4) + start)
-            for array in arrays:
-                content = np.ascontiguousarray(array).data.cast("B") if array.size else b""
-                for part in (content, bytes(_padding(array.nbytes))):
-                    checksum = zlib.crc32(part, checksum)
-                    file.write(part)
-            file.seek(len(MAGIC))
-            file.write(checksum.to_bytes(4, "little"))
+            file.write(MAGIC + sums.tobytes())
+            for words in parts:
+                file.write(words.data)
         os.replace(name, path)
     except BaseException:
         Path(name).unlink(missing_ok=True)
@@ -232,7 +239,7 @@ def read_operator(path: Path, key: str, limit: float = SIZE_LIMIT) -> ElasticOpe
 
 
 def _arrays(file: BinaryIO, size: int, key: str) -> Iterator[NDArray[Any]]:
-    """Yield the arrays of a file of that size, after a look at its key and its CRC-32."""
+    """Yield the arrays of a file of that size, after a look at its key and its sums."""
     start = file.read(PREFIX)
     length = int.from_bytes(start[-8:], "little")
     if len(start) < PREFIX or start[: len(MAGIC)] != MAGIC or length > LONGEST_HEADER:
@@ -249,11 +256,27 @@ def _arrays(file: BinaryIO, size: int, key: str) -> Iterator[NDArray[Any]]:
     # Mapped, not read: nothing is copied, and processes share it. A file is never written in
     # place; what is written to a mapped array stays this process's own.
     content = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY))
-    checksum = zlib.crc32(content[firsts[0] :], zlib.crc32(start[-8:] + text))
-    if checksum.to_bytes(4, "little") != start[len(MAGIC) : -8]:
-        raise ValueError("another CRC-32")
+    sums = np.zeros(2, np.uint64)
+    _add_sums(_words(content[len(MAGIC) + SUMS :]), 0, sums)
+    if sums.tobytes() != start[len(MAGIC) : -8]:
+        raise ValueError("other sums")
     for (kind, shape), first, n in zip(shapes, firsts, sizes, strict=False):
         yield np.frombuffer(content[first : first + n], kind).reshape(shape)
+
+
+def _words(content: bytes | memoryview) -> NDArray[np.uint64]:
+    """Return content as 64-bit words."""
+    return np.frombuffer(content, np.uint64) if len(content) else np.zeros(0, np.uint64)
+
+
+@compiled
+def _add_sums(words: NDArray[np.uint64], first: int, sums: NDArray[np.uint64]) -> None:
+    """Add 64-bit words, plain and times their number, to two sums; the first has a number."""
+    plain, weighted, number = sums[0], sums[1], np.uint64(first)
+    for i in range(len(words)):
+        plain += words[i]
+        weighted += words[i] * (np.uint64(i) + number)
+    sums[0], sums[1] = plain, weighted
 
 
 def _padding(length: int) -> int:

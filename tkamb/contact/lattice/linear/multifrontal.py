@@ -17,12 +17,13 @@ fast as over four rows at a time, and faster than `einsum` and BLAS.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
-from scipy.linalg import blas, lapack
+from scipy.linalg import blas, get_blas_funcs, lapack
 
 from tkamb.compiled import compiled
 from tkamb.errors import ComputationError
@@ -211,42 +212,81 @@ def _backward(block: NDArray[Any], scale: Array, boundary: Index, start: int, x:
 
 def fronts_of(
     matrix: sparse.csr_matrix,
-    tree: Dissection,
-    unknowns: list[Index],
+    rank: Index,
+    starts: Index,
+    parent: list[int],
     precision: type[np.floating] = np.float64,
 ) -> Iterator[Front]:
     """Yield the fronts of the Cholesky factor, children before parents.
 
     Args:
-        matrix: (n, n) symmetric positive definite.
-        tree: dissection; used for its parents.
-        unknowns: unknowns that each tree member eliminates.
+        matrix: (n, n) symmetric, positive definite on the unknowns that have a rank.
+        rank: (n,) place of each unknown in elimination order, -1 for one left out.
+        starts: (f + 1,) first place of each tree member, and how many there are.
+        parent: index of the parent of each member, -1 for a root.
         precision: in which the fronts are yielded; they are worked out in float64.
 
     Raises:
         ComputationError: the matrix is not positive definite.
     """
-    order = np.concatenate(unknowns)
-    matrix = _lower_columns(matrix[order][:, order])
+    columns = lower_columns(matrix, rank, int(starts[-1]))
+    del matrix
     updates: dict[int, list[tuple[Index, Array]]] = {}
-    row = np.empty(len(order), np.int64)
-    start = 0
-    for member, own in enumerate(unknowns):
-        stop = start + len(own)
+    row = np.empty(columns.shape[0], np.int64)
+    for member, (start, stop) in enumerate(pairwise(starts.tolist())):
         children = updates.pop(member, [])
-        boundary, block, update = _eliminate(matrix, start, stop, children, row, precision)
+        boundary, block, update = _eliminate(columns, start, stop, children, row, precision)
         if len(boundary):
-            updates.setdefault(tree.parent[member], []).append((boundary, update))
+            updates.setdefault(parent[member], []).append((boundary, update))
         scale = np.ones(len(block), precision)
-        yield Front(start, stop, boundary, tree.parent[member], block, scale)
-        start = stop
+        yield Front(start, stop, boundary, parent[member], block, scale)
 
 
-def _lower_columns(matrix: sparse.csr_matrix) -> sparse.csc_matrix:
-    """Return the lower half of a symmetric matrix by columns: by rows, its upper half."""
-    half = sparse.triu(matrix, format="csr").T
-    half.sort_indices()
-    return half
+def lower_columns(matrix: sparse.csr_matrix, rank: Index, count: int) -> sparse.csc_matrix:
+    """Return the lower half of a symmetric matrix in elimination order, by columns.
+
+    The rows of a column are in no order.
+
+    Args:
+        matrix: (n, n).
+        rank: (n,) place of each unknown, -1 for one left out.
+        count: how many have one.
+    """
+    edges = np.zeros(count + 1, np.int64)
+    _count_lower(matrix.indptr, matrix.indices, rank, edges)
+    np.cumsum(edges, out=edges)
+    rows, values = np.empty(edges[-1], np.int64), np.empty(edges[-1])
+    _fill_lower(matrix.indptr, matrix.indices, matrix.data, rank, edges, rows, values)
+    return sparse.csc_matrix((values, rows, edges), (count, count))
+
+
+@compiled
+def _count_lower(indptr: Index, indices: Index, rank: Index, counts: Index) -> None:
+    """Put the number of entries of each column j into counts[j + 1]: a row read as a column."""
+    for i in range(len(rank)):
+        for at in range(indptr[i], indptr[i + 1]):
+            if 0 <= rank[i] <= rank[indices[at]]:
+                counts[rank[i] + 1] += 1
+
+
+@compiled
+def _fill_lower(
+    indptr: Index,
+    indices: Index,
+    data: Array,
+    rank: Index,
+    edges: Index,
+    rows: Index,
+    values: Array,
+) -> None:
+    """Put rows and values where each column's edge says."""
+    for i in range(len(rank)):
+        if rank[i] >= 0:
+            free = edges[rank[i]]
+            for at in range(indptr[i], indptr[i + 1]):
+                if rank[indices[at]] >= rank[i]:
+                    rows[free], values[free] = rank[indices[at]], data[at]
+                    free += 1
 
 
 def _eliminate(
@@ -286,9 +326,12 @@ def _eliminate(
     if m:
         mixed = blas.dtrmm(1.0, inverse, mixed, side=1, lower=1, trans_a=1, overwrite_b=1)
         rest = blas.dsyrk(-1.0, mixed, 1.0, rest, lower=1, overwrite_c=1)
-        mixed = blas.dtrmm(1.0, inverse, mixed, side=1, lower=1, overwrite_b=1)
     block = np.empty((k + m, k), precision)
     block[:k], block[k:] = inverse, mixed
+    if m:  # W is not used any further: to the precision in which it is kept
+        times = get_blas_funcs("trmm", dtype=precision)
+        # Of an array kept row by row BLAS, which reads column by column, sees the transpose.
+        times(1.0, block[:k].T, block[k:].T, overwrite_b=1)
     return boundary, block, rest
 
 

@@ -1,5 +1,6 @@
 """The linear operator of one insert: factor, boundary conditions, response of contact nodes."""
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -7,13 +8,15 @@ import numpy as np
 import scipy.sparse as sparse
 
 from tkamb.contact.lattice.linear.memory_need import check_memory, factor_memory
-from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor, dissect, fronts_of
+from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor, Front, dissect, fronts_of
 from tkamb.contact.lattice.linear.response import HalfResponse, HalfSolves
 from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.contact.pair import Bearing
 from tkamb.geometry.frames import Array, Index, Mask
 
 SEED = 20_240_501
+AHEAD = 8
+"""Fronts that the factorisation may be ahead of the response: they are kept whole so long."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,12 +161,22 @@ def prepare_operator(
     rank[np.flatnonzero(free)[order]] = np.arange(len(order))
     wanted = rank[(3 * contact_nodes[:, None] + np.arange(3)).ravel()]
     starts = np.cumsum([0, *map(len, unknowns)])
-    half, fronts = HalfSolves(starts, tree.parent, wanted, precision), []
-    made = fronts_of(stiffness[free][:, free], tree, unknowns, precision)
+    half = HalfSolves(starts, tree.parent, wanted, precision)
+    made = fronts_of(stiffness, rank, starts, tree.parent, precision)
     del stiffness, joined  # as large as half of the factor, and not needed any more
-    for member, front in enumerate(made):
+
+    def taken(member: int, front: Front) -> Front:
         half.add(member, front)
-        fronts.append(front.coarsened() if coarse else front)
+        return front.coarsened() if coarse else front
+
+    # The response follows the factor in a thread of its own: BLAS lets both go on.
+    with ThreadPoolExecutor(1) as other:
+        waiting: list[Future[Front]] = []
+        for member, front in enumerate(made):
+            waiting.append(other.submit(taken, member, front))
+            if member >= AHEAD:
+                waiting[member - AHEAD].result()
+    fronts = [one.result() for one in waiting]
     return ElasticOperator(free, CholeskyFactor(order, fronts), contact_nodes, half.response())
 
 

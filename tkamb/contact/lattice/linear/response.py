@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import get_blas_funcs
 
 from tkamb.compiled import compiled
 from tkamb.contact.lattice.linear.multifrontal import Front
@@ -182,6 +183,14 @@ def _products(values: Array, which: Index, few: Array) -> Array:
     return result
 
 
+@compiled
+def _take_away(target: Array, columns: Index, values: Array) -> None:
+    """Take values (n, k) from some columns (k,) of the target."""
+    for i in range(len(values)):
+        for j in range(len(columns)):
+            target[i, columns[j]] -= values[i, j]
+
+
 def unknowns_of(nodes: Index) -> Index:
     """Return the three unknowns of each node (n,), one node after the other (3n,)."""
     return (3 * nodes[:, None] + np.arange(3)).ravel()
@@ -221,13 +230,13 @@ class HalfSolves:
         del self._waiting[member]
         a, b = np.searchsorted(self._rows, [front.start, front.stop])
         right[np.arange(a, b) - first, self._rows[a:b] - front.start] += 1.0
-        product = right @ front.block.T
-        del right  # at the root as large as the columns that are kept
-        done = product
+        count = front.stop - front.start
         if len(front.boundary):
-            self._pass_up(member, front.boundary, product[:, front.stop - front.start :])
-            done = product[:, : front.stop - front.start].copy()
-        self._blocks.append(Block.of(front.start, front.stop, first, last, done))
+            self._pass_up(member, front.boundary, right @ front.block[count:].T)
+        # Of arrays kept row by row BLAS, which reads column by column, sees the transposes.
+        times = get_blas_funcs("trmm", dtype=self._precision)
+        own = times(1.0, front.block[:count].T, right.T, trans_a=1, overwrite_b=1).T
+        self._blocks.append(Block.of(front.start, front.stop, first, last, own))
 
     def response(self) -> HalfResponse:
         """Return what all fronts have made."""
@@ -262,5 +271,5 @@ class HalfSolves:
             if end > at:
                 start = self._spans[above][0]
                 local = boundary[at:end] - self._starts[above]
-                self._of(above)[first - start : last - start, local] -= passed[:, at:end]
+                _take_away(self._of(above)[first - start : last - start], local, passed[:, at:end])
             above, at = self._parents[above], end

@@ -27,6 +27,7 @@ import scipy.sparse as sparse
 from tkamb.contact.lattice.meshing.cells import CORNERS, PAIR_AXES, PAIRS
 from tkamb.contact.lattice.solids.cell_loops import (
     deviatoric_matrices,
+    largest_pull,
     shear_forces,
     softened_forces,
     strained_cells,
@@ -97,20 +98,16 @@ def body_diagonal_stiffness(edges: Array) -> float:
     pairs = square * np.roll(square, 1)
     upper = np.prod(edges) * square.sum() / (4 * pairs.max())
     candidates = np.linspace(0, upper, 201)[1:-1]
-    families = np.stack([spring_families(edges, k) for k in candidates])
+    none = spring_families(edges, 0.0)
+    per_unit = spring_families(edges, 1.0) - none
+    families = none + candidates[:, None] * per_unit
     kept = families.min(axis=1) >= 0
     if kept.any():
-        candidates, families = candidates[kept], families[kept]
-    corners, none = box_corners(edges)[None], spring_families(edges, 0.0)
-    per_unit = spring_matrix(corners, spring_families(edges, 1.0) - none)
-    matrices = spring_matrix(corners, none) + candidates[:, None, None] * per_unit
+        candidates = candidates[kept]
+    corners = box_corners(edges)[None]
+    matrices = spring_matrix(corners, none)
+    matrices = matrices + candidates[:, None, None] * spring_matrix(corners, per_unit)
     return float(candidates[np.linalg.eigvalsh(matrices)[:, 6].argmax()])
-
-
-def _square_norm(matrices: Array) -> Array:
-    """Return a bound (c,) of the squared spectral norm of matrices (c, 8, 3)."""
-    products = np.einsum("cik,cil->ckl", matrices, matrices)
-    return np.asarray(np.abs(products).sum(axis=2).max(axis=1))
 
 
 class CalibratedNetwork(Solid):
@@ -170,16 +167,9 @@ class CalibratedNetwork(Solid):
 
     @cached_property
     def _largest(self) -> float:
-        """Bound of (3 V lambda)^½ of all cells, m².
-
-        lambda <= 2 V |g|² + `_stiffest` |P|²; P = I - x gᵀ is a projection as x gᵀ is, whose norms
-        are the same and no larger than |x| |g|.
-        """
+        """A bound of (3 V lambda)^½ of all cells, m²."""
         corners, gradients, volume, _ = self._shapes
-        shape = _square_norm(gradients)
-        size = _square_norm(corners - corners.mean(axis=1, keepdims=True))
-        stiffest = 2 * volume * shape + self._stiffest * size * shape
-        return float(np.sqrt(3 * volume * stiffest).max())
+        return largest_pull(corners, gradients, volume, self._stiffest)
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n): mu_s K_d + mu_s'/(3 V e) (K_d u)(K_d u)ᵀ + bulk."""

@@ -74,6 +74,38 @@ def _parted(
 
 
 @compiled
+def largest_pull(corners: Array, gradients: Array, volumes: Array, stiffest: float) -> float:
+    """Return a bound of (3 V lambda)^½ of all cells, m², lambda the largest eigenvalue of K_d.
+
+    lambda <= 2 V |g|² + `stiffest` |P|²; P = I - x gᵀ is a projection as x gᵀ is, whose norms are
+    the same and no larger than |x| |g|. See `strained_cells` for the arguments.
+    """
+    largest = 0.0
+    for cell in range(len(corners)):
+        shape = _square_norm(gradients[cell])
+        lambda_ = 2 * volumes[cell] * shape + stiffest * _square_norm(corners[cell]) * shape
+        largest = max(largest, 3 * volumes[cell] * lambda_)
+    return np.sqrt(largest)
+
+
+@compiled
+def _square_norm(matrix: Array) -> float:
+    """Return a bound of the squared spectral norm of a matrix (8, 3) less its rows' mean."""
+    mean, largest = np.zeros(3), 0.0
+    for i in range(8):
+        mean += matrix[i] / 8
+    for a in range(3):
+        row = 0.0
+        for b in range(3):
+            product = 0.0
+            for i in range(8):
+                product += (matrix[i, a] - mean[a]) * (matrix[i, b] - mean[b])
+            row += abs(product)
+        largest = max(largest, row)
+    return largest
+
+
+@compiled
 def strained_cells(
     corners: Array,
     gradients: Array,
