@@ -27,7 +27,7 @@ import os
 import stat
 import tempfile
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -116,8 +116,8 @@ def cached_operator(
     try:
         found = read_operator(path, key, limit)
         if found is not None:
-            check_operator(found, solid, held, contact_nodes)
-            return found
+            check_operator(*found, solid, held, contact_nodes)
+            return found[0]
     except DamagedOperator as damage:
         _log.warning("%s: %s; the operator is made again", path, damage)
     made = make()
@@ -136,11 +136,15 @@ class DamagedOperator(Exception):
 
 def check_operator(
     operator: ElasticOperator,
+    mapped: mmap.mmap,
     solid: Solid,
     held: Mask,
     contact_nodes: Index,
 ) -> None:
     """Hold an operator that was read against the solid that it is to be of.
+
+    Its file is given back as soon as it has been read: what a motion reads of the response is a
+    small part. Pages that are read again come from the system's memory of the file.
 
     Raises:
         DamagedOperator: it is of other unknowns, or does not invert the solid's stiffness.
@@ -149,7 +153,7 @@ def check_operator(
     if not same or not np.array_equal(operator.contact_nodes, contact_nodes):
         raise DamagedOperator("is of another boundary")
     try:
-        error = operator_error(operator, solid)
+        error = operator_error(operator, solid, lambda: mapped.madvise(mmap.MADV_DONTNEED))
     except (ValueError, IndexError) as broken:  # indices that lead nowhere
         raise DamagedOperator(f"is not an operator ({broken})") from None
     if not error <= LARGEST_ERROR:
@@ -211,8 +215,10 @@ def _blocks(operator: ElasticOperator) -> list[NDArray[Any]]:
     return [f.block for f in operator.factor.fronts] + [b.values for b in operator.half.blocks]
 
 
-def read_operator(path: Path, key: str, limit: float = SIZE_LIMIT) -> ElasticOperator | None:
-    """Return the operator in a file, None if there is no file.
+def read_operator(
+    path: Path, key: str, limit: float = SIZE_LIMIT
+) -> tuple[ElasticOperator, mmap.mmap] | None:
+    """Return the operator in a file, and the file in memory; None if there is no file.
 
     Raises:
         DamagedOperator: the file is not one that this user wrote whole, or of another key.
@@ -228,18 +234,18 @@ def read_operator(path: Path, key: str, limit: float = SIZE_LIMIT) -> ElasticOpe
         if status.st_uid != os.geteuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
             raise DamagedOperator("is not the user's own")
         try:
-            arrays = list(_arrays(file, status.st_size, key))
+            mapped, arrays = _arrays(file, status.st_size, key)
             operator = _operator_of(arrays)
         except (OSError, ValueError, KeyError, TypeError, IndexError, MemoryError) as error:
             raise DamagedOperator(f"is damaged ({error})") from None
         # Says when it was last used. Another process may have removed it, or nobody may say so.
         with suppress(OSError):
             os.utime(file.fileno())
-    return operator
+    return operator, mapped
 
 
-def _arrays(file: BinaryIO, size: int, key: str) -> Iterator[NDArray[Any]]:
-    """Yield the arrays of a file of that size, after a look at its key and its sums."""
+def _arrays(file: BinaryIO, size: int, key: str) -> tuple[mmap.mmap, list[NDArray[Any]]]:
+    """Return a file of that size in memory and its arrays, after a look at key and sums."""
     start = file.read(PREFIX)
     length = int.from_bytes(start[-8:], "little")
     if len(start) < PREFIX or start[: len(MAGIC)] != MAGIC or length > LONGEST_HEADER:
@@ -255,13 +261,16 @@ def _arrays(file: BinaryIO, size: int, key: str) -> Iterator[NDArray[Any]]:
         raise ValueError("another size than its header says")
     # Mapped, not read: nothing is copied, and processes share it. A file is never written in
     # place; what is written to a mapped array stays this process's own.
-    content = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY))
-    sums = np.zeros(2, np.uint64)
+    mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+    content, sums = memoryview(mapped), np.zeros(2, np.uint64)
     _add_sums(_words(content[len(MAGIC) + SUMS :]), 0, sums)
+    mapped.madvise(mmap.MADV_DONTNEED)
     if sums.tobytes() != start[len(MAGIC) : -8]:
         raise ValueError("other sums")
-    for (kind, shape), first, n in zip(shapes, firsts, sizes, strict=False):
-        yield np.frombuffer(content[first : first + n], kind).reshape(shape)
+    return mapped, [
+        np.frombuffer(content[first : first + n], kind).reshape(shape)
+        for (kind, shape), first, n in zip(shapes, firsts, sizes, strict=False)
+    ]
 
 
 def _words(content: bytes | memoryview) -> NDArray[np.uint64]:

@@ -1,5 +1,6 @@
 """The linear operator of one insert: factor, boundary conditions, response of contact nodes."""
 
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -180,7 +181,9 @@ def prepare_operator(
     return ElasticOperator(free, CholeskyFactor(order, fronts), contact_nodes, half.response())
 
 
-def operator_error(operator: ElasticOperator, solid: Solid) -> float:
+def operator_error(
+    operator: ElasticOperator, solid: Solid, response_read: Callable[[], None] | None = None
+) -> float:
     """Return how far an operator is from its solid's stiffness K, relative.
 
     The largest of
@@ -198,20 +201,23 @@ def operator_error(operator: ElasticOperator, solid: Solid) -> float:
     Args:
         operator: to be looked at.
         solid: that it should be of.
+        response_read: called when all of the response has been read, and nothing of the factor.
     """
     chance = np.random.default_rng(SEED)
     nodes, shape = operator.contact_nodes, solid.nodes.shape
     pressed, touched = np.zeros(shape), np.zeros(shape)
     pressed[nodes, 1] = -1.0
     touched[nodes] = chance.normal(size=(len(nodes), 3))
+    stored = np.zeros(len(operator.factor.order))
+    operator.half.apply(touched[nodes].ravel(), stored)
+    if response_read is not None:
+        response_read()
     moved = np.where(operator.free.reshape(-1, 3), chance.normal(size=shape), 0.0)
     force = _carried(operator, solid, moved)
     missing = _carried(operator, solid, operator.solve(force)) - force
     sunk = operator.solve(pressed)
     work, energy = (float((f * sunk).sum()) for f in (pressed, _carried(operator, solid, sunk)))
     directly = operator.start(touched)
-    stored = np.zeros_like(directly)
-    operator.half.apply(touched[nodes].ravel(), stored)
     return max(
         _ratio(np.linalg.norm(missing), np.linalg.norm(force)),
         _ratio(work - energy, work),
