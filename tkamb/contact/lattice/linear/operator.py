@@ -16,7 +16,7 @@ from tkamb.contact.pair import Bearing
 from tkamb.geometry.frames import Array, Index, Mask
 
 SEED = 20_240_501
-AHEAD = 8
+AHEAD = 128
 """Fronts that the factorisation may be ahead of the response: they are kept whole so long."""
 
 
