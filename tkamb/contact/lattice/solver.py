@@ -33,6 +33,7 @@ PASSED_OVER = 0.03
 SLOW = 0.7
 """When a pass leaves more than this share of the last distance, sliding steps are halved."""
 SMALLEST_SHARE = 0.125
+NONE = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -216,6 +217,7 @@ class NonlinearBalance:
         self.region = problem.everywhere if guess.region is None else guess.region
         self.h = np.zeros_like(problem.solid.nodes)
         self.noticed: Index | None = None
+        self._shares = np.zeros((0, 3 * problem.solid.scatter.elements.shape[1]))
         if guess.nonlinear_residual is not None:
             self.h[self.region.nodes] = guess.nonlinear_residual[self.region.nodes]
         self._mixer = AndersonMixer()
@@ -229,7 +231,10 @@ class NonlinearBalance:
         operator.factor.backward(self._x, region.fronts)
         self.field = np.zeros_like(self.h)
         self.field[region.nodes] = operator.nodal(self._x, region.nodes)
-        self._look(region)
+        if region.whole:
+            self._look_at_all(NONE)
+        else:
+            self._look(region)
 
     def look_everywhere(self) -> None:
         """Look at the rest of the solid, for the residual and the field of all of it."""
@@ -240,7 +245,7 @@ class NonlinearBalance:
         rest = np.setdiff1d(everywhere.fronts, region.fronts, assume_unique=True)
         operator.factor.backward(self._x, rest)
         self.field = operator.nodal(self._x)
-        self._look(everywhere)
+        self._look_at_all(region.elements)
 
     def advance(self) -> None:
         """Take the next h."""
@@ -259,22 +264,33 @@ class NonlinearBalance:
         self.offset = self._response.displacement(self._x)
 
     def _look(self, region: Region) -> None:
-        """Find the imbalance of a region; of the whole, also which elements count."""
-        solid, chosen = self._problem.solid, region.elements
-        if region.whole:
-            allowed = PASSED_OVER * self._tolerance * self.size
-            self.noticed = solid.noticeable(self.field, allowed / np.sqrt(len(chosen)))
-            chosen = chosen if self.noticed is None else self.noticed
-        forces = solid.nonlinear_residual(self.field, chosen)
-        value = self._summed(forces, chosen)
-        self.residual = float(np.linalg.norm(value - self._taken)) / self.size
-        if region.whole:
-            size = np.sqrt(np.einsum("ij,ij->i", forces, forces))
-            count = elements_that_count(size, SHARE * self._tolerance * self.size)
-            self.region = Region.of(self._problem, chosen[count])
-            value = self._summed(forces[count], self.region.elements)
-            self._narrowed = True
-        self.h = value
+        """Find the imbalance of a region."""
+        solid = self._problem.solid
+        self._shares = solid.nonlinear_residual(self.field, region.elements)
+        self.h = self._summed(self._shares, region.elements)
+        self.residual = float(np.linalg.norm(self.h - self._taken)) / self.size
+
+    def _look_at_all(self, known: Index) -> None:
+        """Find the imbalance of all elements and which count; the shares of some are known."""
+        solid, everywhere = self._problem.solid, self._problem.everywhere.elements
+        allowed = PASSED_OVER * self._tolerance * self.size
+        self.noticed = solid.noticeable(self.field, allowed / np.sqrt(len(everywhere)))
+        if self.noticed is None:
+            elements, shares = everywhere, solid.nonlinear_residual(self.field)
+        else:
+            left = np.zeros(len(everywhere), bool)
+            left[self.noticed] = True
+            left[known] = False
+            rest = np.flatnonzero(left)
+            elements = np.concatenate([known, rest])
+            shares = np.vstack([self._shares, solid.nonlinear_residual(self.field, rest)])
+        asked = self._summed(shares, elements)
+        self.residual = float(np.linalg.norm(asked - self._taken)) / self.size
+        size = np.sqrt(np.einsum("ij,ij->i", shares, shares))
+        count = elements_that_count(size, SHARE * self._tolerance * self.size)
+        self.region = Region.of(self._problem, np.sort(elements[count]))
+        self.h = self._summed(shares[count], elements[count])
+        self._narrowed = True
 
     def _summed(self, forces: Array, elements: Index) -> Array:
         value = self._problem.solid.scatter.sum(forces, elements)

@@ -119,11 +119,12 @@ def _add_up(parts: Array, nodes: Index, total: Array) -> None:
 
 
 @compiled
-def _mean_strains(cells: Index, gradients: Array, displacement: Array) -> Array:
-    """Return the symmetric mean gradient (c, 3, 3) of nodal displacements (n, 3)."""
-    strains = np.empty((len(cells), 3, 3))
+def _mean_strains(cells: Index, gradients: Array, displacement: Array, chosen: Index) -> Array:
+    """Return the symmetric mean gradient (k, 3, 3) of nodal displacements (n, 3) in some cells."""
+    strains = np.empty((len(chosen), 3, 3))
     gradient = np.empty((3, 3))
-    for cell in range(len(cells)):
+    for k in range(len(chosen)):
+        cell = chosen[k]
         gradient[:] = 0.0
         for corner in range(8):
             for a in range(3):
@@ -132,7 +133,7 @@ def _mean_strains(cells: Index, gradients: Array, displacement: Array) -> Array:
                     gradient[a, b] += moved * gradients[cell, corner, b]
         for a in range(3):
             for b in range(3):
-                strains[cell, a, b] = (gradient[a, b] + gradient[b, a]) / 2
+                strains[k, a, b] = (gradient[a, b] + gradient[b, a]) / 2
     return strains
 
 
@@ -229,7 +230,7 @@ class Solid(ABC):
         strain = self.strain(displacement, chosen)
         if not len(strain):
             return 0.0
-        norm = np.linalg.norm(strain, axis=(1, 2))
+        norm = np.sqrt(np.einsum("kab,kab->k", strain, strain))
         first = float(np.linalg.eigvalsh(strain[norm.argmax()])[0])
         return float(np.linalg.eigvalsh(strain[norm >= -first])[:, 0].min())
 
@@ -247,8 +248,8 @@ class Solid(ABC):
 
     def strain(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return the mean strain (k, 3, 3) of cells, by default of all."""
-        cells, gradients = (elements_of(values, chosen) for values in (self.cells, self.gradients))
-        return _mean_strains(cells, gradients, displacement)
+        some = np.arange(len(self.cells)) if chosen is None else chosen
+        return _mean_strains(self.cells, self.gradients, displacement, some)
 
 
 def chunks(count: int) -> Iterator[slice]:
