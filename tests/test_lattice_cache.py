@@ -117,6 +117,18 @@ def test_flipped_bits_anywhere_are_noticed(folder, caplog, flips):
         assert np.array_equal(again.half.compliance(), first)
 
 
+def test_words_that_changed_places_are_noticed(folder, caplog):
+    """Their plain sum is the same."""
+    cached()
+    path = only_file(folder)
+    words = np.frombuffer(path.read_bytes(), np.uint64).copy()
+    first, second = np.flatnonzero(words[len(words) // 2 :])[[0, 40]] + len(words) // 2
+    assert words[first] != words[second]
+    words[[first, second]] = words[[second, first]]
+    path.write_bytes(words.tobytes())
+    check_made_again_with_one_notice(folder, caplog, "other sums")
+
+
 def test_an_operator_under_another_name_is_noticed(folder, caplog):
     cached()
     path = only_file(folder)

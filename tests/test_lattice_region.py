@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from lattice_bodies import condyles, dished_insert, pair
+from tkamb.contact.lattice import solver
 from tkamb.contact.lattice.initial_guess import WarmStart, initial_guess
 from tkamb.contact.lattice.linear import compliance, response
 from tkamb.contact.lattice.linear.compliance import ComplianceCache, by_component
 from tkamb.contact.lattice.linear.response import unknowns_of
 from tkamb.contact.lattice.model import warm_start_of
-from tkamb.contact.lattice.problem import undeformed
+from tkamb.contact.lattice.problem import Region, undeformed
 from tkamb.contact.lattice.solids.solid import SMALL_STRAIN
 from tkamb.contact.lattice.solver import Tolerance, elements_that_count, solve
 from tkamb.contact.materials import material
@@ -148,6 +149,23 @@ def test_the_calibrated_cells_pass_most_of_the_solid_over(pressed):
     field = field.copy()
     field[solid.cells[7, 3]] = np.nan
     assert 7 in solid.noticeable(field, limit)
+
+
+@pytest.mark.parametrize("model", ["lattice"], indirect=True)
+def test_a_region_may_become_the_whole_solid(state, monkeypatch):
+    """Passes that looked at few elements go on with all: none is counted twice, none left out."""
+    cold = solved(state, 0.0, 1e-3)
+    sizes = np.linalg.norm(state.problem.solid.nonlinear_residual(cold.field), axis=1)
+    few = Region.of(state.problem, np.sort(np.argsort(sizes)[-40:]))
+    everything = np.arange(len(sizes))
+    monkeypatch.setattr(solver, "SHARE", 0.0)
+    monkeypatch.setattr(type(state.problem.solid), "noticeable", lambda *given: everything)
+    found = solved(state, 0.4e-3, 1e-3, replace(cold, region=few))
+    assert found.region.whole and found.converged and found.passes > 1
+    assert imbalance(state, found) <= 1.05e-3
+    assert found.forces.approach == pytest.approx(
+        solved(state, 0.4e-3, 1e-3).forces.approach, rel=5e-3
+    )
 
 
 def test_the_approach_is_that_of_the_pose(state):

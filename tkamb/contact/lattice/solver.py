@@ -33,7 +33,6 @@ PASSED_OVER = 0.03
 SLOW = 0.7
 """When a pass leaves more than this share of the last distance, sliding steps are halved."""
 SMALLEST_SHARE = 0.125
-NONE = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -217,7 +216,6 @@ class NonlinearBalance:
         self.region = problem.everywhere if guess.region is None else guess.region
         self.h = np.zeros_like(problem.solid.nodes)
         self.noticed: Index | None = None
-        self._shares = np.zeros((0, 3 * problem.solid.scatter.elements.shape[1]))
         if guess.nonlinear_residual is not None:
             self.h[self.region.nodes] = guess.nonlinear_residual[self.region.nodes]
         self._mixer = AndersonMixer()
@@ -232,7 +230,7 @@ class NonlinearBalance:
         self.field = np.zeros_like(self.h)
         self.field[region.nodes] = operator.nodal(self._x, region.nodes)
         if region.whole:
-            self._look_at_all(NONE)
+            self._look_at_all(None)
         else:
             self._look(region)
 
@@ -245,7 +243,7 @@ class NonlinearBalance:
         rest = np.setdiff1d(everywhere.fronts, region.fronts, assume_unique=True)
         operator.factor.backward(self._x, rest)
         self.field = operator.nodal(self._x)
-        self._look_at_all(region.elements)
+        self._look_at_all((region.elements, self._shares))
 
     def advance(self) -> None:
         """Take the next h."""
@@ -270,8 +268,12 @@ class NonlinearBalance:
         self.h = self._summed(self._shares, region.elements)
         self.residual = float(np.linalg.norm(self.h - self._taken)) / self.size
 
-    def _look_at_all(self, known: Index) -> None:
-        """Find the imbalance of all elements and which count; the shares of some are known."""
+    def _look_at_all(self, known: tuple[Index, Array] | None) -> None:
+        """Find the imbalance of all elements, and which count.
+
+        Args:
+            known: some elements (k,) and their shares (k, 3p) of this field, N, or None.
+        """
         solid, everywhere = self._problem.solid, self._problem.everywhere.elements
         allowed = PASSED_OVER * self._tolerance * self.size
         self.noticed = solid.noticeable(self.field, allowed / np.sqrt(len(everywhere)))
@@ -280,10 +282,13 @@ class NonlinearBalance:
         else:
             left = np.zeros(len(everywhere), bool)
             left[self.noticed] = True
-            left[known] = False
-            rest = np.flatnonzero(left)
-            elements = np.concatenate([known, rest])
-            shares = np.vstack([self._shares, solid.nonlinear_residual(self.field, rest)])
+            if known is not None:
+                left[known[0]] = False
+            elements = np.flatnonzero(left)
+            shares = solid.nonlinear_residual(self.field, elements)
+            if known is not None:
+                elements = np.concatenate([known[0], elements])
+                shares = np.vstack([known[1], shares])
         asked = self._summed(shares, elements)
         self.residual = float(np.linalg.norm(asked - self._taken)) / self.size
         size = np.sqrt(np.einsum("ij,ij->i", shares, shares))

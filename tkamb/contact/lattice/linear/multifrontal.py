@@ -229,7 +229,7 @@ def fronts_of(
     Raises:
         ComputationError: the matrix is not positive definite.
     """
-    columns = lower_columns(matrix, rank, int(starts[-1]))
+    columns = _lower_columns(matrix, rank, int(starts[-1]))
     del matrix
     updates: dict[int, list[tuple[Index, Array]]] = {}
     row = np.empty(columns.shape[0], np.int64)
@@ -242,7 +242,7 @@ def fronts_of(
         yield Front(start, stop, boundary, parent[member], block, scale)
 
 
-def lower_columns(matrix: sparse.csr_matrix, rank: Index, count: int) -> sparse.csc_matrix:
+def _lower_columns(matrix: sparse.csr_matrix, rank: Index, count: int) -> sparse.csc_matrix:
     """Return the lower half of a symmetric matrix in elimination order, by columns.
 
     The rows of a column are in no order.
@@ -328,7 +328,7 @@ def _eliminate(
         rest = blas.dsyrk(-1.0, mixed, 1.0, rest, lower=1, overwrite_c=1)
     block = np.empty((k + m, k), precision)
     block[:k], block[k:] = inverse, mixed
-    if m:  # W is not used any further: to the precision in which it is kept
+    if m:  # in the precision in which W is kept: nothing else of the factor is made of it
         times = get_blas_funcs("trmm", dtype=precision)
         # Of an array kept row by row BLAS, which reads column by column, sees the transpose.
         times(1.0, block[:k].T, block[k:].T, overwrite_b=1)
