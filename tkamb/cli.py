@@ -21,6 +21,7 @@ from tkamb.mesh_command import add_contact, add_mesh, add_no_cache, add_press, w
 from tkamb.scene_options import add_scene_options, overrides_of
 from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
+from tkamb.threads import threads
 from tkamb.uncertainty.command import add_uncertainty
 from tkamb.view.command import add_view
 from tkamb.wear.command import add_wear
@@ -42,6 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def command() -> int:
         _parser().parse_args(arguments, options)
+        threads()  # is refused here where it is no number of threads
         log_to_stderr()
         return int(options.command(options))
 

@@ -33,6 +33,7 @@ from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.scene.case import Case
+from tkamb.threads import both
 
 if TYPE_CHECKING:
     from tkamb.contact.cam_post import CamPost
@@ -122,8 +123,9 @@ class ContactSide:
         self, k: int, before: Sequence[FrameContact]
     ) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact at the recorded rotation."""
-        guess = before[-1].result if before else None
-        body = self.mechanics.frame(k)
+        guess, pose = before[-1].result if before else None, self.mechanics.poses[k]
+        # Every press asks where the bodies first touch, of which the body's equations need nothing.
+        body, _ = both(lambda: self.mechanics.frame(k), lambda: self.state.pair.touch_at(pose))
         contact = self.carry(body, self.mechanics.poses[k], guess)
         if contact.adjustment and contact.adjustment.restored:
             body = self.mechanics.frame(k, contact.adjustment)

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from tkamb.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.tree import TriangleTree, rows
+from tkamb.threads import in_halves
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
@@ -23,6 +24,8 @@ STILL = 1e-200
 """A smaller part of a direction is none; its inverse times a length is still a number."""
 PARALLEL = 1e-9
 """Sine of the angle to a triangle's plane below which a ray does not cross it."""
+MANY = 500
+"""Rays from which on two threads share them."""
 DEEPEST = 64
 """Boxes that wait at one time: one of each level."""
 NO_TRIANGLE = -1
@@ -70,8 +73,17 @@ class RayCaster:
         Returns:
             distance (n,) m, face (n,), barycentric coordinates (n, 3), NaN where nothing is hit.
         """
-        rays = _rays(origins, directions)
-        return _first_crossings(*self._tree, *rays, -self._same, EDGE_TOLERANCE)
+        origins, directions = _rays(origins, directions)
+
+        def crossings(some: slice) -> tuple[Array, Index, Array]:
+            along = directions[some] if len(directions) > 1 else directions
+            return _first_crossings(*self._tree, origins[some], along, -self._same, EDGE_TOLERANCE)
+
+        if len(origins) < MANY:
+            return crossings(slice(0, len(origins)))
+        one, other = in_halves(crossings, len(origins))
+        distance, face, weights = (np.concatenate(two) for two in zip(one, other, strict=True))
+        return distance, face, weights
 
     def all(self, origins: ArrayLike, directions: ArrayLike) -> tuple[Index, Array, Index]:
         """Return every crossing of every ray at or beyond its origin.

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import IO, Any
 
+from tkamb import threads
 from tkamb.errors import ComputationError, InputError, TkambError
 from tkamb.guard import log_to_stderr
 
@@ -164,9 +165,10 @@ class Team:
 
 
 def _start() -> "subprocess.Popen[bytes]":
-    # a session of its own: Ctrl-C is the parent's to handle
+    # a session of its own: Ctrl-C is the parent's to handle; one thread: others share the cores
     return subprocess.Popen(
         [sys.executable, "-m", "tkamb.run.workers"],
+        env=os.environ | {threads.VARIABLE: "1"},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         start_new_session=True,

@@ -17,6 +17,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from tkamb import threads
 from tkamb.contact.model import ContactModel
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult, ContactStatus
@@ -33,7 +34,9 @@ REPEATS = 3
 WARM_PRESSES = 7
 ENOUGH_SECONDS = 3.0
 """No more repeats once this much was measured; warm presses: `REPEATS` in any case."""
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", threads.VARIABLE), "1"
+)
 
 
 @contextmanager

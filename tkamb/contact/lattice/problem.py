@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from tkamb.contact.lattice.linear.compliance import ComplianceCache
+from tkamb.contact.lattice.linear.multifrontal import Shares
 from tkamb.contact.lattice.linear.operator import ElasticOperator
 from tkamb.contact.lattice.meshing.contact_map import ContactMap
 from tkamb.contact.lattice.meshing.grid import Lattice
@@ -186,13 +187,13 @@ class Region:
     Args:
         elements: (k,) increasing.
         nodes: (m,) their nodes that are not held.
-        fronts: (f,) what of the factor these nodes need, increasing.
+        fronts: what of the factor these nodes need.
         whole: these are all elements.
     """
 
     elements: Index
     nodes: Index
-    fronts: Index
+    fronts: Shares
     whole: bool
 
     @classmethod

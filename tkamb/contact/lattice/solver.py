@@ -239,9 +239,9 @@ class NonlinearBalance:
         region, operator = self.region, self._problem.operator
         if self._narrowed:
             return
-        everywhere = self._problem.everywhere
-        rest = np.setdiff1d(everywhere.fronts, region.fronts, assume_unique=True)
-        operator.factor.backward(self._x, rest)
+        factor, every = operator.factor, self._problem.everywhere.fronts.fronts
+        rest = np.setdiff1d(every, region.fronts.fronts, assume_unique=True)
+        factor.backward(self._x, factor.shared(rest))
         self.field = operator.nodal(self._x)
         self._look_at_all((region.elements, self._shares))
 

@@ -37,15 +37,15 @@ from numpy.typing import NDArray
 
 from tkamb.code_identity import code_identity
 from tkamb.compiled import compiled
-from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor, Front
+from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor
 from tkamb.contact.lattice.linear.operator import ElasticOperator, operator_error
-from tkamb.contact.lattice.linear.response import SINGLE, Block, HalfResponse
+from tkamb.contact.lattice.linear.response import Block, HalfResponse
 from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.errors import InputError
 from tkamb.files import open_regular
 from tkamb.geometry.frames import Index, Mask
 
-MAGIC = b"tkamb operator 8"
+MAGIC = b"tkamb operator 9"
 SUMS = 16
 """Bytes of the two sums."""
 PREFIX = len(MAGIC) + SUMS + 8
@@ -196,23 +196,24 @@ def write_operator(path: Path, key: str, operator: ElasticOperator) -> None:
 
 
 def _tables(operator: ElasticOperator) -> list[NDArray[Any]]:
-    fronts, blocks = operator.factor.fronts, operator.half.blocks
-    sizes = [[f.start, f.stop, f.parent, len(f.boundary)] for f in fronts]
+    factor, blocks = operator.factor, operator.half.blocks
     rows = [[b.start, b.stop, b.first, b.last] for b in blocks]
     return [
         operator.free,
         operator.contact_nodes,
-        operator.factor.order,
-        np.array(sizes, np.int64).reshape(-1, 4),
-        np.concatenate([np.zeros(0, np.int64), *(f.boundary for f in fronts)]),
-        np.concatenate([np.zeros(0, SINGLE), *(f.scale for f in fronts)]),
+        factor.order,
+        factor.starts,
+        factor.parents,
+        factor.edges,
+        factor.boundary,
+        factor.scale,
         operator.half.rank,
         np.array(rows, np.int64).reshape(-1, 4),
     ]
 
 
 def _blocks(operator: ElasticOperator) -> list[NDArray[Any]]:
-    return [f.block for f in operator.factor.fronts] + [b.values for b in operator.half.blocks]
+    return [operator.factor.values] + [b.values for b in operator.half.blocks]
 
 
 def read_operator(
@@ -298,29 +299,27 @@ def _operator_of(arrays: list[NDArray[Any]]) -> ElasticOperator:
 
     Compiled code looks at no bounds: every index is held against them here.
     """
-    free, contact_nodes, order, sizes, boundaries, scales, rank, rows, *values = arrays
-    if len(values) != len(sizes) + len(rows):
-        raise ValueError("another number of blocks")
-    unknowns, edge, last, fronts = len(order), 0, 0, []
-    _check(order, 0, unknowns)
-    _check(boundaries, 0, unknowns)
-    _check(np.concatenate([sizes[:, 0], sizes[:, 1] - 1]), 0, unknowns)
-    _check(sizes[:, 2], -1, len(sizes))
-    for (start, stop, parent, touched), block in zip(sizes.tolist(), values, strict=False):
-        boundary = boundaries[edge : edge + touched]
-        scale = scales[last : last + stop - start + touched]
-        if block.shape != (len(scale), stop - start) or len(boundary) != touched:
-            raise ValueError("a block of another shape")
-        fronts.append(Front(start, stop, boundary, parent, block, scale))
-        edge, last = edge + touched, last + len(scale)
+    free, contact_nodes, order, starts, parents, edges, boundary = arrays[:7]
+    scale, rank, rows, values = arrays[7:11]
+    factor = CholeskyFactor(order, starts, parents, edges, boundary, values, scale)
+    unknowns, fronts = len(factor.order), len(factor.parents)
+    _check(factor.order, 0, unknowns)
+    _check(factor.boundary, 0, unknowns)
+    _check(factor.parents, -1, fronts)
+    for edges, count in (factor.starts, unknowns), (factor.edges, len(factor.boundary)):
+        if len(edges) != fronts + 1 or edges[0] != 0 or edges[-1] != count:
+            raise ValueError("fronts that do not follow each other")
+        _check(np.diff(edges), 0, count + 1)
+    if len(factor.scale) != unknowns + len(factor.boundary) or len(values) != factor.firsts[-1]:
+        raise ValueError("rows of another number or length")
+    if factor.parents.size and not (factor.parents > np.arange(fronts))[factor.parents >= 0].all():
+        raise ValueError("a front that is not below its parent")
     blocks = []
-    for (start, stop, first, end), block in zip(rows.tolist(), values[len(sizes) :], strict=True):
+    for (start, stop, first, end), block in zip(rows.tolist(), arrays[11:], strict=True):
         if block.shape != (end - first, stop - start):
             raise ValueError("a block of another shape")
         blocks.append(Block.of(start, stop, first, end, block))
-    return ElasticOperator(
-        free, CholeskyFactor(order, fronts), contact_nodes, HalfResponse(rank, blocks)
-    )
+    return ElasticOperator(free, factor, contact_nodes, HalfResponse(rank, blocks))
 
 
 def _check(indices: Index, least: int, end: int) -> None:

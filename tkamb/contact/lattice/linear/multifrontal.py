@@ -16,7 +16,8 @@ fast as over four rows at a time, and faster than `einsum` and BLAS.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -28,6 +29,10 @@ from scipy.linalg import blas, get_blas_funcs, lapack
 from tkamb.compiled import compiled
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, Index
+from tkamb.threads import both
+
+CUTS = 16
+"""Ways in which fronts are divided between two threads, to take the best."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,49 +107,128 @@ def _along_columns(index: Index, part: Index) -> Index:
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """One member of the factor.
+    """One member of the factor, as it is made.
 
     Args:
         start: first own unknown in elimination order.
         stop: one past the last own unknown.
         boundary: (m,) later unknowns that it touches, increasing.
-        parent: member above, -1 at a root.
-        block: (k + m, k) W = [L11⁻¹; L21 L11⁻¹], each row over its scale.
-        scale: (k + m,) of the rows; the type of all that is worked out with them. Of the
-            integers that `coarsened` makes; else 1.
+        block: (k + m, k) W = [L11⁻¹; L21 L11⁻¹].
     """
 
     start: int
     stop: int
     boundary: Index
-    parent: int
     block: NDArray[Any]
-    scale: Array
 
-    def coarsened(self) -> "Front":
-        """Return it in 16-bit integers: entries to 1.5e-5 of the largest in their row."""
-        largest = np.abs(self.block).max(axis=1, initial=0.0)
-        scale = np.maximum(largest, np.finfo(np.float32).tiny) / np.iinfo(np.int16).max
-        block = np.rint(self.block / scale[:, None]).astype(np.int16)
-        return replace(self, block=block, scale=scale.astype(np.float32))
+    def rows(self, coarse: bool) -> tuple[NDArray[Any], Array]:
+        """Return W row by row without the zeros of L11⁻¹, each row over its scale; the scales.
+
+        Args:
+            coarse: in 16-bit integers, entries to 1.5e-5 of the largest in their row; else as
+                they are, and the scales are 1.
+        """
+        block, scale = self.block, np.ones(len(self.block), self.block.dtype)
+        if coarse:
+            largest = np.abs(block).max(axis=1, initial=0.0)
+            scale = np.maximum(largest, np.finfo(np.float32).tiny) / np.iinfo(np.int16).max
+            block = np.rint(block / scale[:, None]).astype(np.int16)
+            scale = scale.astype(np.float32)
+        count = self.stop - self.start
+        own = block[:count][np.tri(count, dtype=bool)]
+        return np.concatenate([own, block[count:].ravel()]), scale
+
+
+@dataclass(frozen=True, eq=False)
+class Shares:
+    """Fronts of a factor, divided so that two threads may go through them.
+
+    No front of one of the first two is above one of the other.
+
+    Args:
+        first: increasing.
+        second: increasing.
+        above: increasing; none is below one of the first two.
+    """
+
+    first: Index
+    second: Index
+    above: Index
+
+    @property
+    def fronts(self) -> Index:
+        """All of them, increasing."""
+        return np.sort(np.concatenate([self.first, self.second, self.above]))
 
 
 @dataclass(frozen=True, eq=False)
 class CholeskyFactor:
     """P A Pᵀ = L Lᵀ of a symmetric positive definite matrix.
 
+    Of a front's unknowns and boundary together, f + m, each has a row of W. All fronts' rows
+    follow each other; the first `edges[i] + starts[i]` of them are those of the fronts before i.
+
     Args:
         order: (n,) unknowns in elimination order.
-        fronts: members, children before parents.
+        starts: (f + 1,) first unknown of each front in elimination order, children before
+            parents, and how many there are.
+        parents: (f,) front above each, -1 at a root.
+        edges: (f + 1,) first place of each front's boundary in `boundary`, and its length.
+        boundary: (b,) later unknowns that the fronts touch, increasing within a front.
+        values: the rows of W, without the zeros of L11⁻¹, each over its scale.
+        scale: (n + b,) of the rows; the type of all that is worked out with them.
     """
 
     order: Index
-    fronts: list[Front]
+    starts: Index
+    parents: Index
+    edges: Index
+    boundary: Index
+    values: NDArray[Any]
+    scale: Array
+
+    @classmethod
+    def of(
+        cls,
+        order: Index,
+        starts: Index,
+        parents: list[int],
+        boundaries: list[Index],
+        rows: list[tuple[NDArray[Any], Array]],
+    ) -> "CholeskyFactor":
+        """Return the factor of fronts' boundaries and `Front.rows`, which are taken away."""
+        edges = np.cumsum([0, *map(len, boundaries)])
+        values = np.empty(sum(len(row) for row, _ in rows), rows[0][0].dtype if rows else float)
+        scales, at = [], len(values)
+        while rows:  # each is freed when it has been copied: the factor is not there twice
+            row, scale = rows.pop()
+            at -= len(row)
+            values[at : at + len(row)] = row
+            scales.append(scale)
+        boundary = np.concatenate([np.zeros(0, np.int64), *boundaries])
+        scale = np.concatenate(scales[::-1]) if scales else np.zeros(0)
+        return cls(order, starts, np.array(parents, np.int64), edges, boundary, values, scale)
 
     @property
     def entries(self) -> int:
         """How many numbers the factor holds."""
-        return sum(front.block.size for front in self.fronts)
+        return self.values.size
+
+    @cached_property
+    def firsts(self) -> Index:
+        """Where the rows of each front (f + 1,) begin in `values`, and how long that has to be."""
+        own, touched = np.diff(self.starts), np.diff(self.edges)
+        return np.cumsum(np.concatenate([[0], own * (own + 1) // 2 + own * touched]))
+
+    @cached_property
+    def everything(self) -> Shares:
+        """All fronts."""
+        return self.shared(np.arange(len(self.parents)))
+
+    def shared(self, fronts: Index) -> Shares:
+        """Return fronts (increasing) divided between two threads."""
+        share = _divided(fronts, self.parents, np.diff(self.firsts))
+        return Shares(*(fronts[share == number] for number in range(3)))
 
     def solve(self, right: Array) -> Array:
         """Return x (n,) of A x = right."""
@@ -155,59 +239,171 @@ class CholeskyFactor:
         result[self.order] = x
         return result
 
-    def forward(self, x: Array, fronts: Index | None = None) -> None:
+    def forward(self, x: Array, fronts: Shares | None = None) -> None:
         """Turn x (n,) into L⁻¹ x in place, in elimination order.
 
         Args:
             x: zero but on the fronts.
-            fronts: increasing, with everything above each of them; all by default.
+            fronts: with everything above each of them; all by default.
         """
-        for front in self._chosen(fronts):
-            _forward(front.block, front.scale, front.boundary, front.start, x)
+        some = self.everything if fronts is None else fronts
+        # Both threads take from what is above: each in a vector of its own, added in one order.
+        other = np.zeros_like(x)
+        _copy(some.second, self.starts, x, other)
+        both(
+            lambda: _forward(some.first, *self._parts, x),
+            lambda: _forward(some.second, *self._parts, other),
+        )
+        _copy(some.second, self.starts, other, x)
+        _add(some.above, self.starts, other, x)
+        _forward(some.above, *self._parts, x)
 
-    def backward(self, x: Array, fronts: Index | None = None) -> None:
+    def backward(self, x: Array, fronts: Shares | None = None) -> None:
         """Turn x (n,) into L⁻ᵀ x in place, in elimination order.
 
         Args:
             x: L⁻ᵀ x already on what lies above the fronts and is none of them.
-            fronts: increasing; all by default.
+            fronts: all by default.
         """
-        for front in reversed(self._chosen(fronts)):
-            _backward(front.block, front.scale, front.boundary, front.start, x)
+        some = self.everything if fronts is None else fronts
+        _backward(some.above, *self._parts, x)
+        both(
+            lambda: _backward(some.first, *self._parts, x),
+            lambda: _backward(some.second, *self._parts, x),
+        )
 
-    def _chosen(self, fronts: Index | None) -> list[Front]:
-        return self.fronts if fronts is None else [self.fronts[f] for f in fronts.tolist()]
-
-
-@compiled
-def _forward(block: NDArray[Any], scale: Array, boundary: Index, start: int, x: Array) -> None:
-    """Take one front's step of L⁻¹ x: own unknowns times W, what lies below less the rest."""
-    rows, count = block.shape
-    number = scale.dtype.type
-    own = x[start : start + count].astype(scale.dtype)
-    for i in range(rows):
-        row, total = block[i], number(0)
-        for j in range(min(i + 1, count)):
-            total += number(row[j]) * own[j]
-        if i < count:
-            x[start + i] = scale[i] * total
-        else:
-            x[boundary[i - count]] -= scale[i] * total
+    @cached_property
+    def _parts(self) -> tuple[Index, Index, Index, Index, NDArray[Any], Array]:
+        return self.starts, self.edges, self.boundary, self.firsts, self.values, self.scale
 
 
 @compiled
-def _backward(block: NDArray[Any], scale: Array, boundary: Index, start: int, x: Array) -> None:
-    """Take one front's step of L⁻ᵀ x: Wᵀ times its own unknowns and minus those below."""
-    rows, count = block.shape
+def _forward(
+    fronts: Index,
+    starts: Index,
+    edges: Index,
+    boundary: Index,
+    firsts: Index,
+    values: NDArray[Any],
+    scale: Array,
+    x: Array,
+) -> None:
+    """Take steps of L⁻¹ x: own unknowns times L11⁻¹, what lies above less the rest of W."""
     number = scale.dtype.type
-    total = np.zeros(count, scale.dtype)
-    for i in range(rows):
-        row = block[i]
-        right = number(scale[i] * (x[start + i] if i < count else -x[boundary[i - count]]))
-        for j in range(min(i + 1, count)):
-            total[j] += right * number(row[j])
-    for j in range(count):
-        x[start + j] = total[j]
+    for front in fronts:
+        start, stop = starts[front], starts[front + 1]
+        count, at, scales = stop - start, firsts[front], scale[start + edges[front] :]
+        own = x[start:stop].astype(scale.dtype)
+        for i in range(count):
+            row, total = values[at : at + i + 1], number(0)
+            for j in range(i + 1):
+                total += number(row[j]) * own[j]
+            x[start + i] = scales[i] * total
+            at += i + 1
+        later = boundary[edges[front] : edges[front + 1]]
+        for i in range(len(later)):
+            row, total = values[at : at + count], number(0)
+            for j in range(count):
+                total += number(row[j]) * own[j]
+            x[later[i]] -= scales[count + i] * total
+            at += count
+
+
+@compiled
+def _backward(
+    fronts: Index,
+    starts: Index,
+    edges: Index,
+    boundary: Index,
+    firsts: Index,
+    values: NDArray[Any],
+    scale: Array,
+    x: Array,
+) -> None:
+    """Take steps of L⁻ᵀ x: Wᵀ times own unknowns and minus those above, the last front first."""
+    number = scale.dtype.type
+    for front in fronts[::-1]:
+        start, stop = starts[front], starts[front + 1]
+        count, at, scales = stop - start, firsts[front], scale[start + edges[front] :]
+        total = np.zeros(count, scale.dtype)
+        for i in range(count):
+            row, right = values[at : at + i + 1], number(scales[i] * x[start + i])
+            for j in range(i + 1):
+                total[j] += right * number(row[j])
+            at += i + 1
+        later = boundary[edges[front] : edges[front + 1]]
+        for i in range(len(later)):
+            row, right = values[at : at + count], number(-scales[count + i] * x[later[i]])
+            for j in range(count):
+                total[j] += right * number(row[j])
+            at += count
+        for j in range(count):
+            x[start + j] = total[j]
+
+
+@compiled
+def _copy(fronts: Index, starts: Index, source: Array, target: Array) -> None:
+    """Copy what belongs to some fronts from one vector to another."""
+    for front in fronts:
+        for i in range(starts[front], starts[front + 1]):
+            target[i] = source[i]
+
+
+@compiled
+def _add(fronts: Index, starts: Index, source: Array, target: Array) -> None:
+    """Add what belongs to some fronts in one vector to another."""
+    for front in fronts:
+        for i in range(starts[front], starts[front + 1]):
+            target[i] += source[i]
+
+
+@compiled
+def _divided(fronts: Index, parents: Index, sizes: Index) -> Index:
+    """Return for each of some fronts (k,), increasing, whose it is: 0, 1, or 2 for above both.
+
+    The heaviest subtree is cut below its top, again and again, and each time the subtrees go
+    to whoever has less, the heaviest first; kept is what lets the two be done soonest.
+    """
+    count = len(fronts)
+    place = np.full(len(parents), -1)
+    place[fronts] = np.arange(count)
+    above = np.empty(count, np.int64)
+    weight = np.empty(count, np.int64)
+    for i in range(count):
+        parent = parents[fronts[i]]
+        while parent >= 0 and place[parent] < 0:  # of those left out, what is above
+            parent = parents[parent]
+        above[i] = place[parent] if parent >= 0 else -1
+        weight[i] = sizes[fronts[i]]
+    for i in range(count):  # children before parents
+        if above[i] >= 0:
+            weight[above[i]] += weight[i]
+    open_, cut = above < 0, np.zeros(count, np.bool_)
+    whose = np.full(count, 2)
+    best, on_top = np.inf, 0
+    for _ in range(CUTS):
+        tops = np.flatnonzero(open_)
+        tops = tops[np.argsort(-weight[tops])]
+        loads, owner = np.zeros(2, np.int64), np.empty(len(tops), np.int64)
+        for k in range(len(tops)):
+            owner[k] = 0 if loads[0] <= loads[1] else 1
+            loads[owner[k]] += weight[tops[k]]
+        if on_top + loads.max() < best:
+            best = on_top + loads.max()
+            whose[:] = 2
+            whose[tops] = owner
+            for i in range(count - 1, -1, -1):
+                if not open_[i] and not cut[i]:
+                    whose[i] = whose[above[i]]
+        if len(tops) == 0:
+            break
+        heaviest = tops[0]
+        open_[heaviest], cut[heaviest] = False, True
+        on_top += sizes[fronts[heaviest]]
+        for i in range(count):
+            if above[i] == heaviest:
+                open_[i] = True
+    return whose
 
 
 def fronts_of(
@@ -238,8 +434,7 @@ def fronts_of(
         boundary, block, update = _eliminate(columns, start, stop, children, row, precision)
         if len(boundary):
             updates.setdefault(parent[member], []).append((boundary, update))
-        scale = np.ones(len(block), precision)
-        yield Front(start, stop, boundary, parent[member], block, scale)
+        yield Front(start, stop, boundary, block)
 
 
 def _lower_columns(matrix: sparse.csr_matrix, rank: Index, count: int) -> sparse.csc_matrix:

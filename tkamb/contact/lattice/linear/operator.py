@@ -4,12 +4,20 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
+from numpy.typing import NDArray
 
 from tkamb.contact.lattice.linear.memory_need import check_memory, factor_memory
-from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor, Front, dissect, fronts_of
+from tkamb.contact.lattice.linear.multifrontal import (
+    CholeskyFactor,
+    Front,
+    Shares,
+    dissect,
+    fronts_of,
+)
 from tkamb.contact.lattice.linear.response import HalfResponse, HalfSolves
 from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.contact.pair import Bearing
@@ -42,7 +50,7 @@ class ElasticOperator:
         self.factor.backward(y)
         return self.nodal(y)
 
-    def start(self, force: Array, fronts: Index | None = None) -> Array:
+    def start(self, force: Array, fronts: Shares | None = None) -> Array:
         """Return y = L⁻¹ f in elimination order, for nodal forces (n, 3).
 
         Args:
@@ -73,26 +81,26 @@ class ElasticOperator:
         place[self._unknown] = np.arange(len(self._unknown))
         return place.reshape(-1, 3)
 
-    def fronts_of(self, nodes: Index) -> Index:
+    def fronts_of(self, nodes: Index) -> Shares:
         """Return the fronts of the factor that eliminate the nodes, and all above them."""
         own = np.unique(self._front_of_node[nodes])
-        return np.flatnonzero(self._above[own[own >= 0]].any(axis=0))
+        return self.factor.shared(np.flatnonzero(self._above[own[own >= 0]].any(axis=0)))
 
     @cached_property
     def _above(self) -> Mask:
         """Which fronts are each front or lie above it (f, f)."""
-        fronts = self.factor.fronts
-        above = np.eye(len(fronts), dtype=bool)
-        for member in reversed(range(len(fronts))):  # the parent's row is complete
-            if fronts[member].parent >= 0:
-                above[member] |= above[fronts[member].parent]
+        parents = self.factor.parents
+        above = np.eye(len(parents), dtype=bool)
+        for member in reversed(range(len(parents))):  # the parent's row is complete
+            if parents[member] >= 0:
+                above[member] |= above[parents[member]]
         return above
 
     @cached_property
     def _front_of_node(self) -> Index:
         """Front (n,) that eliminates each node; -1 for a node that is held."""
-        fronts = self.factor.fronts
-        member = np.repeat(np.arange(len(fronts)), [f.stop - f.start for f in fronts])
+        own = np.diff(self.factor.starts)
+        member = np.repeat(np.arange(len(own)), own)
         result = np.full(len(self.free) // 3, -1)
         result[self._unknown // 3] = member
         return result
@@ -166,19 +174,23 @@ def prepare_operator(
     made = fronts_of(stiffness, rank, starts, tree.parent, precision)
     del stiffness, joined  # as large as half of the factor, and not needed any more
 
-    def taken(member: int, front: Front) -> Front:
+    def taken(member: int, front: Front) -> tuple[NDArray[Any], Array]:
         half.add(member, front)
-        return front.coarsened() if coarse else front
+        return front.rows(coarse)
 
     # The response follows the factor in a thread of its own: BLAS lets both go on.
     with ThreadPoolExecutor(1) as other:
-        waiting: list[Future[Front]] = []
+        waiting: list[Future[tuple[NDArray[Any], Array]]] = []
+        boundaries = []
         for member, front in enumerate(made):
+            boundaries.append(front.boundary)
             waiting.append(other.submit(taken, member, front))
             if member >= AHEAD:
                 waiting[member - AHEAD].result()
-    fronts = [one.result() for one in waiting]
-    return ElasticOperator(free, CholeskyFactor(order, fronts), contact_nodes, half.response())
+    rows = [one.result() for one in waiting]
+    del waiting
+    factor = CholeskyFactor.of(order, starts, tree.parent, boundaries, rows)
+    return ElasticOperator(free, factor, contact_nodes, half.response())
 
 
 def operator_error(

@@ -36,6 +36,7 @@ from tkamb.contact.lattice.solids.curve import LEAST_STRAIN, ShearCurve
 from tkamb.contact.lattice.solids.solid import SMALL_STRAIN, Solid, chunks
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array, Index
+from tkamb.threads import in_halves
 
 
 def spring_families(edges: Array, body_diagonal: float) -> Array:
@@ -146,7 +147,14 @@ class CalibratedNetwork(Solid):
         if self.curve.spline is None:
             return np.zeros((len(cells), 24))
         curve = self.curve.shear_modulus, self.curve.spline.x, self.curve.spline.c, LEAST_STRAIN
-        return softened_forces(*self._shapes, *curve, self.cells, cells, displacement)
+        forces = np.empty((len(cells), 24))
+
+        def softened(some: slice) -> None:
+            shapes, where = self._shapes, (self.cells, cells[some], displacement)
+            softened_forces(*shapes, *curve, *where, forces[some])
+
+        in_halves(softened, len(cells))
+        return forces
 
     def noticeable(self, displacement: Array, share: float) -> Index | None:
         """Return the cells whose share of h may exceed `share`, N; see `Solid`.
@@ -157,8 +165,14 @@ class CalibratedNetwork(Solid):
             return None
         corners, gradients, volume, _ = self._shapes
         strain = min(self.curve.strain_that_softens(share / self._largest), SMALL_STRAIN)
-        shapes = corners, gradients, volume, self._stiffest
-        return strained_cells(*shapes, self.cells, displacement, strain, 3 * SMALL_STRAIN)
+
+        def noticed(some: slice) -> Index:
+            shapes = corners[some], gradients[some], volume[some], self._stiffest
+            limits = strain, 3 * SMALL_STRAIN
+            found = strained_cells(*shapes, self.cells[some], displacement, *limits)
+            return found + some.start
+
+        return np.concatenate(in_halves(noticed, len(self.cells)))
 
     @cached_property
     def _stiffest(self) -> float:

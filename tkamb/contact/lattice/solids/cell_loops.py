@@ -262,8 +262,9 @@ def softened_forces(
     nodes: Index,
     chosen: Index,
     displacement: Array,
-) -> Array:
-    """Return (mu - mu_s) K_d u (k, 24), N, of cells; see `shear_forces`.
+    forces: Array,
+) -> None:
+    """Put (mu - mu_s) K_d u (k, 24), N, of cells into `forces`; see `shear_forces`.
 
     Args:
         corners: (c, 8, 3) m.
@@ -277,8 +278,8 @@ def softened_forces(
         nodes: (c, 8) of the cells.
         chosen: (k,) cells.
         displacement: (n, 3) m.
+        forces: (k, 24).
     """
-    forces = np.empty((len(chosen), 24))
     u, rest = np.empty((8, 3)), np.empty((8, 3))
     for k in range(len(chosen)):
         cell, force = chosen[k], forces[k].reshape(8, 3)
@@ -291,4 +292,3 @@ def softened_forces(
         softened = shear_modulus - stress / (3 * strain)
         for i in range(24):
             forces[k, i] *= softened
-    return forces

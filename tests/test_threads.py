@@ -1,0 +1,132 @@
+"""Two threads: what is done by both, and that it does not show in an answer."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from lattice_bodies import condyles, dished_insert, pair
+from tkamb import threads
+from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor
+from tkamb.contact.materials import material
+from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactStatus
+from tkamb.geometry.frames import knee_pose
+
+
+@pytest.fixture
+def with_threads(monkeypatch):
+    def use(count):
+        monkeypatch.setattr(threads, "threads", lambda: count)
+
+    return use
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_both_give_what_they_return_also_one_within_the_other(with_threads, count):
+    with_threads(count)
+
+    def nested():
+        return threads.both(lambda: 3, lambda: 4)
+
+    assert threads.both(nested, nested) == ((3, 4), (3, 4))
+    assert threads.in_halves(lambda some: list(range(9))[some], 9) == (
+        [0, 1, 2, 3],
+        [4, 5, 6, 7, 8],
+    )
+
+
+def test_two_run_at_the_same_time(with_threads):
+    """Each waits for the other: one after the other they would never meet."""
+    with_threads(2)
+    meeting = threading.Barrier(2, timeout=30)
+    assert sorted(threads.both(meeting.wait, meeting.wait)) == [0, 1]
+
+
+def test_an_error_comes_out_once_the_other_has_ended(with_threads):
+    with_threads(2)
+    ended = []
+
+    def fails():
+        raise ValueError("mine")
+
+    def slow():
+        time.sleep(0.05)
+        ended.append(True)
+
+    with pytest.raises(ValueError, match="mine"):
+        threads.both(fails, slow)
+    assert ended == [True]
+    with pytest.raises(ValueError, match="mine"):
+        threads.both(slow, fails)
+    assert threads.both(lambda: 1, lambda: 2) == (1, 2)
+
+
+def test_a_wrong_number_of_threads_is_one_line(tmp_path):
+    command = [sys.executable, "-m", "tkamb", "run", "nothing.toml", "--out", tmp_path / "out"]
+    environment = os.environ | {threads.VARIABLE: "many"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+    assert "TKAMB_THREADS" in done.stderr and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["lattice", "lattice-linear", "foundation"])
+def test_a_press_is_the_same_to_the_bit(with_threads, name):
+    bodies = pair(condyles(subdivisions=4), dished_insert(cells=24), material("polyethylene"))
+    pose = knee_pose([1e-3, 0.0, 0.3e-3, 0.0, np.radians(0.3), 0.0])
+    found = []
+    for count in (1, 2):
+        with_threads(count)
+        model = contact_model(name, 2.0)
+        found.append(model.press(model.prepare(bodies), 2000.0, pose))
+    one, two = found
+    assert one.status is two.status is ContactStatus.OK
+    assert one.pose.tobytes() == two.pose.tobytes()
+    assert one.pressure.tobytes() == two.pressure.tobytes()
+    assert (one.pressure > 0).any()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_fronts_are_divided_without_one_above_the_other(seed):
+    """Any forest: the two shares do not depend on each other, nor what is above on neither."""
+    chance = np.random.default_rng(seed)
+    count = int(chance.integers(1, 80))
+    parents = [int(chance.integers(i + 1, min(i + 12, count) + 1)) for i in range(count)]
+    parents = np.array([-1 if parent == count else parent for parent in parents])
+    sizes = chance.integers(1, 40, count)
+    starts = np.cumsum([0, *sizes])
+    empty = np.zeros(0, np.int64)
+    factor = CholeskyFactor(
+        empty, starts, parents, np.zeros(count + 1, np.int64), empty, np.zeros(0), np.zeros(0)
+    )
+    some = np.flatnonzero(chance.random(count) < chance.choice([0.3, 0.9, 1.0]))
+    shares = factor.shared(some)
+    assert (shares.fronts == some).all()
+    whose = np.full(count, -1)
+    for number, own in enumerate((shares.first, shares.second, shares.above)):
+        whose[own] = number
+    for front in some.tolist():
+        above = parents[front]
+        while above >= 0:
+            if whose[above] >= 0:
+                assert whose[above] in (whose[front], 2)
+            above = parents[above]
+    weight = np.diff(factor.firsts)
+    loads = [weight[own].sum() for own in (shares.first, shares.second, shares.above)]
+    assert loads[2] + max(loads[:2]) <= weight[some].sum()
+
+
+def test_a_balanced_tree_is_divided_in_two_halves():
+    """Two subtrees under one root, each of a top with two leaves."""
+    parents = np.array([2, 2, 6, 5, 5, 6, -1])
+    starts, empty = np.arange(8) * 10, np.zeros(0, np.int64)
+    factor = CholeskyFactor(
+        empty, starts, parents, np.zeros(8, np.int64), empty, np.zeros(0), np.zeros(0)
+    )
+    shares = factor.everything
+    assert sorted([shares.first.tolist(), shares.second.tolist()]) == [[0, 1, 2], [3, 4, 5]]
+    assert shares.above.tolist() == [6]

@@ -1,0 +1,73 @@
+"""A second thread, for what is compiled and lets others run meanwhile.
+
+TKAMB_THREADS says how many threads a process may use, 1 or 2; without it 2, where the machine
+gives it two processors. What is computed does not depend on it, to the last bit: work is divided
+in the same way whether one thread does it or two.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from threading import Lock
+from typing import TypeVar
+
+from tkamb.errors import InputError
+
+VARIABLE = "TKAMB_THREADS"
+
+First = TypeVar("First")
+Second = TypeVar("Second")
+
+
+def both(first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
+    """Call two functions, at the same time if the other thread has nothing to do.
+
+    Args:
+        first: called in this thread.
+        second: must not need what `first` makes, nor write to what it reads.
+
+    Returns:
+        What they return. An error of `first` is raised when `second` has ended.
+    """
+    if threads() == 1 or not _busy.acquire(blocking=False):
+        return first(), second()
+    try:
+        other = _other().submit(second)
+        try:
+            result = first()
+        finally:
+            other.exception()
+        return result, other.result()
+    finally:
+        _busy.release()
+
+
+def in_halves(part: Callable[[slice], First], count: int) -> tuple[First, First]:
+    """Return what is made of the first and of the second half of so many things; see `both`."""
+    half = count // 2
+    return both(lambda: part(slice(0, half)), lambda: part(slice(half, count)))
+
+
+@cache
+def threads() -> int:
+    """Return how many threads this process may use: 1 or 2.
+
+    Raises:
+        InputError: TKAMB_THREADS is neither.
+    """
+    asked = os.environ.get(VARIABLE, "")
+    if asked not in ("", "1", "2"):
+        raise InputError(f"{asked!r} is neither 1 nor 2", VARIABLE)
+    if asked:
+        return int(asked)
+    own = getattr(os, "sched_getaffinity", None)  # Linux: what this process was given
+    return min(2, len(own(0)) if own else os.cpu_count() or 1)
+
+
+_busy = Lock()
+
+
+@cache
+def _other() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, "tkamb")
