@@ -39,7 +39,7 @@ from tkamb.code_identity import code_identity
 from tkamb.compiled import compiled
 from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor
 from tkamb.contact.lattice.linear.operator import ElasticOperator, operator_error
-from tkamb.contact.lattice.linear.response import Block, HalfResponse
+from tkamb.contact.lattice.linear.response import HalfResponse
 from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.errors import InputError
 from tkamb.files import open_regular
@@ -121,7 +121,7 @@ def cached_operator(
     except DamagedOperator as damage:
         _log.warning("%s: %s; the operator is made again", path, damage)
     made = make()
-    if sum(block.nbytes for block in _blocks(made)) <= limit:
+    if sum(part.nbytes for part in _parts(made)) <= limit:
         try:
             write_operator(path, key, made)
             prune(path.parent, limit)
@@ -163,7 +163,7 @@ def check_operator(
 def write_operator(path: Path, key: str, operator: ElasticOperator) -> None:
     """Write beside the path, then move there in one step."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    arrays = [*_tables(operator), *_blocks(operator)]
+    arrays = _parts(operator)
     header = json.dumps(
         {
             "key": key,
@@ -195,9 +195,8 @@ def write_operator(path: Path, key: str, operator: ElasticOperator) -> None:
         raise
 
 
-def _tables(operator: ElasticOperator) -> list[NDArray[Any]]:
-    factor, blocks = operator.factor, operator.half.blocks
-    rows = [[b.start, b.stop, b.first, b.last] for b in blocks]
+def _parts(operator: ElasticOperator) -> list[NDArray[Any]]:
+    factor, half = operator.factor, operator.half
     return [
         operator.free,
         operator.contact_nodes,
@@ -206,14 +205,12 @@ def _tables(operator: ElasticOperator) -> list[NDArray[Any]]:
         factor.parents,
         factor.edges,
         factor.boundary,
+        factor.values,
         factor.scale,
-        operator.half.rank,
-        np.array(rows, np.int64).reshape(-1, 4),
+        half.rank,
+        half.blocks,
+        half.values,
     ]
-
-
-def _blocks(operator: ElasticOperator) -> list[NDArray[Any]]:
-    return [operator.factor.values] + [b.values for b in operator.half.blocks]
 
 
 def read_operator(
@@ -295,13 +292,12 @@ def _padding(length: int) -> int:
 
 
 def _operator_of(arrays: list[NDArray[Any]]) -> ElasticOperator:
-    """Return the operator of the arrays of `_tables` and `_blocks`, one after the other.
+    """Return the operator of the arrays of `_parts`.
 
     Compiled code looks at no bounds: every index is held against them here.
     """
-    free, contact_nodes, order, starts, parents, edges, boundary = arrays[:7]
-    scale, rank, rows, values = arrays[7:11]
-    factor = CholeskyFactor(order, starts, parents, edges, boundary, values, scale)
+    free, contact_nodes, *of_factor, rank, blocks, columns = arrays
+    factor = CholeskyFactor(*of_factor)
     unknowns, fronts = len(factor.order), len(factor.parents)
     _check(factor.order, 0, unknowns)
     _check(factor.boundary, 0, unknowns)
@@ -310,16 +306,21 @@ def _operator_of(arrays: list[NDArray[Any]]) -> ElasticOperator:
         if len(edges) != fronts + 1 or edges[0] != 0 or edges[-1] != count:
             raise ValueError("fronts that do not follow each other")
         _check(np.diff(edges), 0, count + 1)
-    if len(factor.scale) != unknowns + len(factor.boundary) or len(values) != factor.firsts[-1]:
+    if (
+        len(factor.scale) != unknowns + len(factor.boundary)
+        or len(factor.values) != factor.firsts[-1]
+    ):
         raise ValueError("rows of another number or length")
     if factor.parents.size and not (factor.parents > np.arange(fronts))[factor.parents >= 0].all():
         raise ValueError("a front that is not below its parent")
-    blocks = []
-    for (start, stop, first, end), block in zip(rows.tolist(), arrays[11:], strict=True):
-        if block.shape != (end - first, stop - start):
-            raise ValueError("a block of another shape")
-        blocks.append(Block.of(start, stop, first, end, block))
-    return ElasticOperator(free, factor, contact_nodes, HalfResponse(rank, blocks))
+    half = HalfResponse.of(rank, blocks, columns)
+    for edges, count in (blocks[:, :2], unknowns), (blocks[:, 2:], half.columns):
+        _check(edges, 0, count + 1)
+        _check(np.diff(edges), 0, count + 1)
+    _check(rank, -1, half.columns)
+    if len(columns) != (np.diff(blocks[:, :2]) * np.diff(blocks[:, 2:])).sum():
+        raise ValueError("columns of another number or length")
+    return ElasticOperator(free, factor, contact_nodes, half)
 
 
 def _check(indices: Index, least: int, end: int) -> None:

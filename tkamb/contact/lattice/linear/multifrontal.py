@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 from scipy.linalg import blas, get_blas_funcs, lapack
 
 from tkamb.compiled import compiled
@@ -197,17 +197,14 @@ class CholeskyFactor:
         rows: list[tuple[NDArray[Any], Array]],
     ) -> "CholeskyFactor":
         """Return the factor of fronts' boundaries and `Front.rows`, which are taken away."""
+        values, scales = map(list, zip(*rows, strict=True)) if rows else ([], [])
+        rows.clear()
         edges = np.cumsum([0, *map(len, boundaries)])
-        values = np.empty(sum(len(row) for row, _ in rows), rows[0][0].dtype if rows else float)
-        scales, at = [], len(values)
-        while rows:  # each is freed when it has been copied: the factor is not there twice
-            row, scale = rows.pop()
-            at -= len(row)
-            values[at : at + len(row)] = row
-            scales.append(scale)
-        boundary = np.concatenate([np.zeros(0, np.int64), *boundaries])
-        scale = np.concatenate(scales[::-1]) if scales else np.zeros(0)
-        return cls(order, starts, np.array(parents, np.int64), edges, boundary, values, scale)
+        boundary = joined(boundaries, np.dtype(np.int64))
+        number = values[0].dtype if values else np.dtype(float)
+        scale = joined(scales, scales[0].dtype if scales else number)
+        parts = edges, boundary, joined(values, number), scale
+        return cls(order, starts, np.array(parents, np.int64), *parts)
 
     @property
     def entries(self) -> int:
@@ -275,6 +272,17 @@ class CholeskyFactor:
     @cached_property
     def _parts(self) -> tuple[Index, Index, Index, Index, NDArray[Any], Array]:
         return self.starts, self.edges, self.boundary, self.firsts, self.values, self.scale
+
+
+def joined(parts: list[NDArray[Any]], number: DTypeLike) -> NDArray[Any]:
+    """Return what the parts hold one after the other; each is freed when it has been copied."""
+    whole = np.empty(sum(part.size for part in parts), number)
+    at = len(whole)
+    while parts:
+        part = parts.pop()
+        at -= part.size
+        whole[at : at + part.size] = part.ravel()
+    return whole
 
 
 @compiled

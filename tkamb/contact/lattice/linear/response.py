@@ -7,7 +7,6 @@ follow each other, so Z is kept as one dense block per member of the tree, colum
 what is asked of few nodes reads their columns alone.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -18,8 +17,9 @@ from numpy.typing import NDArray
 from scipy.linalg import get_blas_funcs
 
 from tkamb.compiled import compiled
-from tkamb.contact.lattice.linear.multifrontal import Front
+from tkamb.contact.lattice.linear.multifrontal import Front, joined
 from tkamb.geometry.frames import Array, Index
+from tkamb.threads import both, in_halves
 
 Precision = type[np.floating[Any]]
 
@@ -32,60 +32,46 @@ FEW = 12
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
-    """Rows [start, stop) of Z in its columns [first, last), the columns in sorted order.
-
-    Args:
-        start: first row, in elimination order.
-        stop: one past the last row.
-        first: first column.
-        last: one past the last column.
-        values: (v, stop - start) columns of Z, float64 or float32.
-        which: (last - first,) of these.
-    """
-
-    start: int
-    stop: int
-    first: int
-    last: int
-    values: NDArray[Any]
-    which: Index
-
-    @classmethod
-    def of(cls, start: int, stop: int, first: int, last: int, values: NDArray[Any]) -> "Block":
-        """Return the block whose columns are all of `values`."""
-        return cls(start, stop, first, last, values, np.arange(last - first))
-
-
-@dataclass(frozen=True, eq=False)
 class HalfResponse:
     """Z = L⁻¹ E of q unknowns.
 
     Args:
         rank: (q,) sorted column of each unknown as the caller numbers them; -1 if it is held.
-        blocks: rows of Z that are not zero.
+        blocks: (b, 4) rows of Z that are not zero: first row, in elimination order, one past the
+            last, first column and one past the last column. No two share a row.
+        values: (v,) float64 or float32, columns of Z, each as long as its block has rows.
+        places: (w,) where in `values` each column of each block begins, block after block.
     """
 
     rank: Index
-    blocks: list[Block]
+    blocks: Index
+    values: NDArray[Any]
+    places: Index
+
+    @classmethod
+    def of(cls, rank: Index, blocks: Index, values: NDArray[Any]) -> "HalfResponse":
+        """Return the response whose columns lie one after the other, block after block."""
+        lengths = np.repeat(blocks[:, 1] - blocks[:, 0], blocks[:, 3] - blocks[:, 2])
+        return cls(rank, blocks, values, np.cumsum(lengths) - lengths)
 
     def apply(self, force: Array, y: Array) -> None:
         """Add Z f to y (in elimination order), for forces (q,) on the unknowns."""
         ordered = np.zeros(self.columns)
         ordered[self.rank[self.rank >= 0]] = force[self.rank >= 0]
-        pushed = np.flatnonzero(ordered)
-        for block, a, b in self._parts(pushed):
-            columns = pushed[a:b]
-            which = block.which[columns - block.first]
-            _add_columns(block.values, which, ordered[columns], y[block.start : block.stop])
+
+        def add(first: int, last: int) -> None:
+            _add_columns(*self._parts, ordered, y, first, last)
+
+        both(lambda: add(0, self._middle), lambda: add(self._middle, len(self.blocks)))
 
     def project(self, y: Array) -> Array:
         """Return Zᵀ y (q,): displacement of the unknowns under the load whose L⁻¹ f is y."""
         ordered = np.zeros(self.columns)
-        for block in self.blocks:
-            part = y[block.start : block.stop]
-            if part.any():
-                _add_products(block.values, block.which, part, ordered[block.first : block.last])
+
+        def add(some: slice) -> None:
+            _add_products(*self._parts, y, ordered, some.start, some.stop)
+
+        in_halves(add, self.columns)
         return np.where(self.rank >= 0, ordered[np.maximum(self.rank, 0)], 0.0)
 
     def among(self, unknowns: Index) -> "HalfResponse":
@@ -95,30 +81,25 @@ class HalfResponse:
         order = live[np.argsort(wanted[live])]
         rank = np.full(len(unknowns), -1)
         rank[order] = np.arange(len(order))
-        columns = wanted[order]
-        return HalfResponse(
-            rank,
-            [
-                Block(
-                    *(block.start, block.stop, a, b, block.values),
-                    block.which[columns[a:b] - block.first],
-                )
-                for block, a, b in self._parts(columns)
-            ],
-        )
+        blocks, places = _of_columns(*self._parts[:3], wanted[order])
+        return HalfResponse(rank, blocks, self.values, places)
 
     def compliance(self, some: Index | None = None) -> Array:
         """Return the compliance (s, q), m/N, of some unknowns, by default all, to all."""
         rank = self.rank if some is None else self.rank[some]
         rows, live = np.unique(rank[rank >= 0]), self.rank >= 0
         inner = np.zeros((len(rows), self.columns))
-        for block, a, b in self._parts(rows):
-            few = block.values[block.which[rows[a:b] - block.first]]
+        firsts, lasts = np.searchsorted(rows, self.blocks[:, 2:]).T
+        for block in np.flatnonzero(lasts > firsts):
+            start, stop, first, last = self.blocks[block].tolist()
+            places = self.places[self._edges[block] : self._edges[block + 1]]
+            a, b = int(firsts[block]), int(lasts[block])
+            few = _gathered(self.values, places[rows[a:b] - first], stop - start)
             if len(few) <= FEW:
-                product = _products(block.values, block.which, few)
+                product = _products(self.values, places, few)
             else:
-                product = few @ block.values[block.which].T
-            inner[a:b, block.first : block.last] += product
+                product = few @ _gathered(self.values, places, stop - start).T
+            inner[a:b, first:last] += product
         result = np.zeros((len(rank), len(self.rank)))
         index = np.searchsorted(rows, rank[rank >= 0])
         result[np.ix_(rank >= 0, live)] = inner[np.ix_(index, self.rank[live])]
@@ -127,54 +108,111 @@ class HalfResponse:
     @property
     def entries(self) -> int:
         """How many numbers Z holds."""
-        return sum(block.values.size for block in self.blocks)
+        return self.values.size
 
     @property
     def columns(self) -> int:
         """How many columns Z has."""
         return int((self.rank >= 0).sum())
 
-    def _parts(self, columns: Index) -> Iterator[tuple[Block, int, int]]:
-        """Yield the blocks of some sorted columns (u,), and which [a, b) of these are theirs."""
-        first, last = np.searchsorted(columns, self._spans)
-        for number in np.flatnonzero(last > first):
-            yield self.blocks[number], int(first[number]), int(last[number])
+    @property
+    def _parts(self) -> tuple[Index, Index, Index, NDArray[Any]]:
+        return self.blocks, self._edges, self.places, self.values
 
     @cached_property
-    def _spans(self) -> Index:
-        """First column (row 0) and one past the last column (row 1) of each block."""
-        return np.array([(b.first, b.last) for b in self.blocks], np.int64).reshape(-1, 2).T
+    def _edges(self) -> Index:
+        """Where the places of each block (b + 1,) begin, and how many there are."""
+        return np.cumsum(np.concatenate([[0], self.blocks[:, 3] - self.blocks[:, 2]]))
+
+    @cached_property
+    def _middle(self) -> int:
+        """How many of the blocks hold half of the numbers."""
+        sizes = (self.blocks[:, 1] - self.blocks[:, 0]) * (self.blocks[:, 3] - self.blocks[:, 2])
+        return int(np.searchsorted(np.cumsum(sizes), sizes.sum() / 2))
 
 
 @compiled
-def _add_columns(values: Array, which: Index, factors: Array, y: Array) -> None:
-    """Add the sum of some columns times factors to y, worked out in their precision."""
-    total = np.zeros(len(y), values.dtype)
-    for k in range(len(which)):
-        column, factor = values[which[k]], values.dtype.type(factors[k])
+def _add_columns(
+    blocks: Index,
+    edges: Index,
+    places: Index,
+    values: Array,
+    factors: Array,
+    y: Array,
+    begin: int,
+    end: int,
+) -> None:
+    """Add the columns times factors to y in the rows of blocks [begin, end), in their precision."""
+    for block in range(begin, end):
+        start, stop, first = blocks[block, 0], blocks[block, 1], blocks[block, 2]
+        total = np.zeros(stop - start, values.dtype)
+        for k in range(edges[block + 1] - edges[block]):
+            factor = values.dtype.type(factors[first + k])
+            if factor != 0:
+                place = places[edges[block] + k]
+                column = values[place : place + len(total)]
+                for i in range(len(total)):
+                    total[i] += factor * column[i]
         for i in range(len(total)):
-            total[i] += factor * column[i]
-    for i in range(len(y)):
-        y[i] += total[i]
+            y[start + i] += total[i]
 
 
 @compiled
-def _add_products(values: Array, which: Index, y: Array, products: Array) -> None:
-    """Add some columns' products with y to `products`, worked out in their precision."""
-    own = y.astype(values.dtype)
-    for k in range(len(which)):
-        column, total = values[which[k]], values.dtype.type(0)
-        for i in range(len(own)):
-            total += column[i] * own[i]
-        products[k] += total
+def _add_products(
+    blocks: Index,
+    edges: Index,
+    places: Index,
+    values: Array,
+    y: Array,
+    products: Array,
+    begin: int,
+    end: int,
+) -> None:
+    """Add the products of columns [begin, end) with y to `products`, in their precision."""
+    for block in range(len(blocks)):
+        first = blocks[block, 2]
+        some, last = max(first, begin), min(blocks[block, 3], end)
+        if some < last:
+            own = y[blocks[block, 0] : blocks[block, 1]].astype(values.dtype)
+            for column in range(some, last):
+                place = places[edges[block] + column - first]
+                part, total = values[place : place + len(own)], values.dtype.type(0)
+                for i in range(len(own)):
+                    total += part[i] * own[i]
+                products[column] += total
 
 
 @compiled
-def _products(values: Array, which: Index, few: Array) -> Array:
+def _of_columns(blocks: Index, edges: Index, places: Index, columns: Index) -> tuple[Index, Index]:
+    """Return blocks and places of some columns (u,), increasing, in their numbers."""
+    firsts, lasts = np.searchsorted(columns, blocks[:, 2]), np.searchsorted(columns, blocks[:, 3])
+    kept = np.flatnonzero(lasts > firsts)
+    some, at = blocks[kept], 0
+    chosen = np.empty((lasts - firsts).sum(), np.int64)
+    for number, block in enumerate(kept):
+        first, last = firsts[block], lasts[block]
+        for k in range(first, last):
+            chosen[at] = places[edges[block] + columns[k] - blocks[block, 2]]
+            at += 1
+        some[number, 2], some[number, 3] = first, last
+    return some, chosen
+
+
+@compiled
+def _gathered(values: Array, places: Index, length: int) -> Array:
+    """Return the columns (k, length) that begin at places (k,)."""
+    result = np.empty((len(places), length), values.dtype)
+    for k in range(len(places)):
+        result[k] = values[places[k] : places[k] + length]
+    return result
+
+
+@compiled
+def _products(values: Array, places: Index, few: Array) -> Array:
     """Return the products (f, k) of a few columns (f, n) with some others, in their precision."""
-    result = np.empty((len(few), len(which)), values.dtype)
-    for k in range(len(which)):
-        column = values[which[k]]
+    result = np.empty((len(few), len(places)), values.dtype)
+    for k in range(len(places)):
+        column = values[places[k] : places[k] + few.shape[1]]
         for f in range(len(few)):
             own, total = few[f], values.dtype.type(0)
             for i in range(len(own)):
@@ -219,7 +257,8 @@ class HalfSolves:
         self._starts, self._parents, self._precision = starts, parents, precision
         self._spans = self._column_spans()
         self._waiting: dict[int, NDArray[Any]] = {}
-        self._blocks: list[Block] = []
+        self._blocks: list[tuple[int, int, int, int]] = []
+        self._columns: list[NDArray[Any]] = []
 
     def add(self, member: int, front: Front) -> None:
         """Take the next front, before its numbers are made coarser."""
@@ -236,11 +275,13 @@ class HalfSolves:
         # Of arrays kept row by row BLAS, which reads column by column, sees the transposes.
         times = get_blas_funcs("trmm", dtype=self._precision)
         own = times(1.0, front.block[:count].T, right.T, trans_a=1, overwrite_b=1).T
-        self._blocks.append(Block.of(front.start, front.stop, first, last, own))
+        self._blocks.append((front.start, front.stop, first, last))
+        self._columns.append(own)
 
     def response(self) -> HalfResponse:
-        """Return what all fronts have made."""
-        return HalfResponse(self._rank, self._blocks)
+        """Return what all fronts have made; it is taken away."""
+        blocks = np.array(self._blocks, np.int64).reshape(-1, 4)
+        return HalfResponse.of(self._rank, blocks, joined(self._columns, self._precision))
 
     def _of(self, member: int) -> NDArray[Any]:
         """Return a front's right-hand side so far (its columns, own unknowns)."""
