@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from tkamb.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.subdivision import Coarsened, coarsened
 from tkamb.geometry.surface import Surface
@@ -64,26 +65,40 @@ class CurvedSurface:
         To first order in the patch's height.
 
         Args:
-            faces: (n,) triangles, of the finer surface if there is one.
+            faces: (n,) triangles, of the finer surface if there is one; -1 for none.
             weights: (n, 3) barycentric coordinates of points on them.
             direction: (3,) unit vector.
 
         Returns:
             Signed distance (n,), m, and outward unit normals (n, 3), which are interpolated
-            between the corners.
+            between the corners; NaN without a triangle.
         """
         if self.finer is not None:
             weights = np.einsum("ij,ijk->ik", weights, self.finer.corners[faces])
-            faces = self.finer.parent[faces]
-        corners, sagittas, planes = np.split(self._patches[faces], [9, 12], axis=1)
-        normals = np.einsum("ij,ijk->ik", weights, corners.reshape(-1, 3, 3))
-        normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
-        around = weights[:, [1, 2, 0]] * weights[:, [2, 0, 1]]
-        height = 4.0 * np.einsum("ij,ij->i", around, sagittas)
-        along = np.einsum("ij,ij->i", normals, planes)
-        cosine = normals @ direction
-        steep = np.copysign(np.maximum(np.abs(cosine), SMALLEST_COSINE), cosine)
-        return height * along / steep, normals
+            faces = np.where(faces < 0, faces, self.finer.parent[faces])
+        return _shifts(self._patches, faces, weights, direction)
+
+
+@compiled_as_written
+def _shifts(patches: Array, faces: Index, weights: Array, direction: Array) -> tuple[Array, Array]:
+    """Return what `CurvedSurface.shift` does, from corner normals, sagittas and planes (k, 15)."""
+    shifts, normals = np.full(len(faces), np.nan), np.full((len(faces), 3), np.nan)
+    for n in range(len(faces)):
+        if faces[n] < 0:
+            continue
+        patch, (a, b, c) = patches[faces[n]], weights[n]
+        x = a * patch[0] + b * patch[3] + c * patch[6]
+        y = a * patch[1] + b * patch[4] + c * patch[7]
+        z = a * patch[2] + b * patch[5] + c * patch[8]
+        length = np.sqrt(x * x + y * y + z * z)
+        x, y, z = x / length, y / length, z / length
+        height = 4.0 * (b * c * patch[9] + c * a * patch[10] + a * b * patch[11])
+        along = x * patch[12] + y * patch[13] + z * patch[14]
+        cosine = x * direction[0] + y * direction[1] + z * direction[2]
+        steep = np.copysign(max(abs(cosine), SMALLEST_COSINE), cosine)
+        shifts[n] = height * along / steep
+        normals[n, 0], normals[n, 1], normals[n, 2] = x, y, z
+    return shifts, normals
 
 
 def _sagittas(surface: Surface, normals: Array) -> Array:

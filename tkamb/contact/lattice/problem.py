@@ -64,16 +64,11 @@ class SurfaceFromBelow:
         below[:, 1] = start
         origins, up = transform(back, below), rotate(back, UP)
         distance, face, weights = self.rays.first_in_face(origins, up)
-        hit = np.flatnonzero(face >= 0)
-        shift, outward = self._curved.shift(face[hit], weights[hit], up)
-        met = np.full((len(points), 3), np.nan)
-        normals = np.full((len(points), 3), np.nan)
-        below[:, 1] += distance
-        below[hit, 1] += shift
-        met[hit] = below[hit]
+        shift, outward = self._curved.shift(face, weights, up)
+        below[:, 1] += distance + shift
+        below[face < 0] = np.nan
         outward = rotate(pose, outward)
-        normals[hit] = np.where(outward[:, 1:2] > 0, -outward, outward)
-        return met, normals
+        return below, np.where(outward[:, 1:2] > 0, -outward, outward)
 
 
 @dataclass(frozen=True, eq=False)

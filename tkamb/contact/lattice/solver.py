@@ -310,9 +310,11 @@ def elements_that_count(size: Array, allowed: float) -> Index:
         size: (c,) norm of each element's share of h, N.
         allowed: N, root of the sum of squares of those left out.
     """
-    order = np.argsort(size)
-    left_out = int(np.searchsorted(np.cumsum(size[order] ** 2), allowed**2, side="right"))
-    return np.sort(order[left_out:])
+    surely = size <= allowed / np.sqrt(max(len(size), 1))  # even if all were as large
+    others = np.flatnonzero(~surely)
+    order = others[np.argsort(size[others])]
+    total = (size[surely] ** 2).sum() + np.cumsum(size[order] ** 2)
+    return np.sort(order[np.searchsorted(total, allowed**2, side="right") :])
 
 
 class SlidingNodes:

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
+from tkamb.compiled import compiled
 from tkamb.contact.lattice.linear.memory_need import check_memory, factor_memory
 from tkamb.contact.lattice.linear.multifrontal import (
     CholeskyFactor,
@@ -66,8 +67,7 @@ class ElasticOperator:
 
         They are 0 where held.
         """
-        place = self._place if nodes is None else self._place[nodes]
-        return np.where(place >= 0, x[place], 0.0)
+        return _at_places(x, self._place if nodes is None else self._place[nodes])
 
     @cached_property
     def _unknown(self) -> Index:
@@ -104,6 +104,17 @@ class ElasticOperator:
         result = np.full(len(self.free) // 3, -1)
         result[self._unknown // 3] = member
         return result
+
+
+@compiled
+def _at_places(x: Array, places: Index) -> Array:
+    """Return x (n,) at places (m, 3), 0 at those below 0."""
+    result = np.zeros(places.shape)
+    for i in range(len(places)):
+        for axis in range(3):
+            if places[i, axis] >= 0:
+                result[i, axis] = x[places[i, axis]]
+    return result
 
 
 def fixed_unknowns(nodes: Array, bottom: Index, bearing: Bearing) -> Mask:
