@@ -108,6 +108,11 @@ class ContactProblem:
         return points
 
     @cached_property
+    def held_unknowns(self) -> Index:
+        """Which of the 3n unknowns are held."""
+        return np.flatnonzero(self.held)
+
+    @cached_property
     def free_nodes(self) -> Mask:
         """Which nodes (n,) can move at all."""
         return np.asarray(~self.held.reshape(-1, 3).all(axis=1), bool)

@@ -289,22 +289,22 @@ class NonlinearBalance:
             if known is not None:
                 elements = np.concatenate([known[0], elements])
                 shares = np.vstack([known[1], shares])
-        asked = self._summed(shares, elements)
-        self.residual = float(np.linalg.norm(asked - self._taken)) / self.size
         size = np.sqrt(np.einsum("ij,ij->i", shares, shares))
-        count = elements_that_count(size, SHARE * self._tolerance * self.size)
-        self.region = Region.of(self._problem, np.sort(elements[count]))
-        self.h = self._summed(shares[count], elements[count])
+        counts = elements_that_count(size, SHARE * self._tolerance * self.size)
+        self.region = Region.of(self._problem, np.sort(elements[counts]))
+        self.h = self._summed(shares, elements, np.flatnonzero(counts))
+        asked = self.h + self._summed(shares, elements, np.flatnonzero(~counts))
+        self.residual = float(np.linalg.norm(asked - self._taken)) / self.size
         self._narrowed = True
 
-    def _summed(self, forces: Array, elements: Index) -> Array:
-        value = self._problem.solid.scatter.sum(forces, elements)
-        value[self._problem.held.reshape(-1, 3)] = 0.0
+    def _summed(self, forces: Array, elements: Index, which: Index | None = None) -> Array:
+        value = self._problem.solid.scatter.sum(forces, elements, which)
+        value.ravel()[self._problem.held_unknowns] = 0.0
         return value
 
 
-def elements_that_count(size: Array, allowed: float) -> Index:
-    """Return the elements (k,) without the smallest, which together are below a bound.
+def elements_that_count(size: Array, allowed: float) -> Mask:
+    """Return which elements (c,) count: all but the smallest, which together are below a bound.
 
     Args:
         size: (c,) norm of each element's share of h, N.
@@ -314,7 +314,9 @@ def elements_that_count(size: Array, allowed: float) -> Index:
     others = np.flatnonzero(~surely)
     order = others[np.argsort(size[others])]
     total = (size[surely] ** 2).sum() + np.cumsum(size[order] ** 2)
-    return np.sort(order[np.searchsorted(total, allowed**2, side="right") :])
+    counts = np.zeros(len(size), bool)
+    counts[order[np.searchsorted(total, allowed**2, side="right") :]] = True
+    return counts
 
 
 class SlidingNodes:

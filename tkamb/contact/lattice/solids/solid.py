@@ -98,10 +98,19 @@ class Scatter:
         elements = elements_of(self.elements, chosen)
         return displacement[elements].reshape(len(elements), 3 * elements.shape[1])
 
-    def sum(self, forces: Array, chosen: Index | None = None) -> Array:
-        """Return nodal (n, 3) from (k, 3p) of the chosen elements, by default of all."""
+    def sum(self, forces: Array, chosen: Index | None = None, which: Index | None = None) -> Array:
+        """Return nodal (n, 3) from (k, 3p) of the chosen elements, by default of all.
+
+        Args:
+            forces: (k, 3p) N.
+            chosen: (k,) elements.
+            which: of the k that count; all by default.
+        """
         total = np.zeros((self.nodes, 3))
-        _add_up(forces.reshape(-1, 3), elements_of(self.elements, chosen).ravel(), total)
+        own = np.arange(len(self.elements)) if chosen is None else chosen
+        some = np.arange(len(own)) if which is None else which
+        shape = len(own), self.elements.shape[1], 3
+        _add_up(forces.reshape(shape), self.elements, own, some, total)
         return total
 
 
@@ -111,11 +120,13 @@ def elements_of(elements: NDArray[Any], chosen: Index | None) -> NDArray[Any]:
 
 
 @compiled
-def _add_up(parts: Array, nodes: Index, total: Array) -> None:
-    """Add vectors (k, 3) to those of their nodes (n, 3)."""
-    for k in range(len(nodes)):
-        for axis in range(3):
-            total[nodes[k], axis] += parts[k, axis]
+def _add_up(parts: Array, elements: Index, chosen: Index, which: Index, total: Array) -> None:
+    """Add vectors (k, p, 3) of chosen elements (k,), some of them, to those of nodes (n, 3)."""
+    for k in which:
+        element = chosen[k]
+        for corner in range(parts.shape[1]):
+            for axis in range(3):
+                total[elements[element, corner], axis] += parts[k, corner, axis]
 
 
 @compiled
