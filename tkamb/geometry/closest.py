@@ -5,8 +5,8 @@ from functools import cached_property
 
 import fcl
 import numpy as np
-from scipy.spatial import cKDTree
 
+from tkamb.compiled import compiled_as_written
 from tkamb.geometry.bounds import HeightBound
 from tkamb.geometry.condyles import FACET_DEPTH, SAMPLE_SPACING, condyle_faces
 from tkamb.geometry.first_touch import FirstTouch
@@ -137,11 +137,7 @@ class ClosestPointQuery:
         The depth along y bounds the depth from above and orders the search; what lies above all
         that faces up over its place has none.
         """
-        low, high = self.insert.bounds
-        near = np.flatnonzero(condyle.points @ pose[1, :3] + pose[1, 3] < high[1])
-        points = transform(pose, condyle.points[near])
-        within = ((points > low) & (points < high)).all(axis=1)
-        near, points = near[within], points[within]
+        near, points = _within_box(condyle.points, pose, *self.insert.bounds)
         under = points[:, 1] < self._ceiling.over(points) + ABOVE
         near, points = near[under], points[under]
         below = self._depth_along_y(points)
@@ -191,7 +187,9 @@ class _Condyle:
         self.vertices = np.unique(femoral.faces[faces])
         self.points = femoral.vertices[self.vertices]
         self.region = _CloseRegion(femoral, faces)
-        self._corners = femoral.faces[faces]
+        corners = femoral.faces[faces].ravel()
+        self._by_vertex = np.argsort(corners, kind="stable")
+        self._edges = np.searchsorted(corners[self._by_vertex], np.arange(corners.max() + 2))
 
     @cached_property
     def tree(self) -> fcl.BVHModel:
@@ -205,9 +203,8 @@ class _Condyle:
 
     def around(self, vertices: Index) -> Index:
         """Return the triangles that touch the vertices."""
-        touched = np.zeros(self._corners.max() + 1, bool)
-        touched[vertices] = True
-        return self.faces[touched[self._corners].any(axis=1)]
+        corners = [self._by_vertex[self._edges[v] : self._edges[v + 1]] for v in vertices.tolist()]
+        return self.faces[np.unique(np.concatenate(corners) // 3)]
 
 
 class _CloseRegion:
@@ -231,7 +228,6 @@ class _CloseRegion:
         samples, owner, areas = sampled(part, SAMPLE_SPACING)
         first, self._areas = _thinned(samples, areas)
         self._samples, self._normals = samples[first], part.face_normals[owner[first]]
-        self._tree = cKDTree(self._samples)
 
     def centre(
         self, other: NearestPoints, pose: Array, gap: float, closest: Array
@@ -245,9 +241,7 @@ class _CloseRegion:
             closest: (3,) m, this body's point with that gap.
         """
         own = transform(inverse(pose), closest)
-        near = np.array(self._tree.query_ball_point(own, REGION_RADIUS), dtype=int)
-        here = self._normals[self._tree.query(own)[1]]
-        near = near[self._normals[near] @ here > 0.5]
+        near = _facing_alike(self._samples, self._normals, own, REGION_RADIUS)
         points = np.concatenate([transform(pose, self._samples[near]), closest[None]])
         within, found = other.within(points, abs(gap) + NEARLY_AS_CLOSE)
         near, points = near[within[:-1]], points[within[:-1]]
@@ -286,9 +280,62 @@ def _tree(surface: Surface, faces: Index) -> fcl.BVHModel:
     return model
 
 
+@compiled_as_written
+def _within_box(points: Array, pose: Array, low: Array, high: Array) -> tuple[Index, Array]:
+    """Return which points (n, 3) lie within a box once they are moved, and where they are then."""
+    found, moved, count = np.empty(len(points), np.int64), np.empty((len(points), 3)), 0
+    for i in range(len(points)):
+        within = True
+        for axis in (1, 0, 2):  # most of a condyle is above the insert
+            place = pose[axis, 3]
+            for k in range(3):
+                place += pose[axis, k] * points[i, k]
+            moved[count, axis] = place
+            if not low[axis] < place < high[axis]:
+                within = False
+                break
+        if within:
+            found[count] = i
+            count += 1
+    return found[:count].copy(), moved[:count].copy()
+
+
+@compiled_as_written
+def _facing_alike(samples: Array, normals: Array, place: Array, radius: float) -> Index:
+    """Return the samples within a radius of a place that face as the nearest of all does (60 deg).
+
+    Args:
+        samples: (n, 3) m.
+        normals: (n, 3) unit.
+        place: (3,) m.
+        radius: m.
+    """
+    square, nearest = np.empty(len(samples)), 0
+    for i in range(len(samples)):
+        x, y, z = samples[i, 0] - place[0], samples[i, 1] - place[1], samples[i, 2] - place[2]
+        square[i] = x * x + y * y + z * z
+        if square[i] < square[nearest]:
+            nearest = i
+    here, found, count = normals[nearest], np.empty(len(samples), np.int64), 0
+    for i in range(len(samples)):
+        if square[i] <= radius * radius:
+            alike = normals[i, 0] * here[0] + normals[i, 1] * here[1] + normals[i, 2] * here[2]
+            if alike > 0.5:
+                found[count] = i
+                count += 1
+    return found[:count].copy()
+
+
+@compiled_as_written
 def _quartered(triangles: Array) -> Array:
     """Return the four halves-by-edge triangles (4k, 3, 3) of triangles (k, 3, 3)."""
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-    return np.concatenate([np.stack(part, axis=1) for part in parts])
+    count = len(triangles)
+    parts = np.empty((4 * count, 3, 3))
+    for k in range(count):
+        for axis in range(3):
+            a, b, c = triangles[k, 0, axis], triangles[k, 1, axis], triangles[k, 2, axis]
+            ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+            for part, corners in enumerate(((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))):
+                for corner in range(3):
+                    parts[part * count + k, corner, axis] = corners[corner]
+    return parts
