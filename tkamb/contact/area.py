@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from tkamb.compiled import compiled_as_written
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array, Index
 
@@ -96,28 +97,71 @@ def area_above(points: Array, triangles: Index, pressure: Array, level: float) -
         pressure: (n,) Pa.
         level: Pa, positive.
     """
-    near = np.zeros(len(points), bool)
-    near[triangles[(pressure[triangles] > 0).any(axis=1)]] = True
-    corners = triangles[near[triangles].any(axis=1)]
-    square, positions = (pressure**2)[corners], points[corners]
-    edges = np.roll(positions, -2, axis=1) - np.roll(positions, -1, axis=1)  # opposite each corner
-    cross = np.cross(edges[:, 0], edges[:, 1])
-    size = 0.5 * np.linalg.norm(cross, axis=1)
-    across = np.cross(cross[:, None], edges)
-    slope = np.einsum("ki,kij->kj", square, across) / (4.0 * size**2)[:, None]
-    total = np.zeros((len(points), 4))
-    np.add.at(total, corners.T, np.column_stack([size[:, None] * slope, size]))
-    gradient = total[corners, :3] / total[corners, 3:]
-    bend = np.roll(gradient, -1, axis=1) - np.roll(gradient, -2, axis=1)
-    square += np.einsum("kij,kij->k", bend, edges)[:, None] / 24.0
-    return float(size @ _share_above(square, level**2))
+    return float(_area_above(points, triangles, pressure**2, level**2))
 
 
-def _share_above(values: Array, level: float) -> Array:
-    """Return the share (k,) of triangles where linear values (k, 3) exceed a level."""
-    low, middle, high = np.sort(values, axis=1).T
-    with np.errstate(divide="ignore", invalid="ignore"):  # what is not chosen below
-        tip = (high - level) ** 2 / ((high - low) * (high - middle))
-        rest = 1.0 - (level - low) ** 2 / ((middle - low) * (high - low))
-    chosen = [level >= high, level >= middle, level > low]
-    return np.select(chosen, [np.zeros_like(tip), tip, rest], 1.0)
+@compiled_as_written
+def _area_above(points: Array, triangles: Index, square: Array, level: float) -> float:
+    """Return what `area_above` does, from p² and the level's square."""
+    near, total = np.zeros(len(points), np.bool_), np.zeros((len(points), 4))
+    for k in range(len(triangles)):
+        a, b, c = triangles[k, 0], triangles[k, 1], triangles[k, 2]
+        if square[a] > 0.0 or square[b] > 0.0 or square[c] > 0.0:
+            near[a] = near[b] = near[c] = True
+    edges, across = np.empty((3, 3)), np.empty(3)
+    for k in range(len(triangles)):
+        if near[triangles[k, 0]] or near[triangles[k, 1]] or near[triangles[k, 2]]:
+            size = _shape(points, triangles[k], edges, across)
+            for axis in range(3):
+                slope = 0.0  # of the linear q, times size
+                for i in range(3):
+                    j, m = (axis + 1) % 3, (axis + 2) % 3
+                    turned = across[j] * edges[i, m] - across[m] * edges[i, j]
+                    slope += square[triangles[k, i]] * turned
+                for i in range(3):
+                    total[triangles[k, i], axis] += slope / (4.0 * size)
+            for i in range(3):
+                total[triangles[k, i], 3] += size
+    for n in range(len(points)):
+        if near[n]:
+            for axis in range(3):
+                total[n, axis] /= total[n, 3]
+    area, values = 0.0, np.empty(3)
+    for k in range(len(triangles)):
+        corners = triangles[k]
+        if near[corners[0]] or near[corners[1]] or near[corners[2]]:
+            size, rise = _shape(points, corners, edges, across), 0.0
+            for i in range(3):
+                one, other = corners[(i + 1) % 3], corners[(i + 2) % 3]
+                for axis in range(3):
+                    rise += (total[one, axis] - total[other, axis]) * edges[i, axis]
+            for i in range(3):
+                values[i] = square[corners[i]] + rise / 24.0
+            area += size * _share_above(values, level)
+    return area
+
+
+@compiled_as_written
+def _shape(points: Array, corners: Index, edges: Array, across: Array) -> float:
+    """Return a triangle's area; write its edges (3, 3), opposite each corner, and their product."""
+    for i in range(3):
+        for axis in range(3):
+            edges[i, axis] = points[corners[(i + 2) % 3], axis] - points[corners[(i + 1) % 3], axis]
+    for axis in range(3):
+        j, m = (axis + 1) % 3, (axis + 2) % 3
+        across[axis] = edges[0, j] * edges[1, m] - edges[0, m] * edges[1, j]
+    return 0.5 * np.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2)
+
+
+@compiled_as_written
+def _share_above(values: Array, level: float) -> float:
+    """Return the share of a triangle where linear values (3,) exceed a level; they are sorted."""
+    values.sort()
+    low, middle, high = values[0], values[1], values[2]
+    if level >= high:
+        return 0.0
+    if level >= middle:
+        return (high - level) ** 2 / ((high - low) * (high - middle))
+    if level > low:
+        return 1.0 - (level - low) ** 2 / ((middle - low) * (high - low))
+    return 1.0
