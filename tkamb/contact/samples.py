@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from tkamb.compiled import compiled_as_written
 from tkamb.contact.pair import ContactSurface, PreparedContact
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array, Index, Mask, inverse, rotate, transform
+from tkamb.geometry.frames import Array, Index, Mask, inverse, rotate
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
@@ -100,7 +101,7 @@ def gaps_along_normals(samples: SurfaceSamples, femoral: Surface, pose: Array) -
     start beside it, under the dish, where the femoral component may be although it leaves the
     rim alone: theirs counts only where it holds their point of the surface.
     """
-    return gaps_and_facets(samples, femoral, pose)[0]
+    return _gaps(samples, femoral, inverse(pose))[0]
 
 
 def gaps_and_facets(
@@ -110,10 +111,14 @@ def gaps_and_facets(
 
     They are those of the femoral facets that are met, the normals in the insert frame.
     """
-    back = inverse(pose)
-    normals = rotate(back, samples.normals)
-    below = DEEPEST * np.minimum(samples.thickness, samples.depth)
-    origins = transform(back, samples.points) - below[:, None] * normals
+    gap, face = _gaps(samples, femoral, inverse(pose))
+    return gap, rotate(pose, femoral.face_normals[face]), face
+
+
+def _gaps(samples: SurfaceSamples, femoral: Surface, back: Array) -> tuple[Array, Index]:
+    """Return the gap (n,), m, and the facet met (n,), for the pose of the insert in the femur."""
+    columns = samples.points, samples.normals, samples.thickness, samples.depth
+    origins, normals, below = _columns(*columns, back)
     gap, face = _first_entry(femoral, origins, normals)
     gap -= below
     aside = np.flatnonzero((gap < 0) & (samples.normals[:, 1] < SIDEWAYS))
@@ -122,14 +127,44 @@ def gaps_and_facets(
         above, onto = _first_entry(femoral, rim, normals[aside])
         free = above > 0
         gap[aside[free]], face[aside[free]] = above[free], onto[free]
-    return gap, rotate(pose, femoral.face_normals[face]), face
+    return gap, face
+
+
+@compiled_as_written
+def _columns(
+    points: Array, normals: Array, thickness: Array, depth: Array, back: Array
+) -> tuple[Array, Array, Array]:
+    """Return where columns' rays start and go (n, 3), femoral frame, and how far below (n,), m."""
+    origins, along = np.empty((len(points), 3)), np.empty((len(points), 3))
+    below = np.empty(len(points))
+    for n in range(len(points)):
+        below[n] = DEEPEST * min(thickness[n], depth[n])
+        for i in range(3):
+            place, way = back[i, 3], 0.0
+            for k in range(3):
+                place += back[i, k] * points[n, k]
+                way += back[i, k] * normals[n, k]
+            along[n, i], origins[n, i] = way, place - below[n] * way
+    return origins, along, below
 
 
 def _first_entry(femoral: Surface, origins: Array, directions: Array) -> tuple[Array, Index]:
     """Return where rays (n, 3) enter the femur first (n,), m, -inf: they start in it; the facet."""
     distance, face = femoral.rays.first(origins, directions)
-    facing = np.einsum("ij,ij->i", directions, femoral.face_normals[face])
-    return np.where((face >= 0) & (facing > 0), -np.inf, distance), face
+    _mark_within(distance, face, directions, femoral.face_normals)
+    return distance, face
+
+
+@compiled_as_written
+def _mark_within(distance: Array, face: Index, directions: Array, normals: Array) -> None:
+    """Put -inf where a ray leaves through the facet that it meets first."""
+    for n in range(len(face)):
+        if face[n] >= 0:
+            facing = 0.0
+            for k in range(3):
+                facing += directions[n, k] * normals[face[n], k]
+            if facing > 0.0:
+                distance[n] = -np.inf
 
 
 def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:
