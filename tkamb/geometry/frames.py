@@ -116,11 +116,11 @@ def knee_coordinates(pose_femoral_in_insert: ArrayLike) -> Array:
 
     Flexion is unwrapped along the first axis so that deep flexion never jumps by 360 deg.
     """
-    from scipy.spatial.transform import Rotation
-
     p = np.asarray(pose_femoral_in_insert, float)
-    euler = Rotation.from_matrix(p[..., :3, :3].reshape(-1, 3, 3)).as_euler("YXZ")
-    angles = euler.reshape(*p.shape[:-2], 3) * np.array([-1.0, -1.0, 1.0])
+    r = p[..., :3, :3]  # see `_poses_of_knee`
+    first, third = np.arctan2(r[..., 0, 2], r[..., 2, 2]), np.arctan2(r[..., 1, 0], r[..., 1, 1])
+    second = np.arctan2(-r[..., 1, 2], np.hypot(r[..., 1, 0], r[..., 1, 1]))
+    angles = np.stack([first, second, third], axis=-1) * _TURNS
     if angles.ndim > 1:
         angles = np.unwrap(angles, axis=0)
     return np.concatenate([p[..., :3, 3], angles], axis=-1)

@@ -95,9 +95,10 @@ class FrameSolver:
 
 
 def _without_warm_start(contact: "FrameContact") -> "FrameContact":
-    if contact.result is None:
+    result = contact.result
+    if result is None or (result.warm_start is None and contact.turned is None):
         return contact
-    return replace(contact, result=replace(contact.result, warm_start=None), turned=None)
+    return replace(contact, result=replace(result, warm_start=None), turned=None)
 
 
 Chunk = tuple[list[int], "dict[str, CondyleSlip]"]
