@@ -10,8 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "tkamb"
 KNOWN_TO_ALL = {
     *("atomic", "claim", "code_identity", "compiled", "defaults", "errors", "files", "guard"),
     *("activities", "known_errors", "memory", "named_classes", "occupants", "scene_options"),
-    *("threads",),
-    "units",
+    *("threads", "units"),
 }
 """Modules without knees: numbers, files, memory, messages."""
 KNEE = {"body", "contact", "equilibrium", "geometry", "scene"}
