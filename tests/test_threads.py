@@ -66,6 +66,20 @@ def test_an_error_comes_out_once_the_other_has_ended(with_threads):
     assert threads.both(lambda: 1, lambda: 2) == (1, 2)
 
 
+def test_a_forked_process_has_a_second_thread_of_its_own(with_threads):
+    """As `multiprocessing` makes them: the parent's thread, and its lock, are not there."""
+    with_threads(2)
+    assert threads.both(lambda: 1, lambda: 2) == (1, 2)
+    busy, _ = threads._second()
+    assert busy.acquire(blocking=False)  # as if the other thread were at work
+    child = os.fork()
+    if not child:
+        meeting = threading.Barrier(2, timeout=30)
+        os._exit(0 if sorted(threads.both(meeting.wait, meeting.wait)) == [0, 1] else 1)
+    busy.release()
+    assert os.waitpid(child, 0)[1] == 0
+
+
 def test_a_wrong_number_of_threads_is_one_line(tmp_path):
     command = [sys.executable, "-m", "tkamb", "run", "nothing.toml", "--out", tmp_path / "out"]
     environment = os.environ | {threads.VARIABLE: "many"}

@@ -30,17 +30,18 @@ def both(first: Callable[[], First], second: Callable[[], Second]) -> tuple[Firs
     Returns:
         What they return. An error of `first` is raised when `second` has ended.
     """
-    if threads() == 1 or not _busy.acquire(blocking=False):
+    busy, thread = _second()
+    if threads() == 1 or not busy.acquire(blocking=False):
         return first(), second()
     try:
-        other = _other().submit(second)
+        other = thread.submit(second)
         try:
             result = first()
         finally:
             other.exception()
         return result, other.result()
     finally:
-        _busy.release()
+        busy.release()
 
 
 def in_halves(part: Callable[[slice], First], count: int) -> tuple[First, First]:
@@ -65,9 +66,10 @@ def threads() -> int:
     return min(2, len(own(0)) if own else os.cpu_count() or 1)
 
 
-_busy = Lock()
-
-
 @cache
-def _other() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(1, "tkamb")
+def _second() -> tuple[Lock, ThreadPoolExecutor]:
+    """The second thread, and what is locked while it works."""
+    return Lock(), ThreadPoolExecutor(1, "tkamb")
+
+
+os.register_at_fork(after_in_child=_second.cache_clear)  # a forked process does not have it
