@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tkamb.contact.pair import ContactPair, PreparedContact
-from tkamb.geometry.frames import Array, Mask, inverse, transform
+from tkamb.geometry.frames import Array, Mask
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 HIGHEST_KNOWN = 100.0 * MEGAPASCAL
@@ -215,7 +215,8 @@ def medial_points(points: Array, pose: Array, split: float | None) -> Mask:
     """
     if split is None:
         return np.ones(len(points), bool)
-    return transform(inverse(pose), points)[:, 2] < split
+    along = np.asarray(pose, float)[:3, 2]  # the femoral z axis
+    return points @ along - pose[:3, 3] @ along < split
 
 
 def wrench_of(points: Array, nodal_force: Array) -> Array:

@@ -88,9 +88,20 @@ class HalfResponse:
         """Return the compliance (s, q), m/N, of some unknowns, by default all, to all."""
         rank = self.rank if some is None else self.rank[some]
         rows, live = np.unique(rank[rank >= 0]), self.rank >= 0
-        inner = np.zeros((len(rows), self.columns))
+        middle, count = self._middle, len(self.blocks)
+        inner = np.add(
+            *both(lambda: self._among(rows, 0, middle), lambda: self._among(rows, middle, count))
+        )
+        result = np.zeros((len(rank), len(self.rank)))
+        index = np.searchsorted(rows, rank[rank >= 0])
+        result[np.ix_(rank >= 0, live)] = inner[np.ix_(index, self.rank[live])]
+        return result
+
+    def _among(self, rows: Index, begin: int, end: int) -> Array:
+        """Return the products (r, columns) of some columns with all, in blocks [begin, end)."""
+        result = np.zeros((len(rows), self.columns))
         firsts, lasts = np.searchsorted(rows, self.blocks[:, 2:]).T
-        for block in np.flatnonzero(lasts > firsts):
+        for block in begin + np.flatnonzero((lasts > firsts)[begin:end]):
             start, stop, first, last = self.blocks[block].tolist()
             places = self.places[self._edges[block] : self._edges[block + 1]]
             a, b = int(firsts[block]), int(lasts[block])
@@ -99,10 +110,7 @@ class HalfResponse:
                 product = _products(self.values, places, few)
             else:
                 product = few @ _gathered(self.values, places, stop - start).T
-            inner[a:b, first:last] += product
-        result = np.zeros((len(rank), len(self.rank)))
-        index = np.searchsorted(rows, rank[rank >= 0])
-        result[np.ix_(rank >= 0, live)] = inner[np.ix_(index, self.rank[live])]
+            result[a:b, first:last] += product
         return result
 
     @property
