@@ -27,6 +27,8 @@ SINGLE: Precision = np.float32
 """What a stored operator is kept in: it halves what every solve has to read."""
 
 
+GATHERED = 512
+"""Columns that are copied for BLAS at a time: 3 MB."""
 FEW = 12
 """Columns up to which products with others are taken where these lie: no copy for BLAS."""
 
@@ -88,29 +90,22 @@ class HalfResponse:
         """Return the compliance (s, q), m/N, of some unknowns, by default all, to all."""
         rank = self.rank if some is None else self.rank[some]
         rows, live = np.unique(rank[rank >= 0]), self.rank >= 0
-        middle, count = self._middle, len(self.blocks)
-        inner = np.add(
-            *both(lambda: self._among(rows, 0, middle), lambda: self._among(rows, middle, count))
-        )
-        result = np.zeros((len(rank), len(self.rank)))
-        index = np.searchsorted(rows, rank[rank >= 0])
-        result[np.ix_(rank >= 0, live)] = inner[np.ix_(index, self.rank[live])]
-        return result
-
-    def _among(self, rows: Index, begin: int, end: int) -> Array:
-        """Return the products (r, columns) of some columns with all, in blocks [begin, end)."""
-        result = np.zeros((len(rows), self.columns))
+        inner = np.zeros((len(rows), self.columns))
         firsts, lasts = np.searchsorted(rows, self.blocks[:, 2:]).T
-        for block in begin + np.flatnonzero((lasts > firsts)[begin:end]):
+        for block in np.flatnonzero(lasts > firsts):
             start, stop, first, last = self.blocks[block].tolist()
             places = self.places[self._edges[block] : self._edges[block + 1]]
             a, b = int(firsts[block]), int(lasts[block])
             few = _gathered(self.values, places[rows[a:b] - first], stop - start)
             if len(few) <= FEW:
-                product = _products(self.values, places, few)
-            else:
-                product = few @ _gathered(self.values, places, stop - start).T
-            result[a:b, first:last] += product
+                inner[a:b, first:last] += _products(self.values, places, few)
+                continue
+            for part in range(0, last - first, GATHERED):
+                others = _gathered(self.values, places[part : part + GATHERED], stop - start)
+                inner[a:b, first + part : min(first + part + GATHERED, last)] += few @ others.T
+        result = np.zeros((len(rank), len(self.rank)))
+        index = np.searchsorted(rows, rank[rank >= 0])
+        result[np.ix_(rank >= 0, live)] = inner[np.ix_(index, self.rank[live])]
         return result
 
     @property
