@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Measure the lattice: time, memory, and how approach, force, area and peak settle.
 
-Each row is a process of its own, so that its peak memory is its own. BLAS is kept to one
-thread, as the command line does; OMP_NUM_THREADS says otherwise. The approach since first touch
+Each row is a process of its own, so that its peak memory is its own, with one thread;
+OMP_NUM_THREADS and TKAMB_THREADS say otherwise. The approach since first touch
 is found when it is read: `approach_s` is what that takes.
 
     scripts/bench_lattice.py --cases two-condyles dm30 jw --data FOLDER --resolutions 2 1.5 1
@@ -20,6 +20,7 @@ import time
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("TKAMB_THREADS", "1")
 
 import numpy as np
 
