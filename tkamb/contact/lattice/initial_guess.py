@@ -39,6 +39,8 @@ class WarmStart:
         pose: (4, 4) pose_femoral_in_insert where it was.
         looked: the contact forces' norm, N, and the pose when all elements were last looked at.
         before: where the solution ended that this one began from, or None.
+        half: L⁻¹ h in elimination order, or None: nobody has worked it out.
+        left: share of the imbalance that a pass leaves, or None.
     """
 
     problem: ContactProblem
@@ -49,6 +51,8 @@ class WarmStart:
     pose: Array
     looked: tuple[float, Array]
     before: "WarmStart | None" = None
+    half: Array | None = None
+    left: float | None = None
 
     def near(self, pose: Array) -> bool:
         """Return whether a pose is within `UNSEEN_WAY` of where all elements were looked at."""
@@ -72,6 +76,7 @@ class WarmStart:
         return replace(
             self,
             nonlinear_residual=h + along * (h - last.nonlinear_residual),
+            half=_gone_on(self.half, last.half, self.half, along),
             moved=self.moved + along * np.where(both, self.moved - last.moved, 0.0),
         )
 
@@ -90,9 +95,22 @@ class WarmStart:
             return self
         moved = self.moved - (end.moved - start.moved)
         came = replace(
-            self, nonlinear_residual=h - (last - first), moved=moved, pose=2 * self.pose - pose
+            self,
+            nonlinear_residual=h - (last - first),
+            half=_gone_on(self.half, start.half, end.half, -1.0),
+            moved=moved,
+            pose=2 * self.pose - pose,
         )
         return replace(self, before=replace(came, before=None))
+
+
+def _gone_on(
+    here: Array | None, start: Array | None, end: Array | None, share: float
+) -> Array | None:
+    """Return what a share of the change from start to end adds up to; None if one is missing."""
+    if here is None or start is None or end is None:
+        return None
+    return here + share * (end - start)
 
 
 def _way(start: Array, end: Array) -> Array:
@@ -120,6 +138,8 @@ class InitialGuess:
             force made, or None.
         unseen: N, contact forces up to which the elements outside of the region need not be
             looked at; 0: they are looked at.
+        half: L⁻¹ h in elimination order, or None.
+        left: share of the imbalance that a pass left in the earlier solution, or None.
     """
 
     candidates: Index
@@ -132,11 +152,15 @@ class InitialGuess:
     region: Region | None = None
     offset: Array | None = None
     unseen: float = 0.0
+    half: Array | None = None
+    left: float | None = None
 
     @property
     def cold(self) -> "InitialGuess":
         """The same without what an earlier solution left."""
-        return replace(self, nonlinear_residual=None, moved=None, region=None, unseen=0.0)
+        return replace(
+            self, nonlinear_residual=None, half=None, moved=None, region=None, unseen=0.0, left=None
+        )
 
 
 def initial_guess(
@@ -175,6 +199,8 @@ def initial_guess(
     return replace(
         guess,
         nonlinear_residual=warm.nonlinear_residual,
+        half=warm.half,
+        left=warm.left,
         moved=warm.moved[nodes],
         region=warm.region,
         unseen=unseen,

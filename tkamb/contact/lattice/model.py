@@ -242,6 +242,7 @@ class CellContact(ContactModel):
                 warm = WarmStart(
                     state.problem, solution.nonlinear_residual, moved, below, solution.region,
                     pose, looked, None if last is None else replace(last, before=None),
+                    solution.half, solution.left,
                 )  # fmt: skip
             if covered or reached <= start.reach:
                 rule = self.pressure_rule

@@ -10,6 +10,8 @@ one:
 h is accelerated by Anderson's method; its change is the out-of-balance force. An element's
 share of h falls with a power of its strain (4.5 for polyethylene), so most of the insert is as
 good as linear: passes look at the `Region` where it counts, and at everything once, at the end.
+The contact under the h that this last look asks for ends the iteration: what it leaves out of
+balance is foreseen from what passes leave of it, not looked at again.
 For a linear material h = 0 and the pass is repeated only until the sliding nodes rest.
 """
 
@@ -30,6 +32,11 @@ SHARE = 0.1
 """What elements left out may add to the imbalance, relative to the tolerance."""
 PASSED_OVER = 0.03
 """And what those may that a bound of their strain passes over, when all are looked at."""
+LEFT = 2.5
+"""Times what passes left of the imbalance before, the next may leave of it: what is then foreseen is
+1.0 to 7 times what is found (docs/lattice.md)."""
+OLDER = 1.1
+"""And so many times more with every solution that had but one pass since."""
 SLOW = 0.7
 """When a pass leaves more than this share of the last distance, sliding steps are halved."""
 SMALLEST_SHARE = 0.125
@@ -57,14 +64,17 @@ class Solution:
         forces: along the normals, with approach and active set.
         planes: femoral points and normals of the candidates.
         displacement: (m, 3) of the candidates, m.
-        field: (n, 3) displacement of all nodes, or None (linear material).
-        nonlinear_residual: (n, 3) h, N, where another pass would start, or None (linear).
+        field: (n, 3) displacement of all nodes when they were last looked at, or None (linear
+            material).
+        nonlinear_residual: (n, 3) h, N, that the forces hold with, or None (linear).
         passes: how many.
-        residual: out-of-balance force or distance from the femoral surface, the larger one,
-            both relative.
+        residual: out-of-balance force, as foreseen, or distance from the femoral surface, the
+            larger one, both relative.
         region: outside of which h is zero, or None.
         seen: all elements were looked at; else `field` is that of the region.
         noticed: elements but which the bound passed over, or None (all).
+        half: L⁻¹ h in elimination order, or None.
+        left: share of the imbalance that a pass leaves, or None.
     """
 
     candidates: Index
@@ -78,6 +88,8 @@ class Solution:
     region: Region | None = None
     seen: bool = True
     noticed: Index | None = None
+    half: Array | None = None
+    left: float | None = None
 
     @property
     def converged(self) -> bool:
@@ -103,7 +115,6 @@ def solve(
     best: Solution | None = None
     warm = guess.nonlinear_residual is not None
     while True:
-        passes += 1
         planes = sliding.planes
         forces, moved = solve_pass(guess.response, balance.offset, points, planes, load, active)
         if warm and not forces.active.any():
@@ -113,22 +124,35 @@ def solve(
             sliding = SlidingNodes(problem, points, balance.offset, pose, guess.planes)
             continue
         active = forces.active
-        balance.respond(forces.force[:, None] * planes.normals)
         missed = sliding.follow(moved, forces)
-        if max(balance.residual, missed) <= tolerance.force and balance.size > guess.unseen:
-            balance.look_everywhere()
-        residual = max(balance.residual, missed)
+        residual = max(balance.foreseen, missed)
         done = residual <= tolerance.force
-        forces = replace(forces, converged=done and forces.converged)
-        field, h, region = balance.field, balance.h, balance.region
-        seen = balance.size > guess.unseen
+        if not done:
+            passes += 1
+            balance.respond(forces.force[:, None] * planes.normals)
+            if balance.foreseen <= tolerance.force and balance.size > guess.unseen:
+                balance.look_everywhere()
+            residual = max(balance.residual, missed)
         now = Solution(
-            chosen, forces, planes, moved, field, h, passes, residual, region, seen, balance.noticed
+            chosen,
+            replace(forces, converged=done and forces.converged),
+            planes,
+            moved,
+            balance.field,
+            balance.h,
+            passes,
+            residual,
+            balance.region,
+            balance.size > guess.unseen,
+            balance.noticed,
+            balance.half,
+            balance.left,
         )
         if done:
             return now
         best = now if best is None or residual < best.residual else best
-        if passes >= tolerance.passes or not residual < DIVERGED * best.residual:
+        last = passes >= tolerance.passes and balance.foreseen > tolerance.force
+        if last or passes > tolerance.passes or not residual < DIVERGED * best.residual:
             return _given_up(problem, best, passes)
         balance.advance()
 
@@ -207,6 +231,8 @@ class NonlinearBalance:
         offset: (m, 3) m, displacement of the candidates without contact forces.
         field: (n, 3) m, displacement of the nodes looked at, 0 elsewhere.
         residual: imbalance of the elements looked at, relative to the contact forces.
+        foreseen: imbalance that contact forces under h would leave, relative.
+        half: L⁻¹ h in elimination order.
         size: N, norm of the contact forces.
         noticed: elements but which the bound passed over in the last look at all, or None.
     """
@@ -214,17 +240,25 @@ class NonlinearBalance:
     def __init__(self, problem: ContactProblem, guess: InitialGuess, tolerance: float) -> None:
         self._problem, self._response, self._tolerance = problem, guess.response, tolerance
         self.region = problem.everywhere if guess.region is None else guess.region
-        self.h = np.zeros_like(problem.solid.nodes)
         self.noticed: Index | None = None
+        self._earlier = [] if guess.left is None else [OLDER * guess.left]
+        self._left: list[float] = []
+        self.foreseen, self._last = np.inf, np.nan
+        self._mixer = AndersonMixer()
+        if guess.nonlinear_residual is not None and guess.half is not None:
+            self.h = guess.nonlinear_residual
+            self._begin(guess.half)
+            return
+        self.h = np.zeros_like(problem.solid.nodes)
         if guess.nonlinear_residual is not None:
             self.h[self.region.nodes] = guess.nonlinear_residual[self.region.nodes]
-        self._mixer = AndersonMixer()
-        self._begin()
+        self._begin(problem.operator.start(self.h, self.region.fronts))
 
     def respond(self, pushed: Array) -> None:
         """Work out displacements and imbalance of the region under contact forces (m, 3), N."""
         operator, region = self._problem.operator, self.region
         self.size = max(float(np.linalg.norm(pushed)), 1e-300)
+        self._x = self.half.copy()
         self._response.push(pushed, self._x)
         operator.factor.backward(self._x, region.fronts)
         self.field = np.zeros_like(self.h)
@@ -233,6 +267,9 @@ class NonlinearBalance:
             self._look_at_all(None)
         else:
             self._look(region)
+        if np.isfinite(self._last):
+            self._left.append(self.residual / self._last)
+        self._foresee()
 
     def look_everywhere(self) -> None:
         """Look at the rest of the solid, for the residual and the field of all of it."""
@@ -244,6 +281,7 @@ class NonlinearBalance:
         factor.backward(self._x, factor.shared(rest))
         self.field = operator.nodal(self._x)
         self._look_at_all((region.elements, self._shares))
+        self._foresee()
 
     def advance(self) -> None:
         """Take the next h."""
@@ -253,13 +291,23 @@ class NonlinearBalance:
         mixed = self._mixer.next(self._taken[nodes].ravel(), self.h[nodes].ravel())
         self.h = np.zeros_like(self.h)
         self.h[nodes] = mixed.reshape(-1, 3)
-        self._begin()
+        self._begin(self._problem.operator.start(self.h, self.region.fronts))
 
-    def _begin(self) -> None:
-        """Solve the first half, L x = P h."""
-        operator, self._taken, self._narrowed = self._problem.operator, self.h, False
-        self._x = operator.start(self.h, self.region.fronts)
-        self.offset = self._response.displacement(self._x)
+    def _begin(self, half: Array) -> None:
+        """Take h with L⁻¹ of it."""
+        self._taken, self.half, self._narrowed = self.h, half, False
+        self.offset = self._response.displacement(half)
+
+    def _foresee(self) -> None:
+        """Foresee what a contact under the h asked for leaves of the imbalance."""
+        self._last = self.residual
+        left = LEFT * max(self._left + self._earlier, default=1.0)
+        self.foreseen = min(left * self.residual + SHARE * self._tolerance, self.residual)
+
+    @property
+    def left(self) -> float | None:
+        """Largest share of the imbalance that a pass has left, or None: there were no two."""
+        return max(self._left or self._earlier, default=None)
 
     def _look(self, region: Region) -> None:
         """Find the imbalance of a region."""
