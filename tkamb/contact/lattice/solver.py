@@ -33,8 +33,8 @@ SHARE = 0.1
 PASSED_OVER = 0.03
 """And what those may that a bound of their strain passes over, when all are looked at."""
 LEFT = 2.5
-"""Times what passes left of the imbalance before, the next may leave of it: what is then foreseen is
-1.0 to 7 times what is found (docs/lattice.md)."""
+"""Times what passes left of the imbalance before, the next may leave of it. What is then foreseen
+is 1.0 to 7 times what is found (docs/lattice.md)."""
 OLDER = 1.1
 """And so many times more with every solution that had but one pass since."""
 SLOW = 0.7
