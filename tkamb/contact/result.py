@@ -250,9 +250,9 @@ def thickness_under(position: Array, points: Array, thickness: Array) -> float:
 
     Inverse-distance weights of the four points nearest in x and z.
     """
-    away = np.hypot(*(points[:, [0, 2]] - position[[0, 2]]).T)
-    near = np.argpartition(away, 3)[:4] if len(points) > 4 else np.arange(len(points))
-    weight = 1.0 / np.maximum(away[near], 1e-9)
+    square = (points[:, 0] - position[0]) ** 2 + (points[:, 2] - position[2]) ** 2
+    near = np.argpartition(square, 3)[:4] if len(points) > 4 else np.arange(len(points))
+    weight = 1.0 / np.maximum(np.sqrt(square[near]), 1e-9)
     return float(weight @ thickness[near] / weight.sum())
 
 

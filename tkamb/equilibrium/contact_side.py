@@ -89,8 +89,8 @@ class ContactSide:
             from tkamb.equilibrium.released import ReleasedKnee
             from tkamb.equilibrium.starts import Starts
 
-            both = self._probe if self.post is None else self.post.probe_with(self._probe)
-            self.released = ReleasedKnee(mechanics, both, table.released)
+            probe = self._probe if self.post is None else self.post.probe_with(self._probe)
+            self.released = ReleasedKnee(mechanics, probe, table.released)
             self.starts = Starts(case, self.released, self.state.pair, self.post)
 
     def frame(self, k: int, before: Sequence[FrameContact] = ()) -> tuple[FrameLoads, FrameContact]:
@@ -218,7 +218,11 @@ class ContactSide:
             return replace(body, loads=unsolved([contact.problem])), contact
         result, contact = None, self.nothing(knee.problem)
         if not knee.problem:
-            result = self.model.evaluate(self.state, knee_pose(knee.coordinates), guess)
+            pose, pair = knee_pose(knee.coordinates), self.state.pair
+            # The check that follows asks where the bodies first touch.
+            result, _ = both(
+                lambda: self.model.evaluate(self.state, pose, guess), lambda: pair.touch_at(pose)
+            )
             result = within_insert(self.state, result)
             contact = self._contact(result, None, 0.0)
             flags = (*contact.flags, *_doubts(knee))

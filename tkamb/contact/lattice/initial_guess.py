@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tkamb.compiled import compiled
 from tkamb.contact.lattice.linear.compliance import ComplianceCache, ContactResponse
 from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes
 from tkamb.geometry.frames import Array, Index, Mask
@@ -75,7 +76,7 @@ class WarmStart:
         both = self.moved.any(axis=1, keepdims=True) & last.moved.any(axis=1, keepdims=True)
         return replace(
             self,
-            nonlinear_residual=h + along * (h - last.nonlinear_residual),
+            nonlinear_residual=_gone_on(h, last.nonlinear_residual, h, along),
             half=_gone_on(self.half, last.half, self.half, along),
             moved=self.moved + along * np.where(both, self.moved - last.moved, 0.0),
         )
@@ -110,7 +111,16 @@ def _gone_on(
     """Return what a share of the change from start to end adds up to; None if one is missing."""
     if here is None or start is None or end is None:
         return None
-    return here + share * (end - start)
+    return _with_change(here.ravel(), start.ravel(), end.ravel(), share).reshape(here.shape)
+
+
+@compiled
+def _with_change(here: Array, start: Array, end: Array, share: float) -> Array:
+    """Return here (n,) and a share of the change, in one go."""
+    result = np.empty(len(here))
+    for i in range(len(here)):
+        result[i] = here[i] + share * (end[i] - start[i])
+    return result
 
 
 def _way(start: Array, end: Array) -> Array:

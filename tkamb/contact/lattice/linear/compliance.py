@@ -1,6 +1,7 @@
 """What forces on the contact nodes do to each other, kept while it serves."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from threading import Lock
 
 import numpy as np
@@ -19,26 +20,33 @@ class ContactResponse:
     """What forces on candidate nodes do.
 
     Args:
-        half: response of the candidates.
+        whole: response of nodes of which the candidates are some.
+        candidates: (m,) their positions among these.
         compliance: (3, m, 3, m) m/N, of the candidates: component and node moved, component
             and node pushed.
     """
 
-    half: HalfResponse
+    whole: HalfResponse
+    candidates: Index
     compliance: Array
 
     @classmethod
     def of(cls, half: HalfResponse) -> "ContactResponse":
         """Return the response of candidates that are all of the nodes of `half`."""
-        return cls(half, by_component(half.compliance()))
+        return cls(half, np.arange(len(half.rank) // 3), by_component(half.compliance()))
+
+    @cached_property
+    def _half(self) -> HalfResponse:
+        """The response of the candidates alone; a linear material never asks for it."""
+        return self.whole.among(unknowns_of(self.candidates))
 
     def push(self, force: Array, y: Array) -> None:
         """Add L⁻¹ of forces (m, 3), N, to y (in elimination order)."""
-        self.half.apply(force.ravel(), y)
+        self._half.apply(force.ravel(), y)
 
     def displacement(self, y: Array) -> Array:
         """Return the candidates' displacement (m, 3), m, under the load whose L⁻¹ f is y."""
-        return self.half.project(y).reshape(-1, 3)
+        return self._half.project(y).reshape(-1, 3)
 
     def along(self, normals: Array) -> tuple[Array, Array]:
         """Return the compliance along normals (m, 3), and all that forces along them move.
@@ -86,7 +94,7 @@ class ComplianceCache:
         with self._lock:
             at = self._at(wanted, spare)
             compliance = _taken(_taken(self.stored, at, 1), at, 3)
-        return ContactResponse(self.whole.among(unknowns_of(wanted)), compliance)
+        return ContactResponse(self.whole, wanted, compliance)
 
     def moved(self, nodes: Index, pushed: Index, force: Array) -> Array:
         """Return the displacement (m, 3), m, of contact nodes under forces on contact nodes.
