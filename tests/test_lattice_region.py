@@ -14,7 +14,7 @@ from tkamb.contact.lattice.linear.compliance import ComplianceCache, by_componen
 from tkamb.contact.lattice.linear.response import unknowns_of
 from tkamb.contact.lattice.model import warm_start_of
 from tkamb.contact.lattice.problem import Region, undeformed
-from tkamb.contact.lattice.solids.solid import SMALL_STRAIN
+from tkamb.contact.lattice.solids.solid import SMALL_STRAIN, Noticed
 from tkamb.contact.lattice.solver import Tolerance, elements_that_count, solve
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
@@ -147,10 +147,17 @@ def test_no_share_of_an_element_that_is_passed_over_exceeds_the_limit(pressed, s
     field = scale * (field + turned + shaken)
     sizes = np.linalg.norm(solid.nonlinear_residual(field), axis=1)
     noticed = solid.noticeable(field, share)
-    others = np.setdiff1d(np.arange(len(sizes)), noticed)
+    others = np.setdiff1d(np.arange(len(sizes)), noticed.elements)
     assert sizes[others].max(initial=0.0) <= share
     strain = np.linalg.eigvalsh(solid.strain(field, others))
     assert np.abs(strain).max(initial=0.0) < 2 * SMALL_STRAIN
+    norms = np.linalg.norm(solid.strain(field, noticed.elements), axis=(1, 2))
+    assert noticed.strain == pytest.approx(norms, rel=1e-9, abs=1e-12)
+    if len(others) and len(noticed.elements):
+        least = solid.least_principal_strain(field)
+        assert min(least, strain.min()) == pytest.approx(
+            min(solid.least_principal_strain(field, noticed), strain.min()), rel=1e-12
+        )
 
 
 @pytest.mark.parametrize("model", ["lattice"], indirect=True)
@@ -160,15 +167,15 @@ def test_the_calibrated_cells_pass_most_of_the_solid_over(pressed):
     sizes = np.linalg.norm(solid.nonlinear_residual(field), axis=1)
     limit = 1e-2
     assert (sizes > limit).any()
-    assert len(solid.noticeable(field, limit)) < 0.6 * len(sizes)
-    assert len(solid.noticeable(field, limit)) < 3 * (sizes > limit).sum()
+    assert len(solid.noticeable(field, limit).elements) < 0.6 * len(sizes)
+    assert len(solid.noticeable(field, limit).elements) < 3 * (sizes > limit).sum()
     wrong = copy(solid)
     wrong.__dict__["_largest"] = solid._largest / 10
-    lost = np.setdiff1d(np.arange(len(sizes)), wrong.noticeable(field, limit))
+    lost = np.setdiff1d(np.arange(len(sizes)), wrong.noticeable(field, limit).elements)
     assert sizes[lost].max() > limit
     field = field.copy()
     field[solid.cells[7, 3]] = np.nan
-    assert 7 in solid.noticeable(field, limit)
+    assert 7 in solid.noticeable(field, limit).elements
 
 
 @pytest.mark.parametrize("model", ["lattice"], indirect=True)
@@ -177,7 +184,7 @@ def test_a_region_may_become_the_whole_solid(state, monkeypatch):
     cold = solved(state, 0.0, 1e-3)
     sizes = np.linalg.norm(state.problem.solid.nonlinear_residual(cold.field), axis=1)
     few = Region.of(state.problem, np.sort(np.argsort(sizes)[-40:]))
-    everything = np.arange(len(sizes))
+    everything = Noticed(np.arange(len(sizes)), np.zeros(len(sizes)))
     monkeypatch.setattr(solver, "SHARE", 0.0)
     monkeypatch.setattr(type(state.problem.solid), "noticeable", lambda *given: everything)
     found = solved(state, 0.4e-3, 1e-3, replace(cold, region=few))

@@ -338,5 +338,6 @@ def _rehearse(problem: ContactProblem, pair: ContactPair) -> None:
     pair.touch_at(np.eye(4))
     if not problem.solid.material.is_linear:
         still = np.zeros_like(problem.solid.nodes)
-        problem.solid.nonlinear_residual(still, problem.solid.noticeable(still, 1.0))
+        noticed = problem.solid.noticeable(still, 1.0)
+        problem.solid.nonlinear_residual(still, None if noticed is None else noticed.elements)
         problem.solid.least_principal_strain(still)

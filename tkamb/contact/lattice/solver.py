@@ -24,6 +24,7 @@ from tkamb.contact.lattice.anderson import AndersonMixer
 from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.linear.compliance import ContactResponse
 from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes, tangent_planes
+from tkamb.contact.lattice.solids.solid import Noticed
 from tkamb.geometry.frames import Array, Index, Mask
 
 DIVERGED = 100.0
@@ -87,7 +88,7 @@ class Solution:
     residual: float
     region: Region | None = None
     seen: bool = True
-    noticed: Index | None = None
+    noticed: Noticed | None = None
     half: Array | None = None
     left: float | None = None
 
@@ -240,7 +241,7 @@ class NonlinearBalance:
     def __init__(self, problem: ContactProblem, guess: InitialGuess, tolerance: float) -> None:
         self._problem, self._response, self._tolerance = problem, guess.response, tolerance
         self.region = problem.everywhere if guess.region is None else guess.region
-        self.noticed: Index | None = None
+        self.noticed: Noticed | None = None
         self._earlier = [] if guess.left is None else [OLDER * guess.left]
         self._left: list[float] = []
         self.foreseen, self._last = np.inf, np.nan
@@ -329,7 +330,7 @@ class NonlinearBalance:
             elements, shares = everywhere, solid.nonlinear_residual(self.field)
         else:
             left = np.zeros(len(everywhere), bool)
-            left[self.noticed] = True
+            left[self.noticed.elements] = True
             if known is not None:
                 left[known[0]] = False
             elements = np.flatnonzero(left)

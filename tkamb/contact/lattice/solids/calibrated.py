@@ -33,7 +33,7 @@ from tkamb.contact.lattice.solids.cell_loops import (
     strained_cells,
 )
 from tkamb.contact.lattice.solids.curve import LEAST_STRAIN, ShearCurve
-from tkamb.contact.lattice.solids.solid import SMALL_STRAIN, Solid, chunks
+from tkamb.contact.lattice.solids.solid import SMALL_STRAIN, Noticed, Solid, chunks
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array, Index
 from tkamb.threads import in_halves
@@ -156,7 +156,7 @@ class CalibratedNetwork(Solid):
         in_halves(softened, len(cells))
         return forces
 
-    def noticeable(self, displacement: Array, share: float) -> Index | None:
+    def noticeable(self, displacement: Array, share: float) -> Noticed | None:
         """Return the cells whose share of h may exceed `share`, N; see `Solid`.
 
         |(mu - mu_s) K_d u| <= (mu - mu_s) e (3 V lambda)^½, lambda the largest eigenvalue of K_d.
@@ -166,13 +166,14 @@ class CalibratedNetwork(Solid):
         corners, gradients, volume, _ = self._shapes
         strain = min(self.curve.strain_that_softens(share / self._largest), SMALL_STRAIN)
 
-        def noticed(some: slice) -> Index:
+        def noticed(some: slice) -> tuple[Index, Array]:
             shapes = corners[some], gradients[some], volume[some], self._stiffest
             limits = strain, 3 * SMALL_STRAIN
-            found = strained_cells(*shapes, self.cells[some], displacement, *limits)
-            return found + some.start
+            found, norms = strained_cells(*shapes, self.cells[some], displacement, *limits)
+            return found + some.start, norms
 
-        return np.concatenate(in_halves(noticed, len(self.cells)))
+        both = in_halves(noticed, len(self.cells))
+        return Noticed(*(np.concatenate(parts) for parts in zip(*both, strict=True)))
 
     @cached_property
     def _stiffest(self) -> float:

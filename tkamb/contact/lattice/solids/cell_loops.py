@@ -115,8 +115,10 @@ def strained_cells(
     displacement: Array,
     strain: float,
     dilatation: float,
-) -> Index:
+) -> tuple[Index, Array]:
     """Return the cells whose strain or dilatation may exceed its limit; of the others none does.
+
+    And the norm of the mean strain sym G of each that is returned.
 
     With the parts G x and r of the displacement, uᵀ K_d u is 2 V |dev sym G|² and what the springs
     store of r. That is no more than `stiffest` |r|²: K_spr is no larger than the Laplacian of the
@@ -132,7 +134,7 @@ def strained_cells(
         strain: limit of the equivalent strain e, e² = uᵀ K_d u / (3 V).
         dilatation: limit of |tr G|.
     """
-    found, count = np.empty(len(nodes), np.int64), 0
+    found, norms, count = np.empty(len(nodes), np.int64), np.empty(len(nodes)), 0
     u, rest = np.empty((8, 3)), np.empty((8, 3))
     for cell in range(len(nodes)):
         xx, xy, xz, yx, yy, yz, zx, zy, zz = _parted(
@@ -150,9 +152,9 @@ def strained_cells(
             size += square - total * total / 8
         small = 2 * volumes[cell] * shear + stiffest * size <= 3 * volumes[cell] * strain**2
         if not (small and abs(3 * mean) <= dilatation):  # NaN is not small
-            found[count] = cell
+            found[count], norms[count] = cell, np.sqrt(shear + 3 * mean**2)
             count += 1
-    return found[:count].copy()
+    return found[:count].copy(), norms[:count].copy()
 
 
 @compiled

@@ -21,6 +21,8 @@ CHUNK = 2000
 DEVIATORIC = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 DEVIATORIC[:3, :3] -= 2 / 3
 """2 dev eps : dev eps as a form (6, 6) in [xx, yy, zz, 2xy, 2yz, 2zx]."""
+ROUNDING = 1e-9
+"""Of a norm; larger than what separates two ways to sum it."""
 SMALL_STRAIN = 0.1
 """Elements strained more are always noticed, whatever their law makes of it."""
 
@@ -148,6 +150,19 @@ def _mean_strains(cells: Index, gradients: Array, displacement: Array, chosen: I
     return strains
 
 
+@dataclass(frozen=True, eq=False)
+class Noticed:
+    """Elements that a bound does not pass over.
+
+    Args:
+        elements: (k,) increasing.
+        strain: (k,) norms of their mean strains.
+    """
+
+    elements: Index
+    strain: Array
+
+
 class Solid(ABC):
     """Cells of eight nodes with a material, small strain.
 
@@ -200,7 +215,7 @@ class Solid(ABC):
             chosen: (k,) elements; all by default.
         """
 
-    def noticeable(self, displacement: Array, share: float) -> Index | None:
+    def noticeable(self, displacement: Array, share: float) -> Noticed | None:
         """Return the elements whose share of h may matter; None: all may.
 
         Of no other is the norm of `nonlinear_residual` above `share`, N, or a principal strain of
@@ -232,18 +247,22 @@ class Solid(ABC):
     def linear_force(self, displacement: Array) -> Array:
         """Return K u, N, (n, 3), summed element by element: no matrix is assembled."""
 
-    def least_principal_strain(self, displacement: Array, chosen: Index | None = None) -> float:
+    def least_principal_strain(self, displacement: Array, some: Noticed | None = None) -> float:
         """Return the smallest principal strain of the mean gradients of cells, by default of all.
 
         It is no smaller than minus the norm of its tensor: where the cell of largest norm is
         compressed, only cells whose norm exceeds that compression are looked at.
         """
-        strain = self.strain(displacement, chosen)
-        if not len(strain):
+        if some is None:
+            strain = self.strain(displacement)
+            norms = np.sqrt(np.einsum("kab,kab->k", strain, strain))
+            some = Noticed(np.arange(len(strain)), norms)
+        if not len(some.elements):
             return 0.0
-        norm = np.sqrt(np.einsum("kab,kab->k", strain, strain))
-        first = float(np.linalg.eigvalsh(strain[norm.argmax()])[0])
-        return float(np.linalg.eigvalsh(strain[norm >= -first])[:, 0].min())
+        most = self.strain(displacement, some.elements[[some.strain.argmax()]])
+        first = float(np.linalg.eigvalsh(most)[0, 0])
+        near = some.strain >= -first * (1 - ROUNDING)
+        return float(np.linalg.eigvalsh(self.strain(displacement, some.elements[near])).min())
 
     def bulk(self, cells: slice) -> Array:
         """Return K V g gᵀ of some cells (k, 24, 24), N/m, g · u their mean dilatation."""
