@@ -14,10 +14,10 @@ import threading
 import time as clock
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from tkamb import __version__
 from tkamb.atomic import (
     MARKER,
     claim_directory,
@@ -151,7 +151,7 @@ def _mark(path: Path) -> None:
     if folder_token(path):
         return
     content = {
-        "tkamb": version("tkamb"),
+        "tkamb": __version__,
         "token": secrets.token_hex(8),
         "note": "tkamb writes its results into this folder and may replace them",
     }

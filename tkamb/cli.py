@@ -6,10 +6,10 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from tkamb import __version__
 from tkamb.check.command import add_check
 from tkamb.cohort.command import add_cohort
 from tkamb.compare.command import add_compare
@@ -70,7 +70,7 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="tkamb", description="What happens inside a total knee replacement.")
-    parser.add_argument("--version", action="version", version=f"tkamb {version('tkamb')}")
+    parser.add_argument("--version", action="version", version=f"tkamb {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     add_new(commands)
     add_check(commands)

@@ -15,10 +15,10 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import TextIO
 
+from tkamb import __version__
 from tkamb.errors import TkambError
 
 
@@ -153,7 +153,7 @@ def _write_log(error: Exception, options: argparse.Namespace) -> Path | None:
     """Write the traceback beside the output, else here, else where temporary files go."""
     text = "".join(
         (
-            f"tkamb {version('tkamb')}, {datetime.now(UTC).isoformat(timespec='seconds')}\n",
+            f"tkamb {__version__}, {datetime.now(UTC).isoformat(timespec='seconds')}\n",
             f"{sys.argv}\n",
             *traceback.format_exception(error),
         )

@@ -5,12 +5,12 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tkamb import __version__
 from tkamb.atomic import Replacement, replaced_together, write_synced
 from tkamb.claim import claimed_directory, settle
 from tkamb.code_identity import code_identity
@@ -251,10 +251,10 @@ def _notes(summary: Mapping[str, Any]) -> list[str]:
     identity = identity if isinstance(identity, Mapping) else {}
     notes, made_by = [], identity.get("version of tkamb")
     code, this = str(identity.get("code of tkamb")), code_identity()
-    if made_by != version("tkamb") or code != this:
+    if made_by != __version__ or code != this:
         notes.append(
             f"computed by other code (tkamb {made_by}, {code[:12]}; "
-            f"this is {version('tkamb')}, {this[:12]})"
+            f"this is {__version__}, {this[:12]})"
         )
     contact = summary.get("contact")
     if CONTACT_CODE in identity and isinstance(contact, Mapping):

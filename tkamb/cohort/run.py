@@ -4,10 +4,10 @@ import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from tkamb import __version__
 from tkamb.claim import claimed_directory, is_ours
 from tkamb.code_identity import code_identity
 from tkamb.cohort.folder import write_cohort
@@ -121,7 +121,7 @@ def run_cohort(
 
 
 def _identity(cohort: Cohort) -> dict[str, Any]:
-    code: dict[str, Any] = {"version of tkamb": version("tkamb"), "code of tkamb": code_identity()}
+    code: dict[str, Any] = {"version of tkamb": __version__, "code of tkamb": code_identity()}
     models = sorted({run.scene.contact.model for run in cohort.runs if run.scene.contact})
     foreign = {name: found for name in models if (found := contact_code(name)) is not None}
     return cohort.identity() | code | ({CONTACT_CODE: foreign} if foreign else {})

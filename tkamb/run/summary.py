@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from tkamb import __version__
 from tkamb.code_identity import code_identity
 from tkamb.columns import JOINT_MOMENT, RESERVE, belongs, family_column, name_in
 from tkamb.equilibrium.mechanics import STRAIN_FLEXIONS
@@ -132,7 +133,7 @@ def _counts(columns: dict[str, Any]) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def _versions() -> dict[str, str]:
-    own = {"python": sys.version.split()[0], "tkamb": version("tkamb")}
+    own = {"python": sys.version.split()[0], "tkamb": __version__}
     return own | {name: version(name) for name in LIBRARIES}
 
 
@@ -150,7 +151,7 @@ def run_identity(case: Case, frames: range) -> dict[str, Any]:
         "scene": scene_hash(case),
         "content of a file": files_hash(case),
         "choice of frames": [frames.start, frames.stop, frames.step],
-        "version of tkamb": version("tkamb"),
+        "version of tkamb": __version__,
         "code of tkamb": code_identity(),
     }
     contact = case.scene.contact
