@@ -188,7 +188,7 @@ def _given_up(problem: ContactProblem, best: Solution, passes: int) -> Solution:
     applied[problem.contact_nodes[best.candidates]] += (
         best.forces.force[:, None] * best.planes.normals
     )
-    return replace(best, field=problem.operator.solve(applied), passes=passes)
+    return replace(best, field=problem.operator.solve(applied), passes=passes, noticed=None)
 
 
 def _solve_linear(

@@ -21,8 +21,6 @@ CHUNK = 2000
 DEVIATORIC = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 DEVIATORIC[:3, :3] -= 2 / 3
 """2 dev eps : dev eps as a form (6, 6) in [xx, yy, zz, 2xy, 2yz, 2zx]."""
-ROUNDING = 1e-9
-"""Of a norm; larger than what separates two ways to sum it."""
 SMALL_STRAIN = 0.1
 """Elements strained more are always noticed, whatever their law makes of it."""
 
@@ -259,9 +257,10 @@ class Solid(ABC):
             some = Noticed(np.arange(len(strain)), norms)
         if not len(some.elements):
             return 0.0
-        most = self.strain(displacement, some.elements[[some.strain.argmax()]])
-        first = float(np.linalg.eigvalsh(most)[0, 0])
-        near = some.strain >= -first * (1 - ROUNDING)
+        most = int(some.strain.argmax())
+        largest = self.strain(displacement, some.elements[[most]])
+        near = some.strain >= -np.linalg.eigvalsh(largest)[0, 0]
+        near[most] = True  # compressed along one axis its norm is its compression, but for rounding
         return float(np.linalg.eigvalsh(self.strain(displacement, some.elements[near])).min())
 
     def bulk(self, cells: slice) -> Array:
