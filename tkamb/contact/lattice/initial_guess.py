@@ -97,7 +97,7 @@ class WarmStart:
         moved = self.moved - (end.moved - start.moved)
         came = replace(
             self,
-            nonlinear_residual=h - (last - first),
+            nonlinear_residual=_gone_on(h, first, last, -1.0),
             half=_gone_on(self.half, start.half, end.half, -1.0),
             moved=moved,
             pose=2 * self.pose - pose,
