@@ -5,6 +5,8 @@ import pytest
 
 from lattice_bodies import above, box_insert, condyles, dished_insert, pair, plate, sphere_cap
 from layer_contact import sphere_on_layer
+from tkamb.contact.lattice import model as lattice_model
+from tkamb.contact.lattice import solver
 from tkamb.contact.lattice.active_set import solve_contact
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
@@ -104,6 +106,33 @@ def test_accelerated_iteration_agrees_with_newton(name, load):
     assert -fast.wrench_on_insert[1] == pytest.approx(load, rel=1e-6)
     if exact.medial and exact.lateral:
         assert fast.medial.force == pytest.approx(exact.medial.force, rel=0.01)
+
+
+@pytest.mark.parametrize("cause", ["surface", "forces"])
+def test_newton_is_asked_where_forces_stay_out_of_balance(cause, monkeypatch):
+    """Of a femoral surface on which no node rests its answer would be the same."""
+    asked, by_newton = [], lattice_model.solve_by_newton
+    follow = solver.SlidingNodes.follow
+
+    def counted(*given):
+        asked.append(cause)
+        return by_newton(*given)
+
+    monkeypatch.setattr(lattice_model, "solve_by_newton", counted)
+    if cause == "surface":
+        never = lambda *given: max(follow(*given), 0.1)  # noqa: E731
+        monkeypatch.setattr(solver.SlidingNodes, "follow", never)
+    else:
+        monkeypatch.setattr(solver, "DIVERGED", 0.0)
+    model = contact_model("lattice", 3.0)
+    state = model.prepare(pair(condyles(subdivisions=4), dished_insert(cells=24), POLYETHYLENE))
+    result = model.press(state, 800.0, knee_pose([1e-3, 0.0, 0.3e-3, 0.0, 0.0, 0.0]))
+    if cause == "surface":
+        assert not asked
+        assert result.status is ContactStatus.NOT_CONVERGED
+    else:
+        assert asked
+        assert result.status is ContactStatus.OK
 
 
 @pytest.mark.parametrize("name", ["lattice", "lattice-linear", "fe", "lattice-source"])

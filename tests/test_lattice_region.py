@@ -109,6 +109,26 @@ def test_what_the_last_contact_leaves_is_foreseen(tight, monkeypatch):
     assert max(along_a_way(0.01))[0] > 5e-4
 
 
+def test_what_softened_elements_will_ask_for_saves_passes(tight, monkeypatch):
+    """And without it, or with much more, the same is found."""
+
+    def along_a_way(times):
+        monkeypatch.setattr(solver, "FURTHER", times * further)
+        solutions = [solved(tight, 0.0, 1e-4)]
+        for x in 0.1e-3 * np.arange(1, 9):
+            solutions.append(solved(tight, x, 1e-4, solutions[-1]))
+        return solutions
+
+    further = solver.FURTHER
+    now, without, too_much = (along_a_way(times) for times in (1.0, 0.0, 4.0))
+    passes = [sum(one.passes for one in found) for found in (now, without, too_much)]
+    print(passes)
+    assert passes[0] < min(passes[1:])
+    for one, same, again in zip(now, without, too_much, strict=True):
+        found = [x.forces.approach for x in (same, again)]
+        assert found == pytest.approx(2 * [one.forces.approach], rel=1e-4)
+
+
 def test_few_elements_count_and_the_rest_of_the_forces_is_zero(state):
     found = solved(state, 0.0, 1e-3)
     region, whole = found.region, state.problem.everywhere

@@ -24,6 +24,19 @@ SPARE = 1.6
 """The stored compliance covers nodes down to this many times the depth asked for."""
 
 
+@dataclass(frozen=True)
+class Left:
+    """Shares of the imbalance that passes leave; None: not known.
+
+    Args:
+        first: what the first pass of a solution leaves.
+        later: the most that a later one leaves: what is left then goes away more slowly.
+    """
+
+    first: float | None = None
+    later: float | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class WarmStart:
     """Where a solution ended: what its result carries for the next solution of the problem.
@@ -41,7 +54,7 @@ class WarmStart:
         looked: the contact forces' norm, N, and the pose when all elements were last looked at.
         before: where the solution ended that this one began from, or None.
         half: L⁻¹ h in elimination order, or None: nobody has worked it out.
-        left: share of the imbalance that a pass leaves, or None.
+        left: shares of the imbalance that passes leave.
     """
 
     problem: ContactProblem
@@ -53,7 +66,7 @@ class WarmStart:
     looked: tuple[float, Array]
     before: "WarmStart | None" = None
     half: Array | None = None
-    left: float | None = None
+    left: Left = Left()
 
     def near(self, pose: Array) -> bool:
         """Return whether a pose is within `UNSEEN_WAY` of where all elements were looked at."""
@@ -149,7 +162,7 @@ class InitialGuess:
         unseen: N, contact forces up to which the elements outside of the region need not be
             looked at; 0: they are looked at.
         half: L⁻¹ h in elimination order, or None.
-        left: share of the imbalance that a pass left in the earlier solution, or None.
+        left: shares of the imbalance that passes left in earlier solutions.
     """
 
     candidates: Index
@@ -163,13 +176,13 @@ class InitialGuess:
     offset: Array | None = None
     unseen: float = 0.0
     half: Array | None = None
-    left: float | None = None
+    left: Left = Left()
 
     @property
     def cold(self) -> "InitialGuess":
         """The same without what an earlier solution left."""
-        return replace(
-            self, nonlinear_residual=None, half=None, moved=None, region=None, unseen=0.0, left=None
+        return InitialGuess(
+            self.candidates, self.response, self.active, self.planes, reach=self.reach
         )
 
 

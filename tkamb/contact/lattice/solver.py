@@ -15,13 +15,13 @@ balance is foreseen from what passes leave of it, not looked at again.
 For a linear material h = 0 and the pass is repeated only until the sliding nodes rest.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from tkamb.contact.lattice.active_set import ContactForces, solve_contact
 from tkamb.contact.lattice.anderson import AndersonMixer
-from tkamb.contact.lattice.initial_guess import InitialGuess
+from tkamb.contact.lattice.initial_guess import InitialGuess, Left
 from tkamb.contact.lattice.linear.compliance import ContactResponse
 from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes, tangent_planes
 from tkamb.contact.lattice.solids.solid import Noticed
@@ -37,7 +37,11 @@ LEFT = 2.5
 """Times what passes left of the imbalance before, the next may leave of it. What is then foreseen
 is 1.0 to 7 times what is found (docs/lattice.md)."""
 OLDER = 1.1
-"""And so many times more with every solution that had but one pass since."""
+"""And so many times more with every solution since in which it was not measured."""
+KEPT = 0.8
+"""Share of what passes left before that counts where the last solution measured less."""
+FURTHER = 0.4
+"""Of a change of h and of the stiffness that is lost there: what the next pass would add to it."""
 SLOW = 0.7
 """When a pass leaves more than this share of the last distance, sliding steps are halved."""
 SMALLEST_SHARE = 0.125
@@ -75,7 +79,9 @@ class Solution:
         seen: all elements were looked at; else `field` is that of the region.
         noticed: elements but which the bound passed over, or None (all).
         half: L⁻¹ h in elimination order, or None.
-        left: share of the imbalance that a pass leaves, or None.
+        left: shares of the imbalance that passes leave.
+        balanced: some pass had no force out of balance; active nodes may yet have missed the
+            femoral surface.
     """
 
     candidates: Index
@@ -90,7 +96,8 @@ class Solution:
     seen: bool = True
     noticed: Noticed | None = None
     half: Array | None = None
-    left: float | None = None
+    left: Left = field(default_factory=Left)
+    balanced: bool = False
 
     @property
     def converged(self) -> bool:
@@ -108,7 +115,7 @@ def solve(
     """Return the contact at a pose under a load (N), or at approach 0 when load is None."""
     if problem.solid.material.is_linear:
         return _solve_linear(problem, pose, load, guess, tolerance)
-    chosen, active, passes = guess.candidates, guess.active, 0
+    chosen, active, passes, balanced = guess.candidates, guess.active, 0, False
     balance = NonlinearBalance(problem, guess, tolerance.force)
     points = problem.surface_points[chosen]
     first = balance.offset if guess.moved is None else guess.moved
@@ -148,13 +155,14 @@ def solve(
             balance.noticed,
             balance.half,
             balance.left,
+            balanced := balanced or balance.residual <= tolerance.force,
         )
         if done:
             return now
         best = now if best is None or residual < best.residual else best
         last = passes >= tolerance.passes and balance.foreseen > tolerance.force
         if last or passes > tolerance.passes or not residual < DIVERGED * best.residual:
-            return _given_up(problem, best, passes)
+            return replace(_given_up(problem, best, passes), balanced=balanced)
         balance.advance()
 
 
@@ -242,8 +250,7 @@ class NonlinearBalance:
         self._problem, self._response, self._tolerance = problem, guess.response, tolerance
         self.region = problem.everywhere if guess.region is None else guess.region
         self.noticed: Noticed | None = None
-        self._earlier = [] if guess.left is None else [OLDER * guess.left]
-        self._left: list[float] = []
+        self._earlier, self._left = guess.left, list[float]()
         self.foreseen, self._last = np.inf, np.nan
         self._mixer = AndersonMixer()
         if guess.nonlinear_residual is not None and guess.half is not None:
@@ -289,10 +296,22 @@ class NonlinearBalance:
         nodes = self.region.nodes
         if self._narrowed:  # another set of unknowns: earlier differences do not apply
             self._mixer = AndersonMixer()
-        mixed = self._mixer.next(self._taken[nodes].ravel(), self.h[nodes].ravel())
+        mixed = self._mixer.next(self._taken[nodes].ravel(), self._expected(nodes).ravel())
         self.h = np.zeros_like(self.h)
         self.h[nodes] = mixed.reshape(-1, 3)
         self._begin(self._problem.operator.start(self.h, self.region.fronts))
+
+    def _expected(self, nodes: Index) -> Array:
+        """Return what nodes (m, 3) will ask for when they are given what they now ask for, N.
+
+        Elements that have lost stiffness strain more under what they ask for, and ask for more:
+        h at a node goes on by `FURTHER` of its last change and of its elements' lost stiffness.
+        """
+        solid, elements, shares = self._problem.solid, self.region.elements, self._shares
+        lost = solid.lost_stiffness(self.field, elements)
+        size = np.sqrt(np.einsum("ij,ij->i", shares, shares))
+        further = FURTHER * solid.scatter.mean(lost, size, elements)[nodes, None]
+        return self.h[nodes] + further * (self.h[nodes] - self._taken[nodes])
 
     def _begin(self, half: Array) -> None:
         """Take h with L⁻¹ of it."""
@@ -301,14 +320,20 @@ class NonlinearBalance:
 
     def _foresee(self) -> None:
         """Foresee what a contact under the h asked for leaves of the imbalance."""
-        self._last = self.residual
-        left = LEFT * max(self._left + self._earlier, default=1.0)
-        self.foreseen = min(left * self.residual + SHARE * self._tolerance, self.residual)
+        self._last, left = self.residual, self.left
+        share = (left.later or left.first) if self._left else left.first
+        if share is not None:
+            left_over = LEFT * share * self.residual + SHARE * self._tolerance
+            self.foreseen = min(left_over, self.residual)
+        else:
+            self.foreseen = self.residual
 
     @property
-    def left(self) -> float | None:
-        """Largest share of the imbalance that a pass has left, or None: there were no two."""
-        return max(self._left or self._earlier, default=None)
+    def left(self) -> Left:
+        """Shares that passes left here, or where there were none, a bit more than before."""
+        return Left(
+            _most(self._left[:1], self._earlier.first), _most(self._left[1:], self._earlier.later)
+        )
 
     def _look(self, region: Region) -> None:
         """Find the imbalance of a region."""
@@ -340,7 +365,9 @@ class NonlinearBalance:
                 shares = np.vstack([known[1], shares])
         size = np.sqrt(np.einsum("ij,ij->i", shares, shares))
         counts = elements_that_count(size, SHARE * self._tolerance * self.size)
-        self.region = Region.of(self._problem, np.sort(elements[counts]))
+        which = np.flatnonzero(counts)
+        which = which[np.argsort(elements[which])]
+        self.region, self._shares = Region.of(self._problem, elements[which]), shares[which]
         self.h = self._summed(shares, elements, np.flatnonzero(counts))
         asked = self.h + self._summed(shares, elements, np.flatnonzero(~counts))
         self.residual = float(np.linalg.norm(asked - self._taken)) / self.size
@@ -350,6 +377,12 @@ class NonlinearBalance:
         value = self._problem.solid.scatter.sum(forces, elements, which)
         value.ravel()[self._problem.held_unknowns] = 0.0
         return value
+
+
+def _most(measured: list[float], earlier: float | None) -> float | None:
+    """Return the most of what was measured and of what was so before, by now; None: nothing."""
+    before = [] if earlier is None else [earlier * (KEPT if measured else OLDER)]
+    return max(measured + before, default=None)
 
 
 def elements_that_count(size: Array, allowed: float) -> Mask:

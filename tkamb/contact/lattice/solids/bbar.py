@@ -66,6 +66,10 @@ class BbarHexahedra(Solid):
         strain *= (softened * elements_of(self.weights, chosen))[..., None]
         return self._per_cell_forces(strain, chosen)
 
+    def lost_stiffness(self, displacement: Array, chosen: Index) -> Array:
+        """Return 1 - mu_t/mu (k,) at the cells' mean strains; see `Solid`."""
+        return self.curve.lost(self.mean_equivalent_strain(displacement, chosen))
+
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n), N/m."""
         strain, equivalent = self._state(displacement)

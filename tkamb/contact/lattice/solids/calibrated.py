@@ -186,6 +186,10 @@ class CalibratedNetwork(Solid):
         corners, gradients, volume, _ = self._shapes
         return largest_pull(corners, gradients, volume, self._stiffest)
 
+    def lost_stiffness(self, displacement: Array, chosen: Index) -> Array:
+        """Return 1 - mu_t/mu (k,) at the cells' mean strains; see `Solid`."""
+        return self.curve.lost(self.mean_equivalent_strain(displacement, chosen))
+
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n): mu_s K_d + mu_s'/(3 V e) (K_d u)(K_d u)ᵀ + bulk."""
         force, equivalent = self._state(displacement)

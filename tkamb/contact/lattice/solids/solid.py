@@ -113,6 +113,16 @@ class Scatter:
         _add_up(forces.reshape(shape), self.elements, own, some, total)
         return total
 
+    def mean(self, values: Array, weights: Array, chosen: Index) -> Array:
+        """Return at nodes (n,) the weighted mean of what elements have; 0 where none is.
+
+        Args:
+            values: (k,) of the chosen elements.
+            weights: (k,) none negative.
+            chosen: (k,) elements.
+        """
+        return _mean_of(values, weights, self.elements, chosen, self.nodes)
+
 
 def elements_of(elements: NDArray[Any], chosen: Index | None) -> NDArray[Any]:
     """Return some rows, by default all."""
@@ -127,6 +137,21 @@ def _add_up(parts: Array, elements: Index, chosen: Index, which: Index, total: A
         for corner in range(parts.shape[1]):
             for axis in range(3):
                 total[elements[element, corner], axis] += parts[k, corner, axis]
+
+
+@compiled
+def _mean_of(values: Array, weights: Array, elements: Index, chosen: Index, nodes: int) -> Array:
+    """Return the nodes' weighted means (n,); see `Scatter.mean`."""
+    total, weight = np.zeros(nodes), np.zeros(nodes)
+    for k in range(len(chosen)):
+        for corner in range(elements.shape[1]):
+            node = elements[chosen[k], corner]
+            total[node] += weights[k] * values[k]
+            weight[node] += weights[k]
+    for node in range(nodes):
+        if weight[node] > 0.0:
+            total[node] /= weight[node]
+    return total
 
 
 @compiled
@@ -213,6 +238,15 @@ class Solid(ABC):
             chosen: (k,) elements; all by default.
         """
 
+    @abstractmethod
+    def lost_stiffness(self, displacement: Array, chosen: Index) -> Array:
+        """Return what elements (k,) have lost of their tangent stiffness, 0 to 1.
+
+        Args:
+            displacement: (n, 3) m; only the chosen elements' nodes are looked at.
+            chosen: (k,) elements.
+        """
+
     def noticeable(self, displacement: Array, share: float) -> Noticed | None:
         """Return the elements whose share of h may matter; None: all may.
 
@@ -274,6 +308,13 @@ class Solid(ABC):
         g = self.gradients.reshape(-1, 24)
         dilatation = np.einsum("ci,ci->c", g, displacement[self.cells].reshape(-1, 24))
         return (self.material.bulk_modulus * self.volume * dilatation)[:, None] * g
+
+    def mean_equivalent_strain(self, displacement: Array, chosen: Index) -> Array:
+        """Return e (k,) of the mean strain of cells, e² = (2/3) dev eps : dev eps."""
+        strain = self.strain(displacement, chosen)
+        mean = np.einsum("kaa->k", strain) / 3
+        square = np.einsum("kab,kab->k", strain, strain) - 3 * mean**2
+        return np.sqrt(2 / 3 * np.maximum(square, 0.0))
 
     def strain(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return the mean strain (k, 3, 3) of cells, by default of all."""

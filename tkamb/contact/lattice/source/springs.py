@@ -89,6 +89,11 @@ class SourceNetwork(Solid):
         softened = self.factor * (linear - now)
         return np.hstack([-softened, softened])
 
+    def lost_stiffness(self, displacement: Array, chosen: Index) -> Array:
+        """Return 1 - (d sigma/d eps)/E (k,) of springs; see `Solid`."""
+        strain, _ = self._state(displacement, chosen)
+        return 1 - self.material.tangent(strain) / self.material.young_modulus
+
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return the springs' (d sigma/d eps) C n nᵀ, assembled as in Sharma (2008) (3n, 3n).
 
