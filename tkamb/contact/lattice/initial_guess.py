@@ -37,6 +37,9 @@ class Left:
     later: float | None = None
 
 
+NOT_KNOWN = Left()
+
+
 @dataclass(frozen=True, eq=False)
 class WarmStart:
     """Where a solution ended: what its result carries for the next solution of the problem.
@@ -66,7 +69,7 @@ class WarmStart:
     looked: tuple[float, Array]
     before: "WarmStart | None" = None
     half: Array | None = None
-    left: Left = Left()
+    left: Left = NOT_KNOWN
 
     def near(self, pose: Array) -> bool:
         """Return whether a pose is within `UNSEEN_WAY` of where all elements were looked at."""
@@ -176,7 +179,7 @@ class InitialGuess:
     offset: Array | None = None
     unseen: float = 0.0
     half: Array | None = None
-    left: Left = Left()
+    left: Left = NOT_KNOWN
 
     @property
     def cold(self) -> "InitialGuess":

@@ -15,13 +15,13 @@ balance is foreseen from what passes leave of it, not looked at again.
 For a linear material h = 0 and the pass is repeated only until the sliding nodes rest.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from tkamb.contact.lattice.active_set import ContactForces, solve_contact
 from tkamb.contact.lattice.anderson import AndersonMixer
-from tkamb.contact.lattice.initial_guess import InitialGuess, Left
+from tkamb.contact.lattice.initial_guess import NOT_KNOWN, InitialGuess, Left
 from tkamb.contact.lattice.linear.compliance import ContactResponse
 from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes, tangent_planes
 from tkamb.contact.lattice.solids.solid import Noticed
@@ -96,7 +96,7 @@ class Solution:
     seen: bool = True
     noticed: Noticed | None = None
     half: Array | None = None
-    left: Left = field(default_factory=Left)
+    left: Left = NOT_KNOWN
     balanced: bool = False
 
     @property
