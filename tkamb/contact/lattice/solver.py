@@ -288,7 +288,7 @@ class NonlinearBalance:
         rest = np.setdiff1d(every, region.fronts.fronts, assume_unique=True)
         factor.backward(self._x, factor.shared(rest))
         self.field = operator.nodal(self._x)
-        self._look_at_all((region.elements, self._shares))
+        self._look_at_all((region.elements, self._shares, self._lost))
         self._foresee()
 
     def advance(self) -> None:
@@ -307,10 +307,8 @@ class NonlinearBalance:
         Elements that have lost stiffness strain more under what they ask for, and ask for more:
         h at a node goes on by `FURTHER` of its last change and of its elements' lost stiffness.
         """
-        solid, elements, shares = self._problem.solid, self.region.elements, self._shares
-        lost = solid.lost_stiffness(self.field, elements)
-        size = np.sqrt(np.einsum("ij,ij->i", shares, shares))
-        further = FURTHER * solid.scatter.mean(lost, size, elements)[nodes, None]
+        scatter, shares = self._problem.solid.scatter, self._shares
+        further = FURTHER * scatter.mean(self._lost, shares, self.region.elements)[nodes, None]
         return self.h[nodes] + further * (self.h[nodes] - self._taken[nodes])
 
     def _begin(self, half: Array) -> None:
@@ -338,37 +336,40 @@ class NonlinearBalance:
     def _look(self, region: Region) -> None:
         """Find the imbalance of a region."""
         solid = self._problem.solid
-        self._shares = solid.nonlinear_residual(self.field, region.elements)
+        self._lost = np.empty(len(region.elements))
+        self._shares = solid.nonlinear_residual(self.field, region.elements, self._lost)
         self.h = self._summed(self._shares, region.elements)
         self.residual = float(np.linalg.norm(self.h - self._taken)) / self.size
 
-    def _look_at_all(self, known: tuple[Index, Array] | None) -> None:
+    def _look_at_all(self, known: tuple[Index, Array, Array] | None) -> None:
         """Find the imbalance of all elements, and which count.
 
         Args:
-            known: some elements (k,) and their shares (k, 3p) of this field, N, or None.
+            known: some elements (k,), their shares (k, 3p) of this field, N, and what they have
+                lost of their stiffness (k,); or None.
         """
         solid, everywhere = self._problem.solid, self._problem.everywhere.elements
         allowed = PASSED_OVER * self._tolerance * self.size
         self.noticed = solid.noticeable(self.field, allowed / np.sqrt(len(everywhere)))
-        if self.noticed is None:
-            elements, shares = everywhere, solid.nonlinear_residual(self.field)
-        else:
+        elements = everywhere
+        if self.noticed is not None:
             left = np.zeros(len(everywhere), bool)
             left[self.noticed.elements] = True
             if known is not None:
                 left[known[0]] = False
             elements = np.flatnonzero(left)
-            shares = solid.nonlinear_residual(self.field, elements)
-            if known is not None:
-                elements = np.concatenate([known[0], elements])
-                shares = np.vstack([known[1], shares])
+        lost = np.empty(len(elements))
+        shares = solid.nonlinear_residual(self.field, elements, lost)
+        if self.noticed is not None and known is not None:
+            elements, lost = np.concatenate([known[0], elements]), np.concatenate([known[2], lost])
+            shares = np.vstack([known[1], shares])
         size = np.sqrt(np.einsum("ij,ij->i", shares, shares))
         counts = elements_that_count(size, SHARE * self._tolerance * self.size)
         which = np.flatnonzero(counts)
         which = which[np.argsort(elements[which])]
-        self.region, self._shares = Region.of(self._problem, elements[which]), shares[which]
-        self.h = self._summed(shares, elements, np.flatnonzero(counts))
+        self.region = Region.of(self._problem, elements[which])
+        self._shares, self._lost = shares[which], lost[which]
+        self.h = self._summed(shares, elements, which)
         asked = self.h + self._summed(shares, elements, np.flatnonzero(~counts))
         self.residual = float(np.linalg.norm(asked - self._taken)) / self.size
         self._narrowed = True

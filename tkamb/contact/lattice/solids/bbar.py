@@ -59,16 +59,16 @@ class BbarHexahedra(Solid):
         force = self._per_cell_forces(strain, None) + self.bulk_force(displacement)
         return self.scatter.sum(force)
 
-    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
+    def nonlinear_residual(
+        self, displacement: Array, chosen: Index | None = None, lost: Array | None = None
+    ) -> Array:
         """Return the Gauss points' (mu - mu_s) times unit shear forces, N, (k, 24)."""
         strain, equivalent = self._state(displacement, chosen)
         softened = self.material.shear_modulus - self.curve.modulus(equivalent)
+        if lost is not None:
+            lost[:] = self.curve.lost(equivalent).mean(axis=1)
         strain *= (softened * elements_of(self.weights, chosen))[..., None]
         return self._per_cell_forces(strain, chosen)
-
-    def lost_stiffness(self, displacement: Array, chosen: Index) -> Array:
-        """Return 1 - mu_t/mu (k,) at the cells' mean strains; see `Solid`."""
-        return self.curve.lost(self.mean_equivalent_strain(displacement, chosen))
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n), N/m."""

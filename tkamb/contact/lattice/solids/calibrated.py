@@ -141,17 +141,20 @@ class CalibratedNetwork(Solid):
         force *= self.material.shear_modulus
         return self.scatter.sum(force + self.bulk_force(displacement))
 
-    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
+    def nonlinear_residual(
+        self, displacement: Array, chosen: Index | None = None, lost: Array | None = None
+    ) -> Array:
         """Return (mu - mu_s) K_d u of the cells, N, (k, 24); see `Solid`."""
         cells = np.arange(len(self.cells)) if chosen is None else chosen
         if self.curve.spline is None:
             return np.zeros((len(cells), 24))
         curve = self.curve.shear_modulus, self.curve.spline.x, self.curve.spline.c, LEAST_STRAIN
         forces = np.empty((len(cells), 24))
+        lost = np.empty(len(cells)) if lost is None else lost
 
         def softened(some: slice) -> None:
             shapes, where = self._shapes, (self.cells, cells[some], displacement)
-            softened_forces(*shapes, *curve, *where, forces[some])
+            softened_forces(*shapes, *curve, *where, forces[some], lost[some])
 
         in_halves(softened, len(cells))
         return forces
@@ -185,10 +188,6 @@ class CalibratedNetwork(Solid):
         """A bound of (3 V lambda)^½ of all cells, m²."""
         corners, gradients, volume, _ = self._shapes
         return largest_pull(corners, gradients, volume, self._stiffest)
-
-    def lost_stiffness(self, displacement: Array, chosen: Index) -> Array:
-        """Return 1 - mu_t/mu (k,) at the cells' mean strains; see `Solid`."""
-        return self.curve.lost(self.mean_equivalent_strain(displacement, chosen))
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n): mu_s K_d + mu_s'/(3 V e) (K_d u)(K_d u)ᵀ + bulk."""

@@ -265,8 +265,11 @@ def softened_forces(
     chosen: Index,
     displacement: Array,
     forces: Array,
+    lost: Array,
 ) -> None:
-    """Put (mu - mu_s) K_d u (k, 24), N, of cells into `forces`; see `shear_forces`.
+    """Put (mu - mu_s) K_d u (k, 24), N, of cells into `forces`, 1 - mu_t/mu (k,) into `lost`.
+
+    See `shear_forces`.
 
     Args:
         corners: (c, 8, 3) m.
@@ -281,6 +284,7 @@ def softened_forces(
         chosen: (k,) cells.
         displacement: (n, 3) m.
         forces: (k, 24).
+        lost: (k,).
     """
     u, rest = np.empty((8, 3)), np.empty((8, 3))
     for k in range(len(chosen)):
@@ -292,5 +296,7 @@ def softened_forces(
         y = strain - knots[part]
         stress = ((cubic[0, part] * y + cubic[1, part]) * y + cubic[2, part]) * y + cubic[3, part]
         softened = shear_modulus - stress / (3 * strain)
+        slope = (3 * cubic[0, part] * y + 2 * cubic[1, part]) * y + cubic[2, part]
+        lost[k] = 1 - slope / (3 * shear_modulus)
         for i in range(24):
             forces[k, i] *= softened

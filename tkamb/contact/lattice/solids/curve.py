@@ -73,12 +73,8 @@ class ShearCurve:
         """Return 1 - (dq/de)/(3 mu) at equivalent strains e >= 0: of the tangent, what is lost."""
         if self.spline is None:
             return np.zeros_like(equivalent)
-        return np.interp(equivalent, self.spline.x, self._lost)
-
-    @cached_property
-    def _lost(self) -> Array:
-        assert self.spline is not None
-        return 1 - self.spline(self.spline.x, 1) / (3 * self.shear_modulus)
+        slope = self.spline(np.clip(equivalent, LEAST_STRAIN, self.spline.x[-1]), 1)
+        return np.asarray(1 - slope / (3 * self.shear_modulus))
 
     def softening(self, equivalent: Array) -> Array:
         """Return (d mu_s / d e) / e, Pa, at equivalent strains e >= 0: never positive."""

@@ -113,15 +113,15 @@ class Scatter:
         _add_up(forces.reshape(shape), self.elements, own, some, total)
         return total
 
-    def mean(self, values: Array, weights: Array, chosen: Index) -> Array:
-        """Return at nodes (n,) the weighted mean of what elements have; 0 where none is.
+    def mean(self, values: Array, forces: Array, chosen: Index) -> Array:
+        """Return at nodes (n,) the mean of what elements have, by their forces; 0 where none is.
 
         Args:
             values: (k,) of the chosen elements.
-            weights: (k,) none negative.
+            forces: (k, 3p) N; their norms are the weights.
             chosen: (k,) elements.
         """
-        return _mean_of(values, weights, self.elements, chosen, self.nodes)
+        return _mean_of(values, forces, self.elements, chosen, self.nodes)
 
 
 def elements_of(elements: NDArray[Any], chosen: Index | None) -> NDArray[Any]:
@@ -140,14 +140,18 @@ def _add_up(parts: Array, elements: Index, chosen: Index, which: Index, total: A
 
 
 @compiled
-def _mean_of(values: Array, weights: Array, elements: Index, chosen: Index, nodes: int) -> Array:
+def _mean_of(values: Array, forces: Array, elements: Index, chosen: Index, nodes: int) -> Array:
     """Return the nodes' weighted means (n,); see `Scatter.mean`."""
     total, weight = np.zeros(nodes), np.zeros(nodes)
     for k in range(len(chosen)):
+        size = 0.0
+        for i in range(forces.shape[1]):
+            size += forces[k, i] ** 2
+        size = np.sqrt(size)
         for corner in range(elements.shape[1]):
             node = elements[chosen[k], corner]
-            total[node] += weights[k] * values[k]
-            weight[node] += weights[k]
+            total[node] += size * values[k]
+            weight[node] += size
     for node in range(nodes):
         if weight[node] > 0.0:
             total[node] /= weight[node]
@@ -230,21 +234,15 @@ class Solid(ABC):
         """Linear stiffness (3n, 3n), N/m; assembled anew, it is as large as half of the factor."""
 
     @abstractmethod
-    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
+    def nonlinear_residual(
+        self, displacement: Array, chosen: Index | None = None, lost: Array | None = None
+    ) -> Array:
         """Return linear forces minus the material's own, N, of elements of `scatter` (k, 3p).
 
         Args:
             displacement: (n, 3) m; only the chosen elements' nodes are looked at.
             chosen: (k,) elements; all by default.
-        """
-
-    @abstractmethod
-    def lost_stiffness(self, displacement: Array, chosen: Index) -> Array:
-        """Return what elements (k,) have lost of their tangent stiffness, 0 to 1.
-
-        Args:
-            displacement: (n, 3) m; only the chosen elements' nodes are looked at.
-            chosen: (k,) elements.
+            lost: (k,) to be written: what elements have lost of their tangent stiffness, 0 to 1.
         """
 
     def noticeable(self, displacement: Array, share: float) -> Noticed | None:
@@ -308,13 +306,6 @@ class Solid(ABC):
         g = self.gradients.reshape(-1, 24)
         dilatation = np.einsum("ci,ci->c", g, displacement[self.cells].reshape(-1, 24))
         return (self.material.bulk_modulus * self.volume * dilatation)[:, None] * g
-
-    def mean_equivalent_strain(self, displacement: Array, chosen: Index) -> Array:
-        """Return e (k,) of the mean strain of cells, e² = (2/3) dev eps : dev eps."""
-        strain = self.strain(displacement, chosen)
-        mean = np.einsum("kaa->k", strain) / 3
-        square = np.einsum("kab,kab->k", strain, strain) - 3 * mean**2
-        return np.sqrt(2 / 3 * np.maximum(square, 0.0))
 
     def strain(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return the mean strain (k, 3, 3) of cells, by default of all."""

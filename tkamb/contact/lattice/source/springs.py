@@ -77,7 +77,9 @@ class SourceNetwork(Solid):
         pull = (self.material.young_modulus * self.factor * longer)[:, None] * straight
         return self.scatter.sum(np.hstack([-pull, pull]))
 
-    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
+    def nonlinear_residual(
+        self, displacement: Array, chosen: Index | None = None, lost: Array | None = None
+    ) -> Array:
         """Return linear forces minus those of the springs as they lie, N, (k, 6)."""
         springs = slice(None) if chosen is None else chosen
         strain, direction = self._state(displacement, springs)
@@ -87,12 +89,9 @@ class SourceNetwork(Solid):
         linear = self.material.young_modulus * longer[:, None] * straight
         now = (self.material.stress(strain) * self.lengths[springs])[:, None] * direction
         softened = self.factor * (linear - now)
+        if lost is not None:
+            lost[:] = 1 - self.material.tangent(strain) / self.material.young_modulus
         return np.hstack([-softened, softened])
-
-    def lost_stiffness(self, displacement: Array, chosen: Index) -> Array:
-        """Return 1 - (d sigma/d eps)/E (k,) of springs; see `Solid`."""
-        strain, _ = self._state(displacement, chosen)
-        return 1 - self.material.tangent(strain) / self.material.young_modulus
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return the springs' (d sigma/d eps) C n nᵀ, assembled as in Sharma (2008) (3n, 3n).
