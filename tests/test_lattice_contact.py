@@ -108,6 +108,36 @@ def test_accelerated_iteration_agrees_with_newton(name, load):
         assert fast.medial.force == pytest.approx(exact.medial.force, rel=0.01)
 
 
+@pytest.mark.parametrize("name", ["lattice", "lattice-linear"])
+def test_a_contact_that_grows_is_solved_again_only_for_nodes_that_it_touches(name, monkeypatch):
+    """From a guess for less load; were no node looked at, a deep contact would be too soft."""
+    begun, first_guess = [], lattice_model.initial_guess
+
+    def counted(*given):
+        begun.append(given)
+        return first_guess(*given)
+
+    monkeypatch.setattr(lattice_model, "initial_guess", counted)
+    model = contact_model(name, 2.0)
+    state = model.prepare(pair(condyles(subdivisions=4), dished_insert(cells=24), POLYETHYLENE))
+    pose = knee_pose([1e-3, 0.0, 0.3e-3, 0.0, 0.0, 0.0])
+
+    def pressed(load, guess=None):
+        begun.clear()
+        return model.press(state, load, pose, guess), len(begun)
+
+    light, _ = pressed(800.0)
+    for load, times in ((1100.0, 1), (4000.0, 2)):
+        alone, _ = pressed(load)
+        after, solved = pressed(load, light)
+        assert solved >= 2 if times == 2 else solved == 1
+        assert after.approach == pytest.approx(alone.approach, rel=1e-3)
+        assert after.pressure == pytest.approx(alone.pressure, abs=2e-3 * alone.pressure.max())
+    monkeypatch.setattr(lattice_model, "_others_clear", lambda *given: True)
+    wrong, _ = pressed(4000.0, light)
+    assert wrong.approach > 1.02 * alone.approach
+
+
 @pytest.mark.parametrize("cause", ["surface", "forces"])
 def test_newton_is_asked_where_forces_stay_out_of_balance(cause, monkeypatch):
     """Of a femoral surface on which no node rests its answer would be the same."""

@@ -31,7 +31,7 @@ from tkamb.contact.lattice.problem import (
     TangentPlanes,
     undeformed,
 )
-from tkamb.contact.lattice.report import PressureRule, result_of
+from tkamb.contact.lattice.report import PressureRule, gaps_of_others, result_of
 from tkamb.contact.lattice.solids.bbar import BbarHexahedra
 from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
 from tkamb.contact.lattice.solids.solid import Solid
@@ -244,7 +244,11 @@ class CellContact(ContactModel):
                     pose, looked, None if last is None else replace(last, before=None),
                     solution.half, solution.left,
                 )  # fmt: skip
-            if covered or reached <= start.reach:
+            if (
+                covered
+                or reached <= start.reach
+                or _others_clear(state, pose, gaps <= reached, solution)
+            ):
                 rule = self.pressure_rule
                 result = result_of(state, pose, load, gaps, solution, rule, sketch)
                 if load is not None and not sketch:
@@ -333,6 +337,25 @@ def warm_start_of(state: LatticeState, guess: ContactResult | None) -> WarmStart
     warm = None if guess is None else guess.warm_start
     mine = isinstance(warm, WarmStart) and warm.problem is state.problem
     return warm if mine else None
+
+
+def _others_clear(state: LatticeState, pose: Array, near: Mask, solution: Solution) -> bool:
+    """Say whether no node touches the femoral component that was no candidate.
+
+    Args:
+        state: prepared contact.
+        pose: (4, 4) at approach 0 of the solution.
+        near: (c,) nodes that might.
+        solution: under a load.
+    """
+    if not (solution.converged and solution.seen):
+        return False
+    others, force = near.copy(), np.zeros_like(state.surface.points)
+    others[solution.candidates] = False
+    force[solution.candidates] = solution.forces.force[:, None] * solution.planes.normals
+    there = pose.copy()
+    there[1, 3] -= solution.forces.approach
+    return bool((gaps_of_others(state, there, np.flatnonzero(others), force, solution) > 0).all())
 
 
 def _rehearse(problem: ContactProblem, pair: ContactPair) -> None:

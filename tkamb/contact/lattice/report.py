@@ -110,11 +110,11 @@ def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution:
     close[own] = False
     rest = np.flatnonzero(close)
     if rest.size:
-        gap[rest] = _gaps_of_others(state, pose, rest, force, solution)
+        gap[rest] = gaps_of_others(state, pose, rest, force, solution)
     return gap
 
 
-def _gaps_of_others(
+def gaps_of_others(
     state: LatticeState, pose: Array, nodes: Index, force: Array, solution: Solution
 ) -> Array:
     """Return the gaps (m,), m, of deformed nodes that are no candidates; inf: nothing above."""
