@@ -205,9 +205,13 @@ class CalibratedNetwork(Solid):
 
     @cached_property
     def _shapes(self) -> tuple[Array, Array, Array, Array]:
-        """Corners (c, 8, 3), mean gradients (c, 8, 3), volumes (c,) and springs (28,)."""
-        corners = self.corners()
-        return corners, np.ascontiguousarray(self.gradients), self.volume, self.springs
+        """Corners (c, 3, 8), mean gradients (c, 3, 8), volumes (c,) and springs (8, 8)."""
+        corners, gradients = (
+            np.ascontiguousarray(one.transpose(0, 2, 1)) for one in (self.corners(), self.gradients)
+        )
+        springs = np.zeros((8, 8))
+        springs[tuple(PAIRS.T)] = self.springs
+        return corners, gradients, self.volume, springs + springs.T
 
     def _state(self, displacement: Array, chosen: Index | None = None) -> tuple[Array, Array]:
         """Return K_d u (k, 24) and the equivalent strain e (k,) of the chosen cells."""

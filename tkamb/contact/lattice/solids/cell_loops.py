@@ -5,6 +5,9 @@ import numpy as np
 from tkamb.compiled import compiled
 from tkamb.geometry.frames import Array, Index
 
+NOTHING = 1e-300
+"""m², so that nothing is divided by zero."""
+
 
 @compiled
 def deviatoric_matrices(
@@ -56,21 +59,34 @@ def _parted(
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
     """Part a cell's displacement into G x, G = sum u_i g_iᵀ, and a rest; return G, row by row.
 
-    G is held in nine registers: an array would be written and read in every line. The arguments
-    are those of `_shear_force`.
+    One axis after the other, each with its eight corners side by side: so they fill the
+    processor's vectors. G is held in nine registers. The arguments are those of `_shear_force`.
     """
-    xx = xy = xz = yx = yy = yz = zx = zy = zz = 0.0
+    first = nodes[0]
     for i in range(8):
-        for a in range(3):
-            u[i, a] = displacement[nodes[i], a] - displacement[nodes[0], a]
-        xx, xy, xz = xx + u[i, 0] * g[i, 0], xy + u[i, 0] * g[i, 1], xz + u[i, 0] * g[i, 2]
-        yx, yy, yz = yx + u[i, 1] * g[i, 0], yy + u[i, 1] * g[i, 1], yz + u[i, 1] * g[i, 2]
-        zx, zy, zz = zx + u[i, 2] * g[i, 0], zy + u[i, 2] * g[i, 1], zz + u[i, 2] * g[i, 2]
+        node = nodes[i]
+        u[0, i] = displacement[node, 0] - displacement[first, 0]
+        u[1, i] = displacement[node, 1] - displacement[first, 1]
+        u[2, i] = displacement[node, 2] - displacement[first, 2]
+    xx, xy, xz = _along(u[0], g[0]), _along(u[0], g[1]), _along(u[0], g[2])
+    yx, yy, yz = _along(u[1], g[0]), _along(u[1], g[1]), _along(u[1], g[2])
+    zx, zy, zz = _along(u[2], g[0]), _along(u[2], g[1]), _along(u[2], g[2])
     for i in range(8):
-        rest[i, 0] = u[i, 0] - (xx * x[i, 0] + xy * x[i, 1] + xz * x[i, 2])
-        rest[i, 1] = u[i, 1] - (yx * x[i, 0] + yy * x[i, 1] + yz * x[i, 2])
-        rest[i, 2] = u[i, 2] - (zx * x[i, 0] + zy * x[i, 1] + zz * x[i, 2])
+        rest[0, i] = u[0, i] - (xx * x[0, i] + xy * x[1, i] + xz * x[2, i])
+    for i in range(8):
+        rest[1, i] = u[1, i] - (yx * x[0, i] + yy * x[1, i] + yz * x[2, i])
+    for i in range(8):
+        rest[2, i] = u[2, i] - (zx * x[0, i] + zy * x[1, i] + zz * x[2, i])
     return xx, xy, xz, yx, yy, yz, zx, zy, zz
+
+
+@compiled
+def _along(one: Array, other: Array) -> float:
+    """Return the product of eight numbers with eight others."""
+    total = 0.0
+    for i in range(8):
+        total += one[i] * other[i]
+    return total
 
 
 @compiled
@@ -90,17 +106,15 @@ def largest_pull(corners: Array, gradients: Array, volumes: Array, stiffest: flo
 
 @compiled
 def _square_norm(matrix: Array) -> float:
-    """Return a bound of the squared spectral norm of a matrix (8, 3) less its rows' mean."""
+    """Return a bound of the squared spectral norm of a matrix (3, 8) less its rows' means."""
     mean, largest = np.zeros(3), 0.0
-    for i in range(8):
-        mean += matrix[i] / 8
+    for a in range(3):
+        for i in range(8):
+            mean[a] += matrix[a, i] / 8
     for a in range(3):
         row = 0.0
         for b in range(3):
-            product = 0.0
-            for i in range(8):
-                product += (matrix[i, a] - mean[a]) * (matrix[i, b] - mean[b])
-            row += abs(product)
+            row += abs(_along(matrix[a], matrix[b]) - 8 * mean[a] * mean[b])
         largest = max(largest, row)
     return largest
 
@@ -125,8 +139,8 @@ def strained_cells(
     same springs without directions, and that no larger than twice its largest diagonal entry.
 
     Args:
-        corners: (c, 8, 3) m.
-        gradients: (c, 8, 3) 1/m.
+        corners: (c, 3, 8) m.
+        gradients: (c, 3, 8) 1/m.
         volumes: (c,) m³.
         stiffest: m, twice the largest sum of the springs of one node.
         nodes: (c, 8) of the cells.
@@ -135,7 +149,7 @@ def strained_cells(
         dilatation: limit of |tr G|.
     """
     found, norms, count = np.empty(len(nodes), np.int64), np.empty(len(nodes)), 0
-    u, rest = np.empty((8, 3)), np.empty((8, 3))
+    u, rest = np.empty((3, 8)), np.empty((3, 8))
     for cell in range(len(nodes)):
         xx, xy, xz, yx, yy, yz, zx, zy, zz = _parted(
             corners[cell], gradients[cell], nodes[cell], displacement, u, rest
@@ -147,8 +161,8 @@ def strained_cells(
         for a in range(3):
             square = total = 0.0
             for i in range(8):
-                square += rest[i, a] * rest[i, a]
-                total += rest[i, a]
+                square += rest[a, i] * rest[a, i]
+                total += rest[a, i]
             size += square - total * total / 8
         small = 2 * volumes[cell] * shear + stiffest * size <= 3 * volumes[cell] * strain**2
         if not (small and abs(3 * mean) <= dilatation):  # NaN is not small
@@ -169,54 +183,47 @@ def _shear_force(
     rest: Array,
     force: Array,
 ) -> float:
-    """Put K_d u of a cell into force (8, 3); return uᵀ K_d u.
+    """Put K_d u of a cell into force (3, 8); return uᵀ K_d u.
 
     K_d is never made: from G = sum u_i g_iᵀ follow the rests u_i - G x_i, from these the springs'
     forces t_i, and with D = 2 V dev(sym G) - sum t_i x_iᵀ the nodes' forces t_i + D g_i. D is held
     in nine registers as G is.
 
     Args:
-        x: (8, 3) m, corners.
-        g: (8, 3) 1/m, mean gradients.
+        x: (3, 8) m, corners.
+        g: (3, 8) 1/m, mean gradients.
         volume: m³.
-        springs: (28,) m, `spring_families` of the nominal box.
+        springs: (8, 8) m, `spring_families` of the nominal box between any two corners.
         nodes: (8,).
         displacement: (n, 3) m.
-        u: (8, 3) scratch, as `rest`: displacements from the cell's first node.
-        rest: (8, 3).
-        force: (8, 3) m².
+        u: (3, 8) scratch, as `rest`: displacements from the cell's first node.
+        rest: (3, 8).
+        force: (3, 8) m².
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = _parted(x, g, nodes, displacement, u, rest)
-    force[:] = 0.0
-    spring = 0
     for i in range(8):
-        for j in range(i + 1, 8):
-            line_x, line_y, line_z = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
-            pull = (rest[j, 0] - rest[i, 0]) * line_x + (rest[j, 1] - rest[i, 1]) * line_y
-            pull += (rest[j, 2] - rest[i, 2]) * line_z
-            pull *= springs[spring] / (line_x * line_x + line_y * line_y + line_z * line_z)
-            force[i, 0] -= pull * line_x
-            force[i, 1] -= pull * line_y
-            force[i, 2] -= pull * line_z
-            force[j, 0] += pull * line_x
-            force[j, 1] += pull * line_y
-            force[j, 2] += pull * line_z
-            spring += 1
+        fx = fy = fz = 0.0
+        for j in range(8):
+            line_x, line_y, line_z = x[0, j] - x[0, i], x[1, j] - x[1, i], x[2, j] - x[2, i]
+            pull = (rest[0, j] - rest[0, i]) * line_x + (rest[1, j] - rest[1, i]) * line_y
+            pull += (rest[2, j] - rest[2, i]) * line_z
+            square = line_x * line_x + line_y * line_y + line_z * line_z
+            pull *= springs[i, j] / max(square, NOTHING)  # of a corner with itself
+            fx, fy, fz = fx - pull * line_x, fy - pull * line_y, fz - pull * line_z
+        force[0, i], force[1, i], force[2, i] = fx, fy, fz
     mean = 2.0 / 3.0 * (xx + yy + zz)
     xy, xz, yz = volume * (xy + yx), volume * (xz + zx), volume * (yz + zy)
     yx, zx, zy = xy, xz, yz
     xx, yy, zz = volume * (2 * xx - mean), volume * (2 * yy - mean), volume * (2 * zz - mean)
+    fx, fy, fz = force[0], force[1], force[2]
+    xx, xy, xz = xx - _along(fx, x[0]), xy - _along(fx, x[1]), xz - _along(fx, x[2])
+    yx, yy, yz = yx - _along(fy, x[0]), yy - _along(fy, x[1]), yz - _along(fy, x[2])
+    zx, zy, zz = zx - _along(fz, x[0]), zy - _along(fz, x[1]), zz - _along(fz, x[2])
     for i in range(8):
-        fx, fy, fz = force[i, 0], force[i, 1], force[i, 2]
-        xx, xy, xz = xx - fx * x[i, 0], xy - fx * x[i, 1], xz - fx * x[i, 2]
-        yx, yy, yz = yx - fy * x[i, 0], yy - fy * x[i, 1], yz - fy * x[i, 2]
-        zx, zy, zz = zx - fz * x[i, 0], zy - fz * x[i, 1], zz - fz * x[i, 2]
-    energy = 0.0
-    for i in range(8):
-        force[i, 0] += xx * g[i, 0] + xy * g[i, 1] + xz * g[i, 2]
-        force[i, 1] += yx * g[i, 0] + yy * g[i, 1] + yz * g[i, 2]
-        force[i, 2] += zx * g[i, 0] + zy * g[i, 1] + zz * g[i, 2]
-        energy += force[i, 0] * u[i, 0] + force[i, 1] * u[i, 1] + force[i, 2] * u[i, 2]
+        force[0, i] += xx * g[0, i] + xy * g[1, i] + xz * g[2, i]
+        force[1, i] += yx * g[0, i] + yy * g[1, i] + yz * g[2, i]
+        force[2, i] += zx * g[0, i] + zy * g[1, i] + zz * g[2, i]
+    energy = _along(force[0], u[0]) + _along(force[1], u[1]) + _along(force[2], u[2])
     return max(energy, 0.0)
 
 
@@ -233,21 +240,24 @@ def shear_forces(
     """Return K_d u (k, 24) and the equivalent strain (k,), e² = uᵀ K_d u / (3 V), of cells.
 
     Args:
-        corners: (c, 8, 3) m.
-        gradients: (c, 8, 3) mean gradients, 1/m.
+        corners: (c, 3, 8) m.
+        gradients: (c, 3, 8) mean gradients, 1/m.
         volumes: (c,) m³.
-        springs: (28,) m.
+        springs: (8, 8) m.
         nodes: (c, 8) of the cells.
         chosen: (k,) cells.
         displacement: (n, 3) m.
     """
     forces, strains = np.empty((len(chosen), 24)), np.empty(len(chosen))
-    u, rest = np.empty((8, 3)), np.empty((8, 3))
+    u, rest, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))
     for k in range(len(chosen)):
-        cell, force = chosen[k], forces[k].reshape(8, 3)
+        cell = chosen[k]
         x, g, volume = corners[cell], gradients[cell], volumes[cell]
         energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, rest, force)
         strains[k] = np.sqrt(energy / (3 * volume))
+        for i in range(8):
+            for a in range(3):
+                forces[k, 3 * i + a] = force[a, i]
     return forces, strains
 
 
@@ -272,10 +282,10 @@ def softened_forces(
     See `shear_forces`.
 
     Args:
-        corners: (c, 8, 3) m.
-        gradients: (c, 8, 3) 1/m.
+        corners: (c, 3, 8) m.
+        gradients: (c, 3, 8) 1/m.
         volumes: (c,) m³.
-        springs: (28,) m.
+        springs: (8, 8) m.
         shear_modulus: mu, Pa.
         knots: (q,) e between which 3 mu_s e is cubic.
         cubic: (4, q - 1) its coefficients, the highest power first.
@@ -286,9 +296,9 @@ def softened_forces(
         forces: (k, 24).
         lost: (k,).
     """
-    u, rest = np.empty((8, 3)), np.empty((8, 3))
+    u, rest, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))
     for k in range(len(chosen)):
-        cell, force = chosen[k], forces[k].reshape(8, 3)
+        cell = chosen[k]
         x, g, volume = corners[cell], gradients[cell], volumes[cell]
         energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, rest, force)
         strain = min(max(np.sqrt(energy / (3 * volume)), least), knots[-1])
@@ -298,5 +308,6 @@ def softened_forces(
         softened = shear_modulus - stress / (3 * strain)
         slope = (3 * cubic[0, part] * y + 2 * cubic[1, part]) * y + cubic[2, part]
         lost[k] = 1 - slope / (3 * shear_modulus)
-        for i in range(24):
-            forces[k, i] *= softened
+        for i in range(8):
+            for a in range(3):
+                forces[k, 3 * i + a] = softened * force[a, i]
