@@ -1,5 +1,7 @@
 """Contact of the calibrated lattice: Hertz, conservation, Newton as reference, extremes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,10 +10,12 @@ from layer_contact import sphere_on_layer
 from tkamb.contact.lattice import model as lattice_model
 from tkamb.contact.lattice import solver
 from tkamb.contact.lattice.active_set import solve_contact
+from tkamb.contact.lattice.problem import tangent_planes
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
 from tkamb.geometry.frames import knee_pose
+from tkamb.studies.extremes import extremes
 from tkamb.testing import check_contact_model
 
 E, NU, RADIUS = 561.5e6, 0.45, 22e-3
@@ -127,15 +131,69 @@ def test_a_contact_that_grows_is_solved_again_only_for_nodes_that_it_touches(nam
         return model.press(state, load, pose, guess), len(begun)
 
     light, _ = pressed(800.0)
-    for load, times in ((1100.0, 1), (4000.0, 2)):
+    for load, again in ((1100.0, False), (4000.0, True)):
         alone, _ = pressed(load)
         after, solved = pressed(load, light)
-        assert solved >= 2 if times == 2 else solved == 1
+        assert (solved > 1) is again
         assert after.approach == pytest.approx(alone.approach, rel=1e-3)
         assert after.pressure == pytest.approx(alone.pressure, abs=2e-3 * alone.pressure.max())
     monkeypatch.setattr(lattice_model, "_others_clear", lambda *given: True)
     wrong, _ = pressed(4000.0, light)
     assert wrong.approach > 1.02 * alone.approach
+
+
+def test_newton_is_not_asked_about_a_contact_that_has_outgrown_its_candidates(monkeypatch):
+    """It is solved again with more of them first, and the answer is that of the load alone."""
+    model = contact_model("lattice", 2.0)
+    state = model.prepare(pair(condyles(subdivisions=4), dished_insert(cells=24), POLYETHYLENE))
+    pose = knee_pose([1e-3, 0.0, 0.3e-3, 0.0, 0.0, 0.0])
+    alone, light = model.press(state, 4000.0, pose), model.press(state, 800.0, pose)
+    solve, given = lattice_model.solve, []
+
+    def swinging_at_first(*guess):
+        given.append(guess)
+        found = solve(*guess)
+        if len(given) > 1:
+            return found
+        return replace(found, forces=replace(found.forces, converged=False), balanced=False)
+
+    def asked(*guess):
+        raise AssertionError("Newton's method was asked")
+
+    monkeypatch.setattr(lattice_model, "solve", swinging_at_first)
+    monkeypatch.setattr(lattice_model, "solve_by_newton", asked)
+    after = model.press(state, 4000.0, pose, light)
+    assert after.status is ContactStatus.OK and len(given) > 1
+    assert after.approach == pytest.approx(alone.approach, rel=1e-3)
+    given.clear()
+    with pytest.raises(AssertionError, match="was asked"):
+        model.press(state, 4000.0, pose, alone)
+
+
+def test_active_nodes_come_to_rest_within_a_quarter_of_the_tolerance(monkeypatch):
+    """Of what they move, by rays fired anew, on a rough femoral component; the last pass aside."""
+    label = "load_N=20000.0, rough_mm=0.01"
+    rough = next(x for x in extremes() if (x.model, x.label) == ("lattice", label))
+
+    def farthest(tolerance):
+        """Return the share of the tolerance and the passes."""
+        model = contact_model("lattice", rough.resolution_mm, tolerance=tolerance)
+        state = model.prepare(rough.pair)
+        found = model.press(state, 15e3, rough.pose)
+        assert found.status is ContactStatus.OK and found.warm_start is not None
+        touching = found.pressure > 0
+        moved = found.warm_start.moved[touching]
+        there = state.problem.surface_points[touching] + moved
+        gap = tangent_planes(state.problem, there, found.pose, None).gap(there)
+        return np.abs(gap).max() / np.abs(moved).max() / tolerance, found.iterations
+
+    share, passes = farthest(5e-4)
+    assert share < 0.25 and passes < 40
+    share, passes = farthest(2e-4)
+    assert 0.25 < share < 1.0 and passes == 40
+    monkeypatch.setattr(solver, "AT_REST", 1.0)
+    share, passes = farthest(5e-4)
+    assert 0.25 < share < 1.0 and passes < 40
 
 
 @pytest.mark.parametrize("cause", ["surface", "forces"])

@@ -132,3 +132,6 @@ def test_linear_material_loses_nothing():
     for solid in SOLIDS:
         made = solid(nodes, cells, edges, material("polyethylene-linear"))
         assert not made.residual_force(np.ones_like(nodes)).any()
+        lost = np.full(len(cells), np.nan)
+        assert not made.nonlinear_residual(np.ones_like(nodes), None, lost).any()
+        assert not lost.any()

@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 
 from lattice_bodies import condyles, dished_insert, pair
-from tkamb.contact.lattice import solver
+from tkamb.contact.lattice import nonlinear_balance
 from tkamb.contact.lattice.initial_guess import WarmStart, initial_guess
 from tkamb.contact.lattice.linear import compliance, response
 from tkamb.contact.lattice.linear.compliance import ComplianceCache, by_component
 from tkamb.contact.lattice.linear.response import unknowns_of
 from tkamb.contact.lattice.model import warm_start_of
+from tkamb.contact.lattice.nonlinear_balance import elements_that_count
 from tkamb.contact.lattice.problem import Region, undeformed
 from tkamb.contact.lattice.solids.solid import SMALL_STRAIN, Noticed
-from tkamb.contact.lattice.solver import Tolerance, elements_that_count, solve
+from tkamb.contact.lattice.solver import Tolerance, solve
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult
@@ -97,13 +98,13 @@ def test_what_the_last_contact_leaves_is_foreseen(tight, monkeypatch):
     """Never more than said; were next to nothing foreseen, more than the tolerance."""
 
     def along_a_way(share):
-        monkeypatch.setattr(solver, "LEFT", share * left)
+        monkeypatch.setattr(nonlinear_balance, "LEFT", share * left)
         solutions = [solved(tight, 0.0, 1e-4)]
         for x in 0.15e-3 * np.arange(1, 9) ** 1.5:
             solutions.append(solved(tight, x, 1e-4, solutions[-1]))
         return [(imbalance(tight, one), one.residual) for one in solutions[1:]]
 
-    left = solver.LEFT
+    left = nonlinear_balance.LEFT
     for found, said in along_a_way(1.0):
         assert found <= 1.05 * said <= 1.05e-4
     assert max(along_a_way(0.01))[0] > 5e-4
@@ -113,16 +114,15 @@ def test_what_softened_elements_will_ask_for_saves_passes(tight, monkeypatch):
     """And without it, or with much more, the same is found."""
 
     def along_a_way(times):
-        monkeypatch.setattr(solver, "FURTHER", times * further)
+        monkeypatch.setattr(nonlinear_balance, "FURTHER", times * further)
         solutions = [solved(tight, 0.0, 1e-4)]
         for x in 0.1e-3 * np.arange(1, 9):
             solutions.append(solved(tight, x, 1e-4, solutions[-1]))
         return solutions
 
-    further = solver.FURTHER
+    further = nonlinear_balance.FURTHER
     now, without, too_much = (along_a_way(times) for times in (1.0, 0.0, 4.0))
     passes = [sum(one.passes for one in found) for found in (now, without, too_much)]
-    print(passes)
     assert passes[0] < min(passes[1:])
     for one, same, again in zip(now, without, too_much, strict=True):
         found = [x.forces.approach for x in (same, again)]
@@ -202,7 +202,7 @@ def test_a_region_may_become_the_whole_solid(state, monkeypatch):
     sizes = np.linalg.norm(state.problem.solid.nonlinear_residual(cold.field), axis=1)
     few = Region.of(state.problem, np.sort(np.argsort(sizes)[-40:]))
     everything = Noticed(np.arange(len(sizes)), np.zeros(len(sizes)))
-    monkeypatch.setattr(solver, "SHARE", 0.0)
+    monkeypatch.setattr(nonlinear_balance, "SHARE", 0.0)
     monkeypatch.setattr(type(state.problem.solid), "noticeable", lambda *given: everything)
     found = solved(state, 0.4e-3, 1e-3, replace(cold, region=few))
     assert found.region.whole and found.converged and found.passes > 1

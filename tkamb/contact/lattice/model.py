@@ -68,8 +68,9 @@ class CellContact(ContactModel):
 
     Args:
         resolution: m, edge of the cells.
-        tolerance: largest out-of-balance force relative to the contact force, and largest
-            distance of an active node from the femoral surface relative to its displacement.
+        tolerance: largest out-of-balance force relative to the contact force, and four times the
+            largest distance of an active node from the femoral surface relative to its
+            displacement.
         pressure_rule: "tributary" (force over the node's own area) or "source" (force over
             total area by number of nodes, Sharma 2008, section 4.5.6).
         newton: solve by full Newton steps (slow; the reference).
@@ -228,9 +229,10 @@ class CellContact(ContactModel):
             start = initial_guess(
                 state.compliance, gaps, planes, depth, load is None, touched, warm, unseen
             )
-            solution = self._solution(state.problem, pose, load, start, tolerance)
-            covered = load is None or len(start.candidates) == np.isfinite(gaps).sum()
             below = -min(float(gaps.min()), 0.0)
+            most = load is None or len(start.candidates) == np.isfinite(gaps).sum()
+            within = np.inf if most else (start.reach - below) / REACH
+            solution = self._solution(state.problem, pose, load, start, tolerance, within)
             reached = solution.forces.approach * REACH + below
             if solution.converged:
                 moved = np.zeros_like(state.surface.points)
@@ -244,10 +246,8 @@ class CellContact(ContactModel):
                     pose, looked, None if last is None else replace(last, before=None),
                     solution.half, solution.left,
                 )  # fmt: skip
-            if (
-                covered
-                or reached <= start.reach
-                or _others_clear(state, pose, gaps <= reached, solution)
+            if solution.forces.approach <= within or _others_clear(
+                state, pose, gaps <= reached, solution
             ):
                 rule = self.pressure_rule
                 result = result_of(state, pose, load, gaps, solution, rule, sketch)
@@ -265,15 +265,19 @@ class CellContact(ContactModel):
         load: float | None,
         guess: InitialGuess,
         tolerance: Tolerance,
+        within: float,
     ) -> Solution:
         """Solve by the stored response; by Newton's method when that leaves forces out of balance.
 
-        A femoral surface on which nodes come to no rest stays that to Newton's method.
+        A femoral surface on which nodes come to no rest stays that to Newton's method, and an
+        approach beyond `within`, m, is solved again with more candidates.
         """
         if self.newton:
             return solve_by_newton(problem, pose, load, guess, tolerance)
         solution = solve(problem, pose, load, guess, tolerance)
         if solution.converged or solution.balanced or problem.solid.material.is_linear:
+            return solution
+        if not solution.forces.approach <= within:
             return solution
         try:
             return solve_by_newton(problem, pose, load, guess, tolerance, solution.field)
@@ -350,12 +354,10 @@ def _others_clear(state: LatticeState, pose: Array, near: Mask, solution: Soluti
     """
     if not (solution.converged and solution.seen):
         return False
-    others, force = near.copy(), np.zeros_like(state.surface.points)
+    others, there = near.copy(), pose.copy()
     others[solution.candidates] = False
-    force[solution.candidates] = solution.forces.force[:, None] * solution.planes.normals
-    there = pose.copy()
     there[1, 3] -= solution.forces.approach
-    return bool((gaps_of_others(state, there, np.flatnonzero(others), force, solution) > 0).all())
+    return bool((gaps_of_others(state, there, np.flatnonzero(others), solution) > 0).all())
 
 
 def _rehearse(problem: ContactProblem, pair: ContactPair) -> None:

@@ -54,7 +54,7 @@ def solve_by_newton(
         active = forces.active
         residual = _imbalance(problem, nodes, u, forces.force[:, None] * planes.normals)
         missed = sliding.follow(u[nodes], forces)
-        done = max(residual, missed) <= tolerance.force
+        done = residual <= tolerance.force and tolerance.at_rest(missed, steps == MOST_STEPS)
         if done or steps == MOST_STEPS:
             forces = replace(forces, converged=done and forces.converged)
             h = solid.residual_force(u)

@@ -110,20 +110,19 @@ def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution:
     close[own] = False
     rest = np.flatnonzero(close)
     if rest.size:
-        gap[rest] = gaps_of_others(state, pose, rest, force, solution)
+        gap[rest] = gaps_of_others(state, pose, rest, solution)
     return gap
 
 
-def gaps_of_others(
-    state: LatticeState, pose: Array, nodes: Index, force: Array, solution: Solution
-) -> Array:
+def gaps_of_others(state: LatticeState, pose: Array, nodes: Index, solution: Solution) -> Array:
     """Return the gaps (m,), m, of deformed nodes that are no candidates; inf: nothing above."""
     problem = state.problem
     if solution.field is not None:
         moved = solution.field[problem.contact_nodes[nodes]]
     else:
-        pushed = np.flatnonzero(force.any(axis=1))
-        moved = state.compliance.moved(nodes, pushed, force[pushed])
+        loaded = solution.forces.force != 0.0
+        force = solution.forces.force[loaded, None] * solution.planes.normals[loaded]
+        moved = state.compliance.moved(nodes, solution.candidates[loaded], force)
     positions = problem.surface_points[nodes] + moved
     planes = tangent_planes(problem, positions, pose, None)
     return np.where(planes.normal_y < LEAST_NORMAL_Y, planes.gap(positions), np.inf)

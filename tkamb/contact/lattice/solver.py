@@ -3,16 +3,9 @@
 Every pass fires the rays through the displaced contact nodes, solves the unilateral contact
 on the stored compliance of the linear operator (approach included), finds the displacement of
 all nodes, and renews the nonlinear residual h, what the material carries less than the linear
-one:
-
-    K u = f_contact + h,    h = K u - f_internal(u)
-
-h is accelerated by Anderson's method; its change is the out-of-balance force. An element's
-share of h falls with a power of its strain (4.5 for polyethylene), so most of the insert is as
-good as linear: passes look at the `Region` where it counts, and at everything once, at the end.
-The contact under the h that this last look asks for ends the iteration: what it leaves out of
-balance is foreseen from what passes leave of it, not looked at again.
-For a linear material h = 0 and the pass is repeated only until the sliding nodes rest.
+one (`NonlinearBalance`). The contact under the h that the last look at all elements asks for ends
+the iteration. For a linear material h = 0 and the pass is repeated only until the sliding nodes
+rest.
 """
 
 from dataclasses import dataclass, replace
@@ -20,28 +13,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tkamb.contact.lattice.active_set import ContactForces, solve_contact
-from tkamb.contact.lattice.anderson import AndersonMixer
 from tkamb.contact.lattice.initial_guess import NOT_KNOWN, InitialGuess, Left
 from tkamb.contact.lattice.linear.compliance import ContactResponse
+from tkamb.contact.lattice.nonlinear_balance import NonlinearBalance
 from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes, tangent_planes
 from tkamb.contact.lattice.solids.solid import Noticed
 from tkamb.geometry.frames import Array, Index, Mask
 
 DIVERGED = 100.0
 """The iteration is given up when the imbalance is this many times the smallest so far."""
-SHARE = 0.1
-"""What elements left out may add to the imbalance, relative to the tolerance."""
-PASSED_OVER = 0.03
-"""And what those may that a bound of their strain passes over, when all are looked at."""
-LEFT = 2.5
-"""Times what passes left of the imbalance before, the next may leave of it. What is then foreseen
-is 1.0 to 7 times what is found (docs/lattice.md)."""
-OLDER = 1.1
-"""And so many times more with every solution since in which it was not measured."""
-KEPT = 0.8
-"""Share of what passes left before that counts where the last solution measured less."""
-FURTHER = 0.4
-"""Of a change of h and of the stiffness that is lost there: what the next pass would add to it."""
+AT_REST = 0.25
+"""Of the tolerance: so far may active nodes be from the femoral surface. At a rim, where its normal
+turns, a peak is off by up to three times as much."""
 SLOW = 0.7
 """When a pass leaves more than this share of the last distance, sliding steps are halved."""
 SMALLEST_SHARE = 0.125
@@ -58,6 +41,15 @@ class Tolerance:
 
     force: float = 1e-3
     passes: int = 40
+
+    def at_rest(self, missed: float, last: bool) -> bool:
+        """Say whether active nodes are near enough to the femoral surface.
+
+        Args:
+            missed: largest distance, relative to what nodes move.
+            last: it is the last pass: what comes to rest slowly is held to the whole tolerance.
+        """
+        return missed <= (self.force if last else AT_REST * self.force)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,13 +126,15 @@ def solve(
         active = forces.active
         missed = sliding.follow(moved, forces)
         residual = max(balance.foreseen, missed)
-        done = residual <= tolerance.force
+        at_rest = tolerance.at_rest(missed, passes == tolerance.passes)
+        done = residual <= tolerance.force and at_rest
         if not done:
             passes += 1
             balance.respond(forces.force[:, None] * planes.normals)
             if balance.foreseen <= tolerance.force and balance.size > guess.unseen:
                 balance.look_everywhere()
             residual = max(balance.residual, missed)
+            balanced = balanced or balance.residual <= tolerance.force
         now = Solution(
             chosen,
             replace(forces, converged=done and forces.converged),
@@ -155,7 +149,7 @@ def solve(
             balance.noticed,
             balance.half,
             balance.left,
-            balanced := balanced or balance.residual <= tolerance.force,
+            balanced,
         )
         if done:
             return now
@@ -218,188 +212,10 @@ def _solve_linear(
         forces, moved = solve_pass(guess.response, offset, points, planes, load, active)
         active = forces.active
         missed = sliding.follow(moved, forces)
-        done = missed <= tolerance.force
+        done = tolerance.at_rest(missed, passes == tolerance.passes)
         if done or passes == tolerance.passes:
             forces = replace(forces, converged=done and forces.converged)
             return Solution(guess.candidates, forces, planes, moved, None, None, passes, missed)
-
-
-class NonlinearBalance:
-    """One solution's nonlinear residual h, brought into balance with what it causes.
-
-    A pass looks at the region where h counts; `look_everywhere` at the rest.
-
-    Args:
-        problem: solid and operator.
-        guess: response of the candidates; h of an earlier solution and its region.
-        tolerance: largest imbalance relative to the contact forces.
-
-    Attributes:
-        h: (n, 3) N, what the last pass asks for.
-        region: outside of which it is zero.
-        offset: (m, 3) m, displacement of the candidates without contact forces.
-        field: (n, 3) m, displacement of the nodes looked at, 0 elsewhere.
-        residual: imbalance of the elements looked at, relative to the contact forces.
-        foreseen: imbalance that contact forces under h would leave, relative.
-        half: L⁻¹ h in elimination order.
-        size: N, norm of the contact forces.
-        noticed: elements but which the bound passed over in the last look at all, or None.
-    """
-
-    def __init__(self, problem: ContactProblem, guess: InitialGuess, tolerance: float) -> None:
-        self._problem, self._response, self._tolerance = problem, guess.response, tolerance
-        self.region = problem.everywhere if guess.region is None else guess.region
-        self.noticed: Noticed | None = None
-        self._earlier, self._left = guess.left, list[float]()
-        self.foreseen, self._last = np.inf, np.nan
-        self._mixer = AndersonMixer()
-        if guess.nonlinear_residual is not None and guess.half is not None:
-            self.h = guess.nonlinear_residual
-            self._begin(guess.half)
-            return
-        self.h = np.zeros_like(problem.solid.nodes)
-        if guess.nonlinear_residual is not None:
-            self.h[self.region.nodes] = guess.nonlinear_residual[self.region.nodes]
-        self._begin(problem.operator.start(self.h, self.region.fronts))
-
-    def respond(self, pushed: Array) -> None:
-        """Work out displacements and imbalance of the region under contact forces (m, 3), N."""
-        operator, region = self._problem.operator, self.region
-        self.size = max(float(np.linalg.norm(pushed)), 1e-300)
-        self._x = self.half.copy()
-        self._response.push(pushed, self._x)
-        operator.factor.backward(self._x, region.fronts)
-        self.field = np.zeros_like(self.h)
-        self.field[region.nodes] = operator.nodal(self._x, region.nodes)
-        if region.whole:
-            self._look_at_all(None)
-        else:
-            self._look(region)
-        if np.isfinite(self._last):
-            self._left.append(self.residual / self._last)
-        self._foresee()
-
-    def look_everywhere(self) -> None:
-        """Look at the rest of the solid, for the residual and the field of all of it."""
-        region, operator = self.region, self._problem.operator
-        if self._narrowed:
-            return
-        factor, every = operator.factor, self._problem.everywhere.fronts.fronts
-        rest = np.setdiff1d(every, region.fronts.fronts, assume_unique=True)
-        factor.backward(self._x, factor.shared(rest))
-        self.field = operator.nodal(self._x)
-        self._look_at_all((region.elements, self._shares, self._lost))
-        self._foresee()
-
-    def advance(self) -> None:
-        """Take the next h."""
-        nodes = self.region.nodes
-        if self._narrowed:  # another set of unknowns: earlier differences do not apply
-            self._mixer = AndersonMixer()
-        mixed = self._mixer.next(self._taken[nodes].ravel(), self._expected(nodes).ravel())
-        self.h = np.zeros_like(self.h)
-        self.h[nodes] = mixed.reshape(-1, 3)
-        self._begin(self._problem.operator.start(self.h, self.region.fronts))
-
-    def _expected(self, nodes: Index) -> Array:
-        """Return what nodes (m, 3) will ask for when they are given what they now ask for, N.
-
-        Elements that have lost stiffness strain more under what they ask for, and ask for more:
-        h at a node goes on by `FURTHER` of its last change and of its elements' lost stiffness.
-        """
-        scatter, shares = self._problem.solid.scatter, self._shares
-        further = FURTHER * scatter.mean(self._lost, shares, self.region.elements)[nodes, None]
-        return self.h[nodes] + further * (self.h[nodes] - self._taken[nodes])
-
-    def _begin(self, half: Array) -> None:
-        """Take h with L⁻¹ of it."""
-        self._taken, self.half, self._narrowed = self.h, half, False
-        self.offset = self._response.displacement(half)
-
-    def _foresee(self) -> None:
-        """Foresee what a contact under the h asked for leaves of the imbalance."""
-        self._last, left = self.residual, self.left
-        share = (left.later or left.first) if self._left else left.first
-        if share is not None:
-            left_over = LEFT * share * self.residual + SHARE * self._tolerance
-            self.foreseen = min(left_over, self.residual)
-        else:
-            self.foreseen = self.residual
-
-    @property
-    def left(self) -> Left:
-        """Shares that passes left here, or where there were none, a bit more than before."""
-        return Left(
-            _most(self._left[:1], self._earlier.first), _most(self._left[1:], self._earlier.later)
-        )
-
-    def _look(self, region: Region) -> None:
-        """Find the imbalance of a region."""
-        solid = self._problem.solid
-        self._lost = np.empty(len(region.elements))
-        self._shares = solid.nonlinear_residual(self.field, region.elements, self._lost)
-        self.h = self._summed(self._shares, region.elements)
-        self.residual = float(np.linalg.norm(self.h - self._taken)) / self.size
-
-    def _look_at_all(self, known: tuple[Index, Array, Array] | None) -> None:
-        """Find the imbalance of all elements, and which count.
-
-        Args:
-            known: some elements (k,), their shares (k, 3p) of this field, N, and what they have
-                lost of their stiffness (k,); or None.
-        """
-        solid, everywhere = self._problem.solid, self._problem.everywhere.elements
-        allowed = PASSED_OVER * self._tolerance * self.size
-        self.noticed = solid.noticeable(self.field, allowed / np.sqrt(len(everywhere)))
-        elements = everywhere
-        if self.noticed is not None:
-            left = np.zeros(len(everywhere), bool)
-            left[self.noticed.elements] = True
-            if known is not None:
-                left[known[0]] = False
-            elements = np.flatnonzero(left)
-        lost = np.empty(len(elements))
-        shares = solid.nonlinear_residual(self.field, elements, lost)
-        if self.noticed is not None and known is not None:
-            elements, lost = np.concatenate([known[0], elements]), np.concatenate([known[2], lost])
-            shares = np.vstack([known[1], shares])
-        size = np.sqrt(np.einsum("ij,ij->i", shares, shares))
-        counts = elements_that_count(size, SHARE * self._tolerance * self.size)
-        which = np.flatnonzero(counts)
-        which = which[np.argsort(elements[which])]
-        self.region = Region.of(self._problem, elements[which])
-        self._shares, self._lost = shares[which], lost[which]
-        self.h = self._summed(shares, elements, which)
-        asked = self.h + self._summed(shares, elements, np.flatnonzero(~counts))
-        self.residual = float(np.linalg.norm(asked - self._taken)) / self.size
-        self._narrowed = True
-
-    def _summed(self, forces: Array, elements: Index, which: Index | None = None) -> Array:
-        value = self._problem.solid.scatter.sum(forces, elements, which)
-        value.ravel()[self._problem.held_unknowns] = 0.0
-        return value
-
-
-def _most(measured: list[float], earlier: float | None) -> float | None:
-    """Return the most of what was measured and of what was so before, by now; None: nothing."""
-    before = [] if earlier is None else [earlier * (KEPT if measured else OLDER)]
-    return max(measured + before, default=None)
-
-
-def elements_that_count(size: Array, allowed: float) -> Mask:
-    """Return which elements (c,) count: all but the smallest, which together are below a bound.
-
-    Args:
-        size: (c,) norm of each element's share of h, N.
-        allowed: N, root of the sum of squares of those left out.
-    """
-    surely = size <= allowed / np.sqrt(max(len(size), 1))  # even if all were as large
-    others = np.flatnonzero(~surely)
-    order = others[np.argsort(size[others])]
-    total = (size[surely] ** 2).sum() + np.cumsum(size[order] ** 2)
-    counts = np.zeros(len(size), bool)
-    counts[order[np.searchsorted(total, allowed**2, side="right") :]] = True
-    return counts
 
 
 class SlidingNodes:

@@ -146,11 +146,12 @@ class CalibratedNetwork(Solid):
     ) -> Array:
         """Return (mu - mu_s) K_d u of the cells, N, (k, 24); see `Solid`."""
         cells = np.arange(len(self.cells)) if chosen is None else chosen
+        lost = np.empty(len(cells)) if lost is None else lost
         if self.curve.spline is None:
+            lost[:] = 0.0
             return np.zeros((len(cells), 24))
         curve = self.curve.shear_modulus, self.curve.spline.x, self.curve.spline.c, LEAST_STRAIN
         forces = np.empty((len(cells), 24))
-        lost = np.empty(len(cells)) if lost is None else lost
 
         def softened(some: slice) -> None:
             shapes, where = self._shapes, (self.cells, cells[some], displacement)

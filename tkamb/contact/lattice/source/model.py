@@ -81,10 +81,11 @@ class SourceLattice(CellContact):
         load: float | None,
         guess: InitialGuess,
         tolerance: Tolerance,
+        within: float,
     ) -> Solution:
         if self.loops == "source":
             return solve_by_loops(problem, pose, load, guess, tolerance)
-        return super()._solution(problem, pose, load, guess, tolerance)
+        return super()._solution(problem, pose, load, guess, tolerance, within)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +127,7 @@ def solve_by_loops(
         opening = np.where(active, 0.0, planes.gap(points + moved) - depth)
         force = np.where(active, np.maximum(pressed.force, 0), 0.0)
         forces = ContactForces(force, opening, depth, active, loops, True)
-        settled = sliding.follow(moved, forces) <= tolerance.force
+        settled = tolerance.at_rest(sliding.follow(moved, forces), loops == MOST_LOOPS)
         still = bool((changed == active).all())
         done = still and settled and max(missed, pressed.residual) <= tolerance.force
         if done or loops == MOST_LOOPS:
