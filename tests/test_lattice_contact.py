@@ -8,7 +8,7 @@ import pytest
 from lattice_bodies import above, box_insert, condyles, dished_insert, pair, plate, sphere_cap
 from layer_contact import sphere_on_layer
 from tkamb.contact.lattice import model as lattice_model
-from tkamb.contact.lattice import solver
+from tkamb.contact.lattice import nonlinear_balance, solver
 from tkamb.contact.lattice.active_set import solve_contact
 from tkamb.contact.lattice.problem import tangent_planes
 from tkamb.contact.materials import material
@@ -194,6 +194,29 @@ def test_active_nodes_come_to_rest_within_a_quarter_of_the_tolerance(monkeypatch
     monkeypatch.setattr(solver, "AT_REST", 1.0)
     share, passes = farthest(5e-4)
     assert 0.25 < share < 1.0 and passes < 40
+
+
+def test_a_contact_that_has_softened_is_held_closer(monkeypatch):
+    """Approach and peak of heavy loads against a solution to 1e-5, from rest and from others."""
+    bodies = pair(condyles(subdivisions=4), dished_insert(cells=24), POLYETHYLENE)
+    pose = knee_pose([1e-3, 0.0, 0.3e-3, 0.0, 0.0, 0.0])
+    model, fine = (contact_model("lattice", 2.0, tolerance=x) for x in (1e-3, 1e-5))
+    state, exact = model.prepare(bodies), fine.prepare(bodies)
+    wanted = {load: fine.press(exact, load, pose) for load in (8e3, 16e3)}
+    starts = {load: model.press(state, load, pose) for load in (800.0, 15e3)}
+
+    def errors(load, start=None):
+        found = model.press(state, load, pose, starts.get(start))
+        assert found.status is ContactStatus.OK
+        approach = found.approach / wanted[load].approach - 1
+        return abs(approach), abs(found.pressure.max() / wanted[load].pressure.max() - 1)
+
+    ways = [(8e3, None), (8e3, 800.0), (16e3, None), (16e3, 800.0), (16e3, 15e3)]
+    for way in ways:
+        approach, peak = errors(*way)
+        assert approach < 5e-4 and peak < 1e-3, way
+    monkeypatch.setattr(nonlinear_balance, "SOFT", 1.0)  # an imbalance counts the same everywhere
+    assert max(errors(*way)[0] for way in ways) > 1.5e-3
 
 
 @pytest.mark.parametrize("cause", ["surface", "forces"])

@@ -12,6 +12,7 @@ from tkamb.contact.lattice.active_set import ContactForces
 from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.linear.compliance import ContactResponse
 from tkamb.contact.lattice.linear.operator import prepare_operator
+from tkamb.contact.lattice.nonlinear_balance import norms, weight_of
 from tkamb.contact.lattice.problem import ContactProblem, TangentPlanes
 from tkamb.contact.lattice.solver import SlidingNodes, Solution, Tolerance, solve_pass
 from tkamb.errors import ComputationError
@@ -53,9 +54,12 @@ def solve_by_newton(
         u = u + step * (u_full - u)
         active = forces.active
         residual = _imbalance(problem, nodes, u, forces.force[:, None] * planes.normals)
-        missed = sliding.follow(u[nodes], forces)
-        done = residual <= tolerance.force and tolerance.at_rest(missed, steps == MOST_STEPS)
-        if done or steps == MOST_STEPS:
+        lost = np.empty(len(problem.everywhere.elements))
+        weight = weight_of(norms(solid.nonlinear_residual(u, None, lost)), lost)
+        missed, ends = sliding.follow(u[nodes], forces), steps == MOST_STEPS
+        allowed = tolerance.force if ends else tolerance.force / weight
+        done = residual <= allowed and tolerance.at_rest(missed, ends)
+        if done or ends:
             forces = replace(forces, converged=done and forces.converged)
             h = solid.residual_force(u)
             h[problem.held.reshape(-1, 3)] = 0.0

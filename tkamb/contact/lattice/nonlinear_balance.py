@@ -32,6 +32,11 @@ FURTHER = 0.4
 """Of a change of h and of the stiffness that is lost there: what the next pass would add to it."""
 
 
+SOFT = 0.65
+"""Share of its stiffness that a contact may have lost, in the mean, before imbalance counts more:
+real knees' (polyethylene, body weights) stay below."""
+
+
 class NonlinearBalance:
     """One solution's nonlinear residual h, brought into balance with what it causes.
 
@@ -49,6 +54,7 @@ class NonlinearBalance:
         field: (n, 3) m, displacement of the nodes looked at, 0 elsewhere.
         residual: imbalance of the elements looked at, relative to the contact forces.
         foreseen: imbalance that contact forces under h would leave, relative.
+        weight: how much more an imbalance counts, by the stiffness that the contact has lost.
         half: L⁻¹ h in elimination order.
         size: N, norm of the contact forces.
         noticed: elements but which the bound passed over in the last look at all, or None.
@@ -60,7 +66,7 @@ class NonlinearBalance:
         self.noticed: Noticed | None = None
         self._earlier, self._left = guess.left, list[float]()
         self.foreseen, self._last = np.inf, np.nan
-        self._mixer = AndersonMixer()
+        self._mixer, self.weight = AndersonMixer(), 1.0
         if guess.nonlinear_residual is not None and guess.half is not None:
             self.h = guess.nonlinear_residual
             self._begin(guess.half)
@@ -145,6 +151,7 @@ class NonlinearBalance:
         solid = self._problem.solid
         self._lost = np.empty(len(region.elements))
         self._shares = solid.nonlinear_residual(self.field, region.elements, self._lost)
+        self.weight = weight_of(norms(self._shares), self._lost)
         self.h = self._summed(self._shares, region.elements)
         self.residual = float(np.linalg.norm(self.h - self._taken)) / self.size
 
@@ -170,8 +177,9 @@ class NonlinearBalance:
         if self.noticed is not None and known is not None:
             elements, lost = np.concatenate([known[0], elements]), np.concatenate([known[2], lost])
             shares = np.vstack([known[1], shares])
-        size = np.sqrt(np.einsum("ij,ij->i", shares, shares))
-        counts = elements_that_count(size, SHARE * self._tolerance * self.size)
+        size = norms(shares)
+        self.weight = weight_of(size, lost)
+        counts = elements_that_count(size, SHARE * self._tolerance * self.size / self.weight)
         which = np.flatnonzero(counts)
         which = which[np.argsort(elements[which])]
         self.region = Region.of(self._problem, elements[which])
@@ -185,6 +193,25 @@ class NonlinearBalance:
         value = self._problem.solid.scatter.sum(forces, elements, which)
         value.ravel()[self._problem.held_unknowns] = 0.0
         return value
+
+
+def norms(shares: Array) -> Array:
+    """Return the norms (k,) of elements' shares of h (k, 3p), N."""
+    return np.sqrt(np.einsum("ij,ij->i", shares, shares))
+
+
+def weight_of(size: Array, lost: Array) -> float:
+    """Return how much more an imbalance counts, 1 or more, where the contact has softened.
+
+    The approach follows an imbalance by the tangent stiffness, and what Anderson's steps leave
+    points one way: beyond `SOFT` the errors grew as the inverse cube of the stiffness left.
+
+    Args:
+        size: (k,) norms of the elements' shares of h.
+        lost: (k,) shares of their tangent stiffness that they have lost.
+    """
+    mean = float(size @ lost) / max(float(size.sum()), 1e-300)
+    return float(max(1.0, (1 - SOFT) / max(1 - mean, 1e-3)) ** 3)
 
 
 def _most(measured: list[float], earlier: float | None) -> float | None:

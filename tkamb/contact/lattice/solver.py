@@ -113,31 +113,13 @@ def solve(
     first = balance.offset if guess.moved is None else guess.moved
     sliding = SlidingNodes(problem, points, first, pose, guess.planes)
     best: Solution | None = None
-    warm = guess.nonlinear_residual is not None
-    while True:
-        planes = sliding.planes
-        forces, moved = solve_pass(guess.response, balance.offset, points, planes, load, active)
-        if warm and not forces.active.any():
-            # What a heavier contact left behind holds the nodes down: begin without it.
-            warm, guess = False, guess.cold
-            balance = NonlinearBalance(problem, guess, tolerance.force)
-            sliding = SlidingNodes(problem, points, balance.offset, pose, guess.planes)
-            continue
-        active = forces.active
-        missed = sliding.follow(moved, forces)
-        residual = max(balance.foreseen, missed)
-        at_rest = tolerance.at_rest(missed, passes == tolerance.passes)
-        done = residual <= tolerance.force and at_rest
-        if not done:
-            passes += 1
-            balance.respond(forces.force[:, None] * planes.normals)
-            if balance.foreseen <= tolerance.force and balance.size > guess.unseen:
-                balance.look_everywhere()
-            residual = max(balance.residual, missed)
-            balanced = balanced or balance.residual <= tolerance.force
-        now = Solution(
+    settled: Solution | None = None
+    warm, enough = guess.nonlinear_residual is not None, tolerance.force
+
+    def found(residual: float, converged: bool) -> Solution:
+        return Solution(
             chosen,
-            replace(forces, converged=done and forces.converged),
+            replace(forces, converged=converged and forces.converged),
             planes,
             moved,
             balance.field,
@@ -151,12 +133,34 @@ def solve(
             balance.left,
             balanced,
         )
-        if done:
-            return now
-        best = now if best is None or residual < best.residual else best
-        last = passes >= tolerance.passes and balance.foreseen > tolerance.force
-        if last or passes > tolerance.passes or not residual < DIVERGED * best.residual:
-            return replace(_given_up(problem, best, passes), balanced=balanced)
+
+    while True:
+        planes = sliding.planes
+        forces, moved = solve_pass(guess.response, balance.offset, points, planes, load, active)
+        if warm and not forces.active.any():
+            # What a heavier contact left behind holds the nodes down: begin without it.
+            warm, guess = False, guess.cold
+            balance = NonlinearBalance(problem, guess, tolerance.force)
+            sliding = SlidingNodes(problem, points, balance.offset, pose, guess.planes)
+            continue
+        active = forces.active
+        missed = sliding.follow(moved, forces)
+        last = passes == tolerance.passes
+        if balance.foreseen <= enough and tolerance.at_rest(missed, last):
+            settled = found(max(balance.foreseen, missed), True)
+            enough = tolerance.force / balance.weight  # a softened contact goes on to this
+            if balance.foreseen <= enough or last:
+                return settled
+        passes += 1
+        balance.respond(forces.force[:, None] * planes.normals)
+        if balance.foreseen <= enough and balance.size > guess.unseen:
+            balance.look_everywhere()
+        balanced = balanced or balance.residual <= tolerance.force
+        now = found(max(balance.residual, missed), False)
+        best = now if best is None or now.residual < best.residual else best
+        spent = passes >= tolerance.passes and balance.foreseen > enough
+        if spent or passes > tolerance.passes or not now.residual < DIVERGED * best.residual:
+            return settled or replace(_given_up(problem, best, passes), balanced=balanced)
         balance.advance()
 
 
