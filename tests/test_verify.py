@@ -72,6 +72,17 @@ CHANGES = [
 ]
 
 
+def test_the_base_that_a_scene_stands_on_is_an_input(tmp_path, capfd):
+    base = write_scene(tmp_path, contact__resolution_mm=3.0, contact__model="foundation")
+    own, out = tmp_path / "own.toml", tmp_path / "out"
+    own.write_text('base = "scene.toml"\n[patient]\nmass_kg = 80.0\n')
+    assert main(["run", str(own), "--out", str(out), "--frames", "0:1"]) == 0
+    assert verified(out, capfd)[0] == 0
+    base.write_text(base.read_text() + "\n# by another hand\n")
+    status, said = verified(out, capfd)
+    assert status != 0 and f"input {base} has changed" in said
+
+
 @pytest.mark.parametrize(("change", "words"), CHANGES)
 def test_what_differs_is_said_by_all_who_read(run, capfd, change, words):
     scene, out = run

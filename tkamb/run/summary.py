@@ -20,7 +20,7 @@ from tkamb.known_errors import as_json, known_error, left_out
 from tkamb.plug_ins import CONTACT_CODE, contact_code
 from tkamb.run.status import FAILED
 from tkamb.scene.case import Case
-from tkamb.scene.scene import Scene
+from tkamb.scene.scene import Scene, scene_files
 from tkamb.scene.tables import ContactTable, MusclesTable
 from tkamb.units import DEGREE, MILLIMETRE
 
@@ -168,8 +168,8 @@ def files_hash(case: Case) -> str:
 
 
 def input_hashes(case: Case, scene: Path | None) -> dict[str, str]:
-    """Return path -> SHA-256 of the scene file, if there is one, and of the files it has read."""
-    paths = [*([] if scene is None else [scene.absolute()]), *_files_read(case)]
+    """Return path -> SHA-256 of the scene file, if there is one, its base and what it has read."""
+    paths = [*([] if scene is None else scene_files(scene.absolute())), *_files_read(case)]
     return {str(path): sha256_of(path) for path in paths}
 
 

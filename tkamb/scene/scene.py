@@ -140,6 +140,12 @@ def load_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> Sce
     return resolved
 
 
+def scene_files(path: Path) -> list[Path]:
+    """Return a scene file that could be read and, if it stands on one, its base."""
+    base = _parse(path).get("base")
+    return [path] if base is None else [path, path.parent / base]
+
+
 def _content(path: Path) -> dict[str, Any]:
     """Return what a scene file says, on top of what its base says."""
     content = _parse(path)
