@@ -230,10 +230,10 @@ class CellContact(ContactModel):
                 state.compliance, gaps, planes, depth, load is None, touched, warm, unseen
             )
             below = -min(float(gaps.min()), 0.0)
-            most = load is None or len(start.candidates) == np.isfinite(gaps).sum()
-            within = np.inf if most else (start.reach - below) / REACH
+            covered = load is None or len(start.candidates) == np.isfinite(gaps).sum()
+            within = np.inf if covered else (start.reach - below) / REACH
             solution = self._solution(state.problem, pose, load, start, tolerance, within)
-            reached = solution.forces.approach * REACH + below
+            outgrown = solution.forces.approach > within
             if solution.converged:
                 moved = np.zeros_like(state.surface.points)
                 moved[solution.candidates] = solution.displacement
@@ -246,9 +246,8 @@ class CellContact(ContactModel):
                     pose, looked, None if last is None else replace(last, before=None),
                     solution.half, solution.left,
                 )  # fmt: skip
-            if solution.forces.approach <= within or _others_clear(
-                state, pose, gaps <= reached, solution
-            ):
+            others = gaps <= solution.forces.approach * REACH + below
+            if not outgrown or _others_clear(state, pose, others, solution):
                 rule = self.pressure_rule
                 result = result_of(state, pose, load, gaps, solution, rule, sketch)
                 if load is not None and not sketch:
@@ -277,7 +276,7 @@ class CellContact(ContactModel):
         solution = solve(problem, pose, load, guess, tolerance)
         if solution.converged or solution.balanced or problem.solid.material.is_linear:
             return solution
-        if not solution.forces.approach <= within:
+        if solution.forces.approach > within:
             return solution
         try:
             return solve_by_newton(problem, pose, load, guess, tolerance, solution.field)

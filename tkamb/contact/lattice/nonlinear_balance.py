@@ -23,18 +23,16 @@ PASSED_OVER = 0.03
 """And what those may that a bound of their strain passes over, when all are looked at."""
 LEFT = 2.5
 """Times what passes left of the imbalance before, the next may leave of it. What is then foreseen
-is 1.0 to 7 times what is found (docs/lattice.md)."""
+is 1.0 to 8.5 times what is found (docs/lattice.md)."""
 OLDER = 1.1
 """And so many times more with every solution since in which it was not measured."""
 KEPT = 0.8
 """Share of what passes left before that counts where the last solution measured less."""
 FURTHER = 0.4
 """Of a change of h and of the stiffness that is lost there: what the next pass would add to it."""
-
-
 SOFT = 0.65
 """Share of its stiffness that a contact may have lost, in the mean, before imbalance counts more:
-real knees' (polyethylene, body weights) stay below."""
+that of knees in daily motions stays below (docs/lattice.md)."""
 
 
 class NonlinearBalance:
@@ -136,7 +134,7 @@ class NonlinearBalance:
         left = self.left
         share = left.first if not self._left or left.later is None else left.later
         if share is not None:
-            leaves = LEFT * share * self.residual + SHARE * self._tolerance
+            leaves = LEFT * share * self.residual + SHARE * self._tolerance / self.weight
             self.foreseen = min(leaves, self.residual)
 
     @property
@@ -163,7 +161,7 @@ class NonlinearBalance:
                 lost of their stiffness (k,); or None.
         """
         solid, everywhere = self._problem.solid, self._problem.everywhere.elements
-        allowed = PASSED_OVER * self._tolerance * self.size
+        allowed = PASSED_OVER * self._tolerance * self.size / self.weight
         self.noticed = solid.noticeable(self.field, allowed / np.sqrt(len(everywhere)))
         elements = everywhere
         if self.noticed is not None:
@@ -203,8 +201,8 @@ def norms(shares: Array) -> Array:
 def weight_of(size: Array, lost: Array) -> float:
     """Return how much more an imbalance counts, 1 or more, where the contact has softened.
 
-    The approach follows an imbalance by the tangent stiffness, and what Anderson's steps leave
-    points one way: beyond `SOFT` the errors grew as the inverse cube of the stiffness left.
+    What passes leave is what they find slowly, the softest of it, and the approach follows it by
+    the tangent stiffness. The cube of that is measured, not proven (docs/lattice.md).
 
     Args:
         size: (k,) norms of the elements' shares of h.
