@@ -18,6 +18,7 @@ from tkamb.export_command import add_export
 from tkamb.guard import guarded, log_to_stderr
 from tkamb.importing.command import add_import
 from tkamb.mesh_command import add_contact, add_mesh, add_no_cache, add_press, without_cache
+from tkamb.run.settings import add_settings
 from tkamb.scene_options import add_scene_options, overrides_of
 from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
@@ -90,6 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     add_wear(commands)
     add_uncertainty(commands)
     add_cohort(commands)
+    add_settings(commands)
     return parser
 
 

@@ -18,6 +18,7 @@ from tkamb.equilibrium.mechanics import STRAIN_FLEXIONS
 from tkamb.files import sha256_of
 from tkamb.known_errors import as_json, known_error, left_out
 from tkamb.plug_ins import CONTACT_CODE, contact_code
+from tkamb.run.settings import changed_settings
 from tkamb.run.status import FAILED
 from tkamb.scene.case import Case
 from tkamb.scene.scene import Scene, scene_files
@@ -63,6 +64,8 @@ def summary_of(
     summary["not_modelled"] = not_modelled(case)
     summary["assumptions"] = assumptions(case)
     summary["notes"] = list(scene.output.notes)
+    if changed := changed_settings():
+        summary["changed_settings"] = changed
     if strains:
         summary["ligament_strain"] = {"flexion_deg": STRAIN_FLEXIONS, "strain": strains}
     if scene.patella:

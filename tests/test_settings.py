@@ -1,0 +1,63 @@
+"""The settings of the algorithms: found, explained, and recorded where they are changed."""
+
+import ast
+from dataclasses import dataclass, fields
+from importlib import import_module
+from types import ModuleType
+
+import pytest
+
+from tkamb.cli import main
+from tkamb.run.settings import PACKAGE, all_settings, changed_settings, field_docstrings
+
+
+def settings_classes():
+    """Return module and name of every settings class of the package."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if (
+                isinstance(node, ast.ClassDef)
+                and node.name.endswith("Settings")
+                and node.name != "Settings"
+            ):
+                module = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
+                yield module, node.name
+
+
+def test_every_field_of_every_settings_object_says_what_it_is():
+    listed = {(row.module, row.name.split(".")[1]): row for row in all_settings()}
+    for module, name in settings_classes():
+        for field in fields(getattr(import_module(module), name)):
+            assert listed[module, field.name].meaning, f"{module}.{name}.{field.name}"
+            assert "TODO" not in listed[module, field.name].meaning, f"{name}.{field.name}"
+
+
+def test_the_docstring_below_a_field_is_its_meaning():
+    text = 'class A:\n    x: float = 1.0\n    """m; how\n    far."""\n    y: int = 2\n'
+    assert field_docstrings(ast.parse(text), "A") == {"x": "m; how far."}
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """A search."""
+
+    tolerance: float = 1e-3
+    steps: int = 5
+
+
+def test_a_run_records_only_what_differs_from_the_default(monkeypatch):
+    module = ModuleType("tkamb.invented")
+    monkeypatch.setattr(SearchSettings, "__module__", "tkamb.invented")
+    monkeypatch.setitem(__import__("sys").modules, "tkamb.invented", module)
+    module.SEARCH = SearchSettings()
+    assert "search.tolerance" not in changed_settings()
+    module.SEARCH = SearchSettings(tolerance=1e-4)
+    changed = changed_settings()
+    assert changed["search.tolerance"] == 1e-4
+    assert "search.steps" not in changed
+
+
+@pytest.mark.parametrize("words", [[], ["no-such-word"]])
+def test_the_command_prints_them(words, capsys):
+    assert main(["settings", *words]) == 0
+    assert ("=" in capsys.readouterr().out) == (not words and bool(all_settings()))

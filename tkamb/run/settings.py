@@ -1,0 +1,164 @@
+"""The settings of tkamb's algorithms: what decides how a number is computed.
+
+A settings object is an instance of a frozen dataclass whose name ends in `Settings`. It stands at
+the top level of the module that uses it, and each field has a docstring: unit, meaning, origin.
+This module finds them; it holds no list of its own.
+"""
+
+import argparse
+import ast
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from importlib import import_module
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+PACKAGE = Path(__file__).parents[1]
+SUFFIX = "Settings"
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One number that decides how something is computed.
+
+    Args:
+        name: dotted, as in "lattice_solver.residual_tolerance".
+        value: value of this process.
+        default: value that it has unless somebody changes it.
+        meaning: unit, meaning and origin.
+        algorithm: what the settings object belongs to, its docstring's first line.
+        module: where the object stands.
+    """
+
+    name: str
+    value: Any
+    default: Any
+    meaning: str
+    algorithm: str
+    module: str
+
+
+def all_settings() -> list[Setting]:
+    """Return the settings of all algorithms, in the order of their modules.
+
+    It imports every module that holds one.
+    """
+    rows = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        if SUFFIX not in text:
+            continue
+        names = [name for name, _ in _instances(ast.parse(text))]
+        module = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
+        for name in names:
+            rows += _rows(module, name, text)
+    return rows
+
+
+def changed_settings() -> dict[str, Any]:
+    """Return name -> value of the settings that differ from their defaults in this process.
+
+    Only modules that are imported already are looked at: no other has computed anything.
+    """
+    changed: dict[str, Any] = {}
+    for module_name, module in sorted(sys.modules.items()):
+        if not module_name.startswith("tkamb.") or module is None:
+            continue
+        for name, value in vars(module).items():
+            if _is_settings(value) and type(value).__module__ == module_name:
+                default = type(value)()
+                changed |= {
+                    f"{name.lower()}.{field.name}": getattr(value, field.name)
+                    for field in fields(value)
+                    if getattr(value, field.name) != getattr(default, field.name)
+                }
+    return changed
+
+
+def _is_settings(value: Any) -> bool:
+    kind = type(value)
+    return is_dataclass(value) and kind.__name__.endswith(SUFFIX)
+
+
+def _instances(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    """Yield instance and class of each settings object at the top level of a module."""
+    for node in tree.body:
+        if (
+            isinstance(node, ast.Assign)
+            and isinstance(node.value, ast.Call)
+            and isinstance(node.value.func, ast.Name)
+            and node.value.func.id.endswith(SUFFIX)
+            and isinstance(node.targets[0], ast.Name)
+        ):
+            yield node.targets[0].id, node.value.func.id
+
+
+def _rows(module: str, name: str, text: str) -> Iterator[Setting]:
+    value = getattr(import_module(module), name)
+    default, kind = type(value)(), type(value)
+    meanings = field_docstrings(ast.parse(text), kind.__name__)
+    algorithm = " ".join((kind.__doc__ or "").split("\n\n")[0].split())
+    for field in fields(value):
+        yield Setting(
+            f"{name.lower()}.{field.name}",
+            getattr(value, field.name),
+            getattr(default, field.name),
+            meanings.get(field.name, ""),
+            algorithm,
+            module,
+        )
+
+
+def field_docstrings(tree: ast.Module, name: str) -> dict[str, str]:
+    """Return field -> the docstring below it, of a class of a module."""
+    body = next((n.body for n in tree.body if isinstance(n, ast.ClassDef) and n.name == name), [])
+    texts = {}
+    for node, following in pairwise(body):
+        if (
+            isinstance(node, ast.AnnAssign)
+            and isinstance(node.target, ast.Name)
+            and isinstance(following, ast.Expr)
+            and isinstance(following.value, ast.Constant)
+        ):
+            texts[node.target.id] = " ".join(str(following.value.value).split())
+    return texts
+
+
+def add_settings(commands: Any) -> None:
+    """Add `tkamb settings` to the command line."""
+    parser = commands.add_parser(
+        "settings",
+        help="the numbers that decide how things are computed, with their meaning",
+        description="Print the settings of every algorithm: name, value, unit and meaning.",
+        epilog="examples: tkamb settings | tkamb settings lattice --json",
+    )
+    parser.add_argument("words", nargs="*", metavar="WORD", help="only settings that hold a word")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(command=_settings)
+
+
+def _settings(options: argparse.Namespace) -> int:
+    words = [word.lower() for word in options.words]
+    rows = [
+        row
+        for row in all_settings()
+        if all(word in f"{row.name} {row.algorithm} {row.meaning}".lower() for word in words)
+    ]
+    if options.json:
+        print(json.dumps({row.name: asdict(row) for row in rows}, indent=2))
+        return 0
+    algorithm = ""
+    for row in rows:
+        if row.algorithm != algorithm:
+            algorithm = row.algorithm
+            print(f"\n{algorithm} ({row.module})")
+        print(
+            f"  {row.name} = {row.value:g}"
+            if isinstance(row.value, int | float)
+            else f"  {row.name} = {row.value}"
+        )
+        print(f"      {row.meaning}")
+    return 0
