@@ -17,7 +17,7 @@ KNEE = {"body", "contact", "equilibrium", "geometry", "scene"}
 SHOWN = {"columns", "output", "results", "results_folder"}
 DRAWING = {
     "datasets": set(),
-    "starter": set(),
+    "starter": {"geometry", "inputs"},
     "geometry": set(),
     "opensim": {"geometry", "inputs"},
     "body": {"geometry"},
