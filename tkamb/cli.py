@@ -115,6 +115,13 @@ def _add_folder_commands(commands: Any) -> None:
     report = commands.add_parser("report", help="write report.html of a folder of results anew")
     report.add_argument("folder", type=Path, metavar="DIR")
     report.set_defaults(command=_report)
+    methods = commands.add_parser(
+        "methods",
+        help="the Methods paragraph of a paper, from a folder of results",
+        epilog="examples: tkamb methods out/bend | tkamb methods out/bend > methods.txt",
+    )
+    methods.add_argument("folder", type=Path, metavar="DIR")
+    methods.set_defaults(command=_methods)
 
 
 def _add_scene(commands: Any) -> None:
@@ -201,6 +208,14 @@ def _report(options: argparse.Namespace) -> int:
     with claimed_directory(options.folder) as folder:
         write_report(results, folder / REPORT_NAME)
     print(f"report: {options.folder / REPORT_NAME}")
+    return 0
+
+
+def _methods(options: argparse.Namespace) -> int:
+    from tkamb.output.methods import methods
+    from tkamb.results_folder import read_results
+
+    print(methods(read_results(options.folder).summary).text())
     return 0
 
 

@@ -15,6 +15,7 @@ from tkamb.geometry.frames import Array
 from tkamb.output.axis import LABELS, HorizontalAxis, horizontal_axis
 from tkamb.output.frame_maps import draw_insert, frame_maps, largest_pressure
 from tkamb.output.headline import cards, run_title
+from tkamb.output.methods import methods
 from tkamb.output.metrics import body_weight, failed, flagged
 from tkamb.output.pages import asset, policy_sources, render
 from tkamb.output.panels import Panel, centre_panel, panels
@@ -93,6 +94,7 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
         strain=strain_table(results.summary),
         flags=flag_rows(results, axis),
         axis_name=LABELS[axis.kind].split(" (")[0],
+        methods=methods(results.summary) if "scene_tables" in results.summary else None,
         provenance=_provenance(results.summary),
         last_frame=len(results) - 1,
         first_frame=int(np.nanargmax(force)) if np.isfinite(force).any() else 0,

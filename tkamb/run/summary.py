@@ -64,6 +64,7 @@ def summary_of(
     summary["not_modelled"] = not_modelled(case)
     summary["assumptions"] = assumptions(case)
     summary["notes"] = list(scene.output.notes)
+    summary["scene_tables"] = scene.model_dump(mode="json", exclude_none=True, exclude={"output"})
     if changed := changed_settings():
         summary["changed_settings"] = changed
     if strains:

@@ -1,0 +1,74 @@
+"""The Methods paragraph: what was modelled, with the scene's own numbers."""
+
+import json
+
+import pytest
+
+import tkamb
+from scenes import MODEL
+from tkamb.cli import main
+from tkamb.errors import InputError
+from tkamb.output.methods import methods
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Return the folder of a short run of the shipped knee."""
+    out = tmp_path_factory.mktemp("methods") / "run"
+    scene = str(MODEL / "scene.toml")
+    options = ["--contact", "foundation", "--frames", "0:101:50", "--out", str(out)]
+    assert main(["run", scene, *options]) == 0
+    return out
+
+
+def test_the_paragraph_needs_only_the_folder(run, capsys):
+    capsys.readouterr()
+    assert main(["methods", str(run)]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for words in (
+        "75 kg",
+        "MCL_anterior k = 91.25 N/mm, L0 = 82.73 mm",
+        "elastic foundation of independent columns",
+        "points lay 1 mm apart",
+        "E = 561.5 MPa",
+        "coefficient of 0.05",
+        "doi:10.1016/0021-9290(91)90019-J",
+    ):
+        assert words in text
+    assert f"tkamb {tkamb.__version__}" in text
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words", "absent"),
+    [
+        ("ligament", [], "No ligaments were modelled", "two-line"),
+        ("contact.friction", 0.08, "coefficient of 0.08", "0.05"),
+        ("motion.cutoff_Hz", 6.0, "low-pass filtered at 6 Hz", "It was not filtered"),
+        ("ground_reaction.applied", "ankle", "at the ankle's centre", "free moment"),
+        ("contact.model", "hertz", "Hertz's theory", "elastic foundation"),
+    ],
+)
+def test_what_the_scene_changes_the_paragraph_says(run, key, value, words, absent):
+    scene = tkamb.load_scene(MODEL / "scene.toml", {"contact.model": "foundation", key: value})
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    summary["scene_tables"] = scene.model_dump(mode="json", exclude_none=True)
+    text = " ".join(methods(summary).sentences)
+    assert words in text
+    assert absent not in text
+
+
+def test_a_paragraph_cites_only_what_it_names(run):
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    cited = " ".join(methods(summary).references)
+    assert "Shin" in cited and "Sharma" in cited
+    assert "Lu TW" not in cited and "Hughes" not in cited
+
+
+def test_a_folder_of_an_earlier_version_is_told_what_to_do():
+    with pytest.raises(InputError, match="run the scene again"):
+        methods({"frames": 3})
+
+
+def test_the_report_holds_the_paragraph(run):
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert "Methods paragraph" in page and "Carpentier" in page
