@@ -258,11 +258,11 @@ REFUSED = {
     "pounds": (lambda d: written(d, units=["lbf"] * 6), "lbf"),
     "inches": (lambda d: written(d, point_unit="in"), "'in'"),
     "no surface": (lambda d: written(d, plate={"corners": 0 * AMTI_CORNERS}), "corners"),
-    "type 4, no matrix": (lambda d: written(d, plate={"type": 4}), "CAL_MATRIX"),
+    "type 4, no matrix": (lambda d: written(d, plate={"type": 4}, units=["V"] * 6), "CAL_MATRIX"),
     "type 3 with six channels": (lambda d: written(d, plate={"type": 3}), "channels"),
     "NaN in a channel": (
         lambda d: written(d, analog={f"c{k}": np.full(COUNT * RATIO, np.nan) for k in range(6)}),
-        "not a number",
+        "no value that is a number",
     ),
 }
 

@@ -188,9 +188,7 @@ def _floats(content: bytes, machine: int) -> Array:
     return np.ascontiguousarray(halves).view("<f4").ravel().astype(float) / 4.0
 
 
-def _parameters(
-    content: bytes, at: int, end: int, machine: int
-) -> tuple[dict[str, Any], set[str]]:
+def _parameters(content: bytes, at: int, end: int, machine: int) -> tuple[dict[str, Any], set[str]]:
     """Return the values of the chain of records between two places, and those damaged."""
     order = "big" if machine == _MIPS else "little"
     groups: dict[int, str] = {}
@@ -274,7 +272,7 @@ def _check_agreement(header: Header, parameters: Parameters, path: Path) -> None
             EXPORT,
         )
     scale = parameters.number("POINT:SCALE")
-    if not math.isfinite(header.scale) or header.scale == 0 and header.markers:
+    if not math.isfinite(header.scale) or (header.scale == 0 and header.markers):
         raise InputError(f"has a scale of {header.scale:g} for its markers", path, EXPORT)
     stored_otherwise = scale is not None and (scale < 0) != (header.scale < 0)
     if stored_otherwise and (header.markers or header.analog):
@@ -378,7 +376,7 @@ class _Data:
                 return count
         for name in ("POINT:LONG_FRAMES", "POINT:FRAMES"):
             longer = self.parameters.number(name)
-            if longer is not None and math.isfinite(longer) and longer > max(header, LARGEST_16_BIT):
+            if longer and math.isfinite(longer) and longer > max(header, LARGEST_16_BIT):
                 return int(longer)
         return header
 

@@ -193,9 +193,8 @@ def _read(record: PlateRecord) -> tuple[Array, Array, tuple[str, ...]]:
     if matrix is None and stated is not None:
         matrix = np.eye(6)  # channels that state force and moment are calibrated
     if matrix is None or matrix.shape != (6, len(record.signals)):
-        raise InputError(
-            f"is of type {record.kind} without CAL_MATRIX", record.where, "export it with the matrix"
-        )
+        what = f"is of type {record.kind} without CAL_MATRIX"
+        raise InputError(what, record.where, "export it with the matrix")
     unit = newtons(record.given.force or record.force_unit)
     if unit is None:
         raise _no_unit(record, record.force_unit, "force_unit", "N")

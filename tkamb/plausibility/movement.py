@@ -105,6 +105,18 @@ def marker_questions(case: Case) -> Iterator[Question]:
         )
 
 
+def drift_questions(case: Case) -> Iterator[Question]:
+    """Force plates that read a force while nobody stands on them."""
+    if case.ground is None:
+        return
+    for number, level in case.ground.drift.items():
+        yield Question(
+            f"force plate {number} reads {level:.1f} N while nobody stands on it, and as much too "
+            "much under the foot: was it not set to zero before the trial?",
+            "force plate drifts",
+        )
+
+
 def sample_questions(case: Case) -> Iterator[Question]:
     """Recorded samples that lie off their neighbours' curve, one question a file."""
     parts = (case.motion, case.tibia, case.ground)
