@@ -134,10 +134,7 @@ def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> Gro
     check_spacing(path, stamps)
     _check_upward(force, source)
     loaded = force[:, 1] >= source.unloaded
-    held = _hold_point(stamps, point, loaded, path)
-    # a row with a full moment states it about its own point, wherever that is
-    own = np.isfinite(point).all(axis=1) & (np.abs(moment[:, [0, 2]]) > FREE_MOMENT).any(axis=1)
-    point = np.where(own[:, None], point, held)
+    held, point = _own_points(recorded, loaded, path)
     near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
     # of plates the wrench was recorded: their point is a quotient, which small forces shake
     points = None if from_plates else point[near]
@@ -162,6 +159,34 @@ def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> Gro
         drift=recorded.drift,
         notices=recorded.notices,
     )
+
+
+def recorded_wrench(source: ForceRecording) -> tuple[Array, Array, float]:
+    """Return times (k,) s, wrench (k, 6) N and N·m, and level (m) of a table's force.
+
+    The wrench is that on the foot, in the laboratory and about its origin.
+
+    Raises:
+        InputError: columns that cannot be used, or a force that is not mainly upwards.
+    """
+    recorded = _read_table(source)
+    _check_upward(recorded.force, source)
+    loaded = recorded.force[:, 1] >= source.unloaded
+    _, point = _own_points(recorded, loaded, source.file)
+    about = np.cross(point, recorded.force) + recorded.moment
+    level = float(np.median(point[loaded, 1])) if loaded.any() else 0.0
+    return recorded.time, np.concatenate([recorded.force, about], axis=1), level
+
+
+def _own_points(recorded: RecordedReaction, loaded: np.ndarray, path: Path) -> tuple[Array, Array]:
+    """Return the points carried over while unloaded, and those of the moments, each (k, 3) m.
+
+    A row with a full moment states it about its own point, wherever that is.
+    """
+    held = _hold_point(recorded.time, recorded.point, loaded, path)
+    aside = np.abs(recorded.moment[:, [0, 2]]) > FREE_MOMENT
+    own = np.isfinite(recorded.point).all(axis=1) & aside.any(axis=1)
+    return held, np.where(own[:, None], recorded.point, held)
 
 
 def recorded_span(source: ForceRecording) -> tuple[float, float]:
@@ -282,10 +307,16 @@ def _read_columns(source: ForceRecording, recorded: Table) -> tuple[Array, Array
     roles = [f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)]
     check_roles(source.columns, ("time", *roles), recorded.path, "ground_reaction")
     rotation = laboratory_rotation(source.laboratory_axes, recorded.path)
+    there = {role for role in roles if role in source.columns or role in recorded.columns}
     columns = []
+    # moments about the file's origin need no points: the force then is given there
+    pointless = not any(role.startswith("point") for role in there) and len(there) == 6
     for role in roles:
         column = source.columns.get(role, role)
-        given = role in source.columns or column in recorded.columns
+        given = role in there
+        if role.startswith("point") and pointless:
+            columns.append(np.zeros(recorded.rows))
+            continue
         if role.startswith("point") and (given or role != _upright_point(source)):
             columns.append(recorded.column(column))  # undefined while unloaded
         elif role.startswith("force") or given:

@@ -5,7 +5,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from tkamb.errors import InputError, names_near
 from tkamb.files import TABLE_LIMIT, read_text
 from tkamb.geometry.frames import Array
-from tkamb.inputs.unit_words import metres
+from tkamb.inputs.unit_words import GivenUnits, metres
 from tkamb.units import LENGTH
 
 TRC_ROUNDING_S = 1e-3
@@ -41,6 +41,7 @@ class Table:
         in_degrees: what the file itself states about angles (`.sto`, `.mot`), else None.
         equal: names that stand for several columns; none of these is in `columns`.
         notices: remarks on what was read otherwise than stated, or not at all.
+        unit_given: whether the unit of length is the user's word, for want of the file's.
     """
 
     path: Path
@@ -49,6 +50,7 @@ class Table:
     in_degrees: bool | None = None
     equal: tuple[str, ...] = ()
     notices: tuple[str, ...] = ()
+    unit_given: bool = False
 
     @property
     def rows(self) -> int:
@@ -141,6 +143,23 @@ def read_table(path: Path, format: str | None = None) -> Table:
     if kind not in READERS:
         raise InputError(f"unknown table format '{kind}'", path, f"use {', '.join(READERS)}")
     return READERS[kind](path)
+
+
+def with_unit(table: Table, length_unit: str | None) -> Table:
+    """Return a table with a unit of length that it may lack.
+
+    Raises:
+        InputError: the file states another one.
+    """
+    if length_unit is None:
+        return table
+    if table.path.suffix.lower() == ".c3d" and table.length_unit is not None:
+        from tkamb.inputs.c3d import read_c3d
+
+        read_c3d(table.path, GivenUnits(length_unit))
+        return table  # in m already
+    table.unit_scale(length_unit, "--length-unit")
+    return replace(table, length_unit=length_unit, unit_given=True)
 
 
 def read_lines(path: Path) -> list[str]:
