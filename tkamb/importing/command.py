@@ -143,6 +143,8 @@ def import_request(options: argparse.Namespace) -> "ImportRequest":
         if getattr(options, name) and not (options.c3d and options.grf is None):
             option = f"--{name.replace('_', '-')}"
             raise InputError("is for the plates of a .c3d: tables are in N and N·m", option)
+    if options.length_unit and options.motion:
+        raise InputError("is for recordings of markers", "--length-unit", "leave it out")
     if options.grf_force and not options.grf:
         raise InputError("needs --grf", "--grf-force")
     return ImportRequest(

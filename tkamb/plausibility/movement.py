@@ -109,10 +109,11 @@ def drift_questions(case: Case) -> Iterator[Question]:
     """Force plates that read a force while nobody stands on them."""
     if case.ground is None:
         return
-    for number, level in case.ground.drift.items():
+    drift = [f"plate {number} {level:.1f} N" for number, level in case.ground.drift.items()]
+    if drift:
         yield Question(
-            f"force plate {number} reads {level:.1f} N while nobody stands on it, and as much too "
-            "much under the foot: was it not set to zero before the trial?",
+            f"force plates drift: while nobody stands on it, {', '.join(drift)}, and as much too "
+            "much under the foot: were they not set to zero before the trial?",
             "force plate drifts",
         )
 
