@@ -27,6 +27,8 @@ BLOCK = 512
 LARGEST_16_BIT = 65535
 """The largest frame number that the header can hold; longer recordings state theirs in TRIAL."""
 EXPORT = "export the trial again as C3D"
+MOST_DIMENSIONS = 7
+"""Of a parameter, by the format."""
 _KEY = 0x50
 _DEC, _MIPS, _INTEL = 85, 86, 84
 _SIZES = {-1: 1, 1: 1, 2: 2, 4: 4}
@@ -236,7 +238,7 @@ def _value(record: bytes, machine: int) -> Any:
         return None
     kind, dimensions = int(np.frombuffer(record, "i1", 1)[0]), record[1]
     shape = tuple(record[2 : 2 + dimensions])
-    if kind not in _SIZES or len(shape) != dimensions:
+    if kind not in _SIZES or len(shape) != dimensions or dimensions > MOST_DIMENSIONS:
         return None
     count = math.prod(shape)
     first = 2 + dimensions
