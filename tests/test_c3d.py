@@ -247,7 +247,8 @@ REFUSED = {
     "text": (lambda d: text(d, "not a recording at all" * 100), "not a C3D file"),
     "empty": (lambda d: text(d, ""), "not a C3D file"),
     "not there": (lambda d: d / "none.c3d", "no such file"),
-    "type 5": (lambda d: written(d, plate={"type": 5}), "type 5"),
+    "type 5 with six channels": (lambda d: written(d, plate={"type": 5}), "6 of 8 channels"),
+    "type 7": (lambda d: written(d, plate={"type": 7}), "type 7"),
     "type 0": (lambda d: written(d, plate={"type": 0}), "type 0"),
     "channel that is not there": (
         lambda d: written(d, plate={"channels": [1, 2, 3, 4, 5, 99]}),
@@ -257,11 +258,11 @@ REFUSED = {
     "pounds": (lambda d: written(d, units=["lbf"] * 6), "lbf"),
     "inches": (lambda d: written(d, point_unit="in"), "'in'"),
     "no surface": (lambda d: written(d, plate={"corners": 0 * AMTI_CORNERS}), "corners"),
-    "type 4, no matrix": (lambda d: written(d, plate={"type": 4}), "CAL_MATRIX"),
+    "type 4, no matrix": (lambda d: written(d, plate={"type": 4}, units=["V"] * 6), "CAL_MATRIX"),
     "type 3 with six channels": (lambda d: written(d, plate={"type": 3}), "channels"),
     "NaN in a channel": (
         lambda d: written(d, analog={f"c{k}": np.full(COUNT * RATIO, np.nan) for k in range(6)}),
-        "not a number",
+        "no value that is a number",
     ),
 }
 
@@ -277,7 +278,7 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, mistake):
     make, words = REFUSED[mistake]
     path = make(tmp_path)
     with pytest.raises(InputError) as caught:
-        read_c3d(path)
+        read_c3d(path).plate(1)
     assert words in str(caught.value) and "\n" not in str(caught.value)
 
 

@@ -165,7 +165,6 @@ MISTAKES = {
     "too few markers": ({"without": "M.tibia_r.1,M.tibia_r.2"}, "three are needed"),
     "force that is not there": ({"grf_force": "plate_3"}, "plate_3"),
     "force of no table": ({"grf": None}, "needs --grf"),
-    "a table beside a C3D file": ({"trc": None, "c3d": "a.c3d"}, "--grf"),
     "standing trial of poses": ({"static": "s.trc"}, "--static"),
 }
 

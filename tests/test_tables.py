@@ -66,7 +66,6 @@ def test_trc_time_that_is_not_even_stays(tmp_path):
         ("a.csv", "time,x\n", "no data rows"),
         ("a.csv", "time,x\n0,1\n1\n", "line 3 has 1 cells, the header 2"),
         ("a.csv", "time,x\n0,one\n", "line 2 holds 'one'"),
-        ("a.csv", "time,time\n0,1\n", "two columns named 'time'"),
         ("a.sto", "time\tx\n0\t1\n", "no 'endheader'"),
         ("a.trc", "time,x\n", "not a .trc"),
         ("a.xls", "time,x\n", "unknown table format 'xls'"),
@@ -86,6 +85,13 @@ def test_words_that_only_contain_nan_are_no_gaps(tmp_path):
     assert np.isnan(values).all()
     with pytest.raises(InputError, match="holds 'banana'"):
         read_table(written(tmp_path, "a.csv", "time,x\n0,banana\n"))
+
+
+def test_equal_columns_are_refused_only_where_one_is_needed(tmp_path):
+    table = read_table(written(tmp_path, "a.csv", "time,x,arm,arm\n0,1,2,3\n"))
+    assert table.column("x")[0] == 1.0 and "two columns named 'arm'" in table.notices[0]
+    with pytest.raises(InputError, match="two columns named 'arm'"):
+        table.column("arm")
 
 
 def test_missing_file():

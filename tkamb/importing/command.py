@@ -23,7 +23,9 @@ def add_import(commands: Any) -> None:
     source.add_argument("--motion", type=Path, metavar="F", help="the model's coordinates")
     p.add_argument("--grf", type=Path, metavar="F", help=".mot or .sto of the ground reactions")
     p.add_argument(
-        "--grf-force", metavar="NAME", help="how the foot's columns in it begin: ground_force_2"
+        "--grf-force",
+        metavar="NAME,NAME",
+        help="how the foot's columns in it begin: ground_force_2; several are summed",
     )
     p.add_argument("--static", type=Path, metavar="F", help="standing trial: where markers sit")
     p.add_argument("--side", choices=("right", "left"), required=True)
@@ -54,10 +56,16 @@ def add_import(commands: Any) -> None:
 def _add_inferred(p: argparse.ArgumentParser) -> None:
     """Add the options that stand instead of what is inferred."""
     p.add_argument("--knee", metavar="JOINT", help="the femorotibial joint of the model")
-    p.add_argument("--plates", type=_numbers, metavar="2,3", help="under the foot")
+    p.add_argument("--plates", type=_numbers, metavar="2,3", help="under the foot; or none")
     p.add_argument("--interval", type=_interval, metavar="A:B", help="s, part of the recording")
     p.add_argument("--laboratory-axes", metavar="FORWARD,UP,RIGHT", help="of the recording")
     p.add_argument("--without", type=_names, default=(), metavar="A,B", help="markers not used")
+    p.add_argument(
+        "--marker-prefix", metavar="NAME", help="of the labels that are used: JW of JW:RHeel"
+    )
+    p.add_argument("--length-unit", choices=("m", "cm", "mm"), help="of a .c3d that lacks it")
+    p.add_argument("--force-unit", metavar="N", help="of a .c3d's force channels, likewise")
+    p.add_argument("--moment-unit", metavar="Nmm", help="of its moment channels, likewise")
     p.add_argument("--method", choices=("segments", "chain"), default="segments")
     p.add_argument("--cutoff-hz", type=float, default=6.0, metavar="HZ")
 
@@ -92,10 +100,12 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _numbers(text: str) -> tuple[int, ...]:
+    if text == "none":
+        return ()
     try:
         return tuple(int(part) for part in text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is not numbers like 2,3") from None
+        raise argparse.ArgumentTypeError(f"'{text}' is not numbers like 2,3, or none") from None
 
 
 def _interval(text: str) -> tuple[float, float]:
@@ -123,13 +133,18 @@ def import_request(options: argparse.Namespace) -> "ImportRequest":
         InputError: options that do not go together, or numbers that cannot be.
     """
     from tkamb.importing.request import ImportRequest
+    from tkamb.inputs.unit_words import GivenUnits
 
     if not options.mass_kg > 0:
         raise InputError(f"{options.mass_kg:g} kg is no mass", "--mass-kg")
     if not options.cutoff_hz > 0:
         raise InputError(f"{options.cutoff_hz:g} Hz is no frequency", "--cutoff-hz")
-    if options.c3d and options.grf:
-        raise InputError("goes with --trc or --motion: a C3D file's plates are its own", "--grf")
+    for name in ("force_unit", "moment_unit"):
+        if getattr(options, name) and not (options.c3d and options.grf is None):
+            option = f"--{name.replace('_', '-')}"
+            raise InputError("is for the plates of a .c3d: tables are in N and N·m", option)
+    if options.length_unit and options.motion:
+        raise InputError("is for recordings of markers", "--length-unit", "leave it out")
     if options.grf_force and not options.grf:
         raise InputError("needs --grf", "--grf-force")
     return ImportRequest(
@@ -158,6 +173,8 @@ def import_request(options: argparse.Namespace) -> "ImportRequest":
         contact=options.contact,
         activity=options.activity,
         notes=tuple(options.note),
+        prefix=options.marker_prefix,
+        units=GivenUnits(options.length_unit, options.force_unit, options.moment_unit),
     )
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -10,8 +9,8 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, transform
 from tkamb.importing.anatomy import Leg, find_leg
 from tkamb.importing.links import Links
-from tkamb.inputs.markers import fit_seen, marker_trajectories, matched_labels
-from tkamb.inputs.tables import Table, read_table
+from tkamb.inputs.markers import fit_seen, marker_trajectories, matched_labels, plain_label
+from tkamb.inputs.tables import Table
 from tkamb.units import DEGREE
 
 
@@ -54,6 +53,13 @@ def model_segments(
         segment = found[name]
         if len(segment.points) < 3:
             labels = recorded_labels(recorded)
+            if prefixes := _clashing_prefixes(labels, segment.missing):
+                raise InputError(
+                    f"holds the markers of the {name} under several prefixes: "
+                    f"{', '.join(prefixes)}",
+                    recorded.path,
+                    f"say which with --marker-prefix, like --marker-prefix {prefixes[0]}",
+                )
             raise InputError(
                 f"the model and the recording share {len(segment.points)} markers of the "
                 f"{segment.name}, three are needed",
@@ -122,15 +128,45 @@ def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], li
     return [name for name in seen if name not in left_out], left_out
 
 
-def segments_of(recording: Path, segments: list[ModelSegment]) -> list[ModelSegment]:
+def segments_of(recorded: Table, segments: list[ModelSegment]) -> list[ModelSegment]:
     """Return the segments with the labels of another recording, those that it holds."""
-    labels = recorded_labels(read_table(recording))
+    labels = recorded_labels(recorded)
     found = []
     for segment in segments:
         match = matched_labels(segment.points, labels)
         points = {match[name]: p for name, p in segment.points.items() if name in match}
         found.append(replace(segment, points=points))
     return found
+
+
+def _clashing_prefixes(labels: list[str], wanted: Sequence[str]) -> list[str]:
+    """Return the prefixes under which a wanted marker stands more than once."""
+    plain = {plain_label(name) for name in wanted}
+    found: dict[str, list[str]] = {}
+    for label in labels:
+        if plain_label(label) in plain:
+            found.setdefault(plain_label(label), []).append(label.rpartition(":")[0])
+    clashing = [prefix for prefixes in found.values() if len(prefixes) > 1 for prefix in prefixes]
+    return list(dict.fromkeys(clashing))
+
+
+def with_prefix(recorded: Table, prefix: str) -> Table:
+    """Return a table of markers with those of one prefix alone, like "JW" in "JW:RHeel".
+
+    Raises:
+        InputError: no label begins with it.
+    """
+    wanted = prefix.rstrip(":")
+    labels = recorded_labels(recorded)
+    there = list(dict.fromkeys(label.rpartition(":")[0] for label in labels))
+    if wanted not in there:
+        listed = ", ".join(name or "none" for name in there[:8])
+        raise InputError(
+            f"has no marker with the prefix '{prefix}'", recorded.path, f"its prefixes: {listed}"
+        )
+    other = {label for label in labels if label.rpartition(":")[0] != wanted}
+    columns = {k: v for k, v in recorded.columns.items() if k[:-2] not in other}
+    return replace(recorded, columns=columns)
 
 
 def recorded_labels(recorded: Table) -> list[str]:

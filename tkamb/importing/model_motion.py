@@ -1,6 +1,6 @@
 """A motion in a model's coordinates (`.mot`, `.sto`) as the scene's knee and shank."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,10 +13,12 @@ from tkamb.geometry.frames import (
     knee_coordinates,
     mirrored_pose,
 )
+from tkamb.importing.anatomy import OTHER, find_leg
 from tkamb.importing.links import Links
+from tkamb.importing.plates import Feet
 from tkamb.inputs.tables import Table
 from tkamb.opensim.kinematics import Kinematics
-from tkamb.opensim.motion import read_coordinates
+from tkamb.opensim.motion import angle_lines, read_coordinates
 from tkamb.units import DEGREE, MILLIMETRE
 
 MOTION_FILE = "motion.csv"
@@ -37,11 +39,29 @@ class ModelMotion:
         time: (n,) s.
         values: (n, 12) of `COLUMNS`.
         missing: coordinates of the model that the file does not hold: at their defaults.
+        said: lines on how the file was read.
     """
 
     time: Array
     values: Array
     missing: tuple[str, ...]
+    said: tuple[str, ...] = ()
+
+    def part(self, start: float, end: float) -> "ModelMotion":
+        """Return the rows from one time to another.
+
+        Raises:
+            InputError: fewer than two.
+        """
+        inside = (self.time >= start - 1e-9) & (self.time <= end + 1e-9)
+        if inside.sum() < 2:
+            raise InputError(
+                f"has no two frames between {start:g} and {end:g} s, the motion lasts from "
+                f"{self.time[0]:g} to {self.time[-1]:g} s",
+                "--interval",
+                "choose another",
+            )
+        return replace(self, time=self.time[inside], values=self.values[inside])
 
     def text(self) -> str:
         """Return the table as CSV."""
@@ -83,7 +103,27 @@ def model_motion(links: Links, recorded: Table) -> ModelMotion:
         ],
         axis=1,
     )
-    return ModelMotion(time, values, missing)
+    return ModelMotion(time, values, missing, angle_lines(kinematics, recorded, q))
+
+
+def model_feet(links: Links, recorded: Table) -> Feet:
+    """Return where the feet are in a motion: the mean origin of each foot's bodies, m."""
+    leg = links.leg
+    kinematics = Kinematics(leg.model)
+    q, _ = read_coordinates(kinematics, recorded)
+    poses = kinematics.poses(kinematics.coupled(q))
+    bodies = {leg.side: leg.foot}
+    try:
+        bodies[OTHER[leg.side]] = find_leg(leg.model, OTHER[leg.side]).foot
+    except InputError:
+        bodies[OTHER[leg.side]] = ()  # a model of one leg
+    middles = {
+        side: np.mean([poses[:, kinematics.bodies[body], :3, 3] for body in own], axis=0)
+        if own
+        else np.full((recorded.rows, 3), np.nan)
+        for side, own in bodies.items()
+    }
+    return Feet(recorded.path, recorded.time(), middles)
 
 
 def motion_tables(flexion_alone: bool) -> list[str]:

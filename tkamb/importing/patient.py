@@ -11,17 +11,17 @@ from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.surface import Surface
 from tkamb.importing.anatomy import Leg, find_leg
 from tkamb.importing.links import Links, find_links
-from tkamb.importing.markers import recorded_labels
+from tkamb.importing.markers import recorded_labels, with_prefix
 from tkamb.importing.model_motion import MOTION_FILE
 from tkamb.importing.recorded_poses import read_poses
 from tkamb.importing.request import ImportRequest
-from tkamb.importing.scene_text import SceneText
+from tkamb.importing.scene_text import GROUND_FILE, SceneText
 from tkamb.importing.soft_tissue import soft_tissue
 from tkamb.importing.standing import with_static_markers
 from tkamb.importing.trial import Trial, from_coordinates, from_markers, from_poses
 from tkamb.importing.urdf import patient_urdf
 from tkamb.inputs.meshes import axes_rotation, load_surface
-from tkamb.inputs.tables import read_table
+from tkamb.inputs.tables import read_table, with_unit
 from tkamb.opensim.read import read_osim
 from tkamb.scene import load_scene
 from tkamb.scene.case import Case, load_case
@@ -39,6 +39,7 @@ class ImportedPatient:
         urdf: text of patient.urdf.
         scene: the scene, to be written as text.
         motion: text of motion.csv; None where markers are read from the recording.
+        ground: text of ground_reaction.csv; None where the ground reaction has one file.
         report: lines on what was understood and assumed.
     """
 
@@ -46,6 +47,7 @@ class ImportedPatient:
     scene: SceneText
     motion: str | None
     report: tuple[str, ...]
+    ground: str | None = None
 
 
 def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
@@ -100,16 +102,23 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
             raise InputError(
                 "is for a knee whose motion comes from markers", "--static", "leave it out"
             )
-        scene, line = with_static_markers(scene, request.static, list(found.markers.segments))
-        report.append(line)
+        segments = list(found.markers.segments)
+        unit = request.units.length
+        scene, lines = with_static_markers(scene, request.static, segments, unit)
+        report += lines
     comment = f"Made by tkamb import from {request.model.name}, {request.side} leg (m, kg)"
     motion = found.motion.text() if found.motion else None
-    return ImportedPatient(patient_urdf(links, scale, comment), scene, motion, tuple(report))
+    ground = found.ground.made if found.ground else None
+    return ImportedPatient(
+        patient_urdf(links, scale, comment), scene, motion, tuple(report), ground
+    )
 
 
 def _trial(request: ImportRequest, leg: Leg, links: Links, insert: Surface | None) -> Trial:
     """Return the recording: markers, poses with markers, or the model's coordinates."""
-    recorded = read_table(request.recording)
+    recorded = with_unit(read_table(request.recording), request.units.length)
+    if request.prefix is not None:
+        recorded = with_prefix(recorded, request.prefix)
     labels = recorded_labels(recorded)
     if request.poses is not None:
         if insert is None or request.meshes is None or not labels:
@@ -144,6 +153,8 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
     files = {urdf: patient.urdf, scene: patient.scene.text()}
     if patient.motion is not None:
         files[folder / MOTION_FILE] = patient.motion
+    if patient.ground is not None:
+        files[folder / GROUND_FILE] = patient.ground
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     claim_directory(folder)
     before = {p: p.read_text(encoding="utf-8") if p.is_file() else None for p in files}

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from tkamb.importing.recorded_poses import PoseRecording
 from tkamb.importing.scene_text import Meshes
+from tkamb.inputs.unit_words import GivenUnits
 
 
 @dataclass(frozen=True)
@@ -16,8 +17,8 @@ class ImportRequest:
         side: of the knee.
         mass_kg: of the subject.
         recording: .c3d or .trc; .mot or .sto of the model's coordinates.
-        grf: table of ground reactions, beside a .trc.
-        grf_force: how the columns of the foot's force begin in it.
+        grf: table of ground reactions, instead of a C3D file's plates.
+        grf_force: how the columns of the foot's forces begin in it, separated by commas.
         poses: of the femoral component in the insert; then the recording's markers place the
             shank alone.
         without: labels of markers that are not to be used.
@@ -34,6 +35,8 @@ class ImportRequest:
         contact: the scene's contact model.
         activity: what the report compares with; None: with nothing.
         notes: of the user, for the report.
+        prefix: of the markers' labels that are used, where several prefixes share a label.
+        units: what the recording's units are, where it does not say.
     """
 
     model: Path
@@ -57,3 +60,5 @@ class ImportRequest:
     contact: str = "foundation"
     activity: str | None = None
     notes: tuple[str, ...] = ()
+    prefix: str | None = None
+    units: GivenUnits = field(default_factory=GivenUnits)

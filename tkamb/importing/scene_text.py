@@ -2,7 +2,7 @@
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from tkamb.geometry.frames import Array
@@ -14,7 +14,11 @@ from tkamb.importing.shank import ShankMarkers
 from tkamb.importing.soft_tissue import SoftTissue
 from tkamb.importing.toml_text import toml_end, toml_markers, toml_mm, toml_numbers, toml_text
 from tkamb.importing.urdf import body_link
+from tkamb.inputs.unit_words import GivenUnits
 from tkamb.units import DEGREE
+
+GROUND_FILE = "ground_reaction.csv"
+"""Beside the scene: a foot's ground reaction, where it is a sum of several of a table's forces."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,8 @@ class Meshes:
 class GroundFile:
     """Where the ground reaction stands: plates of a C3D file, or columns of a table.
 
-    A foot on a step stands `surface` (m) above its plates.
+    A foot on a step stands `surface` (m) above its plates. `made` is the text of a table that the
+    import writes: forces in turn, summed.
     """
 
     path: Path
@@ -42,11 +47,16 @@ class GroundFile:
     columns: tuple[tuple[str, str], ...] = ()
     length_unit: str | None = None
     surface: float = 0.0
+    units: GivenUnits = field(default_factory=GivenUnits)
+    made: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class MarkerFile:
-    """A recording of markers and how they are read."""
+    """A recording of markers and how they are read.
+
+    `whole_labels`: the scene names markers with their prefix, since the recording has several.
+    """
 
     path: Path
     axes: str
@@ -55,6 +65,8 @@ class MarkerFile:
     knee: str
     interval: tuple[float, float] | None
     frames: int | None = None
+    length_unit: str | None = None
+    whole_labels: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +116,7 @@ class SceneText:
             [f"# {line}" for line in self.title],
             self._patient(),
             self._motion(),
-            *(_segment(s) for s in (self.markers.segments if self.markers else ())),
+            *self._segments(),
             self.shank.lines(self._path(self.shank.path)) if self.shank else [],
             self._ground(),
             *self._implant(),
@@ -135,6 +147,7 @@ class SceneText:
             head += ['angle_unit = "deg"', 'length_unit = "mm"', f"cutoff_Hz = {self.cutoff_Hz:g}"]
             return [*head, "", *motion_tables(self.meshes is not None)]
         lines = ["[motion]", f"file = {self._path(m.path)}", 'interpretation = "markers"']
+        lines += [f'length_unit = "{m.length_unit}"'] if m.length_unit else []
         lines.append(f"cutoff_Hz = {self.cutoff_Hz:g}")
         if m.interval:
             lines.append("# the part in which all that the foot stands on was measured, own clock")
@@ -158,13 +171,21 @@ class SceneText:
         ]
         return lines
 
+    def _segments(self) -> list[list[str]]:
+        m = self.markers
+        return [_segment(segment, m.whole_labels) for segment in m.segments] if m else []
+
     def _ground(self) -> list[str]:
         g = self.ground
         if g is None:
             return []
-        lines = ["[ground_reaction]", f"file = {self._path(g.path)}"]
+        file = toml_text(GROUND_FILE) if g.made else self._path(g.path)
+        lines = ["[ground_reaction]", f"file = {file}"]
         lines += [f"plates = {list(g.plates)}"] if g.plates else []
-        lines += [f'length_unit = "{g.length_unit}"'] if g.length_unit else []
+        length = g.length_unit or g.units.length
+        lines += [f'length_unit = "{length}"'] if length else []
+        for key, unit in (("force_unit", g.units.force), ("moment_unit", g.units.moment)):
+            lines += [f"{key} = {toml_text(unit)}"] if unit else []
         lines += [
             f'laboratory_axes = "{g.axes}"',
             f"cutoff_Hz = {self.cutoff_Hz:g}",
@@ -280,7 +301,7 @@ class SceneText:
 _ALL = ["flexion", "adduction", "axial_rotation", "ap", "si", "ml"]
 
 
-def _segment(segment: ModelSegment) -> list[str]:
+def _segment(segment: ModelSegment, whole_labels: bool) -> list[str]:
     lines = ["[[motion.markers.segment]]", f'name = "{segment.name}"']
     if segment.joint is not None and segment.centre is not None:
         lines += [
@@ -288,7 +309,7 @@ def _segment(segment: ModelSegment) -> list[str]:
             f"joint_mm = {toml_mm(segment.joint)}",
             f"centre_mm = {toml_mm(segment.centre)}",
         ]
-    return [*lines, f"markers_mm = {toml_markers(segment.points)}"]
+    return [*lines, f"markers_mm = {toml_markers(segment.points, whole_labels)}"]
 
 
 def _button(in_patella: Array | None) -> list[str]:

@@ -13,26 +13,30 @@ from tkamb.importing.scene_text import SceneText
 from tkamb.inputs.leg_chain import LegChain
 from tkamb.inputs.marker_motion import both_fits, leg_segments, neutral_coordinates
 from tkamb.inputs.markers import matched_labels, plain_label
-from tkamb.inputs.tables import read_table
+from tkamb.inputs.tables import Table, read_table, with_unit
 from tkamb.scene import Scene
 from tkamb.scene.recording_tables import MarkersTable
 from tkamb.scene.si import in_si
 
 
 def with_static_markers(
-    scene: SceneText, static: Path, segments: list[ModelSegment]
-) -> tuple[SceneText, str]:
-    """Return the scene with its markers where they sit in a standing trial, and a line on it."""
+    scene: SceneText, static: Path, segments: list[ModelSegment], length_unit: str | None = None
+) -> tuple[SceneText, list[str]]:
+    """Return the scene with its markers where they sit in a standing trial, and lines on it.
+
+    `length_unit` is the trial's, where its own word is not understood.
+    """
     assert scene.markers is not None
     known = Scene.model_validate(tomllib.loads(scene.text())).motion.markers
     assert known is not None
-    own = facing(segments_of(static, segments), read_table(static)).axes
+    recorded = with_unit(read_table(static), length_unit)
+    own = facing(segments_of(recorded, segments), recorded).axes
     known = known.model_copy(update={"laboratory_axes": own})
     side: Literal["right", "left"] = "left" if scene.side == "left" else "right"
     insert = scene.links.insert_in_tibia
     if side == "left":
         insert = mirrored_pose(insert)
-    places = calibrated_markers(known, static, side, insert)
+    places = calibrated_markers(known, recorded, side, insert)
     moved, farthest = [], 0.0
     for segment in segments:
         there = {plain_label(k): v for k, v in places[segment.name].items()}
@@ -45,12 +49,13 @@ def with_static_markers(
         f"markers' places are those of the standing trial {static.name}, at most "
         f"{farthest * 1e3:.1f} mm from the model's"
     )
-    return replace(scene, markers=markers), line
+    notices = [f"notice: {static.name}: {notice}" for notice in recorded.notices]
+    return replace(scene, markers=markers), [line, *notices]
 
 
 def calibrated_markers(
     table: MarkersTable,
-    file: Path,
+    recorded: Table,
     side: Literal["right", "left"],
     pose_insert_in_tibia: Array,
 ) -> dict[str, dict[str, Array]]:
@@ -62,14 +67,13 @@ def calibrated_markers(
 
     Args:
         table: markers and joints; those that the trial does not hold are left as they are.
-        file: the standing trial.
+        recorded: the standing trial.
         side: of the leg.
         pose_insert_in_tibia: (4, 4), of the (mirrored) patient.
 
     Raises:
         InputError: the trial cannot be read, or its markers do not fit.
     """
-    recorded = read_table(file)
     labels = [column[:-2] for column in recorded.columns if column.endswith("_x")]
     there = [
         own.model_copy(

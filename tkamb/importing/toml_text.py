@@ -23,15 +23,16 @@ def toml_mm(point: Array) -> str:
     return toml_numbers(point * 1e3)
 
 
-def toml_key(label: str) -> str:
-    """Return a marker's label without the subject's prefix, quoted where TOML wants it."""
-    plain = label.rpartition(":")[2]
+def toml_key(label: str, whole: bool = False) -> str:
+    """Return a marker's label, quoted where TOML wants it; not `whole`: without its prefix."""
+    plain = label if whole else label.rpartition(":")[2]
     return plain if re.fullmatch(r"[A-Za-z0-9_-]+", plain) else toml_text(plain)
 
 
-def toml_markers(points: Mapping[str, Array]) -> str:
-    """Return markers and their places, m, as an inline table in mm."""
-    return f"{{ {', '.join(f'{toml_key(k)} = {toml_mm(p)}' for k, p in points.items())} }}"
+def toml_markers(points: Mapping[str, Array], whole: bool = False) -> str:
+    """Return markers, by their `whole` labels or without prefix, and their places as TOML in mm."""
+    places = [f"{toml_key(label, whole)} = {toml_mm(point)}" for label, point in points.items()]
+    return f"{{ {', '.join(places)} }}"
 
 
 def toml_end(key: str, end: End) -> str:

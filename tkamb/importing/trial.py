@@ -1,15 +1,14 @@
 """A trial: markers or coordinates, which way the subject faces, which plates bear the foot."""
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.importing.anatomy import OTHER, Leg
+from tkamb.importing.ground import common_interval, find_ground
 from tkamb.importing.links import Links
 from tkamb.importing.markers import (
     Facing,
@@ -19,21 +18,13 @@ from tkamb.importing.markers import (
     model_segments,
     seen_segments,
 )
-from tkamb.importing.model_motion import MOTION_FILE, ModelMotion, model_motion
-from tkamb.importing.plates import (
-    Load,
-    common_surface,
-    known_interval,
-    own_plates,
-    plate_loads,
-    unmeasured,
-)
+from tkamb.importing.model_motion import MOTION_FILE, ModelMotion, model_feet, model_motion
+from tkamb.importing.plates import marked_feet
 from tkamb.importing.recorded_poses import RecordedPoses
 from tkamb.importing.request import ImportRequest
 from tkamb.importing.scene_text import GroundFile, MarkerFile
 from tkamb.importing.shank import ShankMarkers, shank_markers
-from tkamb.inputs.c3d import Recording, read_c3d
-from tkamb.inputs.tables import Table, read_table
+from tkamb.inputs.tables import Table
 
 FRAMES_PER_CUTOFF = 5.0
 """Frames per period of the cut-off: what is low-passed holds nothing between them."""
@@ -59,14 +50,25 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
     """
     segments = model_segments(links, recorded, request.without)
     seen = _facing(request, segments, recorded)
-    ground, interval, stood = _ground(request, leg, recorded, seen.axes)
-    interval, frames, thinned = _thinned(recorded.time(), interval, request.cutoff_Hz)
+    feet_there = marked_feet(recorded, seen.axes, feet(leg, recorded, OTHER[leg.side]))
+    found = find_ground(request, leg.side, seen.axes, feet_there)
+    time = recorded.time()
+    interval, joined = common_interval(time, found.interval, found.span)
+    interval, frames, thinned = _thinned(time, interval, request.cutoff_Hz)
     markers = MarkerFile(
-        request.recording, seen.axes, tuple(segments), request.method, "hinge", interval, frames
+        request.recording,
+        seen.axes,
+        tuple(segments),
+        request.method,
+        "hinge",
+        interval,
+        frames,
+        recorded.length_unit if recorded.unit_given else None,
+        request.prefix is not None,
     )
-    matched = _segment_lines(segments, request.without)
-    said = (*matched, _facing_line(request, seen), *stood, thinned)
-    return Trial(ground, said, markers)
+    matched = [*_notices(recorded), *_segment_lines(segments, request.without)]
+    said = (*matched, _facing_line(request, seen), *found.said, *joined, thinned)
+    return Trial(found.ground, said, markers)
 
 
 def from_poses(
@@ -82,10 +84,11 @@ def from_poses(
     stance = poses.femur[poses.in_stance]
     shank = shank_markers(links, segments, stance, request.recording, seen.axes)
     covered = replace(request, interval=(float(poses.time[0]), float(poses.time[-1])))
-    ground, _, stood = _ground(covered, leg, recorded, seen.axes)
-    matched = _segment_lines(segments.values(), request.without)
-    said = (*poses.said, *matched, _facing_line(request, seen), *shank.said, *stood)
-    return Trial(ground, said, poses=poses, shank=shank)
+    feet_there = marked_feet(recorded, seen.axes, feet(leg, recorded, OTHER[leg.side]))
+    found = find_ground(covered, leg.side, seen.axes, feet_there)
+    matched = [*_notices(recorded), *_segment_lines(segments.values(), request.without)]
+    said = (*poses.said, *matched, _facing_line(request, seen), *shank.said, *found.said)
+    return Trial(found.ground, said, poses=poses, shank=shank)
 
 
 def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> Trial:
@@ -98,13 +101,21 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
     said = [f"motion: the model's coordinates in {recorded.path.name}, into {MOTION_FILE}"]
     if motion.missing:
         said.append(f"not in the motion, so at their defaults: {', '.join(motion.missing)}")
-    ground = None
-    if request.grf is not None:
-        ground, line = _table_ground(request.grf, leg.side, "+x,+y,+z", request.grf_force)
-        said.append(line + "; laboratory: the model's ground, x forward, y up")
-    else:
-        said.append("no ground reaction given: none is modelled")
-    return Trial(ground, tuple(said), motion=motion)
+    said += [*_notices(recorded), *motion.said]
+    there = model_feet(links, recorded) if request.grf is not None else None
+    found = find_ground(request, leg.side, "+x,+y,+z", there)
+    said += found.said
+    if found.ground is not None:
+        said.append("laboratory: the model's ground, x forward, y up")
+    interval, joined = common_interval(motion.time, found.interval, found.span)
+    if interval is not None:
+        motion = motion.part(*interval)
+    return Trial(found.ground, (*said, *joined), motion=motion)
+
+
+def _notices(recorded: Table) -> list[str]:
+    """Return lines on what of the recording is not used or was read otherwise than stated."""
+    return [f"notice: {recorded.path.name}: {notice}" for notice in recorded.notices]
 
 
 def _facing(request: ImportRequest, segments: list[ModelSegment], recorded: Table) -> Facing:
@@ -130,38 +141,6 @@ def _segment_lines(segments: Iterable[ModelSegment], without: tuple[str, ...]) -
         own = ", ".join(segment.points) or "none"
         lines.append(f"markers of the {segment.name}: {own}{missing}")
     return lines + ([f"markers left out, as given: {', '.join(without)}"] if without else [])
-
-
-def _ground(
-    request: ImportRequest, leg: Leg, recorded: Table, axes: str
-) -> tuple[GroundFile | None, tuple[float, float] | None, list[str]]:
-    """Return the ground reaction, the interval in which it is known, and lines on both."""
-    if request.recording.suffix.lower() != ".c3d":
-        if request.grf is None:
-            return None, request.interval, ["no ground reaction given: none is modelled"]
-        ground, line = _table_ground(request.grf, leg.side, axes, request.grf_force)
-        return ground, request.interval, [line]
-    recording = read_c3d(request.recording)
-    if not recording.plates:
-        raise InputError(
-            "holds no force plates",
-            request.recording,
-            "give its markers with --trc and the ground reaction with --grf",
-        )
-    sides = feet(leg, recorded, OTHER[leg.side])
-    if request.plates is not None:
-        return (
-            GroundFile(request.recording, axes, request.plates),
-            request.interval,
-            [f"force plates {_listed(request.plates)} under the {leg.side} foot, as given"],
-        )
-    loads = plate_loads(recording, axes, sides)
-    plates = own_plates(loads, leg.side, recording)
-    interval = request.interval or known_interval(loads, plates, recording)
-    lines = [*(_load_line(load) for load in loads), _interval_line(request, interval)]
-    lines += _unmeasured_line(loads, plates, recording, sides[leg.side], interval)
-    surface = common_surface(loads, plates)
-    return GroundFile(request.recording, axes, plates, surface=surface), interval, lines
 
 
 def _thinned(
@@ -194,79 +173,3 @@ def _thinned(
     last = float(inside[(count - 1) * every])
     line = f"frames: every {every}th of the recording, {count} at {rate / every:g} Hz"
     return (float(inside[0]), last), count, line
-
-
-def _load_line(load: Load) -> str:
-    other = "" if np.isnan(load.other) else f", {load.other * 1e3:.0f} mm from the other's"
-    step = (
-        f"; the foot stands on a step, about {load.surface:.2f} m above the plate: the wrench is "
-        "taken as it is, with its point on that level"
-        if load.surface
-        else ""
-    )
-    return (
-        f"force plate {load.plate}: {load.side} foot from {load.start:.3f} to {load.end:.3f} s "
-        f"(centre of pressure {load.distance * 1e3:.0f} mm from that foot's markers{other}){step}"
-    )
-
-
-def _interval_line(request: ImportRequest, interval: tuple[float, float]) -> str:
-    why = "as given" if request.interval else "from the first to the last load on these plates"
-    return f"interval: {interval[0]:.4f} to {interval[1]:.4f} s of the recording's clock, {why}"
-
-
-def _unmeasured_line(
-    loads: list[Load],
-    plates: tuple[int, ...],
-    recording: Recording,
-    labels: list[str],
-    interval: tuple[float, float],
-) -> list[str]:
-    times = unmeasured(loads, plates, recording, labels, interval)
-    if not len(times):
-        return []
-    return [
-        f"ATTENTION: off its plates the foot is nearly still in {len(times)} frames, first at "
-        f"{times[0]:.3f} s: does it stand on something that was not measured?"
-    ]
-
-
-def _table_ground(path: Path, side: str, axes: str, force: str | None) -> tuple[GroundFile, str]:
-    """Return the columns of one foot's ground reaction in a table of OpenSim's style."""
-    table = read_table(path)
-    stem = _force_stem(table, side, force)
-    columns = [("time", "time")]
-    columns += [(f"force_{k}", f"{stem}v{a}") for k, a in enumerate("xyz", 1)]
-    columns += [(f"point_{k}", f"{stem}p{a}") for k, a in enumerate("xyz", 1)]
-    torque = stem.replace("force", "torque").rstrip("_")
-    found = [f"{torque}_{a}" for a in "xyz"]
-    if all(name in table.columns for name in found):
-        columns += [(f"moment_{k}", name) for k, name in enumerate(found, 1)]
-    ground = GroundFile(path, axes, (), tuple(columns), "m")
-    why = "as given" if force else "by their name"
-    return ground, (
-        f"ground reaction of the {side} foot: columns {stem}v*, {stem}p* of {path.name}, m, {why}"
-    )
-
-
-def _force_stem(table: Table, side: str, force: str | None) -> str:
-    """Return what the columns of a foot's force begin with: as given, or named after the foot."""
-    stems = [n[:-2] for n in table.columns if n.endswith("vy") and f"{n[:-2]}vx" in table.columns]
-    there = ", ".join(stems) or "none"
-    if force is not None:
-        own = [s for s in stems if s.rstrip("_") == force.removesuffix("_v").rstrip("_")]
-        if len(own) != 1:
-            raise InputError(f"has no force '{force}' (it has {there})", table.path, "--grf-force")
-        return own[0]
-    own = [s for s in stems if re.search(rf"(^|_){side[0]}(_|$)|{side}", s.lower())]
-    if len(own) != 1:
-        raise InputError(
-            f"does not say which force is the {side} foot's (it has {there})",
-            table.path,
-            f"give --grf-force, or name its columns after the foot: ground_force_{side[0]}_vx",
-        )
-    return own[0]
-
-
-def _listed(numbers: tuple[int, ...]) -> str:
-    return ", ".join(map(str, numbers))

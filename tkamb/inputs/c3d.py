@@ -1,31 +1,32 @@
 """C3D recordings: markers, force plates and other analog channels, in SI, with gaps as NaN.
 
 The clock is the recording's own: frame k of the file is at (first frame + k)/rate, with the
-first frame as ezc3d gives it (counted from zero), so that a trial cut out of a longer one keeps
-its times. A sample with a negative residual, or at exactly (0, 0, 0), was not seen: a gap.
+first frame counted from zero, so that a trial cut out of a longer one keeps its times. A sample
+with a negative residual, or at exactly (0, 0, 0), was not seen: a gap.
+
+A recording is read for what a job needs. Markers, channels and each plate are read by
+themselves; what is wrong with one of them is kept, and raised by who asks for it.
 
 Format: C3D user guide, https://www.c3d.org.
 """
 
-import struct
-from dataclasses import dataclass
+import math
+from collections import Counter
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.errors import InputError
+from tkamb.errors import InputError, names_near
+from tkamb.files import TABLE_LIMIT, read_bytes
 from tkamb.geometry.frames import Array
-from tkamb.inputs.force_plates import CHANNELS, ForcePlate, force_plate
-from tkamb.units import LENGTH
+from tkamb.inputs.c3d_file import EXPORT, C3dFile, Parameters, parse_c3d
+from tkamb.inputs.force_plates import CHANNELS, ForcePlate, PlateRecord, force_plate
+from tkamb.inputs.unit_words import GivenUnits, metres
 
-_BLOCK = 512
-_INTEL, _KEY = 84, 0x50
-_LONGEST = 65535
-"""Frames that the header's 16 bits can count; longer recordings say so in TRIAL."""
-_EXPORT = "export the trial again as C3D"
+LARGEST_VALUE = 1e12
+"""In any unit: what is larger was not measured, and its square may overflow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +37,17 @@ class Recording:
         path: the file.
         rate_Hz: of the markers.
         first_frame: number of the first frame, counted from zero.
-        labels: (m) of the markers, as in the file.
-        points: (n, m, 3) m; gaps are NaN.
+        labels: (m) of the markers, as in the file; those without are `marker 7`.
+        points: (n, m, 3) m; gaps are NaN. In the file's unit while `length_unit` is None.
         residual: (n, m) m, of the markers' reconstruction; NaN in gaps.
+        length_unit: of the markers, m, or None where the file's word is not understood.
         analog_rate_Hz: samples per second of the channels.
         channels: name -> (k,) of those channels that belong to no plate, EMG among them.
         channel_units: name -> unit, as in the file.
-        plates: the force plates, in the file's order.
+        plates: the force plates that could be read, in the file's order.
+        faults: "markers", "channels" or "plate 2" -> what is wrong with it.
+        equal_channels: names that stand for several channels.
+        notices: remarks on what was read otherwise than stated.
     """
 
     path: Path
@@ -51,10 +56,14 @@ class Recording:
     labels: tuple[str, ...]
     points: Array
     residual: Array
+    length_unit: str | None
     analog_rate_Hz: float
     channels: dict[str, Array]
     channel_units: dict[str, str]
     plates: tuple[ForcePlate, ...]
+    faults: dict[str, InputError] = field(default_factory=dict)
+    equal_channels: tuple[str, ...] = ()
+    notices: tuple[str, ...] = ()
 
     @property
     def time(self) -> Array:
@@ -68,197 +77,325 @@ class Recording:
         count = len(self.points) * ratio
         return (self.first_frame * ratio + np.arange(count)) / self.analog_rate_Hz
 
+    @property
+    def unread_plates(self) -> dict[int, InputError]:
+        """Number of each plate that could not be read -> why."""
+        return {int(k[6:]): error for k, error in self.faults.items() if k.startswith("plate ")}
 
-def read_c3d(path: str | Path) -> Recording:
+    @property
+    def all_notices(self) -> tuple[str, ...]:
+        """Remarks on the file and its plates, and what of it could not be read."""
+        own = [notice for plate in self.plates for notice in plate.notices]
+        unread = [f"not read, and not needed so far: {error.what}" for error in self._once()]
+        return (*self.notices, *own, *unread)
+
+    def _once(self) -> list[InputError]:
+        return list({error.what: error for error in self.faults.values()}.values())
+
+    def plate(self, number: int) -> ForcePlate:
+        """Return a plate by its number.
+
+        Raises:
+            InputError: there is none of that number, or it cannot be read.
+        """
+        for plate in self.plates:
+            if plate.number == number:
+                return plate
+        if number in self.unread_plates:
+            raise self.unread_plates[number]
+        there = ", ".join(str(plate.number) for plate in self.plates) or "none"
+        raise InputError(
+            f"has no force plate {number}", self.path, f"give [ground_reaction] plates, of {there}"
+        )
+
+    def channel(self, name: str) -> Array:
+        """Return the samples (k,) of a channel that belongs to no plate.
+
+        Raises:
+            InputError: no such channel, several of that name, or channels that cannot be read.
+        """
+        if "channels" in self.faults:
+            raise self.faults["channels"]
+        if name in self.equal_channels:
+            raise InputError(f"has two channels '{name}'", self.path, "rename one")
+        if name not in self.channels:
+            mend = names_near(name, self.channels, "its channels")
+            raise InputError(f"has no channel '{name}'", self.path, mend)
+        return self.channels[name]
+
+    def check_markers(self) -> None:
+        """Raise an InputError if there are no markers."""
+        if "markers" in self.faults:
+            raise self.faults["markers"]
+
+
+def read_c3d(path: str | Path, units: GivenUnits | None = None) -> Recording:
     """Read a C3D file.
 
+    Args:
+        path: the file.
+        units: what unit words mean that the file lacks or writes in a way of its own.
+
     Raises:
-        InputError: no such file, not C3D or cut short, no markers, units or rates that do not
-            fit, or a force plate that cannot be read; the message names it.
+        InputError: no such file, not a regular one, not C3D or cut short, frames of no rate, or
+            header and parameters that contradict each other.
     """
     path = Path(path)
     try:
         changed = path.stat().st_mtime_ns
-    except OSError:
+    except (OSError, ValueError):
         raise InputError("no such file", path, "check the path") from None
-    return _read(path, changed)
+    return _read(path, changed, units or GivenUnits())
 
 
 @lru_cache(maxsize=2)
-def _read(path: Path, changed: int) -> Recording:
+def _read(path: Path, changed: int, units: GivenUnits) -> Recording:
     """Read the file as it was at `changed`; markers and plates of one trial are asked apart."""
-    held = _check_whole(path)
-    content = _parsed(path)
-    parameters, header = content["parameters"], content["header"]
-    points, data = header["points"], content["data"]
-    labels = _labels(parameters["POINT"], path)
-    rate = float(points["frame_rate"])
-    if not labels or not points["size"]:
-        raise InputError("holds no markers", path, _EXPORT)
-    if not (np.isfinite(rate) and rate > 0):
-        raise InputError(f"markers have a rate of {rate:g} Hz", path, _EXPORT)
-    scale = _metres(_first(parameters["POINT"], "UNITS"), path)
-    trajectories = np.moveaxis(data["points"][:3], 0, 2).transpose(1, 0, 2) * scale
-    residual = np.asarray(data["meta_points"]["residuals"], float)[0].T * scale
-    gap = ~np.isfinite(trajectories).all(axis=2) | (residual < 0) | (trajectories == 0).all(axis=2)
-    trajectories[gap], residual[gap] = np.nan, np.nan
-    analog_rate, channels, units = _channels(content, rate, held, path)
-    plates = _plates(parameters, channels, units, scale, path)
-    used = {name for plate in plates for name in plate.channels}
-    return Recording(
+    with np.errstate(all="ignore"):  # damaged numbers overflow; they are gaps below
+        file = parse_c3d(read_bytes(path, TABLE_LIMIT), path)
+        return _Reader(path, file, units).recording()
+
+
+@dataclass(frozen=True, eq=False)
+class _Reader:
+    """The parts of a recording, each by itself; what fails is kept in `faults`."""
+
+    path: Path
+    file: C3dFile
+    units: GivenUnits
+    faults: dict[str, InputError] = field(default_factory=dict)
+
+    @property
+    def _parameters(self) -> Parameters:
+        return self.file.parameters
+
+    def recording(self) -> Recording:
+        """Return the recording."""
+        rate = self._rate()
+        labels, equal = self._labels()
+        scale = self._metres_per_unit()
+        points, residual = self.file.points, self.file.residual
+        wild = ~(np.abs(points) < LARGEST_VALUE).all(axis=2)
+        points[wild], residual[wild] = np.nan, np.nan
+        analog_rate, names, signals, units = self._analog(rate)
+        plates = self._plates(names, signals, units, scale)
+        used = {name for plate in plates for name in plate.channels}
+        counts = Counter(names)
+        own = [k for k, name in enumerate(names) if name not in used and counts[name] == 1]
+        notices = list(self.file.notices)
+        notices += [f"has two markers '{name}'; neither is used" for name in equal]
+        return Recording(
+            self.path,
+            rate,
+            self.file.first_frame,
+            labels,
+            points * (scale or 1.0),
+            residual * (scale or 1.0),
+            "m" if scale else None,
+            analog_rate,
+            {names[k]: signals[k] for k in own},
+            {names[k]: units[k] for k in own},
+            plates,
+            self.faults,
+            tuple(sorted(name for name, count in counts.items() if count > 1)),
+            tuple(notices),
+        )
+
+    def _rate(self) -> float:
+        """Return frames per second: POINT:RATE, or the header's."""
+        stated = self._parameters.number("POINT:RATE")
+        rates = [stated, self.file.header.rate_Hz]
+        for rate in rates:
+            if rate is not None and math.isfinite(rate) and 1e-3 < rate < 1e6:
+                return rate
+        raise InputError(f"markers have a rate of {rates[0] or 0:g} Hz", self.path, EXPORT)
+
+    def _labels(self) -> tuple[tuple[str, ...], list[str]]:
+        """Return a label per marker, and those that stand twice."""
+        count = self.file.points.shape[1]
+        stated = self._parameters.texts("POINT:LABELS")[:count]
+        stated += [""] * (count - len(stated))
+        labels = tuple(name or f"marker {k}" for k, name in enumerate(stated, 1))
+        if not count:
+            self.faults["markers"] = InputError("holds no markers", self.path, EXPORT)
+        return labels, sorted(name for name, n in Counter(labels).items() if n > 1)
+
+    def _metres_per_unit(self) -> float | None:
+        """Return metres per unit of length; None where the file's word is not understood."""
+        words = self._parameters.texts("POINT:UNITS")
+        word = words[0] if words else ""
+        own, given = metres(word), self.units.length
+        if given is None:
+            return own
+        if own is not None and own != metres(given):
+            raise InputError(
+                f"is in {word} by its own header, but length_unit says {given}",
+                self.path,
+                "correct length_unit",
+            )
+        return metres(given)
+
+    def _analog(self, rate: float) -> tuple[float, list[str], Array, list[str]]:
+        """Return rate (Hz), and names, samples (c, k) and units of the analog channels."""
+        header, parameters = self.file.header, self._parameters
+        samples = header.samples or 1
+        nothing = rate * samples, [], np.empty((0, 0)), []
+        count = self.file.raw_analog.shape[1]
+        if not count:
+            return rate, [], np.empty((0, 0)), []
+        stated = parameters.number("ANALOG:RATE")
+        try:
+            _check_rates(stated, rate, samples, self.path)
+            scale = parameters.series("ANALOG:SCALE")[:count]
+            offset = parameters.series("ANALOG:OFFSET")[:count]
+            general = parameters.number("ANALOG:GEN_SCALE")
+            names, units = (parameters.texts(f"ANALOG:{key}") for key in ("LABELS", "UNITS"))
+            unsigned = [text.upper() for text in parameters.texts("ANALOG:FORMAT")[:1]]
+            if len(scale) < count or not np.isfinite(scale).all():
+                raise InputError(
+                    f"has scales for {len(scale)} of its {count} channels", self.path, EXPORT
+                )
+        except InputError as error:
+            self.faults["channels"] = error
+            return nothing
+        if unsigned == ["UNSIGNED"]:
+            offset = np.where(offset < 0, offset + 65536.0, offset)
+        offset = np.concatenate([offset, np.zeros(count - len(offset))])
+        factor = scale * (1.0 if general is None else general)
+        signals = ((self.file.raw_analog - offset) * factor).T
+        signals[~(np.abs(signals) < LARGEST_VALUE)] = np.nan
+        names = [name or f"channel {k}" for k, name in enumerate(names[:count], 1)]
+        names += [f"channel {k}" for k in range(len(names) + 1, count + 1)]
+        return rate * samples, names, signals, [*units[:count], *[""] * (count - len(units))]
+
+    def _plates(
+        self, names: list[str], signals: Array, units: list[str], scale: float | None
+    ) -> tuple[ForcePlate, ...]:
+        """Return the plates that can be read; the faults of the others are kept."""
+        try:
+            used = self._parameters.integers("FORCE_PLATFORM:USED")
+        except InputError as error:
+            self.faults["plate 1"] = error
+            return ()
+        plates = []
+        for number in range(1, min(used[0] if used else 0, 255) + 1):
+            try:
+                record = self._record(number, names, signals, units, scale)
+                plates.append(force_plate(record))
+            except InputError as error:
+                self.faults[f"plate {number}"] = error
+        return tuple(plates)
+
+    def _record(
+        self, number: int, names: list[str], signals: Array, units: list[str], scale: float | None
+    ) -> PlateRecord:
+        """Return what the file says of a plate."""
+        where, k = f"{self.path}: force plate {number}", number - 1
+        if "channels" in self.faults:
+            raise self.faults["channels"]
+        if scale is None:
+            words = self._parameters.texts("POINT:UNITS")
+            raise no_length_unit(words[0] if words else "", self.path)
+        kinds = self._parameters.integers("FORCE_PLATFORM:TYPE")
+        corners, origin, channel = (
+            self._per_plate(key, rows)
+            for key, rows in (("CORNERS", (3, 4)), ("ORIGIN", (3,)), ("CHANNEL", None))
+        )
+        there = (len(kinds), *(0 if v is None else v.shape[-1] for v in (corners, origin, channel)))
+        if min(there) < number:
+            raise InputError("is not described in full", where, EXPORT)
+        assert corners is not None and origin is not None and channel is not None
+        wanted = channel[: CHANNELS.get(kinds[k], 6), k]
+        if not np.isfinite(wanted).all() or len(set(wanted)) < len(wanted):
+            raise InputError("names one channel twice", where, EXPORT)
+        if len(wanted) and (wanted.min() < 1 or wanted.max() > len(names)):
+            raise InputError(f"asks for channel {wanted.max():g} of {len(names)}", where, EXPORT)
+        rows = [int(one) - 1 for one in wanted]
+        force = self._parameters.texts("FORCE_PLATFORM:UNITS")
+        return PlateRecord(
+            number,
+            kinds[k],
+            corners[:, :, k].T * scale,
+            origin[:, k] * scale,
+            tuple(names[row] for row in rows),
+            signals[rows],
+            tuple(units[row] for row in rows),
+            self._calibration(kinds[k], k),
+            (force[0] if force else "") or "N",
+            scale,
+            self._zero(),
+            self.units,
+            where,
+        )
+
+    def _per_plate(self, key: str, rows: tuple[int, ...] | None) -> Array | None:
+        """Return numbers whose last index is the plate; one plate's may lack that index."""
+        value = self._parameters.numbers(f"FORCE_PLATFORM:{key}")
+        if value is None or not value.size:
+            return None
+        shape = rows or (value.shape[0],) if value.ndim else (1,)
+        if value.size % math.prod(shape):
+            return None
+        return value.reshape((*shape, -1), order="F")
+
+    def _calibration(self, kind: int, k: int) -> Array | None:
+        """Return the calibration matrix (6, c) of plate k, columns by channel; None without."""
+        value = self._parameters.numbers("FORCE_PLATFORM:CAL_MATRIX")
+        if kind not in (4, 5) or value is None or value.ndim < 2:
+            return None
+        value = value.reshape((*value.shape[:2], -1), order="F")
+        if value.shape[2] <= k or not np.isfinite(value[:, :, k]).all():
+            return None
+        matrix, channels = value[:, :, k], CHANNELS[kind]
+        if matrix.shape[0] != 6:
+            matrix = matrix.T
+        matrix = matrix[:6, :channels]
+        return matrix if matrix.any() else None
+
+    def _zero(self) -> slice | None:
+        """Return the samples that FORCE_PLATFORM:ZERO calls unloaded; None if it names none.
+
+        Its frames are those of the recording's own count. In a recording cut out of a longer
+        one they may lie before its first frame; they are then counted from that.
+        """
+        frames = self._parameters.integers("FORCE_PLATFORM:ZERO")
+        if len(frames) != 2 or frames[1] < 1 or frames[1] < frames[0]:
+            return None
+        first, last = max(frames[0], 1) - 1, frames[1]
+        count, start = len(self.file.points), self.file.first_frame
+        if start <= first and last <= start + count:
+            first, last = first - start, last - start
+        if last > count:
+            return None
+        ratio = self.file.header.samples or 1
+        return slice(first * ratio, last * ratio)
+
+
+def no_length_unit(word: str, path: Path) -> InputError:
+    """Return the refusal of a recording whose unit of length is not understood."""
+    stated = f"the unit '{word}'" if word else "no unit"
+    return InputError(
+        f"states {stated} for its markers (POINT:UNITS)",
         path,
-        rate,
-        int(points["first_frame"]),
-        labels[: trajectories.shape[1]],
-        trajectories,
-        residual,
-        analog_rate,
-        {name: values for name, values in channels.items() if name not in used},
-        {name: unit for name, unit in units.items() if name not in used},
-        plates,
+        "state it with --length-unit or length_unit: m, cm or mm",
     )
 
 
-def _check_whole(path: Path) -> int:
-    """Raise unless the file is C3D and as long as its own header says.
-
-    ezc3d fills what is missing with zeros, or worse.
-
-    Returns:
-        Analog samples a frame, by the header; 0 without any or in another machine's numbers.
-    """
-    content = path.read_bytes()
-    if len(content) < _BLOCK or content[1] != _KEY:
-        raise InputError("is not a C3D file", path, "give a recording in C3D")
-    start = (content[0] - 1) * _BLOCK
-    if start < _BLOCK or len(content) < start + 4:
-        raise InputError("is cut short: its parameters are missing", path, "copy it again")
-    if content[start + 3] != _INTEL:
-        return 0  # another machine's numbers: ezc3d turns them
-    markers, analog, first, last = struct.unpack("<4H", content[2:10])
-    scale, data_block, samples = struct.unpack("<fHH", content[12:20])
-    frames, size = last - first + 1, (4 * markers + analog) * (4 if scale < 0 else 2)
-    there = max(len(content) - (data_block - 1) * _BLOCK, 0)
-    if last < _LONGEST and there < frames * size:
-        share = 100.0 * there / (frames * size)
-        raise InputError(
-            f"is cut short: it holds {share:.0f} % of its {frames} frames", path, "copy it again"
-        )
-    return int(samples) if analog else 0
-
-
-def _parsed(path: Path) -> Any:
-    import ezc3d
-
-    try:
-        return ezc3d.c3d(str(path))
-    except Exception as error:  # the reader raises what its bindings make of C++ exceptions
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"cannot be read as C3D ({reason})", path, _EXPORT) from None
-
-
-def _first(group: Any, key: str) -> Any:
-    value = group[key]["value"] if key in group else []
-    return value[0] if len(value) else None
-
-
-def _labels(group: Any, path: Path) -> tuple[str, ...]:
-    """Return LABELS, LABELS2, … in one: each holds 255 at most."""
-    names: list[str] = []
-    for key in sorted((k for k in group if k.startswith("LABELS")), key=lambda k: (len(k), k)):
-        names += [str(name).strip() for name in group[key]["value"]]
-    repeated = sorted({name for name in names if name and names.count(name) > 1})
-    if repeated:
-        raise InputError(f"has two channels or markers '{repeated[0]}'", path, "rename one")
-    return tuple(names)
-
-
-def _metres(unit: str | None, path: Path) -> float:
-    if unit not in LENGTH:
-        stated = f"the unit '{unit}'" if unit else "no unit"
-        raise InputError(f"states {stated} for its markers (POINT:UNITS)", path, "m, cm or mm")
-    return LENGTH[unit]
-
-
-def _channels(
-    content: Any, rate: float, held: int, path: Path
-) -> tuple[float, dict[str, Array], dict[str, str]]:
-    """Return rate (Hz), samples and units of the analog channels, by name.
-
-    `held` is how many samples a frame the header counts; 0 if it says nothing.
-    """
-    group, values = content["parameters"].get("ANALOG", {}), content["data"]["analogs"][0]
-    stated = _first(group, "RATE")
-    if held and stated:
-        _check_rates(float(stated), rate, held, path)
-    if not values.shape[0] or not values.shape[1]:
-        return rate, {}, {}
-    analog_rate = float(stated or content["header"]["analogs"]["frame_rate"])
-    names = [name or f"channel {k}" for k, name in enumerate(_labels(group, path), 1)]
-    names += [f"channel {k}" for k in range(len(names) + 1, values.shape[0] + 1)]
-    stated = [str(unit).strip() for unit in group["UNITS"]["value"]] if "UNITS" in group else []
-    units = [*stated, *[""] * len(names)]
-    columns = dict(zip(names, np.asarray(values, float), strict=False))
-    return analog_rate, columns, dict(zip(names, units, strict=False))
-
-
-def _check_rates(analog_rate: float, rate: float, held: int, path: Path) -> None:
-    """Raise unless the rates that a file states are those of what it holds.
-
-    ezc3d goes by the rates: where they are wrong it takes samples for markers.
-    """
+def _check_rates(analog_rate: float | None, rate: float, samples: int, path: Path) -> None:
+    """Raise unless the rates that a file states are those of the samples that it holds."""
+    if analog_rate is None or analog_rate == 0:
+        return  # the samples a frame say it
     ratio = analog_rate / rate
-    if ratio < 1 or abs(ratio - round(ratio)) > 1e-6:
+    if not ratio >= 1 or abs(ratio - round(ratio)) > 1e-4:
         raise InputError(
             f"analog rate {analog_rate:g} Hz is no multiple of the markers' {rate:g} Hz",
             path,
-            _EXPORT,
+            EXPORT,
         )
-    if round(ratio) != held:
+    if round(ratio) != samples:
         raise InputError(
-            f"states an analog rate of {analog_rate:g} Hz, but holds {held} samples a frame of "
+            f"states an analog rate of {analog_rate:g} Hz, but holds {samples} samples a frame of "
             f"{rate:g} Hz",
             path,
-            _EXPORT,
+            EXPORT,
         )
-
-
-def _plates(
-    parameters: Any,
-    channels: dict[str, Array],
-    units: dict[str, str],
-    scale: float,
-    path: Path,
-) -> tuple[ForcePlate, ...]:
-    group: Any = parameters.get("FORCE_PLATFORM", {})
-    count = int(_first(group, "USED") or 0)
-    plates = []
-    names = list(channels)
-    for k in range(count):
-        where = f"{path}: force plate {k + 1}"
-        try:
-            kind = int(group["TYPE"]["value"][k])
-            corners = np.asarray(group["CORNERS"]["value"], float)[:, :, k].T * scale
-            origin = np.asarray(group["ORIGIN"]["value"], float)[:, k] * scale
-            wanted = np.asarray(group["CHANNEL"]["value"], int)[: CHANNELS.get(kind, 6), k]
-        except (KeyError, IndexError, ValueError):
-            raise InputError("is not described in full", where, _EXPORT) from None
-        if len(wanted) and (wanted.min() < 1 or wanted.max() > len(names)):
-            raise InputError(f"asks for channel {wanted.max()} of {len(names)}", where, _EXPORT)
-        own = tuple(names[channel - 1] for channel in wanted)
-        matrix = _calibration(group, k)
-        signals = np.array([channels[name] for name in own])
-        plates.append(
-            force_plate(
-                k + 1, kind, corners, origin, own, signals, [units[n] for n in own], matrix, where
-            )
-        )
-    return tuple(plates)
-
-
-def _calibration(group: Any, k: int) -> NDArray[np.float64] | None:
-    """Return the calibration matrix (6, 6) of plate k, columns by channel; None without one."""
-    matrices = np.asarray(group["CAL_MATRIX"]["value"], float) if "CAL_MATRIX" in group else None
-    if matrices is None or matrices.ndim != 3 or matrices.shape[2] <= k:
-        return None
-    return matrices[:, :, k]

@@ -18,7 +18,7 @@ from typing import Literal
 
 import numpy as np
 
-from tkamb.errors import InputError, names_near
+from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.inputs.recordings import EmgRecording
 from tkamb.inputs.samples import check_overlap
@@ -144,8 +144,5 @@ def _signals(source: EmgRecording) -> tuple[Array, dict[str, Array]]:
     from tkamb.inputs.c3d import read_c3d
 
     recording = read_c3d(source.file)
-    for name in source.channels:
-        if name not in recording.channels:
-            mend = names_near(name, recording.channels, "its channels")
-            raise InputError(f"has no channel '{name}'", source.file, mend)
-    return recording.analog_time, {name: recording.channels[name] for name in source.channels}
+    signals = {name: recording.channel(name) for name in source.channels}
+    return recording.analog_time, signals

@@ -11,7 +11,8 @@ loaded frames on either side and the moment is whatever the wrench needs about t
 force and moment stay exactly as measured and filtered, only their point is conventional.
 """
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from tkamb.inputs.laboratory import check_roles, laboratory_rotation
 from tkamb.inputs.recordings import ForceRecording, Side
 from tkamb.inputs.samples import OddSample, check_range, check_spacing, odd_samples
 from tkamb.inputs.tables import Table, read_table
+from tkamb.inputs.unit_words import GivenUnits
 from tkamb.units import MILLIMETRE
 
 DIRECTIONS = ("forward", "upward", "rightward")
@@ -38,6 +40,23 @@ ODD_FORCE, LEAST_ODD_FORCE, ODD_POINT = 0.05, 0.01, 5e-3
 larger of the forces, or as the last, no sample is odd."""
 WINDOW = 0.5
 """s: samples farther from the frames than this do not reach them through the filter."""
+AROUND_LOAD_S = 0.05
+"""A plate's wrench counts from this much before its load to this much after: a foot comes down
+and leaves within 0.02 s, and amplifiers drift while nobody stands on a plate."""
+DRIFT_N = 2.0
+"""Vertical force of a plate that nobody stands on; noise has no median, and 2 N act on the knee
+by less than 0.5 % of a body's weight."""
+UNLOADED_S = 0.1
+"""A plate that is unloaded for less shows no drift."""
+LOAD_N = 20.0
+"""Force beyond what a plate reads while nobody stands on it that is a load: as filters of ground
+reactions mostly have it."""
+QUIET_SHARE, QUIET_SPREAD_N, MOST_DRIFT_N = 0.1, 4.0, 60.0
+"""The smallest tenth of a plate's forces is what it reads unloaded if they lie within the second
+of each other (no foot is so steady) and below the third; else the plate has no drift to see."""
+FREE_MOMENT = 1e-6
+"""N·m: horizontal moments above this show a moment about another point than the centre of
+pressure."""
 FARTHEST_FROM_ANKLE = 0.5
 """m; a centre of pressure farther from the ankle than this is under no foot of that leg."""
 
@@ -53,6 +72,8 @@ class GroundReaction:
         loaded: (f,) whether the vertical force is at or above `unloaded_N`.
         odd: recorded samples around the frames that lie off their neighbours' curve.
         level_assumed: no column says the plate's height, so it is the laboratory's 0.
+        drift: number of a plate -> N, what it reads while nobody stands on it, where that is much.
+        notices: remarks on what of the file was used.
     """
 
     force: Array
@@ -61,6 +82,36 @@ class GroundReaction:
     loaded: np.ndarray
     odd: tuple[OddSample, ...] = ()
     level_assumed: bool = False
+    drift: dict[int, float] = field(default_factory=dict)
+    notices: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedReaction:
+    """What a file holds of a foot's ground reaction, in the laboratory.
+
+    Args:
+        time: (k,) s.
+        force: (k, 3) N.
+        point: (k, 3) m.
+        moment: (k, 3) N·m about that point.
+        level_assumed: no column says the plate's height.
+        drift: as in `GroundReaction`.
+        notices: as there.
+    """
+
+    time: Array
+    force: Array
+    point: Array
+    moment: Array
+    level_assumed: bool = False
+    drift: dict[int, float] = field(default_factory=dict)
+    notices: tuple[str, ...] = ()
+
+    def part(self, rows: slice) -> "RecordedReaction":
+        """Return some of the samples."""
+        own = {name: getattr(self, name)[rows] for name in ("time", "force", "point", "moment")}
+        return replace(self, **own)
 
 
 def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> GroundReaction:
@@ -76,14 +127,14 @@ def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> Gro
             mainly upwards, or a centre of pressure is missing or not level while the plate is
             loaded.
     """
-    from_plates = (source.format or source.file.suffix.lower().lstrip(".")) == "c3d"
-    read = _read_plates if from_plates else _read_table
-    stamps, force, point, moment, level_assumed = read(source)
+    from_plates = _is_c3d(source)
+    recorded = _complete_part((_read_plates if from_plates else _read_table)(source), time, source)
+    stamps, force, point, moment = recorded.time, recorded.force, recorded.point, recorded.moment
     path = source.file
     check_spacing(path, stamps)
     _check_upward(force, source)
     loaded = force[:, 1] >= source.unloaded
-    point = _hold_point(stamps, point, loaded, path)
+    held, point = _own_points(recorded, loaded, path)
     near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
     # of plates the wrench was recorded: their point is a quotient, which small forces shake
     points = None if from_plates else point[near]
@@ -97,24 +148,112 @@ def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> Gro
         )
     if side == "left":
         force, point, moment = force @ MIRROR, point @ MIRROR, -moment @ MIRROR
+        held = held @ MIRROR
     wrench = np.concatenate([force, np.cross(point, force) + moment], axis=1)
     filtered, _, _ = differentiate_coordinates(stamps, wrench, source.cutoff, time, name=str(path))
-    reaction = _at_centre_of_pressure(filtered, level, source.unloaded, time, stamps, point)
-    return replace(reaction, odd=odd, level_assumed=level_assumed)
+    reaction = _at_centre_of_pressure(filtered, level, source.unloaded, time, stamps, held)
+    return replace(
+        reaction,
+        odd=odd,
+        level_assumed=recorded.level_assumed,
+        drift=recorded.drift,
+        notices=recorded.notices,
+    )
 
 
-def _read_table(source: ForceRecording) -> tuple[Array, Array, Array, Array, bool]:
-    """Return what `_read_plates` does; a table without the points' heights has them at zero."""
+def recorded_wrench(source: ForceRecording) -> tuple[Array, Array, float]:
+    """Return times (k,) s, wrench (k, 6) N and N·m, and level (m) of a table's force.
+
+    The wrench is that on the foot, in the laboratory and about its origin.
+
+    Raises:
+        InputError: columns that cannot be used, or a force that is not mainly upwards.
+    """
+    recorded = _read_table(source)
+    _check_upward(recorded.force, source)
+    loaded = recorded.force[:, 1] >= source.unloaded
+    _, point = _own_points(recorded, loaded, source.file)
+    about = np.cross(point, recorded.force) + recorded.moment
+    level = float(np.median(point[loaded, 1])) if loaded.any() else 0.0
+    return recorded.time, np.concatenate([recorded.force, about], axis=1), level
+
+
+def _own_points(recorded: RecordedReaction, loaded: np.ndarray, path: Path) -> tuple[Array, Array]:
+    """Return the points carried over while unloaded, and those of the moments, each (k, 3) m.
+
+    A row with a full moment states it about its own point, wherever that is.
+    """
+    held = _hold_point(recorded.time, recorded.point, loaded, path)
+    aside = np.abs(recorded.moment[:, [0, 2]]) > FREE_MOMENT
+    own = np.isfinite(recorded.point).all(axis=1) & aside.any(axis=1)
+    return held, np.where(own[:, None], recorded.point, held)
+
+
+def recorded_span(source: ForceRecording) -> tuple[float, float]:
+    """Return first and last time (s) of a file's ground reaction."""
+    if _is_c3d(source):
+        time = read_c3d(source.file, _units(source)).analog_time
+    else:
+        time = read_table(source.file, source.format).time(source.columns.get("time", "time"))
+    return float(time[0]), float(time[-1])
+
+
+def _is_c3d(source: ForceRecording) -> bool:
+    return (source.format or source.file.suffix.lower().lstrip(".")) == "c3d"
+
+
+def _units(source: ForceRecording) -> GivenUnits:
+    return GivenUnits(source.length_unit, source.force_unit, source.moment_unit)
+
+
+def _complete_part(
+    recorded: RecordedReaction, time: Array, source: ForceRecording
+) -> RecordedReaction:
+    """Return the samples around the frames up to the next that is not a number.
+
+    Raises:
+        InputError: one among the frames.
+    """
+    gaps = ~(np.isfinite(recorded.force) & np.isfinite(recorded.moment)).all(axis=1)
+    if not gaps.any():
+        return recorded
+    stamps = recorded.time
+    first = max(int(np.searchsorted(stamps, time[0] + 1e-9, side="right")) - 1, 0)
+    last = min(int(np.searchsorted(stamps, time[-1] - 1e-9)), len(stamps) - 1)
+    inside = gaps[first : last + 1]
+    if inside.any():
+        raise InputError(
+            f"holds a value that is not a number at {stamps[first + int(np.argmax(inside))]:.4f} s",
+            source.file,
+            "choose an interval without it, or fill the gap",
+        )
+    before, after = np.flatnonzero(gaps[:first]), np.flatnonzero(gaps[last:])
+    start = int(before[-1]) + 1 if len(before) else 0
+    end = last + int(after[0]) if len(after) else len(stamps)
+    part = recorded.part(slice(start, end))
+    line = f"used from {part.time[0]:.4f} to {part.time[-1]:.4f} s: beside it are values that are "
+    return replace(part, notices=(*part.notices, line + "not numbers"))
+
+
+def _read_table(source: ForceRecording) -> RecordedReaction:
+    """Return what a table holds; one without the points' heights has them at zero."""
     if source.surface:
         raise InputError(
             "is for plates of a .c3d: a table states its points itself",
             "[ground_reaction] surface_mm",
             "leave it out",
         )
+    for key, given in (("force_unit", source.force_unit), ("moment_unit", source.moment_unit)):
+        if given:
+            raise InputError(
+                "is for plates of a .c3d: a table is in N and N·m",
+                f"[ground_reaction] {key}",
+                "leave it out",
+            )
     recorded = read_table(source.file, source.format)
     stamps = recorded.time(source.columns.get("time", "time"))
     level_assumed = _upright_point(source) not in {*source.columns, *recorded.columns}
-    return stamps, *_read_columns(source, recorded), level_assumed
+    return RecordedReaction(stamps, *_read_columns(source, recorded), level_assumed)
 
 
 def _odd_samples(
@@ -168,14 +307,20 @@ def _read_columns(source: ForceRecording, recorded: Table) -> tuple[Array, Array
     roles = [f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)]
     check_roles(source.columns, ("time", *roles), recorded.path, "ground_reaction")
     rotation = laboratory_rotation(source.laboratory_axes, recorded.path)
+    there = {role for role in roles if role in source.columns or role in recorded.columns}
     columns = []
+    # moments about the file's origin need no points: the force then is given there
+    pointless = not any(role.startswith("point") for role in there) and len(there) == 6
     for role in roles:
         column = source.columns.get(role, role)
-        given = role in source.columns or column in recorded.columns
+        given = role in there
+        if role.startswith("point") and pointless:
+            columns.append(np.zeros(recorded.rows))
+            continue
         if role.startswith("point") and (given or role != _upright_point(source)):
             columns.append(recorded.column(column))  # undefined while unloaded
         elif role.startswith("force") or given:
-            columns.append(recorded.complete_column(column))
+            columns.append(recorded.column(column))
             _check_size(recorded.path, role[:-2], column, columns[-1])
         else:
             columns.append(np.zeros_like(columns[0]))
@@ -188,43 +333,98 @@ def _check_size(path: Path, kind: str, column: str, values: Array) -> None:
     """Raise an InputError where a column (n,) of a kind holds more than a foot exerts."""
     largest, unit = LARGEST[kind]
     question = f"is a cell mistyped, or the {kind} not in {unit}?"
-    check_range(path, f"foot: column '{column}'", values, (-largest, largest), unit, question)
+    known = np.where(np.isfinite(values), values, 0.0)  # a gap is refused where it is needed
+    check_range(path, f"foot: column '{column}'", known, (-largest, largest), unit, question)
 
 
-def _read_plates(source: ForceRecording) -> tuple[Array, Array, Array, Array, bool]:
-    """Return times (k,) s, force, point and free moment, each (k, 3), of a recording's plates.
+def _read_plates(source: ForceRecording) -> RecordedReaction:
+    """Return the ground reaction of a recording's plates.
 
-    And False: how high the plates lie is recorded.
-
-    The wrenches are summed about the laboratory's origin and kept: the point lies on the level
-    of the plates' surface or that of a step on them, `surface_mm` above it, and is carried over
-    in time while the vertical force is below `unloaded_N`.
+    The wrenches are summed about the laboratory's origin and kept, each while its plate is
+    loaded: the point lies on the level of the plates' surface or that of a step on them,
+    `surface_mm` above it, and is carried over in time while the vertical force is below
+    `unloaded_N`.
     """
-    recording = read_c3d(source.file)
+    recording = read_c3d(source.file, _units(source))
     check_roles(source.columns, (), source.file, "ground_reaction")
-    there = {plate.number: plate for plate in recording.plates}
-    missing = [number for number in source.plates if number not in there]
-    if missing or not source.plates:
-        asked = f"has no force plate {missing[0]}" if missing else "holds several force plates"
+    there = [plate.number for plate in recording.plates]
+    if not source.plates:
         raise InputError(
-            asked if there else "holds no force plate",
+            "holds several force plates" if there else "holds no force plate",
             source.file,
             f"give [ground_reaction] plates, of {', '.join(map(str, there)) or 'none'}",
         )
+    plates = [recording.plate(number) for number in dict.fromkeys(source.plates)]
     rotation = laboratory_rotation(source.laboratory_axes, source.file)
-    plates = [there[number] for number in dict.fromkeys(source.plates)]
-    wrench = source.sign * np.sum([plate.wrench for plate in plates], axis=0)
-    force, about_origin = wrench[:, :3] @ rotation.T, wrench[:, 3:] @ rotation.T
     levels = [float((rotation @ plate.centre)[1]) for plate in plates]
     if np.ptp(levels) > LEVEL_TOLERANCE:
         raise InputError("the plates lie at different levels", source.file, "give them one by one")
+    wrenches, drift = [], {}
+    for plate in plates:
+        in_file = source.sign * plate.wrench
+        wrench = np.concatenate([in_file[:, :3] @ rotation.T, in_file[:, 3:] @ rotation.T], axis=1)
+        size = np.linalg.norm(wrench[:, :3], axis=1)  # in any direction: wrong axes are told below
+        on = around_load(size, recording.analog_time)
+        wrenches.append(np.where((on | ~np.isfinite(wrench).all(axis=1))[:, None], wrench, 0.0))
+        level = unloaded_level(wrench[:, 1], on, recording.analog_time)
+        if abs(level) > DRIFT_N:
+            drift[plate.number] = level
+    point, moment, force = summed_reaction(
+        recording.analog_time, wrenches, levels[0] + source.surface, source.unloaded, source.file
+    )
+    notices = tuple(notice for plate in plates for notice in plate.notices)
+    return RecordedReaction(
+        recording.analog_time, force, point, moment, drift=drift, notices=notices
+    )
+
+
+def summed_reaction(
+    time: Array, wrenches: list[Array], level: float, unloaded: float, path: Path
+) -> tuple[Array, Array, Array]:
+    """Return point (k, 3) m, moment (k, 3) N·m about it and force (k, 3) N of summed wrenches.
+
+    Args:
+        time: (k,) s.
+        wrenches: each (k, 6), force and moment about the laboratory's origin.
+        level: m, height of the point.
+        unloaded: N, vertical force below which the point is carried over in time.
+        path: the file, for messages.
+    """
+    wrench = np.sum(wrenches, axis=0)
+    force, about_origin = wrench[:, :3], wrench[:, 3:]
     point = np.full_like(force, np.nan)
-    loaded = force[:, 1] >= source.unloaded
-    level = levels[0] + source.surface
+    loaded = force[:, 1] >= unloaded
     point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], level)
-    point = _hold_point(recording.analog_time, point, loaded, source.file)
-    moment = about_origin - np.cross(point, force)
-    return recording.analog_time, force, point, moment, False
+    point = _hold_point(time, point, loaded, path)
+    return point, about_origin - np.cross(point, force), force
+
+
+def around_load(force: Array, time: Array) -> np.ndarray:
+    """Return (k,) whether a plate is loaded, or was or will be within `AROUND_LOAD_S`.
+
+    Args:
+        force: (k,) N, size of the force on the plate.
+        time: (k,) s.
+    """
+    known = np.sort(force[np.isfinite(force)])
+    quiet = known[: math.ceil(QUIET_SHARE * len(known))]
+    steady = len(quiet) and np.ptp(quiet) <= QUIET_SPREAD_N and quiet[-1] <= MOST_DRIFT_N
+    loaded = np.flatnonzero(force >= LOAD_N + (float(np.median(quiet)) if steady else 0.0))
+    if not len(loaded):
+        return np.zeros(len(force), bool)
+    after = np.searchsorted(loaded, np.arange(len(force)))
+    nearest = np.minimum(
+        np.abs(time[loaded[np.minimum(after, len(loaded) - 1)]] - time),
+        np.abs(time - time[loaded[np.maximum(after - 1, 0)]]),
+    )
+    return np.asarray(nearest <= AROUND_LOAD_S)
+
+
+def unloaded_level(vertical: Array, on: np.ndarray, time: Array) -> float:
+    """Return the median (N) of a plate's vertical force while nobody stands on it; else zero."""
+    free = vertical[~on & np.isfinite(vertical)]
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    return float(np.median(free)) if len(free) * step >= UNLOADED_S else 0.0
 
 
 def _centre_of_pressure(force: Array, about_origin: Array, level: float) -> Array:

@@ -176,6 +176,8 @@ class ForceRecording:
         force: what the file's force acts on; that on the plate is the opposite of that on the foot.
         unloaded: N, vertical force below which the centre of pressure is held.
         surface: m, of a C3D file: height above the plates of what the foot stands on.
+        force_unit: of a C3D file's force channels, where it does not say; None: it does.
+        moment_unit: of its moment channels, likewise.
     """
 
     file: Path
@@ -188,6 +190,8 @@ class ForceRecording:
     force: Literal["on the foot", "on the plate"]
     unloaded: float
     surface: float
+    force_unit: str | None = None
+    moment_unit: str | None = None
 
     @property
     def sign(self) -> float:

@@ -11,6 +11,11 @@ from tkamb.inputs.tables import Table
 from tkamb.opensim.kinematics import Kinematics
 from tkamb.units import DEGREE
 
+MOST_RADIANS = 6.5
+"""A joint's angle never exceeds a whole turn, 6.28; in degrees most movements do."""
+LEAST_TURN_DEG = 0.2
+"""What turns by less in a whole recording stands still, in degrees and in radians."""
+
 
 @dataclass(frozen=True, eq=False)
 class CoordinateMotion:
@@ -43,19 +48,80 @@ def read_coordinates(kinematics: Kinematics, recorded: Table) -> tuple[Array, tu
     """
     model = kinematics.model
     q = np.tile(kinematics.vector({}), (recorded.rows, 1))
-    missing = []
-    for name, coordinate in model.coordinates.items():
-        column = next((c for c in recorded.columns if name in (c, *c.split("/")[-2:-1])), None)
-        if column is None:
-            missing.append(name)
-            continue
-        values = recorded.complete_column(column)
-        if coordinate.rotational:
-            if recorded.in_degrees is None:
-                raise InputError("does not say inDegrees", recorded.path, "add it to its header")
-            values = values * (DEGREE if recorded.in_degrees else 1.0)
-        q[:, kinematics.coordinates[name]] = values
-    return q, tuple(missing)
+    found = {name: _column_of(name, recorded) for name in model.coordinates}
+    missing = tuple(name for name, column in found.items() if column is None)
+    columns = {name: recorded.complete_column(c) for name, c in found.items() if c is not None}
+    angles = {name: v for name, v in columns.items() if model.coordinates[name].rotational}
+    scale = _angle_scale(angles, recorded) if angles else 1.0
+    for name, values in columns.items():
+        q[:, kinematics.coordinates[name]] = values * (scale if name in angles else 1.0)
+    return q, missing
+
+
+def _column_of(name: str, recorded: Table) -> str | None:
+    """Return the column of a coordinate's value: its name, or its path in a states file.
+
+    There `/jointset/knee/flexion/value` stands beside `/jointset/knee/flexion/speed`.
+    """
+    paths = [column.split("/") for column in recorded.columns]
+    readings = (
+        lambda path: path == [name],
+        lambda path: path[-2:] == [name, "value"],
+        lambda path: len(path) > 1 and path[-1] == name,
+    )
+    for reading in readings:
+        for path in paths:
+            if reading(path):
+                return "/".join(path)
+    return None
+
+
+def _angle_scale(angles: dict[str, Array], recorded: Table) -> float:
+    """Return radians per unit of the angles; the file's header says it, or their size does.
+
+    Raises:
+        InputError: neither does, or the two contradict each other.
+    """
+    largest = max(float(np.abs(values).max()) for values in angles.values())
+    worst = max(angles, key=lambda name: np.abs(angles[name]).max())
+    if recorded.in_degrees is None:
+        if largest <= MOST_RADIANS:
+            raise InputError(
+                "does not say inDegrees",
+                recorded.path,
+                "add a line inDegrees=yes or inDegrees=no above its endheader",
+            )
+        return DEGREE
+    if not recorded.in_degrees and largest > MOST_RADIANS:
+        raise InputError(
+            f"says inDegrees=no, but '{worst}' reaches {largest:.4g}, which no joint does in "
+            "radians",
+            recorded.path,
+            "is it in degrees? then write inDegrees=yes",
+        )
+    return DEGREE if recorded.in_degrees else 1.0
+
+
+def angle_lines(kinematics: Kinematics, recorded: Table, q: Array) -> tuple[str, ...]:
+    """Return lines on the unit of the angles where the file does not say it, or hardly can.
+
+    Args:
+        kinematics: of the model.
+        recorded: the file.
+        q: (f, n) coordinates that were read from it, rad and m.
+    """
+    coordinates = kinematics.model.coordinates
+    own = [kinematics.coordinates[name] for name in coordinates if coordinates[name].rotational]
+    if recorded.in_degrees is None:
+        return ("angles are read as degrees, too large for radians: inDegrees is missing",)
+    turns = np.ptp(q[:, own], axis=0) / DEGREE
+    small = np.abs(q[:, own]).max() < MOST_RADIANS * DEGREE
+    if recorded.in_degrees and small and turns.max() > LEAST_TURN_DEG:
+        return (
+            "ATTENTION: by inDegrees=yes no joint of the whole motion bends or turns by more than "
+            f"{turns.max():.2g} deg: is it in radians?",
+        )
+    return ()
 
 
 def coordinate_motion(

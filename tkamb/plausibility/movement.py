@@ -105,6 +105,19 @@ def marker_questions(case: Case) -> Iterator[Question]:
         )
 
 
+def drift_questions(case: Case) -> Iterator[Question]:
+    """Force plates that read a force while nobody stands on them."""
+    if case.ground is None:
+        return
+    drift = [f"plate {number} {level:.1f} N" for number, level in case.ground.drift.items()]
+    if drift:
+        yield Question(
+            f"force plates drift: while nobody stands on it, {', '.join(drift)}, and as much too "
+            "much under the foot: were they not set to zero before the trial?",
+            "force plate drifts",
+        )
+
+
 def sample_questions(case: Case) -> Iterator[Question]:
     """Recorded samples that lie off their neighbours' curve, one question a file."""
     parts = (case.motion, case.tibia, case.ground)

@@ -14,7 +14,12 @@ from tkamb.plausibility.ground import (
     step_questions,
 )
 from tkamb.plausibility.implant import implant_questions
-from tkamb.plausibility.movement import marker_questions, motion_questions, sample_questions
+from tkamb.plausibility.movement import (
+    drift_questions,
+    marker_questions,
+    motion_questions,
+    sample_questions,
+)
 from tkamb.plausibility.question import Question, some
 from tkamb.plausibility.segments import segment_questions
 
@@ -48,6 +53,7 @@ class Plausibility:
             *motion_questions(case),
             *marker_questions(case),
             *sample_questions(case),
+            *drift_questions(case),
             *load_questions(case),
             *foot_questions(case),
             *direction_questions(case),

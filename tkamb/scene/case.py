@@ -1,7 +1,7 @@
 """A case: the scene with its files read, in SI, as a right knee. Only what the scene asks for."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from tkamb.inputs.emg import Envelopes
     from tkamb.inputs.ground_reaction import GroundReaction
     from tkamb.inputs.measured_force import MeasuredForce
+    from tkamb.inputs.recordings import MotionRecording
     from tkamb.inputs.tibia import BodyMotion
 
 logger = logging.getLogger("tkamb")
@@ -104,19 +105,13 @@ class Case:
         return self.body_mass * -float(self.chain.model.gravity.linear[1])
 
 
-def load_case(scene: Scene) -> Case:
-    """Read the files that the scene names, and no other.
-
-    Raises:
-        InputError: whatever is wrong with them, in one line.
-    """
-    with_patella = scene.patella is not None
-    chain = Chain(load_urdf(in_si(scene.patient), with_patella), with_patella)
-    # tables before meshes, which take longer: a mistake in them is told at once
-    parts = _Parts(scene) if scene.motion.interpretation == "pose" else None
+def _recordings(
+    scene: Scene, source: "MotionRecording", chain: Chain, parts: "_Parts | None"
+) -> "tuple[KneeMotion, BodyMotion | None, GroundReaction | None]":
+    """Return knee, shank and ground reaction at the frames of the motion."""
     released = scene.contact.released if scene.contact else ()
     motion = load_motion(
-        in_si(scene.motion),
+        source,
         scene.patient.side,
         parts.insert_mesh_in_insert if parts else np.eye(4),
         parts.femoral_mesh_in_femur if parts else np.eye(4),
@@ -139,6 +134,53 @@ def load_case(scene: Scene) -> Case:
         ground = load_ground_reaction(in_si(scene.ground_reaction), motion.time, scene.patient.side)
         if tibia and scene.ground_reaction.applied == "cop":
             check_under_foot(ground, tibia.pose[:, :3, 3], scene.ground_reaction.file)
+    return motion, tibia, ground
+
+
+def _common_part(scene: Scene) -> "MotionRecording | None":
+    """Return the motion on the part that the ground reaction covers; None if that is no remedy.
+
+    A scene that states no interval means all that was recorded, and clocks of two files begin
+    and end a little apart.
+    """
+    if scene.ground_reaction is None or scene.motion.interval_s or scene.motion.cycle_s:
+        return None
+    from tkamb.inputs.ground_reaction import recorded_span
+    from tkamb.inputs.tables import read_table
+
+    source: MotionRecording = in_si(scene.motion)
+    recorded = read_table(source.file, source.format)
+    time = recorded.time(source.columns.get("time", "time"))
+    start, end = recorded_span(in_si(scene.ground_reaction))
+    inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
+    if len(inside) < 2 or len(inside) == len(time):
+        return None
+    common = (float(inside[0]), float(inside[-1]))
+    logger.warning(
+        "%s: recorded from %.4f to %.4f s, the motion from %.4f to %.4f s: %.4f to %.4f s are used",
+        scene.ground_reaction.file,
+        *(start, end, time[0], time[-1], *common),
+    )
+    return replace(source, interval=common)
+
+
+def load_case(scene: Scene) -> Case:
+    """Read the files that the scene names, and no other.
+
+    Raises:
+        InputError: whatever is wrong with them, in one line.
+    """
+    with_patella = scene.patella is not None
+    chain = Chain(load_urdf(in_si(scene.patient), with_patella), with_patella)
+    # tables before meshes, which take longer: a mistake in them is told at once
+    parts = _Parts(scene) if scene.motion.interpretation == "pose" else None
+    try:
+        motion, tibia, ground = _recordings(scene, in_si(scene.motion), chain, parts)
+    except InputError:
+        source = _common_part(scene)
+        if source is None:
+            raise
+        motion, tibia, ground = _recordings(scene, source, chain, parts)
     parts = parts or _Parts(scene)
     motion = _derived(scene, motion, parts)
     muscles: tuple[Muscle, ...] = ()

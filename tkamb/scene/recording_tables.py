@@ -268,7 +268,17 @@ class GroundReactionTable(SceneTable):
             "point; those not named and not in the file are zero)"
         ),
     )
-    length_unit: LengthUnit | None = Field(None, description="of the file; a .c3d states its own")
+    length_unit: LengthUnit | None = Field(
+        None, description="of the file; a .c3d mostly states its own"
+    )
+    force_unit: str | None = Field(
+        None,
+        description="of a .c3d: what its force channels are in (N, kN), where they state no unit "
+        "or one that is not understood",
+    )
+    moment_unit: str | None = Field(
+        None, description="of a .c3d: what its moment channels are in (Nm, Nmm, Ncm), likewise"
+    )
     laboratory_axes: Axes = Field(
         "+x,+y,+z", description="axes of the file that point forward, up and right"
     )

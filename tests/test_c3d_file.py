@@ -1,0 +1,181 @@
+"""The container of C3D files: machines, integers, long recordings, damage, and a second reader."""
+
+import os
+import sys
+from pathlib import Path
+
+import ezc3d
+import numpy as np
+import pytest
+
+from damaged_recordings import TEXTS, WORDS, damaged, read_all
+from raw_c3d import MACHINES, RawC3d
+from recordings import standing_markers, write_c3d
+from tkamb.errors import InputError
+from tkamb.inputs.c3d import read_c3d
+from tkamb.output.storage import write_trc
+
+JW = Path(__file__).parents[2] / "shared" / "data" / "jw" / "motion"
+POINTS = np.round(np.random.default_rng(3).normal(0.0, 400.0, (12, 3, 3)), 1)  # mm
+POINTS[4, 1] = np.nan
+ANALOG = np.random.default_rng(4).integers(-900, 900, (120, 2)).astype(float)
+
+
+def raw(machine="intel", **options):
+    file = RawC3d(machine, **options)
+    file.add("POINT", "LABELS", ["A", "B", "C"]).add("POINT", "UNITS", ["mm"])
+    file.add("ANALOG", "LABELS", ["emg one", "emg two"]).add("ANALOG", "UNITS", ["V", "V"])
+    file.add("ANALOG", "SCALE", np.array([0.01, 0.5])).add("ANALOG", "GEN_SCALE", np.array([2.0]))
+    file.add("ANALOG", "OFFSET", [3, 7]).add("ANALOG", "RATE", np.array([1000.0]))
+    return file
+
+
+@pytest.mark.parametrize("integers", [False, True], ids=["floats", "integers"])
+@pytest.mark.parametrize("machine", MACHINES)
+def test_every_machines_numbers_are_read(tmp_path, machine, integers):
+    path = raw(machine, integers=integers, first=31).write(tmp_path / "a.c3d", POINTS, ANALOG)
+    recording = read_c3d(path)
+    np.testing.assert_allclose(recording.points, POINTS * 1e-3, atol=1e-7)
+    volts = (ANALOG - [3, 7]) * [0.01, 0.5] * 2.0
+    found = np.stack([recording.channels[name] for name in ("emg one", "emg two")], axis=1)
+    np.testing.assert_allclose(found, volts, rtol=1e-6)
+    np.testing.assert_allclose(recording.time, (30 + np.arange(12)) / 100.0)
+    if machine == "mips":
+        return  # the second reader reads none of these
+    theirs = ezc3d.c3d(str(path))["data"]
+    np.testing.assert_allclose(found.T, theirs["analogs"][0], rtol=1e-6)
+    seen = np.isfinite(recording.points)
+    points = theirs["points"][:3].transpose(2, 1, 0) * 1e-3
+    np.testing.assert_allclose(recording.points[seen], points[seen], atol=1e-9)
+
+
+def test_a_negative_offset_is_subtracted_too(tmp_path):
+    file = raw().add("ANALOG", "OFFSET", [3, -7])
+    recording = read_c3d(file.write(tmp_path / "a.c3d", POINTS, ANALOG))
+    np.testing.assert_allclose(recording.channels["emg two"], (ANALOG[:, 1] + 7), rtol=1e-6)
+
+
+def test_unsigned_analog_words_count_to_65535(tmp_path):
+    file = (
+        raw(integers=True)
+        .add("ANALOG", "FORMAT", ["UNSIGNED"])
+        .add("ANALOG", "OFFSET", [40000] * 2)
+    )
+    words = np.full((120, 2), 60000.0)
+    recording = read_c3d(file.write(tmp_path / "a.c3d", POINTS, words))
+    np.testing.assert_allclose(recording.channels["emg two"], 20000.0 * 0.5 * 2.0)
+
+
+@pytest.mark.skipif(not JW.is_dir(), reason="subject JW's recordings are not beside the project")
+@pytest.mark.parametrize("name", ["jw_ngait_og3", "jw_2legsquat1", "jw_1legstand1"])
+def test_markers_and_plates_are_those_of_a_second_reader(name):
+    path = JW / f"{name}.c3d"
+    mine, theirs = read_c3d(path), ezc3d.c3d(str(path), extract_forceplat_data=True)
+    points = theirs["data"]["points"][:3].transpose(2, 1, 0) * 1e-3
+    seen = np.isfinite(mine.points)
+    np.testing.assert_array_equal(mine.points[seen], points[seen])
+    assert np.isnan(points[~seen]).all() or (points[~seen] == 0).all()
+    assert mine.first_frame == theirs["header"]["points"]["first_frame"]
+    for plate, other in zip(mine.plates, theirs["data"]["platform"], strict=True):
+        np.testing.assert_allclose(plate.force.T, other["force"], atol=1e-9)
+        np.testing.assert_allclose(plate.moment.T * 1e3, other["moment"], atol=1e-6)
+
+
+def long_points(count):
+    points = np.zeros((count, 1, 3)) + [[[100.0, 200.0, 1.0]]]
+    points[:, 0, 0] += np.arange(count) * 1e-3
+    return points
+
+
+@pytest.mark.parametrize(
+    ("first", "how"),
+    [(1, "TRIAL"), (101, "TRIAL"), (1, "LONG_FRAMES"), (1, "wrapped"), (1, "FRAMES")],
+)
+def test_more_frames_than_16_bits_count_are_read_to_the_end(tmp_path, first, how):
+    count = 70_000
+    file = RawC3d(first=first)
+    file.add("POINT", "LABELS", ["A"]).add("POINT", "UNITS", ["mm"])
+    last, stated = first + count - 1, min(count, 65536 - first)
+    if how in ("TRIAL", "wrapped"):
+        file.add("TRIAL", "ACTUAL_START_FIELD", [first, 0])
+        file.add("TRIAL", "ACTUAL_END_FIELD", [last % 65536, last // 65536])
+    else:
+        file.add("POINT", how, np.array([float(count)]))
+    if how == "wrapped":
+        stated = last % 65536
+    path = file.write(tmp_path / "a.c3d", long_points(count), frames=stated)
+    recording = read_c3d(path)
+    assert len(recording.points) == count
+    assert recording.points[-1, 0, 0] == pytest.approx(0.1 + (count - 1) * 1e-6, abs=1e-7)
+    assert recording.time[-1] == pytest.approx((last - 1) / 100.0)
+
+
+@pytest.mark.parametrize("stated", [65535, 70_000 - 65_536])
+def test_frames_that_nothing_counts_are_refused_by_their_number(tmp_path, stated):
+    file = RawC3d().add("POINT", "LABELS", ["A"]).add("POINT", "UNITS", ["mm"])
+    path = file.write(tmp_path / "a.c3d", long_points(70_000), frames=stated)
+    with pytest.raises(InputError, match=r"long enough for 700\d\d"):
+        read_c3d(path)
+
+
+def test_header_and_parameters_that_contradict_each_other_are_refused(tmp_path):
+    path = raw().write(tmp_path / "a.c3d", POINTS, ANALOG)
+    content = bytearray(path.read_bytes())
+    content[2] = 7  # markers, by the header
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="holds 7 markers by its header, 3 by POINT:USED"):
+        read_c3d(path)
+
+
+def test_wrong_bytes_end_in_a_recording_or_in_one_line(tmp_path):
+    c3d = raw("mips", integers=True).write(tmp_path / "a.c3d", POINTS, ANALOG)
+    trc = tmp_path / "a.trc"
+    write_trc(trc, np.arange(20) / 100.0, standing_markers(20), 100.0)
+    said = []
+    for seed in range(300):
+        source = (c3d, trc)[seed % 2]
+        path = tmp_path / f"damaged{source.suffix}"
+        words = WORDS if source is c3d else TEXTS
+        path.write_bytes(damaged(source.read_bytes(), seed, words))
+        said.append(read_all(path))
+    assert 20 < said.count("read") < 280  # both happen
+
+
+def test_a_parameter_of_many_dimensions_is_damaged(tmp_path):
+    path = raw().write(tmp_path / "a.c3d", POINTS, ANALOG)
+    content = bytearray(path.read_bytes())
+    at = content.index(b"SCALE") + 5 + 2
+    content[at + 1] = 200
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="damaged parameter"):
+        read_c3d(path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no FIFO in its folders")
+def test_what_is_no_regular_file_is_refused_before_it_is_read(tmp_path):
+    os.mkfifo(tmp_path / "fifo.c3d")
+    (tmp_path / "folder.c3d").mkdir()
+    (tmp_path / "device.c3d").symlink_to("/dev/zero")
+    with open(tmp_path / "sparse.c3d", "wb") as file:
+        file.truncate(40 * 10**9)
+    words = {"fifo": "FIFO", "folder": "folder", "device": "device", "sparse": "MB large"}
+    for name, word in words.items():
+        with pytest.raises(InputError, match=word):
+            read_c3d(tmp_path / f"{name}.c3d")
+
+
+def test_markers_are_read_where_the_analog_rate_is_wrong(tmp_path):
+    """The header lays out the data; a wrong rate concerns the channels alone."""
+    file = raw().add("ANALOG", "RATE", np.array([1500.0]))
+    recording = read_c3d(file.write(tmp_path / "a.c3d", POINTS, ANALOG))
+    np.testing.assert_allclose(recording.points, POINTS * 1e-3, atol=1e-7)
+    with pytest.raises(InputError, match="holds 10 samples a frame"):
+        recording.channel("emg one")
+    assert "1500 Hz" in recording.all_notices[0]
+
+
+def test_labels_beyond_255_stand_in_a_second_parameter(tmp_path):
+    markers = {f"M{k}": np.zeros((3, 3)) + 0.001 * (k + 1) for k in range(300)}
+    recording = read_c3d(write_c3d(tmp_path / "a.c3d", markers))
+    assert recording.labels[299] == "M299"
+    np.testing.assert_allclose(recording.points[0, 299], 0.3, atol=1e-6)
