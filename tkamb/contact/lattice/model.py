@@ -97,7 +97,9 @@ class CellContact(ContactModel):
         """Build the grid, factorise its stiffness, store the contact nodes' response."""
         lattice = whole_lattice(pair.insert, self.resolution)
         solid = self.solid(lattice, pair.material)
-        held = fixed_unknowns(lattice.nodes, lattice.bottom_nodes, pair.bearing)
+        held = fixed_unknowns(
+            lattice.nodes, lattice.bottom_nodes, pair.bearing, lattice.piece_of_node
+        )
         nodes, surface = contact_map(lattice, pair.insert)
         operator = self._operator(solid, lattice, held, nodes)
         femoral = SurfaceFromBelow(pair.femoral, pair.femoral.rays)

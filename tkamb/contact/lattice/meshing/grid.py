@@ -19,7 +19,7 @@ from tkamb.contact.lattice.meshing.cells import (
     shortest_edges,
 )
 from tkamb.contact.lattice.meshing.columns import NodeField, settle_columns
-from tkamb.contact.lattice.meshing.pieces import standing_pieces
+from tkamb.contact.lattice.meshing.pieces import connected_pieces, standing_pieces
 from tkamb.contact.lattice.meshing.walls import settle_walls
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index, Mask
@@ -96,6 +96,13 @@ class Lattice:
     def springs(self) -> Springs:
         """Springs that join each cell's nodes, each once."""
         return join_springs(self.cells, len(self.nodes))
+
+    @cached_property
+    def piece_of_node(self) -> Index:
+        """Piece (n,) of each node; two pieces share no cell face."""
+        piece = np.zeros(len(self.nodes), np.int64)
+        piece[self.cells] = connected_pieces(self.cells)[:, None]
+        return piece
 
     @property
     def contact_nodes(self) -> Index:
