@@ -1,11 +1,21 @@
-"""Random inserts: blocks with ridges, posts, steps, notches, holes and voids, anywhere, in any pose."""
+"""Random inserts: blocks with ridges, posts, steps, notches, holes and voids, in any pose."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
+from tkamb.contact.lattice.meshing.cells import cell_volumes
+from tkamb.contact.lattice.meshing.whole import whole_lattice
+from tkamb.contact.materials import material
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactStatus
+from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import Array, Mask, pose
+from tkamb.geometry.repair import repair
 from tkamb.geometry.surface import Surface
 
 KINDS = ("ridge", "post", "step", "notch", "hole", "void", "dish")
@@ -87,7 +97,7 @@ def random_insert(seed: int, symmetric: bool | None = None) -> RandomInsert:
 def _on_ties(box, plan, size):
     """Return the box with its walls on planes of a grid's nodes, or half-way between them."""
     moved = list(box)
-    for axis, extent in zip((0, 2), plan):
+    for axis, extent in zip((0, 2), plan, strict=True):
         half = extent / round(extent / size) / 2
         planes = [half * np.round((edge + extent / 2) / half) - extent / 2 for edge in box[axis]]
         moved[axis] = (planes[0], max(planes[1], planes[0] + 2 * half))
@@ -134,12 +144,15 @@ def _filled(features, size):
         for axis in range(3):
             planes[axis] += list(box[axis])
     lines = [
-        _refined(np.unique(np.round(plane, 9)), step) for plane, step in zip(planes, (2, 3, 2))
+        _refined(np.unique(np.round(plane, 9)), step)
+        for plane, step in zip(planes, (2, 3, 2), strict=True)
     ]
     middle = np.meshgrid(*[(line[1:] + line[:-1]) / 2 for line in lines], indexing="ij")
     solid = middle[1] < height
     for kind, box in sorted(features, key=lambda f: f[0] not in ("ridge", "post")):
-        within = np.all([(m > low) & (m < high) for m, (low, high) in zip(middle, box)], axis=0)
+        within = np.all(
+            [(m > low) & (m < high) for m, (low, high) in zip(middle, box, strict=True)], axis=0
+        )
         if kind in ("ridge", "post"):
             solid |= within
         elif kind != "dish":
@@ -153,10 +166,7 @@ def _filled(features, size):
 
 def _refined(planes, step):
     """Return the planes with even ones between them, at most `step` apart."""
-    parts = [
-        np.linspace(a, b, int(np.ceil((b - a) / step)) + 1)[:-1]
-        for a, b in zip(planes[:-1], planes[1:])
-    ]
+    parts = [np.linspace(a, b, int(np.ceil((b - a) / step)) + 1)[:-1] for a, b in pairwise(planes)]
     return np.concatenate([*parts, planes[-1:]])
 
 
@@ -186,3 +196,49 @@ def _shaped(random, surface, height, dished, symmetric, upright):
         turn = Rotation.from_euler("zyx", angles).as_matrix()
         place = pose(turn, random.uniform(-0.05, 0.05, 3) * [1, 1, 0 if symmetric else 1])
     return Surface(points, surface.faces, surface.name).moved(place)
+
+
+def in_insert_frame(design: RandomInsert) -> Surface:
+    """Return the design as a run reads it: mended and placed on its flat bottom."""
+    mended = repair(design.surface.vertices, design.surface.faces)
+    assert not mended.holes and not len(mended.forks) and not mended.one_sided
+    surface = Surface(mended.vertices, mended.faces, "insert", merged=True)
+    return surface.moved(insert_placement(surface))
+
+
+def lattice_error(design: RandomInsert) -> float:
+    """Return by how much the volume of a run's lattice differs from the mesh's, as a share.
+
+    Raises:
+        InputError: the lattice is refused.
+    """
+    surface = in_insert_frame(design)
+    lattice = whole_lattice(surface, design.size)
+    return cell_volumes(lattice.nodes[lattice.cells]).sum() / surface.volume - 1.0
+
+
+def share_of_load(design: RandomInsert, contact: str = "lattice-linear") -> float | None:
+    """Return the share of 1000 N that the medial one of two condyles carries.
+
+    None where they would not both stand on the insert's main plane.
+    """
+    insert = in_insert_frame(design)
+    width = np.ptp(insert.bounds[:, 2])
+    balls = []
+    for side in (-1, 1):
+        ball = trimesh.creation.icosphere(4, 0.022)
+        ball.apply_translation([0.0, 0.05, side * width / 4])
+        balls.append(ball)
+    both = trimesh.util.concatenate(balls)
+    vertices = np.asarray(both.vertices)
+    vertices[:, 2] = np.where(vertices[:, 2] < 0, vertices[:, 2], np.abs(vertices[:, 2]))
+    femoral = Surface(vertices, np.asarray(both.faces, np.int64), "femoral", merged=True)
+    pair = ContactPair(femoral, insert, material("polyethylene"))
+    model = contact_model(contact, max(1e3 * design.size, 1.5), cache=False)
+    result = model.press(model.prepare(pair), 1000.0, np.eye(4))
+    if result.status is not ContactStatus.OK:
+        return None
+    medial, lateral = (
+        0.0 if part is None else part.force for part in (result.medial, result.lateral)
+    )
+    return medial / (medial + lateral)

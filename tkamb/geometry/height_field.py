@@ -7,6 +7,11 @@ bit and none slips between them. A line that meets an edge exactly is moved by a
 infinitesimal into each of the four quadrants around it (simulation of simplicity, Edelsbrunner
 & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639); what is inside for any of the
 four is inside, so that a line along a wall belongs to the part.
+
+What is inside is where the surface winds around the line (`tkamb.geometry.winding`): entries less
+exits below are more than 0. So a wall between two touching bodies divides nothing, and a void stays
+empty. Only a line that passes a hole of the mesh, and so has not as many entries as exits, is taken
+by pairs of crossings.
 """
 
 from dataclasses import dataclass
@@ -23,6 +28,8 @@ ODD_SHARE = 0.01
 """Largest share of lines with an odd number of crossings that is mended, not refused."""
 SAME_HEIGHT = 1e-12
 """Crossings of duplicate faces, m."""
+SAME_WALL = 1e-7
+"""m: two bodies nearer to one another touch; ten times what single precision rounds off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +72,7 @@ def inside_intervals(surface: Surface, axis: int, first: Array, second: Array) -
     tied[line[~(sides.all(axis=0) | ~sides.any(axis=0))]] = True
     for quadrant in range(4):
         here = sides[quadrant] & ((quadrant == 0) | tied[line])
-        lines, heights = _distinct(line[here], height[here], rising[here])
+        lines, heights = _paired(line[here], height[here], rising[here], tied.size)
         odd = np.bincount(lines, minlength=tied.size) % 2 == 1
         if quadrant == 0:
             mended = int(odd.sum())
@@ -128,7 +135,10 @@ def _crossings(
     weight = area / area.sum(axis=0)
     heights = surface.vertices[surface.faces[face], along]
     height = np.einsum("em,me->m", weight, heights)
-    return a * len(second) + b, height, sides[0, 0] > 0, (sides == sides[:1]).all(axis=0)
+    counts = (sides == sides[:1]).all(axis=0)
+    # how the triangle faces is known in the quadrants in which the line passes through it
+    rising = (sides[0] * counts).sum(axis=0) > 0
+    return a * len(second) + b, height, rising, counts
 
 
 def _signed_areas(faces: Index, flat: Array, points: Array) -> tuple[Array, NDArray[np.int8]]:
@@ -150,6 +160,33 @@ def _signed_areas(faces: Index, flat: Array, points: Array) -> tuple[Array, NDAr
             moved = np.where(edge[:, 1] != 0.0, -edge[:, 1] * u, edge[:, 0] * v)
             sides[corner, quadrant] = np.sign(np.where(value == 0.0, moved, value)) * orientation
     return area, sides
+
+
+def _paired(line: Index, height: Array, rising: Mask, count: int) -> tuple[Index, Array]:
+    """Return where lines begin and cease to run inside, in turn, sorted by line and height.
+
+    Args:
+        line: (m,) of each crossing.
+        height: (m,) m.
+        rising: (m,) whether the triangle faces along the lines, so that they leave there.
+        count: number of lines.
+    """
+    step = np.where(rising, -1, 1)
+    whole = (np.bincount(line, step, minlength=count) == 0)[line]
+    lines, heights = _distinct(line[~whole], height[~whole], rising[~whole])
+    line, height, step = line[whole], height[whole], step[whole]
+    order = np.lexsort((-step, height, line))
+    line, height, step = line[order], height[order], step[order]
+    winding = np.cumsum(step)
+    ends = np.flatnonzero((winding > 0) != (winding - step > 0))
+    line, height = line[ends], height[ends]
+    touching = np.zeros(len(ends), bool)
+    touching[1:-1:2] = (np.diff(line)[1::2] == 0) & (np.diff(height)[1::2] <= SAME_WALL)
+    touching[2::2] = touching[1:-1:2]
+    lines = np.concatenate([lines, line[~touching]])
+    heights = np.concatenate([heights, height[~touching]])
+    order = np.lexsort((heights, lines))
+    return lines[order], heights[order]
 
 
 def _distinct(line: Index, height: Array, rising: Mask) -> tuple[Index, Array]:

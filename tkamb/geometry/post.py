@@ -89,6 +89,8 @@ def find_post(insert: Surface) -> Post | None:
         if centred and patch.sum() >= 9 and _steep_share(top, patch) >= STEEP_SHARE:
             tip = float(top[patch].max())
             foot = _ground(top, patch, dish) + FOOT_CLEARANCE
+            if tip <= foot:  # what surrounds it is higher
+                continue
             high = patch & (top > foot + BACK_SHARE * (tip - foot))
             return Post(
                 x=float(x[i].mean()),
