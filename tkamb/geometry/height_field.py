@@ -1,9 +1,9 @@
 """Where the lines of a structured grid run inside a closed surface, exactly and at once.
 
 Every triangle is offered to the grid lines in its own projected rectangle; three signed areas
-say whether a line passes through it. The signed area of an edge is computed from its two
-vertices in one fixed order, so that neighbouring triangles agree on every line to the last
-bit and none slips between them. A line that meets an edge exactly is moved by an
+say whether a line passes through it. Their signs are those of whole numbers, exact
+(`tkamb.geometry.winding.PlanGrid`), so that all triangles agree on every line and none slips
+between them. A line that meets an edge exactly is moved by an
 infinitesimal into each of the four quadrants around it (simulation of simplicity, Edelsbrunner
 & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639); what is inside for any of the
 four is inside, so that a line along a wall belongs to the part.
@@ -23,6 +23,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.ragged import counted
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.winding import PlanGrid
 
 ODD_SHARE = 0.01
 """Largest share of lines with an odd number of crossings that is mended, not refused."""
@@ -123,7 +124,10 @@ def _crossings(
     width = (b1 - b0)[face]
     a, b = a0[face] + rank // np.maximum(width, 1), b0[face] + rank % np.maximum(width, 1)
     points = np.column_stack([first[a], second[b]])
-    area, sides = _signed_areas(surface.faces[face], flat, points)
+    grid = PlanGrid.over(flat)
+    area, sides = _signed_areas(
+        surface.faces[face], flat, points, grid.whole(flat), grid.whole(points)
+    )
     through = (sides == sides[:1]).all(axis=0).any(axis=0)
     face, area, sides, a, b = (
         face[through],
@@ -132,7 +136,8 @@ def _crossings(
         a[through],
         b[through],
     )
-    weight = area / area.sum(axis=0)
+    total = area.sum(axis=0)
+    weight = np.divide(area, total, out=np.full_like(area, 1 / 3), where=total != 0.0)
     heights = surface.vertices[surface.faces[face], along]
     height = np.einsum("em,me->m", weight, heights)
     counts = (sides == sides[:1]).all(axis=0)
@@ -141,10 +146,19 @@ def _crossings(
     return a * len(second) + b, height, rising, counts
 
 
-def _signed_areas(faces: Index, flat: Array, points: Array) -> tuple[Array, NDArray[np.int8]]:
+def _signed_areas(
+    faces: Index, flat: Array, points: Array, whole_flat: Index, whole_points: Index
+) -> tuple[Array, NDArray[np.int8]]:
     """Return twice the signed areas (3, m) opposite each corner, and signs (3, 4, m).
 
     The second axis of the signs is the quadrant into which a tied point is moved.
+
+    Args:
+        faces: (m, 3).
+        flat: (n, 2) m, the vertices.
+        points: (m, 2) m.
+        whole_flat: (n, 2), the vertices in whole numbers, from which the signs are taken.
+        whole_points: (m, 2), likewise.
     """
     area = np.empty((3, len(faces)))
     sides = np.empty((3, 4, len(faces)), np.int8)
@@ -154,11 +168,14 @@ def _signed_areas(faces: Index, flat: Array, points: Array) -> tuple[Array, NDAr
         tail, head = flat[np.where(turned, end, start)], flat[np.where(turned, start, end)]
         edge, offset = head - tail, points - tail
         value = edge[:, 0] * offset[:, 1] - edge[:, 1] * offset[:, 0]
+        tail, head = (whole_flat[np.where(t, end, start)] for t in (turned, ~turned))
+        edge, offset = head - tail, whole_points - tail
+        exact = edge[:, 0] * offset[:, 1] - edge[:, 1] * offset[:, 0]
         orientation = np.where(turned, -1, 1)
         area[corner] = value * orientation
         for quadrant, (u, v) in enumerate(((1, 1), (-1, 1), (1, -1), (-1, -1))):
-            moved = np.where(edge[:, 1] != 0.0, -edge[:, 1] * u, edge[:, 0] * v)
-            sides[corner, quadrant] = np.sign(np.where(value == 0.0, moved, value)) * orientation
+            moved = np.where(edge[:, 1] != 0, -edge[:, 1] * u, edge[:, 0] * v)
+            sides[corner, quadrant] = np.sign(np.where(exact == 0, moved, exact)) * orientation
     return area, sides
 
 
