@@ -36,7 +36,6 @@ from tkamb.contact.lattice.meshing.grid import (
 )
 from tkamb.contact.lattice.meshing.levels import Levels
 from tkamb.contact.lattice.meshing.quality import measure_quality
-from tkamb.contact.lattice.meshing.walls import inside
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import pose
@@ -406,7 +405,7 @@ def test_ten_micrometres_of_jitter_leave_the_classes_right(name):
     kind, nodes = lattice.node_class, lattice.nodes
     on_top = distances(surface, nodes[kind == CONTACT]) < 3e-5
     on_bottom = np.abs(nodes[kind == BOTTOM, 1]) < 5e-5
-    within = inside(surface.rays, nodes[kind == INTERNAL])
+    within = surface.winding.inside(nodes[kind == INTERNAL])
     near_wall = distances(surface, nodes[kind == OTHER], 2.5e-3) < 2.5e-3
     right = on_top.sum() + on_bottom.sum() + within.sum() + near_wall.sum()
     assert right >= 0.999 * len(nodes)

@@ -8,8 +8,9 @@ from typing import Any
 import trimesh
 
 from tkamb.atomic import replaced_file
-from tkamb.contact.lattice.meshing.grid import Lattice, build_grid
+from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.lattice.meshing.quality import LatticeQuality, measure_quality
+from tkamb.contact.lattice.meshing.whole import whole_lattice
 from tkamb.contact.registry import COARSEST_MM
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
@@ -87,7 +88,7 @@ def lattice_of_file(
     elif side != "right":
         raise InputError(f"'{side}' is no side", "side", "give right or left")
     surface = surface.moved(insert_placement(surface, axes_rotation(axes)))
-    lattice = build_grid(surface, resolution_mm * MILLIMETRE)
+    lattice = whole_lattice(surface, resolution_mm * MILLIMETRE)
     if out is not None:
         write_lattice(lattice, out)
     return LatticeReport(

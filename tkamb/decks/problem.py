@@ -11,7 +11,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from tkamb.contact.lattice.meshing.contact_map import ContactMap, contact_map
-from tkamb.contact.lattice.meshing.grid import Lattice, build_grid
+from tkamb.contact.lattice.meshing.grid import Lattice
+from tkamb.contact.lattice.meshing.whole import whole_lattice
 from tkamb.contact.lattice.problem import SurfaceFromBelow
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
@@ -68,7 +69,7 @@ def press_problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -
         InputError: the insert cannot be meshed.
         ComputationError: the load presses nothing together.
     """
-    lattice = build_grid(pair.insert, grid_mm * MILLIMETRE)
+    lattice = whole_lattice(pair.insert, grid_mm * MILLIMETRE)
     nodes, surface = contact_map(lattice, pair.insert)
     smooth = lattice.nodes.copy()
     smooth[nodes, 1] += surface.lift

@@ -1,12 +1,17 @@
 """Where the lines of a structured grid run inside a closed surface, exactly and at once.
 
 Every triangle is offered to the grid lines in its own projected rectangle; three signed areas
-say whether a line passes through it. The signed area of an edge is computed from its two
-vertices in one fixed order, so that neighbouring triangles agree on every line to the last
-bit and none slips between them. A line that meets an edge exactly is moved by an
+say whether a line passes through it. Their signs are those of whole numbers, exact
+(`tkamb.geometry.winding.PlanGrid`), so that all triangles agree on every line and none slips
+between them. A line that meets an edge exactly is moved by an
 infinitesimal into each of the four quadrants around it (simulation of simplicity, Edelsbrunner
 & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639); what is inside for any of the
 four is inside, so that a line along a wall belongs to the part.
+
+What is inside is where the surface winds around the line (`tkamb.geometry.winding`): entries less
+exits below are more than 0. So a wall between two touching bodies divides nothing, and a void stays
+empty. Only a line that passes a hole of the mesh, and so has not as many entries as exits, is taken
+by pairs of crossings.
 """
 
 from dataclasses import dataclass
@@ -18,11 +23,14 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.ragged import counted
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.winding import PlanGrid
 
 ODD_SHARE = 0.01
 """Largest share of lines with an odd number of crossings that is mended, not refused."""
 SAME_HEIGHT = 1e-12
 """Crossings of duplicate faces, m."""
+SAME_WALL = 1e-7
+"""m: two bodies nearer to one another touch; ten times what single precision rounds off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +73,7 @@ def inside_intervals(surface: Surface, axis: int, first: Array, second: Array) -
     tied[line[~(sides.all(axis=0) | ~sides.any(axis=0))]] = True
     for quadrant in range(4):
         here = sides[quadrant] & ((quadrant == 0) | tied[line])
-        lines, heights = _distinct(line[here], height[here], rising[here])
+        lines, heights = _paired(line[here], height[here], rising[here], tied.size)
         odd = np.bincount(lines, minlength=tied.size) % 2 == 1
         if quadrant == 0:
             mended = int(odd.sum())
@@ -116,7 +124,10 @@ def _crossings(
     width = (b1 - b0)[face]
     a, b = a0[face] + rank // np.maximum(width, 1), b0[face] + rank % np.maximum(width, 1)
     points = np.column_stack([first[a], second[b]])
-    area, sides = _signed_areas(surface.faces[face], flat, points)
+    grid = PlanGrid.over(flat)
+    area, sides = _signed_areas(
+        surface.faces[face], flat, points, grid.whole(flat), grid.whole(points)
+    )
     through = (sides == sides[:1]).all(axis=0).any(axis=0)
     face, area, sides, a, b = (
         face[through],
@@ -125,16 +136,29 @@ def _crossings(
         a[through],
         b[through],
     )
-    weight = area / area.sum(axis=0)
+    total = area.sum(axis=0)
+    weight = np.divide(area, total, out=np.full_like(area, 1 / 3), where=total != 0.0)
     heights = surface.vertices[surface.faces[face], along]
     height = np.einsum("em,me->m", weight, heights)
-    return a * len(second) + b, height, sides[0, 0] > 0, (sides == sides[:1]).all(axis=0)
+    counts = (sides == sides[:1]).all(axis=0)
+    # how the triangle faces is known in the quadrants in which the line passes through it
+    rising = (sides[0] * counts).sum(axis=0) > 0
+    return a * len(second) + b, height, rising, counts
 
 
-def _signed_areas(faces: Index, flat: Array, points: Array) -> tuple[Array, NDArray[np.int8]]:
+def _signed_areas(
+    faces: Index, flat: Array, points: Array, whole_flat: Index, whole_points: Index
+) -> tuple[Array, NDArray[np.int8]]:
     """Return twice the signed areas (3, m) opposite each corner, and signs (3, 4, m).
 
     The second axis of the signs is the quadrant into which a tied point is moved.
+
+    Args:
+        faces: (m, 3).
+        flat: (n, 2) m, the vertices.
+        points: (m, 2) m.
+        whole_flat: (n, 2), the vertices in whole numbers, from which the signs are taken.
+        whole_points: (m, 2), likewise.
     """
     area = np.empty((3, len(faces)))
     sides = np.empty((3, 4, len(faces)), np.int8)
@@ -144,12 +168,42 @@ def _signed_areas(faces: Index, flat: Array, points: Array) -> tuple[Array, NDAr
         tail, head = flat[np.where(turned, end, start)], flat[np.where(turned, start, end)]
         edge, offset = head - tail, points - tail
         value = edge[:, 0] * offset[:, 1] - edge[:, 1] * offset[:, 0]
+        tail, head = (whole_flat[np.where(t, end, start)] for t in (turned, ~turned))
+        edge, offset = head - tail, whole_points - tail
+        exact = edge[:, 0] * offset[:, 1] - edge[:, 1] * offset[:, 0]
         orientation = np.where(turned, -1, 1)
         area[corner] = value * orientation
         for quadrant, (u, v) in enumerate(((1, 1), (-1, 1), (1, -1), (-1, -1))):
-            moved = np.where(edge[:, 1] != 0.0, -edge[:, 1] * u, edge[:, 0] * v)
-            sides[corner, quadrant] = np.sign(np.where(value == 0.0, moved, value)) * orientation
+            moved = np.where(edge[:, 1] != 0, -edge[:, 1] * u, edge[:, 0] * v)
+            sides[corner, quadrant] = np.sign(np.where(exact == 0, moved, exact)) * orientation
     return area, sides
+
+
+def _paired(line: Index, height: Array, rising: Mask, count: int) -> tuple[Index, Array]:
+    """Return where lines begin and cease to run inside, in turn, sorted by line and height.
+
+    Args:
+        line: (m,) of each crossing.
+        height: (m,) m.
+        rising: (m,) whether the triangle faces along the lines, so that they leave there.
+        count: number of lines.
+    """
+    step = np.where(rising, -1, 1)
+    whole = (np.bincount(line, step, minlength=count) == 0)[line]
+    lines, heights = _distinct(line[~whole], height[~whole], rising[~whole])
+    line, height, step = line[whole], height[whole], step[whole]
+    order = np.lexsort((-step, height, line))
+    line, height, step = line[order], height[order], step[order]
+    winding = np.cumsum(step)
+    ends = np.flatnonzero((winding > 0) != (winding - step > 0))
+    line, height = line[ends], height[ends]
+    touching = np.zeros(len(ends), bool)
+    touching[1:-1:2] = (np.diff(line)[1::2] == 0) & (np.diff(height)[1::2] <= SAME_WALL)
+    touching[2::2] = touching[1:-1:2]
+    lines = np.concatenate([lines, line[~touching]])
+    heights = np.concatenate([heights, height[~touching]])
+    order = np.lexsort((heights, lines))
+    return lines[order], heights[order]
 
 
 def _distinct(line: Index, height: Array, rising: Mask) -> tuple[Index, Array]:

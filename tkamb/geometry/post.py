@@ -88,7 +88,9 @@ def find_post(insert: Surface) -> Post | None:
         centred = abs(z[k].mean() - (low[2] + high[2]) / 2) < MIDDLE_SHARE * (high[2] - low[2]) / 2
         if centred and patch.sum() >= 9 and _steep_share(top, patch) >= STEEP_SHARE:
             tip = float(top[patch].max())
-            foot = _ground(top, patch) + FOOT_CLEARANCE
+            foot = _ground(top, patch, dish) + FOOT_CLEARANCE
+            if tip <= foot:  # what surrounds it is higher
+                continue
             high = patch & (top > foot + BACK_SHARE * (tip - foot))
             return Post(
                 x=float(x[i].mean()),
@@ -130,11 +132,11 @@ def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
     return Surface(*dishes, insert.name), Surface(*closed_by_fans(vertices, behind, "post"), "post")
 
 
-def _ground(top: Array, patch: Mask) -> float:
-    """Return the highest y (m) of what surrounds the foot of a patch."""
+def _ground(top: Array, patch: Mask, dish: float) -> float:
+    """Return the highest y (m) of what surrounds the foot of a patch; `dish` if nothing does."""
     near, far = (binary_dilation(patch, iterations=n) for n in FOOT_RING)
     ring = top[far & ~near]
-    return float(ring[np.isfinite(ring)].max())
+    return float(ring[np.isfinite(ring)].max(initial=dish))
 
 
 def _steep_share(top: Array, patch: Mask) -> float:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from tkamb.geometry.nearest import NearestPoints
     from tkamb.geometry.rays import RayCaster
     from tkamb.geometry.tree import TriangleTree
+    from tkamb.geometry.winding import WindingNumber
 
 SMOOTH_WITHIN = np.radians(30.0)
 """rad; triangles that meet at a larger angle belong to different smooth surfaces."""
@@ -173,6 +174,19 @@ class Surface:
         from tkamb.geometry.nearest import NearestPoints
 
         return NearestPoints(self, self.tree)
+
+    @cached_property
+    def winding(self) -> "WindingNumber":
+        """How often the surface winds around points, in its own frame."""
+        from tkamb.geometry.winding import WindingNumber
+
+        return WindingNumber(self)
+
+    @cached_property
+    def volume(self) -> float:
+        """The enclosed volume, m³; that of overlapping bodies counts once for each."""
+        a, b, c = np.moveaxis(self.triangles - self.bounds.mean(axis=0), 1, 0)
+        return float(np.einsum("kj,kj->", a, np.cross(b, c)) / 6.0)
 
     def moved(self, pose_here_in_there: Array) -> "Surface":
         """Return the surface in another frame; where that is the same, itself."""

@@ -116,9 +116,9 @@ def lattice_lines(case: Case) -> Array:
     if case.scene.contact is None or case.insert is None:
         return np.empty((0, 2, 3))
     from tkamb.contact.lattice.meshing.cells import FACES
-    from tkamb.contact.lattice.meshing.grid import build_grid
+    from tkamb.contact.lattice.meshing.whole import whole_lattice
 
-    lattice = build_grid(case.insert, case.scene.contact.resolution_mm * MILLIMETRE)
+    lattice = whole_lattice(case.insert, case.scene.contact.resolution_mm * MILLIMETRE)
     faces = lattice.cells[:, FACES].reshape(-1, 4)
     _, first, count = np.unique(
         np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True

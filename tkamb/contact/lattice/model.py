@@ -20,7 +20,8 @@ from tkamb.contact.lattice.linear.memory_need import TooLittleMemoryError, check
 from tkamb.contact.lattice.linear.operator import ElasticOperator, fixed_unknowns, prepare_operator
 from tkamb.contact.lattice.linear.response import SINGLE
 from tkamb.contact.lattice.meshing.contact_map import contact_map
-from tkamb.contact.lattice.meshing.grid import Lattice, build_grid
+from tkamb.contact.lattice.meshing.grid import Lattice
+from tkamb.contact.lattice.meshing.whole import whole_lattice
 from tkamb.contact.lattice.newton import solve_by_newton
 from tkamb.contact.lattice.probe import LatticeProbe
 from tkamb.contact.lattice.problem import (
@@ -94,9 +95,11 @@ class CellContact(ContactModel):
 
     def prepare(self, pair: ContactPair) -> LatticeState:
         """Build the grid, factorise its stiffness, store the contact nodes' response."""
-        lattice = build_grid(pair.insert, self.resolution)
+        lattice = whole_lattice(pair.insert, self.resolution)
         solid = self.solid(lattice, pair.material)
-        held = fixed_unknowns(lattice.nodes, lattice.bottom_nodes, pair.bearing)
+        held = fixed_unknowns(
+            lattice.nodes, lattice.bottom_nodes, pair.bearing, lattice.piece_of_node
+        )
         nodes, surface = contact_map(lattice, pair.insert)
         operator = self._operator(solid, lattice, held, nodes)
         femoral = SurfaceFromBelow(pair.femoral, pair.femoral.rays)

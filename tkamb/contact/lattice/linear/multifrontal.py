@@ -96,6 +96,11 @@ def _halves(
         low[np.flatnonzero(low)[np.unique(across.nonzero()[0])]] = False
         if not low.any():
             return None
+    if (low | high).all():  # two pieces apart: a member without unknowns of its own is none
+        lower = np.flatnonzero(low)
+        low[lower[position[lower, axis].argmax()]] = False
+        if not low.any():
+            return None
     return part[low], part[high], part[~(low | high)]
 
 

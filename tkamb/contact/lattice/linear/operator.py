@@ -117,22 +117,35 @@ def _at_places(x: Array, places: Index) -> Array:
     return result
 
 
-def fixed_unknowns(nodes: Array, bottom: Index, bearing: Bearing) -> Mask:
+def fixed_unknowns(
+    nodes: Array, bottom: Index, bearing: Bearing, piece: Index | None = None
+) -> Mask:
     """Return which of the 3n unknowns are held.
 
     Fixed bearing: all of the bottom nodes' unknowns. Mobile bearing: their y, and x and z of
-    the two end nodes along z, which takes away the rigid modes (those nearest to x = 0).
+    the two end nodes along z, which takes away the rigid modes (those nearest to x = 0). Each of
+    several pieces slides by itself.
+
+    Args:
+        nodes: (n, 3) m.
+        bottom: (b,) nodes in the flat bottom.
+        bearing: "fixed" or "mobile".
+        piece: (n,) of each node; None: all belong together.
     """
     held = np.zeros((len(nodes), 3), bool)
     if bearing == "fixed":
         held[bottom] = True
         return held.ravel()
     held[bottom, 1] = True
-    x, z = np.abs(nodes[bottom, 0]), nodes[bottom, 2]
-    tolerance = 1e-9 + 1e-6 * np.ptp(z)
-    for end in (z.min(), z.max()):
-        at_end = bottom[np.abs(z - end) <= tolerance]
-        held[at_end[np.argmin(x[np.abs(z - end) <= tolerance])], [0, 2]] = True
+    pieces = [bottom]
+    if piece is not None:
+        pieces = [bottom[piece[bottom] == each] for each in np.unique(piece[bottom])]
+    for own in pieces:
+        x, z = np.abs(nodes[own, 0]), nodes[own, 2]
+        tolerance = 1e-9 + 1e-6 * np.ptp(z)
+        for end in (z.min(), z.max()):
+            at_end = own[np.abs(z - end) <= tolerance]
+            held[at_end[np.argmin(x[np.abs(z - end) <= tolerance])], [0, 2]] = True
     return held.ravel()
 
 

@@ -13,7 +13,6 @@ from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.height_field import Intervals, inside_intervals
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
-from tkamb.units import MILLIMETRE
 
 Nodes = tuple[Index, ...]
 
@@ -196,24 +195,6 @@ def _admit(field: NodeField, intervals: Intervals, ends: Ends) -> None:
     highest = np.append(~same, True) & ~ends.single
     field.top[i[highest], ends.last[highest], k[highest]] = True
     field.thin = int(ends.single.sum())
-
-
-def inside(rays: RayCaster, points: Array) -> Mask:
-    """Say which points (n, 3) lie in a closed surface, by counting crossings upwards.
-
-    Points on one line along y, as most of a grid are, share a ray from below the part.
-    """
-    lines, line = np.unique(points[:, 0] + 1j * points[:, 2], return_inverse=True)
-    base = rays.surface.bounds[0, 1] - MILLIMETRE
-    begin = np.column_stack([lines.real, np.full(len(lines), base), lines.imag])
-    ray, t, _ = rays.all(begin, (0.0, 1.0, 0.0))
-    heights = np.concatenate([points[:, 1], base + t])
-    order = np.lexsort((heights, np.concatenate([line, ray])))
-    crossing = order >= len(points)
-    passed, upto = np.cumsum(crossing), np.cumsum(np.bincount(ray, minlength=len(lines)))
-    above = np.empty(len(points), np.int64)
-    above[order[~crossing]] = upto[line[order[~crossing]]] - passed[~crossing]
-    return above % 2 == 1
 
 
 def refired_inwards(

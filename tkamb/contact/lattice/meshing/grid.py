@@ -10,19 +10,17 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from tkamb.contact.lattice.meshing.cells import (
     CORNERS,
-    FACES,
     Springs,
     join_springs,
     scaled_jacobians,
     shortest_edges,
 )
 from tkamb.contact.lattice.meshing.columns import NodeField, settle_columns
-from tkamb.contact.lattice.meshing.walls import inside, settle_walls
+from tkamb.contact.lattice.meshing.pieces import connected_pieces, standing_pieces
+from tkamb.contact.lattice.meshing.walls import settle_walls
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.post import find_post
@@ -64,6 +62,7 @@ class Lattice:
         mended_rays: (3,) lines along x, y, z mended from their neighbours.
         closed_gaps: gaps narrower than a cell, filled.
         thin_intervals: parts thinner than half a cell, left out or held by one node.
+        size_notices: what was told of the cells' size.
     """
 
     nodes: Array
@@ -78,6 +77,7 @@ class Lattice:
     mended_rays: int
     closed_gaps: int
     thin_intervals: int
+    size_notices: tuple[str, ...] = ()
 
     @property
     def notices(self) -> tuple[str, ...]:
@@ -89,12 +89,20 @@ class Lattice:
             (self.dropped_cells, "{} cells left out: flat, inverted, across a gap, or loose"),
             (self.dropped_nodes, "{} nodes left out that no cell holds"),
         )
-        return tuple(phrase.format(count) for count, phrase in counts if count)
+        counted = (phrase.format(count) for count, phrase in counts if count)
+        return (*self.size_notices, *counted)
 
     @cached_property
     def springs(self) -> Springs:
         """Springs that join each cell's nodes, each once."""
         return join_springs(self.cells, len(self.nodes))
+
+    @cached_property
+    def piece_of_node(self) -> Index:
+        """Piece (n,) of each node; two pieces share no cell face."""
+        piece = np.zeros(len(self.nodes), np.int64)
+        piece[self.cells] = connected_pieces(self.cells)[:, None]
+        return piece
 
     @property
     def contact_nodes(self) -> Index:
@@ -108,7 +116,7 @@ class Lattice:
 
 
 def build_grid(insert: Surface, target_size: float) -> Lattice:
-    """Return the lattice of a closed insert.
+    """Return the lattice of a closed insert, whatever its volume; see `whole_lattice`.
 
     Mended rays and a post (cam-post contact is not modelled) are told on the logger "tkamb".
 
@@ -120,6 +128,24 @@ def build_grid(insert: Surface, target_size: float) -> Lattice:
         InputError: the surface is open beyond mending, thinner than the cells, or they are
             more than `MOST_CELLS`.
     """
+    lattice = make_grid(insert, target_size)
+    tell_repairs(lattice, insert)
+    return lattice
+
+
+def tell_repairs(lattice: Lattice, insert: Surface) -> None:
+    """Log mended rays and a post."""
+    if lattice.mended_rays:
+        _log.warning(
+            "%s: %d rays through gaps in the mesh mended", insert.name, lattice.mended_rays
+        )
+    post = find_post(insert)
+    if post is not None:
+        _log.warning("%s: %s", insert.name, post.notice)
+
+
+def make_grid(insert: Surface, target_size: float) -> Lattice:
+    """Return what `build_grid` does, and log nothing."""
     extent = insert.bounds[1] - insert.bounds[0]
     spacing = grid_spacing(extent, target_size)
     count = float((extent / spacing).prod())
@@ -131,11 +157,6 @@ def build_grid(insert: Surface, target_size: float) -> Lattice:
         )
     field = settle_columns(insert, spacing)
     settle_walls(field, insert)
-    if field.mended:
-        _log.warning("%s: %d rays through gaps in the mesh mended", insert.name, field.mended)
-    post = find_post(insert)
-    if post is not None:
-        _log.warning("%s: %s", insert.name, post.notice)
     cells, dropped_cells = _sound_cells(field, insert)
     if not len(cells):
         raise InputError(
@@ -177,8 +198,8 @@ def _sound_cells(field: NodeField, insert: Surface) -> tuple[Index, int]:
     points = field.points.reshape(-1, 3)
     cells = cells[scaled_jacobians(points[cells]) > LEAST_JACOBIAN]
     cells = cells[shortest_edges(points[cells]) > LEAST_EDGE * field.spacing.min()]
-    cells = cells[inside(insert.rays, points[cells].mean(axis=1))]
-    cells = cells[_largest_piece(cells)]
+    cells = cells[insert.winding.inside(points[cells].mean(axis=1))]
+    cells = cells[standing_pieces(cells, _on_bottom(field))]
     return cells, found - len(cells)
 
 
@@ -193,21 +214,6 @@ def _bridges_gap(field: NodeField, cells: Index) -> Mask:
     number = field.interval.ravel()[cells]
     low, high = number[:, [0, 1, 4, 5]], number[:, [3, 2, 7, 6]]
     return ((low >= 0) & (high >= 0) & (low != high)).any(axis=1)
-
-
-def _largest_piece(cells: Index) -> Mask:
-    """Say which cells belong to the largest piece joined through whole faces."""
-    if not len(cells):
-        return np.ones(0, bool)
-    faces = np.sort(cells[:, FACES].reshape(-1, 4), axis=1)[:, [0, 3]]
-    owner = np.repeat(np.arange(len(cells)), len(FACES))
-    order = np.lexsort((faces[:, 1], faces[:, 0]))
-    faces, owner = faces[order], owner[order]
-    shared = (faces[1:] == faces[:-1]).all(axis=1)
-    a, b = owner[:-1][shared], owner[1:][shared]
-    graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(len(cells), len(cells)))
-    label = connected_components(graph, directed=False)[1]
-    return label == np.bincount(label).argmax()
 
 
 def _assemble(field: NodeField, cells: Index, dropped_cells: int) -> Lattice:
@@ -239,10 +245,15 @@ def _classes(field: NodeField, cells: Index) -> NDArray[np.int8]:
     outside = np.bincount(cells.ravel(), minlength=field.member.size) < 8
     result = np.where(outside, OTHER, INTERNAL).astype(np.int8)
     result[field.top.ravel()] = CONTACT
+    result[_on_bottom(field)] = BOTTOM
+    return result
+
+
+def _on_bottom(field: NodeField) -> Mask:
+    """Say which grid nodes (flat) lie in the flat bottom."""
     height = field.points[..., 1].ravel()
     flat = np.abs(height) <= max(FLATNESS, 0.02 * field.spacing[1])
-    result[field.lower_end.ravel() & flat] = BOTTOM
-    return result
+    return field.lower_end.ravel() & flat
 
 
 def _contact_triangles(index: Index, node_class: NDArray[np.int8], shape: tuple) -> Index:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tkamb.contact.lattice.meshing.columns import NodeField, Nodes, inside, refired
+from tkamb.contact.lattice.meshing.columns import NodeField, Nodes, refired
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.rays import RayCaster
 
@@ -87,8 +87,9 @@ def _fill(field: NodeField, notch: Notch, before: Array, rays: RayCaster) -> Non
     )
     within = np.where(upper, -FIRE_AT, np.where(lower, FIRE_AT, 0.0)) * field.spacing[1]
     corner = _towards(corner, across, INSET, 0.0)
-    is_corner = inside(rays, _towards(corner, across, 0.0, within))
-    keep = is_corner | inside(rays, _towards(middle, across, 0.1, within))
+    winding = rays.surface.winding
+    is_corner = winding.inside(_towards(corner, across, 0.0, within))
+    keep = is_corner | winding.inside(_towards(middle, across, 0.1, within))
     target = np.where(is_corner[:, None], corner, middle + BULGE * (own - middle))
     if flat:
         probe = np.where(is_corner[:, None], corner, middle)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tkamb.contact.lattice.meshing.columns import NodeField, Nodes, inside, refired_inwards
+from tkamb.contact.lattice.meshing.columns import NodeField, Nodes, refired_inwards
 from tkamb.contact.lattice.meshing.notches import fill_notches
 from tkamb.geometry.frames import Array, Mask
 from tkamb.geometry.height_field import inside_intervals
@@ -138,7 +138,7 @@ def _corner_or_wall(start: Array, move: Array, rays: RayCaster) -> Array:
     if both.size:
         tested = corner[both].copy()
         tested[:, [0, 2]] -= 1e-3 * move[both]
-        cut = both[~inside(rays, tested)]
+        cut = both[~rays.surface.winding.inside(tested)]
         u, w = move[cut].T
         foot = np.column_stack([u * w**2, w * u**2]) / (u**2 + w**2)[:, None]
         corner[cut[:, None], [0, 2]] = start[cut][:, [0, 2]] + foot

@@ -1,0 +1,248 @@
+"""Vertices and polygons of OBJ and PLY files; colours, textures and normals are left out.
+
+Wavefront's OBJ: "Object Files", Advanced Visualizer manual, appendix B1. PLY: Turk, "The PLY
+polygon file format" (1994). What belongs to the appearance is not even looked for.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.files import MESH_LIMIT, read_bytes
+from tkamb.geometry.frames import Array, Index
+
+Polygons = tuple[Array, Index, Index]
+"""Vertices (n, 3), corners of all polygons (m,), and where each polygon ends (p,)."""
+
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
+    "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8", "int64": "i8", "uint64": "u8",
+}  # fmt: skip
+_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_MOST_HEADER_LINES = 1000
+
+
+def read_obj(path: str | Path) -> Polygons:
+    """Return the vertices and polygons of an OBJ file, in file units.
+
+    Negative indices count back from the vertices that were read so far, wherever a block of them
+    stands.
+
+    Raises:
+        InputError: no such file.
+        ValueError: a line cannot be understood; the words say which.
+    """
+    text = read_bytes(path, MESH_LIMIT, what="mesh file").decode("latin-1")
+    if "\\" in text:  # a line goes on in the next one
+        text = text.replace("\\\r\n", " ").replace("\\\n", " ")
+    vertices: list[tuple[float, ...]] = []
+    corners: list[int] = []
+    ends: list[int] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words or words[0] not in ("v", "f", "fo"):
+            continue
+        try:
+            if words[0] == "v":
+                vertices.append((float(words[1]), float(words[2]), float(words[3])))
+                continue
+            for word in words[1:]:
+                if word.startswith("#"):
+                    break
+                index = int(word.split("/")[0])
+                corners.append(index - 1 if index > 0 else len(vertices) + index)
+                if index == 0 or corners[-1] < 0:
+                    raise ValueError(f"vertex {index} of {len(vertices)}")
+            ends.append(len(corners))
+        except (ValueError, IndexError) as error:
+            raise ValueError(f"line {number}: '{line.strip()[:40]}', {error}") from None
+    return _checked(vertices, corners, ends)
+
+
+@dataclass(frozen=True)
+class _Element:
+    """What a PLY file has several of: its name, how many, and each one's properties.
+
+    A property is its name, its type and, for a list, the type of the list's length, else "".
+    """
+
+    name: str
+    count: int
+    properties: tuple[tuple[str, str, str], ...]
+
+
+def read_ply(path: str | Path) -> Polygons:
+    """Return the vertices and polygons of a PLY file, text or binary, in file units.
+
+    Raises:
+        InputError: no such file.
+        ValueError: it is no PLY file, or cut short, or holds triangle strips.
+    """
+    content = read_bytes(path, MESH_LIMIT, what="mesh file")
+    order, elements, start = _ply_header(content)
+    if any(element.name == "tristrips" for element in elements):
+        raise ValueError("it holds triangle strips")
+    values = _ply_text if order == "" else _ply_binary
+    found = dict(values(content, start, elements, order))
+    if "vertex" not in found:
+        raise ValueError("it has no vertices")
+    flat, _ = found["vertex"]
+    corners, ends = found.get("face", (np.zeros(0), np.zeros(0, np.int64)))
+    return _checked(flat.reshape(-1, 3), corners, ends)
+
+
+def _checked(vertices: object, corners: object, ends: object) -> Polygons:
+    """Return them as arrays.
+
+    Raises:
+        ValueError: a polygon has a corner that is no vertex.
+    """
+    points = np.asarray(vertices, np.float64).reshape(-1, 3)
+    index = np.asarray(corners).astype(np.int64)
+    if len(index) and not (index.min() >= 0 and index.max() < len(points)):
+        raise ValueError(f"a polygon has a corner that is none of the {len(points)} vertices")
+    return points, index, np.asarray(ends).astype(np.int64)
+
+
+def _ply_header(content: bytes) -> tuple[str, list[_Element], int]:
+    """Return the byte order ("" for text), the elements, and where the data begin."""
+    if not content.startswith(b"ply"):
+        raise ValueError("it does not begin with 'ply'")
+    order, elements, place = None, list[_Element](), 0
+    for _ in range(_MOST_HEADER_LINES):
+        end = content.find(b"\n", place)
+        if end < 0:
+            break
+        words = content[place:end].decode("latin-1").split()
+        place = end + 1
+        if words[:1] == ["format"]:
+            order = _ORDERS.get(words[1])
+        elif words[:1] == ["element"]:
+            elements.append(_Element(words[1], int(words[2]), ()))
+        elif words[:1] == ["property"] and elements:
+            kinds = words[2:4] if words[1] == "list" else ["", words[1]]
+            if words[-1] in ("x", "y", "z") or all(kind in _TYPES or not kind for kind in kinds):
+                last = elements[-1]
+                more = (*last.properties, (words[-1], _TYPES[kinds[1]], _TYPES.get(kinds[0], "")))
+                elements[-1] = _Element(last.name, last.count, more)
+            else:
+                raise ValueError(f"property type '{' '.join(words[1:-1])}'")
+        elif words[:1] == ["end_header"]:
+            if order is None:
+                raise ValueError("its format is none of ascii, binary_little_endian, _big_endian")
+            return order, elements, place
+    raise ValueError("its header has no end")
+
+
+def _wanted(element: _Element) -> list[int]:
+    """Return which properties of an element are read: x, y and z, or the list of corners."""
+    names = [name for name, _, _ in element.properties]
+    if element.name == "vertex":
+        return [names.index(axis) for axis in "xyz" if axis in names]
+    lists = [n for n, (name, _, length) in enumerate(element.properties) if length]
+    return [n for n in lists if names[n] in ("vertex_indices", "vertex_index")] or lists[:1]
+
+
+def _ply_text(
+    content: bytes, start: int, elements: list[_Element], order: str
+) -> Iterator[tuple[str, tuple[Array, Index]]]:
+    """Yield the name of each element of a text file, its values and where each one's end."""
+    lines = iter(content[start:].decode("latin-1").splitlines())
+    for element in elements:
+        wanted, values, ends = _wanted(element), list[float](), list[int]()
+        if element.name == "vertex" and len(wanted) < 3:
+            raise ValueError("its vertices lack x, y or z")
+        for row in range(element.count):
+            words = next((w for w in (line.split() for line in lines) if w), None)
+            if words is None:
+                raise ValueError(f"it is cut short: {row} of {element.count} of {element.name}")
+            place, own = 0, []
+            for _, _, length in element.properties:
+                count = int(words[place]) if length else 1
+                place += bool(length)
+                own.append(words[place : place + count])
+                if len(own[-1]) < count:
+                    raise ValueError(f"{element.name} {row} is cut short")
+                place += count
+            for n in wanted:
+                values.extend(float(word) for word in own[n])
+            ends.append(len(values))
+        yield element.name, (np.array(values), np.array(ends, np.int64))
+
+
+def _ply_binary(
+    content: bytes, start: int, elements: list[_Element], order: str
+) -> Iterator[tuple[str, tuple[Array, Index]]]:
+    """Yield the name of each element of a binary file, its values and where each one's end."""
+    for element in elements:
+        wanted, place = _wanted(element), start
+        if element.name == "vertex" and len(wanted) < 3:
+            raise ValueError("its vertices lack x, y or z")
+        rows, start = _equal_rows(content, start, element, order)
+        if rows is not None:
+            parts = [rows[f"p{n}"].reshape(element.count, -1) for n in wanted]
+            table = np.concatenate([part.astype(float) for part in parts], axis=1) if parts else (
+                np.zeros((element.count, 0))
+            )  # fmt: skip
+            ends = table.shape[1] * np.arange(1, element.count + 1)
+            yield element.name, (table.ravel(), ends)
+            continue
+        values, ends_, start = _uneven_rows(content, place, element, order, wanted)
+        yield element.name, (values, ends_)
+
+
+def _equal_rows(
+    content: bytes, start: int, element: _Element, order: str
+) -> tuple[NDArray | None, int]:
+    """Return an element's rows and where they end, if its lists are as long as in the first row."""
+    fields, place = [], start
+    for n, (_, kind, length) in enumerate(element.properties):
+        dtype, shape = np.dtype(order + kind), ()
+        if length:
+            header = np.dtype(order + length)
+            if element.count == 0 or len(content) < place + header.itemsize:
+                return None, start
+            shape = (int(np.frombuffer(content, header, 1, place)[0]),)
+            fields.append((f"n{n}", header))
+            place += header.itemsize
+        fields.append((f"p{n}", dtype, shape))
+        place += dtype.itemsize * int(np.prod(shape))
+    row = np.dtype(fields)
+    end = start + row.itemsize * element.count
+    if len(content) < end:
+        return None, start
+    rows = np.frombuffer(content, row, element.count, start)
+    for name in row.names or ():
+        if name.startswith("n") and element.count and (rows[name] != rows[name][0]).any():
+            return None, start
+    return rows, end
+
+
+def _uneven_rows(
+    content: bytes, start: int, element: _Element, order: str, wanted: list[int]
+) -> tuple[Array, Index, int]:
+    """Return an element's values, where each one's end, and where the rows end, row by row."""
+    kinds = [
+        (np.dtype(order + kind), np.dtype(order + length) if length else None)
+        for _, kind, length in element.properties
+    ]
+    values, ends, total = list[Array](), list[int](), 0
+    for row in range(element.count):
+        for n, (dtype, header) in enumerate(kinds):
+            count = 1
+            if header is not None and len(content) >= start + header.itemsize:
+                count = int(np.frombuffer(content, header, 1, start)[0])
+                start += header.itemsize
+            if count < 0 or len(content) < start + count * dtype.itemsize:
+                raise ValueError(f"it is cut short: {row} of {element.count} of {element.name}")
+            if n in wanted:
+                values.append(np.frombuffer(content, dtype, count, start).astype(float))
+                total += count
+            start += count * dtype.itemsize
+        ends.append(total)
+    joined = np.concatenate(values) if values else np.zeros(0)
+    return joined, np.array(ends, np.int64), start
