@@ -11,6 +11,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from tkamb.contact.articular_edge import edge_of_insert_flags
 from tkamb.contact.pair import ContactPair, ContactSurface, PreparedContact
 from tkamb.geometry.frames import Array, Mask
 from tkamb.units import MEGAPASCAL, MILLIMETRE
@@ -162,7 +163,16 @@ class ContactResult:
             "medial": _summed(loaded & medial, *sums, surface.thickness),
             "lateral": _summed(loaded & ~medial, *sums, surface.thickness),
         }
-        flags = (*ending.get("flags", ()), *peak_flags(sides))
+        flags = (
+            *ending.get("flags", ()),
+            *peak_flags(sides),
+            *edge_of_insert_flags(
+                state.pair.articular_edge,
+                surface.points,
+                pressure,
+                {"medial": medial, "lateral": ~medial},
+            ),
+        )
         if state.pair.split is None:
             flags = (*flags, *patch_flags(surface, pressure, nodal_force))
         ending["flags"] = flags
