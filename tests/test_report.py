@@ -13,6 +13,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 
 from headless import Page
 from synthetic_run import MASS_KG, make_run
+from tkamb.contact.articular_edge import AT_EDGE
+from tkamb.contact.narrow import TOO_NARROW
 from tkamb.errors import InputError
 from tkamb.output import metrics
 from tkamb.output.axis import horizontal_axis, round_step
@@ -176,6 +178,27 @@ def test_headline_numbers_are_those_of_the_columns(bend, gait):
     assert shown["Frames computed"].value == "100 of 101"
     assert shown["Frames computed"].warning
     assert "6 to be read with care" in shown["Frames computed"].detail
+
+
+def test_a_peak_at_the_edge_of_the_insert_is_said_to_be_there(bend):
+    axis = horizontal_axis(bend)
+
+    def told(flags):
+        status = list(bend.status)
+        status[peak.frame] = flags
+        results = replace(bend, columns=bend.columns | {"status": status})
+        (card,) = (c for c in cards(results, axis) if c.title == "Peak contact pressure")
+        return card
+
+    peak = metrics.peak(bend, "<side>_peak_pressure_MPa")
+    other = {"medial": "lateral", "lateral": "medial"}[peak.side]
+    assert "edge of the insert" not in told("ok").detail
+    assert "edge of the insert" not in told(f"the {other} {AT_EDGE} (within 2.5 mm)").detail
+    at_edge = told(f"lateral condyle lifts off; the {peak.side} {AT_EDGE} (within 2.5 mm)")
+    assert "reaches the edge of the insert's articular surface" in at_edge.detail
+    assert at_edge.warning
+    narrow = told(f"the {peak.side} {TOO_NARROW} for the cells: its peak pressure cannot")
+    assert "the peak is not resolved" in narrow.detail and narrow.warning
 
 
 def test_the_post_s_force_and_pressure_are_told_beside_the_condyles(bend):

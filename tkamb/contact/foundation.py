@@ -8,6 +8,7 @@ import numpy as np
 from tkamb.compiled import compiled_as_written
 from tkamb.contact.materials import Material
 from tkamb.contact.model import ContactModel
+from tkamb.contact.narrow import narrow_flags
 from tkamb.contact.neighbourhood import NEAR, Neighbourhood
 from tkamb.contact.pressing import LOAD_TOLERANCE, press_by_search
 from tkamb.contact.probe import CondyleWrench, ProbedContact
@@ -101,7 +102,11 @@ class ElasticFoundation(ContactModel):
             whole = (samples.depth >= samples.thickness)[deep].any()
             return ContactResult.failed(state, pose, TOO_DEEP if whole else OVER_THE_EDGE)
         pressure = layer_pressure(self.law, state.pair.material, strain)
-        return ContactResult.of(state, pose, pressure, gap)
+        medial = medial_points(samples.points, pose, state.pair.split)
+        flags = narrow_flags(
+            samples.triangles, pressure > 0, {"medial": medial, "lateral": ~medial}, "columns"
+        )
+        return ContactResult.of(state, pose, pressure, gap, medial=medial, flags=tuple(flags))
 
     def press(
         self, state: SampledContact, load: float, pose: Array, guess: ContactResult | None = None

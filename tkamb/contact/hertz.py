@@ -204,11 +204,13 @@ def _collected(
         else replace(patch, force=found.force, mean_pressure=found.force / patch.area)
         for side, patch, found in zip(SIDES, patches, (result.medial, result.lateral), strict=True)
     }
+    of_map = set(peak_flags({"medial": result.medial, "lateral": result.lateral}))
+    others = (flag for flag in result.flags if flag not in of_map)
     return replace(
         result,
         medial=sides["medial"],
         lateral=sides["lateral"],
-        flags=(*flags, *peak_flags(sides)),
+        flags=(*flags, *peak_flags(sides), *others),
     )
 
 

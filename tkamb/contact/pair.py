@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from tkamb.contact.articular_edge import ArticularEdge
 from tkamb.contact.materials import Material
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.first_touch import FirstTouch, Touch
@@ -41,6 +42,11 @@ class ContactPair:
     def first_touch(self) -> FirstTouch:
         """How far the femoral component travels until each condyle touches."""
         return FirstTouch(self.femoral, self.insert, self.split)
+
+    @cached_property
+    def articular_edge(self) -> ArticularEdge:
+        """Where the insert's articular surface ends."""
+        return ArticularEdge.of(self.insert)
 
     def touch_at(self, pose: Array) -> Touch | None:
         """Return the first touch of either condyle, whatever the pose's y; travel from y = 0.

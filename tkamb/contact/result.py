@@ -8,13 +8,21 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from tkamb.contact.pair import ContactPair, PreparedContact
+from tkamb.contact.articular_edge import edge_of_insert_flags
+from tkamb.contact.pair import ContactPair, ContactSurface, PreparedContact
 from tkamb.geometry.frames import Array, Mask
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 HIGHEST_KNOWN = 100.0 * MEGAPASCAL
 """Peak pressure beyond which polyethylene's curves are extrapolated (they end at 40 to 60 MPa)."""
+
+LEAST_PATCH_SHARE = 0.05
+"""Share of the force that a patch of contact must carry to count as a second condyle's."""
+LEAST_PATCH_DISTANCE = 15.0 * MILLIMETRE
+"""Between the centres of two condyles' patches; those of a knee are 40 to 50 mm apart."""
 
 
 class ContactStatus(Enum):
@@ -155,7 +163,19 @@ class ContactResult:
             "medial": _summed(loaded & medial, *sums, surface.thickness),
             "lateral": _summed(loaded & ~medial, *sums, surface.thickness),
         }
-        ending["flags"] = (*ending.get("flags", ()), *peak_flags(sides))
+        flags = (
+            *ending.get("flags", ()),
+            *peak_flags(sides),
+            *edge_of_insert_flags(
+                state.pair.articular_edge,
+                surface.points,
+                pressure,
+                {"medial": medial, "lateral": ~medial},
+            ),
+        )
+        if state.pair.split is None:
+            flags = (*flags, *patch_flags(surface, pressure, nodal_force))
+        ending["flags"] = flags
         return cls(
             pair=state.pair,
             pose=pose,
@@ -217,6 +237,39 @@ def medial_points(points: Array, pose: Array, split: float | None) -> Mask:
         return np.ones(len(points), bool)
     along = np.asarray(pose, float)[:3, 2]  # the femoral z axis
     return points @ along - pose[:3, 3] @ along < split
+
+
+def patch_flags(surface: ContactSurface, pressure: Array, nodal_force: Array) -> Iterator[str]:
+    """Yield a flag where a component with one condyle presses on two separate patches.
+
+    Patches are the loaded points that triangles of the map join. Two count where each carries
+    `LEAST_PATCH_SHARE` of the force and their centres are `LEAST_PATCH_DISTANCE` apart.
+
+    Args:
+        surface: the map's points and triangles.
+        pressure: (n,) Pa.
+        nodal_force: (n, 3) N.
+    """
+    loaded = pressure > 0
+    if not loaded.any():
+        return
+    sides = np.concatenate([surface.triangles[:, [0, 1]], surface.triangles[:, [1, 2]]])
+    first, second = sides[loaded[sides].all(axis=1)].T
+    count = len(pressure)
+    graph = coo_array((np.ones(len(first), bool), (first, second)), shape=(count, count))
+    patch = connected_components(graph, directed=False)[1][loaded]
+    weight = np.linalg.norm(nodal_force[loaded], axis=1)
+    force = np.bincount(patch, weight)
+    large = np.flatnonzero(force > LEAST_PATCH_SHARE * force.sum())
+    centres = np.array(
+        [np.bincount(patch, weight * x)[large] / force[large] for x in surface.points[loaded].T]
+    ).T
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2).max(initial=0.0)
+    if apart > LEAST_PATCH_DISTANCE:
+        yield (
+            f"contact in separate patches {apart / MILLIMETRE:.0f} mm apart, but the femoral "
+            "component shows one condyle: all of it is called medial; check the meshes' axes"
+        )
 
 
 def wrench_of(points: Array, nodal_force: Array) -> Array:

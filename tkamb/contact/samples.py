@@ -24,6 +24,8 @@ SIDEWAYS = 0.5
 SKIN = 1e-6
 """m; rays into the insert start so far below its surface."""
 MOST_CELLS = 4_000_000
+MOST_WALLS = 8
+"""Walls within the insert that a ray along the normal passes at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +89,7 @@ def sample_surface(insert: Surface, resolution: float) -> SurfaceSamples:
     normals = insert.smooth_normals(points, face)
     area = covered * resolution**2 / np.maximum(normals[:, 1], STEEPEST)
     triangles = _grid_triangles(cell, shape)
-    depth = SKIN + caster.first(points - SKIN * normals, -normals)[0]
-    depth = np.where(np.isfinite(depth), depth, thickness)
+    depth = _depth(caster, points, normals, thickness)
     return SurfaceSamples(points, normals, area, thickness, triangles, depth, resolution)
 
 
@@ -219,14 +220,14 @@ def _above(surface: Surface, xz: Array) -> Array:
 
 
 def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Index, Array]:
-    """Return first hits (n, 3), their faces (n,) and the thickness (n,) below them."""
+    """Return first hits (n, 3), their faces (n,) and the thickness (n,) below them.
+
+    The thickness ends where the column leaves the insert for good. A wall or a void within the
+    insert does not end it: what lies below carries the load on.
+    """
     origins = _above(insert, xz)
     distance, face = caster.first(origins, DOWN)
-    ray, along, crossed = caster.all(origins, DOWN)
-    leaves = insert.face_normals[crossed, 1] < 0
-    exit_ = np.full(len(xz), np.inf)
-    np.minimum.at(exit_, ray[leaves], along[leaves])
-    thickness = exit_ - distance
+    thickness = caster.last_exit(origins, DOWN) - distance
     lost = ~np.isfinite(thickness)
     if lost.mean() > 0.01:
         raise InputError(
@@ -238,6 +239,25 @@ def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Inde
     if lost.any():
         thickness[lost] = thickness[keep[cKDTree(xz[keep]).query(xz[lost])[1]]]
     return origins + distance[:, None] * DOWN, face, thickness
+
+
+def _depth(caster: RayCaster, points: Array, normals: Array, thickness: Array) -> Array:
+    """Return how far the insert goes along the inward normals (n,), m.
+
+    A wall within the insert does not end it: the insert goes on where the ray has left it.
+    """
+    depth = np.zeros(len(points))
+    open_ = np.arange(len(points))
+    for _ in range(MOST_WALLS):
+        start = points[open_] - (depth[open_] + SKIN)[:, None] * normals[open_]
+        step, face = caster.first(start, -normals[open_])
+        facing = np.einsum("ij,ij->i", caster.surface.face_normals[face], normals[open_])
+        inside = np.isfinite(step) & (facing < 0.0)
+        if not inside.any():
+            break
+        depth[open_[inside]] += SKIN + step[inside]
+        open_ = open_[inside]
+    return np.where(depth > 0.0, depth, thickness)
 
 
 def _grid_triangles(cell: Index, shape: tuple[int, int]) -> Index:

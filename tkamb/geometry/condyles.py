@@ -5,12 +5,15 @@ from functools import lru_cache
 
 import numpy as np
 
+from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index, rotate, transform
 from tkamb.geometry.nearest import sampled
 from tkamb.geometry.surface import Surface
+from tkamb.units import DEGREE, MILLIMETRE
 
-NOTCH_DEPTH = 2e-3
-"""m; a shallower valley between two lobes does not make two condyles."""
+NOTCH_DEPTH = 3e-3
+"""m; a shallower notch does not make two condyles. A single condyle of a real component has up to
+2.4 mm along some direction (DM, JW and the shipped knee cut in halves), two condyles 6 to 14 mm."""
 FACET_DEPTH = 3e-5
 """m; depth that facets of 1–2 mm cut off a condyle: heights that differ by less are the same."""
 STRIP_WIDTH = 1e-3
@@ -24,6 +27,29 @@ _FLEXIONS = np.radians(np.arange(0.0, 121.0, 15.0))
 _DEEPEST = 15e-3
 
 
+@dataclass(frozen=True)
+class YawSearch:
+    """How the line through both condyles is found in the horizontal plane.
+
+    Args:
+        step: rad, between the directions that are tried.
+        spacing: m, between the samples of the surface.
+        strip: m, width of the strips along a direction.
+        flexions: rad, at which the outline is taken.
+        largest_yaw: rad, between that line and z. The estimate is within 3 deg on real
+            components; at 20 deg the plane between the condyles already cuts them.
+    """
+
+    step: float = 10.0 * DEGREE
+    spacing: float = 1.0 * MILLIMETRE
+    strip: float = 2.0 * MILLIMETRE
+    flexions: tuple[float, ...] = tuple(np.arange(0.0, 91.0, 15.0) * DEGREE)
+    largest_yaw: float = 15.0 * DEGREE
+
+
+YAW_SEARCH = YawSearch()
+
+
 @lru_cache(maxsize=2)
 def condyle_split(femoral: Surface) -> float | None:
     """Return the z (m, femoral frame) between the condyles; None for a single condyle.
@@ -31,7 +57,7 @@ def condyle_split(femoral: Surface) -> float | None:
     The lower outline of the component in the frontal plane is taken at flexions from 0 to
     120 deg (rotation about +z, as in `tkamb.geometry.frames`), in strips of 1 mm along z,
     as height above its lowest point, and averaged over flexion. Two condyles show as two
-    valleys with a ridge, the notch, between them. It must rise at least 2 mm above both;
+    valleys with a ridge, the notch, between them. It must rise at least 3 mm above both;
     the split is the middle of the notch at half its height. A sphere, a cylinder along z
     or a unicondylar part has one valley.
 
@@ -39,12 +65,16 @@ def condyle_split(femoral: Surface) -> float | None:
 
     Args:
         femoral: in the femoral frame, anatomical axes (x anterior, y superior, z right).
+
+    Raises:
+        InputError: the two condyles do not lie side by side along z, so that medial and lateral
+            cannot be told.
     """
-    outline, middles = _mean_outline(femoral)
-    left = np.minimum.accumulate(outline)
-    right = np.minimum.accumulate(outline[::-1])[::-1]
-    rise = outline - np.maximum(left, right)
+    samples = _samples(femoral, STRIP_WIDTH / 2)
+    outline, middles = _mean_outline(samples, STRIP_WIDTH, _FLEXIONS)
+    rise = _rise(outline)
     top = int(np.argmax(rise))
+    _check_yaw(femoral)
     if rise[top] < NOTCH_DEPTH:
         return None
     high = outline > outline[top] - rise[top] / 2
@@ -54,6 +84,48 @@ def condyle_split(femoral: Surface) -> float | None:
     while high[last + 1]:
         last += 1
     return float((middles[first] + middles[last]) / 2)
+
+
+def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float, float]:
+    """Return how far the line through both condyles is turned from z, and its notch.
+
+    The notch is looked for along every horizontal direction. It is deepest along the line
+    through both condyles. The mean of the directions, weighted by the depth where it is more
+    than half the largest, is that line.
+
+    Args:
+        femoral: in the femoral frame.
+        search: settings.
+
+    Returns:
+        Angle about +y, rad, in (-90, 90] deg, and depth of the deepest notch, m. A single
+        condyle has no notch along any direction and no direction of its own.
+    """
+    samples = _samples(femoral, search.spacing)
+    yaws = np.arange(-np.pi / 2, np.pi / 2 - search.step / 2, search.step)
+    depth = np.zeros(len(yaws))
+    for n, yaw in enumerate(yaws):
+        cosine, sine = np.cos(yaw), np.sin(yaw)
+        turn = np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
+        outline, _ = _mean_outline(samples @ turn.T, search.strip, np.array(search.flexions))
+        depth[n] = _rise(outline).max()
+    deepest = float(depth.max())
+    weight = np.where(depth > deepest / 2, depth, 0.0)
+    doubled = weight @ np.exp(2j * yaws)  # a line has no sense: its angle is known modulo 180 deg
+    return float(np.angle(doubled) / 2), deepest
+
+
+def _check_yaw(femoral: Surface) -> None:
+    """Raise an InputError where two condyles lie along another direction than z."""
+    yaw, notch = condyle_yaw(femoral)
+    if notch < NOTCH_DEPTH or abs(yaw) <= YAW_SEARCH.largest_yaw:
+        return
+    raise InputError(
+        f"its two condyles lie along a line turned by {abs(yaw) / DEGREE:.0f} deg from the "
+        "medial-lateral axis, so that medial and lateral cannot be told",
+        femoral.name,
+        "check the axes of the mesh: anterior, superior, right",
+    )
 
 
 def condyle_faces(femoral: Surface, split: float | None) -> tuple[Index, Index]:
@@ -68,20 +140,38 @@ def condyle_faces(femoral: Surface, split: float | None) -> tuple[Index, Index]:
     return np.flatnonzero(~lateral), np.flatnonzero(lateral)
 
 
-def _mean_outline(femoral: Surface) -> tuple[Array, Array]:
-    """Return height (n,) of the outline above its lowest point and z (n,) of the strips, m."""
-    samples = np.concatenate([sampled(femoral, STRIP_WIDTH / 2)[0], femoral.vertices])
-    low, high = femoral.bounds[:, 2]
-    count = max(int(np.ceil((high - low) / STRIP_WIDTH)), 3)
+def _samples(femoral: Surface, spacing: float) -> Array:
+    """Return samples (s, 3) of a surface, m, with the corners of its triangles."""
+    corners = femoral.vertices[np.unique(femoral.faces)]
+    return np.concatenate([sampled(femoral, spacing)[0], corners])
+
+
+def _mean_outline(samples: Array, width: float, flexions: Array) -> tuple[Array, Array]:
+    """Return height (n,) of the outline above its lowest point and z (n,) of the strips, m.
+
+    Args:
+        samples: (s, 3) m, of the surface.
+        width: m, of the strips along z.
+        flexions: (f,) rad, over which the outline is averaged.
+    """
+    low, high = samples[:, 2].min(), samples[:, 2].max()
+    count = max(int(np.ceil((high - low) / width)), 3)
     strip = np.clip(((samples[:, 2] - low) / (high - low) * count).astype(int), 0, count - 1)
     total = np.zeros(count)
-    for flexion in _FLEXIONS:
+    for flexion in flexions:
         height = samples[:, 0] * np.sin(flexion) + samples[:, 1] * np.cos(flexion)
         outline = np.full(count, np.inf)
         np.minimum.at(outline, strip, height)
         total += np.minimum(outline - outline.min(), _DEEPEST)
     middles = low + (np.arange(count) + 0.5) * (high - low) / count
-    return total / len(_FLEXIONS), middles
+    return total / len(flexions), middles
+
+
+def _rise(outline: Array) -> Array:
+    """Return by how much each strip (n,) of an outline rises above the valleys beside it, m."""
+    left = np.minimum.accumulate(outline)
+    right = np.minimum.accumulate(outline[::-1])[::-1]
+    return np.asarray(outline - np.maximum(left, right), float)
 
 
 class LowestPoints:

@@ -65,6 +65,23 @@ class RayCaster:
         distance, face, _ = self.first_in_face(origins, directions)
         return distance, face
 
+    def last_exit(self, origins: ArrayLike, directions: ArrayLike) -> Array:
+        """Return the distance (n,) m at which each ray leaves the surface for good; inf: never.
+
+        Walls and voids within a part, which a ray leaves and enters again, do not count.
+
+        Args:
+            origins: (n, 3) m.
+            directions: (n, 3) or (3,), any length but zero.
+        """
+        origins, directions = _rays(origins, directions)
+        ray, along, face = self.all(origins, directions)
+        way = np.broadcast_to(directions, origins.shape)[ray]
+        leaves = np.einsum("ij,ij->i", self.surface.face_normals[face], way) > 0.0
+        last = np.full(len(origins), -np.inf)
+        np.maximum.at(last, ray[leaves], along[leaves])
+        return np.where(np.isfinite(last), last, np.inf)
+
     def first_in_face(
         self, origins: ArrayLike, directions: ArrayLike
     ) -> tuple[Array, Index, Array]:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tkamb.contact.articular_edge import AT_EDGE
+from tkamb.contact.narrow import TOO_NARROW
 from tkamb.geometry.frames import Array
 from tkamb.known_errors import is_large, known_error_words
 from tkamb.output import metrics
@@ -57,6 +59,13 @@ def run_title(summary: Mapping[str, Any]) -> str:
     scene = Path(str(summary.get("scene") or "tkamb run"))
     name = scene.parent.name if scene.stem == "scene" and scene.parent.name else scene.stem
     return name.upper() if len(name) <= 3 else name.replace("_", " ").capitalize()
+
+
+PEAK_DOUBTS = {
+    AT_EDGE: "that contact reaches the edge of the insert's articular surface",
+    TOO_NARROW: "that contact is too narrow for the map, so that the peak is not resolved",
+}
+"""Flag of a frame, after "the <side> ", -> words beside the peak pressure."""
 
 
 def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
@@ -211,8 +220,21 @@ def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
     error = results.summary.get("known_error")
     if error is not None:
         detail += f"; {_model(results)} {known_error_words(error, PRESSURE_AND_AREA)}"
-    large = error is not None and is_large(error, PRESSURE_AND_AREA)
+    doubt = _doubt_of_peak(results, found.side, found.frame)
+    if doubt:
+        detail += f"; {doubt}"
+    large = bool(doubt) or (error is not None and is_large(error, PRESSURE_AND_AREA))
     return Card("Peak contact pressure", f"{found.value:.1f} MPa", detail, large)
+
+
+def _doubt_of_peak(results: "Results", side: str | None, frame: int) -> str:
+    """Return in words why the peak pressure of a condyle at a frame is in doubt; "" if it is not.
+
+    A run's status tells the flags of each frame.
+    """
+    status = str(results.status[frame])
+    words = [word for flag, word in PEAK_DOUBTS.items() if f"the {side} {flag}" in status]
+    return ", and ".join(words)
 
 
 def _post(results: "Results", axis: HorizontalAxis) -> Card | None:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from tkamb.contact.lattice.problem import LatticeState, SurfaceFromBelow
 from tkamb.contact.lattice.solver import Solution
+from tkamb.contact.narrow import narrow_flags
 from tkamb.contact.pressing import HALF
 from tkamb.contact.result import ContactResult, medial_points
-from tkamb.geometry.frames import Array, Index, Mask
+from tkamb.geometry.frames import Array
 from tkamb.units import DEGREE, MILLIMETRE
 
 REACH = 2.0
@@ -25,10 +26,6 @@ SHARPEST = 20.0 * DEGREE
 """Turn of the femoral normal over that way from which a peak is flagged: a radius of 6 cells."""
 
 AROUND = np.array([(x, 0.0, z) for x in (-1, 0, 1) for z in (-1, 0, 1)], float)
-FEWEST_WITHIN = 5
-"""Nodes with contact all around from which a peak is right within 8 %, wherever the contact lies
-in its cells: a sphere's with about 17 nodes in contact, three rows of nodes under a cylinder. With
-none it is 5 to 96 % too low (docs/lattice.md)."""
 STRAIN_FLAG = -0.4
 """Principal strain below which a result is flagged: the law has no barrier at -100 %."""
 MOST_UNSEEN = 0.2e-3
@@ -49,7 +46,7 @@ def unresolved_flags(state: LatticeState, result: ContactResult) -> tuple[str, .
     }
     femoral, spacing = state.problem.femoral, state.lattice.spacing
     return (
-        *coarse_flags(state.surface.triangles, result.pressure > 0, sides),
+        *narrow_flags(state.surface.triangles, result.pressure > 0, sides),
         *edge_flags(femoral, result.pose, spacing, peaks),
     )
 
@@ -91,36 +88,6 @@ def _sharpness(normals: NDArray[np.float64]) -> str:
     cosine = normals @ normals[len(AROUND) // 2]
     turn = float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
     return f"turns by {turn / DEGREE:.0f} deg" if turn > SHARPEST else ""
-
-
-def coarse_flags(
-    triangles: Index,
-    touched: Mask,
-    sides: Mapping[str, Mask],
-) -> Iterator[str]:
-    """Yield a flag for each condyle whose contact has fewer than `FEWEST_WITHIN`.
-
-    Args:
-        triangles: (k, 3) of the contact surface.
-        touched: (n,) which of its nodes are in contact.
-        sides: side -> (n,) which nodes are under it.
-    """
-    within = surrounded(triangles, touched)
-    for side, own in sides.items():
-        if touched[own].any() and np.count_nonzero(within & own) < FEWEST_WITHIN:
-            yield (
-                f"the {side} contact is too narrow for the cells: its peak pressure cannot be "
-                "relied on and is mostly too low; take finer cells"
-            )
-
-
-def surrounded(triangles: Index, touched: Mask) -> Mask:
-    """Return which nodes (n,) have contact all around: at every corner of their triangles."""
-    a, b, c = touched[triangles.T]
-    edge = triangles[(a | b | c) & ~(a & b & c)]
-    within = touched.copy()
-    within[edge] = False
-    return within
 
 
 def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ...], bool]:

@@ -98,7 +98,7 @@ def _fill(field: NodeField, notch: Notch, before: Array, rays: RayCaster) -> Non
         target[:, 1] = refired(field, notch.node, probe, rays)
     reach = REACH * np.linalg.norm(field.spacing[list(notch.axes)])
     keep &= np.linalg.norm((target - own)[:, notch.axes], axis=1) <= reach
-    _settle(field, notch, target, keep, is_corner & flat)
+    _settle(field, notch, target, keep, flat)
 
 
 def _towards(point: Array, other: Array, share: float, rise: Array | float) -> Array:
@@ -108,11 +108,16 @@ def _towards(point: Array, other: Array, share: float, rise: Array | float) -> A
     return result
 
 
-def _settle(field: NodeField, notch: Notch, target: Array, keep: Mask, top: Mask) -> None:
+def _settle(field: NodeField, notch: Notch, target: Array, keep: Mask, flat: bool) -> None:
+    """Admit the nodes to keep.
+
+    In a flat notch, a node between two nodes of the top is one of the top itself. Otherwise the
+    upper face of its cell would carry no contact, and the face's other nodes too much.
+    """
     dropped, chosen = (tuple(n[mask] for n in notch.node) for mask in (~keep, keep))
     field.upper_end[dropped] = field.lower_end[dropped] = False
     field.points[chosen] = target[keep]
     field.member[chosen] = True
-    both = field.top[notch.first] & field.top[notch.second] & top
+    both = field.top[notch.first] & field.top[notch.second] & flat
     both &= ~field.has_top(notch.node)
     field.top[chosen] = both[keep]

@@ -1,0 +1,169 @@
+"""Medial and lateral: told where the condyles lie side by side along z, refused where not."""
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from contact_bodies import dished_insert, flat_insert, graded_sphere
+from scenes import write_scene
+from shapes import bicondylar, sphere
+from tkamb import simulate
+from tkamb.cli import main
+from tkamb.contact.foundation import LinearFoundation
+from tkamb.contact.materials import material
+from tkamb.contact.pair import ContactPair
+from tkamb.errors import InputError
+from tkamb.geometry.condyles import condyle_split, condyle_yaw
+from tkamb.geometry.surface import Surface
+from tkamb.inputs.meshes import load_surface
+from tkamb.press import press_meshes
+
+ROOT = Path(__file__).parents[1]
+DATA = ROOT.parent / "shared" / "data"
+MODEL = ROOT / "models" / "deep_knee_bend"
+MM = 1e-3
+
+
+@cache
+def femoral(kind):
+    if kind in ("dm", "jw"):
+        path = DATA / kind / "geometry" / "femoral_component.stl"
+        if not path.exists():
+            pytest.skip("the real data are not here")
+        return load_surface(path, "m", "-x,+y,-z", name=kind)
+    if kind == "shipped":
+        return load_surface(MODEL / "femoral_component.stl", "mm", "+x,+y,+z", name=kind)
+    return bicondylar(kind)
+
+
+def turned(surface, degrees):
+    turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    return Surface(surface.vertices @ turn.T, surface.faces, surface.name)
+
+
+def mirrored(surface):
+    return Surface(surface.vertices * [1, 1, -1], surface.faces[:, ::-1], surface.name)
+
+
+KINDS = ["sphere", "torus", "shipped", "dm", "jw"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("yaw", [20, 45, 90, -33, -64, 125])
+def test_condyles_that_lie_askew_are_refused(kind, yaw):
+    with pytest.raises(InputError, match="medial and lateral cannot be told"):
+        condyle_split(turned(femoral(kind), yaw))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("yaw", [4, -9])
+def test_condyles_that_lie_side_by_side_are_split(kind, yaw):
+    whole = femoral(kind)
+    # the notch of a real component lies behind the origin, so that its middle moves to the side
+    assert condyle_split(turned(whole, yaw)) == pytest.approx(condyle_split(whole), abs=6 * MM)
+    assert np.degrees(condyle_yaw(turned(whole, yaw))[0]) == pytest.approx(yaw, abs=3.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_mirrored_component_is_split_as_its_mirror_image(kind):
+    """A left part in the axes of a right one: the plane is mirrored, the sides are exchanged."""
+    shift = np.eye(4)
+    shift[2, 3] = 4 * MM
+    shifted = femoral(kind).moved(shift)
+    assert condyle_split(mirrored(shifted)) == pytest.approx(-condyle_split(shifted), abs=1.5 * MM)
+
+
+def one_condyle(kind):
+    ball = sphere(20 * MM)
+    if kind == "sphere":
+        return ball
+    if kind == "cylinder":
+        made = trimesh.creation.cylinder(20 * MM, 50 * MM)
+        return Surface(np.asarray(made.vertices), np.asarray(made.faces), kind)
+    if kind == "runner":  # longer along x than along z
+        return Surface(ball.vertices * [1.8, 1.0, 0.5], ball.faces, kind)
+    if kind == "cap":
+        return Surface(np.minimum(ball.vertices * [1.4, 1, 0.4], [1, 4 * MM, 1]), ball.faces, kind)
+    whole = femoral("shipped")
+    sign = 1.0 if kind == "lateral half" else -1.0
+    kept = (sign * whole.triangles[:, :, 2] > 0).all(axis=1)
+    return Surface(whole.vertices, whole.faces[kept], kind)
+
+
+@pytest.mark.parametrize("yaw", [0, 20, 45, 75, 90, -30, -60])
+@pytest.mark.parametrize(
+    "kind", ["sphere", "cylinder", "runner", "cap", "lateral half", "medial half"]
+)
+def test_a_single_condyle_may_lie_in_any_way(kind, yaw):
+    assert condyle_split(turned(one_condyle(kind), yaw)) is None
+
+
+@pytest.mark.parametrize("subject", ["dm", "jw"])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_half_of_a_real_component_may_lie_in_any_way(subject, sign):
+    whole = femoral(subject)
+    kept = (sign * whole.triangles[:, :, 2] > 0).all(axis=1)
+    half = Surface(whole.vertices, whole.faces[kept], "half")
+    for yaw in (-75, -30, 0, 75):
+        assert condyle_split(turned(half, yaw)) is None
+
+
+AXES = "+z,+y,-x"
+
+
+def test_press_refuses_exchanged_axes_on_the_command_line(capsys):
+    meshes = [str(MODEL / "femoral_component.stl"), str(MODEL / "insert.stl")]
+    for contact in ("foundation", "lattice"):
+        pressing = ["press", *meshes, f"--axes={AXES}", "--load", "1000", "--contact", contact]
+        assert main([*pressing, "--no-cache"] if contact == "lattice" else pressing) == 2
+        said = capsys.readouterr().err
+        assert (
+            "deg from the medial-lateral axis" in said
+            and "axes" in said
+            and "Traceback" not in said
+        )
+
+
+def test_press_and_run_refuse_them_in_python(tmp_path):
+    meshes = MODEL / "femoral_component.stl", MODEL / "insert.stl"
+    with pytest.raises(InputError, match="medial and lateral cannot be told"):
+        press_meshes(*meshes, 1000.0, axes=AXES, contact="foundation")
+    scene = write_scene(tmp_path, implant__femoral__axes=AXES)
+    with pytest.raises(InputError, match="medial and lateral cannot be told"):
+        simulate(scene, frames=slice(0, 1))
+
+
+def test_press_in_the_right_axes_loads_both(capsys):
+    meshes = [str(MODEL / "femoral_component.stl"), str(MODEL / "insert.stl")]
+    assert main(["press", *meshes, "--load", "1000", "--contact", "foundation", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["medial"]["force_N"] == pytest.approx(500, rel=0.1)
+    assert found["lateral"]["force_N"] == pytest.approx(500, rel=0.1)
+
+
+LINEAR = material("polyethylene-linear")
+
+
+def flags_of(femoral, insert, load=500.0):
+    model = LinearFoundation(1 * MM)
+    return model.press(model.prepare(ContactPair(femoral, insert, LINEAR)), load, np.eye(4)).flags
+
+
+def test_one_condyle_on_two_separate_patches_is_flagged():
+    """A flat-bottomed part with one valley, on an insert with two ridges 24 mm apart."""
+    ridges = dished_insert(
+        lambda x, z: 8 * MM - np.minimum((np.abs(x) - 12 * MM) ** 2 / 40e-3, 3 * MM),
+        20 * MM,
+        20 * MM,
+    )
+    bar = flat_insert(8 * MM, half_x=18 * MM, half_z=10 * MM)
+    assert any("separate patches 24 mm apart" in flag for flag in flags_of(bar, ridges))
+
+
+def test_one_condyle_on_one_patch_is_not_flagged():
+    assert flags_of(graded_sphere(20 * MM), flat_insert(8 * MM)) == ()

@@ -1,0 +1,128 @@
+"""How near contact comes to the edge of the insert's articular surface.
+
+At the edge an insert has no neighbour that helps to carry, a real one is rounded more finely than
+any map resolves, and it wears and chips there. A peak pressure at the edge is a place and not a
+number, so that contact there is flagged.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, label
+
+from tkamb.geometry.frames import Array, Mask
+from tkamb.geometry.surface import Surface
+from tkamb.units import DEGREE, MILLIMETRE
+
+AT_EDGE = "contact reaches the edge of the insert's articular surface"
+"""Words of the flag, after "the <side> "."""
+DOWN = np.array([0.0, -1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class EdgeSettings:
+    """When contact is at the edge of an insert.
+
+    Args:
+        spacing: m, of the vertical rays that find the edge; the distance is known to half of it.
+        steepest: rad, from the horizontal: what is steeper beside the outline is its rim.
+        rim: m, the rim is at most so wide. What is steep farther inside is a flank of the
+            eminence or of a post.
+        reach: m, contact nearer to the edge is flagged: the radius of a usual insert's rounded
+            rim (1 to 2 mm) and half a map's spacing.
+        share: of the peak pressure, from which a point counts as loaded.
+    """
+
+    spacing: float = 0.5 * MILLIMETRE
+    steepest: float = 50.0 * DEGREE
+    rim: float = 4.0 * MILLIMETRE
+    reach: float = 2.5 * MILLIMETRE
+    share: float = 0.05
+
+
+EDGE = EdgeSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class ArticularEdge:
+    """Distance from the edge of the articular surface, seen from above.
+
+    Args:
+        origin: (2,) m, x and z of the first cell.
+        away: (a, b) m, distance of each cell's centre from the nearest cell beyond the edge.
+    """
+
+    origin: Array
+    away: Array
+    spacing: float
+
+    @classmethod
+    def of(cls, insert: Surface, settings: EdgeSettings = EDGE) -> "ArticularEdge":
+        """Return the edge of an insert: where it ends, or turns down to its walls.
+
+        Args:
+            insert: in the insert frame.
+            settings: when contact is at the edge.
+        """
+        low, high = insert.bounds[:, [0, 2]]
+        count = np.ceil((high - low) / settings.spacing).astype(int) + 4
+        origin = low - 1.5 * settings.spacing
+        x, z = (origin[d] + settings.spacing * np.arange(count[d]) for d in (0, 1))
+        grid = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
+        height = insert.bounds[1, 1] + MILLIMETRE
+        rays = np.insert(grid, 1, height, axis=1)
+        distance, face = insert.rays.first(rays, DOWN)
+        covered = np.isfinite(distance).reshape(count)
+        upright = insert.face_normals[face][:, 1].reshape(count)
+        inside = distance_transform_edt(covered, settings.spacing)
+        steep = covered & (upright < np.cos(settings.steepest)) & (inside <= settings.rim)
+        beyond = _joined_to_outside(~covered | steep, ~covered)
+        return cls(origin, distance_transform_edt(~beyond, settings.spacing), settings.spacing)
+
+    def distance(self, points: Array) -> Array:
+        """Return the distance (n,) of points (n, 3) from the edge in x and z, m; 0 beyond it."""
+        cell = np.round((points[:, [0, 2]] - self.origin) / self.spacing).astype(int)
+        cell = np.clip(cell, 0, np.array(self.away.shape) - 1)
+        return np.asarray(np.maximum(self.away[tuple(cell.T)] - self.spacing / 2, 0.0), float)
+
+
+def _joined_to_outside(wanted: Mask, outside: Mask) -> Mask:
+    """Return the connected parts of a mask (a, b) that hold a cell outside the insert."""
+    part, _ = label(wanted, structure=np.ones((3, 3)))
+    touching = np.unique(part[outside])
+    return np.asarray(wanted & np.isin(part, touching), bool)
+
+
+def edge_of_insert_flags(
+    edge: ArticularEdge,
+    points: Array,
+    pressure: Array,
+    sides: Mapping[str, Mask],
+    settings: EdgeSettings = EDGE,
+) -> Iterator[str]:
+    """Yield a flag for each condyle whose contact reaches the edge of the articular surface.
+
+    Args:
+        edge: of the insert.
+        points: (n, 3) m, of the map.
+        pressure: (n,) Pa.
+        sides: side -> (n,) which points are under it.
+        settings: when contact is at the edge.
+    """
+    for side, own in sides.items():
+        carried = np.where(own, pressure, 0.0)
+        highest = float(carried.max(initial=0.0))
+        if highest <= 0.0:
+            continue
+        loaded = np.flatnonzero(carried > settings.share * highest)
+        away = edge.distance(points[loaded])
+        if away.min() > settings.reach:
+            continue
+        peak = float(away[np.argmax(carried[loaded])])
+        where = (
+            "its peak pressure lies there"
+            if peak <= settings.reach
+            else f"its peak pressure lies {peak / MILLIMETRE:.1f} mm from it"
+        )
+        yield (f"the {side} {AT_EDGE} (within {settings.reach / MILLIMETRE:g} mm); {where}")

@@ -1,0 +1,189 @@
+"""Pairs of bodies on which the contact models' errors are measured, by situation.
+
+Three situations differ in what limits a map: contact in the interior of a smooth surface, on a
+flank (its normal far from the vertical) and at an edge (the outline of the insert, a rim with a
+fillet, a femoral part with an edge). Every second pair of each situation is held out: it judges
+the errors that the other half states, and takes no part in them.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from tkamb.contact.materials import material
+from tkamb.contact.pair import ContactPair
+from tkamb.geometry.frames import Array, pose
+from tkamb.geometry.surface import Surface
+from tkamb.studies.bodies import Height, block
+from tkamb.units import DEGREE, MILLIMETRE
+
+Situation = Literal["interior", "flank", "edge"]
+SITUATIONS: tuple[Situation, ...] = ("interior", "flank", "edge")
+INSERT_MM = 16.0
+"""Edge of the inserts: small enough for fine cells, wide enough that contact ends inside."""
+VERTICES_MM = 0.25
+"""Between the vertices of the surfaces."""
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorCase:
+    """A pair of bodies, where they meet and the load.
+
+    Args:
+        name: of the case.
+        situation: where the contact lies.
+        held_out: whether it judges the stated errors; else they are made from it.
+        femoral: height (m) of the femoral component's underside over its lowest point.
+        insert: height (m) of the insert's top.
+        load: N.
+        shift_mm: x and z of the femoral component.
+        width_mm: of the femoral component.
+    """
+
+    name: str
+    situation: Situation
+    held_out: bool
+    femoral: Height
+    insert: Height
+    load: float
+    shift_mm: tuple[float, float] = (0.0, 0.0)
+    width_mm: float = 20.0
+
+    def pair(self, material_name: str = "polyethylene") -> ContactPair:
+        """Return the two bodies."""
+        size = (INSERT_MM * MILLIMETRE, INSERT_MM * MILLIMETRE)
+        insert = block(self.insert, size, VERTICES_MM * MILLIMETRE)
+        return ContactPair(
+            _upside_down(self.femoral, self.width_mm), insert, material(material_name)
+        )
+
+    @property
+    def pose(self) -> Array:
+        """pose_femoral_in_insert (4, 4); its height does not matter."""
+        x, z = np.array(self.shift_mm) * MILLIMETRE
+        return pose(np.eye(3), [x, 0.1, z])
+
+
+def error_cases() -> list[ErrorCase]:
+    """Return all pairs."""
+    found: list[ErrorCase] = []
+    for situation, rows in (("interior", _interior()), ("flank", _flank()), ("edge", _edge())):
+        for number, (name, *given) in enumerate(rows):
+            keys = ("femoral", "insert", "load", "shift_mm", "width_mm")
+            found.append(
+                ErrorCase(
+                    f"{situation}: {name}",
+                    situation,  # type: ignore[arg-type]
+                    number % 2 == 1,
+                    **dict(zip(keys, given, strict=False)),
+                )
+            )
+    return found
+
+
+def _interior() -> Iterator[tuple]:
+    yield "ball of 22 on 8 mm", _ball(22, 22), _level(8), 600.0
+    yield "ball of 15 on 4 mm", _ball(15, 15), _level(4), 300.0
+    yield "ellipsoid 35 x 18 on 6 mm", _ball(35, 18), _level(6), 700.0
+    yield "ball of 20 in a dish of 28", _ball(20, 20), _dish(7, 28, 28), 1000.0
+    yield "torus 30 x 22 in a dish 60 x 26", _ball(30, 22), _dish(7, 60, 26), 1200.0
+    yield "ball of 40 on 3 mm", _ball(40, 40), _level(3), 900.0
+    yield "roller 80 x 12 on 8 mm", _ball(80, 12), _level(8), 800.0
+    yield "ball of 24 in a trough of 30", _ball(24, 24), _dish(6, 1e4, 30), 900.0
+
+
+def _flank() -> Iterator[tuple]:
+    yield "ball of 18 on a slope of 15 deg", _ball(18, 18), _slope(7, 15), 500.0, (-4.7, 0), 26.0
+    yield "ball of 22 on a slope of 25 deg", _ball(22, 22), _slope(8, 25), 500.0, (-9.3, 0), 34.0
+    yield "ball of 14 in a dish of 20, 4 mm", _ball(14, 14), _dish(5, 20, 20), 600.0, (1.2, 0)
+    yield "ball of 16 in a dish of 24, 4 mm", _ball(16, 16), _dish(5, 24, 24), 700.0, (1, 1)
+    yield (
+        "roller 60 x 14 in a trough of 18, 4 mm",
+        _ball(60, 14),
+        _dish(5, 1e4, 18),
+        700.0,
+        (0, 0.9),
+    )
+    yield "ball of 20 on an eminence", _ball(20, 20), _dish(9, -14, 1e4), 400.0, (6.0, 0)
+    yield (
+        "torus 30 x 16 on a slope of 20 deg",
+        _ball(30, 16),
+        _slope(7, 20),
+        700.0,
+        (-10.2, 0.5),
+        36.0,
+    )
+    yield "ball of 25 in a trough of 35, 5 mm", _ball(25, 25), _dish(5, 35, 1e4), 800.0, (1.4, 0)
+
+
+def _edge() -> Iterator[tuple]:
+    yield "ball of 22 at the outline", _ball(22, 22), _level(8), 500.0, (6.5, 0)
+    yield "ball of 30 at the outline", _ball(30, 30), _level(6), 600.0, (0.3, 7.0)
+    yield "ball of 22 at a rim of fillet 1 mm", _ball(22, 22), _rim(8, 1.0), 500.0, (4.5, 0)
+    yield "ball of 18 at a rim of fillet 2 mm", _ball(18, 18), _rim(8, 2.0), 500.0, (4.2, 0.3)
+    yield "punch of fillet 0.5 mm", _punch(4.0, 0.5), _level(7), 900.0, (0.2, 0.1), 10.0
+    yield "punch of fillet 1.5 mm", _punch(3.5, 1.5), _level(7), 900.0, (0.4, 0.3), 10.0
+    yield "ball of 40 at a rim of fillet 0.5 mm", _ball(40, 40), _rim(6, 0.5), 800.0, (4.0, 1.0)
+    yield "roller 60 x 10 with fillet ends", _runner(10, 3.0, 1.0), _level(7), 500.0, (0, 0), 12.0
+
+
+def _level(thickness_mm: float) -> Height:
+    return lambda x, z: np.full_like(x, thickness_mm * MILLIMETRE)
+
+
+def _ball(radius_x_mm: float, radius_z_mm: float) -> Height:
+    """Return an ellipsoid with these radii along x and z at its lowest point."""
+    a, b = radius_x_mm * MILLIMETRE, radius_z_mm * MILLIMETRE
+
+    def height(x: Array, z: Array) -> Array:
+        square = 1.0 - x**2 / a**2 - z**2 * a / (b * a**2)
+        return np.asarray(a * (1.0 - np.sqrt(np.maximum(square, 0.05))), float)
+
+    return height
+
+
+def _dish(thickness_mm: float, radius_x_mm: float, radius_z_mm: float) -> Height:
+    """Return a dish of these radii; a negative one is a ridge."""
+    a, b = radius_x_mm * MILLIMETRE, radius_z_mm * MILLIMETRE
+    return lambda x, z: thickness_mm * MILLIMETRE + x**2 / (2 * a) + z**2 / (2 * b)
+
+
+def _slope(thickness_mm: float, degrees: float) -> Height:
+    return lambda x, z: thickness_mm * MILLIMETRE + np.tan(degrees * DEGREE) * x
+
+
+def _rim(thickness_mm: float, fillet_mm: float) -> Height:
+    """Return a plateau that ends at x = 5 mm, with a fillet, in a slope of 60 deg."""
+    return lambda x, z: thickness_mm * MILLIMETRE - _rounded(x - 5 * MILLIMETRE, fillet_mm)
+
+
+def _rounded(beyond: Array, fillet_mm: float) -> Array:
+    """Return the drop (m) of a level surface that turns down by 60 deg over a fillet."""
+    radius, turn = fillet_mm * MILLIMETRE, 60.0 * DEGREE
+    end = radius * np.sin(turn)
+    x = np.maximum(beyond, 0.0)
+    arc = radius - np.sqrt(np.maximum(radius**2 - np.minimum(x, end) ** 2, 0.0))
+    return np.asarray(arc + np.tan(turn) * np.maximum(x - end, 0.0), float)
+
+
+def _punch(half_mm: float, fillet_mm: float) -> Height:
+    """Return a round punch, flat to a radius, with a fillet."""
+    return lambda x, z: _rounded(np.hypot(x, z) - half_mm * MILLIMETRE, fillet_mm)
+
+
+def _runner(radius_mm: float, half_mm: float, fillet_mm: float) -> Height:
+    """Return a roller along x that ends with fillets."""
+    across = _ball(1e4, radius_mm)
+    return lambda x, z: across(0 * x, z) + _rounded(np.abs(x) - half_mm * MILLIMETRE, fillet_mm)
+
+
+def _upside_down(height: Height, width_mm: float) -> Surface:
+    """Return a body whose underside is at a height over the lowest point, in y = 0."""
+    size, top = (width_mm * MILLIMETRE, width_mm * MILLIMETRE), 30.0 * MILLIMETRE
+    whole = block(
+        lambda x, z: np.maximum(top - height(x, z), MILLIMETRE), size, VERTICES_MM * MILLIMETRE
+    )
+    vertices = whole.vertices * [1.0, -1.0, 1.0] + [0.0, top, 0.0]
+    return Surface(vertices, whole.faces[:, ::-1], "femoral")
