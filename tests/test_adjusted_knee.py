@@ -45,11 +45,11 @@ def test_the_adjustment_leaves_the_shipped_total_alone(tmp_path):
     np.testing.assert_allclose(split(adjusted), split(recorded), atol=1e-4)
 
 
-@pytest.mark.parametrize("degrees", [0.4, pytest.param(-0.4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("degrees", [0.35, pytest.param(-0.35, marks=pytest.mark.slow)])
 def test_the_adjustment_mends_the_split_of_a_coronal_error(tmp_path, degrees):
-    """0.4 deg and 0.4 mm of error: the split is mended, the total changes by 0.006 BW."""
+    """0.35 deg and 0.3 mm of error: the split is mended, the total changes by 0.006 BW."""
     right = next(with_and_without(wrong_scene(tmp_path / "right", 0.0, 0.0)))
-    adjusted, recorded = with_and_without(wrong_scene(tmp_path / "wrong", degrees, 0.4))
+    adjusted, recorded = with_and_without(wrong_scene(tmp_path / "wrong", degrees, 0.3))
     change = adjusted["force_total_BW"] - recorded["force_total_BW"]
     assert 1e-6 < np.abs(change).max() < 0.01
     np.testing.assert_allclose(adjusted["adjust_force_change_BW"], change, rtol=1e-9)
@@ -58,8 +58,8 @@ def test_the_adjustment_mends_the_split_of_a_coronal_error(tmp_path, degrees):
     assert set(adjusted.status) == {"ok"}
     assert any("contradicts" in status for status in recorded.status)
     assert (np.abs(adjusted["adjust_coronal_deg"]) > 0.3).all()
-    kept = adjusted["adjust_restored"] == 0
-    error = [np.abs(split(results) - split(right))[kept].max() for results in (adjusted, recorded)]
+    np.testing.assert_array_equal(adjusted["adjust_restored"], 0)
+    error = [np.abs(split(results) - split(right)).max() for results in (adjusted, recorded)]
     assert error[0] < 0.2 * error[1]
 
 
@@ -78,7 +78,8 @@ def test_a_total_that_hangs_on_the_adjustment_is_flagged(tmp_path):
 def test_a_restored_frame_is_the_recorded_rotation_for_the_body_too(tmp_path):
     """The load pressed in is that of the points at the restored pose."""
     path = wrong_scene(tmp_path, 0.3, 0.0)
-    case = load_case(load_scene(path, {"contact.adjust": True, "motion.frames": 26}))
+    changes = {"contact.adjust": True, "contact.adjust_restore_when": "either"}
+    case = load_case(load_scene(path, changes | {"motion.frames": 26}))
     side = ContactSide(case, Mechanics(case))
     restored = 0
     for k in (12, 23):

@@ -1,17 +1,21 @@
 """Femoral adjustment: what is corrected, what is left, and what is undone after the press."""
 
+from functools import cache
+from typing import Any
+
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
 from tkamb.contact.materials import material
+from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult
 from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.errors import InputError
-from tkamb.geometry.adjustment import adjust
+from tkamb.geometry.adjustment import Adjustment, AdjustmentSettings, RestoreRule, adjust
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import Array, pose, transform
 from tkamb.geometry.surface import Surface
@@ -110,9 +114,28 @@ def test_level_condyles_are_not_turned(query: ClosestPointQuery) -> None:
 
 
 def test_always_moved_to_first_touch(query: ClosestPointQuery) -> None:
-    for height in (-1e-3, 0.0, 1e-3):
+    for height in (-4e-4, 0.0, 4e-4):
         found = adjust(query, tilted(0.0, height))
         assert found.translation == pytest.approx(-height, abs=2e-6)
+        assert not found.flags
+
+
+@pytest.mark.parametrize("height", [-1.76e-3, 0.6e-3, 1.76e-3])
+def test_no_farther_than_fluoroscopy_errs(query: ClosestPointQuery, height: float) -> None:
+    found = adjust(query, tilted(0.3, height))
+    assert found.translation == pytest.approx(-np.sign(height) * 5e-4, abs=1e-12)
+    assert found.pose[1, 3] == pytest.approx(found.recorded[1, 3] + found.translation, abs=1e-6)
+    assert f"{abs(height) * 1e3:.2f} mm" in found.flags[0]
+    assert "first touch" in found.flags[0]
+
+
+def test_the_lift_off_limit_is_flagged_on_both_sides(query: ClosestPointQuery) -> None:
+    """0.1 mm at a condyle is 0.13 deg: closer to 0.5 deg than that, either answer may be right."""
+    for angle, made, flagged in ((0.3, True, False), (0.45, True, True), (0.55, False, True),
+                                 (0.7, False, False)):  # fmt: skip
+        found = adjust(query, tilted(angle))
+        assert (found.coronal_angle != 0.0) is made
+        assert any("limit" in flag for flag in found.flags) is flagged
 
 
 def test_neither_condyle_near_is_an_input_error(query: ClosestPointQuery) -> None:
@@ -120,18 +143,32 @@ def test_neither_condyle_near_is_an_input_error(query: ClosestPointQuery) -> Non
         adjust(query, tilted(0.0, 8e-3))
 
 
-def pressed(
-    query: ClosestPointQuery, angle_deg: float, height: float, load: float, **options: str
-) -> tuple[ContactResult, object]:
+@cache
+def prepared(query: ClosestPointQuery) -> tuple[ContactModel, Any]:
     model = contact_model("foundation", 1.0)
-    pair = ContactPair(query.femoral, query.insert, material("polyethylene"))
-    state = model.prepare(pair)
-    adjustment = adjust(query, tilted(angle_deg, height))
-    return press_adjusted(model, state, load, adjustment, query, **options)
+    return model, model.prepare(ContactPair(query.femoral, query.insert, material("polyethylene")))
+
+
+def pressed(
+    query: ClosestPointQuery,
+    angle_deg: float,
+    height: float,
+    load: float,
+    restore_when: RestoreRule = "both",
+) -> tuple[ContactResult, Adjustment]:
+    model, state = prepared(query)
+    settings = AdjustmentSettings(restore_when=restore_when)
+    adjustment = adjust(query, tilted(angle_deg, height), settings)
+    return press_adjusted(model, state, load, adjustment, query)
+
+
+def medial_share(result: ContactResult) -> float:
+    medial, lateral = (0.0 if c is None else c.force for c in (result.medial, result.lateral))
+    return medial / (medial + lateral)
 
 
 def test_adjustment_holds_when_it_exceeds_the_deformation(query: ClosestPointQuery) -> None:
-    result, found = pressed(query, 0.3, 1e-3, 500.0)
+    result, found = pressed(query, 0.3, 4e-4, 500.0, "either")
     assert found.penetration < abs(found.translation)
     assert not found.restored
     assert result.medial.force == pytest.approx(result.lateral.force, rel=1e-3)
@@ -139,7 +176,7 @@ def test_adjustment_holds_when_it_exceeds_the_deformation(query: ClosestPointQue
 
 def test_deeper_press_restores_the_recorded_rotation(query: ClosestPointQuery) -> None:
     """First touch is all the femur was moved by: any load sinks it deeper than that."""
-    result, found = pressed(query, 0.3, 0.0, 2500.0)
+    result, found = pressed(query, 0.3, 0.0, 2500.0, "either")
     assert found.restored
     assert found.penetration > 1e-5
     assert result.pose[:3, :3] == pytest.approx(tilted(0.3)[:3, :3])
@@ -148,15 +185,52 @@ def test_deeper_press_restores_the_recorded_rotation(query: ClosestPointQuery) -
 
 
 def test_both_conditions_are_the_sources_reading(query: ClosestPointQuery) -> None:
-    _, found = pressed(query, 0.3, 0.0, 2500.0, restore_when="both")
+    """The femur sinks deeper than it was moved, but the condyles sink alike: it stays turned."""
+    result, found = pressed(query, 0.3, 0.0, 2500.0)
     assert not found.restored
+    assert found.penetration > abs(found.translation)
     assert abs(found.final_angle) < abs(found.coronal_angle)
+    assert medial_share(result) == pytest.approx(0.5, abs=0.01)
+
+
+SWEEP = np.arange(-0.7, 0.75, 0.1) * 1e-3
+
+
+@pytest.mark.parametrize("angle_deg", [0.2, -0.3])
+def test_the_recorded_height_does_not_decide_the_split(
+    query: ClosestPointQuery, angle_deg: float
+) -> None:
+    """The load is carried wherever the femur was recorded: no step, not even at 0.5 mm."""
+    shares = [medial_share(pressed(query, angle_deg, h, 1500.0)[0]) for h in SWEEP]
+    assert shares == pytest.approx([0.5] * len(shares), abs=0.01)
+
+
+def test_the_other_reading_steps_and_says_so(query: ClosestPointQuery) -> None:
+    found = [pressed(query, 0.3, h, 1500.0, "either")[0] for h in SWEEP]
+    shares = np.array([medial_share(result) for result in found])
+    steps = np.flatnonzero(np.abs(np.diff(shares)) > 0.02)
+    assert len(steps) == 2
+    for step in steps:
+        for side in (found[step], found[step + 1]):
+            assert any("recorded pose decides" in flag for flag in side.flags)
+
+
+def test_the_only_step_over_the_coronal_angle_is_flagged(query: ClosestPointQuery) -> None:
+    """Beyond 0.5 deg it is lift-off: where that begins, the split steps, and both sides say so."""
+    angles = np.arange(-0.7, 0.75, 0.05)
+    found = [pressed(query, a, 1e-4, 1500.0)[0] for a in angles]
+    shares = np.array([medial_share(result) for result in found])
+    steps = np.flatnonzero(np.abs(np.diff(shares)) > 0.1)
+    assert np.abs(angles[steps] + 0.025) == pytest.approx([0.525, 0.525], abs=0.01)
+    for step in steps:
+        for side in (found[step], found[step + 1]):
+            assert any("limit" in flag for flag in side.flags)
 
 
 def test_total_force_is_unchanged_and_split_moves(query: ClosestPointQuery) -> None:
     """The load is the load; the adjustment decides how the condyles share it."""
-    adjusted, _ = pressed(query, 0.3, 1e-3, 1500.0)
-    left, _ = pressed(query, 0.3, 0.0, 1500.0)
+    adjusted, _ = pressed(query, 0.3, 0.0, 1500.0)
+    left, _ = pressed(query, 0.3, 0.0, 1500.0, "either")
     for result in (adjusted, left):
         assert -result.wrench_on_insert[1] == pytest.approx(1500.0, rel=1e-3)
     assert adjusted.medial.force != pytest.approx(left.medial.force, rel=0.05)

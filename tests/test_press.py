@@ -218,6 +218,39 @@ def test_adjustment_evens_out_the_condyles(meshes, capsys):
         press_meshes(*meshes(), 2000.0, pose=(0, 100, 0, 0, 0, 0), adjust=True)
 
 
+KNEE = Path(__file__).parents[1] / "models" / "deep_knee_bend"
+
+
+@pytest.mark.parametrize(("height", "moved"), [(30.5, 0.24), (30.7, 0.04), (31.2, -0.46)])
+def test_the_recorded_height_does_not_undo_the_adjustment(height, moved, capsys):
+    """0.3 deg of adduction on the shipped knee: level condyles share, wherever it was recorded."""
+    files = [str(KNEE / name) for name in ("femoral_component.stl", "insert.stl")]
+    pose = ["--pose", "-6.9", str(height), "0", "0.3", "0", "0"]
+    assert main(["press", *files, "--load", "1500", *pose, *FOUNDATION, "--adjust", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["medial"]["force_N"] == pytest.approx(748, abs=3)
+    assert found["lateral"]["force_N"] == pytest.approx(752.5, abs=3)
+    assert found["adjustment"]["translation_mm"] == pytest.approx(moved, abs=0.01)
+    assert found["adjustment"]["coronal_deg"] == pytest.approx(-0.3, abs=0.01)
+    assert not found["adjustment"]["restored"]
+    assert found["flags"] == []
+
+
+def test_the_other_reading_restores_where_the_height_was_right(meshes):
+    """Penetration alone undoes it; without --adjust the rule has nothing to say."""
+    bodies = [KNEE / name for name in ("femoral_component.stl", "insert.stl")]
+    pose = (-6.9, 30.7, 0, 0.3, 0, 0)
+    report = press_meshes(*bodies, 1500.0, pose=pose, adjust=True, restore_when="either")
+    assert report.adjustment is not None
+    assert report.adjustment.restored
+    assert report.as_dict()["medial"] is None or report.result.medial.force < 100.0
+    assert any("recorded pose decides" in line for line in report.lines())
+    with pytest.raises(InputError, match="needs the femoral adjustment"):
+        press_meshes(*bodies, 1500.0, pose=pose, restore_when="either")
+    with pytest.raises(InputError, match="'neither' is no rule"):
+        press_meshes(*bodies, 1500.0, pose=pose, adjust=True, restore_when="neither")
+
+
 def test_single_sphere_is_medial_and_lateral_is_null(tmp_path):
     graded_sphere(20e-3).mesh.export(tmp_path / "sphere.ply")
     flat_insert(10e-3).mesh.export(tmp_path / "block.ply")

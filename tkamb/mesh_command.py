@@ -34,6 +34,11 @@ def add_press(commands: Any) -> None:
     press.add_argument("--material", default="polyethylene", metavar="NAME")
     _add_side(press)
     press.add_argument("--adjust", action=argparse.BooleanOptionalAction, default=False)
+    press.add_argument(
+        "--restore-when",
+        choices=("both", "either"),
+        help="with --adjust: what must exceed the adjustment for it to be undone; default: both",
+    )
     press.add_argument("--out", type=Path, metavar="F.vtp", help="the pressure map, for ParaView")
     press.add_argument("--json", action="store_true")
     press.set_defaults(command=_press)
@@ -58,6 +63,7 @@ def _press(options: argparse.Namespace) -> int:
         axes=options.axes,
         side=options.side,
         adjust=options.adjust,
+        restore_when=options.restore_when,
         options=without_cache(options.contact) if options.no_cache else None,
     )
     if options.out:

@@ -5,7 +5,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,7 +20,7 @@ from tkamb.defaults import CONTACT_MODEL
 from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.errors import InputError
 from tkamb.files import read_text
-from tkamb.geometry.adjustment import Adjustment
+from tkamb.geometry.adjustment import Adjustment, AdjustmentSettings, RestoreRule
 from tkamb.geometry.adjustment import adjust as adjusted
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.condyles import condyle_split
@@ -135,7 +135,8 @@ class PressReport:
     def as_dict(self) -> dict[str, Any]:
         """Return what `tkamb press --json` prints; None stands for what is unknown.
 
-        Vectors are in the insert frame, z to the subject's right on either side.
+        Vectors are in the insert frame, z to the subject's right on either side. "adjustment" is
+        there where the femur was adjusted.
         """
         result = self.result
         return {
@@ -155,7 +156,18 @@ class PressReport:
             "status": result.status.value,
             "flags": [*left_out(self.contact, self.pair.bearing), *result.flags],
             "known_error": as_json(self.known_error),
-        }
+        } | ({} if self.adjustment is None else {"adjustment": _adjustment(self.adjustment)})
+
+
+def _adjustment(done: Adjustment) -> dict[str, Any]:
+    return {
+        "translation_mm": done.translation / MILLIMETRE,
+        "coronal_deg": done.coronal_angle / DEGREE,
+        "penetration_mm": _known(done.penetration / MILLIMETRE),
+        "final_angle_deg": _known(done.final_angle / DEGREE),
+        "restore_when": done.settings.restore_when,
+        "restored": done.restored,
+    }
 
 
 def _condyle(carried: CondyleContact | None, side: Side) -> dict[str, Any] | None:
@@ -193,6 +205,7 @@ def press_meshes(
     axes: str = "+x,+y,+z",
     side: Side = "right",
     adjust: bool = False,
+    restore_when: RestoreRule | None = None,
     options: dict[str, Any] | None = None,
 ) -> PressReport:
     """Press a femoral component into an insert until it carries the load.
@@ -213,13 +226,18 @@ def press_meshes(
         side: of the knee; a left one is mirrored.
         adjust: femoral adjustment before contact (`tkamb.geometry.adjustment`); the pose must then
             be a recorded one, with a condyle within 3 mm of the insert.
+        restore_when: with `adjust`: the recorded rotation is restored if penetration and coronal
+            angle after the press exceed the adjustment ("both", Sharma 2008, the default), or
+            if "either" does.
         options: the model's own options.
 
     Raises:
         InputError: bad file, unit, axes, name or load, or a femoral component that does not
-            lie over the insert, or not near it where it is to be adjusted.
+            lie over the insert, or not near it where it is to be adjusted; or `restore_when`
+            without `adjust`.
     """
     _check_load(load)
+    settings = _adjustment_settings(adjust, restore_when)
     model = contact_model(contact, resolution_mm, **(options or {}))
     pair, femoral_pose = load_pair(femoral, insert, units, pose, bearing, material, axes, side)
     if not math.isfinite(pair.first_touch_height(femoral_pose)):
@@ -231,7 +249,7 @@ def press_meshes(
     started = time.perf_counter()
     state = model.prepare(pair)
     prepared = time.perf_counter()
-    result, adjustment = _press(model, state, load, femoral_pose, adjust)
+    result, adjustment = _press(model, state, load, femoral_pose, settings)
     solved = time.perf_counter()
     return PressReport(
         contact=contact,
@@ -257,14 +275,37 @@ def _check_load(load: float) -> None:
         raise InputError(f"impossible load {load:g} N", mend=f"{limit}; is it in N?")
 
 
-def _press(
-    model: ContactModel, state: Any, load: float, femoral_pose: Array, adjust: bool
-) -> tuple[ContactResult, Adjustment | None]:
+def _adjustment_settings(adjust: bool, restore_when: str | None) -> AdjustmentSettings | None:
+    """Return how to adjust; None: not at all."""
+    if restore_when not in (None, *get_args(RestoreRule)):
+        raise InputError(
+            f"'{restore_when}' is no rule",
+            "restore_when",
+            f"one of {', '.join(get_args(RestoreRule))}",
+        )
     if not adjust:
+        if restore_when is not None:
+            raise InputError("needs the femoral adjustment", "restore_when", "give --adjust too")
+        return None
+    return (
+        AdjustmentSettings()
+        if restore_when is None
+        else AdjustmentSettings(restore_when=restore_when)
+    )
+
+
+def _press(
+    model: ContactModel,
+    state: Any,
+    load: float,
+    femoral_pose: Array,
+    settings: AdjustmentSettings | None,
+) -> tuple[ContactResult, Adjustment | None]:
+    if settings is None:
         return model.press(state, load, femoral_pose), None
     pair: ContactPair = state.pair
     query = ClosestPointQuery(pair.femoral, pair.insert, condyle_split(pair.femoral))
-    return press_adjusted(model, state, load, adjusted(query, femoral_pose), query)
+    return press_adjusted(model, state, load, adjusted(query, femoral_pose, settings), query)
 
 
 def load_pair(

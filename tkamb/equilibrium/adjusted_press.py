@@ -1,19 +1,28 @@
-"""Pressing an adjusted femur in, then checking the adjustment against the deformation.
+"""Pressing an adjusted femur in, then comparing the adjustment with the deformation.
 
-Where the femur has sunk in deeper than it was moved, or has come to lie at a larger coronal
-angle than it was turned by, the load would have brought both condyles into contact anyway:
-the recorded rotation is restored and pressed again (Sharma 2008, 4.3, figure 4-8).
+Sharma (2008), section 4.3, figure 4-8: "If the final femoral penetration and coronal angle is more
+than the adjustments made, the original orientation of the femur is restored and the analysis is
+reconducted." The rule has two readings, `AdjustmentSettings.restore_when`:
 
-Sharma (2008) joins the two conditions by "and"; `restore_when="both"` does so.
+- "both" (the wording, and the default): restored if the penetration exceeds the translation
+  and the coronal angle of the penetrations exceeds the turn.
+- "either": restored if one of them does. Penetration then decides almost alone. A femur that was
+  recorded at the right height is hardly moved, so that nearly every load restores it, and
+  the split steps where the recorded height changes by a tenth of a millimetre.
+
+Where a change of the recorded pose by `AdjustmentSettings.input_change` may change that decision,
+the result carries a flag.
 """
 
 from dataclasses import replace
-from typing import Any, Literal
+from itertools import product
+from typing import Any
 
 from tkamb.contact.model import ContactModel
 from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.geometry.adjustment import Adjustment, raised, touches, travel_to_touch
+from tkamb.geometry.adjustment import Adjustment, RestoreRule, moved_to_touch, touches
 from tkamb.geometry.closest import ClosestPointQuery
+from tkamb.units import MILLIMETRE
 
 
 def press_adjusted(
@@ -23,7 +32,6 @@ def press_adjusted(
     adjustment: Adjustment,
     query: ClosestPointQuery,
     guess: ContactResult | None = None,
-    restore_when: Literal["either", "both"] = "either",
 ) -> tuple[ContactResult, Adjustment]:
     """Press the adjusted femur in, check the adjustment, undo its rotation if it must be.
 
@@ -34,7 +42,10 @@ def press_adjusted(
         adjustment: of the recorded pose, by `tkamb.geometry.adjustment.adjust`.
         query: closest points of the same pair.
         guess: an earlier result, to save time.
-        restore_when: whether one exceeded limit of step 4 restores, or both are needed.
+
+    Returns:
+        The contact, whose flags hold those of the adjustment, and the adjustment as it
+        was checked.
 
     Raises:
         ComputationError: the femoral component does not lie over the insert.
@@ -42,21 +53,57 @@ def press_adjusted(
     result = model.press(state, load, adjustment.pose, guess)
     final = adjustment.coronal_angle == 0.0 or adjustment.restored
     if result.status is not ContactStatus.OK or final:
-        return result, replace(adjustment, penetration=float(result.approach))
-    checked = _check(query, adjustment, result)
-    exceeded = (
-        checked.penetration > abs(checked.translation),
-        abs(checked.final_angle) > abs(checked.coronal_angle),
-    )
-    if not (any(exceeded) if restore_when == "either" else all(exceeded)):
-        return result, checked
-    travel = travel_to_touch(query, adjustment.recorded)
-    restored = raised(adjustment.recorded, -travel)
-    result = model.press(state, load, restored, result)
-    return result, replace(checked, pose=restored, translation=-travel, restored=True)
+        adjustment = replace(adjustment, penetration=float(result.approach))
+        return _flagged(result, adjustment), adjustment
+    checked, restore, doubts = _check(query, adjustment, result)
+    if restore:
+        # At the recorded rotation the limit of the turn decides nothing any more.
+        pose, translation, flags = moved_to_touch(query, checked.recorded, checked.settings)
+        checked = replace(checked, pose=pose, translation=translation, restored=True, flags=flags)
+        result = model.press(state, load, pose, result)
+    checked = replace(checked, flags=(*checked.flags, *doubts))
+    return _flagged(result, checked), checked
 
 
-def _check(query: ClosestPointQuery, adjustment: Adjustment, result: ContactResult) -> Adjustment:
+def _flagged(result: ContactResult, adjustment: Adjustment) -> ContactResult:
+    """Return the contact with the adjustment's flags after its own."""
+    if not adjustment.flags:
+        return result
+    return replace(result, flags=(*result.flags, *adjustment.flags))
+
+
+def _check(
+    query: ClosestPointQuery, adjustment: Adjustment, result: ContactResult
+) -> tuple[Adjustment, bool, tuple[str, ...]]:
+    """Return the checked adjustment, whether to undo it, and a flag where that is in doubt."""
+    settings, distance = adjustment.settings, adjustment.intercondylar_distance
     medial, lateral = touches(query, result.pose)
-    angle = (medial - lateral) / adjustment.intercondylar_distance
-    return replace(adjustment, penetration=-min(medial, lateral), final_angle=angle)
+    penetration, angle = -min(medial, lateral), (medial - lateral) / distance
+    deeper = penetration - abs(adjustment.translation)
+    turned = (abs(angle) - abs(adjustment.coronal_angle)) * distance
+    margin = settings.input_change
+    # Where the angle passes the turn, the turn is as small as the angle: if the mesh calls that
+    # level, restoring changes nothing.
+    tilted = abs(angle) * distance > settings.level_difference
+    outcomes = {
+        _restored(settings.restore_when, *exceeded)
+        for exceeded in product(_either_side(deeper, margin), _either_side(turned, margin * tilted))
+    }
+    doubts: tuple[str, ...] = ()
+    if len(outcomes) > 1:
+        doubts = (
+            f"femoral adjustment: {margin / MILLIMETRE:g} mm of the recorded pose decides whether "
+            "the recorded rotation is restored, and the split with it",
+        )
+    restore = _restored(settings.restore_when, deeper > 0, turned > 0)
+    checked = replace(adjustment, penetration=penetration, final_angle=angle)
+    return checked, restore, doubts
+
+
+def _either_side(excess: float, margin: float) -> set[bool]:
+    """Return what `excess > 0` may be where the excess is known to within a margin, both m."""
+    return {excess - margin > 0, excess > 0, excess + margin > 0}
+
+
+def _restored(rule: RestoreRule, deeper: bool, turned: bool) -> bool:
+    return (deeper and turned) if rule == "both" else (deeper or turned)

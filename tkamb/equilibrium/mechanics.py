@@ -290,10 +290,11 @@ class Mechanics:
         contact = self.case.scene.contact
         if self.query is None or contact is None or not contact.adjust:
             return None, ()
-        from tkamb.geometry.adjustment import adjust
+        from tkamb.geometry.adjustment import AdjustmentSettings, adjust
 
+        settings = AdjustmentSettings(restore_when=contact.adjust_restore_when)
         try:
-            return adjust(self.query, self.poses[k]), ()
+            return adjust(self.query, self.poses[k], settings), ()
         except TkambError as error:
             return None, (error.what,)
 

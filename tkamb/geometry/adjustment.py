@@ -1,25 +1,30 @@
 """Femoral adjustment: fluoroscopy's coronal error is taken out before contact, then checked.
 
-Fluoroscopy errs by about 0.5 mm and 0.5 deg, which is more than the deformation itself.
+Fluoroscopy errs by about 0.5 mm and 0.5 deg, which is more than the deformation itself. Sharma
+(2008), section 4.3, takes both as cut-offs:
 
 1. Gap of each condyle at the recorded pose (closest points); coronal angle = difference of
    the gaps / distance of the contact points in the coronal plane.
 2. Below 0.5 deg the femur is turned in the coronal plane, about the component's own centre,
-   until both condyles touch together; above it is left: evidence of lift-off. So it is where
-   the turn that this takes would exceed 0.5 deg.
-3. It is always moved along y to first touch.
+   until both condyles touch together. Above, it is not turned: that is evidence of lift-off. It is
+   not turned either where the turn that this takes would exceed 0.5 deg.
+3. It is moved along y to first touch, by 0.5 mm at most. A femur that is farther from touch
+   than fluoroscopy errs is flagged. The press moves it on to contact in any case, since it
+   moves the femur along y until the load is carried. The height therefore decides nothing
+   about the split, and the split has no step at the limit.
 
 Sharma (2008) does not say about which point it turns. Registration places the component's centre
 better than any other point, so the centre stays where it was recorded. About the contact
 points, 25 mm below, 0.4 deg shift the component sideways by 0.2 mm, and in dishes little
 wider than the condyles the contact by 1.3 mm: enough to change the total force by 0.02 BW.
 
-`tkamb.equilibrium.adjusted_press` checks it after the deformation, and restores the recorded
-rotation.
+`tkamb.equilibrium.adjusted_press` compares the adjustment with the deformation, and may restore
+the recorded rotation.
 """
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -29,19 +34,38 @@ from tkamb.geometry.closest import ClosestPointQuery, CondyleGaps
 from tkamb.geometry.frames import Array, pose, transform
 from tkamb.units import DEGREE, MILLIMETRE
 
-LARGEST_ANGLE = 0.5 * DEGREE
-"""rad: coronal angles from here on are taken as lift-off and left alone."""
+RestoreRule = Literal["both", "either"]
 
-LARGEST_RECORDED_GAP = 3.0 * MILLIMETRE
-"""m: with both condyles farther than this from the insert the pose is no recorded contact."""
 
-LEVEL_DIFFERENCE = 5e-6
-"""m: condyles whose gaps differ by less are level as far as a mesh can say; no turn."""
+@dataclass(frozen=True)
+class AdjustmentSettings:
+    """The limits of the adjustment and the rule by which it is undone.
 
-TOUCH_DIFFERENCE = 1e-7
-"""m: difference of the condyles' clearances at which they touch together."""
+    Args:
+        largest_angle: rad; a coronal angle from here on is lift-off and is not corrected
+            (Sharma 2008: 0.5 deg, what fluoroscopy errs by).
+        largest_translation: m; the adjustment moves the femur by no more than this along y
+            (Sharma 2008: 0.5 mm, what fluoroscopy errs by).
+        restore_when: "both": the recorded rotation is restored if penetration and coronal angle
+            after the press exceed the adjustment (Sharma 2008); "either": if one of them does.
+        input_change: m; a change of the recorded pose that must not change the answer by a
+            step without a flag. A fifth of what fluoroscopy errs by.
+        largest_recorded_gap: m; with both condyles farther than this from the insert the pose is
+            no recorded contact.
+        level_difference: m; condyles whose gaps differ by less are level as far as a mesh can
+            say, and the femur is not turned.
+        touch_difference: m; difference of the condyles' clearances at which they touch together.
+        max_turns: most steps of the search for the turn at which they do.
+    """
 
-MOST_TURNS = 20
+    largest_angle: float = 0.5 * DEGREE
+    largest_translation: float = 0.5 * MILLIMETRE
+    restore_when: RestoreRule = "both"
+    input_change: float = 0.1 * MILLIMETRE
+    largest_recorded_gap: float = 3.0 * MILLIMETRE
+    level_difference: float = 5e-6
+    touch_difference: float = 1e-7
+    max_turns: int = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,16 +73,18 @@ class Adjustment:
     """What was done to a recorded pose before contact.
 
     Args:
-        pose: (4, 4) adjusted pose_femoral_in_insert, at first touch.
+        pose: (4, 4) adjusted pose_femoral_in_insert.
         recorded: (4, 4) the pose as recorded.
         translation: m along y, of the component's centre; negative is downwards.
         coronal_angle: rad about the insert's x axis by which the femur was turned.
         measured_angle: rad, coronal angle of the recorded pose that was found.
         intercondylar_distance: m; NaN with one condyle.
+        settings: the limits that it was made with.
         penetration: m, how deep the femur sank in afterwards; NaN before the press.
         final_angle: rad, difference of the penetrations / intercondylar distance.
         restored: the recorded rotation was put back after the press; `coronal_angle` then
-            says what had been tried, and `pose` is the restored one at first touch.
+            says what had been tried, and `pose` is the restored one.
+        flags: in words, why the answer depends on a limit.
     """
 
     pose: Array
@@ -67,17 +93,24 @@ class Adjustment:
     coronal_angle: float
     measured_angle: float
     intercondylar_distance: float
+    settings: AdjustmentSettings = AdjustmentSettings()
     penetration: float = math.nan
     final_angle: float = math.nan
     restored: bool = False
+    flags: tuple[str, ...] = ()
 
 
-def adjust(query: ClosestPointQuery, recorded: Array) -> Adjustment:
+def adjust(
+    query: ClosestPointQuery,
+    recorded: Array,
+    settings: AdjustmentSettings = AdjustmentSettings(),
+) -> Adjustment:
     """Return the adjusted pose.
 
     Args:
         query: closest points of the pair.
         recorded: (4, 4) pose_femoral_in_insert.
+        settings: the limits, and how the adjustment is undone later.
 
     Raises:
         InputError: neither condyle is near the insert.
@@ -85,24 +118,69 @@ def adjust(query: ClosestPointQuery, recorded: Array) -> Adjustment:
     """
     recorded = np.asarray(recorded, float)
     gaps = query.at(recorded)
-    _check_near(gaps)
+    _check_near(gaps, settings)
     angle, distance = _coronal_angle(gaps)
-    turn = 0.0
-    if (
-        gaps.lateral is not None
-        and LEVEL_DIFFERENCE < abs(angle) * distance < LARGEST_ANGLE * distance
-    ):
-        turn = _levelling_turn(query, recorded, distance)
-        turn = turn if abs(turn) < LARGEST_ANGLE else 0.0
+    turn, flags = 0.0, ()
+    if gaps.lateral is not None and abs(angle) * distance > settings.level_difference:
+        turn, flags = _limited_turn(query, recorded, angle, distance, settings)
     turned = _turned(query, recorded, turn) if turn else recorded
-    travel = travel_to_touch(query, turned)
-    return Adjustment(raised(turned, -travel), recorded, -travel, turn, angle, distance)
+    moved, translation, more = moved_to_touch(query, turned, settings)
+    return Adjustment(
+        moved, recorded, translation, turn, angle, distance, settings, flags=(*flags, *more)
+    )
 
 
-def _check_near(gaps: CondyleGaps) -> None:
+def _limited_turn(
+    query: ClosestPointQuery,
+    recorded: Array,
+    angle: float,
+    distance: float,
+    settings: AdjustmentSettings,
+) -> tuple[float, tuple[str, ...]]:
+    """Return the turn (rad) that is made, 0 beyond the limit, and a flag close to the limit."""
+    limit, margin = settings.largest_angle, settings.input_change / distance
+    if abs(angle) > limit + margin:
+        return 0.0, ()
+    turn = _levelling_turn(query, recorded, distance, settings)
+    largest = max(abs(angle), abs(turn))
+    flags: tuple[str, ...] = ()
+    if abs(largest - limit) <= margin:
+        done = "turned level" if largest < limit else "left as lift-off"
+        flags = (
+            f"coronal angle of {largest / DEGREE:.2f} deg is {done}: the limit of "
+            f"{limit / DEGREE:g} deg is less than {settings.input_change / MILLIMETRE:g} mm at a "
+            "condyle away, and the split steps there",
+        )
+    return (turn if largest < limit else 0.0), flags
+
+
+def moved_to_touch(
+    query: ClosestPointQuery, at: Array, settings: AdjustmentSettings
+) -> tuple[Array, float, tuple[str, ...]]:
+    """Return a pose (4, 4) moved along y to first touch, as far as the limit allows.
+
+    Returns:
+        The pose, the move along y (m), and a flag where first touch is farther than the limit.
+
+    Raises:
+        ComputationError: the femur does not lie over the insert.
+    """
+    travel, limit = travel_to_touch(query, at), settings.largest_translation
+    translation = min(max(-travel, -limit), limit)
+    flags: tuple[str, ...] = ()
+    if abs(travel) > limit:
+        where = "above" if travel > 0 else "below"
+        flags = (
+            f"recorded femur is {abs(travel) / MILLIMETRE:.2f} mm {where} first touch: adjusted by "
+            f"the {limit / MILLIMETRE:g} mm that fluoroscopy errs by, the press moves it on",
+        )
+    return raised(at, translation), translation, flags
+
+
+def _check_near(gaps: CondyleGaps, settings: AdjustmentSettings) -> None:
     found = [gap.gap for gap in (gaps.medial, gaps.lateral) if gap is not None]
     nearest = min(found, key=abs)
-    if abs(nearest) > LARGEST_RECORDED_GAP:
+    if abs(nearest) > settings.largest_recorded_gap:
         word = "above" if nearest > 0.0 else "inside"
         raise InputError(
             f"neither condyle is near the insert (nearest {abs(nearest) * 1e3:.1f} mm {word})",
@@ -120,7 +198,9 @@ def _coronal_angle(gaps: CondyleGaps) -> tuple[float, float]:
     return (gaps.lateral.gap - gaps.medial.gap) / distance, distance
 
 
-def _levelling_turn(query: ClosestPointQuery, recorded: Array, distance: float) -> float:
+def _levelling_turn(
+    query: ClosestPointQuery, recorded: Array, distance: float, settings: AdjustmentSettings
+) -> float:
     """Return the turn (rad) at which both condyles touch together, by the secant method."""
 
     def difference(turn: float) -> float:
@@ -129,8 +209,8 @@ def _levelling_turn(query: ClosestPointQuery, recorded: Array, distance: float) 
 
     last, error = 0.0, difference(0.0)
     turn = error / distance
-    for _ in range(MOST_TURNS):
-        if abs(error) < TOUCH_DIFFERENCE or turn == last:
+    for _ in range(settings.max_turns):
+        if abs(error) < settings.touch_difference or turn == last:
             return last
         now = difference(turn)
         slope = (now - error) / (turn - last)

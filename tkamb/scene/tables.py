@@ -287,7 +287,12 @@ class ContactTable(SceneTable):
     adjust: Switch = Field(
         False,
         description="turns the recorded femur in the coronal plane, by 0.5 deg at most, until both "
-        "condyles touch, before the contact model presses",
+        "condyles touch, and moves it along y, by 0.5 mm at most, before the contact model presses",
+    )
+    adjust_restore_when: Literal["both", "either"] = Field(
+        "both",
+        description="with adjust: the recorded rotation is restored if penetration and coronal "
+        "angle after the press exceed the adjustment (both, Sharma 2008), or if either does",
     )
     coupling: Literal["none", "points"] = Field(
         "none", description="'points': the resultants of the deformed contact act in the equations"

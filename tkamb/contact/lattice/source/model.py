@@ -1,4 +1,4 @@
-"""Sharma's own loops: displacement-driven, one sparse solve per contact set.
+"""Sharma's own loops: displacement-driven, one linear solution per contact set.
 
 Sharma (2008), section 4.5.5. Nodes in contact are given the vertical displacement that the
 femoral component asks of them and slide freely in x and z; the others must carry no force.
@@ -9,6 +9,7 @@ unknowns are iterated to zero force with the tangent springs, then D_new = D
 (F_load/F_reaction)^(1/m). Sharma (2008) has m = 1, which oscillates for ever where the reaction
 grows with the square of D or faster, as it does while nodes come in; from the second D on m is
 the growth seen between the last two.
+No step factorises a matrix: see `held`.
 Sharma (2008) leaves open what happens to nodes that would be pulled: here they are let go, and
 nodes that the femoral component would pass are caught.
 """
@@ -17,26 +18,43 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
-import scipy.sparse as sparse
 
 from tkamb.contact.lattice.active_set import ContactForces
 from tkamb.contact.lattice.initial_guess import InitialGuess
-from tkamb.contact.lattice.linear.operator import prepare_operator
 from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.lattice.model import CellContact
 from tkamb.contact.lattice.problem import ContactProblem, Direction, TangentPlanes
 from tkamb.contact.lattice.report import PressureRule
 from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.contact.lattice.solver import SlidingNodes, Solution, Tolerance
+from tkamb.contact.lattice.source.held import CandidateResponse, HeldNodes
 from tkamb.contact.lattice.source.springs import SourceNetwork
 from tkamb.contact.materials import LinearElastic, Material
 from tkamb.geometry.frames import Array, Index, Mask
 
-MOST_LOOPS = 60
-MOST_STEPS = 30
-_NO_NODES = np.zeros(0, np.int64)
-FIRST_DEPTH = 0.5
-"""First D, as a share of the depth that the candidates cover."""
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """How Sharma's loops begin and end.
+
+    Args:
+        max_loops: most changes of the contact set or of D.
+        max_steps: most tangent steps at one D.
+        first_depth: first D, as a share of the depth that the candidates cover. Candidates
+            reach a quarter deeper than the depth that is expected: 1 / 1.25.
+        load: the load may be missed by this share of the tolerance. One more D costs little, and
+            a load that is missed by the whole tolerance moves the forces by as much.
+        balance: what the free nodes may be out of balance by at one D, as a share of what the
+            load is missed by (or of the tolerance, the larger one).
+        smallest_step: a tangent step is halved down to this share while it raises the imbalance.
+    """
+
+    max_loops: int = 60
+    max_steps: int = 30
+    first_depth: float = 0.8
+    load: float = 0.1
+    balance: float = 0.01
+    smallest_step: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -104,6 +122,7 @@ def solve_by_loops(
     load: float | None,
     guess: InitialGuess,
     tolerance: Tolerance,
+    settings: LoopSettings = LoopSettings(),
 ) -> Solution:
     """Return the contact at a pose under a load (N), or at approach 0 when load is None.
 
@@ -112,14 +131,16 @@ def solve_by_loops(
     """
     nodes = problem.contact_nodes[guess.candidates]
     points = problem.surface_points[guess.candidates]
+    response = CandidateResponse(problem, guess.candidates)
     sliding = SlidingNodes(problem, points, np.zeros_like(points), pose, guess.planes)
-    depth = 0.0 if load is None else FIRST_DEPTH * float(guess.reach)
-    field, loops = np.zeros_like(problem.solid.nodes), 0
+    depth = 0.0 if load is None else settings.first_depth * float(guess.reach)
+    field, loops, missed = np.zeros_like(problem.solid.nodes), 0, 1.0
     active, seen = sliding.planes.gap(points) < depth, []
     while True:
         loops += 1
         planes = sliding.planes
-        pressed = _press(problem, nodes, points, planes, active, depth, field, tolerance)
+        target = settings.balance * max(tolerance.force, missed)
+        pressed = _press(response, points, planes, active, depth, field, target, settings)
         field, moved = pressed.field, pressed.field[nodes]
         reaction = float(pressed.force.sum())
         missed = 0.0 if load is None else abs(reaction - load) / load
@@ -127,15 +148,20 @@ def solve_by_loops(
         opening = np.where(active, 0.0, planes.gap(points + moved) - depth)
         force = np.where(active, np.maximum(pressed.force, 0), 0.0)
         forces = ContactForces(force, opening, depth, active, loops, True)
-        settled = tolerance.at_rest(sliding.follow(moved, forces), loops == MOST_LOOPS)
+        last = loops == settings.max_loops
+        settled = tolerance.at_rest(sliding.follow(moved, forces), last)
         still = bool((changed == active).all())
-        done = still and settled and max(missed, pressed.residual) <= tolerance.force
-        if done or loops == MOST_LOOPS:
+        carried = missed <= settings.load * tolerance.force
+        done = still and settled and carried and pressed.residual <= tolerance.force
+        if done or last:
             return _solution(guess, forces, planes, pressed, nodes, loops, missed, done)
         if load is not None and still:
             seen.append((depth, reaction))
             depth = _next_depth(problem, seen, load, pressed.slope)
             changed = changed | (sliding.planes.gap(points + moved) < depth) & ~active
+        if not carried or not (changed == active).all():
+            # Another set or depth moves the nodes anew: that they do is no sign of swinging.
+            sliding = SlidingNodes(problem, points, moved, pose, planes)
         active = changed
 
 
@@ -161,71 +187,51 @@ def _next_active(
 
 
 def _press(
-    problem: ContactProblem,
-    nodes: Index,
+    response: CandidateResponse,
     points: Array,
     planes: TangentPlanes,
     active: Mask,
     depth: float,
     field: Array,
-    tolerance: Tolerance,
+    target: float,
+    settings: LoopSettings,
 ) -> _Pressed:
     """Give the active nodes their vertical displacement and bring the rest to zero force.
 
     The first step spreads the change with the undeformed stiffness, as in Sharma (2008); then
-    tangent steps, halved while they would raise the unbalanced force.
+    tangent steps, halved while they would raise the unbalanced force, until that is below
+    `target` times the contact force.
     """
-    solid, held = problem.solid, problem.held.copy()
-    chosen = 3 * nodes[active] + 1
-    held[chosen] = True
-    asked = np.zeros(len(held))
-    asked[chosen] = planes.points[active, 1] - depth - points[active, 1]
-    asked[chosen] -= field.ravel()[chosen]
-    u = field + _spread(solid.stiffness, problem, held, asked).reshape(-1, 3)
-    force, residual, internal = _balance(problem, u, held, chosen)
-    for _ in range(MOST_STEPS):
-        if residual <= 1e-2 * tolerance.force:
-            break
-        operator = prepare_operator(solid.tangent(u), problem.index, held, _NO_NODES)
-        step = -operator.solve(np.where(held, 0.0, internal).reshape(-1, 3))
+    solid = response.problem.solid
+    assert isinstance(solid, SourceNetwork)
+    held = HeldNodes(response, active)
+    asked = planes.points[active, 1] - depth - points[active, 1]
+    asked -= field.ravel()[held.unknowns]
+    u = field + held.spread(asked)
+    force, residual, internal = _balance(solid, u, held)
+    steps = 0
+    while residual > target and steps < settings.max_steps:
+        steps += 1
+        step = -held.solve(solid.spring_tangent(u), internal)
         share, last = 1.0, residual
         while True:
-            force, residual, internal = _balance(problem, u + share * step, held, chosen)
-            if residual < last or share < 0.05:
+            force, residual, internal = _balance(solid, u + share * step, held)
+            if residual < last or share < settings.smallest_step:
                 break
             share /= 2
         u = u + share * step
-    everywhere = np.zeros(len(nodes))
+    everywhere = np.zeros(len(active))
     everywhere[active] = force
-    slope = _slope(problem, held, chosen) if solid.material.is_linear else np.nan
-    return _Pressed(everywhere, u, slope, residual)
+    return _Pressed(everywhere, u, held.slope if solid.material.is_linear else np.nan, residual)
 
 
-def _slope(problem: ContactProblem, held: Mask, chosen: Index) -> float:
-    """Return the reaction (N) to a unit dummy displacement of the chosen unknowns, per metre."""
-    dummy = np.zeros(len(held))
-    dummy[chosen] = -1.0
-    dummy = _spread(problem.solid.stiffness, problem, held, dummy)
-    return float(-(problem.solid.stiffness @ dummy)[chosen].sum())
-
-
-def _balance(
-    problem: ContactProblem, u: Array, held: Mask, chosen: Index
-) -> tuple[Array, float, Array]:
-    """Return the forces on the chosen unknowns, the relative imbalance and internal forces."""
-    internal = problem.solid.internal_force(u).ravel()
-    force = -internal[chosen]
+def _balance(solid: SourceNetwork, u: Array, held: HeldNodes) -> tuple[Array, float, Array]:
+    """Return the forces on the active nodes, the relative imbalance and internal forces."""
+    internal = solid.internal_force(u)
+    force = -internal.ravel()[held.unknowns]
     size = max(float(np.abs(force).sum()), 1e-300)
-    return force, float(np.abs(internal[~held]).sum()) / size if len(chosen) else 0.0, internal
-
-
-def _spread(
-    stiffness: sparse.csr_matrix, problem: ContactProblem, held: Mask, given: Array
-) -> Array:
-    """Return the displacement (3n,) with the held unknowns as given and the rest unloaded."""
-    operator = prepare_operator(stiffness, problem.index, held, _NO_NODES)
-    pulled = np.where(held, 0.0, stiffness @ given)
-    return given - operator.solve(pulled.reshape(-1, 3)).ravel()
+    lost = float(np.abs(internal.ravel()[~held.held]).sum()) / size if len(force) else 0.0
+    return force, lost, internal
 
 
 def _solution(

@@ -13,11 +13,13 @@ Nonlinear: f = sigma(eps) C L0 along the spring as it lies now, eps from its tru
 Reference: Sharma, PhD dissertation, University of Tennessee (2008), sections 4.5.1 to 4.5.3.
 """
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
 
+from tkamb.compiled import compiled
 from tkamb.contact.lattice.meshing.cells import DIRECTIONS
 from tkamb.contact.lattice.solids.solid import Pattern, Scatter, Solid
 from tkamb.contact.materials import Material
@@ -35,6 +37,19 @@ def source_factor(spacing: Array) -> float:
     strain = np.column_stack([n**2, n[:, 0] * n[:, 1], n[:, 1] * n[:, 2], n[:, 2] * n[:, 0]])
     unit = np.einsum("s,si,sj->ij", length**2, strain, strain) / np.prod(spacing)
     return float(np.linalg.inv(unit)[VERTICAL, VERTICAL])
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """Tangent of all springs as they lie.
+
+    Args:
+        stiffness: (s,) N/m along the spring.
+        direction: (s, 3) unit.
+    """
+
+    stiffness: Array
+    direction: Array
 
 
 class SourceNetwork(Solid):
@@ -71,11 +86,8 @@ class SourceNetwork(Solid):
 
     def linear_force(self, displacement: Array) -> Array:
         """Return K u, N, (n, 3); see `Solid`."""
-        a, b = self.springs.T
-        straight = self.lines / self.lengths[:, None]
-        longer = np.einsum("sd,sd->s", straight, displacement[b] - displacement[a])
-        pull = (self.material.young_modulus * self.factor * longer)[:, None] * straight
-        return self.scatter.sum(np.hstack([-pull, pull]))
+        k = np.full(len(self.springs), self.material.young_modulus * self.factor)
+        return self.tangent_force(Tangent(k, self._straight), displacement)
 
     def nonlinear_residual(
         self, displacement: Array, chosen: Index | None = None, lost: Array | None = None
@@ -93,6 +105,13 @@ class SourceNetwork(Solid):
             lost[:] = 1 - self.material.tangent(strain) / self.material.young_modulus
         return np.hstack([-softened, softened])
 
+    def internal_force(self, displacement: Array) -> Array:
+        """Return the forces f = sigma C L0 of the springs as they lie, N, (n, 3)."""
+        if self.material.is_linear:
+            return self.linear_force(displacement)
+        strain, direction = self._state(displacement)
+        return self._pulls(self.material.stress(strain) * (self.factor * self.lengths), direction)
+
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return the springs' (d sigma/d eps) C n nᵀ, assembled as in Sharma (2008) (3n, 3n).
 
@@ -100,8 +119,33 @@ class SourceNetwork(Solid):
         """
         if self.material.is_linear:
             return self.stiffness
+        tangent = self.spring_tangent(displacement)
+        return self._assembled(tangent.stiffness, tangent.direction)
+
+    def spring_tangent(self, displacement: Array) -> Tangent:
+        """Return the tangent spring by spring; nothing is assembled."""
+        if self.material.is_linear:
+            k = np.full(len(self.springs), self.material.young_modulus * self.factor)
+            return Tangent(k, self._straight)
         strain, direction = self._state(displacement)
-        return self._assembled(self.material.tangent(strain) * self.factor, direction)
+        return Tangent(self.material.tangent(strain) * self.factor, direction)
+
+    def tangent_force(self, tangent: Tangent, displacement: Array) -> Array:
+        """Return what a small displacement (n, 3) adds to the forces, N, (n, 3)."""
+        total = np.zeros((len(self.nodes), 3))
+        _add_tangent_forces(self.springs, tangent.direction, tangent.stiffness, displacement, total)
+        return total
+
+    def _pulls(self, pull: Array, direction: Array) -> Array:
+        """Return nodal forces (n, 3) of springs that pull their ends together by pull (s,), N."""
+        total = np.zeros((len(self.nodes), 3))
+        _add_pulls(self.springs, direction, pull, total)
+        return total
+
+    @cached_property
+    def _straight(self) -> Array:
+        """Unit directions (s, 3) of the undeformed springs."""
+        return self.lines / self.lengths[:, None]
 
     @cached_property
     def _spring_pattern(self) -> Pattern:
@@ -120,3 +164,37 @@ class SourceNetwork(Solid):
         lines = self.lines[springs] + displacement[b] - displacement[a]
         length = np.linalg.norm(lines, axis=1)
         return length / self.lengths[springs] - 1, lines / length[:, None]
+
+
+@compiled
+def _add_tangent_forces(
+    springs: Index, direction: Array, stiffness: Array, displacement: Array, total: Array
+) -> None:
+    """Add the forces k n (n · (u_b − u_a)) of springs (s, 2) to the nodes' (n, 3).
+
+    Args:
+        springs: (s, 2) nodes a and b.
+        direction: (s, 3) n, unit, from a to b.
+        stiffness: (s,) k, N/m.
+        displacement: (n, 3) u, m.
+        total: (n, 3) N, to be added to: what holds the displacement.
+    """
+    for s in range(len(springs)):
+        a, b = springs[s]
+        longer = 0.0
+        for axis in range(3):
+            longer += direction[s, axis] * (displacement[b, axis] - displacement[a, axis])
+        longer *= stiffness[s]
+        for axis in range(3):
+            total[a, axis] -= longer * direction[s, axis]
+            total[b, axis] += longer * direction[s, axis]
+
+
+@compiled
+def _add_pulls(springs: Index, direction: Array, pull: Array, total: Array) -> None:
+    """Add the forces of springs (s, 2) that pull by pull (s,), N, to the nodes' (n, 3)."""
+    for s in range(len(springs)):
+        a, b = springs[s]
+        for axis in range(3):
+            total[a, axis] -= pull[s] * direction[s, axis]
+            total[b, axis] += pull[s] * direction[s, axis]

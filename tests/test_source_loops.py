@@ -1,0 +1,133 @@
+"""Sharma's loops on the stored factor: what they solve, and what they do not need."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import scipy.sparse.linalg as sparse_linalg
+
+from lattice_bodies import above, box_insert, pair, sphere_cap
+from tkamb.contact.lattice.linear import operator
+from tkamb.contact.lattice.source import model as loops
+from tkamb.contact.lattice.source.held import (
+    CandidateResponse,
+    ConjugateGradientSettings,
+    HeldNodes,
+)
+from tkamb.contact.lattice.source.model import LoopSettings
+from tkamb.contact.materials import material
+from tkamb.contact.registry import contact_model
+from tkamb.contact.result import ContactStatus
+
+RADIUS, LOAD = 20e-3, 800.0
+EXACT = ConjugateGradientSettings(tolerance=1e-10, max_iterations=500)
+
+
+@pytest.fixture(scope="module")
+def bodies():
+    return pair(sphere_cap(RADIUS), box_insert(14e-3, 6e-3, 14e-3), material("polyethylene"))
+
+
+@pytest.fixture(scope="module")
+def prepared(bodies):
+    """The loops at 2 mm with a tight tolerance: the factor is not rounded to 16 bits."""
+    model = contact_model("lattice-source", 2.0, loops="source", tolerance=1e-4, cache=False)
+    return model, model.prepare(bodies)
+
+
+@pytest.fixture
+def held(prepared):
+    """The nodes about the middle of the top, held; the lattice as the load has left it."""
+    problem = prepared[1].problem
+    away = np.hypot(problem.surface_points[:, 0], problem.surface_points[:, 2])
+    candidates = np.flatnonzero(away < 5e-3)
+    active = away[candidates] < 3e-3
+    return HeldNodes(CandidateResponse(problem, candidates), active, EXACT)
+
+
+def squeezed(nodes):
+    """Return a displacement field that strains the upper springs by up to 12 %."""
+    height = nodes[:, 1] / nodes[:, 1].max()
+    u = np.zeros_like(nodes)
+    u[:, 1] = -0.4e-3 * height**2 * np.exp(-(nodes[:, 0] ** 2 + nodes[:, 2] ** 2) / 4e-3**2)
+    return u
+
+
+def test_held_nodes_solve_as_the_assembled_tangent_does(prepared, held):
+    solid, chance = prepared[1].problem.solid, np.random.default_rng(0)
+    u = squeezed(solid.nodes)
+    tangent = solid.spring_tangent(u)
+    assert tangent.stiffness.min() < 0.6 * tangent.stiffness.max()
+    force = chance.normal(size=u.shape)
+    found = held.solve(tangent, force).ravel()
+    free = ~held.held
+    matrix = solid.tangent(u)[free][:, free].tocsc()
+    direct = sparse_linalg.spsolve(matrix, force.ravel()[free])
+    assert found[free] == pytest.approx(direct, rel=1e-6, abs=1e-8 * np.abs(direct).max())
+    assert not found[held.held].any()
+
+
+def test_a_given_displacement_spreads_as_in_the_undeformed_lattice(prepared, held):
+    solid = prepared[1].problem.solid
+    given = -1e-4 * np.linspace(1.0, 2.0, len(held.unknowns))
+    found = held.spread(given).ravel()
+    assert (found[held.unknowns] == given).all()
+    free, stiffness = ~held.held, solid.stiffness
+    prescribed = np.zeros(solid.nodes.size)
+    prescribed[held.unknowns] = given
+    matrix = stiffness[free][:, free].tocsc()
+    direct = sparse_linalg.spsolve(matrix, -(stiffness @ prescribed)[free])
+    assert found[free] == pytest.approx(direct, abs=1e-5 * np.abs(given).max())
+    dummy = np.zeros(solid.nodes.size)
+    dummy[held.unknowns] = -1.0
+    dummy[free] = sparse_linalg.spsolve(matrix, -(stiffness @ dummy)[free])
+    assert held.slope == pytest.approx(-(stiffness @ dummy)[held.unknowns].sum(), rel=1e-4)
+
+
+def test_forces_are_the_slope_of_the_stored_energy(prepared):
+    """f = dU/du with U = sum of C L0² times the area under the curve; linear part: K u."""
+    solid = prepared[1].problem.solid
+    u, chance = squeezed(solid.nodes), np.random.default_rng(1)
+    way = 1e-9 * chance.normal(size=u.shape)
+
+    def energy(displacement):
+        strain, _ = solid._state(displacement)
+        part = (np.arange(400) + 0.5) / 400  # the midpoint rule
+        under = np.mean([solid.material.stress(x * strain) * strain for x in part], axis=0)
+        return float(np.sum(solid.factor * solid.lengths**2 * under))
+
+    change = energy(u + way) - energy(u - way)
+    assert float((solid.internal_force(u) * way).sum()) == pytest.approx(change / 2, rel=1e-3)
+    tiny = 1e-12 * chance.normal(size=u.shape)
+    linear = (solid.stiffness @ tiny.ravel()).reshape(tiny.shape)
+    size = np.abs(linear).max()
+    assert np.abs(solid.internal_force(tiny) - linear).max() < 1e-4 * size
+    assert np.abs(solid.linear_force(tiny) - linear).max() < 1e-12 * size
+
+
+def test_a_press_factorises_nothing(prepared, monkeypatch):
+    """What cost 99 % of the time: 80 factorisations in a press on the shipped insert."""
+
+    def forbidden(*_args, **_more):
+        raise AssertionError("the stiffness was factorised again")
+
+    model, state = prepared
+    for module in (operator, loops):
+        monkeypatch.setattr(module, "prepare_operator", forbidden, raising=False)
+    result = model.press(state, LOAD, above())
+    assert result.status is ContactStatus.OK
+    assert result.iterations < 15
+
+
+@pytest.mark.parametrize("law", ["linear", "nonlinear"])
+def test_where_the_loops_begin_changes_no_answer(bodies, monkeypatch, law):
+    model = contact_model("lattice-source", 2.0, loops="source", law=law, cache=False)
+    state, found = model.prepare(bodies), []
+    for first in (0.4, 0.8, 1.0):
+        begun = partial(loops.solve_by_loops, settings=LoopSettings(first_depth=first))
+        with monkeypatch.context() as patch:
+            patch.setattr(loops, "solve_by_loops", begun)
+            found.append(model.press(state, LOAD, above()))
+    for one in found[1:]:
+        assert one.approach == pytest.approx(found[0].approach, rel=2e-4)
+        assert one.pressure == pytest.approx(found[0].pressure, rel=1e-3, abs=1e4)
