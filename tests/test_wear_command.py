@@ -10,17 +10,15 @@ import time
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial.transform import Rotation
 
 from scenes import write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.geometry.frames import knee_coordinates, pose
+from tkamb.geometry.frames import knee_coordinates
 from tkamb.wear import run as wear_run
 from tkamb.wear.kept import STATE_NAME
 from tkamb.wear.laws import law_names, wear_law
 from tkamb.wear.materials import material_names, wear_material
-from tkamb.wear.motion import CycleMotion
 from tkamb.wear.profile import read_profile
 from tkamb.wear.setup import wear_setup
 from wear_bodies import balls_scene
@@ -197,10 +195,13 @@ def test_a_profile_moves_the_femur_about_its_dwell_position(profile, scene):
 def test_a_folder_of_results_and_its_scene_wear_the_same(tmp_path):
     scene = write_scene(tmp_path / "scene", contact__resolution_mm=3.0)
     assert main(["run", str(scene), "--frames", "0:101:17", "--out", str(tmp_path / "run")]) == 0
-    folder = wear_setup(tmp_path / "run", frames=6)
-    again = wear_setup(scene, frames=6)
-    assert folder.motion.poses == pytest.approx(again.motion.poses[: len(folder.motion)], abs=1e-9)
-    assert folder.motion.passes == 2  # a bend does not close: there and back
+    folder = wear_setup(tmp_path / "run", frames=6, close="there-and-back")
+    again = wear_setup(scene, frames=6, close="there-and-back")
+    assert folder.motion.passes == again.motion.passes == 2
+    # the run left out the recording's last frame, the scene's own motion has it
+    assert folder.motion.poses[0] == pytest.approx(again.motion.poses[0], abs=1e-9)
+    assert [len(one.motion) for one in (folder, again)] == [6, 6]
+    assert again.motion.duration > folder.motion.duration
     scene.write_text(scene.read_text().replace("75.0", "76.0"), encoding="utf-8")
     with pytest.raises(InputError, match="another scene"):
         wear_setup(tmp_path / "run")
@@ -210,25 +211,6 @@ def test_a_scene_without_contact_is_refused(tmp_path):
     scene = write_scene(tmp_path / "scene", drop=("contact",))
     with pytest.raises(InputError, match=r"no \[contact\]"):
         wear_setup(scene)
-
-
-def test_frames_whose_ends_meet_are_a_closed_cycle_and_failed_ones_are_said():
-    poses = np.repeat(np.eye(4)[None], 9, axis=0)
-    poses[:, 0, 3] = 0.01 * np.sin(np.linspace(0, 2 * np.pi, 9))
-    load = np.full(9, 100.0)
-    closed = CycleMotion.of_frames(np.linspace(0, 0.8, 9), poses, load)
-    assert (closed.passes, len(closed), closed.duration) == (1, 10, pytest.approx(0.9))
-    rising = CycleMotion.of_frames(np.linspace(0, 0.8, 9), poses, 10.0 * np.arange(9) + 100.0)
-    assert rising.load[[0, -1]] == pytest.approx(100.0)
-    open_ = CycleMotion.of_frames(np.linspace(0, 0.4, 5), poses[:5] * [1, 1, 1, 2], load[:5])
-    assert open_.passes == 1  # a half sine returns to where it began
-    bend = CycleMotion.of_frames(np.linspace(0, 0.2, 3), poses[:3], load[:3])
-    assert (bend.passes, bend.duration) == (2, pytest.approx(0.4))
-    turned = pose(Rotation.from_euler("z", 5.0, degrees=True).as_matrix(), [0.0] * 3)
-    swung = CycleMotion.of_frames(np.array([0.0, 0.1]), np.array([np.eye(4), turned]), load[:2])
-    assert swung.passes == 2  # what only turns does not close either
-    load[4] = np.nan
-    assert "1 of 9 frames failed" in CycleMotion.of_frames(np.arange(9.0), poses, load).notes[0]
 
 
 def test_every_built_in_material_names_its_sources_and_has_its_law():

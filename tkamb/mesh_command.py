@@ -31,7 +31,12 @@ def add_press(commands: Any) -> None:
     add_no_cache(press)
     press.add_argument("--resolution", type=float, default=1.0, metavar="MM")
     press.add_argument("--bearing", choices=("fixed", "mobile"), default="fixed")
-    press.add_argument("--material", default="polyethylene", metavar="NAME")
+    press.add_argument(
+        "--material",
+        default="polyethylene",
+        metavar="NAME|F.toml",
+        help="built-in, or a file of the keys of a scene's [material]; default: %(default)s",
+    )
     _add_side(press)
     press.add_argument("--adjust", action=argparse.BooleanOptionalAction, default=False)
     press.add_argument(

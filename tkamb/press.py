@@ -10,7 +10,12 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tkamb.contact import materials
+from tkamb.contact.given_material import (
+    material_as_json,
+    material_in_words,
+    named_material,
+)
+from tkamb.contact.materials import Material
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import Bearing, ContactPair
 from tkamb.contact.pressing import check_load
@@ -114,6 +119,7 @@ class PressReport:
             f"{self.contact} at {self.resolution_mm:g} mm, {self.nodes} nodes: {found['status']}",
             f"load {self.load:g} N, reaction {_text(found['reaction_N'])} N, "
             f"approach {_text(found['approach_mm'])} mm",
+            f"material {material_in_words(found['material'])}",
         ]
         for name in ("medial", "lateral"):
             if found[name] is not None:
@@ -142,6 +148,7 @@ class PressReport:
         return {
             "contact": self.contact,
             "resolution_mm": self.resolution_mm,
+            "material": material_as_json(self.pair.material),
             "nodes": self.nodes,
             "load_N": self.load,
             "reaction_N": _known(-result.wrench_on_insert[1]),
@@ -201,7 +208,7 @@ def press_meshes(
     contact: str = CONTACT_MODEL,
     resolution_mm: float = 1.0,
     bearing: Bearing = "fixed",
-    material: str = "polyethylene",
+    material: str | Path | Material = "polyethylene",
     axes: str = "+x,+y,+z",
     side: Side = "right",
     adjust: bool = False,
@@ -221,7 +228,8 @@ def press_meshes(
         contact: a name of `tkamb contact list`.
         resolution_mm: spacing of the model's map points.
         bearing: "fixed" or "mobile".
-        material: a name of `tkamb.contact.materials`.
+        material: a name of `tkamb.contact.materials`, a file (.toml) of the keys of a scene's
+            [material], or a `Material`.
         axes: mesh axes that point anterior, superior and right.
         side: of the knee; a left one is mirrored.
         adjust: femoral adjustment before contact (`tkamb.geometry.adjustment`); the pose must then
@@ -264,7 +272,7 @@ def press_meshes(
         prepare_seconds=prepared - started,
         solve_seconds=solved - prepared,
         peak_rss_MB=peak_rss(),
-        known_error=known_error(contact, resolution_mm, material, options),
+        known_error=known_error(contact, resolution_mm, pair.material.name, options),
     )
 
 
@@ -314,7 +322,7 @@ def load_pair(
     units: str,
     pose: Sequence[float] | None,
     bearing: Bearing,
-    material: str,
+    material: str | Path | Material,
     axes: str,
     side: Side,
 ) -> tuple[ContactPair, Array]:
@@ -332,7 +340,7 @@ def load_pair(
         raise InputError(f"'{bearing}' is no bearing", "bearing", "give fixed or mobile")
     in_frame = insert_placement(insert_surface, rotation)
     pair = ContactPair(
-        femoral_surface, insert_surface.moved(in_frame), materials.material(material), bearing
+        femoral_surface, insert_surface.moved(in_frame), named_material(material), bearing
     )
     return pair, in_frame @ femoral_pose
 

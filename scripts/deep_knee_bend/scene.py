@@ -88,6 +88,9 @@ resolution_mm = 1.0
 material = "polyethylene"
 friction = 0.05
 
+[wear]
+close = "there-and-back"
+
 [output]
 yield_stress_MPa = 21.0
 axis = "flexion"

@@ -8,6 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tkamb.contact.given_material import (
+    given_material,
+    material_as_json,
+    material_in_words,
+)
 from tkamb.equilibrium.mechanics import STRAIN_FLEXIONS, Mechanics
 from tkamb.geometry.frames import KNEE_COORDINATES, Array
 from tkamb.geometry.surface import Surface
@@ -178,7 +183,8 @@ def _extensor(case: Case) -> Entry:
 def _contact(case: Case) -> Entry:
     table = case.scene.contact
     assert table is not None
-    text = f"{table.model} at {table.resolution_mm:g} mm, {table.material}"
+    made_of = material_in_words(material_as_json(given_material(case.scene.insert_material)))
+    text = f"{table.model} at {table.resolution_mm:g} mm, {made_of}"
     if table.released:
         text += f"; solved for: {', '.join(sorted({*table.released, 'si'}))}"
     return Entry("contact", None, text)

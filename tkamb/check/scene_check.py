@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tkamb.check.inventory import Entry, inventory
-from tkamb.contact.materials import material
+from tkamb.contact.given_material import given_material
 from tkamb.contact.registry import contact_model
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.plausibility.plausibility import Plausibility
@@ -88,7 +88,7 @@ def check_scene(
     scene = load_scene(path, overrides)
     if scene.contact:
         contact_model(scene.contact.model, scene.contact.resolution_mm, **scene.contact.options)
-        material(scene.contact.material)
+        given_material(scene.insert_material)
     case = load_case(scene)
     begin("placing leg, patella and muscles")
     mechanics = Mechanics(case)

@@ -138,7 +138,7 @@ class CohortRun:
     @cached_property
     def scene_hash(self) -> str:
         """Return the SHA-256 of the validated scene."""
-        return hashlib.sha256(self.scene.model_dump_json().encode()).hexdigest()
+        return hashlib.sha256(self.scene.identity_json.encode()).hexdigest()
 
     def words(self) -> str:
         """Return the labels in one line."""

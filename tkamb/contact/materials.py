@@ -6,7 +6,7 @@ small strain feeds its engineering strain instead and says so (the two differ by
 strain). Loading and unloading follow the same curve: no hysteresis, no set.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
 
@@ -192,6 +192,7 @@ class Material:
         young_modulus: E, Pa, the slope at the origin.
         poisson_ratio: nu, -1 < nu < 0.5.
         law: shape of the curve.
+        sources: where the numbers come from; they make no other material.
 
     Raises:
         InputError: E not positive and finite, or nu out of range.
@@ -201,6 +202,7 @@ class Material:
     young_modulus: float
     poisson_ratio: float
     law: StressStrainLaw = LinearElastic()
+    sources: tuple[str, ...] = field(default=(), repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not 0 < self.young_modulus < np.inf:
@@ -258,8 +260,10 @@ _POLYETHYLENE = {
     "reference_stress": 8.4194 * MEGAPASCAL,
     "exponent": 4.5485,
 }
-"""The fit of Sharma (2008), section 5.2, to the true stress-strain data of Halloran et al., J
-Biomech 38:323 (2005), doi:10.1016/j.jbiomech.2004.02.046."""
+_SOURCES = (
+    "Sharma (2008), section 5.2: Ramberg-Osgood fit to the true stress-strain data of UHMWPE in "
+    "Halloran et al., J Biomech 38:323 (2005), doi:10.1016/j.jbiomech.2004.02.046",
+)
 
 MATERIALS = {
     "polyethylene": "Ramberg-Osgood fit to true stress-strain of UHMWPE, E 561.5 MPa, nu 0.45",
@@ -292,7 +296,7 @@ def material(name: str, **overrides: float) -> Material:
     law: StressStrainLaw = LinearElastic()
     if not linear:
         law = RambergOsgood(values["alpha"], values["reference_stress"], values["exponent"])
-    return Material(name, values["young_modulus"], values["poisson_ratio"], law)
+    return Material(name, values["young_modulus"], values["poisson_ratio"], law, _SOURCES)
 
 
 def tabulated_material(

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from tkamb.contact.materials import material
+from tkamb.contact.given_material import given_material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_class
 from tkamb.decks.calculix import Deck
@@ -139,5 +139,7 @@ def _pair(results: Results) -> tuple[ContactPair, float]:
     table, insert = case.scene.contact, case.scene.implant.insert
     assert table is not None and insert is not None
     assert case.femoral is not None and case.insert is not None
-    pair = ContactPair(case.femoral, case.insert, material(table.material), insert.bearing)
+    pair = ContactPair(
+        case.femoral, case.insert, given_material(case.scene.insert_material), insert.bearing
+    )
     return pair, table.resolution_mm

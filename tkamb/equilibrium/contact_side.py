@@ -18,7 +18,7 @@ import numpy as np
 
 from tkamb.body.contact_points import CondylePoint
 from tkamb.body.knee import solve_knee, unsolved
-from tkamb.contact.materials import material
+from tkamb.contact.given_material import given_material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import within_insert
 from tkamb.contact.probe import condyle_wrenches
@@ -76,7 +76,9 @@ class ContactSide:
         assert case.femoral is not None and case.insert is not None
         self.case, self.table, self.mechanics = case, table, mechanics
         self.model = contact_model(table.model, table.resolution_mm, **table.options)
-        pair = ContactPair(case.femoral, case.insert, material(table.material), insert.bearing)
+        pair = ContactPair(
+            case.femoral, case.insert, given_material(case.scene.insert_material), insert.bearing
+        )
         start = clock.perf_counter()
         self.state = self.model.prepare(pair) if state is None else state
         self.post = cam_on_post(case, self.model, self.state.pair.material, post)

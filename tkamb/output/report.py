@@ -121,19 +121,23 @@ def _subtitle(results: "Results") -> str:
     parts = [
         f"{summary['side']} knee" if summary.get("side") else "",
         f"{summary['body_mass_kg']:g} kg; one body weight (BW) is {weight:.0f} N",
-        _contact_words(contact),
+        _contact_words(contact, summary.get("material") or {}),
     ]
     return " · ".join(part for part in parts if part)
 
 
-def _contact_words(contact: dict[str, Any]) -> str:
+def _contact_words(contact: dict[str, Any], material: dict[str, Any]) -> str:
     if not contact:
         return "contact not modelled"
     words = f"contact: {contact.get('model', 'unnamed')}"
     if contact.get("resolution_mm"):
         words += f" at {contact['resolution_mm']:g} mm"
-    if contact.get("material"):
-        words += f", {contact['material']}"
+    name = material.get("name") or contact.get("material")
+    if name:
+        words += f", {name}"
+    if material:
+        modulus, ratio = material["young_modulus_MPa"], material["poisson_ratio"]
+        words += f" (E {modulus:.4g} MPa, ν {ratio:.3g}, {material['law']})"
     return words
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from tkamb import __version__
 from tkamb.code_identity import code_identity
 from tkamb.columns import JOINT_MOMENT, RESERVE, belongs, family_column, name_in
+from tkamb.contact.given_material import given_material, material_as_json
 from tkamb.equilibrium.mechanics import STRAIN_FLEXIONS
 from tkamb.files import sha256_of
 from tkamb.known_errors import as_json, known_error, left_out
@@ -79,8 +80,12 @@ def summary_of(
         summary |= compare_recorded(case, columns)
     if scene.contact:
         table = scene.contact
-        error = known_error(table.model, table.resolution_mm, table.material, table.options)
+        chosen = material_as_json(given_material(scene.insert_material))
+        error = known_error(table.model, table.resolution_mm, chosen["name"], table.options)
         summary["contact"] = table.model_dump(mode="json")
+        if scene.material is not None:
+            del summary["contact"]["material"]  # which [material] is in the place of
+        summary["material"] = chosen
         summary["known_error"] = as_json(error)
         summary["split_not_determined_frames"] = int((columns["split_determined"] == 0).sum())
         summary["residuals"] = RESIDUALS
@@ -114,7 +119,7 @@ def _subject(case: Case) -> dict[str, Any]:
         "frame": f"insert frame: x anterior, y superior, z {lateral}",
         "body_mass_kg": case.body_mass,
         "height_mm": case.height_mm,
-        "yield_stress_MPa": output.yield_stress_MPa,
+        "yield_stress_MPa": case.scene.yield_stress_MPa,
         "axis": output.axis,
         "activity": output.activity,
     }
@@ -143,7 +148,7 @@ def _versions() -> dict[str, str]:
 
 def scene_hash(case: Case) -> str:
     """Return the SHA-256 of the validated scene."""
-    return hashlib.sha256(case.scene.model_dump_json().encode()).hexdigest()
+    return hashlib.sha256(case.scene.identity_json.encode()).hexdigest()
 
 
 def run_identity(case: Case, frames: range) -> dict[str, Any]:

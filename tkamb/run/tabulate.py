@@ -66,7 +66,7 @@ def frame_row(
     for side, slip in slips.items():
         row |= _slip_row(case, k, side, slip, body.geometry.condyles.get(side))
     if contact is not None:
-        row |= _contact_row(contact, case.scene.output.yield_stress_MPa * MEGAPASCAL)
+        row |= _contact_row(contact, case.scene.yield_stress_MPa * MEGAPASCAL)
         row |= _pose_row(contact)
         row["medial_force_per_adduction_N_per_deg"] = contact.sensitivity * DEGREE
         row["split_determined"] = split_determined(body, contact)

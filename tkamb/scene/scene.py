@@ -23,6 +23,7 @@ from tkamb.scene.tables import (
     GenericLigamentsTable,
     ImplantTable,
     LigamentTable,
+    MaterialTable,
     MusclesTable,
     MuscleTable,
     OutputTable,
@@ -30,6 +31,7 @@ from tkamb.scene.tables import (
     PatellaTable,
     PatientTable,
     QuadricepsTable,
+    WearTable,
 )
 from tkamb.scene.uncertainty import UncertaintyTable
 
@@ -57,7 +59,9 @@ class Scene(SceneTable):
     patellar_ligament: PatellarLigamentTable | None = None
     patella: PatellaTable | None = None
     contact: ContactTable | None = None
+    material: MaterialTable | None = None
     measured: MeasuredTable | None = None
+    wear: WearTable | None = None
     output: OutputTable = OutputTable()
     uncertainty: UncertaintyTable | None = None
     _overrides: dict[str, Any] = PrivateAttr(default_factory=dict)
@@ -66,6 +70,25 @@ class Scene(SceneTable):
     def overrides(self) -> dict[str, Any]:
         """Return dotted key -> value that `load_scene` put in the place of the file's."""
         return dict(self._overrides)
+
+    @property
+    def identity_json(self) -> str:
+        """All that a run depends on, as JSON: what only `tkamb wear` reads is left out."""
+        unused = {"wear"} if self.material else {"wear", "material"}
+        return self.model_dump_json(exclude=unused)
+
+    @property
+    def insert_material(self) -> dict[str, Any]:
+        """What the insert is made of, as `tkamb.contact.given_material` takes it."""
+        if self.material is not None:
+            return self.material.model_dump()
+        return {} if self.contact is None else {"base": self.contact.material}
+
+    @property
+    def yield_stress_MPa(self) -> float:
+        """Yield stress of the insert: [material]'s, else [output]'s."""
+        own = self.material.yield_stress_MPa if self.material else None
+        return self.output.yield_stress_MPa if own is None else own
 
     def __repr__(self) -> str:
         """Return in a line whose knee it is, what moves and what presses."""
@@ -110,6 +133,14 @@ class Scene(SceneTable):
         for name, asked in needs_implant.items():
             if asked and not (self.implant.femoral and self.implant.insert):
                 raise ValueError(f"{name} needs [implant.femoral] and [implant.insert]")
+        contact = self.contact
+        if self.material and contact and "material" in contact.model_fields_set:
+            raise ValueError("[material] and [contact] material name two materials: give one")
+        own_yield = self.material is not None and self.material.yield_stress_MPa is not None
+        if own_yield and "yield_stress_MPa" in self.output.model_fields_set:
+            raise ValueError("[material] and [output] both give yield_stress_MPa: give one")
+        if self.material and not contact:
+            raise ValueError("[material] needs [contact]: nothing else is pressed")
         if self.tibia and self.motion.markers:
             raise ValueError("[motion.markers] places the shank too: drop [tibia]")
         if self.ground_reaction and not (self.tibia or self.motion.markers):

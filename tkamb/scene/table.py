@@ -12,6 +12,9 @@ Count = Annotated[int, Strict()]
 Switch = Annotated[bool, Strict()]
 Vector = tuple[Number, Number, Number]
 KneeFreedom = Literal["ap", "si", "ml", "axial_rotation", "adduction"]
+Closing = Literal["interpolate", "there-and-back", "as recorded"]
+"""How recorded frames become a cycle of wear, see `tkamb.wear.motion`."""
+DEFAULT_CLOSING: Closing = "interpolate"
 
 
 def _axes(text: str) -> str:

@@ -13,8 +13,10 @@ from tkamb.activities import Activity
 from tkamb.defaults import CONTACT_MODEL
 from tkamb.scene.measured import EmgTable
 from tkamb.scene.table import (
+    DEFAULT_CLOSING,
     Axes,
     Band,
+    Closing,
     HalfThickness,
     KneeFreedom,
     LengthUnit,
@@ -324,6 +326,60 @@ class ContactTable(SceneTable):
                 "where the other lets it settle"
             )
         return self
+
+
+class MaterialTable(SceneTable):
+    """What the insert is made of: elastic constants and a stress-strain curve.
+
+    True stress against true strain, the same in tension and compression. `base` takes a built-in
+    material and changes what is given; without it the material is given whole.
+    """
+
+    base: str | None = Field(None, description="a name of `tkamb contact materials`")
+    name: str | None = Field(
+        None, description="what to call it in results; default: 'own', or the base's with 'changed'"
+    )
+    # From a gel to ceramics; UHMWPE has 0.4 to 1.5 GPa.
+    young_modulus_MPa: Annotated[Number | None, within(0.1, 500000, "is it in megapascals?")] = (
+        Field(None, description="slope of the curve at the origin; a table's own by default")
+    )
+    poisson_ratio: Annotated[Number | None, Field(ge=0, lt=0.5)] = None
+    yield_stress_MPa: Annotated[Number | None, Field(ge=1, le=200)] = Field(
+        None, description="instead of [output] yield_stress_MPa: tells overloaded area"
+    )
+    law: Literal["linear", "ramberg-osgood", "tabulated"] | None = Field(
+        None, description="the curve; default: the base's, or linear"
+    )
+    alpha: Annotated[Number | None, Field(ge=0)] = Field(
+        None, description="ramberg-osgood: strain = s/E + alpha (s/s0)^(n-1) s/E"
+    )
+    reference_stress_MPa: Annotated[Number | None, Field(gt=0)] = Field(
+        None, description="ramberg-osgood: s0"
+    )
+    exponent: Annotated[Number | None, Field(ge=1)] = Field(None, description="ramberg-osgood: n")
+    strain: tuple[Number, ...] = Field((), description="tabulated: true strains, rising from 0")
+    stress_MPa: tuple[Number, ...] = Field(
+        (), description="tabulated: true stresses, from 0, not falling"
+    )
+    sources: tuple[str, ...] = Field((), description="who measured what; printed in results")
+
+
+class WearTable(SceneTable):
+    """What `tkamb wear` does with the scene; its options go before these keys. A run reads none."""
+
+    close: Closing = Field(
+        DEFAULT_CLOSING,
+        description="how recorded frames become a cycle: 'interpolate' leads from the last frame "
+        "to the first, 'there-and-back' goes the same way back, 'as recorded' takes the frames "
+        "alone",
+    )
+    material: str | None = Field(
+        None, description="a wear material's name, or a material file (.toml) beside the scene"
+    )
+    law: str | None = Field(None, description="a wear law; default: the material's own")
+    wear_factor_mm3_per_Nm: Annotated[Number | None, Field(ge=0, le=1e-3)] = Field(
+        None, description="instead of the material's"
+    )
 
 
 class OutputTable(SceneTable):

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from tkamb.contact.given_material import given_material
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.errors import InputError
@@ -168,7 +169,9 @@ def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
     load = float(mechanics.frame(k).loads.contact_force[1])
     if not load > 0:
         raise InputError(f"frame {k} has no compressive contact force", path)
-    pair = ContactPair(case.femoral, case.insert, material(table.material), insert.bearing)
+    pair = ContactPair(
+        case.femoral, case.insert, given_material(case.scene.insert_material), insert.bearing
+    )
     label = f"{path.parent.name} at {case.motion.coordinates[k, 5] / DEGREE:.0f} deg, {load:.0f} N"
     return StudyCase(name, label, pair, mechanics.poses[k], load)
 

@@ -74,13 +74,14 @@ def _scene(case: Case, draw: Draw) -> Scene:
     if scene.contact is None:
         return scene
     friction = max(0.0, scene.contact.friction + draw.error("friction"))
-    limit = scene.output.yield_stress_MPa * draw.factor("yield_stress")
-    return scene.model_copy(
-        update={
-            "contact": scene.contact.model_copy(update={"friction": friction}),
-            "output": scene.output.model_copy(update={"yield_stress_MPa": limit}),
-        }
-    )
+    limit = {"yield_stress_MPa": scene.yield_stress_MPa * draw.factor("yield_stress")}
+    changes: dict[str, Any] = {
+        "contact": scene.contact.model_copy(update={"friction": friction}),
+        "output": scene.output.model_copy(update=limit),
+    }
+    if scene.material is not None:
+        changes["material"] = scene.material.model_copy(update=limit)
+    return scene.model_copy(update=changes)
 
 
 def _ground(ground: "GroundReaction", draw: Draw) -> "GroundReaction":

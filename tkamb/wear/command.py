@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tkamb.scene_options import add_set
+
 if TYPE_CHECKING:
     from tkamb.wear.run import WearRun
 
@@ -37,7 +39,15 @@ def add_wear(commands: Any) -> None:
     )
     wear.add_argument("--law", metavar="NAME", help="wear law; default: the material's own")
     wear.add_argument(
-        "--material", default="conventional", metavar="NAME|F", help="or a material file (.toml)"
+        "--material",
+        metavar="NAME|F",
+        help="wear material, or a material file (.toml); default: conventional",
+    )
+    wear.add_argument(
+        "--close",
+        metavar="HOW",
+        help="how recorded frames become a cycle: interpolate (from the last frame to the first; "
+        "default), there-and-back, or 'as recorded'",
     )
     wear.add_argument(
         "--wear-factor", type=float, metavar="K", help="mm3/(N m), instead of the material's"
@@ -45,7 +55,12 @@ def add_wear(commands: Any) -> None:
     wear.add_argument("--contact", metavar="NAME", help="contact model, instead of the scene's")
     wear.add_argument("--resolution", type=float, metavar="MM", help="spacing of the map points")
     wear.add_argument(
-        "--frames-per-cycle", type=int, default=FRAMES, metavar="N", help="at most; default 40"
+        "--frames-per-cycle",
+        type=int,
+        default=FRAMES,
+        metavar="N",
+        help="at most N of a recording, the last among them; a simulator's rows are all kept, and "
+        "N is the fewest; default 40",
     )
     wear.add_argument(
         "--period", type=float, default=1.0, metavar="S", help="of a simulator's cycle; for creep"
@@ -56,6 +71,7 @@ def add_wear(commands: Any) -> None:
         metavar="N",
         help="for bands; default: 32 where the scene has [uncertainty], else 0, for none",
     )
+    add_set(wear)
     wear.add_argument("--workers", type=int, default=1, metavar="N", help="processes for samples")
     wear.add_argument("--out", type=Path, metavar="DIR", help="output folder")
     wear.add_argument(
@@ -127,6 +143,8 @@ def _prepared(options: argparse.Namespace) -> "WearRun":
         frames=options.frames_per_cycle,
         samples=options.samples,
         period=options.period,
+        close=options.close,
+        overrides=dict(options.set),
         progress=lambda frames: tqdm(frames, "running", unit="frame", disable=None),
     )
 

@@ -46,6 +46,7 @@ class ForceDrive:
         free: indices of the free coordinates, the superior-inferior one among them.
         zero: (6,) m and rad, from where AP, ML and the springs count.
         springs: of the machine; None: it has none.
+        percent: (f,) of the cycle at each row; None: the rows are evenly spaced.
     """
 
     coordinates: Array
@@ -53,6 +54,7 @@ class ForceDrive:
     free: tuple[int, ...]
     zero: Array
     springs: Springs | None = None
+    percent: Array | None = None
 
     @property
     def names(self) -> list[str]:
@@ -86,7 +88,7 @@ class ForceDrive:
     def rows(self, poses: Array, failed: Mapping[int, str]) -> list[dict[str, Any]]:
         """Return each row's position as a profile counts it; None where the row failed."""
         counted = self._counted(poses)
-        percent = np.linspace(0.0, 100.0, len(poses))
+        percent = np.linspace(0.0, 100.0, len(poses)) if self.percent is None else self.percent
         return [
             {
                 "cycle_percent": float(percent[k]),

@@ -27,6 +27,8 @@ def wear_identity(setup: WearSetup, case: WearCase, cycles: int, updates: int) -
     drive = case.motion.drive
     if drive is not None:
         arrays += [drive.coordinates, drive.applied, drive.zero]
+    motion = case.motion
+    arrays += [one for one in (motion.seconds, *(motion.path or ())) if one is not None]
     for array in (*arrays, case.motion.poses, case.motion.load):
         digest.update(np.ascontiguousarray(array, "<f8").tobytes())
     words = (setup.engine.model, setup.engine.material, setup.engine.bearing, case.law, case.creep)

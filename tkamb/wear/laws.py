@@ -38,6 +38,8 @@ class WearLaw(ABC):
 
     name: ClassVar[str]
     assumes: ClassVar[str]
+    geometry: ClassVar[str] = "the law does not say how its volume follows the insert's geometry"
+    """How the worn volume follows the insert's geometry, in words that are printed beside it."""
 
     @abstractmethod
     def depth(self, history: SlidingHistory) -> Array:
@@ -56,6 +58,10 @@ class Archard(WearLaw):
 
     name: ClassVar[str] = "archard"
     assumes: ClassVar[str] = "h = k sum p s; one k, whatever the direction"
+    geometry: ClassVar[str] = (
+        "volume = k x sum of load x sliding path: the contact area cancels, so the volume hardly "
+        "follows conformity and not thickness; they show in the depth"
+    )
 
     wear_factor_mm3_per_Nm: float
 
@@ -83,6 +89,11 @@ class CrossShear(WearLaw):
 
     name: ClassVar[str] = "cross-shear"
     assumes: ClassVar[str] = "h = k(CS) sum p s; work across the principal direction wears more"
+    geometry: ClassVar[str] = (
+        "volume = k(CS) x sum of load x sliding path: the contact area cancels, so the volume "
+        "follows the insert's geometry only by the path and the cross-shear ratio; conformity and "
+        "thickness show in the depth"
+    )
 
     wear_factor_mm3_per_Nm: float
     across_to_along: float
@@ -115,6 +126,10 @@ class PressureCrossShear(WearLaw):
 
     name: ClassVar[str] = "pressure-cross-shear"
     assumes: ClassVar[str] = "h = sum k(CS, p) p s; k by a measured table"
+    geometry: ClassVar[str] = (
+        "volume = sum of k(CS, p) x load x sliding path: it follows the insert's geometry as far "
+        "as the table's k follows the pressure"
+    )
 
     cross_shear: tuple[float, ...]
     pressure_MPa: tuple[float, ...]
@@ -162,6 +177,10 @@ class ContactArea(WearLaw):
 
     name: ClassVar[str] = "contact-area"
     assumes: ClassVar[str] = "W = C(CS) A s; wear by area and path, whatever the pressure"
+    geometry: ClassVar[str] = (
+        "volume = C(CS) x contact area x sliding path: a more conforming or softer insert wears "
+        "more, and the load counts only by the area"
+    )
 
     cross_shear: tuple[float, ...]
     coefficient: tuple[float, ...]

@@ -3,7 +3,7 @@
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,11 @@ from tkamb.files import read_text
 from tkamb.wear.creep import LogarithmicCreep
 from tkamb.wear.laws import WearLaw, law_class, wear_law
 
+DEFAULT_MATERIAL = "conventional"
 DENSITY_RANGE = (500.0, 3000.0)
 """kg/m³ that a bearing polymer may have."""
+TWO_EITHER_WAY = (0.5, 2.0)
+ASSUMED_RANGE = "a factor of two either way: by that much and more laboratories differ (assumption)"
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,8 @@ class WearMaterial:
         sources: one line per number.
         caution: what a reader must know before using the numbers; may be empty.
         creep: parameters of `LogarithmicCreep`; None: creep is not modelled.
+        factor_range: lowest and highest factor on every law's depth that its sources allow.
+        range_source: where that range comes from.
     """
 
     name: str
@@ -40,6 +45,16 @@ class WearMaterial:
     sources: tuple[str, ...]
     caution: str = ""
     creep: LogarithmicCreep | None = None
+    factor_range: tuple[float, float] = TWO_EITHER_WAY
+    range_source: str = ASSUMED_RANGE
+
+    def with_own_factor(self) -> "WearMaterial":
+        """Return the material with the range of a wear factor that the user gives."""
+        return replace(self, factor_range=TWO_EITHER_WAY, range_source=ASSUMED_RANGE, caution="")
+
+    def all_laws(self) -> dict[str, WearLaw]:
+        """Return every law that the material has parameters for."""
+        return {name: wear_law(name, table, self.name) for name, table in self.laws.items()}
 
     def wear_law(self, name: str | None = None, wear_factor: float | None = None) -> WearLaw:
         """Return one of its laws.
@@ -130,7 +145,27 @@ def _material(name: str, content: dict[str, Any], where: object) -> WearMaterial
         sources=_sources(content["sources"], where),
         caution=str(content.get("caution", "")),
         creep=_creep(content.get("creep"), where),
+        factor_range=_factor_range(content, where),
+        range_source=str(content.get("range_source", ASSUMED_RANGE)),
     )
+
+
+def _factor_range(content: dict[str, Any], where: object) -> tuple[float, float]:
+    given = content.get("factor_range")
+    if given is None:
+        return TWO_EITHER_WAY
+    sound = (
+        isinstance(given, list)
+        and len(given) == 2
+        and all(isinstance(one, int | float) and math.isfinite(one) for one in given)
+        and 0 < given[0] <= 1 <= given[1]
+    )
+    if not sound:
+        mend = "give two factors, at most 1 and at least 1, e.g. [0.5, 2.0]"
+        raise InputError(f"cannot be {given}", f"{where}: factor_range", mend)
+    if "range_source" not in content:
+        raise InputError("'range_source' is missing", where, "say where the range comes from")
+    return float(given[0]), float(given[1])
 
 
 def _sources(given: Any, where: object) -> tuple[str, ...]:

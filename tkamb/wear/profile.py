@@ -42,15 +42,18 @@ LIMITS = {
 FLEXION_LIMITS = (-30.0, 170.0)
 LARGEST_FORCE = 1e4
 """N, fifteen body weights."""
+ROUND_OFF = 1e-9
+"""Share of a step by which it may exceed the longest one."""
 CLOSES_WITHIN = 0.01
 """Share of a column's range by which its last row may differ from its first."""
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """One cycle of a simulator, at even steps.
+    """One cycle of a simulator: all rows of its file, and more between them.
 
     Args:
+        percent: (f,) of the cycle, from 0 to 100.
         load: (f,) N, axial.
         coordinates: (f, 6) knee coordinates (`tkamb.geometry.frames`), m and rad; AP and ML from
             the dwell position, SI zero: the load finds it; zero where a force is given instead.
@@ -61,6 +64,7 @@ class Profile:
         source: the file.
     """
 
+    percent: Array
     load: Array
     coordinates: Array
     applied: Array
@@ -91,7 +95,8 @@ class Profile:
             return None
         zero = zero_at(dwell)
         free = tuple(sorted((*self.free, SI)))
-        return ForceDrive(self.coordinates + zero, self.applied, free, zero, springs)
+        places = self.coordinates + zero
+        return ForceDrive(places, self.applied, free, zero, springs, self.percent)
 
 
 def zero_at(dwell: tuple[float, float]) -> Array:
@@ -100,13 +105,21 @@ def zero_at(dwell: tuple[float, float]) -> Array:
 
 
 def read_profile(path: str | Path, frames: int) -> Profile:
-    """Read a profile and lay it on `frames` even steps, the first and last at 0 and 100 %.
+    """Read a profile: all of its rows, and rows between them where they lie far apart.
+
+    A row's values are the file's own, so that no turning point is lost. Between two rows of the
+    file the profile is linear; evenly spaced rows are put there until no step is longer than
+    100/(frames - 1) per cent.
 
     The file has a header and rows from 0 to 100 % of the cycle: cycle_percent, axial_force_N,
     flexion_deg, and any of ap_mm, ml_mm, axial_rotation_deg, adduction_deg; what is not given is
     zero. In place of each of these there may be its force or torque: ap_force_N, ml_force_N,
     axial_torque_Nm, adduction_torque_Nm. Signs and frames are tkamb's: the femoral component's
-    motion on the insert, and what acts on the femoral component. Between rows it is linear.
+    motion on the insert, and what acts on the femoral component.
+
+    Args:
+        path: the file.
+        frames: smallest number of frames of a cycle, at least 2.
 
     Raises:
         InputError: a column that is missing or unknown, a displacement and its force together,
@@ -128,22 +141,32 @@ def read_profile(path: str | Path, frames: int) -> Profile:
     for name, values in columns.items():
         _check_range(name, values, path)
         _check_closed(name, values, path)
-    even = np.linspace(0.0, 100.0, frames)
-    load = np.interp(even, percent, columns[LOAD])
+    rows = _divided(percent, 100.0 / (frames - 1))
+    load = np.interp(rows, percent, columns[LOAD])
     if free and not (columns[LOAD] > 0).all():
         row = int(np.flatnonzero(columns[LOAD] <= 0)[0])
         what = f"'{LOAD}' is 0 in data row {row + 1}: no contact to find a position by"
         raise InputError(what, path, "force control needs more than 0 N in each row")
-    coordinates, applied = np.zeros((2, frames, 6))
+    coordinates, applied = np.zeros((2, len(rows), 6))
     applied[:, SI] = -load
     for name, values in columns.items():
-        steps = np.interp(even, percent, values)
+        steps = np.interp(rows, percent, values)
         if name in COORDINATES:
             unit, place = COORDINATES[name]
             coordinates[:, place] = steps * unit
         elif name in FORCES:
             applied[:, COORDINATES[FORCES[name]][1]] = steps
-    return Profile(load, coordinates, applied, free, str(path))
+    return Profile(rows, load, coordinates, applied, free, str(path))
+
+
+def _divided(rows: Array, longest: float) -> Array:
+    """Return rising numbers with others evenly between them, so that no step exceeds `longest`."""
+    pieces = np.maximum(1, np.ceil(np.diff(rows) / longest - ROUND_OFF)).astype(int)
+    parts = [
+        np.linspace(begin, end, count, endpoint=False)
+        for begin, end, count in zip(rows[:-1], rows[1:], pieces, strict=True)
+    ]
+    return np.append(np.concatenate(parts), rows[-1])
 
 
 def _free(table: Table) -> tuple[int, ...]:

@@ -22,7 +22,7 @@ from tkamb.wear.force_control import UNITS
 from tkamb.wear.kept import STATE_NAME
 from tkamb.wear.materials import WearMaterial
 from tkamb.wear.setup import WearSetup
-from tkamb.wear.simulation import CycleWear, WearCase, WearState
+from tkamb.wear.simulation import CycleWear, FirstCycle, WearCase, WearState
 
 MILLION = 1e6
 SAMPLES_NAME = ".wear_samples"
@@ -32,6 +32,10 @@ FIRST = (
     "between laboratories."
 )
 """What is said before any number."""
+PROPORTIONAL = ("volume_mm3", "mass_mg", "max_depth_mm")
+"""Columns that follow the wear factor in proportion, but for what the worn shape changes."""
+LARGEST_FRAMES_CHANGE = 0.02
+"""Of a cycle's volume by half as many frames, beyond which they are too few."""
 DEAREST_CORRECTION = 0.05
 """Correction of a map's force beyond which the map is too coarse."""
 PUBLISHED_RATES = (1.6, 4.4)
@@ -53,6 +57,7 @@ class WearReport:
         last: what the next cycle would do.
         cycles: asked for.
         updates: asked for.
+        first: what is known of the first cycle.
         bands: beside the rows; None: not asked for.
     """
 
@@ -63,6 +68,7 @@ class WearReport:
     last: CycleWear
     cycles: int
     updates: int
+    first: FirstCycle
     bands: WearBands | None = None
 
     def as_dict(self) -> dict[str, Any]:
@@ -78,8 +84,15 @@ class WearReport:
             "blocks": len(self.state.rows) - 1,
             "volume_mm3_per_Mc": self.rate,
             "mass_mg_per_Mc": self.rate * self.case.density * 1e-3,
+            **self.ranges(),
+            "range_factors": list(self.material.factor_range),
+            "range_source": self.material.range_source,
             "law": law.name,
             "law_parameters": vars(law),
+            "geometry": law.geometry,
+            "laws_side_by_side": self.side_by_side(),
+            "frames_change": _known(self.first.frames_change),
+            "close": self.case.motion.closing or None,
             "material": self.material.name,
             "sources": list(self.material.sources),
             "creep": None if self.case.creep is None else vars(self.case.creep),
@@ -130,9 +143,43 @@ class WearReport:
         last = self.state.rows[-1]
         return last["volume_mm3"] * MILLION / last["cycles"] if last["cycles"] else 0.0
 
+    def ranges(self) -> dict[str, list[float]]:
+        """Return the range of each number that is proportional to the wear factor."""
+        last = self.state.rows[-1]
+        values = {key: last[key] for key in PROPORTIONAL}
+        values["volume_mm3_per_Mc"] = self.rate
+        return {
+            f"{key}_range": [factor * value for factor in self.material.factor_range]
+            for key, value in values.items()
+        }
+
+    def side_by_side(self) -> list[dict[str, Any]]:
+        """Return what each law of the material takes off the unworn insert, with its range."""
+        found = []
+        for name, law in self.material.all_laws().items():
+            if name not in self.first.volumes:
+                continue
+            rate = self.first.volumes[name] * MILLION / MILLIMETRE**3
+            found.append(
+                {
+                    "law": name,
+                    "first_volume_mm3_per_Mc": rate,
+                    "first_volume_mm3_per_Mc_range": [f * rate for f in self.material.factor_range],
+                    "law_parameters": vars(law),
+                    "geometry": law.geometry,
+                }
+            )
+        return found
+
     def questions(self) -> list[str]:
         """Return what a reader must know before using the numbers."""
         asked = [] if not self.material.caution else [self.material.caution]
+        asked += self.case.motion.questions
+        if self.first.frames_change > LARGEST_FRAMES_CHANGE:
+            asked.append(
+                f"half as many frames per cycle move its volume by {self.first.frames_change:.1%}: "
+                "take more with --frames-per-cycle"
+            )
         if self.state.map_error > DEAREST_CORRECTION:
             asked.append(
                 f"maps had to be scaled by up to {self.state.map_error:.0%} to carry their load: "
@@ -169,6 +216,14 @@ class WearReport:
         found = self.as_dict()
         creep = found["creep_depth_mm"]
         said = "not modelled" if creep is None else f"{creep:.4g} mm deep"
+        low, high = found["volume_mm3_range"]
+        slow, fast = found["volume_mm3_per_Mc_range"]
+        others = [
+            f"{one['law']} {one['first_volume_mm3_per_Mc']:.3g} "
+            f"({one['first_volume_mm3_per_Mc_range'][0]:.3g} to "
+            f"{one['first_volume_mm3_per_Mc_range'][1]:.3g})"
+            for one in found["laws_side_by_side"]
+        ]
         return [
             FIRST,
             f"{found['cycles']:.6g} cycles in {found['blocks']} blocks, {found['law']}, "
@@ -176,6 +231,14 @@ class WearReport:
             f"worn off {found['volume_mm3']:.4g} mm3, {found['mass_mg']:.4g} mg, "
             f"{found['max_depth_mm']:.4g} mm deep at most, over {found['worn_area_mm2']:.4g} mm2",
             f"rate {self.rate:.4g} mm3 per million cycles; creep {said}",
+            f"range by the wear factor alone: {low:.3g} to {high:.3g} mm3, {slow:.3g} to "
+            f"{fast:.3g} mm3 per million cycles ({self.material.range_source})",
+            f"geometry: {self.case.law.geometry}",
+            *(
+                [f"laws side by side, mm3 per million cycles of the first: {', '.join(others)}"]
+                if others
+                else []
+            ),
             *([] if self.bands is None else self.bands.lines()),
             *self._found_lines(),
             *(f"note: {note}" for note in found["notes"]),

@@ -11,12 +11,21 @@ from tkamb.errors import InputError
 from tkamb.guard import interrupt_as_such
 from tkamb.run.shards import Shards
 from tkamb.run.workers import Crew
+from tkamb.scene.tables import WearTable
 from tkamb.wear.bands import SAMPLES, Progress, Sampling, check_samples
 from tkamb.wear.kept import keep_state, kept_state, wear_identity
-from tkamb.wear.materials import WearMaterial, wear_material
+from tkamb.wear.laws import WearLaw
+from tkamb.wear.materials import DEFAULT_MATERIAL, WearMaterial, wear_material
 from tkamb.wear.report import SAMPLES_NAME, WearReport
 from tkamb.wear.setup import WearSetup, wear_setup
-from tkamb.wear.simulation import CycleWear, WearCase, WearState, check_blocks, simulate_wear
+from tkamb.wear.simulation import (
+    CycleWear,
+    WearCase,
+    WearState,
+    check_blocks,
+    first_cycle,
+    simulate_wear,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +83,15 @@ class WearRun:
                 (self.case, self.cycles, self.updates), state.rows, crew, shards, sample_progress
             )
         return WearReport(
-            self.setup, self.case, self.material, state, last, self.cycles, self.updates, bands
+            self.setup,
+            self.case,
+            self.material,
+            state,
+            last,
+            self.cycles,
+            self.updates,
+            first_cycle(self.case, self.material.all_laws()),
+            bands,
         )
 
     def _simulated(
@@ -106,13 +123,46 @@ class WearRun:
             raise KeyboardInterrupt(f"{done}; go on with --resume") from None
 
 
+@dataclass(eq=False)
+class _Asked:
+    """Material and law: what the call asks for, else what the scene's [wear] says.
+
+    Args:
+        law: name; None: not asked for.
+        material: name or file; None: not asked for.
+        wear_factor: mm³/(N m); None: not asked for.
+    """
+
+    law: str | None
+    material: str | Path | None
+    wear_factor: float | None
+
+    def check(self, table: WearTable, scene: Path) -> None:
+        """Find the material and the law, with the scene's table where nothing is asked for.
+
+        Raises:
+            InputError: there is no such material or law, or the material has no such law.
+        """
+        name = self.material
+        if name is None and table.material is not None:
+            name = table.material
+            if name.endswith(".toml"):
+                name = scene.parent / name
+        factor = table.wear_factor_mm3_per_Nm if self.wear_factor is None else self.wear_factor
+        made_of = wear_material(name or DEFAULT_MATERIAL)
+        chosen = made_of.wear_law(self.law or table.law, factor)
+        if factor is not None:
+            made_of = made_of.with_own_factor()
+        self.material_and_law: tuple[WearMaterial, WearLaw] = (made_of, chosen)
+
+
 def prepare_wear(
     path: str | Path,
     *,
     cycles: int,
     updates: int = 10,
     law: str | None = None,
-    material: str | Path = "conventional",
+    material: str | Path | None = None,
     wear_factor: float | None = None,
     samples: int | None = None,
     period: float = 1.0,
@@ -124,9 +174,10 @@ def prepare_wear(
         path: a scene file, or a folder that `tkamb run` wrote.
         cycles: how many.
         updates: how often the insert's geometry follows.
-        law: a name of `tkamb.wear.laws`; None: the material's own.
-        material: a name of `tkamb.wear.materials`, or a material file.
-        wear_factor: mm³/(N m), in place of the material's.
+        law: a name of `tkamb.wear.laws`; None: the scene's [wear] law, or the material's own.
+        material: a name of `tkamb.wear.materials`, or a material file; None: the scene's, or
+            "conventional".
+        wear_factor: mm³/(N m), in place of the scene's or the material's.
         samples: for bands, at least 20; 0: none; None: 32 where the scene has [uncertainty].
         period: s of a simulator's cycle.
         setup: simulator, springs, contact, …: see `tkamb.wear.setup.wear_setup`.
@@ -138,9 +189,11 @@ def prepare_wear(
     check_samples(samples or 0)
     if not (math.isfinite(period) and 0.05 <= period <= 3600):
         raise InputError(f"{period} s", "--period", "give 0.05 to 3600 s a cycle")
-    made_of = wear_material(material)
-    chosen = made_of.wear_law(law, wear_factor)
-    ready = wear_setup(path, period=period, **setup)
+    asked = _Asked(law, material, wear_factor)
+    if material is not None:
+        asked.check(WearTable(), Path())  # as early as can be
+    ready = wear_setup(path, period=period, check=asked.check, **setup)
+    made_of, chosen = asked.material_and_law
     case = WearCase(
         ready.engine,
         ready.articular,

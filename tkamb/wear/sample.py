@@ -91,7 +91,10 @@ def moved_case(case: WearCase, draw: Draw) -> WearCase:
         poses = knee_pose(knee_coordinates(motion.poses) + offset)
         if drive is not None:
             drive = replace(drive, coordinates=drive.coordinates + offset)
-        motion = replace(motion, poses=poses, drive=drive)
+        path = motion.path
+        if path is not None:
+            path = path._replace(poses=knee_pose(knee_coordinates(path.poses) + offset))
+        motion = replace(motion, poses=poses, path=path, drive=drive)
     if (stiffer := draw.factor("young_modulus")) != 1.0:
         assert isinstance(engine, ContactEngine)
         material = engine.material

@@ -1,33 +1,37 @@
 """From a scene, a folder of results or a simulator's profile to what is worn by what."""
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from tkamb.contact.materials import material
+from tkamb.contact.given_material import given_material
 from tkamb.contact.registry import contact_model, contact_options
 from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, knee_pose
 from tkamb.output.maps import ContactMaps
 from tkamb.results_folder import read_results
 from tkamb.run.rerun import overrides_of_run
 from tkamb.run.summary import files_hash, scene_hash
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.case import Case, load_case
-from tkamb.scene.tables import ContactTable
+from tkamb.scene.tables import ContactTable, WearTable
 from tkamb.scene.uncertainty import UncertaintyTable
 from tkamb.simulation import simulate
 from tkamb.units import MILLIMETRE
 from tkamb.wear.engine import ContactEngine
-from tkamb.wear.motion import CycleMotion
+from tkamb.wear.motion import CycleMotion, check_closing, chosen_frames
 from tkamb.wear.profile import Profile, read_profile
 from tkamb.wear.springs import Springs, read_springs
 from tkamb.wear.worn_surface import ArticularSurface
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
+AFTER_A_RUN = ("wear",)
+"""Tables of a scene that no run reads: a folder of results takes other keys of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +78,9 @@ def wear_setup(
     resolution_mm: float | None = None,
     frames: int = 40,
     period: float = 1.0,
+    close: str | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    check: Callable[[WearTable, Path], None] = lambda table, path: None,
     progress: Progress = lambda indices: indices,
 ) -> WearSetup:
     """Return what is worn.
@@ -84,8 +91,14 @@ def wear_setup(
         springs: a file of its springs (`tkamb.wear.springs`), for force control.
         contact: contact model, in place of the scene's.
         resolution_mm: in place of the scene's.
-        frames: most frames of a cycle.
+        frames: most frames of a recorded cycle, fewest of a simulator's; they never change what
+            the cycle is.
         period: s of a simulator's cycle.
+        close: how recorded frames become a cycle (`tkamb.wear.motion`), in place of the scene's
+            [wear] close.
+        overrides: dotted key -> value of the scene. A folder of results takes only keys of
+            [wear]: the others would be of another run.
+        check: is given the scene's [wear] and path before any frame is run.
         progress: wraps the frames of a scene that has to be run.
 
     Raises:
@@ -96,19 +109,27 @@ def wear_setup(
     path = Path(path)
     if springs is not None and simulator is None:
         raise InputError("springs without a simulator", "--springs", "give --simulator too")
+    given_keys = dict(overrides or {})
+    if close is not None:
+        if simulator is not None:
+            raise InputError("a simulator's profile is a cycle already", "--close", "leave it out")
+        check_closing(close)
+        given_keys["wear.close"] = close
     motion: CycleMotion | None = None
     run_frames: tuple[int, ...] | None = None
     if os.path.isdir(path) and simulator is None:
-        case, motion, run_frames = _of_results(path)
+        case, motion, run_frames, scene_path = _of_results(path, frames, given_keys)
         hashes = _hashes(case, case.scene)
     else:
-        overrides: dict[str, Any] = {}
+        of_run: dict[str, Any] = {}
         if os.path.isdir(path):
             summary = read_results(path).summary
-            path, overrides = _scene_of(summary, path), overrides_of_run(summary)
-        given = load_scene(path, overrides)
+            path, of_run = _scene_of(summary, path), overrides_of_run(summary)
+        scene_path = path
+        given = load_scene(path, of_run | given_keys)
         case = load_case(_with_contact(given, contact, resolution_mm, path))
         hashes = _hashes(case, given)
+    check(_wear_table(case.scene), scene_path)
     table = _with_contact(case.scene, contact, resolution_mm, path).contact
     assert table is not None and case.femoral is not None and case.insert is not None
     if case.post is not None:
@@ -123,7 +144,7 @@ def wear_setup(
     return WearSetup(
         engine=engine,
         articular=ArticularSurface.of_insert(case.insert, table.resolution_mm * MILLIMETRE),
-        motion=motion if simulator else motion.thinned(frames),
+        motion=motion,
         side=case.scene.patient.side,
         contact=table.model,
         resolution_mm=table.resolution_mm,
@@ -134,6 +155,10 @@ def wear_setup(
         uncertainty=case.scene.uncertainty,
         simulated=simulator is not None,
     )
+
+
+def _wear_table(scene: Scene) -> WearTable:
+    return scene.wear or WearTable()
 
 
 def _hashes(case: Case, given: Scene) -> tuple[str, ...]:
@@ -156,28 +181,89 @@ def _of_profile(
         notes = [f"a simulator's cycle in force control: {found} in equilibrium, without friction"]
         if friction := case.scene.contact.friction:
             notes.append(f"the scene's friction of {friction:g} is left out of force control")
-    return CycleMotion(profile.poses(dwell), profile.load, period, 1, tuple(notes), drive)
+    seconds = np.diff(profile.percent) / 100.0 * period
+    poses = profile.poses(dwell)
+    return CycleMotion(poses, profile.load, period, 1, tuple(notes), drive, seconds)
 
 
 def _of_scene(scene: Scene, path: Path, most: int, progress: Progress) -> CycleMotion:
-    """Run a scene, or every so many of its frames, and return its cycle."""
-    count = len(load_case(scene).motion.time)
-    step = max(1, -(-count // most))
-    results = simulate(scene, frames=slice(0, count, step), scene_path=path, progress=progress)
-    assert results.maps is not None
-    motion = _of_maps(results.maps)
-    if step == 1:
+    """Run a scene, or some of its frames, the first and the last among them; return its cycle."""
+    case = load_case(scene)
+    recorded = case.motion.time
+    count = len(recorded)
+    chosen = [slice(one.start, one.stop, one.step) for one in chosen_frames(count, most)]
+    runs = [simulate(scene, frames=one, scene_path=path, progress=progress) for one in chosen]
+    tracks = [_Track.of_maps(run.maps) for run in runs if run.maps is not None]
+    track = _Track(*(np.concatenate(parts) for parts in zip(*tracks, strict=True)))
+    contact = scene.contact
+    assert contact is not None
+    moved = contact.released or contact.adjust  # other poses than the recorded ones
+    whole = None if moved else (recorded, knee_pose(case.motion.coordinates))
+    return _cycle_of(track, range(len(track.time)), scene, recorded, whole)
+
+
+class _Track(NamedTuple):
+    """Recorded frames.
+
+    Args:
+        time: (f,) s.
+        poses: (f, 4, 4) pose_femoral_in_insert.
+        load: (f,) N along -y.
+    """
+
+    time: Array
+    poses: Array
+    load: Array
+
+    @classmethod
+    def of_maps(cls, maps: ContactMaps) -> "_Track":
+        load = -np.asarray(maps.nodal_force_N)[:, :, 1].sum(axis=1)
+        return cls(np.asarray(maps.time_s), np.asarray(maps.femoral_pose), load)
+
+
+def _cycle_of(
+    track: _Track,
+    chosen: Sequence[int],
+    scene: Scene,
+    recorded: Array,
+    whole: tuple[Array, Array] | None,
+) -> CycleMotion:
+    """Return the cycle that some frames of a track stand for.
+
+    Args:
+        track: what was computed.
+        chosen: frames of it.
+        scene: says how they become a cycle.
+        recorded: (g,) s, times of the whole recording.
+        whole: those times and the poses (g, 4, 4) at them; None: the poses are not known.
+    """
+    frames, count = list(chosen), len(recorded)
+    time, poses, load = (values[frames] for values in track)
+    interval = float(recorded[-1] - recorded[0]) / max(1, count - 1)
+    if len(frames) == count:
+        whole = None
+    closing = _wear_table(scene).close
+    motion = CycleMotion.of_frames(time, poses, load, closing, interval, whole)
+    if len(frames) == count:
         return motion
-    note = f"every {step}th frame of the scene's {count} is computed"
+    note = f"{len(frames)} of its {count} frames are computed, the first and the last among them"
     return replace(motion, notes=(*motion.notes, note))
 
 
-def _of_results(folder: Path) -> tuple[Case, CycleMotion, tuple[int, ...]]:
-    """Return the case, the cycle and the choice of frames of a folder of results."""
+def _of_results(
+    folder: Path, most: int, overrides: Mapping[str, Any]
+) -> tuple[Case, CycleMotion, tuple[int, ...], Path]:
+    """Return the case, the cycle, the choice of frames and the scene of a folder of results."""
+    for key in overrides:
+        if key.partition(".")[0] not in AFTER_A_RUN:
+            what = f"'{key}' is not of the run in this folder"
+            raise InputError(what, f"--set {key}", "give the scene in place of the folder")
     results = read_results(folder)
     if results.maps is None:
         raise InputError("has no contact maps", folder, "run the scene with [contact]")
-    scene = load_scene(_scene_of(results.summary, folder), overrides_of_run(results.summary))
+    keys = overrides_of_run(results.summary) | dict(overrides)
+    scene_path = _scene_of(results.summary, folder)
+    scene = load_scene(scene_path, keys)
     table = results.summary.get("contact")
     if isinstance(table, dict):
         scene = scene.model_copy(update={"contact": ContactTable.model_validate(table)})
@@ -186,7 +272,10 @@ def _of_results(folder: Path) -> tuple[Case, CycleMotion, tuple[int, ...]]:
         what = "was run with another scene than its file says now"
         raise InputError(what, folder, "run it again, or give the scene")
     chosen = (results.summary.get("identity") or {}).get("choice of frames") or ()
-    return case, _of_maps(results.maps), tuple(chosen)
+    track = _Track.of_maps(results.maps)
+    frames = [*chain(*chosen_frames(len(track.time), most))]
+    motion = _cycle_of(track, frames, scene, track.time, (track.time, track.poses))
+    return case, motion, tuple(chosen), scene_path
 
 
 def _scene_of(summary: dict[str, Any], folder: Path) -> Path:
@@ -194,11 +283,6 @@ def _scene_of(summary: dict[str, Any], folder: Path) -> Path:
     if not isinstance(scene, str):
         raise InputError("does not say which scene it is of", folder, "give the scene")
     return Path(scene)
-
-
-def _of_maps(maps: ContactMaps) -> CycleMotion:
-    load = -np.asarray(maps.nodal_force_N)[:, :, 1].sum(axis=1)
-    return CycleMotion.of_frames(maps.time_s, np.asarray(maps.femoral_pose), load)
 
 
 def _with_contact(
@@ -222,4 +306,6 @@ def _engine(case: Case, table: ContactTable) -> ContactEngine:
     if "cache" in contact_options(table.model):
         options["cache"] = False  # every update has an operator of its own, used once
     model = contact_model(table.model, table.resolution_mm, **options)
-    return ContactEngine(model, case.femoral, material(table.material), insert.bearing)
+    return ContactEngine(
+        model, case.femoral, given_material(case.scene.insert_material), insert.bearing
+    )

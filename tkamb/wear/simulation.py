@@ -216,16 +216,64 @@ def _cycle(case: WearCase, state: WearState) -> CycleWear | str:
     insert = case.articular.lowered(state.fall)
     maps = case.engine.maps(insert, case.motion)
     rows = _rows(maps, case.motion)
-    if isinstance(rows, str):
-        return rows
+    return rows if isinstance(rows, str) else _worn_by(case, insert, maps, rows)
+
+
+def _worn_by(case: WearCase, insert: Surface, maps: CycleMaps, rows: list[int]) -> CycleWear:
+    """Return what a cycle through some rows of the maps does to an insert."""
     points = insert.vertices[case.articular.vertices]
     normals, area = case.articular.normals_and_areas(insert)
     pressure = maps.pressure[rows] @ interpolation(maps.points, points).T
     pressure, error = carried(pressure, area * normals[:, 1], case.motion.load[rows])
-    poses, passes = maps.poses[rows], case.motion.passes
-    history = SlidingHistory.of_cycle(poses, pressure, points, normals, passes)
+    poses, path, seconds = maps.poses[rows], case.motion.path, case.motion.seconds_between(rows)
+    if path is not None:
+        weights = path.weights(rows)
+        times = weights @ np.concatenate([[0.0], np.cumsum(seconds)])
+        height = weights @ poses[:, 1, 3]
+        poses, pressure, seconds = path.poses.copy(), weights @ pressure, np.diff(times)
+        poses[:, 1, 3] = height
+    passes = case.motion.passes
+    history = SlidingHistory.of_cycle(poses, pressure, points, normals, passes, seconds)
     rate = case.law.depth(history)
     return CycleWear(rate, history, normals, area, error, maps.poses, maps.failed)
+
+
+@dataclass(frozen=True, eq=False)
+class FirstCycle:
+    """What is found out about the first cycle, on the unworn insert.
+
+    Args:
+        frames_change: by how much half as many steps change the cycle's volume, relative to it.
+            Of a simulator's profile: the steps of the simulation against steps half as long. NaN:
+            a frame of it failed, or nothing wears.
+        volumes: law -> m³ a cycle, of the laws that were asked for.
+    """
+
+    frames_change: float
+    volumes: Mapping[str, float]
+
+
+def first_cycle(case: WearCase, laws: Mapping[str, WearLaw]) -> FirstCycle:
+    """Return how much the number of frames matters, and what other laws say of the first cycle.
+
+    Args:
+        case: what is worn.
+        laws: name -> law.
+    """
+    recorded = bool(case.motion.closing)
+    fine = case if recorded else replace(case, motion=case.motion.refined())
+    insert = case.articular.lowered(np.zeros(len(case.articular.vertices)))
+    maps = case.engine.maps(insert, fine.motion)
+    every = _rows(maps, fine.motion)
+    if isinstance(every, str):
+        return FirstCycle(math.nan, {})
+    whole = _worn_by(fine, insert, maps, every)
+    volumes = {name: float(law.depth(whole.history) @ whole.area) for name, law in laws.items()}
+    if maps.failed:
+        return FirstCycle(math.nan, volumes)
+    half = _worn_by(fine, insert, maps, fine.motion.every_second)
+    total, coarse = (float(one.rate @ one.area) for one in (whole, half))
+    return FirstCycle(abs(coarse / total - 1.0) if total > 0 else math.nan, volumes)
 
 
 def _rows(maps: CycleMaps, motion: CycleMotion) -> list[int] | str:

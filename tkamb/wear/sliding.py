@@ -53,16 +53,24 @@ class SlidingHistory:
         normals: (n, 3) unit outward normals of the insert.
         passes: how often the steps are gone through in a cycle; 2 where the way back is the
             way out.
+        seconds: (s,) duration of each step; None: all are equally long.
     """
 
     pressure: Array
     sliding: Array
     normals: Array
     passes: int = 1
+    seconds: Array | None = None
 
     @classmethod
     def of_cycle(
-        cls, poses: Array, pressure: Array, points: Array, normals: Array, passes: int = 1
+        cls,
+        poses: Array,
+        pressure: Array,
+        points: Array,
+        normals: Array,
+        passes: int = 1,
+        seconds: Array | None = None,
     ) -> "SlidingHistory":
         """Return the history of frames (f,) whose maps (f, n) hold at poses (f, 4, 4).
 
@@ -70,7 +78,7 @@ class SlidingHistory:
         trapezoidal rule, of second order in the step.
         """
         between = 0.5 * (pressure[:-1] + pressure[1:])
-        return cls(between, step_sliding(poses, points, normals), normals, passes)
+        return cls(between, step_sliding(poses, points, normals), normals, passes, seconds)
 
     @cached_property
     def length(self) -> Array:
@@ -94,8 +102,8 @@ class SlidingHistory:
 
     @cached_property
     def mean_pressure(self) -> Array:
-        """Time-mean pressure over the whole cycle, (n,) Pa, all steps equally long."""
-        return self.pressure.mean(axis=0)
+        """Time-mean pressure over the whole cycle, (n,) Pa."""
+        return np.average(self.pressure, axis=0, weights=self.seconds)
 
     @cached_property
     def cross_shear(self) -> Array:

@@ -1,0 +1,203 @@
+"""A material as a user gives it: the table [material] of a scene, or a file of the same keys."""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tkamb.contact.materials import (
+    MATERIALS,
+    LinearElastic,
+    Material,
+    RambergOsgood,
+    StressStrainLaw,
+    TabulatedLaw,
+    material,
+)
+from tkamb.errors import InputError, names_near
+from tkamb.files import read_text
+from tkamb.units import MEGAPASCAL
+
+KEYS = (
+    *("base", "name", "young_modulus_MPa", "poisson_ratio", "yield_stress_MPa", "law", "alpha"),
+    *("reference_stress_MPa", "exponent", "strain", "stress_MPa", "sources"),
+)
+LAW_KEYS = {
+    "linear": (),
+    "ramberg-osgood": ("alpha", "reference_stress_MPa", "exponent"),
+    "tabulated": ("strain", "stress_MPa"),
+}
+"""Law -> the keys that it needs."""
+NUMBERS = (
+    *("young_modulus_MPa", "poisson_ratio", "yield_stress_MPa", "alpha"),
+    *("reference_stress_MPa", "exponent"),
+)
+EXAMPLE = "see docs/materials.md"
+
+
+def given_material(table: Mapping[str, Any], where: object = "[material]") -> Material:
+    """Return the material that a table of the keys `KEYS` describes; None is not given.
+
+    With `base` alone it is that built-in material. With `base` and other keys it is changed;
+    a law that is given replaces the base's. Without `base` E, nu and a law's numbers are needed;
+    E of a tabulated curve is its own slope at the origin unless given, which scales the curve.
+
+    Args:
+        table: see docs/materials.md; MPa, strain dimensionless.
+        where: the file or table, for messages.
+
+    Raises:
+        InputError: an unknown, missing or superfluous key, or a value out of range.
+    """
+    given = {key: value for key, value in table.items() if value is not None and value != ()}
+    for key in given:
+        if key not in KEYS:
+            raise InputError(f"unknown key '{key}'", where, names_near(key, KEYS))
+    for key in NUMBERS:
+        value = given.get(key, 0.0)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise InputError(f"cannot be {value!r}", f"{where}: {key}", "give a number")
+    base = None if "base" not in given else material(given["base"])
+    if base is not None and set(given) == {"base"}:
+        return base
+    _check_name(given, where)
+    law = _law(given, base, where)
+    modulus = given.get("young_modulus_MPa")
+    if modulus is not None:
+        modulus *= MEGAPASCAL
+    elif isinstance(law, TabulatedLaw) and "strain" in given:
+        modulus = law.young_modulus
+    elif base is not None:
+        modulus = base.young_modulus
+    else:
+        raise InputError("'young_modulus_MPa' is missing", where, EXAMPLE)
+    ratio = given.get("poisson_ratio", None if base is None else base.poisson_ratio)
+    if ratio is None:
+        raise InputError("'poisson_ratio' is missing", where, "UHMWPE has about 0.45")
+    sources = tuple(given.get("sources", ()))
+    if base is not None:
+        sources += tuple(f"{base.name}: {source}" for source in base.sources)
+    name = given.get("name") or ("own" if base is None else f"{base.name} (changed)")
+    return replace(Material(name, float(modulus), float(ratio), law), sources=sources)
+
+
+def named_material(name: str | Path | Material) -> Material:
+    """Return a built-in material, that of a TOML file of the keys of [material], or itself.
+
+    Args:
+        name: a key of `MATERIALS`, a path that ends in .toml, or a material.
+
+    Raises:
+        InputError: no such material or file, or the file does not describe one.
+    """
+    if isinstance(name, Material):
+        return name
+    if Path(name).suffix != ".toml":
+        return material(str(name))
+    try:
+        content = tomllib.loads(read_text(name, what="material"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"is not TOML ({error})", name) from None
+    inner = content.get("material")
+    if isinstance(inner, dict) and len(content) == 1:
+        content = inner
+    content.setdefault("name", Path(name).stem)
+    return given_material(content, name)
+
+
+def material_as_json(chosen: Material) -> dict[str, Any]:
+    """Return all numbers of a material, MPa, and where they come from."""
+    law = chosen.law
+    curve: dict[str, Any] = {"law": type(law).__name__}
+    if isinstance(law, LinearElastic):
+        curve = {"law": "linear"}
+    elif isinstance(law, RambergOsgood):
+        curve = {
+            "law": "ramberg-osgood",
+            "alpha": law.alpha,
+            "reference_stress_MPa": law.reference_stress / MEGAPASCAL,
+            "exponent": law.exponent,
+        }
+    elif isinstance(law, TabulatedLaw):
+        scale = chosen.young_modulus / law.young_modulus / MEGAPASCAL
+        curve = {
+            "law": "tabulated",
+            "strain": list(law.strain),
+            "stress_MPa": [value * scale for value in law.values],
+        }
+    return {
+        "name": chosen.name,
+        "young_modulus_MPa": chosen.young_modulus / MEGAPASCAL,
+        "poisson_ratio": chosen.poisson_ratio,
+        **curve,
+        "sources": list(chosen.sources),
+    }
+
+
+def material_in_words(values: Mapping[str, Any]) -> str:
+    """Return in one line what `material_as_json` holds."""
+    parts = [
+        f"E {values['young_modulus_MPa']:.4g} MPa",
+        f"Poisson's ratio {values['poisson_ratio']:.3g}",
+    ]
+    if values["law"] == "ramberg-osgood":
+        parts.append(
+            f"Ramberg-Osgood, alpha {values['alpha']:.4g}, reference stress "
+            f"{values['reference_stress_MPa']:.5g} MPa, exponent {values['exponent']:.5g}"
+        )
+    elif values["law"] == "tabulated":
+        parts.append(
+            f"tabulated curve of {len(values['strain'])} points to {values['strain'][-1]:.3g} "
+            f"strain and {values['stress_MPa'][-1]:.4g} MPa"
+        )
+    else:
+        parts.append(values["law"])
+    sources = "; ".join(values["sources"]) or "no source given"
+    return f"{values['name']}: {', '.join(parts)} ({sources})"
+
+
+def _check_name(given: Mapping[str, Any], where: object) -> None:
+    name = given.get("name")
+    if name in MATERIALS:
+        what = f"name '{name}' is that of a built-in material"
+        raise InputError(what, where, "choose another: results of both must be told apart")
+
+
+def _law(given: Mapping[str, Any], base: Material | None, where: object) -> StressStrainLaw:
+    """Return the curve that is given, or the base's."""
+    name = given.get("law")
+    if name is not None and name not in LAW_KEYS:
+        raise InputError(f"no law '{name}'", where, names_near(str(name), LAW_KEYS))
+    own = base.law if base is not None else None
+    if name is None and isinstance(own, RambergOsgood):
+        name = "ramberg-osgood"
+    name = name or "linear"
+    values = {key: given[key] for keys in LAW_KEYS.values() for key in keys if key in given}
+    if name == "ramberg-osgood" and isinstance(own, RambergOsgood):
+        values = {
+            "alpha": own.alpha,
+            "reference_stress_MPa": own.reference_stress / MEGAPASCAL,
+            "exponent": own.exponent,
+        } | values
+    for key in values:
+        if key not in LAW_KEYS[name]:
+            needs = ", ".join(LAW_KEYS[name]) or "no numbers"
+            raise InputError(f"'{key}' is none of the law '{name}'", where, f"it takes: {needs}")
+    for key in LAW_KEYS[name]:
+        if key not in values:
+            raise InputError(f"law '{name}' needs '{key}'", where, EXAMPLE)
+    if name == "linear":
+        return LinearElastic()
+    try:
+        if name == "ramberg-osgood":
+            stress = float(values["reference_stress_MPa"]) * MEGAPASCAL
+            return RambergOsgood(float(values["alpha"]), stress, float(values["exponent"]))
+        strain, stress_MPa = (np.asarray(values[key], float) for key in LAW_KEYS["tabulated"])
+        return TabulatedLaw(tuple(strain.tolist()), tuple((stress_MPa * MEGAPASCAL).tolist()))
+    except InputError as error:
+        raise InputError(error.what, where, error.mend) from None
+    except (TypeError, ValueError):
+        raise InputError("strain and stress_MPa are no lists of numbers", where, EXAMPLE) from None
