@@ -339,7 +339,7 @@ class Bridge:
             "femur": self.component.joint,
             "patella": self.component.joint if patella is None else patella.joint,
         }
-        for link, wrench in _summed(loads).items():
+        for link, wrench in summed(loads).items():
             joint = homes[link]
             own = mirrored_spatial(wrench) if self.left else wrench
             forces[joint] += data.oMi[joint].actInv(insert).act(pin.Force(own))
@@ -350,7 +350,8 @@ class Bridge:
         return mirrored_pose(pose) if self.left else pose
 
 
-def _summed(loads: "dict[str, Array] | list[PointForces]") -> dict[str, Array]:
+def summed(loads: "dict[str, Array] | list[PointForces]") -> dict[str, Array]:
+    """Return link -> wrench (6,) about the insert's origin of loads in the insert frame."""
     if isinstance(loads, dict):
         return loads
     total: dict[str, Array] = {}

@@ -28,11 +28,13 @@ class DifferenceSettings:
     Args:
         step: m, of a translation. Large against what the solver's tolerance leaves open, small
             against the radius of the contact.
+        exact_step: m, the same for a model without a solver, whose answers are exact.
         arm: m; a rotation is this step over this arm.
         tolerance: solver tolerance of a model that has one, for these evaluations.
     """
 
     step: float = 4e-6
+    exact_step: float = 1e-9
     arm: float = 0.025
     tolerance: float = 1e-6
 
@@ -150,8 +152,11 @@ class KneeContact:
             return total
         precise = self.precise_probe(getattr(probe, "_guess", None))
         self.at(precise, place)
+        settings = self._settings
+        if contact.tangent and contact.exact and not hasattr(self.model, "tolerance"):
+            settings = replace(settings, step=settings.exact_step)
         return differences(
-            lambda moved: self.wrench(self.at(precise, moved), twist), place, self._settings
+            lambda moved: self.wrench(self.at(precise, moved), twist), place, settings
         )
 
 

@@ -29,7 +29,7 @@ from tkamb.geometry.frames import (
     transform,
 )
 from tkamb.knee.anatomy import Place, find_anatomy, knee_size
-from tkamb.knee.canonical import Bridge, CanonicalChain, KneePlace, mirrored_spatial, se3
+from tkamb.knee.canonical import Bridge, CanonicalChain, KneePlace, mirrored_spatial, se3, summed
 from tkamb.knee.instant import Instant, PatellaAt
 from tkamb.knee.loads import KneeLoads, knee_loads
 from tkamb.knee.parts import (
@@ -41,7 +41,7 @@ from tkamb.knee.parts import (
 )
 
 if TYPE_CHECKING:
-    from tkamb.body.ligaments import Ligament
+    from tkamb.body.ligaments import BundleArrays, Ligament
     from tkamb.body.patella import PatellaState
     from tkamb.contact.model import ContactModel
     from tkamb.contact.result import ContactResult
@@ -50,6 +50,8 @@ if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
     from tkamb.knee.contact import KneeContact
 
+PATELLAR_LIGAMENT = "patellar_ligament"
+"""Its name among the tensions."""
 SAME_PLACE = 1e-9
 """m and rad: an insert this near to its flat bottom's frame stands in it."""
 POSE_TOLERANCE = 1e-12
@@ -168,6 +170,7 @@ class Knee:
         self.chain = CanonicalChain(self.anatomy, left, extensor is not None, component, insert)
         self.bridge = Bridge(self.anatomy, left, self.chain, component, insert)
         self.ligaments = tuple(self._bundle(bundle) for bundle in ligaments)
+        self._crossing, self._others = self._divided()
         self._lines = {muscle.name: self._line(muscle) for muscle in muscles}
         self.extensor, self._extensor_lines = extensor, None
         if extensor is not None:
@@ -218,6 +221,8 @@ class Knee:
             q: (nq,).
             v: (nv,).
             tensions: muscle -> N; a number alone is the quadriceps'. What is missing is slack.
+                "patellar_ligament" -> N beside the quadriceps: then its tension is that, and the
+                patellofemoral force what the two leave, as in `KneeLoads.tensions`.
             data: from `create_data`, to save time.
 
         Returns:
@@ -231,26 +236,30 @@ class Knee:
         """
         data = self.create_data() if data is None else data
         place = self._kinematics(data, q, v)
-        total: list[PointForces] = []
-        links: dict[str, Array] = {}
+        on_insert = np.zeros(6)
         if self.contact is not None:
             contact = self.contact.at(data.probe, place.pose)
-            wrench = self.contact.wrench(contact, self.bridge.twist(data.data))
-            links = {"tibia": wrench, "femur": -wrench}
+            on_insert = self.contact.wrench(contact, self.bridge.twist(data.data))
+        if self._crossing is not None:
+            on_insert = on_insert + self._crossing.wrench(place.pose)
         pulled = self._tensions(tensions)
-        patella = None
-        if self.extensor is not None and (self._pulls(pulled) or self._on_patella()):
-            patella = self._find_patella(place, data)
-        poses = self._link_poses(place, patella)
-        if self.ligaments:
-            from tkamb.body.ligaments import ligament_loads
+        total: list[PointForces] = []
+        if self._others or self._pulls(pulled):
+            patella = None
+            if self.extensor is not None:
+                patella = self._find_patella(place, data)
+            poses = self._link_poses(place, patella)
+            if self._others:
+                from tkamb.body.ligaments import ligament_loads
 
-            total += ligament_loads(self.ligaments, poses)[1]
-        if patella is not None:
-            total += self._extensor_pull(poses, place, patella, pulled)
-        forces = self.bridge.joint_forces(data.data, total)
-        more = self.bridge.joint_forces(data.data, links) if links else None
-        return self._with_lines(data, pulled, forces, more)
+                total += ligament_loads(self._others, poses)[1]
+            if patella is not None and self._pulls(pulled):
+                total += self._extensor_pull(poses, place, patella, pulled)
+        links = summed(total)
+        for link, sign in (("tibia", 1.0), ("femur", -1.0)):
+            links[link] = links.get(link, np.zeros(6)) + sign * on_insert
+        forces = self.bridge.joint_forces(data.data, links)
+        return self._with_lines(data, pulled, forces) if self._lines else forces
 
     def stiffness(
         self, q: Array, v: Array, data: KneeData | None = None, exact: bool = True
@@ -541,6 +550,30 @@ class Knee:
             )
         return replace(bundle, proximal=ends[0], distal=ends[1])
 
+    def _divided(self) -> "tuple[BundleArrays | None, tuple[Ligament, ...]]":
+        """Return the bundles between femur and tibia, and the others.
+
+        The ends of the first are in the femoral and the insert frame.
+        """
+        across = [
+            bundle
+            for bundle in self.ligaments
+            if {bundle.proximal.link, bundle.distal.link} == {"femur", "tibia"}
+        ]
+        others = tuple(bundle for bundle in self.ligaments if bundle not in across)
+        if not across:
+            return None, others
+        from tkamb.body.ligaments import BundleArrays
+
+        shank = inverse(self.chain.insert_in_tibia)
+        ends: dict[str, list[Array]] = {"femur": [], "tibia": []}
+        for bundle in across:
+            for end in (bundle.proximal, bundle.distal):
+                at = transform(shank, end.position) if end.link == "tibia" else end.position
+                ends[end.link].append(at)
+        bundles = BundleArrays.of(across, np.array(ends["femur"]), np.array(ends["tibia"]))
+        return bundles, others
+
     def _line(self, muscle: Muscle) -> _Line:
         points = [link_point(point) for point in muscle.points]
         if len(points) < 2 or muscle.wrap is not None:
@@ -618,9 +651,6 @@ class Knee:
         """Whether the place of the patella is found, and not that of q."""
         return self.anatomy.patella is None
 
-    def _on_patella(self) -> bool:
-        return any("patella" in (b.proximal.link, b.distal.link) for b in self.ligaments)
-
     def _pulls(self, tensions: Mapping[str, float]) -> bool:
         return self.extensor is not None and tensions.get(self.extensor.quadriceps.name, 0.0) != 0
 
@@ -630,7 +660,7 @@ class Knee:
         Raises:
             InputError: an unknown muscle, or a tension that is negative or not finite.
         """
-        own = [self.extensor.quadriceps.name] if self.extensor else []
+        own = [self.extensor.quadriceps.name, PATELLAR_LIGAMENT] if self.extensor else []
         if tensions is None:
             return {}
         if not isinstance(tensions, Mapping):
@@ -683,19 +713,29 @@ class Knee:
         """
         assert self.extensor is not None
         tension = tensions.get(self.extensor.quadriceps.name, 0.0)
-        if tension == 0.0:
-            return []
-        if not (patella.ligament_ratio > 0.0 and patella.patellofemoral_ratio > 0.0):
-            raise ComputationError(
-                "the contact would have to pull, or the patellar ligament to push", "extensor"
-            )
-        lines = self._extensor_lines
-        extensor, muscle = lines.loads(place.coordinates[5], _Posed(poses), patella)
-        force = tension * patella.patellofemoral_ratio * patella.contact_normal
-        point = patella.contact_point[None]
+        extensor, muscle = self._extensor_lines.loads(place.coordinates[5], _Posed(poses), patella)
+        point, normal = patella.contact_point[None], patella.contact_normal
+        held = tensions.get(PATELLAR_LIGAMENT)
+        if held is not None:
+            pulls = [
+                *_scaled(muscle.loads, tension),
+                *_scaled(extensor.patellar_ligament, held),
+            ]
+            pull = sum(load.forces.sum(axis=0) for load in pulls if load.link == "patella")
+            across = poses["femur"][:3, 2]
+            force = -(pull - (pull @ across) * across)
+        else:
+            if not (patella.ligament_ratio > 0.0 and patella.patellofemoral_ratio > 0.0):
+                raise ComputationError(
+                    "the contact would have to pull, or the patellar ligament to push", "extensor"
+                )
+            pulls = [
+                *_scaled(muscle.loads, tension),
+                *_scaled(extensor.patellar_ligament, tension * patella.ligament_ratio),
+            ]
+            force = tension * patella.patellofemoral_ratio * normal
         return [
-            *_scaled(muscle.loads, tension),
-            *_scaled(extensor.patellar_ligament, tension * patella.ligament_ratio),
+            *pulls,
             PointForces("patella", point, force[None]),
             PointForces("femur", point, -force[None]),
         ]
@@ -726,24 +766,11 @@ class Knee:
 
     def _ligament_stiffness(self, place: KneePlace) -> Array:
         """Return the derivative (6, 6) of the wrench of the bundles between femur and tibia."""
-        crossing = [
-            bundle
-            for bundle in self.ligaments
-            if {bundle.proximal.link, bundle.distal.link} == {"femur", "tibia"}
-        ]
-        if not crossing:
+        if self._crossing is None:
             return np.zeros((6, 6))
-        from tkamb.body.ligaments import BundleArrays
         from tkamb.knee.contact import DifferenceSettings, differences
 
-        shank = inverse(self.chain.insert_in_tibia)
-        ends: dict[str, list[Array]] = {"femur": [], "tibia": []}
-        for bundle in crossing:
-            for end in (bundle.proximal, bundle.distal):
-                at = transform(shank, end.position) if end.link == "tibia" else end.position
-                ends[end.link].append(at)
-        bundles = BundleArrays.of(crossing, np.array(ends["femur"]), np.array(ends["tibia"]))
-        return differences(bundles.wrench, place.pose, DifferenceSettings(step=1e-7))
+        return differences(self._crossing.wrench, place.pose, DifferenceSettings(step=1e-7))
 
     def _mirrored_matrix(self, matrix: Array) -> Array:
         if not self.left:

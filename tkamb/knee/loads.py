@@ -80,10 +80,15 @@ class KneeLoads:
 
     @property
     def tensions(self) -> dict[str, float]:
-        """Muscle -> N, as `Knee.external_forces` takes it; empty without an extensor."""
-        extensor = self.geometry.extensor
-        names = extensor.muscles if extensor else ()
-        return {name: self.equations.values.get(muscle_load(name), NAN) for name in names}
+        """Muscle and patellar ligament -> N, as `Knee.external_forces` takes them.
+
+        Empty without an extensor mechanism.
+        """
+        extensor, values = self.geometry.extensor, self.equations.values
+        if extensor is None:
+            return {}
+        found = {name: values.get(muscle_load(name), NAN) for name in extensor.muscles}
+        return found | {"patellar_ligament": values.get("patellar_ligament", NAN)}
 
 
 def knee_loads(

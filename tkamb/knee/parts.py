@@ -14,7 +14,6 @@ from tkamb.body.load import LinkPoint
 from tkamb.body.muscles import Muscle, PatellarLigament
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array
-from tkamb.geometry.repair import repair
 from tkamb.geometry.surface import Surface
 
 if TYPE_CHECKING:
@@ -103,6 +102,8 @@ def as_surface(mesh: Mesh, name: str, closed: bool = False) -> Surface:
     """
     if isinstance(mesh, Surface):
         return mesh
+    from tkamb.geometry.repair import repair
+
     vertices, faces = _arrays(mesh, name)
     if not np.isfinite(vertices).all():
         raise InputError("holds coordinates that are not finite", name, "check the mesh")
