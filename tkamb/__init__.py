@@ -12,30 +12,57 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from tkamb.body.ligaments import Ligament
+    from tkamb.body.load import LinkPoint
+    from tkamb.body.muscles import Muscle, PatellarLigament, SagittalWrap
     from tkamb.contact.registry import contact_model
+    from tkamb.knee.knee import Knee
+    from tkamb.knee.loads import KneeLoads
+    from tkamb.knee.parts import Extensor, Implant
     from tkamb.results import Results
     from tkamb.results_folder import read_results
+    from tkamb.run.read_scene import read_scene
     from tkamb.scene import Scene, load_scene
     from tkamb.simulation import simulate
     from tkamb.view.show import show
 
 __all__ = [
+    "Extensor",
+    "Implant",
+    "Knee",
+    "KneeLoads",
+    "Ligament",
+    "LinkPoint",
+    "Muscle",
+    "PatellarLigament",
     "Results",
+    "SagittalWrap",
     "Scene",
     "__version__",
     "contact_model",
     "load_scene",
     "read_results",
+    "read_scene",
     "show",
     "simulate",
 ]
 
 _HOMES = {
+    "Extensor": "tkamb.knee.parts",
+    "Implant": "tkamb.knee.parts",
+    "Knee": "tkamb.knee.knee",
+    "KneeLoads": "tkamb.knee.loads",
+    "Ligament": "tkamb.body.ligaments",
+    "LinkPoint": "tkamb.body.load",
+    "Muscle": "tkamb.body.muscles",
+    "PatellarLigament": "tkamb.body.muscles",
+    "SagittalWrap": "tkamb.body.muscles",
     "Results": "tkamb.results",
     "Scene": "tkamb.scene",
     "contact_model": "tkamb.contact.registry",
     "load_scene": "tkamb.scene",
     "read_results": "tkamb.results_folder",
+    "read_scene": "tkamb.run.read_scene",
     "show": "tkamb.view.show",
     "simulate": "tkamb.simulation",
 }

@@ -170,6 +170,10 @@ class Chain:
 
     def at(self, motion: ChainMotion) -> "ChainState":
         """Return the chain at one instant, with its inertial forces."""
+        return ChainState(self, *self.configuration(motion))
+
+    def configuration(self, motion: ChainMotion) -> tuple[Array, Array, Array]:
+        """Return q (nq,), v (nv,) and a (nv,) of the model at one instant."""
         model = self.model
         root_in_tibia = pin.SE3(inverse(self._tibia_in_root))
         q, v, a = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
@@ -181,7 +185,7 @@ class Chain:
         ):
             q[model.joints[model.getJointId(name)].idx_q] = x
             v[column], a[column] = rate, acceleration
-        return ChainState(self, q, v, a)
+        return q, v, a
 
 
 class ChainState:
@@ -230,6 +234,15 @@ class ChainState:
             np.add.at(on_link, column[own], acting[own])
             total += self._jacobian(link).T @ on_link.T
         return total
+
+    def add_need(self, link: str, wrench: Array) -> None:
+        """Add a wrench (6,) that all loads together must also exert on a link.
+
+        Args:
+            link: its name.
+            wrench: force (N) and moment about the insert's origin (N·m), insert frame.
+        """
+        self.inertial = self.inertial + self._jacobian(link).T @ wrench
 
     def ground_reaction(self, force: Array, point: Array, moment: Array) -> PointForces:
         """Return a laboratory force (3,), its point (3,) and moment (3,) as load on the tibia."""

@@ -4,7 +4,7 @@ import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import overload
+from typing import Protocol, overload
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -48,7 +48,152 @@ class ExtensorParts:
     insert: Surface | None
 
 
-class ExtensorFrames:
+class Posed(Protocol):
+    """The knee at one instant, as far as lines run over it."""
+
+    def pose(self, link: str) -> Array:
+        """Return pose_link_in_insert (4, 4)."""
+
+
+class ExtensorLines:
+    """Muscle, patella and patellar ligament of a knee, at any pose of the femur.
+
+    Args:
+        parts: the mechanism.
+
+    Attributes:
+        muscle: its line of action.
+        ligament: the patellar ligament's.
+
+    Raises:
+        InputError: a line starts inside what it wraps.
+    """
+
+    def __init__(self, parts: ExtensorParts) -> None:
+        self._take(parts)
+
+    def _take(self, parts: ExtensorParts) -> PatellofemoralContact:
+        """Build the lines and the mechanism of parts; return its contact as it was prepared."""
+        self._parts, self._chain = parts, parts.chain
+        self.muscle = muscle_line(parts.muscle, parts.chain, parts.femoral)
+        self.ligament = self._ligament_line()
+        self._check_fixed_ends()
+        self._mechanism, prepared = self._build_mechanism()
+        return prepared
+
+    def given(self, pose: Array, coordinates: Array) -> PatellaState:
+        """Return the patella at given coordinates (3,), the femur at a pose (4, 4)."""
+        contact = self._mechanism.contact.at(coordinates)
+        return patella_at(self._mechanism, pose, coordinates, contact)
+
+    def solved(
+        self, pose: Array, guess: PatellaState | None = None, near: Array | None = None
+    ) -> PatellaState:
+        """Return the patella where its moments balance, the femur at a pose (4, 4).
+
+        Args:
+            pose: pose_femur_in_insert.
+            guess: the patella at a pose near by.
+            near: (3,) coordinates near by, without it; None searches all rotations.
+        """
+        if guess is None or not guess.status.found:
+            return solve_patella(self._mechanism, pose, near)
+        return solve_patella(self._mechanism, pose, guess.coordinates, guess.slopes)
+
+    def loads(
+        self, flexion: float, state: Posed, patella: PatellaState
+    ) -> tuple[Extensor, Unknown]:
+        """Return the mechanism and its muscle, both per unit tension.
+
+        Args:
+            flexion: rad, for messages.
+            state: the chain there.
+            patella: where it is.
+
+        Raises:
+            ComputationError: no patella at this frame, or a line's end inside what it wraps.
+        """
+        if not patella.status.found:
+            raise ComputationError(
+                f"patella lost at {flexion / DEGREE:.1f} deg of flexion: {patella.status.value}"
+            )
+        muscle, ligament = self.paths(state)
+        extensor = Extensor(
+            tuple(_on_tibia(load) for load in self.ligament.loads(ligament)),
+            patella.contact_point,
+            patella.contact_normal,
+            (self.muscle.name,),
+            muscle.wrap_angle,
+        )
+        return extensor, Unknown(muscle_load(self.muscle.name), self.muscle.loads(muscle))
+
+    def paths(self, state: Posed) -> tuple[TautPath, TautPath]:
+        """Return muscle and patellar ligament as they run, in the insert frame.
+
+        Raises:
+            ComputationError: a line's end inside what it wraps.
+        """
+        links = {point.link for line in (self.muscle, self.ligament) for point in line.points}
+        poses = {link: state.pose(link) for link in links | {"femur"}} | {"insert": np.eye(4)}
+        return self.muscle.path(poses), self.ligament.path(poses)
+
+    def _ligament_line(self) -> Line:
+        parts, wrap = self._parts, None
+        ligament = parts.ligament
+        if ligament.wrap is not None and parts.insert is not None:
+            tuberosity = transform(self._tibia_in_insert(), ligament.distal.position)
+            outline = ligament.wrap.outline(parts.insert, float(tuberosity[2]))
+            wrap = Wrap("insert", outline)
+        return Line("patellar_ligament", (ligament.proximal, ligament.distal), wrap)
+
+    def _tibia_in_insert(self) -> Array:
+        """Return the pose in the insert frame of the link that holds the ligament's end."""
+        on_tibia = self._chain.link_in(self._parts.ligament.distal.link, "tibia")
+        return inverse(self._chain.insert_in_tibia) @ on_tibia
+
+    def _check_fixed_ends(self) -> None:
+        """Raise if the end that does not move against an outline lies within it."""
+        ends, name = [], self.muscle.name
+        if self.muscle.wrap is not None:
+            last = self.muscle.points[self.muscle.wrap.stretch]
+            place = transform(self._chain.link_in(last.link, "femur"), last.position)
+            low, high = self._parts.femoral.bounds[:, 2]
+            whole = sagittal_outline([self._parts.femoral], 0.95 * np.linspace(low, high, 15))
+            ends.append((f"the origin of {name}", place, whole, "femur"))
+        if self.ligament.wrap is not None:
+            tuberosity = transform(self._tibia_in_insert(), self.ligament.points[1].position)
+            outline = self.ligament.wrap.outline
+            ends.append(("[patellar_ligament] distal", tuberosity, outline, "insert"))
+        for where, point, outline, bone in ends:
+            if is_inside(point, outline):
+                raise InputError(
+                    f"lies inside the outline of the {bone} that the line wraps",
+                    where,
+                    "move the point, or set wrap = false",
+                )
+
+    def _build_mechanism(self) -> tuple[ExtensorMechanism, PatellofemoralContact]:
+        """Return the mechanism, and its contact as it was prepared."""
+        parts, chain = self._parts, self._chain
+        stretch = off_femur(self.muscle.points, chain)
+        origin, insertion = self.muscle.points[stretch : stretch + 2]
+        joint, (proximal, distal) = chain.patella_joint_in_femur, self.ligament.points
+        prepared = _patellar_contact(parts.femoral, parts.button, joint.tobytes())
+        mechanism = ExtensorMechanism(
+            prepared.unused(),
+            joint,
+            transform(chain.link_in(origin.link, "femur"), origin.position),
+            transform(chain.link_in(insertion.link, "patella"), insertion.position),
+            transform(chain.link_in(proximal.link, "patella"), proximal.position),
+            transform(self._tibia_in_insert(), distal.position),
+            parts.ligament.length,
+            None if self.muscle.wrap is None else self.muscle.wrap.outline,
+            None if self.ligament.wrap is None else self.ligament.wrap.outline,
+        )
+        return mechanism, prepared
+
+
+class ExtensorFrames(ExtensorLines):
     """Muscle, patella and patellar ligament over the frames of a motion.
 
     Args:
@@ -80,15 +225,6 @@ class ExtensorFrames:
         else:
             self.states = _solve_all(self._mechanism, poses)
             self._joints = self._differentiate(time, poses, rates)
-
-    def _take(self, parts: ExtensorParts) -> PatellofemoralContact:
-        """Build the lines and the mechanism of parts; return its contact as it was prepared."""
-        self._parts, self._chain = parts, parts.chain
-        self.muscle = muscle_line(parts.muscle, parts.chain, parts.femoral)
-        self.ligament = self._ligament_line()
-        self._check_fixed_ends()
-        self._mechanism, prepared = self._build_mechanism()
-        return prepared
 
     def moved(self, parts: ExtensorParts, poses: Array, frames: Sequence[int]) -> "ExtensorFrames":
         """Return the mechanism of a solved patella with its parts or the femur a little elsewhere.
@@ -153,85 +289,7 @@ class ExtensorFrames:
         Raises:
             ComputationError: no patella at this frame, or a line's end inside what it wraps.
         """
-        patella = self.states[k] if patella is None else patella
-        if not patella.status.found:
-            raise ComputationError(
-                f"patella lost at {flexion / DEGREE:.1f} deg of flexion: {patella.status.value}"
-            )
-        muscle, ligament = self.paths(state)
-        extensor = Extensor(
-            tuple(_on_tibia(load) for load in self.ligament.loads(ligament)),
-            patella.contact_point,
-            patella.contact_normal,
-            (self.muscle.name,),
-            muscle.wrap_angle,
-        )
-        return extensor, Unknown(muscle_load(self.muscle.name), self.muscle.loads(muscle))
-
-    def paths(self, state: ChainState) -> tuple[TautPath, TautPath]:
-        """Return muscle and patellar ligament as they run, in the insert frame.
-
-        Raises:
-            ComputationError: a line's end inside what it wraps.
-        """
-        links = {point.link for line in (self.muscle, self.ligament) for point in line.points}
-        poses = {link: state.pose(link) for link in links | {"femur"}} | {"insert": np.eye(4)}
-        return self.muscle.path(poses), self.ligament.path(poses)
-
-    def _ligament_line(self) -> Line:
-        parts, wrap = self._parts, None
-        ligament = parts.ligament
-        if ligament.wrap is not None and parts.insert is not None:
-            tuberosity = transform(self._tibia_in_insert(), ligament.distal.position)
-            outline = ligament.wrap.outline(parts.insert, float(tuberosity[2]))
-            wrap = Wrap("insert", outline)
-        return Line("patellar_ligament", (ligament.proximal, ligament.distal), wrap)
-
-    def _tibia_in_insert(self) -> Array:
-        """Return the pose in the insert frame of the link that holds the ligament's end."""
-        on_tibia = self._chain.link_in(self._parts.ligament.distal.link, "tibia")
-        return inverse(self._chain.insert_in_tibia) @ on_tibia
-
-    def _check_fixed_ends(self) -> None:
-        """Raise if the end that does not move against an outline lies within it."""
-        ends, name = [], self.muscle.name
-        if self.muscle.wrap is not None:
-            last = self.muscle.points[self.muscle.wrap.stretch]
-            place = transform(self._chain.link_in(last.link, "femur"), last.position)
-            low, high = self._parts.femoral.bounds[:, 2]
-            whole = sagittal_outline([self._parts.femoral], 0.95 * np.linspace(low, high, 15))
-            ends.append((f"the origin of {name}", place, whole, "femur"))
-        if self.ligament.wrap is not None:
-            tuberosity = transform(self._tibia_in_insert(), self.ligament.points[1].position)
-            outline = self.ligament.wrap.outline
-            ends.append(("[patellar_ligament] distal", tuberosity, outline, "insert"))
-        for where, point, outline, bone in ends:
-            if is_inside(point, outline):
-                raise InputError(
-                    f"lies inside the outline of the {bone} that the line wraps",
-                    where,
-                    "move the point, or set wrap = false",
-                )
-
-    def _build_mechanism(self) -> tuple[ExtensorMechanism, PatellofemoralContact]:
-        """Return the mechanism, and its contact as it was prepared."""
-        parts, chain = self._parts, self._chain
-        stretch = off_femur(self.muscle.points, chain)
-        origin, insertion = self.muscle.points[stretch : stretch + 2]
-        joint, (proximal, distal) = chain.patella_joint_in_femur, self.ligament.points
-        prepared = _patellar_contact(parts.femoral, parts.button, joint.tobytes())
-        mechanism = ExtensorMechanism(
-            prepared.unused(),
-            joint,
-            transform(chain.link_in(origin.link, "femur"), origin.position),
-            transform(chain.link_in(insertion.link, "patella"), insertion.position),
-            transform(chain.link_in(proximal.link, "patella"), proximal.position),
-            transform(self._tibia_in_insert(), distal.position),
-            parts.ligament.length,
-            None if self.muscle.wrap is None else self.muscle.wrap.outline,
-            None if self.ligament.wrap is None else self.ligament.wrap.outline,
-        )
-        return mechanism, prepared
+        return self.loads(flexion, state, self.states[k] if patella is None else patella)
 
     def _differentiate(self, time: Array, poses: Array, rates: Rates) -> Array:
         """Return the solved coordinates with their rates (f, 3, 3); NaN where it is lost.

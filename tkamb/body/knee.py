@@ -145,6 +145,19 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
     return replace(held[0].loads(), ambiguous=len(held) > 1)
 
 
+def solved_unknowns(geometry: KneeGeometry, loads: KneeLoads, friction: float) -> list[Unknown]:
+    """Return the unknown loads of one frame in the load state that was found.
+
+    Args:
+        geometry: the frame.
+        loads: what its equations say; without problems.
+        friction: Coulomb coefficient of the femorotibial contact.
+    """
+    extensors = geometry.extensor.muscles if geometry.extensor else ()
+    slack = frozenset(extensors if loads.slack else ())
+    return KneeSystem(geometry, friction, LoadState(loads.lifted, slack)).unknowns
+
+
 def unsolved(problems: Iterable[str]) -> KneeLoads:
     """Return a frame without a number, and why."""
     nan = np.nan
@@ -212,7 +225,7 @@ class KneeSystem:
         self.lifted, self.slack = assumed
         state = geometry.state
         hip = unknowns.hip(state.point("hip", np.zeros(3)))
-        found = [*hip, *self._extensor(), *self._knee()]
+        found = self.unknowns = [*hip, *self._extensor(), *self._knee()]
         self.names = [unknown.name for unknown in found]
         ground = [geometry.ground] if geometry.ground else []
         couples = [unknowns.moment_pair("tibia", "femur", unknowns.AXES[a]) for a in ("ap", "ml")]

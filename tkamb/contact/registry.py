@@ -55,32 +55,46 @@ def contact_class(name: str) -> type[ContactModel]:
     return CONTACT_MODELS.find(name)
 
 
-def contact_model(name: str, resolution_mm: float = 1.0, **options: Any) -> ContactModel:
+def contact_model(
+    name: str,
+    resolution_mm: float | None = None,
+    *,
+    resolution: float | None = None,
+    **options: Any,
+) -> ContactModel:
     """Return the contact model of that name.
 
     Args:
         name: one of `contact_names()`.
-        resolution_mm: spacing of its map points, mm.
+        resolution_mm: spacing of its map points, mm; 1 mm if neither is given.
+        resolution: the same in metres, instead.
         options: the model's own options, the fields of its class (SI).
 
     Raises:
         InputError: no such name or option, an option's value that is none of its words, or
-            a resolution that is not positive or resolves no contact.
+            a resolution that is not positive, resolves no contact, or is given twice.
     """
     found, where = contact_class(name), f"contact model '{name}'"
-    if not (math.isfinite(resolution_mm) and 0 < resolution_mm <= COARSEST_MM):
-        mend = f"give more than 0, at most {COARSEST_MM:g} mm"
-        raise InputError(f"resolution {resolution_mm} mm", where, mend)
+    if resolution is not None and resolution_mm is not None:
+        raise InputError("resolution and resolution_mm are both given", where, "give one of them")
+    if resolution is None:
+        resolution_mm = 1.0 if resolution_mm is None else resolution_mm
+        words, spacing = f"resolution {resolution_mm} mm", resolution_mm * MILLIMETRE
+    else:
+        words, spacing = f"resolution {resolution} m", resolution
+    if not (math.isfinite(spacing) and 0 < spacing <= COARSEST_MM * MILLIMETRE):
+        mend = f"give more than 0, at most {COARSEST_MM:g} mm ({COARSEST_MM / 1e3:g} m)"
+        raise InputError(words, where, mend)
     own = _options(found)
     for option, value in options.items():
         if option not in own:
             raise InputError(f"has no option '{option}'", where, names_near(option, own))
-        words = _words(found, option)
-        if words and value not in words:
-            mend = f"one of {', '.join(map(str, words))}"
+        choices = _words(found, option)
+        if choices and value not in choices:
+            mend = f"one of {', '.join(map(str, choices))}"
             raise InputError(f"option '{option}' cannot be {value!r}", where, mend)
         _check_kind(found, option, value, where)
-    return found(resolution=resolution_mm * MILLIMETRE, **options)  # type: ignore[call-arg]
+    return found(resolution=spacing, **options)  # type: ignore[call-arg]
 
 
 def contact_options(name: str) -> tuple[str, ...]:

@@ -173,7 +173,7 @@ class Mechanics:
         """
         recorded = self.case.motion.coordinates[k]
         place = recorded if coordinates is None else coordinates
-        state = self.case.chain.at(self._chain_motion(k, place, patella))
+        state = self.case.chain.at(self.chain_motion(k, place, patella))
         poses = {link: state.pose(link) for link in self._attachment_links()}
         tensions, known = self._pulls(poses)
         geometry = KneeGeometry(
@@ -261,10 +261,12 @@ class Mechanics:
         sides = zip(SIDES, found, strict=True)
         return {side: slip for side, slip in sides if slip is not None}
 
-    def _chain_motion(
-        self, k: int, coordinates: Array, patella: "PatellaState | None" = None
+    def chain_motion(
+        self, k: int, coordinates: Array | None = None, patella: "PatellaState | None" = None
     ) -> ChainMotion:
+        """Return how the chain moves in frame k, perhaps at other coordinates (6,)."""
         motion, tibia = self.case.motion, self.case.tibia
+        coordinates = motion.coordinates[k] if coordinates is None else coordinates
         joints = np.stack([coordinates, motion.velocity[k], motion.acceleration[k]])
         if self.extensor:
             own = self.extensor.joints(k)
@@ -276,14 +278,19 @@ class Mechanics:
         return ChainMotion(tibia.pose[k], tibia.velocity[k], tibia.acceleration[k], joints)
 
     def _ground(self, k: int, state: ChainState) -> PointForces | None:
+        load = self.ground_in_laboratory(k)
+        return None if load is None else state.ground_reaction(*load)
+
+    def ground_in_laboratory(self, k: int) -> tuple[Array, Array, Array] | None:
+        """Return force, its point and the moment about it, (3,) each; None if not measured."""
         ground, table = self.case.ground, self.case.scene.ground_reaction
         if ground is None or table is None:
             return None
         if table.applied == "ankle":
             tibia = self.case.tibia
             assert tibia is not None
-            return state.ground_reaction(ground.force[k], tibia.pose[k][:3, 3], np.zeros(3))
-        return state.ground_reaction(ground.force[k], ground.point[k], ground.moment[k])
+            return ground.force[k], tibia.pose[k][:3, 3], np.zeros(3)
+        return ground.force[k], ground.point[k], ground.moment[k]
 
     def _adjust(self, k: int) -> "tuple[Adjustment | None, tuple[str, ...]]":
         """Return the femoral adjustment, if asked for, and why it is not possible."""
@@ -351,7 +358,7 @@ class Mechanics:
             links |= {ligament.proximal.link, ligament.distal.link}
         poses = {link: np.empty((len(recorded), 4, 4)) for link in links}
         for k, coordinates in enumerate(recorded):  # one at a time: a state is a quarter of a MB
-            state = self.case.chain.at(self._chain_motion(k, coordinates))
+            state = self.case.chain.at(self.chain_motion(k, coordinates))
             for link in links:
                 poses[link][k] = state.pose(link)
         return poses

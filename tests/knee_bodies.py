@@ -1,0 +1,179 @@
+"""The shipped knee inside a whole body: Pinocchio's sample humanoid with a leg of other names.
+
+The leg hangs from the pelvis, its knee is one free joint, the foot a body of its own, the world's
+z axis is up; a left one is the mirror image. Poses and motion of its bodies are those of the plain
+chain, which stands on its tibia with y up.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+
+import tkamb
+from tkamb.knee.canonical import mirrored_spatial
+from tkamb.knee.parts import mirrored_surface
+from tkamb.units import STANDARD_GRAVITY
+
+MIRROR = np.diag([1.0, 1.0, -1.0])
+UPRIGHT = pin.SE3(np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]), np.array([0.3, -0.2, 0.1]))
+"""Turns y up into z up, and moves the laboratory."""
+NAMES = {"femur": "thigh_x", "tibia": "calf", "patella": "kneecap", "insert": "tray", "hip": "cup"}
+FOOT = pin.Inertia(0.9, np.array([0.05, -0.03, 0.01]), np.diag([1e-3, 2e-3, 3e-3]))
+
+
+def mirrored_se3(placement):
+    rotation = MIRROR @ placement.rotation @ MIRROR
+    return pin.SE3(rotation, MIRROR @ placement.translation)
+
+
+def mirrored_inertia(inertia):
+    return pin.Inertia(inertia.mass, MIRROR @ inertia.lever, MIRROR @ inertia.inertia @ MIRROR)
+
+
+def same(value):
+    return value
+
+
+@dataclass
+class Body:
+    """A whole body with the leg, and the state that belongs to a frame of the plain chain."""
+
+    model: pin.Model
+    knee: tkamb.Knee
+    left: bool
+    plain: tkamb.Knee
+
+    def state(self, q, v, a, external):
+        """Return q, v, a and external forces of the body for those of the plain chain."""
+        turn = mirrored_se3 if self.left else same
+        flip = mirrored_spatial if self.left else same
+        plain, data = self.plain, self.plain.model.createData()
+        pin.forwardKinematics(plain.model, data, q, v, a)
+        anatomy = plain.anatomy
+        pose, twist, rate = {}, {}, {}
+        for name in ("tibia", "femur", "patella"):
+            place = getattr(anatomy, name)
+            pose[name] = UPRIGHT * turn(data.oMi[place.joint] * place.placement)
+            twist[name], rate[name] = (
+                pin.Motion(flip(place.placement.actInv(moved[place.joint]).vector))
+                for moved in (data.v, data.a)
+            )
+        model = self.model
+        q2, v2, a2 = (
+            pin.randomConfiguration(model, -np.ones(model.nq), np.ones(model.nq)),
+            np.zeros(model.nv),
+            np.zeros(model.nv),
+        )
+        rng = np.random.default_rng(4)
+        v2[:], a2[:] = 0.3 * rng.standard_normal(model.nv), rng.standard_normal(model.nv)
+        where = {n: model.joints[model.getJointId(n)] for n in model.names if n != "universe"}
+        root, hip, knee = where["root_joint"], where["hip_ball"], where["knee_free"]
+        ankle = where["ankle_hinge"]
+        q2[ankle.idx_q] = v2[ankle.idx_v] = a2[ankle.idx_v] = 0.0
+        # the pelvis so that the thigh is where it has to be
+        turn_hip = pin.SE3(pin.Quaternion(q2[hip.idx_q : hip.idx_q + 4]).matrix(), np.zeros(3))
+        hip_id, thigh = model.getJointId("hip_ball"), model.frames[model.getFrameId("thigh_x")]
+        to_thigh = model.jointPlacements[hip_id] * turn_hip * thigh.placement
+        q2[root.idx_q : root.idx_q + 7] = pin.SE3ToXYZQUAT(pose["femur"] * to_thigh.inverse())
+        spin, more = np.zeros(6), np.zeros(6)
+        spin[3:], more[3:] = v2[hip.idx_v :][:3], a2[hip.idx_v :][:3]
+        s, ds = (thigh.placement.actInv(pin.Motion(x)) for x in (spin, more))
+        v_root = to_thigh.act(twist["femur"] - s)
+        a_root = to_thigh.act(rate["femur"] - ds - twist["femur"].cross(s))
+        v2[root.idx_v :][:6], a2[root.idx_v :][:6] = v_root.vector, a_root.vector
+        for joint, name in ((knee, "tibia"), (where["cap_free"], "patella")):
+            relative = pose["femur"].actInv(pose[name])
+            s = twist[name] - relative.actInv(twist["femur"])
+            ds = rate[name] - relative.actInv(rate["femur"]) - twist[name].cross(s)
+            q2[joint.idx_q :][:7] = pin.SE3ToXYZQUAT(relative)
+            v2[joint.idx_v :][:6], a2[joint.idx_v :][:6] = s.vector, ds.vector
+        forces = [pin.Force.Zero() for _ in range(model.njoints)]
+        place = anatomy.tibia
+        load = place.placement.actInv(external[place.joint])
+        ankle_id = model.getJointId("ankle_hinge")
+        forces[ankle_id] = model.jointPlacements[ankle_id].actInv(pin.Force(flip(load.vector)))
+        return q2, v2, a2, pin.StdVec_Force(forces)
+
+
+def whole_body(plain, left=False, leg_first=False):
+    """Return the sample humanoid with the leg of a plain chain's knee."""
+    turn, weigh = (mirrored_se3, mirrored_inertia) if left else (same, same)
+    anatomy, user = plain.anatomy, plain.model
+    model = pin.Model() if leg_first else pin.buildSampleModelHumanoid()
+    if leg_first:
+        root = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
+    else:
+        root = model.getJointId("root_joint")
+    hip = turn(pin.SE3(np.eye(3), (anatomy.hip.placement).translation))
+    on_thigh = pin.SE3(pin.utils.rpyToMatrix(0.3, -0.2, 0.5), np.array([0.01, 0.02, -0.03]))
+    # the joint's frame is the hip's; the thigh's frame is turned in it
+    thigh = hip.inverse()
+    ball = model.addJoint(
+        root, pin.JointModelSpherical(), pin.SE3(np.eye(3), np.array([0, 0.1, -0.1])), "hip_ball"
+    )
+    place = anatomy.femur
+    own = user.inertias[place.joint].se3Action(place.placement.inverse())
+    model.appendBodyToJoint(ball, weigh(own), thigh)
+    frame(model, "thigh_x", ball, thigh)
+    frame(model, "cup", ball, pin.SE3.Identity())
+    cap = model.addJoint(ball, pin.JointModelFreeFlyer(), thigh, "cap_free")
+    own = user.inertias[anatomy.patella.joint].se3Action(anatomy.patella.placement.inverse())
+    model.appendBodyToJoint(cap, weigh(own), pin.SE3.Identity())
+    frame(model, "kneecap", cap, pin.SE3.Identity())
+    shank = model.addJoint(ball, pin.JointModelFreeFlyer(), thigh, "knee_free")
+    ankle = model.addJoint(shank, pin.JointModelRX(), on_thigh, "ankle_hinge")
+    whole = weigh(user.inertias[anatomy.tibia.joint].se3Action(anatomy.tibia.placement.inverse()))
+    rest = whole.toDynamicParameters() - FOOT.se3Action(on_thigh).toDynamicParameters()
+    model.appendBodyToJoint(shank, pin.Inertia.FromDynamicParameters(rest), pin.SE3.Identity())
+    model.appendBodyToJoint(ankle, FOOT, pin.SE3.Identity())
+    frame(model, "calf", shank, pin.SE3.Identity())
+    tray = turn(anatomy.tibia.placement.inverse() * plain.bridge.insert.placement)
+    frame(model, "tray", shank, tray)
+    if leg_first:
+        for k in range(20):
+            base = root if k % 5 == 0 else model.njoints - 1
+            arm = model.addJoint(base, pin.JointModelRY(), pin.SE3.Random(), f"arm_{k}")
+            model.appendBodyToJoint(arm, pin.Inertia.Random(), pin.SE3.Identity())
+    model.gravity = pin.Motion(np.array([0, 0, -STANDARD_GRAVITY]), np.zeros(3))
+    plane = turn(anatomy.femur.placement.inverse() * anatomy.plane.placement)
+    return Body(model, other_knee(plain, model, left, plane), left, plain)
+
+
+def frame(model, name, joint, placement):
+    model.addFrame(pin.Frame(name, joint, 0, placement, pin.FrameType.BODY))
+
+
+def moved(point, left):
+    link = NAMES[point.link]
+    return (link, tuple(MIRROR @ point.position if left else point.position))
+
+
+def other_knee(plain, model, left, plane):
+    """Return the same knee on another model, its meshes as trimesh objects or arrays."""
+    surfaces = [plain.femoral, plain.insert, plain.button]
+    if left:
+        surfaces = [mirrored_surface(one) for one in surfaces]
+    femoral, insert, button = ((one.vertices, one.faces) for one in surfaces)
+    bundles = [
+        replace(one, proximal=moved(one.proximal, left), distal=moved(one.distal, left))
+        for one in plain.ligaments
+    ]
+    muscle, line = plain.extensor.quadriceps, plain.extensor.patellar_ligament
+    extensor = tkamb.Extensor(
+        replace(muscle, points=tuple(moved(point, left) for point in muscle.points)),
+        replace(line, proximal=moved(line.proximal, left), distal=moved(line.distal, left)),
+        plane=plane,
+        solved=plain.extensor.solved,
+    )
+    return tkamb.Knee(
+        model,
+        side="left" if left else "right",
+        implant=tkamb.Implant(surfaces[0].mesh if not left else femoral, insert, button),
+        ligaments=bundles,
+        extensor=extensor,
+        contact=plain.contact.model,
+        friction=plain.friction,
+        frames=NAMES,
+        joints=["knee_free"],
+    )

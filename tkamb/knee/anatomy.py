@@ -1,0 +1,238 @@
+"""Where the knee is in a Pinocchio model: its frames, its joints, and which bodies are the shank.
+
+A knee divides the tree of a model in two. The shank is every body on the tibia's side of the knee
+(the foot among them), whatever joints lie below or above. The thigh is the body that the frame
+"femur" is fixed to: what the pelvis does to it is the load at the hip. So the same equations hold
+for a leg that stands on its foot, a leg that hangs from a pelvis, and a whole body.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from tkamb.errors import InputError, names_near
+
+NEEDED = ("femur", "tibia")
+"""Parts of the knee whose frames a model must have."""
+PARTS = (*NEEDED, "femoral", "insert", "patella", "hip")
+"""Parts of the knee that a frame may be named for."""
+INSERT_JOINT, PLANE_JOINT = "knee_ap", "patella_ap"
+"""Joints of a tkamb URDF whose placements are the insert frame and the patella's plane."""
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A frame that is fixed to a joint of the model.
+
+    Args:
+        joint: index.
+        placement: of the frame in the joint's frame.
+    """
+
+    joint: int
+    placement: pin.SE3
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """The knee in a model.
+
+    Args:
+        model: the user's, unchanged.
+        tibia: the tibia.
+        femur: the femur.
+        femoral: axes of the femoral component's mesh, fixed to the femur.
+        insert: axes of the insert's mesh, fixed to the tibia.
+        hip: hip centre, fixed to the femur.
+        patella: the patella; None where the model has none that moves against the femur.
+        patella_fixed: a frame "patella" that is fixed to the femur; None without one.
+        plane: the sagittal plane of the patella, fixed to the femur.
+        knee_joints: indices of the joints between tibia and femur, root-most first.
+        shank: indices of the joints whose bodies are on the tibia's side.
+        names: part -> name of a frame, as given.
+    """
+
+    model: pin.Model
+    tibia: Place
+    femur: Place
+    femoral: Place
+    insert: Place
+    hip: Place
+    patella: Place | None
+    plane: Place
+    knee_joints: tuple[int, ...]
+    shank: tuple[int, ...]
+    names: Mapping[str, str]
+
+    @property
+    def fixed(self) -> bool:
+        """Whether the tibia is fixed to the universe."""
+        return self.tibia.joint == 0
+
+    def frame(self, name: str) -> Place:
+        """Return a frame by the name of its part in the knee, or by its name in the model.
+
+        Raises:
+            InputError: no such frame.
+        """
+        known = {
+            "femur": self.femur,
+            "tibia": self.tibia,
+            "femoral": self.femoral,
+            "insert": self.insert,
+            "hip": self.hip,
+        }
+        if name in known:
+            return known[name]
+        if name == "patella" and self.patella is not None:
+            return self.patella
+        return _frame(self.model, self.names.get(name, name))
+
+
+def find_anatomy(
+    model: pin.Model,
+    names: Mapping[str, str],
+    joints: Sequence[str],
+    plane: pin.SE3 | None,
+) -> Anatomy:
+    """Return where the knee is in a model.
+
+    Args:
+        model: any Pinocchio model.
+        names: part -> name of a frame of the model, for parts of `PARTS`.
+        joints: names of the knee's joints; empty: the path from tibia to femur in the tree.
+        plane: pose of the patella's sagittal plane in the frame "femur"; None: as documented in
+            `tkamb.knee.parts.Extensor`.
+
+    Raises:
+        InputError: an unknown part, frame or joint; tibia and femur fixed to each other.
+    """
+    for part in names:
+        if part not in PARTS:
+            raise InputError(f"no part '{part}' of the knee", "frames", names_near(part, PARTS))
+    places = {}
+    for part in PARTS:
+        if part in names or part in NEEDED or model.existFrame(part):
+            places[part] = _frame(model, names.get(part, part), part)
+    tibia, femur = places["tibia"], places["femur"]
+    path = _path(model, tibia.joint, femur.joint)
+    if not path:
+        raise InputError("are fixed to each other", "frames femur and tibia", "no joint is between")
+    if tibia.joint in path and femur.joint in path:
+        raise InputError(
+            "hang side by side on another body",
+            "frames femur and tibia",
+            "one must carry the other",
+        )
+    _check_joints(model, joints, path)
+    patella = places.get("patella")
+    if patella is not None and patella.joint == femur.joint:
+        patella = None
+    shank = _shank(model, tibia.joint, femur.joint, path, patella)
+    for part, base in (("insert", tibia), ("femoral", femur), ("hip", femur)):
+        if part in places and places[part].joint != base.joint:
+            raise InputError(
+                f"is not fixed to the {'tibia' if base is tibia else 'femur'}",
+                f"frame {names.get(part, part)}",
+                f"name another one: frames={{'{part}': ...}}",
+            )
+    insert = places.get("insert") or _joint_placement(model, INSERT_JOINT, tibia) or tibia
+    if plane is not None:
+        sagittal = Place(femur.joint, femur.placement * plane)
+    else:
+        sagittal = _joint_placement(model, PLANE_JOINT, femur) or femur
+    return Anatomy(
+        model,
+        tibia,
+        femur,
+        places.get("femoral") or femur,
+        insert,
+        places.get("hip") or _hip(femur, path),
+        patella,
+        sagittal,
+        path,
+        shank,
+        names,
+    )
+
+
+def _frame(model: pin.Model, name: str, part: str | None = None) -> Place:
+    """Return a frame by name; of several of one name the body's."""
+    if not model.existFrame(name):
+        known = [frame.name for frame in model.frames]
+        mend = names_near(name, known)
+        if part is not None:
+            mend = f"name it: frames={{'{part}': ...}}; {mend}"
+        raise InputError(f"no frame '{name}' in the model", "frames", mend)
+    same = [frame for frame in model.frames if frame.name == name]
+    bodies = [frame for frame in same if frame.type == pin.FrameType.BODY]
+    frame = (bodies or same)[0]
+    return Place(frame.parentJoint, frame.placement)
+
+
+def _joint_placement(model: pin.Model, name: str, base: Place) -> Place | None:
+    """Return where a joint stands on the body of a frame; None where it does not."""
+    if not model.existJointName(name):
+        return None
+    joint = model.getJointId(name)
+    if model.parents[joint] != base.joint:
+        return None
+    return Place(base.joint, model.jointPlacements[joint])
+
+
+def _ancestors(model: pin.Model, joint: int) -> list[int]:
+    """Return a joint and what carries it, up to the universe."""
+    line = [joint]
+    while line[-1]:
+        line.append(int(model.parents[line[-1]]))
+    return line
+
+
+def _path(model: pin.Model, one: int, other: int) -> tuple[int, ...]:
+    """Return the joints that lie between two bodies, ascending."""
+    first, second = set(_ancestors(model, one)), set(_ancestors(model, other))
+    return tuple(sorted(first ^ second))
+
+
+def _check_joints(model: pin.Model, joints: Sequence[str], path: tuple[int, ...]) -> None:
+    found = [model.names[joint] for joint in path]
+    for name in joints:
+        if name not in found:
+            words = f"the joints between tibia and femur are {', '.join(found)}"
+            raise InputError(f"joint '{name}' is not part of the knee", "joints", words)
+    if joints and len(joints) != len(path):
+        left_out = ", ".join(name for name in found if name not in joints)
+        raise InputError(f"leaves out {left_out}", "joints", "name all joints of the knee")
+
+
+def _shank(
+    model: pin.Model, tibia: int, femur: int, path: tuple[int, ...], patella: Place | None
+) -> tuple[int, ...]:
+    """Return the joints whose bodies hang together with the tibia once the knee is cut.
+
+    A body between the two counts as the shank's. Whatever hangs from the femur, the patella or
+    the universe does not.
+    """
+    side = {tibia, *path} - {femur}
+    apart = {0, femur} | (set() if patella is None else {patella.joint})
+    grown = True
+    while grown:
+        before = len(side)
+        side |= {int(model.parents[joint]) for joint in side if joint} - apart
+        side |= {
+            joint for joint in range(1, model.njoints) if int(model.parents[joint]) in side - {0}
+        } - apart
+        grown = len(side) > before
+    return tuple(sorted(side - {0}))
+
+
+def _hip(femur: Place, path: tuple[int, ...]) -> Place:
+    """Return the joint that carries the femur, or its own frame where the knee's does."""
+    return femur if femur.joint in path else Place(femur.joint, pin.SE3.Identity())
+
+
+def knee_size(anatomy: Anatomy) -> int:
+    """Return the number of degrees of freedom between tibia and femur."""
+    return int(np.sum([anatomy.model.joints[joint].nv for joint in anatomy.knee_joints]))

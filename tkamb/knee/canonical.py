@@ -1,0 +1,390 @@
+"""The knee of any model as the chain that its equations are written for.
+
+    tibia -> (six knee coordinates) -> femur -> (patella's sagittal plane) -> patella
+
+The chain holds the thigh's and the patella's inertia. What the shank needs, with all that hangs
+from it, is one wrench: its own equations of motion in the user's model. A left knee is mirrored on
+the way in and its loads on the way out, so that the chain is always a right knee's.
+
+With s the twist of the femur against the tibia and s' its rate in the femur's axes, both from the
+spatial velocities v and accelerations a of the two frames,
+
+    s = v_F - X v_T,    s' = a_F - X a_T - v_F x s,    J qd = s,    J qdd = s' - J' qd
+
+give the rates of the knee coordinates, whatever joints the model has there.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from tkamb.body.chain import Chain, ChainMotion, ChainState
+from tkamb.body.load import LinkPoint, PointForces, wrenches
+from tkamb.errors import InputError
+from tkamb.geometry.frames import (
+    KNEE_JOINT_NAMES,
+    MIRROR,
+    PATELLA_JOINT_NAMES,
+    Array,
+    knee_coordinates,
+    mirrored_pose,
+)
+from tkamb.knee.anatomy import Anatomy, Place
+
+_TWIST_MIRROR = np.array([1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
+"""Signs of a twist or wrench (linear or force first) in the mirror image (z to -z)."""
+
+
+def mirrored_spatial(vector: Array) -> Array:
+    """Return twists or wrenches (..., 6) of the mirror image in the sagittal plane."""
+    return np.asarray(vector * _TWIST_MIRROR)
+
+
+def se3(pose: Array) -> pin.SE3:
+    """Return a pose (4, 4) as Pinocchio has it."""
+    return pin.SE3(pose[:3, :3], pose[:3, 3])
+
+
+class CanonicalChain(Chain):
+    """The chain of one knee: see the module.
+
+    Args:
+        anatomy: where the knee is in the user's model.
+        left: the knee is a left one.
+        with_patella: the chain has a patella.
+        component: axes of the femoral component, fixed to the femur's joint.
+        insert: the insert frame, fixed to the tibia's joint.
+    """
+
+    def __init__(
+        self,
+        anatomy: Anatomy,
+        left: bool,
+        with_patella: bool,
+        component: Place,
+        insert: Place,
+    ) -> None:
+        self.joints = KNEE_JOINT_NAMES + (PATELLA_JOINT_NAMES if with_patella else ())
+        self._left = left
+        model, user = pin.Model(), anatomy.model
+        model.gravity = pin.Motion(self._right(np.array(user.gravity.vector)))
+        joint = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
+        _add_body(model, "tibia", joint, self._placed(anatomy.tibia.placement))
+        placement = self._placed(insert.placement)
+        for name, kind in zip(KNEE_JOINT_NAMES, _KNEE_JOINTS, strict=True):
+            joint = model.addJoint(joint, kind(), placement, name)
+            placement = pin.SE3.Identity()
+        _add_body(model, "femur", joint)
+        femur = component.placement
+        hip = femur.inverse() * anatomy.hip.placement
+        _add_body(model, "hip", joint, self._placed(hip))
+        model.inertias[joint] = self._inertia(user.inertias[component.joint], femur)
+        if with_patella:
+            placement = self._placed(femur.inverse() * anatomy.plane.placement)
+            for name, kind in zip(PATELLA_JOINT_NAMES, _PATELLA_JOINTS, strict=True):
+                joint = model.addJoint(joint, kind(), placement, name)
+                placement = pin.SE3.Identity()
+            _add_body(model, "patella", joint)
+            if anatomy.patella is not None:
+                own = user.inertias[anatomy.patella.joint]
+                model.inertias[joint] = self._inertia(own, anatomy.patella.placement)
+        self._columns = [model.joints[model.getJointId(name)].idx_v for name in self.joints]
+        self._take(model)
+
+    def _right(self, vector: Array) -> Array:
+        return mirrored_spatial(vector) if self._left else vector
+
+    def _placed(self, placement: pin.SE3) -> pin.SE3:
+        pose = placement.homogeneous
+        return se3(mirrored_pose(pose) if self._left else pose)
+
+    def _inertia(self, inertia: pin.Inertia, placement: pin.SE3) -> pin.Inertia:
+        """Return the inertia of a body in the axes of a frame that is placed on it."""
+        own = inertia.se3Action(placement.inverse())
+        if not self._left:
+            return own
+        return pin.Inertia(own.mass, MIRROR @ own.lever, MIRROR @ own.inertia @ MIRROR)
+
+
+_KNEE_JOINTS = (
+    pin.JointModelPX,
+    pin.JointModelPY,
+    pin.JointModelPZ,
+    lambda: pin.JointModelRevoluteUnaligned(np.array([0.0, -1.0, 0.0])),
+    lambda: pin.JointModelRevoluteUnaligned(np.array([-1.0, 0.0, 0.0])),
+    pin.JointModelRZ,
+)
+_PATELLA_JOINTS = (pin.JointModelPX, pin.JointModelPY, pin.JointModelRZ)
+
+
+def _add_body(model: pin.Model, name: str, joint: int, placement: pin.SE3 | None = None) -> None:
+    place = pin.SE3.Identity() if placement is None else placement
+    model.addFrame(pin.Frame(name, joint, 0, place, pin.FrameType.BODY))
+
+
+@dataclass(frozen=True, eq=False)
+class KneePlace:
+    """Where a knee is at one instant of the user's model, as a right knee's.
+
+    Args:
+        pose: (4, 4) of the femoral component in the insert frame.
+        coordinates: (6,) knee coordinates, m and rad.
+        patella: (3,) coordinates of the patella, m, m, rad; None where the model has none.
+    """
+
+    pose: Array
+    coordinates: Array
+    patella: Array | None
+
+
+class Bridge:
+    """Carries poses, motions and loads between the user's model and the canonical chain.
+
+    Args:
+        anatomy: where the knee is in the user's model.
+        left: the knee is a left one.
+        chain: the canonical chain.
+        component: axes of the femoral component, fixed to the femur's joint.
+        insert: the insert frame, fixed to the tibia's joint.
+    """
+
+    def __init__(
+        self, anatomy: Anatomy, left: bool, chain: Chain, component: Place, insert: Place
+    ) -> None:
+        self.anatomy, self.left, self.chain = anatomy, left, chain
+        self.component, self.insert = component, insert
+        self._chain_data = chain.model.createData()
+        self._last = chain.model.getJointId(KNEE_JOINT_NAMES[-1])
+
+    def link_point(self, point: LinkPoint) -> LinkPoint:
+        """Return a point on a frame of the user's model as a point on a link of the chain.
+
+        Raises:
+            InputError: the frame is fixed to neither tibia, femur nor patella.
+        """
+        anatomy = self.anatomy
+        links = [("tibia", anatomy.tibia), ("femur", self.component)]
+        if anatomy.patella is not None:
+            links.append(("patella", anatomy.patella))
+        elif point.link == "patella" and "patella_ap" in self.chain.joints:
+            position = np.array(point.position)
+            return LinkPoint("patella", MIRROR @ position if self.left else position)
+        place = anatomy.frame(point.link)
+        for link, base in links:
+            if place.joint == base.joint:
+                local = (base.placement.inverse() * place.placement).act(point.position)
+                return LinkPoint(link, MIRROR @ local if self.left else np.array(local))
+        raise InputError(
+            f"frame '{point.link}' is fixed to neither tibia, femur nor patella",
+            "Knee",
+            "a line that leaves the knee is a muscle: Knee(..., muscles=[...])",
+        )
+
+    def place(self, data: Any) -> KneePlace:
+        """Return where the knee is, from data whose joint placements are up to date."""
+        insert = data.oMi[self.insert.joint] * self.insert.placement
+        femur = data.oMi[self.component.joint] * self.component.placement
+        pose = self._right(insert.actInv(femur))
+        patella = None
+        if self.anatomy.patella is not None and "patella_ap" in self.chain.joints:
+            plane = data.oMi[self.anatomy.plane.joint] * self.anatomy.plane.placement
+            own = data.oMi[self.anatomy.patella.joint] * self.anatomy.patella.placement
+            there = self._right(plane.actInv(own))
+            turn = np.arctan2(there[1, 0], there[0, 0])
+            patella = np.array([there[0, 3], there[1, 3], turn])
+        return KneePlace(pose, knee_coordinates(pose), patella)
+
+    def twist(self, data: Any) -> Array:
+        """Return the femur's twist (6,) against the insert, at the insert's origin, insert frame.
+
+        Args:
+            data: of the user's model, with joint placements and velocities up to date.
+        """
+        insert = data.oMi[self.insert.joint] * self.insert.placement
+        found = np.zeros(6)
+        for place, sign in ((self.component, 1.0), (self.insert, -1.0)):
+            if place.joint:
+                to_insert = insert.actInv(data.oMi[place.joint])
+                found += sign * to_insert.act(data.v[place.joint]).vector
+        return mirrored_spatial(found) if self.left else found
+
+    def motion(self, data: Any, patella: bool) -> ChainMotion:
+        """Return how the chain moves, after the user's `pin.forwardKinematics(..., q, v, a)`.
+
+        Args:
+            data: of the user's model.
+            patella: whether the chain has a patella; one that the model has not stands still, at
+                coordinates zero.
+        """
+        anatomy, place = self.anatomy, self.place(data)
+        tibia, still = anatomy.tibia, pin.Motion.Zero()
+        pose = self._right(data.oMi[tibia.joint] * tibia.placement)
+        rates = [
+            tibia.placement.actInv(still if not tibia.joint else moved[tibia.joint]).vector
+            for moved in (data.v, data.a)
+        ]
+        q = pin.neutral(self.chain.model)
+        q[7:13] = place.coordinates
+        joints = np.zeros((3, 9 if patella else 6))
+        knee = slice(0, 6)
+        joints[:, knee] = self._rates(q, place.coordinates, data, tibia, self.component, knee)
+        if patella and place.patella is not None:
+            assert anatomy.patella is not None
+            q[13:16] = place.patella
+            own = slice(6, 9)
+            joints[:, own] = self._rates(
+                q, place.patella, data, self.component, anatomy.patella, own
+            )
+        tibia_rates = [mirrored_spatial(rate) if self.left else rate for rate in rates]
+        return ChainMotion(pose, tibia_rates[0], tibia_rates[1], joints)
+
+    def _rates(
+        self, q: Array, place: Array, data: Any, base: Place, moved: Place, own: slice
+    ) -> Array:
+        """Return coordinates, rates and accelerations (3, n) between two bodies.
+
+        Args:
+            q: of the chain, its root at rest.
+            place: (n,) the coordinates.
+            data: of the user's model.
+            base: the body that carries,
+            moved: and the one that moves.
+            own: the n coordinates among the chain's joints.
+        """
+        twist, rate = self._relative(data, base, moved)
+        model, cache = self.chain.model, self._chain_data
+        joint = self._last if own.start == 0 else model.njoints - 1
+        columns = slice(6 + own.start, 6 + own.stop)
+        jacobian = pin.computeJointJacobian(model, cache, q, joint)[:, columns]
+        v = np.zeros(model.nv)
+        v[columns] = _solved(jacobian, twist)
+        pin.forwardKinematics(model, cache, q, v, np.zeros(model.nv))
+        acceleration = _solved(jacobian, rate - cache.a[joint].vector)
+        return np.stack([place, v[columns], acceleration])
+
+    def _relative(self, data: Any, base: Place, moved: Place) -> tuple[Array, Array]:
+        """Return s and s' of the module (6,), of one body against another, in the moved axes."""
+        there, still = data.oMi[moved.joint] * moved.placement, pin.Motion.Zero()
+        own, own_rate = (
+            moved.placement.actInv(still if not moved.joint else values[moved.joint])
+            for values in (data.v, data.a)
+        )
+        to_moved = there.actInv(data.oMi[base.joint])
+        carried, carried_rate = (
+            still if not base.joint else to_moved.act(values[base.joint])
+            for values in (data.v, data.a)
+        )
+        twist = own - carried
+        rate = own_rate - carried_rate - own.cross(twist)
+        found = twist.vector, rate.vector
+        if not self.left:
+            return found
+        return mirrored_spatial(found[0]), mirrored_spatial(found[1])
+
+    def shank_needs(self, data: Any, external: Any) -> Array:
+        """Return the wrench (6,) that the knee must exert on the shank, insert frame.
+
+        The sum over the shank's bodies of what their motion and weight need, less the external
+        loads on them: the equations of motion of the shank. Where the tibia is fixed to the
+        universe, the negative of the same sum over everything above the knee.
+
+        Args:
+            data: of the user's model, after `pin.forwardKinematics(model, data, q, v, a)`.
+            external: forces on the joints, each in its joint's frame; None: none.
+        """
+        anatomy = self.anatomy
+        insert = data.oMi[self.insert.joint] * self.insert.placement
+        bodies, sign = anatomy.shank, 1.0
+        if anatomy.fixed:
+            model = anatomy.model
+            carried = anatomy.knee_joints[0]
+            bodies, sign = tuple(model.subtrees[carried]), -1.0
+        total = np.zeros(6)
+        gravity = anatomy.model.gravity
+        for joint in bodies:
+            inertia, velocity = anatomy.model.inertias[joint], data.v[joint]
+            falling = data.a[joint] - data.oMi[joint].actInv(gravity)
+            needs = inertia * falling + velocity.cross(inertia * velocity)
+            if external is not None:
+                needs = needs - external[joint]
+            total += sign * insert.actInv(data.oMi[joint]).act(needs).vector
+        return mirrored_spatial(total) if self.left else total
+
+    def external_on(self, place: Place | None, data: Any, external: Any) -> Array:
+        """Return the external wrench (6,) on the body of a frame, insert frame."""
+        joint = 0 if place is None else place.joint
+        if external is None or not joint:
+            return np.zeros(6)
+        insert = data.oMi[self.insert.joint] * self.insert.placement
+        wrench = insert.actInv(data.oMi[joint]).act(external[joint]).vector
+        return mirrored_spatial(wrench) if self.left else wrench
+
+    def joint_forces(self, data: Any, loads: "dict[str, Array] | list[PointForces]") -> Any:
+        """Return loads on the chain's links as forces on the user's joints.
+
+        Args:
+            data: of the user's model, with joint placements up to date.
+            loads: link -> wrench (6,) about the insert's origin, insert frame; or point forces.
+
+        Returns:
+            `pin.StdVec_Force`, one per joint, each in its joint's frame.
+        """
+        forces = [pin.Force.Zero() for _ in range(self.anatomy.model.njoints)]
+        insert = data.oMi[self.insert.joint] * self.insert.placement
+        patella = self.anatomy.patella
+        homes = {
+            "tibia": self.insert.joint,
+            "femur": self.component.joint,
+            "patella": self.component.joint if patella is None else patella.joint,
+        }
+        for link, wrench in summed(loads).items():
+            joint = homes[link]
+            own = mirrored_spatial(wrench) if self.left else wrench
+            forces[joint] += data.oMi[joint].actInv(insert).act(pin.Force(own))
+        return pin.StdVec_Force(forces)
+
+    def _right(self, placement: pin.SE3) -> Array:
+        pose = placement.homogeneous
+        return mirrored_pose(pose) if self.left else pose
+
+
+def summed(loads: "dict[str, Array] | list[PointForces]") -> dict[str, Array]:
+    """Return link -> wrench (6,) about the insert's origin of loads in the insert frame."""
+    if isinstance(loads, dict):
+        return loads
+    total: dict[str, Array] = {}
+    if loads:
+        for load, wrench in zip(loads, wrenches(loads), strict=True):
+            total[load.link] = total.get(load.link, np.zeros(6)) + wrench
+    return total
+
+
+def _solved(jacobian: Array, twist: Array) -> Array:
+    """Return the rates that make a twist, the nearest to it where there are fewer than six."""
+    if jacobian.shape[1] == 6:
+        return np.asarray(np.linalg.solve(jacobian, twist))
+    return np.asarray(np.linalg.lstsq(jacobian, twist, rcond=None)[0])
+
+
+def canonical_state(
+    chain: Chain, motion: ChainMotion, shank: Array, thigh: Array, patella: Array
+) -> ChainState:
+    """Return the chain at one instant, with what the shank needs in the user's model.
+
+    Args:
+        chain: the canonical chain.
+        motion: how it moves.
+        shank: (6,) wrench that the knee must exert on the shank, insert frame.
+        thigh: (6,) external wrench on the thigh, insert frame.
+        patella: (6,) external wrench on the patella, insert frame.
+    """
+    state = chain.at(motion)
+    needs = [("tibia", shank), ("femur", -thigh)]
+    if "patella_ap" in chain.joints:
+        needs.append(("patella", -patella))
+    for link, wrench in needs:
+        if wrench.any():
+            state.add_need(link, wrench)
+    return state

@@ -1,0 +1,187 @@
+"""The femorotibial contact of a knee at one pose: wrench, friction, stiffness and damping.
+
+Everything is in the insert frame of a right knee; a twist or a small displacement is that of the
+femoral component's point at the insert's origin (m), then its rotation (rad).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tkamb.body.contact_points import CondylePoint
+from tkamb.body.load import wrench_of
+from tkamb.contact.model import ContactModel
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.probe import CondyleWrench, ProbedContact
+from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Array, cross, pose
+
+
+@dataclass(frozen=True)
+class DifferenceSettings:
+    """How the stiffness of a model without an exact tangent is found: by central differences.
+
+    Args:
+        step: m, of a translation. Large against what the solver's tolerance leaves open, small
+            against the radius of the contact.
+        exact_step: m, the same for a model without a solver, whose answers are exact.
+        arm: m; a rotation is this step over this arm.
+        tolerance: solver tolerance of a model that has one, for these evaluations.
+    """
+
+    step: float = 4e-6
+    exact_step: float = 1e-9
+    arm: float = 0.025
+    tolerance: float = 1e-6
+
+
+class KneeContact:
+    """A prepared contact model with friction.
+
+    Args:
+        model: the contact model.
+        pair: femoral component and insert.
+        friction: Coulomb coefficient.
+        settings: of the differences.
+    """
+
+    def __init__(
+        self,
+        model: ContactModel,
+        pair: ContactPair,
+        friction: float,
+        settings: DifferenceSettings | None = None,
+    ) -> None:
+        self.model, self.pair, self.friction = model, pair, friction
+        self.state: Any = model.prepare(pair)
+        self._settings = settings or DifferenceSettings()
+
+    def probe(self, guess: ContactResult | None = None) -> Any:
+        """Return a new probe (`tkamb.contact.probe.Probe`), which a caller keeps as warm start."""
+        return self.model.probe(self.state, guess)
+
+    def precise_probe(self, guess: ContactResult | None = None) -> Any:
+        """Return a new probe whose answers are precise enough for differences."""
+        names = {field.name for field in fields(self.model)}  # type: ignore[arg-type]
+        if "tolerance" not in names:
+            return self.probe(guess)
+        model = replace(self.model, tolerance=self._settings.tolerance)  # type: ignore[type-var]
+        return model.probe(self.state, guess)
+
+    def at(self, probe: Any, place: Array) -> ProbedContact:
+        """Return the contact at a pose (4, 4).
+
+        Raises:
+            ComputationError: the model is out of its range there, or has not converged.
+        """
+        if not np.isfinite(place).all():
+            raise ComputationError("the pose of the femur is not finite", "contact")
+        contact: ProbedContact = probe.at(place)
+        if not contact.known:
+            raise ComputationError(self._why(probe, place), "contact")
+        return contact
+
+    def _why(self, probe: Any, place: Array) -> str:
+        result = self.model.evaluate(self.state, place)
+        words = "; ".join(result.flags) or result.status.value.replace("_", " ")
+        if result.status is ContactStatus.OK:
+            words = "not converged"
+        depth = self.pair.approach(place)
+        return f"{self.model.name}: {words} (approach {depth * 1e3:.3g} mm)"
+
+    def wrench(self, contact: ProbedContact, twist: Array) -> Array:
+        """Return the wrench (6,) on the insert, friction included.
+
+        Args:
+            contact: at the pose.
+            twist: (6,) of the femur against the insert.
+        """
+        total = np.zeros(6)
+        for load in contact.loads:
+            total += load.wrench
+            if self.friction:
+                total += load.force * self._rubbing(load, twist)
+        return total
+
+    def _rubbing(self, load: CondyleWrench, twist: Array) -> Array:
+        """Return the friction's wrench (6,) on the insert per unit force of a condyle."""
+        sliding = twist[:3] + cross(twist[3:], load.point)
+        touch = CondylePoint(load.point, load.normal, sliding, 0.0)
+        return wrench_of(touch.point, touch.normal - touch.direction(self.friction))
+
+    def damping(self, contact: ProbedContact, twist: Array) -> Array:
+        """Return the derivative (6, 6) of the wrench on the insert by the femur's twist.
+
+        Friction alone has one. Central differences; the contact does not change with the twist.
+        """
+        if not self.friction or not contact.loads:
+            return np.zeros((6, 6))
+        steps = 1e-6 * np.diag([1.0, 1.0, 1.0, *np.full(3, 1.0 / self._settings.arm)])
+        columns = [
+            (self.wrench(contact, twist + step) - self.wrench(contact, twist - step))
+            / (2.0 * step.sum())
+            for step in steps
+        ]
+        return np.array(columns).T
+
+    def stiffness(
+        self, probe: Any, place: Array, contact: ProbedContact, twist: Array, exact: bool
+    ) -> Array:
+        """Return the derivative (6, 6) of the wrench on the insert by a displacement of the femur.
+
+        Args:
+            probe: warm start.
+            place: (4, 4) pose.
+            contact: there.
+            twist: (6,) of the femur, held.
+            exact: a tangent that the model knows only roughly is not taken.
+        """
+        rubs = bool(self.friction and np.any(twist) and contact.loads)
+        if contact.tangent and not (exact and (rubs or not contact.exact)):
+            total = np.zeros((6, 6))
+            for load in contact.loads:
+                assert load.stiffness is not None
+                total += load.stiffness
+                if rubs:
+                    pressed = -load.normal @ load.stiffness[:3]
+                    total += np.outer(self._rubbing(load, twist), pressed)
+            return total
+        precise = self.precise_probe(getattr(probe, "_guess", None))
+        self.at(precise, place)
+        settings = self._settings
+        if contact.tangent and contact.exact and not hasattr(self.model, "tolerance"):
+            settings = replace(settings, step=settings.exact_step)
+        return differences(
+            lambda moved: self.wrench(self.at(precise, moved), twist), place, settings
+        )
+
+
+def differences(
+    wrench: Callable[[Array], Array], place: Array, settings: DifferenceSettings
+) -> Array:
+    """Return the derivative (6, 6) of a wrench by a small displacement, by central differences.
+
+    Args:
+        wrench: of a pose (4, 4).
+        place: (4, 4) where.
+        settings: the step.
+    """
+    columns = []
+    for k in range(6):
+        size = settings.step if k < 3 else settings.step / settings.arm
+        ends = [wrench(displaced(place, sign * size * np.eye(6)[k])) for sign in (1.0, -1.0)]
+        columns.append((ends[0] - ends[1]) / (2.0 * size))
+    return np.array(columns).T
+
+
+def displaced(place: Array, displacement: Array) -> Array:
+    """Return a pose (4, 4) moved by a displacement (6,): translation, then rotation vector.
+
+    Both are about the insert's origin, in the insert frame.
+    """
+    turn = Rotation.from_rotvec(displacement[3:]).as_matrix()
+    return pose(turn @ place[:3, :3], turn @ place[:3, 3] + displacement[:3])

@@ -1,0 +1,153 @@
+"""What the equations of a knee say at one instant, in the axes and signs of the user's knee."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tkamb.body.knee import KneeGeometry
+from tkamb.body.knee import KneeLoads as SolvedLoads
+from tkamb.body.unknowns import MUSCLE, muscle_load
+from tkamb.geometry.frames import SIDES, Array
+
+MIRRORED = ("ml", "axial", "coronal")
+"""Parts of a load's name that change sign between a left knee and its mirror image: force along
+z, moments about y and x. Hip moments are named by their axes."""
+NAN = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class KneeLoads:
+    """Loads of the knee at one instant, SI, in the insert frame; NaN where they have no solution.
+
+    The insert frame is x anterior, y superior, z to the subject's right, for left knees too.
+
+    Args:
+        contact_force: (3,) N, of the condyles on the femur, without residuals.
+        normal_force: side -> N, of each condyle along its contact normal, by equilibrium.
+        quadriceps: N; NaN without an extensor mechanism, as the next three.
+        patellar_ligament: N.
+        patellofemoral: N, along the contact normal.
+        patellofemoral_tangential: N, across it in the sagittal plane.
+        ligaments: bundle -> N.
+        residuals: what an exact model would make zero: ap, ml (N), axial, and perhaps coronal,
+            flexion (N·m), on the tibia.
+        hip_force: (3,) N on the femur at the hip centre, all that the thigh's other end carries.
+        hip_moment: (3,) N·m.
+        external_flexion: N·m, moment that tends to flex the knee.
+        external_adduction: N·m, moment that tends to adduct it.
+        condition: condition number of the equations.
+        lifted: condyles that carry nothing.
+        slack: the extensor mechanism carries nothing.
+        ambiguous: other sets of loads have all signs right, too.
+        problems: why there is no solution; empty when there is one.
+        external_forces: `pin.StdVec_Force`: contact, ligaments and extensor mechanism as found, as
+            `fext` of the model. With them and the external loads `pin.rnea` leaves the residuals.
+        residual_forces: `pin.StdVec_Force` of the residuals.
+        hip_forces: `pin.StdVec_Force` of what acts on the thigh at the hip.
+        equations: the solution as the equations have it, of a right knee.
+        geometry: what they stand on.
+    """
+
+    contact_force: Array
+    normal_force: dict[str, float]
+    quadriceps: float
+    patellar_ligament: float
+    patellofemoral: float
+    patellofemoral_tangential: float
+    ligaments: dict[str, float]
+    residuals: dict[str, float]
+    hip_force: Array
+    hip_moment: Array
+    external_flexion: float
+    external_adduction: float
+    condition: float
+    lifted: frozenset[str]
+    slack: bool
+    ambiguous: bool
+    problems: tuple[str, ...]
+    external_forces: Any
+    residual_forces: Any
+    hip_forces: Any
+    equations: SolvedLoads
+    geometry: KneeGeometry
+
+    @property
+    def contact_total(self) -> float:
+        """N, magnitude of the contact force."""
+        return float(np.linalg.norm(self.contact_force))
+
+    @property
+    def tensions(self) -> dict[str, float]:
+        """Muscle and patellar ligament -> N, as `Knee.external_forces` takes them.
+
+        Empty without an extensor mechanism.
+        """
+        extensor, values = self.geometry.extensor, self.equations.values
+        if extensor is None:
+            return {}
+        found = {name: values.get(muscle_load(name), NAN) for name in extensor.muscles}
+        return found | {"patellar_ligament": values.get("patellar_ligament", NAN)}
+
+
+def knee_loads(
+    geometry: KneeGeometry,
+    solved: SolvedLoads,
+    left: bool,
+    forces: Mapping[str, Any],
+) -> KneeLoads:
+    """Return solved loads as those of the user's knee.
+
+    Args:
+        geometry: what the equations stand on.
+        solved: their solution, of a right knee.
+        left: the user's knee is a left one.
+        forces: `external_forces`, `residual_forces` and `hip_forces`.
+    """
+    values = {
+        name: -value if left and _mirrored(name) else value for name, value in solved.values.items()
+    }
+    force = solved.contact_force * (np.array([1.0, 1.0, -1.0]) if left else 1.0)
+    found, extensor = values.get, geometry.extensor
+    return KneeLoads(
+        np.asarray(force),
+        {side: found(f"{side}_normal", 0.0 if solved.values else NAN) for side in _sides(geometry)},
+        extensor.tension(values) if extensor else NAN,
+        found("patellar_ligament", NAN),
+        found("patellofemoral", NAN),
+        found("patellofemoral_tangential", NAN),
+        dict(geometry.tensions),
+        {
+            name.removeprefix("residual_"): value
+            for name, value in values.items()
+            if name.startswith("residual_")
+        },
+        np.array([found(f"hip_force_{axis}", NAN) for axis in ("ap", "si", "ml")]),
+        np.array([found(f"hip_moment_{axis}", NAN) for axis in ("ap", "si", "ml")]),
+        solved.external_flexion,
+        solved.external_adduction,
+        solved.condition,
+        solved.lifted,
+        solved.slack,
+        solved.ambiguous,
+        solved.problems,
+        forces["external"],
+        forces["residual"],
+        forces["hip"],
+        solved,
+        geometry,
+    )
+
+
+def _sides(geometry: KneeGeometry) -> list[str]:
+    return [side for side in SIDES if side in geometry.condyles]
+
+
+def _mirrored(name: str) -> bool:
+    """Say whether a load's magnitude changes sign in the mirror image."""
+    if name.startswith(MUSCLE):
+        return False
+    if "moment" in name:  # about x and y; about z and the clinical axes it keeps its sign
+        return name.endswith(("_ap", "_si", "_axial", "_coronal"))
+    return name.endswith(MIRRORED)
