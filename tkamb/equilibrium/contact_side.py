@@ -37,6 +37,7 @@ from tkamb.threads import both
 
 if TYPE_CHECKING:
     from tkamb.contact.cam_post import CamPost
+    from tkamb.contact.model import ContactModel
     from tkamb.equilibrium.released import KneeEquilibrium
 
 NAN = float("nan")
@@ -60,6 +61,7 @@ class ContactSide:
         sensitivity: whether each frame tells how its split changes with the adduction, which
             takes one more press of a model without a tangent.
         post: cam and post, if they are prepared already.
+        model: what prepared `state`, if there is one already.
     """
 
     def __init__(
@@ -69,13 +71,14 @@ class ContactSide:
         state: Any = None,
         sensitivity: bool = True,
         post: "CamPost | None" = None,
+        model: "ContactModel | None" = None,
     ) -> None:
         table = case.scene.contact
         insert = case.scene.implant.insert
         assert table is not None and insert is not None
         assert case.femoral is not None and case.insert is not None
         self.case, self.table, self.mechanics = case, table, mechanics
-        self.model = contact_model(table.model, table.resolution_mm, **table.options)
+        self.model = model or contact_model(table.model, table.resolution_mm, **table.options)
         pair = ContactPair(
             case.femoral, case.insert, given_material(case.scene.insert_material), insert.bearing
         )
