@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from tkamb.run.read_scene import read_scene
     from tkamb.scene import Scene, load_scene
     from tkamb.simulation import simulate
+    from tkamb.view.live_window import live
     from tkamb.view.show import show
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "Scene",
     "__version__",
     "contact_model",
+    "live",
     "load_scene",
     "read_results",
     "read_scene",
@@ -60,6 +62,7 @@ _HOMES = {
     "Results": "tkamb.results",
     "Scene": "tkamb.scene",
     "contact_model": "tkamb.contact.registry",
+    "live": "tkamb.view.live_window",
     "load_scene": "tkamb.scene",
     "read_results": "tkamb.results_folder",
     "read_scene": "tkamb.run.read_scene",

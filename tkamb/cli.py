@@ -25,6 +25,7 @@ from tkamb.studies.command import add_stability, add_tradeoff
 from tkamb.threads import threads
 from tkamb.uncertainty.command import add_uncertainty
 from tkamb.view.command import add_view
+from tkamb.view.live_command import add_live
 from tkamb.wear.command import add_wear
 
 if TYPE_CHECKING:
@@ -86,6 +87,7 @@ def _parser() -> argparse.ArgumentParser:
     add_data(commands)
     add_export(commands)
     add_view(commands)
+    add_live(commands)
     add_tradeoff(commands)
     add_stability(commands)
     add_wear(commands)

@@ -89,8 +89,7 @@ def _check(options: argparse.Namespace) -> None:
         InputError: an option that cannot be, or a file that cannot be written.
         ComputationError: a picture is wanted and there is no browser.
     """
-    if not 0 <= options.port <= HIGHEST_PORT:
-        raise InputError(f"no port {options.port}", "--port", f"give 0 (any) to {HIGHEST_PORT}")
+    check_port(options.port)
     if options.camera not in CAMERAS:
         mend = f"there are: {', '.join(CAMERAS)}"
         raise InputError(f"no view '{options.camera}'", "--camera", mend)
@@ -116,3 +115,13 @@ def _check(options: argparse.Namespace) -> None:
         from tkamb.view.page import find_browser
 
         find_browser()
+
+
+def check_port(port: int) -> None:
+    """Raise where a number is no port.
+
+    Raises:
+        InputError: it is not 0 to 65535.
+    """
+    if not 0 <= port <= HIGHEST_PORT:
+        raise InputError(f"no port {port}", "--port", f"give 0 (any) to {HIGHEST_PORT}")

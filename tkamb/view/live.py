@@ -3,7 +3,7 @@
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Lock
+from threading import Lock, Thread
 from typing import Any
 
 import numpy as np
@@ -23,9 +23,6 @@ from tkamb.scene.si import in_si
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 from tkamb.view.bench import ROWS, Bench, BenchRequest, write_bench
 
-COARSE = ("foundation", 2.0)
-"""Contact model and spacing (mm) while a slider moves."""
-
 
 @dataclass(frozen=True, eq=False)
 class LiveAnswer:
@@ -40,6 +37,7 @@ class LiveAnswer:
         pressure: (n,) Pa.
         gap: (n,) m.
         ligaments: name -> both ends (2, 3) m in the insert frame.
+        centres: side -> (3,) m, centre of pressure.
     """
 
     request: BenchRequest
@@ -51,6 +49,7 @@ class LiveAnswer:
     pressure: Array
     gap: Array
     ligaments: dict[str, Array]
+    centres: dict[str, Array]
 
     @property
     def failed(self) -> bool:
@@ -76,6 +75,8 @@ class LiveKnee:
         self.bench = Bench(self.case, Mechanics(self.case, near=True).ligaments)
         self._sides: dict[tuple[str, float], ContactSide] = {}
         self._known: Known | None = None
+        self._threads: dict[tuple[str, float], Thread] = {}
+        self._refused: dict[tuple[str, float], TkambError] = {}
         self._before: dict[tuple[str, float], FrameContact] = {}
         self._computing, self._counting, self._latest = Lock(), Lock(), 0
 
@@ -112,6 +113,35 @@ class LiveKnee:
         with self._counting:
             self._latest += 1
             return self._latest
+
+    def preparing(self, request: BenchRequest) -> str:
+        """Return what a request has to wait for, in words; empty where it can be answered.
+
+        What is not prepared yet is prepared in a thread of its own: a lattice takes seconds, in
+        which other models go on answering.
+
+        Raises:
+            InputError: the model cannot be prepared.
+        """
+        key = (request.contact, request.resolution_mm)
+        if key in self._sides:
+            return ""
+        with self._counting:
+            if key in self._refused:
+                raise self._refused.pop(key)
+            if key not in self._threads:
+                thread = Thread(target=self._prepare, args=(request, key), daemon=True)
+                self._threads[key] = thread
+                thread.start()
+        return f"preparing {request.contact} at {request.resolution_mm:g} mm"
+
+    def _prepare(self, request: BenchRequest, key: tuple[str, float]) -> None:
+        try:
+            self._side(request)
+        except TkambError as error:
+            self._refused[key] = error
+        finally:
+            del self._threads[key]
 
     def answer(self, request: BenchRequest, number: int | None = None) -> LiveAnswer:
         """Return what the bench shows.
@@ -171,7 +201,7 @@ class LiveKnee:
         nothing = np.zeros(len(state.points))
         empty = LiveAnswer(
             request, {}, "", np.full((4, 4), np.nan), state.points, state.triangles, nothing,
-            np.full(len(nothing), np.inf), {},
+            np.full(len(nothing), np.inf), {}, {},
         )  # fmt: skip
         case = self._still_case(request)
         if not np.isfinite(case.motion.coordinates).all():
@@ -206,6 +236,11 @@ class LiveKnee:
             result.pressure,
             result.gap,
             ends,
+            {
+                side: getattr(result, side).centre_of_pressure
+                for side in SIDES
+                if getattr(result, side) is not None
+            },
         )
 
     def known_error(self, request: BenchRequest) -> Any:

@@ -56,7 +56,7 @@ def page_html(
     # What stands between script tags must not hold the text that closes them.
     scripts = [
         "\n" + text.replace("</script", "<\\/script")
-        for text in (_meshcat(), *(asset(PACKAGE, name) for name in SCRIPTS))
+        for text in (meshcat_script(), *(asset(PACKAGE, name) for name in SCRIPTS))
     ]
     connect = "'none'" if live is None else "'self'"
     return render(
@@ -71,7 +71,7 @@ def page_html(
     )
 
 
-def _meshcat() -> str:
+def meshcat_script() -> str:
     """Return meshcat's viewer, three.js included, as its package ships it."""
     root = Path(meshcat.__file__).parent
     return (root / "viewer" / "dist" / "main.min.js").read_text(encoding="utf-8")

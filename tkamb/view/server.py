@@ -7,6 +7,7 @@ user's terminal shows.
 
 import json
 import secrets
+from collections.abc import Callable
 from dataclasses import replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -142,6 +143,10 @@ class ContactSwitch:
         return self._sides[model]
 
 
+class NotYet(TkambError):
+    """What is asked for is being prepared; ask again."""
+
+
 class ViewServer:
     """Serves one page on the loopback address.
 
@@ -153,13 +158,19 @@ class ViewServer:
         packed: the drawings.
         switch: computes other contact models; None without.
         port: 0 for any free one.
+        bench: answers a question of `tkamb live`, by its name and content; None without.
 
     Raises:
         InputError: the port is taken.
     """
 
     def __init__(
-        self, html: str, packed: bytes, switch: ContactSwitch | None, port: int = 0
+        self,
+        html: str,
+        packed: bytes,
+        switch: ContactSwitch | None,
+        port: int = 0,
+        bench: "Callable[[str, dict[str, Any]], bytes] | None" = None,
     ) -> None:
         self.switch = switch
         self._token = secrets.token_urlsafe(TOKEN_BYTES)
@@ -172,6 +183,7 @@ class ViewServer:
             pass
 
         Handler.content, Handler.switch, Handler.root = content, switch, f"/{self._token}/"
+        Handler.bench = None if bench is None else staticmethod(bench)
         try:
             self._server = ThreadingHTTPServer((HOST, port), Handler)
         except (OSError, OverflowError) as error:
@@ -198,6 +210,7 @@ class ViewServer:
 class _Handler(BaseHTTPRequestHandler):
     content: dict[str, tuple[str, bytes]]
     switch: ContactSwitch | None
+    bench: "Callable[[str, dict[str, Any]], bytes] | None"
     names: set[str]
     root: str
 
@@ -217,6 +230,8 @@ class _Handler(BaseHTTPRequestHandler):
             return
         try:
             answer = self._answer(self._question())
+        except NotYet as error:
+            self._send_line(HTTPStatus.ACCEPTED, error.what)
         except TimeoutError:
             self._send_line(HTTPStatus.REQUEST_TIMEOUT, "the question did not arrive")
         except (TkambError, ValueError, KeyError, RecursionError) as error:
@@ -228,6 +243,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.OK, "application/octet-stream", answer)
 
     def _answer(self, question: dict[str, Any]) -> bytes:
+        if self.bench is not None:
+            return self.bench(self._path_below_token, question)
         if self.switch is not None and self._path_below_token == "contact":
             frame, model = question["frame"], question["model"]
             if type(frame) is not int or not isinstance(model, str):

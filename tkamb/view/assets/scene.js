@@ -74,7 +74,46 @@ function buildView(viewer, view, number) {
   view.runMap = view.map;
   tkamb.showMap(view, view.map);
   if (view.lattice) tkamb.addLattice(view);
+  if (view.map) addSideNames(viewer, view);
   return view;
+}
+
+// Names beside the insert which side is which, whatever the camera: x is anterior, z lateral.
+function addSideNames(viewer, view) {
+  const low = [Infinity, Infinity, Infinity], high = low.map((x) => -x), {points} = view.map;
+  for (let k = 0; k < points.length; k++) {
+    low[k % 3] = Math.min(low[k % 3], points[k]);
+    high[k % 3] = Math.max(high[k % 3], points[k]);
+  }
+  const middle = low.map((x, k) => (x + high[k]) / 2), away = 0.011;
+  const places = {medial: [middle[0], low[1], low[2] - away],
+    lateral: [middle[0], low[1], high[2] + away], anterior: [high[0] + away, low[1], middle[2]]};
+  for (const [word, place] of Object.entries(places)) {
+    const sprite = wordSprite(word);
+    sprite.position.set(...place);
+    viewer.set_object(tkamb.split(`${view.root}/insert/name ${word}`), sprite);
+    tkamb.node(`${view.root}/insert/name ${word}`).object.position.set(...place);
+  }
+}
+
+function wordSprite(word) {
+  const {THREE} = MeshCat, canvas = document.createElement("canvas");
+  [canvas.width, canvas.height] = [256, 64];
+  const pen = canvas.getContext("2d");
+  pen.font = "600 40px system-ui, sans-serif";
+  pen.textAlign = "center";
+  pen.textBaseline = "middle";
+  pen.lineWidth = 8;
+  pen.strokeStyle = "rgba(255, 255, 255, 0.9)";
+  pen.strokeText(word, 128, 32);
+  pen.fillStyle = "#333333";
+  pen.fillText(word, 128, 32);
+  const material = new THREE.SpriteMaterial({map: new THREE.CanvasTexture(canvas),
+    transparent: true, depthTest: false});
+  const sprite = new THREE.Sprite(material);
+  sprite.scale.set(0.024, 0.006, 1);
+  sprite.renderOrder = 6;
+  return sprite;
 }
 
 // A surface that lets see through first writes its depth, then its colour: its own far side stays
@@ -192,4 +231,28 @@ function renderSideBySide(viewer) {
     this.needs_render = false;
     nameDirections(this.camera);
   };
+}
+
+// Without a graphics card smooth edges take a third of a frame's time: then only pictures have them.
+function newViewer(pane, smooth) {
+  const {prototype} = HTMLCanvasElement, usual = prototype.getContext;
+  if (!smooth) {
+    prototype.getContext = function (kind, wishes) {
+      return usual.call(this, kind, {...wishes, antialias: false});
+    };
+  }
+  try {
+    return new MeshCat.Viewer(pane);
+  } finally {
+    prototype.getContext = usual;
+  }
+}
+
+function softwareGraphics() {
+  const context = document.createElement("canvas").getContext("webgl");
+  const told = context && context.getExtension("WEBGL_debug_renderer_info");
+  const name = told ? context.getParameter(told.UNMASKED_RENDERER_WEBGL) : "";
+  const release = context && context.getExtension("WEBGL_lose_context");
+  if (release) release.loseContext();
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }

@@ -28,30 +28,6 @@ tkamb.start = async function () {
   document.body.dataset.ready = "yes";
 };
 
-// Without a graphics card smooth edges take a third of a frame's time: then only pictures have them.
-function newViewer(pane, smooth) {
-  const {prototype} = HTMLCanvasElement, usual = prototype.getContext;
-  if (!smooth) {
-    prototype.getContext = function (kind, wishes) {
-      return usual.call(this, kind, {...wishes, antialias: false});
-    };
-  }
-  try {
-    return new MeshCat.Viewer(pane);
-  } finally {
-    prototype.getContext = usual;
-  }
-}
-
-function softwareGraphics() {
-  const context = document.createElement("canvas").getContext("webgl");
-  const told = context && context.getExtension("WEBGL_debug_renderer_info");
-  const name = told ? context.getParameter(told.UNMASKED_RENDERER_WEBGL) : "";
-  const release = context && context.getExtension("WEBGL_lose_context");
-  if (release) release.loseContext();
-  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
-}
-
 // Another contact model on the frame that is shown, computed by the server.
 class Live {
   constructor(models) {
