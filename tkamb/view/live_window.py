@@ -46,6 +46,10 @@ class LiveWindow:
         self.start = knee.recorded(frame)
         self.title = f"{knee.case.scene.patient.side.capitalize()} knee, live"
 
+    def set_resolution(self, resolution_mm: float) -> None:
+        """Begin with another spacing of the map than the scene's."""
+        self.start = replace(self.start, resolution_mm=resolution_mm)
+
     def server(self, port: int = 0) -> ViewServer:
         """Return the server of the window, not yet started.
 
@@ -133,6 +137,7 @@ class LiveWindow:
         finite = bool(np.isfinite(answer.pose).all())
         return {
             "status": answer.status,
+            "request": asdict(answer.request),
             "label": f"{answer.request.contact} at {answer.request.resolution_mm:g} mm",
             "error": self._error_words(answer.request),
             "scale_MPa": scale,

@@ -118,7 +118,7 @@ class Bench {
         const value = key === "frame" ? this.frame : this.holder(group)[key];
         const [range, exact] = this.inputs[`${group}-${key}`];
         range.value = value;
-        exact.value = Number(value.toFixed(3));
+        exact.value = Number(value.toFixed(key === "load_N" ? 0 : 3));
       }
     }
     for (const [key, name] of Object.entries(RELEASABLE)) {

@@ -92,7 +92,6 @@ function addSideNames(viewer, view) {
     const sprite = wordSprite(word);
     sprite.position.set(...place);
     viewer.set_object(tkamb.split(`${view.root}/insert/name ${word}`), sprite);
-    tkamb.node(`${view.root}/insert/name ${word}`).object.position.set(...place);
   }
 }
 
