@@ -17,7 +17,8 @@ def tables(rows: Sequence[ErrorRow]) -> list[str]:
     """Return the lines of the page's block."""
     names = " | ".join(f"{HEADS[name]} %" for name in COMPARED)
     lines = [
-        f"| material | contact | mm | situation | pairs | {names} | held-out pairs | {names} | covered |",
+        f"| material | contact | mm | situation | pairs | {names} "
+        f"| held-out pairs | {names} | covered |",
         "| --- | --- | ---: | --- | ---: |" + " ---: |" * (2 * len(COMPARED) + 2),
     ]
     keys = dict.fromkeys((row.material, row.contact, row.resolution_mm) for row in rows)
