@@ -124,5 +124,13 @@ _PLACES = {"interior": "in the interior", "flank": "on a flank", "edge": "at an 
 
 
 def is_large(said: Mapping[str, Any] | str, names: Iterable[str]) -> bool:
-    """Return whether one of the quantities is known to be off by more than 10 %."""
-    return not isinstance(said, str) and any(said[name] > LARGE for name in names)
+    """Return whether one of the quantities is known to be off by more than 10 %.
+
+    Contact at an edge carries its own flag: where situations were measured, the interior and
+    flanks decide.
+    """
+    if isinstance(said, str):
+        return False
+    situations = said.get("situations") or {}
+    smooth = [errors for place, errors in situations.items() if place != "edge"]
+    return any(errors[name] > LARGE for name in names for errors in smooth or [said])
