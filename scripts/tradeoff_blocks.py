@@ -1,14 +1,16 @@
 """The trade-off as blocks of Markdown between two markers, made from the study's JSON alone."""
 
 import json
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from statistics import median
+from typing import Any
 
 from tkamb.errors import InputError
 from tkamb.known_errors import KnownError
 from tkamb.studies.body_trade import HEADS as BODY_HEADS
 from tkamb.studies.body_trade import BodyRow
+from tkamb.studies.error_cases import SITUATIONS
+from tkamb.studies.error_rows import ErrorRow
 from tkamb.studies.row import KEYS, TIMING_NOISE, Row, beats, on_front
 from tkamb.studies.tradeoff_report import (
     Setting,
@@ -77,21 +79,53 @@ def short_block(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def known_errors_json(rows: Sequence[Row]) -> str:
-    """Return the text of `tkamb/known_errors.json`: the table's errors, setting by setting.
+def known_errors_json(rows: Sequence[Row], cases: Sequence[ErrorRow] = ()) -> str:
+    """Return the text of `tkamb/known_errors.json`, setting by setting.
 
-    Settings that failed on a case, or that belong to another program, are left out: nothing is
-    known of them that would hold for every run.
+    Settings that failed on a case of the study, or that belong to another program, are left out:
+    nothing is known of them that would hold for every run.
+
+    Args:
+        rows: of the trade-off study; its material is polyethylene.
+        cases: errors on the pairs of bodies of `tkamb.studies.error_cases`.
     """
-    names = [name for name in KnownError.__dataclass_fields__ if name != "cases"]
-    found = []
+    found: dict[tuple[str, float, str], list[dict[str, float]]] = {}
     for (label, resolution), some in _settings(rows).items():
-        if label.startswith("calculix") or not all(row.errors for row in some):
-            continue
-        worst = {name: max(row.errors[name] for row in some) for name in names}
-        error = asdict(KnownError(**worst, cases=len(some)))
-        found.append({"contact": label, "resolution_mm": resolution} | error)
-    return json.dumps(found, indent=1, allow_nan=False) + "\n"
+        if not label.startswith("calculix") and all(row.errors for row in some):
+            found[label, resolution, "polyethylene"] = [dict(row.errors) for row in some]
+    for row in cases:
+        if not row.held_out and row.errors:
+            found.setdefault((row.contact, row.resolution_mm, row.material), []).append(row.errors)
+    return (
+        json.dumps([_known_error(key, some, cases) for key, some in found.items()], indent=1) + "\n"
+    )
+
+
+def _known_error(
+    key: tuple[str, float, str], errors: Sequence[Mapping[str, float]], cases: Sequence[ErrorRow]
+) -> dict[str, Any]:
+    """Return what is stated of one setting (model, mm, material), as JSON."""
+    names = [name for name in KnownError.__dataclass_fields__ if name in KEYS]
+    worst: dict[str, float | None] = {
+        name: max((row[name] for row in errors if name in row), default=None) for name in names
+    }
+    own = [row for row in cases if (row.contact, row.resolution_mm, row.material) == key]
+    situations = {
+        place: {name: max(row.errors[name] for row in some) for name in names if name != "force"}
+        for place in SITUATIONS
+        if (some := [r for r in own if not r.held_out and r.situation == place and r.errors])
+    }
+    held = [row for row in own if row.held_out and row.errors]
+    judged = [
+        row.errors[name] <= limit
+        for row in held
+        for name, limit in worst.items()
+        if name in row.errors and limit is not None
+    ]
+    covered = sum(judged) / len(judged) if judged else None
+    label, resolution, material = key
+    said = {"contact": label, "resolution_mm": resolution, "material": material}
+    return said | worst | {"cases": len(errors), "situations": situations, "covered": covered}
 
 
 def _settings(rows: Sequence[Row]) -> dict[Setting, list[Row]]:

@@ -78,8 +78,16 @@ COLUMNS: tuple[Column, ...] = (
     Column("medial_share_equilibrium", "medial / (medial + lateral), by coronal equilibrium"),
     Column("medial_area_mm2", "area in contact, medial", _CONTACT),
     Column("lateral_area_mm2", "area in contact, lateral", _CONTACT),
-    Column("medial_mean_pressure_MPa", "medial force / area", _CONTACT),
-    Column("lateral_mean_pressure_MPa", "lateral force / area", _CONTACT),
+    Column(
+        "medial_mean_pressure_MPa",
+        "medial force / area: the magnitude of the summed forces over the area",
+        _CONTACT,
+    ),
+    Column(
+        "lateral_mean_pressure_MPa",
+        "lateral force / area: the magnitude of the summed forces over the area",
+        _CONTACT,
+    ),
     Column("medial_peak_pressure_MPa", "largest pressure of the map, medial", _CONTACT),
     Column("lateral_peak_pressure_MPa", "largest pressure of the map, lateral", _CONTACT),
     Column("medial_cop_ap_mm", "medial centre of pressure, insert x", _CONTACT),

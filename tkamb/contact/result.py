@@ -40,7 +40,8 @@ class CondyleContact:
     Args:
         force: N, magnitude of the summed normal forces on the insert.
         area: m², area in contact.
-        mean_pressure: Pa, force / area.
+        mean_pressure: Pa, force / area: |sum F| / A, not sum |F| / A as in Sharma (2008), which is
+            larger on a curved surface.
         peak_pressure: Pa.
         centre_of_pressure: (3,) m, insert frame.
         thickness: m, insert under the centre of pressure, along y.

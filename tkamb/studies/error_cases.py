@@ -127,6 +127,21 @@ def _edge() -> Iterator[tuple]:
     yield "punch of fillet 1.5 mm", _punch(3.5, 1.5), _level(7), 900.0, (0.4, 0.3), 10.0
     yield "ball of 40 at a rim of fillet 0.5 mm", _ball(40, 40), _rim(6, 0.5), 800.0, (4.0, 1.0)
     yield "roller 60 x 10 with fillet ends", _runner(10, 3.0, 1.0), _level(7), 500.0, (0, 0), 12.0
+    yield "roller 80 x 12 with sharper ends", _runner(12, 3.5, 0.5), _level(7), 600.0, (0, 0), 12.0
+    yield "ball of 15 at the outline", _ball(15, 15), _level(8), 400.0, (-6.9, 0.4)
+    yield "ball of 30 at a rim of fillet 1.5 mm", _ball(30, 30), _rim(7, 1.5), 700.0, (4.4, -0.4)
+    yield "punch of fillet 1 mm", _punch(3.0, 1.0), _level(8), 700.0, (0.3, 0.45), 10.0
+    yield "torus 40 x 15 at a rim of fillet 0.5 mm", _ball(40, 15), _rim(8, 0.5), 500.0, (4.2, 0.5)
+    yield "ellipsoid 20 x 35 at the outline", _ball(20, 35), _level(7), 600.0, (0.2, -6.8)
+    yield (
+        "roller 60 x 16 with blunter ends",
+        _runner(16, 2.5, 2.0),
+        _level(6),
+        600.0,
+        (0.4, 0.3),
+        12.0,
+    )
+    yield "ball of 26 at a rim of fillet 1 mm", _ball(26, 26), _rim(5, 1.0), 500.0, (4.8, 0.25)
 
 
 def _level(thickness_mm: float) -> Height:

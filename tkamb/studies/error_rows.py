@@ -1,0 +1,156 @@
+"""Errors of the contact models on the pairs of `tkamb.studies.error_cases`.
+
+The reference of a pair is the B-bar finite elements at cells of `REFERENCE_MM`. Half of what
+changes from cells twice as large is its uncertainty.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from tkamb.contact.narrow import TOO_NARROW
+from tkamb.contact.registry import contact_class, contact_model
+from tkamb.errors import InputError
+from tkamb.studies.error_cases import ErrorCase, error_cases
+from tkamb.studies.quantities import Quantities, errors, quantities
+
+REFERENCE_MM = 0.5
+REFERENCE = "fe"
+SETTINGS: dict[str, dict[str, tuple[float, ...]]] = {
+    "polyethylene": {
+        "lattice": (3.0, 2.0, 1.5, 1.0),
+        "fe": (2.0, 1.5, 1.0),
+        "lattice-linear": (2.0, 1.0),
+        "foundation": (2.0, 1.0),
+        "foundation-linear": (2.0, 1.0),
+        "hertz": (1.0,),
+    },
+    "polyethylene-linear": {
+        "lattice-linear": (2.0, 1.0),
+        "fe": (2.0, 1.0),
+        "foundation-linear": (2.0, 1.0),
+    },
+}
+"""Material -> contact model -> resolutions, mm, that are measured."""
+COMPARED = ("approach", "mean_pressure", "peak_pressure", "area")
+
+
+@dataclass(frozen=True)
+class ErrorRow:
+    """Errors of one setting on one pair.
+
+    Args:
+        case: name of the pair.
+        situation: where its contact lies.
+        held_out: whether it judges the statement; else it is part of it.
+        material: of the insert.
+        contact: name of the model.
+        resolution_mm: of its map.
+        status: how the press ended; "too narrow" where the contact is flagged as that, which no
+            statement holds for.
+        errors: relative, approach, mean and peak pressure and area; empty without an answer.
+        uncertainty: of the reference, relative.
+    """
+
+    case: str
+    situation: str
+    held_out: bool
+    material: str
+    contact: str
+    resolution_mm: float
+    status: str
+    errors: dict[str, float]
+    uncertainty: dict[str, float]
+
+
+def settings() -> Iterator[tuple[str, str, float]]:
+    """Yield material, model and resolution (mm), references first."""
+    yield from ((material, REFERENCE, REFERENCE_MM) for material in SETTINGS)
+    for material, models in SETTINGS.items():
+        yield from ((material, name, mm) for name, sizes in models.items() for mm in sizes)
+
+
+def solved_key(case: ErrorCase, material: str, contact: str, resolution_mm: float) -> str:
+    """Return the key of a solved setting."""
+    return f"{case.name}|{contact}|{resolution_mm:g}|{material}"
+
+
+def solve(case: ErrorCase, material: str, contact: str, resolution_mm: float) -> dict[str, Any]:
+    """Return status, flags and quantities of a press."""
+    keeps = "cache" in getattr(contact_class(contact), "__dataclass_fields__", {})
+    model = contact_model(contact, resolution_mm, **({"cache": False} if keeps else {}))
+    result = model.press(model.prepare(case.pair(material)), case.load, case.pose)
+    return {"status": result.status.value, "flags": list(result.flags), **quantities(result)}
+
+
+def error_rows(solved: Mapping[str, Mapping[str, Any]]) -> list[ErrorRow]:
+    """Return the errors of all settings that were solved and whose references were.
+
+    Args:
+        solved: `solved_key` -> what `solve` returned.
+    """
+    found = []
+    for case in error_cases():
+        for material, models in SETTINGS.items():
+            fine, coarse = (
+                solved.get(solved_key(case, material, REFERENCE, REFERENCE_MM * factor))
+                for factor in (1, 2)
+            )
+            if fine is None or coarse is None or fine["status"] != "ok":
+                continue
+            reference = _quantities(fine)
+            change = errors(_quantities(coarse), reference)
+            uncertainty = {name: round(change[name] / 2, 5) for name in COMPARED}
+            for name, sizes in models.items():
+                for mm in sizes:
+                    answer = solved.get(solved_key(case, material, name, mm))
+                    if answer is not None:
+                        found.append(_row(case, material, name, mm, answer, reference, uncertainty))
+    return found
+
+
+def _row(
+    case: ErrorCase,
+    material: str,
+    contact: str,
+    resolution_mm: float,
+    answer: Mapping[str, Any],
+    reference: Quantities,
+    uncertainty: dict[str, float],
+) -> ErrorRow:
+    status = str(answer["status"])
+    if any(TOO_NARROW in flag for flag in answer.get("flags", ())):
+        status = "too narrow"
+    apart: dict[str, float] = {}
+    if status == "ok":
+        whole = errors(_quantities(answer), reference)
+        apart = {name: round(whole[name], 5) for name in COMPARED}
+    return ErrorRow(
+        case.name, case.situation, case.held_out, material, contact, resolution_mm, status, apart,
+        uncertainty,
+    )  # fmt: skip
+
+
+def _quantities(answer: Mapping[str, Any]) -> Quantities:
+    return {k: v for k, v in answer.items() if k not in ("status", "flags", "sumF")}
+
+
+def rows_json(rows: list[ErrorRow]) -> str:
+    """Return rows as JSON."""
+    return json.dumps([asdict(row) for row in rows], indent=1, allow_nan=False) + "\n"
+
+
+def read_error_rows(path: Path) -> list[ErrorRow]:
+    """Read rows of a file.
+
+    Raises:
+        InputError: it holds none.
+    """
+    try:
+        return [ErrorRow(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(
+            f"holds no errors of contact models ({error})", path, "run scripts/measure_known_errors"
+        ) from None
