@@ -51,7 +51,7 @@ UNLOADED_S = 0.1
 LOAD_N = 20.0
 """Force beyond what a plate reads while nobody stands on it that is a load: as filters of ground
 reactions mostly have it."""
-QUIET_SHARE, QUIET_SPREAD_N, MOST_DRIFT_N = 0.1, 4.0, 60.0
+QUIET_SHARE, QUIET_SPREAD_N, MOST_DRIFT_N = 0.1, 2.0, 60.0
 """The smallest tenth of a plate's forces is what it reads unloaded if they lie within the second
 of each other (no foot is so steady) and below the third; else the plate has no drift to see."""
 FREE_MOMENT = 1e-6
