@@ -285,7 +285,7 @@ def _trc_labels(names: str, axes: str, usual: int, path: Path) -> list[str]:
         if len(labels) == count:
             return labels
     raise InputError(
-        f"names {len(readings[0])} markers in line 4, but has columns for {count}",
+        f"names {len(readings[0] or readings[-1])} markers in line 4, but has columns for {count}",
         path,
         "write one label every three columns, with tabs between the cells",
     )
