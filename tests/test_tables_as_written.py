@@ -167,7 +167,7 @@ def two_forces(tmp_path, moments=True, at="pressure", rate=60.0, span=(0.0, 1.0)
     own[:, 1] = 0.0
     force = np.stack([20 * np.sin(6 * time), 400 + 50 * np.cos(5 * time), 0 * time + 8.0], axis=1)
     columns = {"time": time}
-    for number, point in ((1, own + [0.0, 0.0, 1.0]), (2, own)):
+    for number, point in ((1, own + np.array([0.0, 0.0, 1.0])), (2, own)):
         moment = np.zeros_like(force)
         moment[:, 1] = 4.0 if moments else 0.0
         place = point
@@ -208,7 +208,7 @@ def test_several_forces_under_one_foot_are_summed(tmp_path):
     table = read_table(tmp_path / "g.mot")
     halved = dict(table.columns)
     for name in table.columns:
-        if name.startswith("ground_force_2_v") or name.startswith("ground_moment_2"):
+        if name.startswith(("ground_force_2_v", "ground_moment_2")):
             halved[name] = table.columns[name] / 2
         if name.startswith(("ground_force_1", "ground_moment_1")):
             halved[name] = table.columns[name.replace("_1_", "_2_")]
