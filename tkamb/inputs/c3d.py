@@ -239,7 +239,6 @@ class _Reader:
         """Return rate (Hz), and names, samples (c, k) and units of the analog channels."""
         header, parameters = self.file.header, self._parameters
         samples = header.samples or 1
-        nothing = rate * samples, [], np.empty((0, 0)), []
         count = self.file.raw_analog.shape[1]
         if not count:
             return rate, [], np.empty((0, 0)), []
@@ -257,7 +256,7 @@ class _Reader:
                 )
         except InputError as error:
             self.faults["channels"] = error
-            return nothing
+            return rate * samples, [], np.empty((0, 0)), []
         if unsigned == ["UNSIGNED"]:
             offset = np.where(offset < 0, offset + 65536.0, offset)
         offset = np.concatenate([offset, np.zeros(count - len(offset))])
