@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array
@@ -214,7 +215,8 @@ def _complete_part(
     Raises:
         InputError: one among the frames.
     """
-    gaps = ~(np.isfinite(recorded.force) & np.isfinite(recorded.moment)).all(axis=1)
+    values = np.concatenate([recorded.force, recorded.moment], axis=1)
+    gaps: NDArray[np.bool_] = np.asarray(~np.isfinite(values).all(axis=1))
     if not gaps.any():
         return recorded
     stamps = recorded.time
