@@ -11,6 +11,7 @@ from tkamb.importing.force_columns import table_forces
 from tkamb.inputs.tables import Table, read_table
 from tkamb.opensim.kinematics import Kinematics
 from tkamb.opensim.motion import angle_lines, read_coordinates
+from tkamb.opensim.read import read_osim
 from tkamb.output.storage import write_storage, write_trc
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
@@ -327,3 +328,32 @@ def test_degrees_that_look_like_radians_are_asked_about(tmp_path, largest, asked
     table = Table(tmp_path / "q.mot", columns, in_degrees=True)
     q, _ = read_coordinates(chain, table)
     assert len(angle_lines(chain, table, q)) == asked
+
+
+def motion_of_the_leg(tmp_path):
+    """Write the moving leg in its model's coordinates, and return the import's arguments."""
+    osim = pendulum_osim(tmp_path / "leg.osim")
+    q, _ = moving_leg(osim)
+    columns = {name: q[:, k] for k, name in enumerate(read_osim(osim).coordinates)}
+    write_storage(tmp_path / "leg.mot", {"time": np.arange(60) / 60.0} | columns, in_degrees=False)
+    given = ["--motion", str(tmp_path / "leg.mot"), "--side", "right", "--mass-kg", "53.5"]
+    return ["import", str(osim), *given, "--out", str(tmp_path / "out")]
+
+
+def test_a_motion_and_a_force_that_lasts_less_are_joined(tmp_path, capsys):
+    """The foot is where the model's coordinates have it; the force is matched to it."""
+    arguments = motion_of_the_leg(tmp_path)
+    assert main([*arguments, "--grf", two_forces(tmp_path, span=(-0.5, 0.6))]) == 0
+    said = capsys.readouterr().out
+    assert "ground_force_2_v*" in said and "by where they act" in said
+    time = read_table(tmp_path / "out" / "motion.csv").column("time_s")
+    assert time[0] == 0.0 and 0.5 < time[-1] <= 0.6
+
+
+def test_an_interval_of_a_motion_is_cut_out(tmp_path, capsys):
+    arguments = motion_of_the_leg(tmp_path)
+    assert main([*arguments, "--interval", "0.25:0.75"]) == 0
+    table = read_table(tmp_path / "out" / "motion.csv")
+    np.testing.assert_allclose(table.column("time_s"), np.arange(15, 46) / 60.0, atol=1e-8)
+    assert main([*arguments, "--interval", "3:4", "--scene", "other.toml"]) == 2
+    assert "--interval" in capsys.readouterr().err

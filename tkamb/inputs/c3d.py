@@ -86,11 +86,11 @@ class Recording:
     def all_notices(self) -> tuple[str, ...]:
         """Remarks on the file and its plates, and what of it could not be read."""
         own = [notice for plate in self.plates for notice in plate.notices]
-        unread = [f"not read, and not needed so far: {error.what}" for error in self._once()]
+        parts: dict[str, list[str]] = {}
+        for part, error in self.faults.items():
+            parts.setdefault(error.what, []).append(part)
+        unread = [f"not used: {', '.join(part)}: {what}" for what, part in parts.items()]
         return (*self.notices, *own, *unread)
-
-    def _once(self) -> list[InputError]:
-        return list({error.what: error for error in self.faults.values()}.values())
 
     def plate(self, number: int) -> ForcePlate:
         """Return a plate by its number.

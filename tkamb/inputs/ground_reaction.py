@@ -186,7 +186,7 @@ def _own_points(recorded: RecordedReaction, loaded: np.ndarray, path: Path) -> t
     """
     held = _hold_point(recorded.time, recorded.point, loaded, path)
     aside = np.abs(recorded.moment[:, [0, 2]]) > FREE_MOMENT
-    own = np.isfinite(recorded.point).all(axis=1) & aside.any(axis=1)
+    own: NDArray[np.bool_] = np.asarray(np.isfinite(recorded.point).all(axis=1) & aside.any(axis=1))
     return held, np.where(own[:, None], recorded.point, held)
 
 
