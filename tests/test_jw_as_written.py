@@ -157,6 +157,8 @@ def test_markers_and_a_table_of_three_plates_give_the_case_of_the_c3d(tmp_path, 
     write_trc(tmp_path / "og3.trc", recording.time, points, recording.rate_Hz)
     given = ("--trc", tmp_path / "og3.trc", "--grf", tmp_path / "g.mot")
     assert_same(imported(tmp_path / "found", *given), reference, N=0.05, Nm=0.15)
+    beside = ("--c3d", TRIAL, "--grf", tmp_path / "g.mot")  # z points up there, y in the table
+    assert_same(imported(tmp_path / "beside", *beside), reference, N=0.05, Nm=0.15)
     named = ("--grf-force", "ground_force_2,ground_force_3", "--interval", "2.075:3.9333334")
     assert_same(imported(tmp_path / "named", *given, *named), reference, N=0.05, Nm=0.15)
 

@@ -48,6 +48,7 @@ class Recording:
         faults: "markers", "channels" or "plate 2" -> what is wrong with it.
         equal_channels: names that stand for several channels.
         notices: remarks on what was read otherwise than stated.
+        length_word: the file's own word for its unit of length.
     """
 
     path: Path
@@ -64,6 +65,7 @@ class Recording:
     faults: dict[str, InputError] = field(default_factory=dict)
     equal_channels: tuple[str, ...] = ()
     notices: tuple[str, ...] = ()
+    length_word: str = ""
 
     @property
     def time(self) -> Array:
@@ -199,6 +201,7 @@ class _Reader:
             self.faults,
             tuple(sorted(name for name, count in counts.items() if count > 1)),
             tuple(notices),
+            (self._parameters.texts("POINT:UNITS") or [""])[0],
         )
 
     def _rate(self) -> float:

@@ -41,25 +41,41 @@ ODD_FORCE, LEAST_ODD_FORCE, ODD_POINT = 0.05, 0.01, 5e-3
 larger of the forces, or as the last, no sample is odd."""
 WINDOW = 0.5
 """s: samples farther from the frames than this do not reach them through the filter."""
-AROUND_LOAD_S = 0.05
-"""A plate's wrench counts from this much before its load to this much after: a foot comes down
-and leaves within 0.02 s, and amplifiers drift while nobody stands on a plate."""
-DRIFT_N = 2.0
-"""Vertical force of a plate that nobody stands on; noise has no median, and 2 N act on the knee
-by less than 0.5 % of a body's weight."""
-UNLOADED_S = 0.1
-"""A plate that is unloaded for less shows no drift."""
-LOAD_N = 20.0
-"""Force beyond what a plate reads while nobody stands on it that is a load: as filters of ground
-reactions mostly have it."""
-QUIET_SHARE, QUIET_SPREAD_N, MOST_DRIFT_N = 0.1, 2.0, 60.0
-"""The smallest tenth of a plate's forces is what it reads unloaded if they lie within the second
-of each other (no foot is so steady) and below the third; else the plate has no drift to see."""
 FREE_MOMENT = 1e-6
 """N·m: horizontal moments above this show a moment about another point than the centre of
 pressure."""
 FARTHEST_FROM_ANKLE = 0.5
 """m; a centre of pressure farther from the ankle than this is under no foot of that leg."""
+
+
+@dataclass(frozen=True)
+class PlateLoadSettings:
+    """When a force plate counts as loaded, and what of it is drift.
+
+    Args:
+        load_N: force beyond the unloaded level that is a load; filters of ground reactions mostly
+            use 20 N.
+        margin_s: the wrench counts from this much before a load to this much after it. A foot
+            comes down and leaves within 0.02 s.
+        quiet_share: share of the samples, those of the smallest force, that show the unloaded
+            level.
+        quiet_spread_N: they show it if they lie within this of each other; no foot is so steady.
+        most_drift_N: and below this; a larger force is a foot's.
+        drift_N: an unloaded level beyond this is told. Noise has no median, and 2 N change the
+            knee's force by less than 0.5 % of a body's weight.
+        unloaded_s: a plate that is free for less shows no drift.
+    """
+
+    load_N: float = 20.0
+    margin_s: float = 0.05
+    quiet_share: float = 0.1
+    quiet_spread_N: float = 2.0
+    most_drift_N: float = 60.0
+    drift_N: float = 2.0
+    unloaded_s: float = 0.1
+
+
+PLATE_LOAD = PlateLoadSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,7 +385,7 @@ def _read_plates(source: ForceRecording) -> RecordedReaction:
         on = around_load(size, recording.analog_time)
         wrenches.append(np.where((on | ~np.isfinite(wrench).all(axis=1))[:, None], wrench, 0.0))
         level = unloaded_level(wrench[:, 1], on, recording.analog_time)
-        if abs(level) > DRIFT_N:
+        if abs(level) > PLATE_LOAD.drift_N:
             drift[plate.number] = level
     point, moment, force = summed_reaction(
         recording.analog_time, wrenches, levels[0] + source.surface, source.unloaded, source.file
@@ -402,16 +418,22 @@ def summed_reaction(
 
 
 def around_load(force: Array, time: Array) -> np.ndarray:
-    """Return (k,) whether a plate is loaded, or was or will be within `AROUND_LOAD_S`.
+    """Return (k,) whether a plate is loaded, or was or will be within the margin.
 
     Args:
         force: (k,) N, size of the force on the plate.
         time: (k,) s.
     """
     known = np.sort(force[np.isfinite(force)])
-    quiet = known[: math.ceil(QUIET_SHARE * len(known))]
-    steady = len(quiet) and np.ptp(quiet) <= QUIET_SPREAD_N and quiet[-1] <= MOST_DRIFT_N
-    loaded = np.flatnonzero(force >= LOAD_N + (float(np.median(quiet)) if steady else 0.0))
+    quiet = known[: math.ceil(PLATE_LOAD.quiet_share * len(known))]
+    steady = (
+        len(quiet)
+        and np.ptp(quiet) <= PLATE_LOAD.quiet_spread_N
+        and quiet[-1] <= PLATE_LOAD.most_drift_N
+    )
+    loaded = np.flatnonzero(
+        force >= PLATE_LOAD.load_N + (float(np.median(quiet)) if steady else 0.0)
+    )
     if not len(loaded):
         return np.zeros(len(force), bool)
     after = np.searchsorted(loaded, np.arange(len(force)))
@@ -419,14 +441,14 @@ def around_load(force: Array, time: Array) -> np.ndarray:
         np.abs(time[loaded[np.minimum(after, len(loaded) - 1)]] - time),
         np.abs(time - time[loaded[np.maximum(after - 1, 0)]]),
     )
-    return np.asarray(nearest <= AROUND_LOAD_S)
+    return np.asarray(nearest <= PLATE_LOAD.margin_s)
 
 
 def unloaded_level(vertical: Array, on: np.ndarray, time: Array) -> float:
     """Return the median (N) of a plate's vertical force while nobody stands on it; else zero."""
     free = vertical[~on & np.isfinite(vertical)]
     step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    return float(np.median(free)) if len(free) * step >= UNLOADED_S else 0.0
+    return float(np.median(free)) if len(free) * step >= PLATE_LOAD.unloaded_s else 0.0
 
 
 def _centre_of_pressure(force: Array, about_origin: Array, level: float) -> Array:
