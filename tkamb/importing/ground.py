@@ -24,12 +24,10 @@ from tkamb.importing.request import ImportRequest
 from tkamb.importing.scene_text import GroundFile
 from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.ground_reaction import (
-    PLATE_LOAD,
-    around_load,
     recorded_wrench,
     summed_reaction,
-    unloaded_level,
 )
+from tkamb.inputs.plate_loads import PLATE_LOAD, around_load, unloaded_level
 from tkamb.inputs.recordings import ForceRecording
 from tkamb.inputs.tables import Table, read_table
 
@@ -160,8 +158,8 @@ def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
     turned = {"x": "+x", "z": "+y", "y": "-z"}
     found = []
     for axis in axes.split(","):
-        sign, letter = turned[axis[-1]]
-        found.append(("+" if sign == axis[0] else "-") + letter)
+        own = turned[axis[-1]]
+        found.append(("+" if own[0] == axis[0] else "-") + own[1])
     return ",".join(found)
 
 

@@ -11,7 +11,6 @@ loaded frames on either side and the moment is whatever the wrench needs about t
 force and moment stay exactly as measured and filtered, only their point is conventional.
 """
 
-import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from tkamb.geometry.frames import MIRROR, Array
 from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import check_roles, laboratory_rotation
+from tkamb.inputs.plate_loads import PLATE_LOAD, around_load, unloaded_level
 from tkamb.inputs.recordings import ForceRecording, Side
 from tkamb.inputs.samples import OddSample, check_range, check_spacing, odd_samples
 from tkamb.inputs.tables import Table, read_table
@@ -46,36 +46,6 @@ FREE_MOMENT = 1e-6
 pressure."""
 FARTHEST_FROM_ANKLE = 0.5
 """m; a centre of pressure farther from the ankle than this is under no foot of that leg."""
-
-
-@dataclass(frozen=True)
-class PlateLoadSettings:
-    """When a force plate counts as loaded, and what of it is drift.
-
-    Args:
-        load_N: force beyond the unloaded level that is a load; filters of ground reactions mostly
-            use 20 N.
-        margin_s: the wrench counts from this much before a load to this much after it. A foot
-            comes down and leaves within 0.02 s.
-        quiet_share: share of the samples, those of the smallest force, that show the unloaded
-            level.
-        quiet_spread_N: they show it if they lie within this of each other; no foot is so steady.
-        most_drift_N: and below this; a larger force is a foot's.
-        drift_N: an unloaded level beyond this is told. Noise has no median, and 2 N change the
-            knee's force by less than 0.5 % of a body's weight.
-        unloaded_s: a plate that is free for less shows no drift.
-    """
-
-    load_N: float = 20.0
-    margin_s: float = 0.05
-    quiet_share: float = 0.1
-    quiet_spread_N: float = 2.0
-    most_drift_N: float = 60.0
-    drift_N: float = 2.0
-    unloaded_s: float = 0.1
-
-
-PLATE_LOAD = PlateLoadSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,40 +385,6 @@ def summed_reaction(
     point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], level)
     point = _hold_point(time, point, loaded, path)
     return point, about_origin - np.cross(point, force), force
-
-
-def around_load(force: Array, time: Array) -> np.ndarray:
-    """Return (k,) whether a plate is loaded, or was or will be within the margin.
-
-    Args:
-        force: (k,) N, size of the force on the plate.
-        time: (k,) s.
-    """
-    known = np.sort(force[np.isfinite(force)])
-    quiet = known[: math.ceil(PLATE_LOAD.quiet_share * len(known))]
-    steady = (
-        len(quiet)
-        and np.ptp(quiet) <= PLATE_LOAD.quiet_spread_N
-        and quiet[-1] <= PLATE_LOAD.most_drift_N
-    )
-    loaded = np.flatnonzero(
-        force >= PLATE_LOAD.load_N + (float(np.median(quiet)) if steady else 0.0)
-    )
-    if not len(loaded):
-        return np.zeros(len(force), bool)
-    after = np.searchsorted(loaded, np.arange(len(force)))
-    nearest = np.minimum(
-        np.abs(time[loaded[np.minimum(after, len(loaded) - 1)]] - time),
-        np.abs(time - time[loaded[np.maximum(after - 1, 0)]]),
-    )
-    return np.asarray(nearest <= PLATE_LOAD.margin_s)
-
-
-def unloaded_level(vertical: Array, on: np.ndarray, time: Array) -> float:
-    """Return the median (N) of a plate's vertical force while nobody stands on it; else zero."""
-    free = vertical[~on & np.isfinite(vertical)]
-    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    return float(np.median(free)) if len(free) * step >= PLATE_LOAD.unloaded_s else 0.0
 
 
 def _centre_of_pressure(force: Array, about_origin: Array, level: float) -> Array:
