@@ -82,7 +82,7 @@ def test_markers_and_plates_are_those_of_a_second_reader(name):
 
 
 def long_points(count):
-    points = np.zeros((count, 1, 3)) + [[[100.0, 200.0, 1.0]]]
+    points = np.tile([100.0, 200.0, 1.0], (count, 1, 1))
     points[:, 0, 0] += np.arange(count) * 1e-3
     return points
 

@@ -107,7 +107,7 @@ def test_a_hundred_thousand_columns(tmp_path):
     assert read_table(path).columns["c99999"] == [1.0]
     path.write_text(",".join([*names, "c5"]) + "\n" + ",".join("1" for _ in [*names, ""]) + "\n")
     with pytest.raises(InputError, match="two columns named 'c5'"):
-        read_table(path)
+        read_table(path).column("c5")
 
 
 @pytest.mark.parametrize(

@@ -24,12 +24,10 @@ from tkamb.importing.request import ImportRequest
 from tkamb.importing.scene_text import GroundFile
 from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.ground_reaction import (
-    DRIFT_N,
-    around_load,
     recorded_wrench,
     summed_reaction,
-    unloaded_level,
 )
+from tkamb.inputs.plate_loads import PLATE_LOAD, around_load, unloaded_level
 from tkamb.inputs.recordings import ForceRecording
 from tkamb.inputs.tables import Table, read_table
 
@@ -117,7 +115,11 @@ def _from_table(
     forces = table_forces(table)
     time = table.time()
     span = (float(time[0]), float(time[-1]))
-    notices = [f"{path.name}: {notice}" for notice in table.notices]
+    notices = [f"notice: {path.name}: {notice}" for notice in table.notices]
+    own_axes = _axes_of_table(table, forces, axes)
+    if own_axes != axes:
+        notices.append(f"{path.name}: y points up; forward, up, right are its {own_axes}")
+        axes = own_axes
     if request.plates is not None:
         raise InputError("is for the plates of a .c3d", "--plates", "give --grf-force for a table")
     chosen = _named(forces, side, request.grf_force, table)
@@ -140,6 +142,25 @@ def _from_table(
     lines += [_columns_line(path, side, chosen, "by where they act"), *notices]
     lines += [*_unmeasured_line(loads, own, feet, side, interval), *_drift_lines(recorded, own)]
     return FoundGround(_table_file(path, axes, chosen, under), interval, span, lines)
+
+
+def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
+    """Return the axes of a table whose y points up beside a recording whose z does.
+
+    OpenSim turns recordings about x: its x, y, z are the recording's x, z, -y.
+    """
+    if not forces or axes.split(",")[1][-1] != "z":
+        return axes
+    columns = [[table.column(force.columns[f"force_{k}"]) for k in (1, 2, 3)] for force in forces]
+    size = np.nansum(np.abs(np.array(columns)), axis=(0, 2))
+    if int(np.argmax(size)) != 1:
+        return axes
+    turned = {"x": "+x", "z": "+y", "y": "-z"}
+    found = []
+    for axis in axes.split(","):
+        own = turned[axis[-1]]
+        found.append(("+" if own[0] == axis[0] else "-") + own[1])
+    return ",".join(found)
 
 
 def _named(
@@ -281,7 +302,7 @@ def _drift_lines(forces: list[RecordedForce], plates: tuple[int | str, ...]) -> 
         f"ATTENTION: {one.title} reads {one.drift:.1f} N while nobody stands on it: it drifts, and "
         "bears as much too much under the foot"
         for one in forces
-        if one.key in plates and abs(one.drift) > DRIFT_N
+        if one.key in plates and abs(one.drift) > PLATE_LOAD.drift_N
     ]
 
 

@@ -65,7 +65,7 @@ def model_segments(
                 f"{segment.name}, three are needed",
                 recorded.path,
                 f"the model has {', '.join(segment.missing) or 'no others'}; "
-                f"the recording {', '.join(labels[:12])}, …",
+                f"the recording {', '.join(labels[:12])}, …{_equal_line(recorded)}",
             )
     return [segment for segment in found.values() if len(segment.points) >= 3]
 
@@ -137,6 +137,12 @@ def segments_of(recorded: Table, segments: list[ModelSegment]) -> list[ModelSegm
         points = {match[name]: p for name, p in segment.points.items() if name in match}
         found.append(replace(segment, points=points))
     return found
+
+
+def _equal_line(recorded: Table) -> str:
+    """Return which labels stand twice, and are not used; empty without any."""
+    names = list(dict.fromkeys(column[:-2] for column in recorded.equal))
+    return f"; it has two markers {', '.join(names)}: rename one of each" if names else ""
 
 
 def _clashing_prefixes(labels: list[str], wanted: Sequence[str]) -> list[str]:

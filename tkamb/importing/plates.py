@@ -11,9 +11,9 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.inputs.c3d import Recording
-from tkamb.inputs.ground_reaction import around_load, unloaded_level
 from tkamb.inputs.laboratory import laboratory_rotation
 from tkamb.inputs.markers import marker_trajectories
+from tkamb.inputs.plate_loads import around_load, unloaded_level
 from tkamb.inputs.tables import Table
 
 LOADED_N = 40.0

@@ -24,6 +24,7 @@ from tkamb.importing.recorded_poses import RecordedPoses
 from tkamb.importing.request import ImportRequest
 from tkamb.importing.scene_text import GroundFile, MarkerFile
 from tkamb.importing.shank import ShankMarkers, shank_markers
+from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.tables import Table
 
 FRAMES_PER_CUTOFF = 5.0
@@ -66,7 +67,7 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
         recorded.length_unit if recorded.unit_given else None,
         request.prefix is not None,
     )
-    matched = [*_notices(recorded), *_segment_lines(segments, request.without)]
+    matched = [*_notices(request, recorded), *_segment_lines(segments, request.without)]
     said = (*matched, _facing_line(request, seen), *found.said, *joined, thinned)
     return Trial(found.ground, said, markers)
 
@@ -86,7 +87,7 @@ def from_poses(
     covered = replace(request, interval=(float(poses.time[0]), float(poses.time[-1])))
     feet_there = marked_feet(recorded, seen.axes, feet(leg, recorded, OTHER[leg.side]))
     found = find_ground(covered, leg.side, seen.axes, feet_there)
-    matched = [*_notices(recorded), *_segment_lines(segments.values(), request.without)]
+    matched = [*_notices(request, recorded), *_segment_lines(segments.values(), request.without)]
     said = (*poses.said, *matched, _facing_line(request, seen), *shank.said, *found.said)
     return Trial(found.ground, said, poses=poses, shank=shank)
 
@@ -101,7 +102,7 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
     said = [f"motion: the model's coordinates in {recorded.path.name}, into {MOTION_FILE}"]
     if motion.missing:
         said.append(f"not in the motion, so at their defaults: {', '.join(motion.missing)}")
-    said += [*_notices(recorded), *motion.said]
+    said += [*_notices(request, recorded), *motion.said]
     there = model_feet(links, recorded) if request.grf is not None else None
     found = find_ground(request, leg.side, "+x,+y,+z", there)
     said += found.said
@@ -113,9 +114,12 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
     return Trial(found.ground, (*said, *joined), motion=motion)
 
 
-def _notices(recorded: Table) -> list[str]:
+def _notices(request: ImportRequest, recorded: Table) -> list[str]:
     """Return lines on what of the recording is not used or was read otherwise than stated."""
-    return [f"notice: {recorded.path.name}: {notice}" for notice in recorded.notices]
+    notices = recorded.notices
+    if recorded.path.suffix.lower() == ".c3d":
+        notices = read_c3d(recorded.path, request.units).all_notices
+    return [f"notice: {recorded.path.name}: {notice}" for notice in notices]
 
 
 def _facing(request: ImportRequest, segments: list[ModelSegment], recorded: Table) -> Facing:

@@ -48,6 +48,7 @@ class Recording:
         faults: "markers", "channels" or "plate 2" -> what is wrong with it.
         equal_channels: names that stand for several channels.
         notices: remarks on what was read otherwise than stated.
+        length_word: the file's own word for its unit of length.
     """
 
     path: Path
@@ -64,6 +65,7 @@ class Recording:
     faults: dict[str, InputError] = field(default_factory=dict)
     equal_channels: tuple[str, ...] = ()
     notices: tuple[str, ...] = ()
+    length_word: str = ""
 
     @property
     def time(self) -> Array:
@@ -86,11 +88,11 @@ class Recording:
     def all_notices(self) -> tuple[str, ...]:
         """Remarks on the file and its plates, and what of it could not be read."""
         own = [notice for plate in self.plates for notice in plate.notices]
-        unread = [f"not read, and not needed so far: {error.what}" for error in self._once()]
+        parts: dict[str, list[str]] = {}
+        for part, error in self.faults.items():
+            parts.setdefault(error.what, []).append(part)
+        unread = [f"not used: {', '.join(part)}: {what}" for what, part in parts.items()]
         return (*self.notices, *own, *unread)
-
-    def _once(self) -> list[InputError]:
-        return list({error.what: error for error in self.faults.values()}.values())
 
     def plate(self, number: int) -> ForcePlate:
         """Return a plate by its number.
@@ -199,6 +201,7 @@ class _Reader:
             self.faults,
             tuple(sorted(name for name, count in counts.items() if count > 1)),
             tuple(notices),
+            (self._parameters.texts("POINT:UNITS") or [""])[0],
         )
 
     def _rate(self) -> float:
@@ -239,7 +242,6 @@ class _Reader:
         """Return rate (Hz), and names, samples (c, k) and units of the analog channels."""
         header, parameters = self.file.header, self._parameters
         samples = header.samples or 1
-        nothing = rate * samples, [], np.empty((0, 0)), []
         count = self.file.raw_analog.shape[1]
         if not count:
             return rate, [], np.empty((0, 0)), []
@@ -257,7 +259,7 @@ class _Reader:
                 )
         except InputError as error:
             self.faults["channels"] = error
-            return nothing
+            return rate * samples, [], np.empty((0, 0)), []
         if unsigned == ["UNSIGNED"]:
             offset = np.where(offset < 0, offset + 65536.0, offset)
         offset = np.concatenate([offset, np.zeros(count - len(offset))])

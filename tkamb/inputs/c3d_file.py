@@ -105,13 +105,13 @@ class Parameters:
     def integers(self, name: str) -> list[int]:
         """Return whole numbers without sign, as counts are; empty without any."""
         value = self.numbers(name)
-        found = [] if value is None else value.ravel(order="F")
+        found: list[float] = [] if value is None else value.ravel(order="F").tolist()
         return [int(v) & 0xFFFF if -32768 <= v < 0 else int(v) for v in found if math.isfinite(v)]
 
     def series(self, name: str) -> Array:
         """Return NAME, NAME2, ... in one row: each holds at most 255 values."""
         parts = [self.numbers(key) for key in self._numbered(name)]
-        return np.concatenate([p.ravel(order="F") for p in parts if p is not None] or [[]])
+        return np.concatenate([np.empty(0), *(p.ravel(order="F") for p in parts if p is not None)])
 
     def texts(self, name: str) -> list[str]:
         """Return NAME, NAME2, ... in one list, stripped."""
@@ -166,8 +166,8 @@ def parse_c3d(content: bytes, path: Path) -> C3dFile:
         raise InputError(f"is of an unknown machine ({machine})", path, EXPORT)
     header = _header(content, machine)
     end = (header.data_block - 1) * BLOCK
-    parameters = _parameters(content, start + 4, end if end > start else len(content), machine)
-    parameters = Parameters(path, *parameters)
+    records = _parameters(content, start + 4, end if end > start else len(content), machine)
+    parameters = Parameters(path, *records)
     _check_agreement(header, parameters, path)
     return _Data(content, header, parameters, machine, path).read()
 
@@ -433,7 +433,7 @@ class _Data:
         fourth = words[:, :, 3]
         known = np.isfinite(fourth) & (np.abs(fourth) < 2**31)
         low_byte = np.where(known, fourth, 0.0).astype(np.int64) & 0xFF
-        residual = low_byte * scale
+        residual = np.asarray(low_byte * scale, float)
         gap = ~np.isfinite(places).all(axis=2) | (fourth < 0) | (places == 0).all(axis=2)
         places[gap], residual[gap] = np.nan, np.nan
         return places, residual

@@ -11,17 +11,18 @@ loaded frames on either side and the moment is whatever the wrench needs about t
 force and moment stay exactly as measured and filtered, only their point is conventional.
 """
 
-import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.inputs.c3d import read_c3d
 from tkamb.inputs.filtering import differentiate_coordinates
 from tkamb.inputs.laboratory import check_roles, laboratory_rotation
+from tkamb.inputs.plate_loads import PLATE_LOAD, around_load, unloaded_level
 from tkamb.inputs.recordings import ForceRecording, Side
 from tkamb.inputs.samples import OddSample, check_range, check_spacing, odd_samples
 from tkamb.inputs.tables import Table, read_table
@@ -40,20 +41,6 @@ ODD_FORCE, LEAST_ODD_FORCE, ODD_POINT = 0.05, 0.01, 5e-3
 larger of the forces, or as the last, no sample is odd."""
 WINDOW = 0.5
 """s: samples farther from the frames than this do not reach them through the filter."""
-AROUND_LOAD_S = 0.05
-"""A plate's wrench counts from this much before its load to this much after: a foot comes down
-and leaves within 0.02 s, and amplifiers drift while nobody stands on a plate."""
-DRIFT_N = 2.0
-"""Vertical force of a plate that nobody stands on; noise has no median, and 2 N act on the knee
-by less than 0.5 % of a body's weight."""
-UNLOADED_S = 0.1
-"""A plate that is unloaded for less shows no drift."""
-LOAD_N = 20.0
-"""Force beyond what a plate reads while nobody stands on it that is a load: as filters of ground
-reactions mostly have it."""
-QUIET_SHARE, QUIET_SPREAD_N, MOST_DRIFT_N = 0.1, 4.0, 60.0
-"""The smallest tenth of a plate's forces is what it reads unloaded if they lie within the second
-of each other (no foot is so steady) and below the third; else the plate has no drift to see."""
 FREE_MOMENT = 1e-6
 """N·m: horizontal moments above this show a moment about another point than the centre of
 pressure."""
@@ -185,7 +172,7 @@ def _own_points(recorded: RecordedReaction, loaded: np.ndarray, path: Path) -> t
     """
     held = _hold_point(recorded.time, recorded.point, loaded, path)
     aside = np.abs(recorded.moment[:, [0, 2]]) > FREE_MOMENT
-    own = np.isfinite(recorded.point).all(axis=1) & aside.any(axis=1)
+    own: NDArray[np.bool_] = np.asarray(np.isfinite(recorded.point).all(axis=1) & aside.any(axis=1))
     return held, np.where(own[:, None], recorded.point, held)
 
 
@@ -214,7 +201,8 @@ def _complete_part(
     Raises:
         InputError: one among the frames.
     """
-    gaps = ~(np.isfinite(recorded.force) & np.isfinite(recorded.moment)).all(axis=1)
+    values = np.concatenate([recorded.force, recorded.moment], axis=1)
+    gaps: NDArray[np.bool_] = np.asarray(~np.isfinite(values).all(axis=1))
     if not gaps.any():
         return recorded
     stamps = recorded.time
@@ -367,7 +355,7 @@ def _read_plates(source: ForceRecording) -> RecordedReaction:
         on = around_load(size, recording.analog_time)
         wrenches.append(np.where((on | ~np.isfinite(wrench).all(axis=1))[:, None], wrench, 0.0))
         level = unloaded_level(wrench[:, 1], on, recording.analog_time)
-        if abs(level) > DRIFT_N:
+        if abs(level) > PLATE_LOAD.drift_N:
             drift[plate.number] = level
     point, moment, force = summed_reaction(
         recording.analog_time, wrenches, levels[0] + source.surface, source.unloaded, source.file
@@ -397,34 +385,6 @@ def summed_reaction(
     point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], level)
     point = _hold_point(time, point, loaded, path)
     return point, about_origin - np.cross(point, force), force
-
-
-def around_load(force: Array, time: Array) -> np.ndarray:
-    """Return (k,) whether a plate is loaded, or was or will be within `AROUND_LOAD_S`.
-
-    Args:
-        force: (k,) N, size of the force on the plate.
-        time: (k,) s.
-    """
-    known = np.sort(force[np.isfinite(force)])
-    quiet = known[: math.ceil(QUIET_SHARE * len(known))]
-    steady = len(quiet) and np.ptp(quiet) <= QUIET_SPREAD_N and quiet[-1] <= MOST_DRIFT_N
-    loaded = np.flatnonzero(force >= LOAD_N + (float(np.median(quiet)) if steady else 0.0))
-    if not len(loaded):
-        return np.zeros(len(force), bool)
-    after = np.searchsorted(loaded, np.arange(len(force)))
-    nearest = np.minimum(
-        np.abs(time[loaded[np.minimum(after, len(loaded) - 1)]] - time),
-        np.abs(time - time[loaded[np.maximum(after - 1, 0)]]),
-    )
-    return np.asarray(nearest <= AROUND_LOAD_S)
-
-
-def unloaded_level(vertical: Array, on: np.ndarray, time: Array) -> float:
-    """Return the median (N) of a plate's vertical force while nobody stands on it; else zero."""
-    free = vertical[~on & np.isfinite(vertical)]
-    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    return float(np.median(free)) if len(free) * step >= UNLOADED_S else 0.0
 
 
 def _centre_of_pressure(force: Array, about_origin: Array, level: float) -> Array:

@@ -41,6 +41,7 @@ class Table:
         in_degrees: what the file itself states about angles (`.sto`, `.mot`), else None.
         equal: names that stand for several columns; none of these is in `columns`.
         notices: remarks on what was read otherwise than stated, or not at all.
+        unit_word: the file's own word for its unit of length, understood or not.
         unit_given: whether the unit of length is the user's word, for want of the file's.
     """
 
@@ -51,6 +52,7 @@ class Table:
     equal: tuple[str, ...] = ()
     notices: tuple[str, ...] = ()
     unit_given: bool = False
+    unit_word: str = ""
 
     @property
     def rows(self) -> int:
@@ -117,7 +119,9 @@ class Table:
         """
         unit = length_unit or self.length_unit
         if unit not in LENGTH:
-            raise InputError("states no unit of length", self.path, f"give '{key}' in the scene")
+            word = f"the unit '{self.unit_word}'" if self.unit_word else "no unit of length"
+            mend = f"give '{key}' in the scene, or --length-unit to an import: m, cm or mm"
+            raise InputError(f"states {word}", self.path, mend)
         if length_unit and self.length_unit and length_unit != self.length_unit:
             raise InputError(
                 f"is in {self.length_unit} by its own header, but the scene says {length_unit}",
@@ -246,7 +250,14 @@ def read_trc(path: Path) -> Table:
     notices = [f"has two markers '{name}'; neither is used" for name in twice]
     if unlabelled := markers.count(""):
         notices.append(f"has {unlabelled} marker(s) without a label; they are not used")
-    return Table(path, table, _trc_unit(header, path), equal=equal, notices=tuple(notices))
+    return Table(
+        path,
+        table,
+        _trc_unit(header, path),
+        equal=equal,
+        notices=tuple(notices),
+        unit_word=header.get("Units", ""),
+    )
 
 
 def _trc_cells(line: str) -> list[str]:
@@ -285,7 +296,7 @@ def _trc_labels(names: str, axes: str, usual: int, path: Path) -> list[str]:
         if len(labels) == count:
             return labels
     raise InputError(
-        f"names {len(readings[0])} markers in line 4, but has columns for {count}",
+        f"names {len(readings[0] or readings[-1])} markers in line 4, but has columns for {count}",
         path,
         "write one label every three columns, with tabs between the cells",
     )
@@ -319,6 +330,7 @@ def read_c3d_markers(path: Path) -> Table:
         length_unit=recording.length_unit,
         equal=tuple(f"{label}_{axis}" for label in sorted(equal) for axis in "xyz"),
         notices=recording.all_notices,
+        unit_word=recording.length_word,
     )
 
 

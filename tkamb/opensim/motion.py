@@ -77,21 +77,20 @@ def _column_of(name: str, recorded: Table) -> str | None:
 
 
 def _angle_scale(angles: dict[str, Array], recorded: Table) -> float:
-    """Return radians per unit of the angles; the file's header says it, or their size does.
+    """Return radians per unit of the angles, as the file's header says.
 
     Raises:
-        InputError: neither does, or the two contradict each other.
+        InputError: it does not, or their size contradicts it.
     """
     largest = max(float(np.abs(values).max()) for values in angles.values())
     worst = max(angles, key=lambda name: np.abs(angles[name]).max())
     if recorded.in_degrees is None:
-        if largest <= MOST_RADIANS:
-            raise InputError(
-                "does not say inDegrees",
-                recorded.path,
-                "add a line inDegrees=yes or inDegrees=no above its endheader",
-            )
-        return DEGREE
+        likely = "yes" if largest > MOST_RADIANS else "no (radians) or inDegrees=yes"
+        raise InputError(
+            f"does not say inDegrees ('{worst}' reaches {largest:.3g})",
+            recorded.path,
+            f"add the line inDegrees={likely} above its endheader",
+        )
     if not recorded.in_degrees and largest > MOST_RADIANS:
         raise InputError(
             f"says inDegrees=no, but '{worst}' reaches {largest:.4g}, which no joint does in "
@@ -103,7 +102,7 @@ def _angle_scale(angles: dict[str, Array], recorded: Table) -> float:
 
 
 def angle_lines(kinematics: Kinematics, recorded: Table, q: Array) -> tuple[str, ...]:
-    """Return lines on the unit of the angles where the file does not say it, or hardly can.
+    """Return lines on the unit of the angles where their size contradicts it.
 
     Args:
         kinematics: of the model.
@@ -112,8 +111,6 @@ def angle_lines(kinematics: Kinematics, recorded: Table, q: Array) -> tuple[str,
     """
     coordinates = kinematics.model.coordinates
     own = [kinematics.coordinates[name] for name in coordinates if coordinates[name].rotational]
-    if recorded.in_degrees is None:
-        return ("angles are read as degrees, too large for radians: inDegrees is missing",)
     turns = np.ptp(q[:, own], axis=0) / DEGREE
     small = np.abs(q[:, own]).max() < MOST_RADIANS * DEGREE
     if recorded.in_degrees and small and turns.max() > LEAST_TURN_DEG:

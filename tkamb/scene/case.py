@@ -132,6 +132,8 @@ def _recordings(
         from tkamb.inputs.ground_reaction import check_under_foot, load_ground_reaction
 
         ground = load_ground_reaction(in_si(scene.ground_reaction), motion.time, scene.patient.side)
+        for notice in ground.notices:
+            logger.warning("%s: %s", scene.ground_reaction.file, notice)
         if tibia and scene.ground_reaction.applied == "cop":
             check_under_foot(ground, tibia.pose[:, :3, 3], scene.ground_reaction.file)
     return motion, tibia, ground

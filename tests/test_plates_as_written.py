@@ -1,0 +1,303 @@
+"""Force plates as laboratories write them: unit words, calibration, baselines, drift, gaps."""
+
+import numpy as np
+import pytest
+
+from recordings import AMTI_CORNERS, standing_markers, write_c3d
+from test_c3d import COUNT, RATIO, plate_signals, pushes
+from tkamb.errors import InputError
+from tkamb.inputs.c3d import read_c3d
+from tkamb.inputs.ground_reaction import load_ground_reaction
+from tkamb.inputs.unit_words import GivenUnits, metres, newton_metres, newtons
+from tkamb.plausibility.movement import drift_questions
+from tkamb.scene.recording_tables import GroundReactionTable
+from tkamb.scene.si import in_si
+
+ORIGIN = np.array([0.003, -0.002, -0.03])
+PER_UNIT = {"mm": 1e3, "m": 1.0}
+
+
+def wrench():
+    """Return what acts in `pushes`: force and moment about the file's origin (k, 6)."""
+    force, point, free = pushes()
+    moment = np.cross(point, force)
+    moment[:, 2] += free
+    return np.concatenate([force, moment], axis=1)
+
+
+def recorded(folder, kind=2, units=None, signals=None, markers=None, **more):
+    """Write a recording of one plate under `pushes`."""
+    origin = more.pop("origin", ORIGIN if kind != 1 else np.zeros(3))
+    if signals is None:
+        signals = plate_signals(2, AMTI_CORNERS, origin)
+    plate = {"type": kind, "channels": list(range(1, len(signals) + 1)), "origin": origin}
+    return write_c3d(
+        folder / "a.c3d",
+        standing_markers(COUNT) if markers is None else markers,
+        analog={f"c{k}": s for k, s in enumerate(signals)},
+        units=units or ["N"] * 3 + ["Nmm"] * 3,
+        plates=[plate | more.pop("plate", {})],
+        **more,
+    )
+
+
+@pytest.mark.parametrize("force", ["N", "nt", "Newtons", "newton", " N ", "NT"])
+@pytest.mark.parametrize("moment", ["Nmm", "ntmm", "N-mm", "NMM", "N.mm", "N*mm", "Newton-mm"])
+def test_a_word_for_newtons_and_newton_millimetres(tmp_path, force, moment):
+    path = recorded(tmp_path, units=[force] * 3 + [moment] * 3)
+    np.testing.assert_allclose(read_c3d(path).plates[0].wrench, wrench(), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("word", "read", "value"),
+    [
+        *((word, metres, 1e-3) for word in ("mm", "MM", "Millimeters", "mill", "mm ")),
+        *((word, metres, 1.0) for word in ("m", "M", "mete", "Meters", "metres")),
+        *((word, metres, 1e-2) for word in ("cm", "Centimeter", "cent")),
+        *((word, metres, None) for word in ("in", "", "V", "mmm", "N")),
+        *((word, newtons, 1.0) for word in ("N", "nt", "Newtons")),
+        *((word, newtons, 1e3) for word in ("kN", "KN")),
+        *((word, newtons, None) for word in ("V", "lbf", "", "Nmm", "N/kg")),
+        *((word, newton_metres, 1.0) for word in ("Nm", "N.m", "N·m", "ntm", "Newton-meters")),
+        *((word, newton_metres, 1e-3) for word in ("NMM", "ntmm", "N-mm")),
+        *((word, newton_metres, 1e-2) for word in ("Ncm", "N cm")),
+        *((word, newton_metres, None) for word in ("N", "mm", "V", "", "Nm/kg")),
+    ],
+)
+def test_unit_words(word, read, value):
+    assert read(word) == (None if value is None else pytest.approx(value))
+
+
+@pytest.mark.parametrize("given", ["moment", "both"])
+def test_an_unknown_word_is_a_unit_where_the_user_says_which(tmp_path, given):
+    force = "N" if given == "moment" else "kiloponds?"
+    path = recorded(tmp_path, units=[force] * 3 + ["huh"] * 3)
+    with pytest.raises(InputError, match=r"'(huh|kiloponds\?)'.*--(force|moment)-unit"):
+        read_c3d(path).plate(1)
+    units = GivenUnits(force="N" if given == "both" else None, moment="Nmm")
+    np.testing.assert_allclose(read_c3d(path, units).plates[0].wrench, wrench(), atol=1e-3)
+    with pytest.raises(InputError, match="correct moment_unit"):
+        read_c3d(recorded(tmp_path), GivenUnits(moment="Nm")).plate(1)
+
+
+def test_a_unit_of_length_that_is_not_understood_concerns_markers_and_plates(tmp_path):
+    path = recorded(tmp_path, point_unit="furlong", plate={"corners": AMTI_CORNERS * 1e3})
+    recording = read_c3d(path)
+    assert recording.length_unit is None and len(recording.channels) == 6
+    with pytest.raises(InputError, match=r"'furlong'.*--length-unit"):
+        recording.plate(1)
+    with pytest.raises(InputError, match="is in mm by its own header"):
+        read_c3d(recorded(tmp_path), GivenUnits(length="cm"))
+
+
+@pytest.mark.parametrize("unit", ["mm", "m", "MM", "Meters"])
+@pytest.mark.parametrize("kind", [4, 5])
+def test_a_calibration_gives_moments_in_the_unit_of_length(tmp_path, unit, kind):
+    """Volts of six or eight channels; the matrix has crosstalk, and is stored either way round."""
+    per_metre = {"mm": 1e3, "m": 1.0}["m" if metres(unit) == 1.0 else "mm"]
+    signals = plate_signals(2, AMTI_CORNERS, ORIGIN)
+    signals[3:] *= 1e-3 * per_metre
+    channels = 6 if kind == 4 else 8
+    matrix = np.random.default_rng(1).normal(0.0, 1.0, (6, channels)) + 3 * np.eye(6, channels)
+    volts = np.linalg.pinv(matrix) @ signals
+    corners = AMTI_CORNERS * per_metre
+    plate = {"matrix": matrix, "corners": corners, "origin": ORIGIN * per_metre}
+    # the writer scales metres to mm and m alone; the unit's word is another
+    path = recorded(
+        tmp_path, kind, ["V"] * channels, volts, point_unit=unit, plate=scaled(plate, unit)
+    )
+    found = read_c3d(path).plates[0].wrench
+    np.testing.assert_allclose(found, wrench(), atol=5e-3)  # single precision, times the matrix
+
+
+def scaled(plate, unit):
+    """Return a plate's lengths as `write_c3d` wants them, which scales by the words mm and m."""
+    by = {"mm": 1e3, "m": 1.0}.get(unit, 1.0)
+    return plate | {key: plate[key] / by for key in ("corners", "origin")}
+
+
+def test_channels_that_state_their_moments_are_believed_where_the_foot_is_on_the_plate(tmp_path):
+    """Type 4 with a unit matrix and N·mm channels, in a file in metres: the stated unit counts."""
+    signals = plate_signals(2, AMTI_CORNERS, ORIGIN)
+    plate = {"matrix": np.eye(6)}
+    path = recorded(tmp_path, 4, None, signals, point_unit="m", plate=plate)
+    np.testing.assert_allclose(read_c3d(path).plates[0].wrench, wrench(), atol=1e-3)
+
+
+def offset_signals(level=12.0):
+    """Return the plate's channels, unloaded in the first six frames, with an offset each."""
+    signals = plate_signals(2, AMTI_CORNERS, ORIGIN)
+    signals[:, : 6 * RATIO] = 0.0
+    return signals, signals + level * np.array([[1.0, -0.5, 1.0, 30.0, -20.0, 10.0]]).T
+
+
+@pytest.mark.parametrize(
+    ("first_frame", "zero"), [(0, [1, 5]), (0, [0, 5]), (217, [218, 222]), (217, [1, 5])]
+)
+def test_frames_of_zero_give_the_baseline(tmp_path, first_frame, zero):
+    clean, offset = offset_signals()
+    path = recorded(tmp_path, signals=offset, first_frame=first_frame)
+    with_zero(path, zero)
+    with_offset = read_c3d(path).plates[0]
+    reference = read_c3d(recorded(tmp_path, signals=clean)).plates[0]
+    np.testing.assert_allclose(with_offset.wrench, reference.wrench, atol=2e-3)
+    assert with_offset.notices == ()
+
+
+@pytest.mark.parametrize("zero", [[1, 0], [0, 0], [900, 910]])
+def test_frames_of_zero_that_are_none_change_nothing(tmp_path, zero):
+    _, offset = offset_signals()
+    path = recorded(tmp_path, signals=offset)
+    before = read_c3d(path).plates[0].wrench
+    np.testing.assert_array_equal(read_c3d(with_zero(path, zero)).plates[0].wrench, before)
+
+
+def test_a_plate_that_is_stood_upon_in_the_frames_of_zero_keeps_its_load(tmp_path):
+    path = with_zero(recorded(tmp_path), [1, 10])
+    plate = read_c3d(path).plates[0]
+    np.testing.assert_allclose(plate.wrench, wrench(), atol=1e-3)
+    assert "no baseline is subtracted" in plate.notices[0]
+
+
+def with_zero(path, zero):
+    """Write FORCE_PLATFORM:ZERO into a file."""
+    import ezc3d
+
+    whole = ezc3d.c3d(str(path))
+    first = whole["header"]["points"]["first_frame"]
+    whole.add_parameter("FORCE_PLATFORM", "ZERO", zero)
+    whole["header"]["points"]["first_frame"] = first
+    whole.write(str(path))
+    return path
+
+
+def two_plates(folder, level):
+    """Write a foot on plate 1 from frame 6, and plate 2 that nobody stands on; both drift."""
+    clean, _ = offset_signals()
+    beside = np.zeros_like(clean)
+    signals = np.concatenate([clean, beside])
+    signals[[2, 8]] += level
+    far = AMTI_CORNERS + np.array([1.5, 0.0, 0.0])
+    plates = [
+        {"type": 2, "channels": range(1, 7), "origin": ORIGIN},
+        {"type": 2, "channels": range(7, 13), "corners": far},
+    ]
+    return write_c3d(
+        folder / "two.c3d",
+        standing_markers(COUNT),
+        analog={f"c{k}": s for k, s in enumerate(signals)},
+        units=(["N"] * 3 + ["Nmm"] * 3) * 2,
+        plates=plates,
+    )
+
+
+@pytest.mark.parametrize("level", [0.0, 5.0, -7.0, 28.0])
+def test_an_unloaded_plate_does_not_enter_the_sum_and_drift_is_told(tmp_path, level):
+    table = GroundReactionTable(
+        file=two_plates(tmp_path, level),
+        plates=(1, 2),
+        laboratory_axes="+x,+z,-y",
+        cutoff_Hz="none",
+    )
+    time = read_c3d(table.file).analog_time
+    ground = load_ground_reaction(in_si(table), time, "right")
+    own = load_ground_reaction(in_si(table.model_copy(update={"plates": (1,)})), time, "right")
+    np.testing.assert_allclose(ground.force, own.force, atol=1e-6)
+    np.testing.assert_allclose(ground.moment, own.moment, atol=1e-6)
+    assert np.abs(ground.force[:5]).max() < 1e-9  # nobody stands on either
+    expected = {} if level == 0 else {2: level}  # plate 1 is free for too short to see it
+    assert ground.drift == pytest.approx(expected, abs=1e-3)
+    case = type("Case", (), {"ground": ground})
+    questions = [str(one.text) for one in drift_questions(case)]
+    assert len(questions) == (level != 0) and all("set to zero" in text for text in questions)
+
+
+def test_light_loads_all_along_are_no_drift(tmp_path):
+    """A plate that bears 25 to 60 N throughout is stood upon: nothing of it is left out."""
+    signals = plate_signals(2, AMTI_CORNERS, ORIGIN)
+    signals *= np.linspace(25.0, 60.0, COUNT * RATIO) / signals[2]
+    path = recorded(tmp_path, signals=signals)
+    table = GroundReactionTable(
+        file=path, plates=(1,), laboratory_axes="+x,+z,-y", cutoff_Hz="none"
+    )
+    ground = load_ground_reaction(in_si(table), read_c3d(path).analog_time, "right")
+    np.testing.assert_allclose(ground.force[:, 1], signals[2], atol=1e-3)
+    assert ground.drift == {}
+
+
+@pytest.mark.parametrize("where", ["tail", "head", "middle"])
+def test_samples_that_are_no_numbers_matter_only_among_the_frames(tmp_path, where):
+    signals = plate_signals(2, AMTI_CORNERS, ORIGIN)
+    lost = {"tail": slice(-40, None), "head": slice(0, 30), "middle": slice(95, 97)}[where]
+    signals[:, lost] = np.nan
+    table = GroundReactionTable(
+        file=recorded(tmp_path, signals=signals),
+        plates=(1,),
+        laboratory_axes="+x,+z,-y",
+        cutoff_Hz="none",
+    )
+    frames = np.linspace(0.04, 0.15, 30)
+    if where == "middle":
+        with pytest.raises(InputError, match=r"not a number at 0\.09"):
+            load_ground_reaction(in_si(table), frames, "right")
+        return
+    ground = load_ground_reaction(in_si(table), frames, "right")
+    time = np.arange(COUNT * RATIO) / 1000.0
+    np.testing.assert_allclose(
+        ground.force[:, 1], np.interp(frames, time, pushes()[0][:, 2]), atol=0.05
+    )
+    assert "not numbers" in ground.notices[0]
+
+
+BAD_PLATES = {
+    "unknown type": {"type": 21},
+    "no surface": {"corners": 0 * AMTI_CORNERS},
+    "channel that is not there": {"channels": [1, 2, 3, 4, 5, 99]},
+    "one channel twice": {"channels": [1, 2, 3, 4, 5, 5]},
+}
+
+
+@pytest.mark.parametrize("fault", BAD_PLATES)
+def test_a_bad_plate_concerns_who_needs_it(tmp_path, fault):
+    path = recorded(tmp_path, plate=BAD_PLATES[fault])
+    recording = read_c3d(path)
+    assert recording.plates == () and np.isfinite(recording.points).all()
+    assert recording.all_notices
+    with pytest.raises(InputError, match="force plate 1"):
+        recording.plate(1)
+
+
+@pytest.mark.parametrize("name", ["arm", "", "J:arm"])
+def test_equal_labels_are_refused_only_where_one_is_needed(tmp_path, name):
+    import ezc3d
+
+    from tkamb.inputs.markers import marker_trajectories
+    from tkamb.inputs.tables import read_table
+
+    markers = standing_markers() | {"x": np.ones((20, 3)), "y": 2 * np.ones((20, 3))}
+    path = write_c3d(tmp_path / "a.c3d", markers)
+    whole = ezc3d.c3d(str(path))
+    whole["parameters"]["POINT"]["LABELS"]["value"] = [*list(markers)[:3], name, name]
+    whole.write(str(path))
+    table = read_table(path)
+    heel = marker_trajectories(table, ["RHeel"], 1.0)
+    np.testing.assert_allclose(heel[:, 0], markers["JW:RHeel"], atol=1e-6)
+    if name:
+        assert "two markers" in table.notices[0]
+        with pytest.raises(InputError, match="two columns named"):
+            marker_trajectories(table, [name], 1.0)
+
+
+def test_equal_channels_are_refused_only_where_one_is_needed(tmp_path):
+    import ezc3d
+
+    time = np.arange(200) / 1000.0
+    signals = {f"c{k}": np.sin(k + 9 * time) for k in range(3)}
+    path = write_c3d(tmp_path / "a.c3d", standing_markers(), analog=signals, units=["V"] * 3)
+    whole = ezc3d.c3d(str(path))
+    whole["parameters"]["ANALOG"]["LABELS"]["value"] = ["soleus", "free", "free"]
+    whole.write(str(path))
+    recording = read_c3d(path)
+    np.testing.assert_allclose(recording.channel("soleus"), signals["c0"], atol=1e-6)
+    with pytest.raises(InputError, match="two channels 'free'"):
+        recording.channel("free")

@@ -1,0 +1,77 @@
+"""When a force plate is loaded, and what it reads while nobody stands on it.
+
+Amplifiers drift. A plate that nobody stands on then adds a moment about the knee that no foot
+exerts, with the plate's whole distance as its lever. So a plate counts while it is loaded, and
+its unloaded level is told.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from tkamb.geometry.frames import Array
+
+
+@dataclass(frozen=True)
+class PlateLoadSettings:
+    """When a force plate counts as loaded, and what of it is drift.
+
+    Args:
+        load_N: force beyond the unloaded level that is a load; filters of ground reactions mostly
+            use 20 N.
+        margin_s: the wrench counts from this much before a load to this much after it. A foot
+            comes down and leaves within 0.02 s.
+        quiet_share: share of the samples, those of the smallest force, that show the unloaded
+            level.
+        quiet_spread_N: they show it if they lie within this of each other; no foot is so steady.
+        most_drift_N: and below this; a larger force is a foot's.
+        drift_N: an unloaded level beyond this is told. Noise has no median, and 2 N change the
+            knee's force by less than 0.5 % of a body's weight.
+        unloaded_s: a plate that is free for less shows no drift.
+    """
+
+    load_N: float = 20.0
+    margin_s: float = 0.05
+    quiet_share: float = 0.1
+    quiet_spread_N: float = 2.0
+    most_drift_N: float = 60.0
+    drift_N: float = 2.0
+    unloaded_s: float = 0.1
+
+
+PLATE_LOAD = PlateLoadSettings()
+
+
+def around_load(force: Array, time: Array) -> np.ndarray:
+    """Return (k,) whether a plate is loaded, or was or will be within the margin.
+
+    Args:
+        force: (k,) N, size of the force on the plate.
+        time: (k,) s.
+    """
+    known = np.sort(force[np.isfinite(force)])
+    quiet = known[: math.ceil(PLATE_LOAD.quiet_share * len(known))]
+    steady = (
+        len(quiet)
+        and np.ptp(quiet) <= PLATE_LOAD.quiet_spread_N
+        and quiet[-1] <= PLATE_LOAD.most_drift_N
+    )
+    loaded = np.flatnonzero(
+        force >= PLATE_LOAD.load_N + (float(np.median(quiet)) if steady else 0.0)
+    )
+    if not len(loaded):
+        return np.zeros(len(force), bool)
+    after = np.searchsorted(loaded, np.arange(len(force)))
+    nearest = np.minimum(
+        np.abs(time[loaded[np.minimum(after, len(loaded) - 1)]] - time),
+        np.abs(time - time[loaded[np.maximum(after - 1, 0)]]),
+    )
+    return np.asarray(nearest <= PLATE_LOAD.margin_s)
+
+
+def unloaded_level(vertical: Array, on: np.ndarray, time: Array) -> float:
+    """Return the median (N) of a plate's vertical force while nobody stands on it; else zero."""
+    free = vertical[~on & np.isfinite(vertical)]
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    return float(np.median(free)) if len(free) * step >= PLATE_LOAD.unloaded_s else 0.0
