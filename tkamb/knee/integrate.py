@@ -6,8 +6,8 @@ With v_m = (1 - theta) v + theta v' the step solves
 
 for v' by Newton's method, a from `pin.aba` with `Knee.external_forces`. theta = 1/2 is the implicit
 midpoint rule, of second order, which keeps the energy of a frictionless contact; theta = 1 is
-implicit Euler, of first order, which takes energy out and so finds where a knee comes to rest. An
-explicit step would have to resolve the contact: polyethylene under a thigh swings at 100 Hz or more.
+implicit Euler, of first order, which takes energy out and so finds where a knee rests. An
+explicit step would have to resolve the contact, which swings at 100 Hz or more under a thigh.
 
 Reference: Hairer, Lubich & Wanner, Geometric Numerical Integration, 2nd ed., II.1.1 (2006),
 doi:10.1007/3-540-30666-8.
