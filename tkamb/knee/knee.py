@@ -496,6 +496,39 @@ class Knee:
 
         show_knee(self, viewer, q, **options)
 
+    def at(self, q: Array, data: KneeData) -> KneePlace:
+        """Return where the knee is at q, and bring the placements in `data` up to date."""
+        return self._kinematics(data, q)
+
+    def link_poses(self, q: Array, femur: Array, data: KneeData) -> tuple[dict[str, Array], bool]:
+        """Return link -> pose (4, 4) in the insert frame, of a right knee.
+
+        Args:
+            q: (nq,), which places a patella of the model.
+            femur: (4, 4) of the femoral component in the insert frame.
+            data: from `create_data`.
+
+        Returns:
+            The poses, and whether the patella is among them; not where it is found nowhere.
+        """
+        place, patella = replace(self._kinematics(data, q), pose=femur), None
+        if self.extensor is not None:
+            try:
+                patella = self._find_patella(place, data)
+            except ComputationError:
+                patella = None
+        return self._link_poses(place, patella), patella is not None
+
+    def extensor_paths(self, poses: dict[str, Array]) -> dict[str, Array]:
+        """Return quadriceps and patellar ligament as they run (n, 3) m, insert frame.
+
+        Empty without an extensor mechanism, or where the patella is found nowhere.
+        """
+        if self._extensor_lines is None or "patella" not in poses:
+            return {}
+        muscle, ligament = self._extensor_lines.paths(_Posed(poses))
+        return {self._extensor_lines.muscle.name: muscle.points, PATELLAR_LIGAMENT: ligament.points}
+
     @property
     def query(self) -> "ClosestPointQuery":
         """Closest points of femoral component and insert, made when first asked for."""
