@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from tkamb.body.ligaments import BundleArrays, Ligament
     from tkamb.body.patella import PatellaState
     from tkamb.contact.model import ContactModel
+    from tkamb.contact.probe import ProbedContact
     from tkamb.contact.result import ContactResult
     from tkamb.equilibrium.released import KneeEquilibrium
     from tkamb.geometry.closest import ClosestPointQuery
@@ -69,11 +70,13 @@ class KneeData:
         data: Pinocchio's, of the user's model.
         probe: of the contact model, which remembers the last contact; None without one.
         patella: where the patella was found last.
+        seen: the last pose, as bytes, and the contact there.
     """
 
     data: Any
     probe: Any = None
     patella: "PatellaState | None" = None
+    seen: "tuple[bytes, ProbedContact] | None" = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +241,7 @@ class Knee:
         place = self._kinematics(data, q, v)
         on_insert = np.zeros(6)
         if self.contact is not None:
-            contact = self.contact.at(data.probe, place.pose)
+            contact = self._contact_at(data, place)
             on_insert = self.contact.wrench(contact, self.bridge.twist(data.data))
         if self._crossing is not None:
             on_insert = on_insert + self._crossing.wrench(place.pose)
@@ -287,7 +290,7 @@ class Knee:
         total = np.zeros((6, 6))
         if self.contact is not None:
             twist = self.bridge.twist(data.data)
-            contact = self.contact.at(data.probe, place.pose)
+            contact = self._contact_at(data, place)
             total += self.contact.stiffness(data.probe, place.pose, contact, twist, exact)
         total += self._ligament_stiffness(place)
         return self._mirrored_matrix(total)
@@ -302,7 +305,7 @@ class Knee:
         place = self._kinematics(data, q, v)
         if self.contact is None:
             return np.zeros((6, 6))
-        contact = self.contact.at(data.probe, place.pose)
+        contact = self._contact_at(data, place)
         return self._mirrored_matrix(self.contact.damping(contact, self.bridge.twist(data.data)))
 
     def relative_jacobian(self, q: Array, data: KneeData | None = None) -> Array:
@@ -321,7 +324,11 @@ class Knee:
         for place, sign in ((self.bridge.component, 1.0), (self.bridge.insert, -1.0)):
             if place.joint:
                 local = pin.getJointJacobian(model, cache, place.joint, pin.ReferenceFrame.LOCAL)
-                total += sign * insert.actInv(cache.oMi[place.joint]).toActionMatrix() @ local
+                total += (
+                    sign
+                    * insert.actInv(cache.oMi[place.joint]).toActionMatrix()
+                    @ local.reshape(6, -1)
+                )
         return total
 
     def inverse_dynamics(
@@ -489,6 +496,39 @@ class Knee:
 
         show_knee(self, viewer, q, **options)
 
+    def at(self, q: Array, data: KneeData) -> KneePlace:
+        """Return where the knee is at q, and bring the placements in `data` up to date."""
+        return self._kinematics(data, q)
+
+    def link_poses(self, q: Array, femur: Array, data: KneeData) -> tuple[dict[str, Array], bool]:
+        """Return link -> pose (4, 4) in the insert frame, of a right knee.
+
+        Args:
+            q: (nq,), which places a patella of the model.
+            femur: (4, 4) of the femoral component in the insert frame.
+            data: from `create_data`.
+
+        Returns:
+            The poses, and whether the patella is among them; not where it is found nowhere.
+        """
+        place, patella = replace(self._kinematics(data, q), pose=femur), None
+        if self.extensor is not None:
+            try:
+                patella = self._find_patella(place, data)
+            except ComputationError:
+                patella = None
+        return self._link_poses(place, patella), patella is not None
+
+    def extensor_paths(self, poses: dict[str, Array]) -> dict[str, Array]:
+        """Return quadriceps and patellar ligament as they run (n, 3) m, insert frame.
+
+        Empty without an extensor mechanism, or where the patella is found nowhere.
+        """
+        if self._extensor_lines is None or "patella" not in poses:
+            return {}
+        muscle, ligament = self._extensor_lines.paths(_Posed(poses))
+        return {self._extensor_lines.muscle.name: muscle.points, PATELLAR_LIGAMENT: ligament.points}
+
     @property
     def query(self) -> "ClosestPointQuery":
         """Closest points of femoral component and insert, made when first asked for."""
@@ -640,6 +680,14 @@ class Knee:
             v = self._check(v, "v", self.model.nv)
             pin.forwardKinematics(self.model, data.data, q, v)
         return self.bridge.place(data.data)
+
+    def _contact_at(self, data: KneeData, place: KneePlace) -> "ProbedContact":
+        """Return the contact at a place; the last one is remembered in the caller's data."""
+        key = place.pose.tobytes()
+        if data.seen is None or data.seen[0] != key:
+            assert self.contact is not None
+            data.seen = key, self.contact.at(data.probe, place.pose)
+        return data.seen[1]
 
     def _need_contact(self) -> "KneeContact":
         if self.contact is None:

@@ -1,0 +1,90 @@
+"""Forward dynamics of a model with a knee: one implicit step, an example to copy and change.
+
+With v_m = (1 - theta) v + theta v' the step solves
+
+    v' = v + h a(q + theta h v_m, v_m),    q' = q + h v_m
+
+for v' by Newton's method, a from `pin.aba` with `Knee.external_forces`. theta = 1/2 is the implicit
+midpoint rule, of second order, which keeps the energy of a frictionless contact; theta = 1 is
+implicit Euler, of first order, which takes energy out and so finds where a knee rests. An
+explicit step would have to resolve the contact, which swings at 100 Hz or more under a thigh.
+
+Reference: Hairer, Lubich & Wanner, Geometric Numerical Integration, 2nd ed., II.1.1 (2006),
+doi:10.1007/3-540-30666-8.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Array
+from tkamb.knee.knee import Knee, KneeData
+
+VELOCITY_TOLERANCE = 1e-10
+"""m/s and rad/s: what Newton's method leaves of the step's equation."""
+MAX_NEWTON_STEPS = 40
+
+
+def implicit_step(
+    knee: Knee,
+    q: Array,
+    v: Array,
+    step: float,
+    tau: Array | None = None,
+    external: Any = None,
+    tensions: Mapping[str, float] | None = None,
+    theta: float = 0.5,
+    friction_of_joints: Array | None = None,
+    data: KneeData | None = None,
+) -> tuple[Array, Array]:
+    """Return q and v one step later.
+
+    Args:
+        knee: on the model that moves.
+        q: (nq,).
+        v: (nv,).
+        step: s.
+        tau: (nv,) of the joints; None: none.
+        external: forces on the joints beside the knee's, as `fext` of `pin.aba`.
+        tensions: of muscles, as `Knee.external_forces` takes them.
+        theta: 0.5: implicit midpoint; 1: implicit Euler.
+        friction_of_joints: (nv,) viscous, N·s/m or N·m·s/rad, of the joints.
+        data: from `Knee.create_data`, to save time.
+
+    Raises:
+        ComputationError: Newton's method does not converge, or the contact model is out of range:
+            the step is too long.
+    """
+    model, data = knee.model, knee.create_data() if data is None else data
+    drag = np.zeros(model.nv) if friction_of_joints is None else friction_of_joints
+    push = np.zeros(model.nv) if tau is None else tau
+    cache, ahead, last = model.createData(), np.array(v, float), np.inf
+    for _ in range(MAX_NEWTON_STEPS):
+        middle = (1.0 - theta) * v + theta * ahead
+        place = pin.integrate(model, q, theta * step * middle)
+        forces = knee.external_forces(place, middle, tensions, data)
+        if external is not None:
+            forces = pin.StdVec_Force([f + e for f, e in zip(forces, external, strict=True)])
+        torque = push - drag * middle
+        pin.computeABADerivatives(model, cache, place, middle, torque, forces)
+        missed = ahead - v - step * cache.ddq
+        size = float(np.abs(missed).max())
+        if size < VELOCITY_TOLERANCE or (size < 1e3 * VELOCITY_TOLERANCE and size >= last):
+            return pin.integrate(model, q, step * middle), ahead
+        last = size
+        jacobian = knee.relative_jacobian(place)
+        stiffness = knee.stiffness(place, middle, data, exact=False)
+        damping = knee.damping(place, middle, data)
+        compliance = cache.Minv
+        by_q = cache.ddq_dq - compliance @ jacobian.T @ stiffness @ jacobian
+        by_v = cache.ddq_dv - compliance @ (jacobian.T @ damping @ jacobian + np.diag(drag))
+        slope = np.eye(model.nv) - step * theta * (by_v + theta * step * by_q)
+        ahead = ahead - np.linalg.solve(slope, missed)
+    raise ComputationError(
+        f"a step of {step:g} s does not converge (off by {last:.2g} m/s or rad/s)",
+        "implicit_step",
+        "shorten the step",
+    )

@@ -1,0 +1,162 @@
+"""The knee drawn in a user's own MeshCat window."""
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import meshcat.geometry as geometry
+import numpy as np
+import pinocchio as pin
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, transform
+from tkamb.knee.parts import mirrored_surface
+
+if TYPE_CHECKING:
+    from tkamb.contact.result import ContactResult
+    from tkamb.geometry.surface import Surface
+    from tkamb.knee.knee import Knee
+
+COLOURS = {"femoral": 0xB8C4CE, "insert": 0xEFEBDD, "patella": 0xEFEBDD}
+LIGAMENT, MUSCLE, ARROW = 0x2E7D32, 0xB71C1C, 0x1A1A1A
+ARROW_RADIUS = 1.5e-3
+"""m."""
+STRAND_RADIUS = 8e-4
+"""m, of ligaments, muscles and the patellar ligament."""
+PRESSURE_COLOURS = np.array([[0.27, 0.0, 0.33], [0.13, 0.57, 0.55], [0.99, 0.91, 0.14]])
+"""RGB from no pressure to the peak: three colours of viridis, even in lightness."""
+
+
+def show_knee(
+    knee: "Knee",
+    viewer: Any,
+    q: Array,
+    contact: "ContactResult | None" = None,
+    node: str = "knee",
+    newton: float = 5e-5,
+    peak: float | None = None,
+    opacity: float = 0.35,
+) -> None:
+    """Draw a knee at q.
+
+    Below the viewer's root node: implant, pressure map, ligaments, lines of the extensor mechanism
+    and an arrow for the force on each condyle. A second call with the same node replaces the first.
+
+    Args:
+        knee: the knee.
+        viewer: a `pin.visualize.MeshcatVisualizer`, or a `meshcat.Visualizer`.
+        q: (nq,).
+        contact: the contact to draw, from `Knee.press` or `Knee.evaluate`; None: at q. Its height
+            is the femur's in the picture.
+        node: its name in the scene's tree.
+        newton: m, length of an arrow per newton.
+        peak: Pa, pressure of the last colour; None: the largest there is.
+        opacity: of the femoral component, 0 to 1.
+
+    Raises:
+        InputError: a viewer that is neither.
+    """
+    window, root = _window(viewer)
+    tree = window[root][node] if root else window[node]
+    tree.delete()
+    data = knee.create_data()
+    place = knee.at(q, data)
+    insert = data.data.oMi[knee.bridge.insert.joint] * knee.bridge.insert.placement
+    world = insert.homogeneous
+    if contact is None and knee.contact is not None:
+        contact = knee.evaluate(q)
+    femur = place.pose if contact is None else contact.pose
+
+    def in_world(points: Array) -> Array:
+        """Return points (n, 3) of the insert frame of a right knee in the world."""
+        return transform(world, points @ MIRROR if knee.left else points)
+
+    flip = mirrored_pose if knee.left else np.asarray
+    femur_in_world = world @ flip(femur)
+    _solid(tree["femoral"], knee.femoral, femur_in_world, knee.left, "femoral", opacity)
+    _solid(tree["insert"], knee.insert, world, knee.left, "insert", 0.6)
+    poses, patella = knee.link_poses(q, femur, data)
+    if patella:
+        _solid(
+            tree["patella"], knee.button, world @ flip(poses["patella"]), knee.left, "patella", 1.0
+        )
+    for bundle in knee.ligaments:
+        if {bundle.proximal.link, bundle.distal.link} <= set(poses):
+            ends = np.array(bundle.ends(poses))
+            _strand(tree["ligaments"][bundle.name], in_world(ends), LIGAMENT)
+    for name, path in knee.extensor_paths(poses).items():
+        _strand(tree["extensor"][name], in_world(path), MUSCLE)
+    if contact is not None and np.isfinite(contact.pressure).all():
+        _map(tree["pressure"], contact, knee.contact.state.triangles, in_world, peak)  # type: ignore[union-attr]
+        for side, condyle in (("medial", contact.medial), ("lateral", contact.lateral)):
+            if condyle is None:
+                continue
+            own = contact.nodal_force[_side(contact, knee, side)].sum(axis=0)
+            start = condyle.centre_of_pressure
+            path = in_world(np.array([start, start - newton * own]))
+            _strand(tree["force"][side], path, ARROW, ARROW_RADIUS)
+
+
+def _window(viewer: Any) -> tuple[Any, str]:
+    """Return the MeshCat window of a viewer, and its root node."""
+    inner = getattr(viewer, "viewer", viewer)
+    if not hasattr(inner, "set_object"):
+        raise InputError(
+            f"{type(viewer).__name__} is no MeshCat viewer",
+            "Knee.show",
+            "give a pin.visualize.MeshcatVisualizer after initViewer()",
+        )
+    return inner, getattr(viewer, "viewerRootNodeName", "") if inner is not viewer else ""
+
+
+def _side(contact: "ContactResult", knee: "Knee", side: str) -> Any:
+    from tkamb.contact.result import medial_points
+
+    assert knee.contact is not None
+    medial = medial_points(contact.points, contact.pose, knee.contact.pair.split)
+    return medial if side == "medial" else ~medial
+
+
+def _solid(
+    node: Any, surface: "Surface | None", pose: Array, left: bool, part: str, opacity: float
+) -> None:
+    if surface is None:
+        return
+    own = mirrored_surface(surface) if left else surface
+    material = geometry.MeshPhongMaterial(
+        color=COLOURS[part], opacity=opacity, transparent=opacity < 1.0
+    )
+    node.set_object(geometry.TriangularMeshGeometry(own.vertices, own.faces), material)
+    node.set_transform(pose)
+
+
+def _strand(node: Any, points: Array, colour: int, radius: float = STRAND_RADIUS) -> None:
+    """Draw a polyline (n, 3) of the world as cylinders."""
+    for k, (start, end) in enumerate(pairwise(points)):
+        along = end - start
+        length = float(np.linalg.norm(along))
+        if length == 0.0:
+            continue
+        pose = np.eye(4)
+        pose[:3, :3] = pin.Quaternion.FromTwoVectors(
+            np.array([0.0, 1.0, 0.0]), along / length
+        ).matrix()
+        pose[:3, 3] = (start + end) / 2.0
+        material = geometry.MeshLambertMaterial(color=colour)
+        node[str(k)].set_object(geometry.Cylinder(length, radius), material)
+        node[str(k)].set_transform(pose)
+
+
+def _map(
+    node: Any, contact: "ContactResult", triangles: Array, in_world: Any, peak: float | None
+) -> None:
+    """Draw the pressure on the loaded triangles of the map, just above the insert."""
+    loaded = triangles[(contact.pressure[triangles] > 0.0).any(axis=1)]
+    if not len(loaded):
+        return
+    top = float(contact.pressure.max()) if peak is None else peak
+    share = np.clip(contact.pressure / top, 0.0, 1.0)
+    ramp = np.linspace(0.0, 1.0, len(PRESSURE_COLOURS))
+    colours = np.stack([np.interp(share, ramp, one) for one in PRESSURE_COLOURS.T], axis=1)
+    points = in_world(contact.points + 1e-4 * contact.normals)
+    material = geometry.MeshBasicMaterial(vertexColors=True, side="DoubleSide")
+    node.set_object(geometry.TriangularMeshGeometry(points, loaded, colours), material)
