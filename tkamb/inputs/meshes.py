@@ -278,9 +278,13 @@ def _check_size(
     advice = ", ".join(
         f"'{u}' would make it {extent * LENGTH[u] / MILLIMETRE:.4g} mm" for u in fits
     )
+    why = (
+        f"which no such part of a knee is ({size[0] / MILLIMETRE:g} to {size[1] / MILLIMETRE:g} mm)"
+    )
+    if size[0] <= extent * LENGTH[unit] <= size[1]:
+        why = "smaller than any person's knee"
     raise InputError(
-        f"{name} is {extent * LENGTH[unit] / MILLIMETRE:.4g} mm long in unit '{unit}', which no "
-        f"such part of a knee is ({size[0] / MILLIMETRE:g} to {size[1] / MILLIMETRE:g} mm)",
+        f"{name} is {extent * LENGTH[unit] / MILLIMETRE:.4g} mm long in unit '{unit}', {why}",
         path,
         f"is the unit right? {advice}" if fits else "check the mesh and its unit",
     )
