@@ -1,6 +1,7 @@
 """Mesh files into surfaces: SI units, anatomical axes, mended with a notice or refused."""
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from tkamb.errors import InputError
 from tkamb.files import MESH_LIMIT, check_file
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import MIRROR, Array
+from tkamb.geometry.inner_walls import InnerWall, find_inner_wall, touching_groups
 from tkamb.geometry.polygons import triangulated
 from tkamb.geometry.repair import Repair, repair
 from tkamb.geometry.surface import Surface
@@ -113,8 +115,11 @@ def load_surface(
     _check_rounding(vertices[faces.reshape(-1)] * LENGTH[unit], LENGTH[unit], path, name)
     mended = repair(vertices * LENGTH[unit], faces)
     _check_surface(mended, path, name, unit)
+    wall = None
+    if closed and size == IMPLANT_SIZE and not mended.holes:
+        mended, wall = _without_inner_wall(mended, unit)
     if size == IMPLANT_SIZE:
-        _check_part(mended, path, name, rotation[2])
+        _check_part(mended, path, name, rotation[2], wall)
     if closed and mended.holes:
         raise InputError(
             f"{name} is not closed: {describe_holes(mended.holes, unit)}", path, _CLOSE
@@ -228,8 +233,27 @@ def _opposite(names: list[str]) -> str:
     return ",".join([*names[:2], turned])
 
 
-def _check_part(mended: Repair, path: str | Path, name: str, right: Array) -> None:
-    """Refuse an open sheet, such as a contact surface, and several bodies in one file."""
+def _without_inner_wall(mended: Repair, unit: str) -> tuple[Repair, InnerWall | None]:
+    """Return the part without a wall inside it, and a wall that has to stay; both are told."""
+    wall = find_inner_wall(mended.vertices, mended.faces)
+    if wall is None:
+        return mended, None
+    where = ", ".join(f"{round(value / LENGTH[unit], 2) + 0.0:g}" for value in wall.centre)
+    words = f"inner wall of {1e6 * wall.area:.0f} mm² at ({where}) {unit} between touching bodies"
+    if wall.without is None:
+        return replace(mended, notices=(*mended.notices, f"{words} does not count")), wall
+    vertices, faces = wall.without
+    notices = (*mended.notices, f"{words} removed")
+    return replace(mended, vertices=vertices, faces=faces, notices=notices), None
+
+
+def _check_part(
+    mended: Repair, path: str | Path, name: str, right: Array, wall: InnerWall | None
+) -> None:
+    """Refuse an open sheet, such as a contact surface, and several bodies in one file.
+
+    Bodies that touch or overlap, on the two sides of a wall, are one.
+    """
     extent = float(np.ptp(mended.vertices, axis=0).max())
     if mended.holes and mended.holes[0].width > SHEET_WIDTH * extent:
         raise InputError(
@@ -242,6 +266,10 @@ def _check_part(mended: Repair, path: str | Path, name: str, right: Array) -> No
     if not connected_parts(mended.faces).any():
         return
     bodies = separate_bodies(mended.vertices, mended.faces)
+    if wall is not None and len(bodies) > 1:
+        own = [body.faces for body in bodies]
+        if touching_groups(mended.vertices, own, mended.faces, wall.faces) == 1:
+            return
     if len(bodies) > 1 and not _two_condyles(bodies, right):
         sizes = ", ".join(body_size(body, MILLIMETRE) for body in bodies[:3])
         more = f", and {len(bodies) - 3} more" if len(bodies) > 3 else ""

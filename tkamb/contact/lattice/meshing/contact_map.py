@@ -57,11 +57,13 @@ def contact_map(lattice: Lattice, insert: Surface) -> tuple[Index, ContactMap]:
 
 
 def _thickness(points: Array, rays: RayCaster, spacing: Array) -> Array:
-    """Return how far down from each point the insert goes, m."""
+    """Return how far down from each point the insert goes, m; to the last exit, voids included."""
     inside = points - [0.0, 1e-3 * spacing[1], 0.0]
-    distance, _ = rays.first(inside, (0.0, -1.0, 0.0))
+    ray, distance, _ = rays.all(inside, (0.0, -1.0, 0.0))
+    last = np.full(len(points), -np.inf)
+    np.maximum.at(last, ray, distance)
     whole = points[:, 1] - rays.surface.bounds[0, 1]
-    return np.where(np.isfinite(distance), distance + 1e-3 * spacing[1], whole)
+    return np.where(np.isfinite(last), last + 1e-3 * spacing[1], whole)
 
 
 def _lift(points: Array, rays: RayCaster) -> Array:
