@@ -112,7 +112,7 @@ def test_bad_files(tmp_path):
     points = tmp_path / "points.ply"
     trimesh.PointCloud(np.random.default_rng(0).normal(size=(20, 3))).export(points)
     refused("triangles", points, "mm")
-    refused("unknown unit 'inch'", save(tmp_path / "plate.stl", plate()), "inch")
+    refused("unknown unit 'foot'", save(tmp_path / "plate.stl", plate()), "foot")
 
 
 def test_a_coordinate_that_is_not_a_number(tmp_path):

@@ -7,6 +7,7 @@ from typing import Any
 
 from tkamb.defaults import CONTACT_MODEL
 from tkamb.errors import InputError
+from tkamb.units import LENGTH
 
 
 def add_press(commands: Any) -> None:
@@ -15,7 +16,7 @@ def add_press(commands: Any) -> None:
     press.add_argument("femoral", type=Path)
     press.add_argument("insert", type=Path)
     press.add_argument("--load", type=float, required=True, metavar="N")
-    press.add_argument("--units", choices=("mm", "cm", "m"), default="mm", help="of both meshes")
+    press.add_argument("--units", choices=tuple(LENGTH), default="mm", help="of both meshes")
     pose = press.add_mutually_exclusive_group()
     pose.add_argument(
         "--pose",
@@ -93,7 +94,7 @@ def add_mesh(commands: Any) -> None:
     lattice = verbs.add_parser("lattice", help="the lattice of an insert, and how good it is")
     lattice.add_argument("insert", type=Path, metavar="INSERT")
     lattice.add_argument("--resolution", type=float, default=1.0, metavar="MM", help="cell size")
-    lattice.add_argument("--units", choices=("mm", "cm", "m"), default="mm", help="of the mesh")
+    lattice.add_argument("--units", choices=tuple(LENGTH), default="mm", help="of the mesh")
     _add_side(lattice)
     lattice.add_argument("--out", type=Path, metavar="F.vtu", help="for ParaView or meshio")
     lattice.add_argument("--json", action="store_true")

@@ -69,7 +69,7 @@ def lattice_of_file(
     Args:
         insert: STL, OBJ or PLY file, closed.
         resolution_mm: wanted edge of a cell.
-        units: of the mesh: "m", "cm" or "mm".
+        units: of the mesh: "m", "cm", "mm" or "inch".
         axes: mesh axes that point anterior, superior and right.
         side: of the knee; a left one is mirrored.
         out: .vtu file (metres, insert frame).

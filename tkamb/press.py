@@ -221,7 +221,7 @@ def press_meshes(
         femoral: mesh file of the femoral component.
         insert: mesh file of the insert, closed.
         load: N, along the insert's bottom normal.
-        units: unit of length of both files and of the pose, "mm", "cm" or "m".
+        units: unit of length of both files and of the pose, "mm", "cm", "m" or "inch".
         pose: x, y, z (units), rx, ry, rz (deg, intrinsic x-y-z): places the femoral mesh in
             the insert mesh's own axes. None: as the files have them, both about one origin.
             Height above the insert does not matter: the press moves along the load.

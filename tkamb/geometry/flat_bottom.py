@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index, Mask, pose
+from tkamb.geometry.inner_walls import facing_material
 from tkamb.geometry.surface import Surface
 
 FLATNESS = 5e-5
@@ -19,6 +20,8 @@ COMPARABLE_SHARE = 0.5
 """Flats whose area is at least this share of the largest compete with it."""
 CLEAR_SHARE = 0.9
 """Between two flats that face down, the larger wins below this ratio of areas."""
+INNER_SHARE = 0.5
+"""A flat of which a larger share faces material is a wall inside the part."""
 UNEVEN_NOISE = 1e-6
 """m; a bottom that is rougher than this gets a notice: noise, or no flat at all."""
 _LEVEL_TILT = 1e-6
@@ -92,6 +95,9 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
     if not flats:
         raise InputError(f"{surface.name} has no flat bottom", None, "is it a tibial insert?")
     down = [flat for flat in flats if -flat.normal[1] >= math.cos(TILT_LIMIT)]
+    if len(down) > 1:  # the wall between two touching bodies faces down too
+        outer = [flat for flat in down if not _is_inner(surface, flat)]
+        down = outer or down
     if not down:
         raise _faces_elsewhere(surface.name, flats[0], rotation)
     if len(down) > 1 and down[1].area >= CLEAR_SHARE * down[0].area:
@@ -116,6 +122,12 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
             _described(flats[0], rotation),
         )
     return down[0]
+
+
+def _is_inner(surface: Surface, flat: FlatBottom) -> bool:
+    """Say whether most of a flat has material on its outer side."""
+    area = surface.areas[flat.faces]
+    return bool(area @ facing_material(surface, flat.faces) > INNER_SHARE * area.sum())
 
 
 def _faces_elsewhere(name: str, flat: FlatBottom, rotation: Array) -> InputError:

@@ -113,7 +113,8 @@ def _crossings(
     across, along = [(axis + 1) % 3, (axis + 2) % 3], axis
     flat = surface.vertices[:, across]
     corners = flat[surface.faces]
-    low, high = corners.min(axis=1), corners.max(axis=1)
+    grid = PlanGrid.over(flat)  # its rounding may bring a line onto a triangle beside it
+    low, high = corners.min(axis=1) - grid.step, corners.max(axis=1) + grid.step
     a0, a1 = np.searchsorted(first, low[:, 0], "left"), np.searchsorted(first, high[:, 0], "right")
     b0, b1 = (
         np.searchsorted(second, low[:, 1], "left"),
@@ -124,7 +125,6 @@ def _crossings(
     width = (b1 - b0)[face]
     a, b = a0[face] + rank // np.maximum(width, 1), b0[face] + rank % np.maximum(width, 1)
     points = np.column_stack([first[a], second[b]])
-    grid = PlanGrid.over(flat)
     area, sides = _signed_areas(
         surface.faces[face], flat, points, grid.whole(flat), grid.whole(points)
     )

@@ -43,11 +43,11 @@ def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
     turned = np.unique(polygon[along < -ROUNDING * size[polygon]])
     if not len(turned):
         return fans
-    ears = [_ears(vertices, corners[starts[p] : ends[p]], total[p]) for p in turned]
-    return np.concatenate([fans[~np.isin(polygon, turned)], *ears])
+    cut = [ears(vertices, corners[starts[p] : ends[p]], total[p]) for p in turned]
+    return np.concatenate([fans[~np.isin(polygon, turned)], *cut])
 
 
-def _ears(vertices: Array, ring: Index, normal: Array) -> Index:
+def ears(vertices: Array, ring: Index, normal: Array) -> Index:
     """Return a polygon (m,) cut into triangles (m - 2, 3), ear after ear.
 
     Args:

@@ -60,6 +60,11 @@ class PlanGrid:
         half = float((high - low).max()) / 2.0
         return cls((low + high) / 2.0, (2**PLAN_BITS - 1) / max(half, 1e-30))
 
+    @property
+    def step(self) -> float:
+        """What separates two whole numbers, m."""
+        return 1.0 / self.scale
+
     def whole(self, plan: Array) -> Index:
         """Return positions (n, 2), m, as whole numbers; what lies far outside is brought near."""
         numbers = np.rint((plan - self.middle) * self.scale)

@@ -34,7 +34,7 @@ def add_import(commands: Any) -> None:
         p.add_argument(f"--{part}", type=Path, metavar="F", help="mesh")
         p.add_argument(f"--{part}-frame", metavar="NAME", help="body or frame of its mesh")
     p.add_argument("--femur-bone", type=Path, metavar="F", help="mesh that the muscle may wrap")
-    p.add_argument("--mesh-unit", choices=("m", "cm", "mm"))
+    p.add_argument("--mesh-unit", choices=tuple(LENGTH))
     p.add_argument(
         "--mesh-axes",
         metavar="ANT,SUP,RIGHT",

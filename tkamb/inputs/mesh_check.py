@@ -150,8 +150,8 @@ class MeshHealth:
 
     def _unit_question(self) -> str:
         if not self.units:
-            return "no unit of m, cm, mm makes this a part of a knee: is it one?"
-        names = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
+            return f"no unit of {', '.join(LENGTH)} makes this a part of a knee: is it one?"
+        names = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "inch": "inches"}
         return " or ".join(f"{names[unit]}? then pass --units {unit}" for unit in self.units)
 
     def _axis_questions(self) -> list[str]:

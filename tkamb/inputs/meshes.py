@@ -1,6 +1,7 @@
 """Mesh files into surfaces: SI units, anatomical axes, mended with a notice or refused."""
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,15 @@ from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.files import MESH_LIMIT, check_file
+from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import MIRROR, Array
+from tkamb.geometry.inner_walls import InnerWall, find_inner_wall, touching_groups
+from tkamb.geometry.polygons import triangulated
 from tkamb.geometry.repair import Repair, repair
 from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import Body, BoundaryLoop, connected_parts, separate_bodies
+from tkamb.inputs.polygon_files import read_obj, read_ply
+from tkamb.inputs.stl import read_binary_stl
 from tkamb.inputs.vtp import read_vtp
 from tkamb.units import LENGTH, MILLIMETRE
 
@@ -21,6 +27,15 @@ IMPLANT_SIZE = (0.010, 0.250)
 """m; least and greatest length of a part of a knee implant."""
 BONE_SIZE = (0.010, 0.650)
 """m; least and greatest length of a bone at the knee, whole or in part."""
+
+SMALLEST_KNEE = 0.034
+"""m; no whole component of a person's knee is shorter (the smallest are 50 mm wide)."""
+USUAL_SIZE = (0.040, 0.120)
+"""m; length of usual components, partial ones included."""
+ROUNDING_NOTICE = 1e-6
+"""m; a mesh rounded more coarsely gets a notice: forces change by about half a per cent."""
+ROUNDING_LIMIT = 5e-6
+"""m; a mesh rounded more coarsely is refused: 8 µm change forces by 4 %."""
 
 SHEET_WIDTH = 1.0 / 3.0
 """An opening wider than this share of a part's length makes it a sheet."""
@@ -78,7 +93,7 @@ def load_surface(
 
     Args:
         path: the file.
-        unit: its unit of length, "m", "cm" or "mm".
+        unit: its unit of length, "m", "cm", "mm" or "inch".
         axes: its axes that point anterior, superior and to the right.
         name: what to call the part in messages.
         closed: whether the surface must enclose a volume.
@@ -97,17 +112,24 @@ def load_surface(
         raise InputError(f"unknown unit '{unit}' of {name}", path, f"one of {', '.join(LENGTH)}")
     vertices, faces = read_triangles(path)
     _check_size(vertices[faces.reshape(-1)], unit, path, name, size)
+    _check_rounding(vertices[faces.reshape(-1)] * LENGTH[unit], LENGTH[unit], path, name)
     mended = repair(vertices * LENGTH[unit], faces)
     _check_surface(mended, path, name, unit)
+    wall = None
+    if closed and size == IMPLANT_SIZE and not mended.holes:
+        mended, wall = _without_inner_wall(mended, unit)
     if size == IMPLANT_SIZE:
-        _check_part(mended, path, name, rotation[2])
+        _check_part(mended, path, name, rotation[2], wall)
     if closed and mended.holes:
         raise InputError(
             f"{name} is not closed: {describe_holes(mended.holes, unit)}", path, _CLOSE
         )
     if mended.notices:
         _log.warning("%s: %s mesh repaired: %s", path, name, "; ".join(mended.notices))
-    return Surface(mended.vertices @ rotation.T + 0.0, mended.faces, name, merged=True)
+    surface = Surface(mended.vertices @ rotation.T + 0.0, mended.faces, name, merged=True)
+    if size == IMPLANT_SIZE:
+        _check_knee_width(surface, path)
+    return surface
 
 
 def mirrored(surface: Surface) -> Surface:
@@ -141,14 +163,16 @@ def read_triangles(path: str | Path) -> tuple[Array, Indices]:
 
 
 def _read_mesh(path: Path) -> tuple[Array, Indices]:
-    """Return vertices and faces of an STL, OBJ or PLY file, as trimesh reads it."""
+    """Return vertices and triangles of a mesh file; OBJ and PLY ones may hold polygons."""
     try:
         check_file(path, MESH_LIMIT, what="mesh file")
-        if path.suffix.lower() == ".stl" and (corners := _binary_stl(path)) is not None:
+        suffix = path.suffix.lower()
+        if suffix == ".stl" and (corners := read_binary_stl(path)) is not None:
             return corners, np.arange(len(corners)).reshape(-1, 3)
-        import trimesh  # a quarter of a second, which the usual mesh need not wait for
-
-        mesh = trimesh.load(path, force="mesh", process=False)
+        if suffix in (".obj", ".ply"):
+            vertices, corners, ends = read_obj(path) if suffix == ".obj" else read_ply(path)
+            return vertices, triangulated(vertices, corners, ends)
+        return _read_by_trimesh(path)
     except InputError:
         raise
     except ImportError:  # an STL that is not binary goes to the reader of text, which is extra
@@ -156,31 +180,30 @@ def _read_mesh(path: Path) -> tuple[Array, Indices]:
     except Exception as error:  # readers of many formats: each raises what it likes
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(f"cannot be read as a mesh ({reason})", path, _FORMATS) from None
+
+
+def _read_by_trimesh(path: Path) -> tuple[Array, Indices]:
+    """Return vertices and triangles of a text STL file, or of another format."""
+    import trimesh  # a quarter of a second, which the usual mesh need not wait for
+
+    mesh = trimesh.load(path, force="mesh", process=False)
     if not isinstance(mesh, trimesh.Trimesh):
         raise InputError(_NO_TRIANGLES, path, _FORMATS)
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
 
 
-def _binary_stl(path: Path) -> Array | None:
-    """Return the corners (3 k, 3) of a binary STL file; None if its length is not that of one.
-
-    80 bytes of anything, the number of triangles, then for each a normal, three corners and two
-    bytes (little-endian).
-    """
-    content = path.read_bytes()
-    count = int.from_bytes(content[80:84], "little")
-    if count == 0 or len(content) != 84 + _STL_TRIANGLE.itemsize * count:
-        return None
-    triangles = np.frombuffer(content, _STL_TRIANGLE, offset=84)
-    return triangles["corners"].reshape(-1, 3).astype(np.float64)
-
-
-_STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
-
-
 def plausible_units(extent: float, size: tuple[float, float] = IMPLANT_SIZE) -> list[str]:
-    """Return the units in which the largest extent (file units) is within `size` (m)."""
-    return [unit for unit, metres in LENGTH.items() if size[0] <= extent * metres <= size[1]]
+    """Return the units in which the largest extent (file units) is within `size` (m).
+
+    One that makes a part of an implant smaller than any knee's is left out if another one makes
+    it as large as they are: inches taken for centimetres give a knee of 30 mm.
+    """
+    lengths = {unit: extent * metres for unit, metres in LENGTH.items()}
+    fits = [unit for unit, length in lengths.items() if size[0] <= length <= size[1]]
+    if size != IMPLANT_SIZE:
+        return fits
+    usual = [unit for unit in fits if USUAL_SIZE[0] <= lengths[unit] <= USUAL_SIZE[1]]
+    return [unit for unit in fits if lengths[unit] >= SMALLEST_KNEE or not usual]
 
 
 def body_size(body: Body, unit: float) -> str:
@@ -210,8 +233,27 @@ def _opposite(names: list[str]) -> str:
     return ",".join([*names[:2], turned])
 
 
-def _check_part(mended: Repair, path: str | Path, name: str, right: Array) -> None:
-    """Refuse an open sheet, such as a contact surface, and several bodies in one file."""
+def _without_inner_wall(mended: Repair, unit: str) -> tuple[Repair, InnerWall | None]:
+    """Return the part without a wall inside it, and a wall that has to stay; both are told."""
+    wall = find_inner_wall(mended.vertices, mended.faces)
+    if wall is None:
+        return mended, None
+    where = ", ".join(f"{round(value / LENGTH[unit], 2) + 0.0:g}" for value in wall.centre)
+    words = f"inner wall of {1e6 * wall.area:.0f} mm² at ({where}) {unit} between touching bodies"
+    if wall.without is None:
+        return replace(mended, notices=(*mended.notices, f"{words} does not count")), wall
+    vertices, faces = wall.without
+    notices = (*mended.notices, f"{words} removed")
+    return replace(mended, vertices=vertices, faces=faces, notices=notices), None
+
+
+def _check_part(
+    mended: Repair, path: str | Path, name: str, right: Array, wall: InnerWall | None
+) -> None:
+    """Refuse an open sheet, such as a contact surface, and several bodies in one file.
+
+    Bodies that touch or overlap, on the two sides of a wall, are one.
+    """
     extent = float(np.ptp(mended.vertices, axis=0).max())
     if mended.holes and mended.holes[0].width > SHEET_WIDTH * extent:
         raise InputError(
@@ -224,6 +266,10 @@ def _check_part(mended: Repair, path: str | Path, name: str, right: Array) -> No
     if not connected_parts(mended.faces).any():
         return
     bodies = separate_bodies(mended.vertices, mended.faces)
+    if wall is not None and len(bodies) > 1:
+        own = [body.faces for body in bodies]
+        if touching_groups(mended.vertices, own, mended.faces, wall.faces) == 1:
+            return
     if len(bodies) > 1 and not _two_condyles(bodies, right):
         sizes = ", ".join(body_size(body, MILLIMETRE) for body in bodies[:3])
         more = f", and {len(bodies) - 3} more" if len(bodies) > 3 else ""
@@ -260,12 +306,73 @@ def _check_size(
     advice = ", ".join(
         f"'{u}' would make it {extent * LENGTH[u] / MILLIMETRE:.4g} mm" for u in fits
     )
+    why = (
+        f"which no such part of a knee is ({size[0] / MILLIMETRE:g} to {size[1] / MILLIMETRE:g} mm)"
+    )
+    if size[0] <= extent * LENGTH[unit] <= size[1]:
+        why = "smaller than any person's knee"
     raise InputError(
-        f"{name} is {extent * LENGTH[unit] / MILLIMETRE:.4g} mm long in unit '{unit}', which no "
-        f"such part of a knee is ({size[0] / MILLIMETRE:g} to {size[1] / MILLIMETRE:g} mm)",
+        f"{name} is {extent * LENGTH[unit] / MILLIMETRE:.4g} mm long in unit '{unit}', {why}",
         path,
         f"is the unit right? {advice}" if fits else "check the mesh and its unit",
     )
+
+
+def _check_knee_width(surface: Surface, path: str | Path) -> None:
+    """Refuse a component with two condyles that no person's knee is small enough for."""
+    extents = np.ptp(surface.bounds, axis=0)
+    if extents.max() < SMALLEST_KNEE and condyle_split(surface) is not None:
+        raise InputError(
+            f"{surface.name} has two condyles and is {extents[2] / MILLIMETRE:.3g} mm wide, "
+            "smaller than any person's knee",
+            path,
+            f"is the unit right? one of {', '.join(LENGTH)}; or was the mesh scaled before?",
+        )
+
+
+def _check_rounding(corners: Array, unit: float, path: str | Path, name: str) -> None:
+    """Tell or refuse coordinates so far from the origin that the file's digits do not suffice.
+
+    Args:
+        corners: (n, 3) m.
+        unit: m.
+        path: the file.
+        name: of the part.
+    """
+    rounding = coordinate_rounding(corners / unit) * unit
+    if rounding <= ROUNDING_NOTICE:
+        return
+    far = float(np.abs(corners).max()) / MILLIMETRE
+    words = (
+        f"{name} lies {far:.3g} mm from the origin of its file, where coordinates are rounded to "
+        f"{rounding / MILLIMETRE:.2g} mm"
+    )
+    if rounding > ROUNDING_LIMIT:
+        raise InputError(
+            words, path, "move it to the origin where it was made, and export it again"
+        )
+    _log.warning("%s: %s", path, words)
+
+
+def coordinate_rounding(corners: Array) -> float:
+    """Return the step to which coordinates (n, 3) are rounded, in their units; 0: not seen.
+
+    Seen are single precision and text of six or seven digits. Coordinates that all are multiples
+    of four such steps lost nothing: they are round numbers.
+    """
+    largest = float(np.abs(corners).max(initial=0.0))
+    if largest == 0.0:
+        return 0.0
+    digits = np.floor(np.log10(largest))
+    single = float(np.spacing(np.float32(largest)))
+    for step in (10.0 ** (digits - 5), 10.0 ** (digits - 6), single):
+        multiples = corners / step
+        whole = np.abs(multiples - np.rint(multiples)).max() <= 1e-6 * max(step / largest, 1.0)
+        if whole or (step == single and (corners == corners.astype(np.float32)).all()):
+            coarser = corners / (4.0 * step)
+            round_numbers = np.abs(coarser - np.rint(coarser)).max() <= 1e-6
+            return 0.0 if round_numbers else float(step)
+    return 0.0
 
 
 def _check_surface(mended: Repair, path: str | Path, name: str, unit: str) -> None:

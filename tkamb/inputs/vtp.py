@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tkamb.errors import InputError
 from tkamb.files import MESH_LIMIT, parse_xml, read_bytes
 from tkamb.geometry.frames import Array
+from tkamb.geometry.polygons import triangulated
 
 Indices = NDArray[np.int64]
 
@@ -35,7 +36,8 @@ _RAW = re.compile(rb"<AppendedData[^>]*encoding=[\"']raw[\"'][^>]*>\s*_")
 def read_vtp(path: str | Path) -> tuple[Array, Indices]:
     """Return the points (n, 3) and triangles (k, 3) of a .vtp file, in file units.
 
-    Polygons of more than three corners become fans; vertices, lines and data are left out.
+    Polygons of more than three corners are cut into triangles; vertices, lines and data are not
+    read.
 
     Raises:
         InputError: no such file, not PolyData, cut short, strips, or another encoding.
@@ -98,7 +100,7 @@ class _PolyData:
             if int(piece.get("NumberOfPoints", len(corners))) != len(corners):
                 raise ValueError("the number of points is not as announced")
             if int(piece.get("NumberOfPolys", 0)):
-                faces.append(self._fans(piece, len(corners)) + start)
+                faces.append(self._polygons(piece, corners.astype(float)) + start)
             points.append(corners.astype(float))
             start += len(corners)
         return np.concatenate(points), np.concatenate(faces)
@@ -111,7 +113,7 @@ class _PolyData:
             found.append(self._array(named.get(name), name).astype(float))
         return np.concatenate(found)
 
-    def _fans(self, piece: Element, points: int) -> Indices:
+    def _polygons(self, piece: Element, points: Array) -> Indices:
         """Return the polygons of a piece as triangles (k, 3)."""
         named = {array.get("Name"): array for array in piece.iterfind("Polys/DataArray")}
         index = self._array(named["connectivity"], "connectivity").astype(np.int64)
@@ -121,12 +123,9 @@ class _PolyData:
         starts = np.concatenate([[0], ends[:-1]])
         if (ends < starts).any() or ends[-1] != len(index):
             raise ValueError("offsets and connectivity do not agree")
-        if len(index) and not (index.min() >= 0 and index.max() < points):
+        if len(index) and not (index.min() >= 0 and index.max() < len(points)):
             raise ValueError("a polygon has a corner that is no point")
-        fans = np.maximum(ends - starts - 2, 0)
-        first = np.repeat(starts, fans)
-        step = np.arange(fans.sum()) - np.repeat(np.cumsum(fans) - fans, fans)
-        return np.stack([index[first], index[first + step + 1], index[first + step + 2]], axis=1)
+        return triangulated(points, index, ends)
 
     def _array(self, array: Element | None, name: str) -> NDArray:
         if array is None:

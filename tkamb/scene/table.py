@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Strict
 
-LengthUnit = Literal["m", "cm", "mm"]
+LengthUnit = Literal["m", "cm", "mm", "inch"]
 AngleUnit = Literal["rad", "deg"]
 Number = Annotated[float, Strict()]
 """Neither `true` nor a number in quotes is one."""

@@ -103,7 +103,7 @@ def consistent_areas(points: Array, squares: Index) -> Array:
 
 
 def _thickness(points: Array, rays: RayCaster, spacing: Array) -> Array:
-    """Return how far down from each point the insert goes, m."""
+    """Return how far down from each point the insert goes, m; to the last exit, voids included."""
     inside = points - [0.0, 1e-3 * spacing[1], 0.0]
     distance = rays.last_exit(inside, (0.0, -1.0, 0.0))
     whole = points[:, 1] - rays.surface.bounds[0, 1]
