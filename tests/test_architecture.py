@@ -50,7 +50,8 @@ DRAWING = {
         "scene",
         "simulation",
     },
-    "validation": {"contact", "designs", "geometry", "scene", "simulation", "studies"},
+    "validation": {"body", "contact", "designs", "geometry", "press", "scene", "simulation"}
+    | {"studies"},
 }
 """Which folder knows which folders and which modules beside them: inputs → body → (equilibrium ⇄
 contact) → results → output, view and studies; the scene is where files become bodies."""

@@ -14,6 +14,8 @@ from tkamb.errors import InputError
 from tkamb.output.report import report_html
 from tkamb.presets.preset import Preset
 from tkamb.presets.registry import find_preset, preset_names
+from tkamb.results_folder import read_results
+from tkamb.run.rerun import case_of_results, run_again
 from tkamb.scene import with_preset
 from tkamb.scene.case import load_case
 
@@ -127,6 +129,19 @@ def test_the_same_from_python_and_from_the_command_line(scene_file):
     assert found.summary["preset"] == same.summary["preset"]
     assert found["force_total_N"] != simulate(read, frames=slice(5, 6))["force_total_N"]
     assert "Run as" in report_html(found)
+
+
+def test_the_scene_of_such_results_is_read_as_they_were_run(scene_file, tmp_path):
+    """`view` and `export --deck` read it again; `run_again` says how to compute it anew."""
+    out = tmp_path / "out"
+    run = ["run", str(scene_file), "--as", SOURCE, "--contact", "hertz", "--frames", "5:6"]
+    assert main([*run, "--set", "motion.frames=11", "--out", str(out)]) == 0
+    results = read_results(out)
+    case = case_of_results(results)
+    assert case.scene.motion.motion == "roll-slip"
+    assert case.scene.contact.adjust
+    again = run_again(results.summary)
+    assert f"{scene_file} --as {SOURCE} --set" in again
 
 
 class MyStudy(Preset):

@@ -13,7 +13,7 @@ from tkamb.contact.registry import contact_model, contact_options
 from tkamb.errors import InputError
 from tkamb.output.maps import ContactMaps
 from tkamb.results_folder import read_results
-from tkamb.run.rerun import overrides_of_run
+from tkamb.run.rerun import overrides_of_run, preset_of_run
 from tkamb.run.summary import files_hash, scene_hash
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.case import Case, load_case
@@ -103,10 +103,12 @@ def wear_setup(
         hashes = _hashes(case, case.scene)
     else:
         overrides: dict[str, Any] = {}
+        preset: str | None = None
         if os.path.isdir(path):
             summary = read_results(path).summary
+            preset = preset_of_run(summary)
             path, overrides = _scene_of(summary, path), overrides_of_run(summary)
-        given = load_scene(path, overrides)
+        given = load_scene(path, overrides, preset)
         case = load_case(_with_contact(given, contact, resolution_mm, path))
         hashes = _hashes(case, given)
     table = _with_contact(case.scene, contact, resolution_mm, path).contact
@@ -177,7 +179,10 @@ def _of_results(folder: Path) -> tuple[Case, CycleMotion, tuple[int, ...]]:
     results = read_results(folder)
     if results.maps is None:
         raise InputError("has no contact maps", folder, "run the scene with [contact]")
-    scene = load_scene(_scene_of(results.summary, folder), overrides_of_run(results.summary))
+    summary = results.summary
+    scene = load_scene(
+        _scene_of(summary, folder), overrides_of_run(summary), preset_of_run(summary)
+    )
     table = results.summary.get("contact")
     if isinstance(table, dict):
         scene = scene.model_copy(update={"contact": ContactTable.model_validate(table)})
