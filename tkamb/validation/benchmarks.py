@@ -149,11 +149,11 @@ def against_fe(
     design = load_design(designs / name)
     fe = _pressed(design, "fe", flexions, size_mm=fe_size_mm)
     found = {}
-    options: dict[str, Any]
-    for model, key, options in (
+    kinds: tuple[tuple[str, str, dict[str, Any]], ...] = (
         ("lattice-source", "source", {"pressure_rule": "source"}),
         ("lattice", "lattice", {}),
-    ):
+    )
+    for model, key, options in kinds:
         ours = _pressed(design, model, flexions, size_mm=size_mm, **options)
         pairs = list(zip(ours, fe, strict=True))
         found[f"{key}_approach"] = max(abs(a[0] - b[0]) for a, b in pairs) / MILLIMETRE

@@ -36,12 +36,15 @@ row in `tkamb/presets/registry.py`, or from another package through the entry-po
 ELEMENTS = """\
 Code and tests are paths in the repository. Where no number stands, the test is the evidence."""
 OPEN = """\
-Three things are not settled by the text. About which point the femur is turned: here its own
-centre. Which cells the 0.5 mm of section 4.3 concern: here the femur is moved by 0.5 mm at most
-and a larger distance from touch is flagged, while the press moves it on to contact in any case.
-What becomes of nodes that would be pulled: here they are let go. Of the two readings of the
-rule that undoes the adjustment, "both" is the default and `[contact] adjust_restore_when =
-"either"` the other."""
+The text leaves three things open:
+
+- The point about which the femur is turned. Here it is the component's own centre.
+- What the 0.5 mm of section 4.3 limit. Here the adjustment moves the femur by 0.5 mm at most and a
+  larger distance from touch is flagged. The press moves the femur on to contact in any case.
+- What becomes of nodes in contact that would be pulled. Here they are let go.
+
+The rule that undoes the adjustment has two readings. "both" is the default, and
+`[contact] adjust_restore_when = "either"` is the other."""
 COMPARED = """\
 Every number of chapter 5, in its order. "Cannot be compared" means what it says: no value of
 ours beside such a number confirms or contradicts it."""
