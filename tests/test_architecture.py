@@ -23,7 +23,8 @@ DRAWING = {
     "body": {"geometry"},
     "contact": {"geometry"},
     "inputs": {"geometry"},
-    "scene": {"body", "geometry", "inputs"},
+    "presets": set(),
+    "scene": {"body", "geometry", "inputs", "presets"},
     "equilibrium": {"body", "contact", "geometry", "muscles", "scene"},
     "plausibility": {"geometry", "inputs", "scene"},
     "check": {*KNEE, "output", "plausibility", "run"},
@@ -49,7 +50,8 @@ DRAWING = {
         "scene",
         "simulation",
     },
-    "validation": {"contact", "designs", "geometry", "scene", "simulation", "studies"},
+    "validation": {"body", "contact", "designs", "geometry", "press", "scene", "simulation"}
+    | {"studies"},
 }
 """Which folder knows which folders and which modules beside them: inputs → body → (equilibrium ⇄
 contact) → results → output, view and studies; the scene is where files become bodies."""

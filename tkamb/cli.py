@@ -19,7 +19,7 @@ from tkamb.guard import guarded, log_to_stderr
 from tkamb.importing.command import add_import
 from tkamb.mesh_command import add_contact, add_mesh, add_no_cache, add_press, without_cache
 from tkamb.run.settings import add_settings
-from tkamb.scene_options import add_scene_options, overrides_of
+from tkamb.scene_options import add_preset, add_scene_options, overrides_of
 from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
 from tkamb.threads import threads
@@ -100,6 +100,7 @@ def _parser() -> argparse.ArgumentParser:
 def _add_run(commands: Any) -> None:
     run = commands.add_parser("run", help="motion in, condyle forces and report out")
     add_scene_options(run)
+    add_preset(run)
     add_no_cache(run)
     run.add_argument("--force", action="store_true", help="write into a folder that is not tkamb's")
     run.add_argument("--resume", action="store_true", help="go on with an interrupted run")
@@ -180,12 +181,14 @@ def _scene_of(options: argparse.Namespace) -> "Scene":
     from tkamb.scene import load_scene
 
     overrides = overrides_of(options)
-    scene = load_scene(options.scene, overrides)
+    scene = load_scene(options.scene, overrides, options.preset)
     if not options.no_cache:
         return scene
     more = without_cache(scene.contact.model if scene.contact else None)
     return load_scene(
-        options.scene, overrides | {f"contact.options.{k}": v for k, v in more.items()}
+        options.scene,
+        overrides | {f"contact.options.{k}": v for k, v in more.items()},
+        options.preset,
     )
 
 

@@ -283,7 +283,9 @@ def _check_load(load: float) -> None:
         raise InputError(f"impossible load {load:g} N", mend=f"{limit}; is it in N?")
 
 
-def _adjustment_settings(adjust: bool, restore_when: str | None) -> AdjustmentSettings | None:
+def _adjustment_settings(
+    adjust: bool, restore_when: RestoreRule | None
+) -> AdjustmentSettings | None:
     """Return how to adjust; None: not at all."""
     if restore_when not in (None, *get_args(RestoreRule)):
         raise InputError(

@@ -29,6 +29,16 @@ def add_set(command: Any) -> None:
     )
 
 
+def add_preset(command: Any) -> None:
+    """Add --as to a command."""
+    command.add_argument(
+        "--as",
+        dest="preset",
+        metavar="NAME",
+        help="lay a study's own choices over the scene: sharma-2008; --set still overrides",
+    )
+
+
 def overrides_of(options: argparse.Namespace) -> dict[str, Any]:
     """Return dotted key -> value of what `add_scene_options` was given."""
     overrides = dict(options.set)

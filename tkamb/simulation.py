@@ -24,7 +24,7 @@ from tkamb.run.recorder import FolderRecorder, Recorder, finished_results
 from tkamb.run.summary import input_hashes, run_identity, scene_hash, summary_of
 from tkamb.run.tabulate import join_rows
 from tkamb.run.workers import Crew, Task, Team
-from tkamb.scene import Scene, load_scene
+from tkamb.scene import Scene, load_scene, with_preset
 from tkamb.scene.case import Case, load_case
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ def simulate(
     *,
     contact: str | None = None,
     resolution_mm: float | None = None,
+    preset: str | None = None,
     frames: slice | None = None,
     directory: str | Path | None = None,
     scene_path: str | Path | None = None,
@@ -53,6 +54,8 @@ def simulate(
         scene: a scene, the path of its file, or its case, read already.
         contact: contact model, instead of the scene's.
         resolution_mm: spacing of the map points, instead of the scene's.
+        preset: name of a study whose choices are laid over the scene, as by `tkamb run --as`
+            (`tkamb.presets.registry`); contact and resolution_mm still hold.
         frames: which frames; default all.
         directory: folder where the finished frames are kept, see `tkamb.run.recorder`; None
             keeps them in memory.
@@ -67,8 +70,8 @@ def simulate(
 
     Raises:
         InputError: the scene or a file that it names cannot be used, a case is given another
-            contact model or resolution, the run to resume is another one, the folder cannot be
-            claimed (`tkamb.claim`), or no such number of workers.
+            contact model, resolution or preset, the run to resume is another one, the folder
+            cannot be claimed (`tkamb.claim`), or no such number of workers.
         ComputationError: a worker was killed.
         KeyboardInterrupt: with a folder, what was finished is written there first.
     """
@@ -77,6 +80,8 @@ def simulate(
         scene_path, scene = scene, load_scene(scene)
     start = clock.perf_counter()
     stage("reading scene and recordings")
+    if preset is not None:
+        scene = _scene_as(scene, preset, contact, resolution_mm)
     case = _case_with_contact(scene, contact, resolution_mm)
     indices = chosen_frames(frames, len(case.motion.time))
     identity = run_identity(case, indices)
@@ -192,6 +197,16 @@ class _Run:
 
         mechanics, last = self.solver.mechanics, list(earlier.items())[-LAST_FRAMES:]
         self.solver.before = [recalled(side, mechanics, k, arrays) for k, arrays in last]
+
+
+def _scene_as(
+    scene: Scene | Case, preset: str, model: str | None, resolution_mm: float | None
+) -> Scene:
+    """Return the scene with a preset laid over it, and over that what else was asked for."""
+    if isinstance(scene, Case):
+        raise InputError("a case has been read already", "preset", "give its scene instead")
+    asked = {"contact.model": model, "contact.resolution_mm": resolution_mm}
+    return with_preset(scene, preset, {key: v for key, v in asked.items() if v is not None})
 
 
 def _case_with_contact(scene: Scene | Case, model: str | None, resolution_mm: float | None) -> Case:

@@ -120,7 +120,7 @@ def adjust(
     gaps = query.at(recorded)
     _check_near(gaps, settings)
     angle, distance = _coronal_angle(gaps)
-    turn, flags = 0.0, ()
+    turn, flags = 0.0, tuple[str, ...]()
     if gaps.lateral is not None and abs(angle) * distance > settings.level_difference:
         turn, flags = _limited_turn(query, recorded, angle, distance, settings)
     turned = _turned(query, recorded, turn) if turn else recorded

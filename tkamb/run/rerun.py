@@ -41,10 +41,19 @@ def overrides_of_run(summary: Mapping[str, Any]) -> dict[str, Any]:
     return dict(summary.get("overrides") or {})
 
 
+def preset_of_run(summary: Mapping[str, Any]) -> str | None:
+    """Return the name of the preset that was laid over the run's scene, if any."""
+    preset = summary.get("preset") or {}
+    return preset.get("name")
+
+
 def run_again(summary: Mapping[str, Any]) -> str:
     """Return the command that computes results like these, for a shell."""
     given = (f"{key}={json.dumps(value)}" for key, value in overrides_of_run(summary).items())
-    return " ".join([RUN_AGAIN, str(summary["scene"]), *(f"--set {shlex.quote(g)}" for g in given)])
+    preset = preset_of_run(summary)
+    study = [] if preset is None else [f"--as {shlex.quote(preset)}"]
+    changed = (f"--set {shlex.quote(one)}" for one in given)
+    return " ".join([RUN_AGAIN, str(summary["scene"]), *study, *changed])
 
 
 def same_files(case: Case, summary: Mapping[str, Any]) -> bool:
@@ -64,4 +73,4 @@ def _scene_of(summary: Mapping[str, Any]) -> Scene:
         raise InputError(what, path, "put it back, or run it again")
     contact = summary.get("contact") or {}
     used = {f"contact.{key}": value for key, value in contact.items() if value is not None}
-    return load_scene(path, overrides_of_run(summary) | used)
+    return load_scene(path, overrides_of_run(summary) | used, preset_of_run(summary))

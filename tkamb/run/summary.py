@@ -103,6 +103,7 @@ def _origin(case: Case, path: Path | None) -> dict[str, Any]:
         "scene": None if path is None else str(path.absolute()),
         "scene_sha256": scene_hash(case),
         "overrides": case.scene.overrides,
+        "preset": None if case.scene.preset is None else case.scene.preset.as_dict(),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": " ".join(["tkamb", *sys.argv[1:]]),
         "versions": _versions(),
@@ -214,6 +215,8 @@ def assumptions(case: Case) -> list[str]:
     sentences = [
         "Segments are rigid; the hip carries the force and moment of all that crosses it.",
     ]
+    if scene.preset is not None:
+        sentences += scene.preset.sentences()
     if scene.motion.cutoff_Hz == "none":
         sentences.append("The motion is differentiated as given, unfiltered.")
     else:

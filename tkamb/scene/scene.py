@@ -8,7 +8,7 @@ import json
 import os
 import tomllib
 from pathlib import Path
-from typing import Any, Self, get_args
+from typing import TYPE_CHECKING, Any, Self, get_args
 
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError, model_validator
 from pydantic_core import ErrorDetails
@@ -34,6 +34,9 @@ from tkamb.scene.tables import (
     WearTable,
 )
 from tkamb.scene.uncertainty import UncertaintyTable
+
+if TYPE_CHECKING:
+    from tkamb.presets.preset import AppliedPreset
 
 
 class Scene(SceneTable):
@@ -65,6 +68,7 @@ class Scene(SceneTable):
     output: OutputTable = OutputTable()
     uncertainty: UncertaintyTable | None = None
     _overrides: dict[str, Any] = PrivateAttr(default_factory=dict)
+    _preset: "AppliedPreset | None" = PrivateAttr(default=None)
 
     @property
     def overrides(self) -> dict[str, Any]:
@@ -89,6 +93,11 @@ class Scene(SceneTable):
         """Yield stress of the insert: [material]'s, else [output]'s."""
         own = self.material.yield_stress_MPa if self.material else None
         return self.output.yield_stress_MPa if own is None else own
+
+    @property
+    def preset(self) -> "AppliedPreset | None":
+        """Return the preset that was laid over the scene, if any."""
+        return self._preset
 
     def __repr__(self) -> str:
         """Return in a line whose knee it is, what moves and what presses."""
@@ -148,18 +157,23 @@ class Scene(SceneTable):
         return self
 
 
-def load_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> Scene:
+def load_scene(
+    path: str | Path, overrides: dict[str, Any] | None = None, preset: str | None = None
+) -> Scene:
     """Read and validate a scene file.
 
     Args:
         path: a TOML file; paths inside it are relative to its folder.
         overrides: dotted key ("contact.model") -> value, applied before validation.
+        preset: name of a preset (`tkamb.presets.registry`), applied before the overrides.
 
     Raises:
-        InputError: unreadable file, unknown key, missing unit, value out of range.
+        InputError: unreadable file, unknown key, missing unit, value out of range, no such
+            preset, or a scene that lacks what the preset needs.
     """
     path = Path(path)
     content = _content(path)
+    applied = None if preset is None else _apply_preset(content, preset, overrides or {}, path)
     for key, value in (overrides or {}).items():
         _override(content, key, value)
     try:
@@ -168,7 +182,40 @@ def load_scene(path: str | Path, overrides: dict[str, Any] | None = None) -> Sce
         raise _complaint(error, path, overrides or {}) from None
     resolved: Scene = _resolve_paths(scene, path.parent)
     resolved._overrides = dict(overrides or {})
+    resolved._preset = applied
     return resolved
+
+
+def with_preset(scene: Scene, preset: str, overrides: dict[str, Any] | None = None) -> Scene:
+    """Return a scene with a preset laid over it; what its own overrides set stays.
+
+    Args:
+        scene: as read.
+        preset: name of a preset (`tkamb.presets.registry`).
+        overrides: dotted key -> value that is laid over the preset.
+
+    Raises:
+        InputError: no such preset, or the scene lacks what it needs.
+    """
+    content = scene.model_dump(exclude_unset=True)
+    more = scene.overrides | (overrides or {})
+    applied = _apply_preset(content, preset, more, "scene")
+    for key, value in more.items():
+        _override(content, key, value)
+    try:
+        found = Scene.model_validate(content)
+    except ValidationError as error:
+        raise _complaint(error, Path("scene"), more) from None
+    found._overrides, found._preset = more, applied
+    return found
+
+
+def _apply_preset(
+    content: dict[str, Any], name: str, overrides: dict[str, Any], where: object
+) -> "AppliedPreset":
+    from tkamb.presets.registry import find_preset
+
+    return find_preset(name).apply(content, overrides, where)
 
 
 def scene_files(path: Path) -> list[Path]:

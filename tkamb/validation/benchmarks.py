@@ -4,7 +4,7 @@ Every function returns {id of `published.toml`: our value in the unit named ther
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -133,30 +133,37 @@ def speed(trade_off: Path) -> Values:
     return {"speed_source": seconds["calculix C3D8I"] / seconds["lattice-source"]}
 
 
-def against_fe(designs: Path, name: str = "nkii_cp") -> Values:
+def against_fe(
+    designs: Path,
+    name: str = "nkii_cp",
+    flexions: Sequence[float] = (15.0, 60.0, 105.0),
+    size_mm: float = COARSE_MM,
+    fe_size_mm: float = COARSE_MM,
+) -> Values:
     """Return the source's lattice and ours against finite elements on an implant.
 
-    One condyle, 1200 N, at 15 to 105 deg. Mean pressures and areas of the source's lattice follow
-    the source's rule, those of the finite elements and of ours the contact area.
+    One condyle, 1200 N, at flexions (deg), with cells of `size_mm` and `fe_size_mm`. Mean
+    pressures and areas of the source's lattice follow the source's rule, those of the finite
+    elements and of ours the contact area.
     """
     design = load_design(designs / name)
-    flexions = (15.0, 60.0, 105.0)
-    fe = _pressed(design, "fe", flexions)
+    fe = _pressed(design, "fe", flexions, size_mm=fe_size_mm)
     found = {}
-    options: dict[str, Any]
-    for model, key, options in (
+    kinds: tuple[tuple[str, str, dict[str, Any]], ...] = (
         ("lattice-source", "source", {"pressure_rule": "source"}),
         ("lattice", "lattice", {}),
-    ):
-        pairs = list(zip(_pressed(design, model, flexions, 1200.0, **options), fe, strict=True))
+    )
+    for model, key, options in kinds:
+        ours = _pressed(design, model, flexions, size_mm=size_mm, **options)
+        pairs = list(zip(ours, fe, strict=True))
         found[f"{key}_approach"] = max(abs(a[0] - b[0]) for a, b in pairs) / MILLIMETRE
         area = max(abs(a[1].area - b[1].area) for a, b in pairs)
         found[f"{key}_area"] = area / MILLIMETRE**2
         for what in ("peak", "mean"):
-            ours, theirs = (
+            pressure, exact = (
                 np.array([getattr(p[i][1], f"{what}_pressure") for p in pairs]) for i in (0, 1)
             )
-            found[f"{key}_{what}"] = 100.0 * float(np.abs(ours / theirs - 1.0).max())
+            found[f"{key}_{what}"] = 100.0 * float(np.abs(pressure / exact - 1.0).max())
     return found
 
 
@@ -165,11 +172,12 @@ def _pressed(
     name: str,
     flexions: Iterable[float],
     load: float = 1200.0,
+    size_mm: float = COARSE_MM,
     **options: Any,
 ) -> list[tuple[float, CondyleContact]]:
     """Return approach (m) and medial condyle of one contact model at flexions (deg)."""
-    pressed = PressedDesign(design, COARSE_MM)
-    pressed.model = _model(name, COARSE_MM, **options)
+    pressed = PressedDesign(design, size_mm)
+    pressed.model = _model(name, size_mm, **options)
     found = []
     for flexion in flexions:
         result = pressed.press_alone("medial", flexion * DEGREE, load)

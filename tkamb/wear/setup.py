@@ -15,7 +15,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.output.maps import ContactMaps
 from tkamb.results_folder import read_results
-from tkamb.run.rerun import overrides_of_run
+from tkamb.run.rerun import overrides_of_run, preset_of_run
 from tkamb.run.summary import files_hash, scene_hash
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.case import Case, load_case
@@ -122,11 +122,13 @@ def wear_setup(
         hashes = _hashes(case, case.scene)
     else:
         of_run: dict[str, Any] = {}
+        preset: str | None = None
         if os.path.isdir(path):
             summary = read_results(path).summary
+            preset = preset_of_run(summary)
             path, of_run = _scene_of(summary, path), overrides_of_run(summary)
         scene_path = path
-        given = load_scene(path, of_run | given_keys)
+        given = load_scene(path, of_run | given_keys, preset)
         case = load_case(_with_contact(given, contact, resolution_mm, path))
         hashes = _hashes(case, given)
     check(_wear_table(case.scene), scene_path)
@@ -263,7 +265,7 @@ def _of_results(
         raise InputError("has no contact maps", folder, "run the scene with [contact]")
     keys = overrides_of_run(results.summary) | dict(overrides)
     scene_path = _scene_of(results.summary, folder)
-    scene = load_scene(scene_path, keys)
+    scene = load_scene(scene_path, keys, preset_of_run(results.summary))
     table = results.summary.get("contact")
     if isinstance(table, dict):
         scene = scene.model_copy(update={"contact": ContactTable.model_validate(table)})
