@@ -147,11 +147,13 @@ def test_bad_input_is_one_line_and_leaves_no_folder(capsys, tmp_path, profile, s
         ("--wear-factor", "nan"): "nan",
         ("--wear-factor", "3.5"): "is the unit",
         ("--law", "archerd"): "did you mean archard",
-        ("--law", "contact-area"): "has no parameters",
+        ("--law", "pressure-cross-shear"): "has no parameters",
         ("--material", "conventionnal"): "did you mean conventional",
         ("--material", "none.toml"): "no such",
         ("--frames-per-cycle", "1"): "at least 2",
         ("--period", "0"): "--period",
+        ("--set", "wear.close=open"): "--set wear.close",
+        ("--set", "wear.laws=archard"): "unknown key 'wear.laws'",
         ("--contact", "latice"): "did you mean lattice",
     }
     for options, words in cases.items():
