@@ -38,7 +38,7 @@ DRAWING = {
     "muscles": {"geometry", "importing", "inputs", "opensim"},
     "designs": {"contact", "geometry"},
     "wear": {"contact", "equilibrium", "geometry", "inputs", "output", "results_folder", "run"}
-    | {"plug_ins", "scene", "simulation", "uncertainty"},
+    | {"plug_ins", "results", "scene", "simulation", "uncertainty"},
     "uncertainty": {*KNEE, "columns", "inputs", "results", "results_folder", "run", "simulation"},
     "cohort": {
         "columns",
@@ -49,6 +49,7 @@ DRAWING = {
         "run",
         "scene",
         "simulation",
+        "wear",
     },
     "validation": {"body", "contact", "designs", "geometry", "press", "scene", "simulation"}
     | {"studies"},

@@ -42,6 +42,7 @@ KEYS = [
     "status",
     "flags",
     "known_error",
+    "material",
 ]
 CONDYLE_KEYS = ["force_N", "area_mm2", "mean_pressure_MPa", "peak_pressure_MPa", "cop_mm"]
 TURN = np.array([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]])

@@ -4,19 +4,21 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from knees import UP, bent_knee
-from shared_trials import STRENGTHS, two_flexors
+from shared_trials import SHANK, STRENGTHS, THIGH, two_flexors
 from tkamb.body.crossing import CrossingLines, MuscleShare
 from tkamb.body.knee import solve_knee
 from tkamb.body.load import PointForces, total_wrench
 from tkamb.columns import MUSCLE_FORCE, RESERVE, belongs, family_column, in_a_family, ordered_names
 from tkamb.equilibrium.shared_muscles import SharedMuscles
 from tkamb.errors import InputError
-from tkamb.geometry.frames import knee_axes, knee_pose, transform
+from tkamb.geometry.frames import knee_axes, knee_pose, pose, transform
 from tkamb.run.summary import reserves
 from tkamb.scene import load_scene
 
@@ -182,3 +184,14 @@ def test_the_summary_says_how_much_no_muscle_carries():
     assert told["largest_Nm"] == 3.0
     assert told["percent_of_largest_moment"] == pytest.approx(7.5)
     assert told["frames_above_5_percent"] == 1
+
+
+def test_how_far_the_knee_is_turned_from_where_the_lines_were_found_is_told():
+    found = pose(Rotation.from_euler("z", -30, degrees=True).as_matrix(), [0.01, 0.4, 0.0])
+    now = pose(Rotation.from_euler("zx", (-40, 3), degrees=True).as_matrix(), [0.0, 0.4, 0.0])
+    tibia = pose(Rotation.from_euler("y", 25, degrees=True).as_matrix(), [0.1, 0.2, 0.3])
+    for knee, angle in ((found, 0.0), (now, np.hypot(10, 3))):
+        state = SimpleNamespace(pose={"tibia": tibia, "femur": tibia @ knee}.__getitem__)
+        turned = np.degrees(CrossingLines(SHANK, THIGH, found).turned(state))
+        assert turned == pytest.approx(angle, abs=0.05)
+        assert np.isnan(CrossingLines(SHANK, THIGH).turned(state))

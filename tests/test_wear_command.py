@@ -11,17 +11,19 @@ import numpy as np
 import pytest
 import trimesh
 
+import shapes
 from scenes import write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_coordinates
 from tkamb.wear import run as wear_run
 from tkamb.wear.kept import STATE_NAME
-from tkamb.wear.laws import law_names, wear_law
+from tkamb.wear.laws import Archard, ContactArea, law_names, wear_law
 from tkamb.wear.materials import material_names, wear_material
 from tkamb.wear.profile import read_profile
 from tkamb.wear.setup import wear_setup
-from wear_bodies import balls_scene
+from tkamb.wear.simulation import first_cycle
+from wear_bodies import balls_scene, swing, swinging_case
 
 CYCLE = """cycle_percent,axial_force_N,flexion_deg,ap_mm,axial_rotation_deg
 0,300,0,0,0
@@ -86,10 +88,10 @@ def test_doubling_the_wear_factor_doubles_the_first_cycles_and_is_said(
 ):
     single = json.loads((written / "wear.json").read_text())
     worn = ["wear", str(scene), "--simulator", str(profile), *QUICK, "--json"]
-    assert main([*worn, "--cycles", "100", "--wear-factor", "7e-6", "--out", str(tmp_path)]) == 0
+    assert main([*worn, "--cycles", "100", "--wear-factor", "5.2e-7", "--out", str(tmp_path)]) == 0
     double = json.loads(capsys.readouterr().out)
     assert double["volume_mm3_per_Mc"] == pytest.approx(2 * single["volume_mm3_per_Mc"], rel=0.01)
-    assert double["law_parameters"]["wear_factor_mm3_per_Nm"] == 7e-6
+    assert double["law_parameters"]["wear_factor_mm3_per_Nm"] == 5.2e-7
 
 
 @pytest.mark.slow
@@ -145,11 +147,13 @@ def test_bad_input_is_one_line_and_leaves_no_folder(capsys, tmp_path, profile, s
         ("--wear-factor", "nan"): "nan",
         ("--wear-factor", "3.5"): "is the unit",
         ("--law", "archerd"): "did you mean archard",
-        ("--law", "contact-area"): "has no parameters",
+        ("--law", "pressure-cross-shear"): "has no parameters",
         ("--material", "conventionnal"): "did you mean conventional",
         ("--material", "none.toml"): "no such",
         ("--frames-per-cycle", "1"): "at least 2",
         ("--period", "0"): "--period",
+        ("--set", "wear.close=open"): "--set wear.close",
+        ("--set", "wear.laws=archard"): "unknown key 'wear.laws'",
         ("--contact", "latice"): "did you mean lattice",
     }
     for options, words in cases.items():
@@ -216,9 +220,59 @@ def test_a_scene_without_contact_is_refused(tmp_path):
 def test_every_built_in_material_names_its_sources_and_has_its_law():
     for name in material_names():
         found = wear_material(name)
-        assert found.sources and found.caution
+        assert found.sources and found.caution and found.range_source
+        low, high = found.factor_range
+        assert low < 1 < high
         for law in found.laws:
             assert found.wear_law(law).name == law
+
+
+def test_results_have_their_range_their_geometry_and_the_laws_side_by_side(written):
+    found = json.loads((written / "wear.json").read_text())
+    made_of = wear_material("conventional")
+    for key in ("volume_mm3", "mass_mg", "max_depth_mm", "volume_mm3_per_Mc"):
+        expected = [factor * found[key] for factor in made_of.factor_range]
+        assert found[f"{key}_range"] == pytest.approx(expected)
+    assert "contact area cancels" in found["geometry"]
+    laws = {one["law"]: one for one in found["laws_side_by_side"]}
+    assert set(laws) == {"archard", "cross-shear", "contact-area"}
+    # the first cycle's rate is that of the law that was chosen, before the shape changes
+    first = laws["cross-shear"]["first_volume_mm3_per_Mc"]
+    assert first == pytest.approx(found["volume_mm3_per_Mc"], rel=0.1)
+    assert "more conforming" in laws["contact-area"]["geometry"]
+
+
+def test_conforming_dishes_wear_as_much_by_archard_and_more_by_area(tmp_path):
+    """The same load and path on more area: the same volume by Archard, more by area."""
+    motion = swing(0.4, 5, 500.0)
+    trough = shapes.trough(0.03)
+    volumes = {}
+    for name, radius in (("tight", 0.028), ("loose", 0.015)):
+        case = swinging_case(shapes.sphere(radius, 4), trough, motion)
+        path = 500.0 * radius * 0.8
+        laws = {"archard": Archard(1e-7), "area": ContactArea((0.0, 0.5), (1e-9, 1e-9))}
+        found = first_cycle(case, laws).volumes
+        volumes[name] = {law: volume / path for law, volume in found.items()}
+    archard, area = ({n: v[law] for n, v in volumes.items()} for law in ("archard", "area"))
+    assert archard["tight"] == pytest.approx(archard["loose"], rel=0.03)
+    assert area["tight"] > 1.3 * area["loose"]
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("factor_range = [0.5]", "cannot be"),
+        ("factor_range = [1.5, 2.0]", "at most 1"),
+        ("factor_range = [0.5, 2.0]", "'range_source' is missing"),
+    ],
+)
+def test_a_range_that_is_none_is_refused(tmp_path, given, words):
+    path = tmp_path / "mine.toml"
+    head = 'density_kg_per_m3 = 940\nlaw = "archard"\nsources = ["here"]\n'
+    laws = "[laws.archard]\nwear_factor_mm3_per_Nm = 2e-7\n"
+    path.write_text(f"{head}{given}\n{laws}", encoding="utf-8")
+    with pytest.raises(InputError, match=words):
+        wear_material(path)
 
 
 def test_a_material_file_brings_laws_and_creep(tmp_path):

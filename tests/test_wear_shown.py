@@ -42,6 +42,17 @@ WEAR = {
     "mass_mg_per_Mc": 1.05,
     "creep_depth_mm": None,
     "creep_volume_mm3": None,
+    "volume_mm3_range": [2.26, 15.8],
+    "range_source": "two whole-knee tests",
+    "geometry": "the contact area cancels",
+    "laws_side_by_side": [
+        {
+            "law": "contact-area",
+            "first_volume_mm3_per_Mc": 1.59,
+            "first_volume_mm3_per_Mc_range": [0.64, 4.45],
+            "geometry": "a conforming insert wears more",
+        }
+    ],
     "law": "archard",
     "material": "mine",
     "control": "displacement",
@@ -96,6 +107,15 @@ def test_the_report_shows_wear_with_its_band_and_says_first_how_sure_it_is(worn,
     section = section[: section.index("</section>")]
     words = re.sub(r"<[^>]+>", " ", section)
     assert words.index("factor of two") < words.index("5.64")
+    ranged = ("2.26 to 15.8", "two whole-knee tests", "the contact area cancels")
+    for found in (
+        *ranged,
+        "contact-area",
+        "1.59",
+        "0.64 to 4.45",
+        "a conforming insert wears more",
+    ):
+        assert found in words
     for found in ("5,000,000", "2.6 to 10.3", "not modelled", "archard", "creep is not modelled"):
         assert found in words
     assert 'src="data:image/png;base64,' in section

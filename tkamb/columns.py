@@ -223,6 +223,12 @@ COLUMNS: tuple[Column, ...] = (
         "between the knee centres that shank and thigh markers carry, each by itself",
         _MARKERS,
     ),
+    Column(
+        "muscle_lines_turned_deg",
+        "by how much the knee is turned from the model's pose at which the muscles' ends on shank "
+        "and thigh were found; they stay on their links, so that lines which wrap err by up to it",
+        _MUSCLES,
+    ),
     Column(MUSCLE_FORCE, "force of the muscle <name> of the model", _MUSCLES),
     Column(ACTIVATION, "its activation, 0 to 1", _MUSCLES),
     Column(

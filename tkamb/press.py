@@ -148,7 +148,6 @@ class PressReport:
         return {
             "contact": self.contact,
             "resolution_mm": self.resolution_mm,
-            "material": material_as_json(self.pair.material),
             "nodes": self.nodes,
             "load_N": self.load,
             "reaction_N": _known(-result.wrench_on_insert[1]),
@@ -163,6 +162,7 @@ class PressReport:
             "status": result.status.value,
             "flags": [*left_out(self.contact, self.pair.bearing), *result.flags],
             "known_error": as_json(self.known_error),
+            "material": material_as_json(self.pair.material),
         } | ({} if self.adjustment is None else {"adjustment": _adjustment(self.adjustment)})
 
 

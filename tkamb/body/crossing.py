@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tkamb.body import unknowns
 from tkamb.body.load import PointForces, wrench_of
-from tkamb.geometry.frames import Array, transform
+from tkamb.geometry.frames import Array, inverse, transform
 
 if TYPE_CHECKING:
     from tkamb.body.chain import ChainState
@@ -27,10 +28,25 @@ class CrossingLines:
     Args:
         shank: (c, 3) m, where they leave the shank or the foot, tibia link.
         thigh: (c, 3) m, where they reach the thigh or the pelvis, femur link.
+        knee: (4, 4) pose of the femur link in the tibia link at which both were found on the
+            muscles' paths; None: not known.
     """
 
     shank: Array
     thigh: Array
+    knee: Array | None = None
+
+    def turned(self, state: "ChainState") -> float:
+        """Return by how much the knee is turned from where the ends were found, rad; NaN: unknown.
+
+        Ends that wrap a bone or pass a via point would move along it as the knee turns. Here they
+        stay on their links, so that a line's direction errs by about this angle at most.
+        """
+        if self.knee is None:
+            return float("nan")
+        now = inverse(state.pose("tibia")) @ state.pose("femur")
+        change = Rotation.from_matrix(self.knee[:3, :3].T @ now[:3, :3])
+        return float(change.magnitude())
 
     def unit_wrenches(self, tibia: Array, femur: Array) -> Array:
         """Return the wrench (..., c, 6) of one newton of each on the insert, about its origin.

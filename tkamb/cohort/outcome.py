@@ -1,12 +1,13 @@
 """One run of a cohort: through the whole pipeline, and what of it is kept."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.cohort.plan import CohortRun
+from tkamb.cohort.plan import CohortRun, CohortWearTable
 from tkamb.columns import KINDS
 from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array
@@ -52,12 +53,16 @@ class Outcome:
         columns: name -> (f,) numbers of results.csv that the run has, without computing times.
         status: of each frame.
         chosen: its pressure map; None without contact.
+        wear: name -> number, "volume_mm3_per_Mc" and others; empty: not asked for, or not found.
+        wear_problem: why there is no wear; empty otherwise.
     """
 
     reason: str
     columns: dict[str, Array]
     status: list[str]
     chosen: PressureMap | None = None
+    wear: Mapping[str, float] = field(default_factory=dict)
+    wear_problem: str = ""
 
     @property
     def failed_frames(self) -> int:
@@ -72,6 +77,7 @@ class Outcome:
     def shard(self) -> Shard:
         """Return it as what is kept in a folder."""
         row: dict[str, Any] = {"reason": self.reason, "status": self.status}
+        row |= {"wear": dict(self.wear), "wear_problem": self.wear_problem}
         arrays: dict[str, Any] = {f"column {name}": values for name, values in self.columns.items()}
         if self.chosen is not None:
             one = self.chosen
@@ -99,7 +105,8 @@ class Outcome:
                 row["side"],
                 row["lateral"],
             )
-        return cls(row["reason"], columns, row["status"], chosen)
+        wear, problem = row.get("wear", {}), row.get("wear_problem", "")
+        return cls(row["reason"], columns, row["status"], chosen, wear, problem)
 
 
 class CohortWorker:
@@ -108,10 +115,13 @@ class CohortWorker:
     Args:
         frames: of every trial.
         map_flexion: deg, which frame's map is kept; None: that of the largest force.
+        wear: of every run's insert; None: none.
     """
 
-    def __init__(self, frames: slice, map_flexion: float | None) -> None:
-        self._frames, self._map_flexion = frames, map_flexion
+    def __init__(
+        self, frames: slice, map_flexion: float | None, wear: CohortWearTable | None = None
+    ) -> None:
+        self._frames, self._map_flexion, self._wear = frames, map_flexion, wear
 
     def __call__(self, number: int, run: CohortRun) -> Outcome:
         """Return what a run gives: what `tkamb run` would, or why it cannot."""
@@ -134,7 +144,37 @@ class CohortWorker:
             and not name.endswith(TIMES)
             and name not in results.not_modelled
         }
-        return Outcome("", columns, results.status, chosen_map(results, self._map_flexion))
+        found = Outcome("", columns, results.status, chosen_map(results, self._map_flexion))
+        return found if self._wear is None else self._worn(run, results, found, self._wear)
+
+    def _worn(
+        self, run: CohortRun, results: Results, found: Outcome, wear: CohortWearTable
+    ) -> Outcome:
+        """Return an outcome with the wear of its insert, or why there is none."""
+        from tkamb.wear.run import wear_of_results
+
+        try:
+            report = wear_of_results(
+                run.scene,
+                run.scene_path,
+                results,
+                cycles=wear.cycles,
+                updates=wear.updates,
+                frames=wear.frames_per_cycle,
+            ).as_dict()
+        except TkambError as error:
+            return replace(found, wear_problem=str(error))
+        low, high = report["volume_mm3_per_Mc_range"]
+        values = {
+            "volume_mm3_per_Mc": report["volume_mm3_per_Mc"],
+            "volume_mm3_per_Mc_low": low,
+            "volume_mm3_per_Mc_high": high,
+            "max_depth_mm": report["max_depth_mm"],
+            "frames_change": report["frames_change"],
+        }
+        for one in report["laws_side_by_side"]:
+            values[f"first_{one['law']}_mm3_per_Mc"] = one["first_volume_mm3_per_Mc"]
+        return replace(found, wear={k: v for k, v in values.items() if v is not None})
 
 
 def chosen_map(results: Results, flexion: float | None) -> PressureMap | None:

@@ -20,7 +20,7 @@ from tkamb.errors import InputError, names_near
 from tkamb.files import read_text, sha256_of
 from tkamb.run.summary import files_in
 from tkamb.scene import Scene, load_scene
-from tkamb.scene.table import Number, SceneTable
+from tkamb.scene.table import Count, Number, SceneTable
 from tkamb.scene_options import frames_slice
 
 AXES = ("subject", "trial", "design", "contact")
@@ -76,6 +76,14 @@ class ContactModelTable(SceneTable):
     set: Overrides
 
 
+class CohortWearTable(SceneTable):
+    """Wear of every run's insert by its own motion; closing, material and law by its [wear]."""
+
+    cycles: Annotated[Count, Field(ge=1, le=10**9)] = 1_000_000
+    updates: Annotated[Count, Field(ge=1, le=1000)] = Field(2, description="of the geometry")
+    frames_per_cycle: Annotated[Count, Field(ge=2, le=1000)] = 40
+
+
 class CohortTable(SceneTable):
     """The cohort file. An axis that is not given has one entry that changes nothing."""
 
@@ -87,6 +95,9 @@ class CohortTable(SceneTable):
     bin_deg: Annotated[Number, Field(ge=1, le=180)] = Field(10.0, description="width of a bin")
     map_flexion_deg: Annotated[Number, Field(ge=-30, le=170)] | None = Field(
         None, description="the frame nearest to it is shown; default: each run's peak force"
+    )
+    wear: CohortWearTable | None = Field(
+        None, description="volumes in runs.csv and groups.csv; not computed without this table"
     )
     set: Overrides
     subject: tuple[SubjectTable, ...] = ()
@@ -183,7 +194,15 @@ class Cohort:
             "content of a file": {str(path): sha256_of(path) for path in files},
             "choice of frames": self.table.frames,
             "choice of maps": self.table.map_flexion_deg,
+            **self._wear_identity(),
         }
+
+    def _wear_identity(self) -> dict[str, Any]:
+        wear = self.table.wear
+        if wear is None:
+            return {}
+        tables = [run.scene.wear and run.scene.wear.model_dump(mode="json") for run in self.runs]
+        return {"wear": [wear.model_dump(mode="json"), tables]}
 
 
 def load_cohort(path: str | Path, frames: str | None = None) -> Cohort:

@@ -102,7 +102,7 @@ def run_cohort(
         wanted = [run.number for run in cohort.runs if part is None or part.holds(run.number)]
         done = _kept([shards, *others], wanted)
         left = [(n, cohort.runs[n]) for n in wanted if n not in done]
-        task = Task(CohortWorker, (cohort.frames, cohort.table.map_flexion_deg))
+        task = Task(CohortWorker, (cohort.frames, cohort.table.map_flexion_deg, cohort.table.wear))
         answers = crew.answers(task, left)
         try:
             with interrupt_as_such():

@@ -6,7 +6,7 @@ parts of a motion weigh no more than others.
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from tkamb.geometry.frames import Array
 from tkamb.run.status import FAILED
 
 PEAK = "largest of the run"
+WEAR = "wear of the run"
 UNITS = ("_N", "_BW", "_MPa", "_mm2", "_mm", "_deg", "_Nm", "_equilibrium", "_yield")
 """Endings of the columns that are averaged."""
 CYCLE = "cycle_percent"
@@ -38,6 +39,7 @@ class Group:
         edges: (b + 1,) of the bins, in the axis's unit.
         bins: column -> (r, b) mean of each run in each bin; NaN where it has none there.
         peaks: column -> (r,) the largest of each run.
+        wear: name -> (r,) of each run; empty: not computed.
     """
 
     labels: dict[str, str]
@@ -47,6 +49,7 @@ class Group:
     edges: Array
     bins: dict[str, Array]
     peaks: dict[str, Array]
+    wear: dict[str, Array] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -121,7 +124,11 @@ def _group(
         pairs = zip(missing, places, strict=True)
         bins[name] = np.array([_means(v, p - first, len(edges) - 1) for v, p in pairs])
         peaks[name] = np.array([np.nanmax(v) if np.isfinite(v).any() else np.nan for v in missing])
-    return Group(labels, tuple(good), len(numbers) - len(good), axis, edges, bins, peaks)
+    worn = dict.fromkeys(name for n in good for name in outcomes[n].wear)
+    wear = {
+        name: np.array([outcomes[n].wear.get(name, np.nan) for n in good], float) for name in worn
+    }
+    return Group(labels, tuple(good), len(numbers) - len(good), axis, edges, bins, peaks, wear)
 
 
 def _computed(outcome: Outcome) -> dict[str, Array]:
@@ -166,6 +173,8 @@ def group_rows(groups: Sequence[Group], group_by: Sequence[str]) -> list[list[st
             over = spread(group.peaks[name][:, None])
             if over.runs[0]:
                 rows.append([*labels, PEAK, "", "", name, *_cells(over, 0)])
+        for name, worn in group.wear.items():
+            rows.append([*labels, WEAR, "", "", name, *_cells(spread(worn[:, None]), 0)])
     return rows
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from tkamb.body.contact_points import CondylePoint
 from tkamb.body.knee import solve_knee, unsolved
-from tkamb.contact.given_material import given_material
+from tkamb.contact.given_material import given_material, material_as_json
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import within_insert
 from tkamb.contact.probe import condyle_wrenches
@@ -32,6 +32,7 @@ from tkamb.equilibrium.split_sensitivity import split_sensitivity, split_tangent
 from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import Array, knee_pose
+from tkamb.scene import Scene
 from tkamb.scene.case import Case
 from tkamb.threads import both
 
@@ -295,6 +296,11 @@ class ContactSide:
         """Return a contact that could not be computed, and why."""
         none = np.zeros(len(self.state.points), bool)
         return FrameContact(None, none, None, 0.0, problem, ())
+
+
+def insert_material_as_json(scene: Scene) -> dict[str, Any]:
+    """Return all numbers of the insert's material, MPa, and their sources."""
+    return material_as_json(given_material(scene.insert_material))
 
 
 def _doubts(knee: "KneeEquilibrium") -> tuple[str, ...]:

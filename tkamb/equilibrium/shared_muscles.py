@@ -43,6 +43,9 @@ class SharedMuscles:
         flip = MIRROR if left else np.eye(3)
         self.trial, self._left, self._names = trial, left, trial.muscles
         self._shank, self._thigh = trial.shank @ flip, trial.thigh @ flip
+        self._knee = trial.knee
+        if left and trial.knee is not None:
+            self._knee = mirrored_pose(trial.knee)
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
@@ -101,7 +104,8 @@ class SharedMuscles:
         return replace(share, lines=self._lines(k))
 
     def _lines(self, k: int) -> CrossingLines:
-        return CrossingLines(self._shank[k], self._thigh[k])
+        knee = None if self._knee is None else self._knee[k]
+        return CrossingLines(self._shank[k], self._thigh[k], knee)
 
     def _shared(self, k: int, lines: CrossingLines, row: FlexionRow) -> MuscleShare:
         trial = self.trial

@@ -32,6 +32,8 @@ class KneeTrial:
         shank: (f, c, 3) m, where these leave shank or foot, tibia link.
         thigh: (f, c, 3) m, where they reach thigh or pelvis, femur link.
         groups: name of a group -> its muscles, see `muscle_groups`.
+        knee: (f, 4, 4) pose of the femur link in the tibia link at which the ends were found;
+            None: not known.
     """
 
     problems: FrameProblems
@@ -41,6 +43,7 @@ class KneeTrial:
     shank: Array
     thigh: Array
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    knee: Array | None = None
 
     @property
     def muscles(self) -> tuple[str, ...]:
@@ -133,7 +136,12 @@ def knee_trial(
     crossing, shank, thigh = _crossing_lines(links, bones, extensor)
     flexion = problems.coordinates.index(leg.flexion)
     groups = muscle_groups(leg, problems.muscles)
-    return KneeTrial(problems, flexion, extensor, crossing, shank, thigh, groups)
+    tibia, femur = (
+        bones.poses[:, bones.index(bone)] @ own
+        for bone, own in (("tibia", links.tibia), ("femur", links.femur))
+    )
+    knee = inverse(tibia) @ femur
+    return KneeTrial(problems, flexion, extensor, crossing, shank, thigh, groups, knee)
 
 
 def _crossing_lines(

@@ -107,6 +107,16 @@ def _peak_force(results: "Results", axis: HorizontalAxis) -> Card | None:
     if found is None:
         return None
     share = results["force_si_N"][found.frame] / results["force_total_N"][found.frame]
+    table, band = results.summary.get("uncertainty"), results.band("force_total_BW")
+    if table and band is not None and np.isfinite(band[0, found.frame]):
+        low, middle, high = band[:, found.frame]
+        sampled = table.get("peak_force_total_BW") or {}
+        words = sampled.get("words", f"{found.value:.2f} BW as the inputs stand")
+        detail = (
+            f"median of {table['samples']} samples and 5 to 95 % of them, "
+            f"{_where(results, axis, found.frame)}; {words}"
+        )
+        return Card("Peak contact force", f"{middle:.2f} BW ({low:.2f}–{high:.2f})", detail)
     detail = (
         f"{results['force_total_N'][found.frame]:.0f} N {_where(results, axis, found.frame)}; "
         f"{100 * share:.1f} % of it superior–inferior"
@@ -136,6 +146,9 @@ def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
                 f"the measured {name} force lies within its band in {inside['share']:.0%} of "
                 f"{inside['frames']} frames"
             )
+    sampled = table.get("peak_force_total_BW")
+    if sampled and sampled["median"] is None:
+        parts.append(sampled["words"])
     worst, held = table["largest_failed_share"], table["not_varied"]
     if worst > NOTABLE_FAILED:
         why = "".join(f", most often: {text}" for text in [*table.get("causes_of_failure", ())][:1])

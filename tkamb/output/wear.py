@@ -24,6 +24,7 @@ ROWS = (
     ("creep volume, mm³", "creep_volume_mm3"),
 )
 """What is shown, and its key."""
+FIRST_RATE = "first_volume_mm3_per_Mc"
 OTHER = (
     "The wear.json in this folder is of another scene, other frames or other meshes, or of a tkamb "
     "that did not say which: it is not shown."
@@ -59,7 +60,14 @@ def _shown(found: dict[str, Any], picture: str) -> dict[str, Any]:
         "first": found["first"],
         "cycles": f"{found['cycles']:,.0f}",
         "banded": bool(bands),
-        "rows": [(name, _number(found[key]), _band(bands, key)) for name, key in ROWS],
+        "rows": [
+            (name, _number(found[key]), _range(found, key), _band(bands, key)) for name, key in ROWS
+        ],
+        "geometry": found.get("geometry"),
+        "laws": [
+            (one["law"], _number(one[FIRST_RATE]), _range(one, FIRST_RATE), one["geometry"])
+            for one in found.get("laws_side_by_side", ())
+        ],
         "legend": _legend(found, bands),
         "picture": f"data:image/png;base64,{picture}",
         "alt": "maps of wear, sliding, cross-shear and pressure, and the worn volume over cycles",
@@ -97,6 +105,8 @@ def _legend(found: dict[str, Any], bands: dict[str, Any]) -> str:
         f"{found['contact']} at {found['resolution_mm']:g} mm, {found['blocks']} blocks of cycles; "
         f"status: {found['status']}. Motion: {found['source']}."
     )
+    if "range_source" in found:
+        words += f" Range: by the wear factor alone, {found['range_source']}."
     if not bands:
         return f"{words} No band: no input was varied."
     deviations = ", ".join(f"{name} {one:g}" for name, one in bands["standard_deviations"].items())
@@ -104,6 +114,12 @@ def _legend(found: dict[str, Any], bands: dict[str, Any]) -> str:
         f"{words} 5 to 95 % of {bands['samples']} samples; standard deviations: {deviations}. "
         f"Not in the band: {bands['not_varied']}."
     )
+
+
+def _range(found: dict[str, Any], key: str) -> str:
+    """Return the range that the wear factor alone gives a number."""
+    given = found.get(f"{key}_range")
+    return "–" if given is None else f"{_number(given[0])} to {_number(given[1])}"
 
 
 def _band(bands: dict[str, Any], key: str) -> str:

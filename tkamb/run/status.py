@@ -27,6 +27,13 @@ ADJUSTED_TOTAL = 0.01
 MARKERS_APART = 20.0 * MILLIMETRE
 """Skin that has moved by more than this against the other segment's: at 700 N 14 N·m."""
 
+PATELLA_ACROSS = 0.03
+"""Share of the patellofemoral force that may act across the button's normal where the patella's
+place was recorded: 2 deg between that normal and what the lines hold. A place that suits the
+lines leaves 0.002."""
+PATELLA_LIGHT = 0.01
+"""BW: a smaller force across the normal is not flagged."""
+
 FAILED = "failed: "
 
 
@@ -50,6 +57,7 @@ def frame_status(
     words = [*_motion_flags(case, k), *_flank_flags(body), *_adjustment_flags(case, body)]
     released = contact is not None and contact.equilibrium is not None
     words += [_lift_off(body, side, released) for side in sorted(body.loads.lifted)]
+    words += _patella_flags(case, body)
     if body.loads.slack and body.geometry.share is None:
         words.append("flexors needed, which are not modelled: quadriceps slack")
     if body.loads.ambiguous:
@@ -96,6 +104,22 @@ def _adjustment_flags(case: Case, body: FrameLoads) -> list[str]:
     if change <= ADJUSTED_TOTAL:
         return []
     return [f"femoral adjustment changes the total force by {change:.2f} BW: {body.effect.cause}"]
+
+
+def _patella_flags(case: Case, body: FrameLoads) -> list[str]:
+    """Return a flag where the lines do not hold a recorded patella at its place."""
+    patella = case.scene.patella
+    if patella is None or patella.motion != "recorded" or body.loads.problems:
+        return []
+    values = body.loads.values
+    across = abs(values.get("patellofemoral_tangential", 0.0))
+    normal = abs(values.get("patellofemoral", 0.0))
+    if not across > max(PATELLA_ACROSS * normal, PATELLA_LIGHT * case.body_weight):
+        return []
+    return [
+        f"recorded patella is not held by its lines: {across:.0f} N across the button's normal, "
+        f"beside {normal:.0f} N along it; nothing real carries that"
+    ]
 
 
 def _motion_flags(case: Case, k: int) -> list[str]:

@@ -14,7 +14,6 @@ import numpy as np
 from tkamb import __version__
 from tkamb.code_identity import code_identity
 from tkamb.columns import JOINT_MOMENT, RESERVE, belongs, family_column, name_in
-from tkamb.contact.given_material import given_material, material_as_json
 from tkamb.equilibrium.mechanics import STRAIN_FLEXIONS
 from tkamb.files import sha256_of
 from tkamb.known_errors import as_json, known_error, left_out
@@ -80,7 +79,9 @@ def summary_of(
         summary |= compare_recorded(case, columns)
     if scene.contact:
         table = scene.contact
-        chosen = material_as_json(given_material(scene.insert_material))
+        from tkamb.equilibrium.contact_side import insert_material_as_json
+
+        chosen = insert_material_as_json(scene)
         error = known_error(table.model, table.resolution_mm, chosen["name"], table.options)
         summary["contact"] = table.model_dump(mode="json")
         if scene.material is not None:

@@ -165,8 +165,10 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
         row |= {
             f"ground_reaction_{a}_N": g for a, g in zip(("ap", "si", "ml"), ground, strict=True)
         }
-    if frame.geometry.share is not None and not loads.problems:
-        row |= _muscle_row(frame.geometry.share)
+    share = frame.geometry.share
+    if share is not None and not loads.problems:
+        row |= _muscle_row(share)
+        row["muscle_lines_turned_deg"] = share.lines.turned(frame.geometry.state) / DEGREE
         parts = condyle_contributions(frame.geometry, loads, friction)
         for side, causes in parts.items():
             row |= {family_column(CONTRIBUTIONS[side], name): n for name, n in causes.items()}

@@ -89,6 +89,12 @@ class UncertaintyTable(SceneTable):
         "the muscles of [muscles] that cross the knee where they leave shank and thigh, each "
         "group by itself" + _GIVE,
     )
+    tendon_band_mm: Length = Field(
+        3.0,
+        description="of band_mm of each wrapped tendon by itself, which stays at or above 0: how "
+        "wide the lamina is whose sections the line wraps. An assumption, without a source: bands "
+        "of 5 to 15 mm are all defensible, and move the quadriceps by up to 9 % in deep flexion",
+    )
     ligament_stiffness: Share = Field(0.0, description="relative, each bundle by itself" + _GIVE)
     ligament_strain: Annotated[Number, Field(ge=0, le=0.1)] = Field(
         0.0,

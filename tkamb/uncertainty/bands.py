@@ -46,6 +46,53 @@ def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Ar
     return dict(zip(PERCENTILES, found, strict=True))
 
 
+def peak_band(nominal: Array, values: Array, failed: np.ndarray) -> dict[str, Any] | None:
+    """Return how the nominal peak lies among its samples; None: no frame has a number.
+
+    Args:
+        nominal: (f,) of the run as its inputs stand; its largest value's frame is looked at.
+        values: (n, f) of the samples, NaN where one has none.
+        failed: (n, f) which frames of which samples failed.
+
+    Returns:
+        frame, nominal, samples, failed_samples (of them, there), median, p05, p95 (None: no
+        band), nominal_percentile: per cent of the samples below the nominal value, those equal to
+        it by half; and all that in words.
+    """
+    if not np.isfinite(nominal).any():
+        return None
+    frame = int(np.nanargmax(nominal))
+    there, level = values[:, frame], float(nominal[frame])
+    known = there[np.isfinite(there)]
+    bands = percentiles(values[:, frame : frame + 1], failed[:, frame : frame + 1])
+    low, middle, high = (float(bands[name][0]) for name in ("p05", "p50", "p95"))
+    below = (known < level).sum() + 0.5 * (known == level).sum()
+    found = {
+        "frame": frame,
+        "nominal": level,
+        "samples": len(there),
+        "failed_samples": int(failed[:, frame].sum()),
+        "median": middle if np.isfinite(middle) else None,
+        "p05": low if np.isfinite(low) else None,
+        "p95": high if np.isfinite(high) else None,
+        "nominal_percentile": 100.0 * float(below) / len(known) if len(known) else None,
+    }
+    return found | {"words": _peak_words(found)}
+
+
+def _peak_words(peak: Mapping[str, Any]) -> str:
+    """Return where the nominal peak lies among its samples, and how many failed, in words."""
+    share = peak["failed_samples"] / peak["samples"]
+    failed = f"{peak['failed_samples']} of {peak['samples']} samples failed there ({share:.0%})"
+    if peak["median"] is None:
+        return failed
+    outside = not peak["p05"] <= peak["nominal"] <= peak["p95"]
+    return (
+        f"{peak['nominal']:.2f} BW as the inputs stand, at the {peak['nominal_percentile']:.0f}th "
+        f"percentile of the samples{', outside the band' if outside else ''}; {failed}"
+    )
+
+
 def band_columns(
     time: Array, names: Sequence[str], values: Array, failed: np.ndarray
 ) -> dict[str, Array]:

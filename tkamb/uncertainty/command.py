@@ -119,12 +119,18 @@ def headline(found: "Uncertainty") -> list[str]:
     if not isfinite(total).any():
         return ["no frame of the nominal run has a force"]
     peak = int(nanargmax(total))
-    low, middle, high = (found.bands[f"force_total_BW_{p}"][peak] for p in ("p05", "p50", "p95"))
     flexion = found.results["flexion_deg"][peak]
-    band = f"5 to 95 %: {low:.2f} to {high:.2f}, median {middle:.2f}"
-    if not isfinite(low):
-        band = f"no band: {found.results.why_no_band(peak)}"
-    lines = [f"peak total force {total[peak]:.2f} BW at {flexion:.0f} deg ({band})"]
+    of_samples = found.results.summary["uncertainty"]["peak_force_total_BW"]
+    words = of_samples["words"]
+    if of_samples["median"] is None:
+        why = found.results.why_no_band(peak)
+        value = f"{total[peak]:.2f} BW as the inputs stand, no median or band: {why}"
+    else:
+        value = (
+            f"median {of_samples['median']:.2f} BW, 5 to 95 %: {of_samples['p05']:.2f} to "
+            f"{of_samples['p95']:.2f}"
+        )
+    lines = [f"peak total force at {flexion:.0f} deg: {value} ({words})"]
     of_chance = TERMS / found.results.summary["uncertainty"]["samples"]
     chance = f"; up to {of_chance:.0%} each is chance" if of_chance >= LEAST_SHOWN else ""
     for result in ("force_total_N", "medial_force_N"):

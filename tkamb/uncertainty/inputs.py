@@ -14,6 +14,7 @@ AXES = ("ap", "si", "ml")
 COP_AXES = {"ap": 0, "ml": 2}
 """Of the laboratory."""
 UNITS = {"mm": MILLIMETRE, "deg": DEGREE}
+PATELLAR_LIGAMENT = "patellar_ligament"
 MARKED = ("shank", "thigh")
 """Segments whose markers vary."""
 LINE_ENDS = ("origin", "insertion")
@@ -139,9 +140,22 @@ def _muscle_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
         ]
     ends = [(one.name, end) for one in case.muscles for end in LINE_ENDS]
     ends += [(group, end) for group in groups if group in ACROSS_KNEE for end in GROUP_ENDS]
+    found += [
+        VariedInput(f"tendon_band.{name}", table.tendon_band_mm, "mm")
+        for name in _wrapped_tendons(case)
+    ]
     for name, end in ends:
         place = f"muscle_attachment.{name}.{end}"
         found += _places(place, AXES, table.muscle_attachment_mm)
+    return found
+
+
+def _wrapped_tendons(case: Case) -> list[str]:
+    """Return the names of the tendons that wrap a part by sections of a band."""
+    found = [one.name for one in case.muscles if one.wrap and one.wrap.band > 0]
+    ligament = case.patellar_ligament
+    if ligament is not None and ligament.wrap and ligament.wrap.band > 0:
+        found.append(PATELLAR_LIGAMENT)
     return found
 
 

@@ -25,6 +25,7 @@ from tkamb.uncertainty.bands import (
     causes,
     influences,
     measured_inside,
+    peak_band,
 )
 from tkamb.uncertainty.correlation import correlation_root
 from tkamb.uncertainty.folder import write_uncertainty
@@ -39,6 +40,8 @@ TORNADO_RESULTS = (
     *("force_total_N", "medial_force_N", "lateral_force_N", "medial_share_equilibrium"),
     *("medial_peak_pressure_MPa", "lateral_peak_pressure_MPa", "quadriceps_N"),
 )
+PEAK = "force_total_BW"
+"""Whose peak is the headline."""
 NO_BAND = (
     *("time_s", "cycle_percent", "iterations", "coupling_iterations", "coupling_change_N"),
     *("coupling_change_mm", "contact_trials", "split_determined", "condition_number"),
@@ -223,6 +226,9 @@ class _Job:
         tornado = influences(wanted, input_names, values[:, rows], errors)
         summary = self.nominal.summary
         summary["uncertainty"] = self._summary(problems, tornado)
+        if PEAK in names:
+            peak = peak_band(self.nominal[PEAK], values[:, names.index(PEAK)], failed)
+            summary["uncertainty"]["peak_force_total_BW"] = peak
         if summary.get("measured"):
             inside = measured_inside(self.nominal.columns, bands, summary["measured"])
             summary["uncertainty"]["measured_inside"] = inside

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.body.ligaments import Ligament
 from tkamb.body.load import LinkPoint
-from tkamb.body.muscles import Muscle
+from tkamb.body.muscles import Muscle, SagittalWrap
 from tkamb.equilibrium.shared_muscles import SharedMuscles
 from tkamb.geometry.frames import (
     KNEE_COORDINATES,
@@ -30,7 +30,15 @@ from tkamb.inputs.markers import fit_seen
 from tkamb.scene import Scene
 from tkamb.scene.case import Case
 from tkamb.scene.recording_tables import MarkerSegmentTable
-from tkamb.uncertainty.inputs import COP_AXES, GROUP_ENDS, LINE_ENDS, MARKED, UNITS, Draw
+from tkamb.uncertainty.inputs import (
+    COP_AXES,
+    GROUP_ENDS,
+    LINE_ENDS,
+    MARKED,
+    PATELLAR_LIGAMENT,
+    UNITS,
+    Draw,
+)
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
@@ -64,7 +72,8 @@ def varied_case(case: Case, draw: Draw) -> Case:
     if case.patellar_ligament is not None:
         end = case.patellar_ligament.distal
         distal = LinkPoint(end.link, end.position + draw.place("tuberosity"))
-        changes["patellar_ligament"] = replace(case.patellar_ligament, distal=distal)
+        wrap = _wrap(case.patellar_ligament.wrap, PATELLAR_LIGAMENT, draw)
+        changes["patellar_ligament"] = replace(case.patellar_ligament, distal=distal, wrap=wrap)
     return replace(case, **changes)
 
 
@@ -127,7 +136,13 @@ def _muscle(case: Case, muscle: Muscle, draw: Draw) -> Muscle:
     for k, end in zip((0, -1), LINE_ENDS, strict=True):
         shift = draw.place(f"muscle_attachment.{muscle.name}.{end}")
         points[k] = LinkPoint(points[k].link, points[k].position + shift)
-    return replace(muscle, points=tuple(points))
+    return replace(muscle, points=tuple(points), wrap=_wrap(muscle.wrap, muscle.name, draw))
+
+
+def _wrap(wrap: SagittalWrap | None, name: str, draw: Draw) -> SagittalWrap | None:
+    """Return how a tendon wraps, its band wider or narrower by the draw's error."""
+    error = draw.error(f"tendon_band.{name}")
+    return wrap if wrap is None or not error else replace(wrap, band=max(0.0, wrap.band + error))
 
 
 def varied_muscles(muscles: SharedMuscles | None, draw: Draw) -> SharedMuscles | None:

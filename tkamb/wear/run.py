@@ -9,15 +9,17 @@ from typing import Any
 
 from tkamb.errors import InputError
 from tkamb.guard import interrupt_as_such
+from tkamb.results import Results
 from tkamb.run.shards import Shards
 from tkamb.run.workers import Crew
+from tkamb.scene import Scene
 from tkamb.scene.tables import WearTable
 from tkamb.wear.bands import SAMPLES, Progress, Sampling, check_samples
 from tkamb.wear.kept import keep_state, kept_state, wear_identity
 from tkamb.wear.laws import WearLaw
 from tkamb.wear.materials import DEFAULT_MATERIAL, WearMaterial, wear_material
 from tkamb.wear.report import SAMPLES_NAME, WearReport
-from tkamb.wear.setup import WearSetup, wear_setup
+from tkamb.wear.setup import WearSetup, setup_of_results, wear_setup
 from tkamb.wear.simulation import (
     CycleWear,
     WearCase,
@@ -194,15 +196,39 @@ def prepare_wear(
         asked.check(WearTable(), Path())  # as early as can be
     ready = wear_setup(path, period=period, check=asked.check, **setup)
     made_of, chosen = asked.material_and_law
-    case = WearCase(
-        ready.engine,
-        ready.articular,
-        ready.motion,
-        chosen,
-        made_of.density_kg_per_m3,
-        made_of.creep,
-    )
+    case = _case(ready, made_of, chosen)
     if samples is None:
         samples = SAMPLES if ready.uncertainty else 0
     sampling = Sampling.of(ready, case, samples) if samples else None
     return WearRun(ready, case, made_of, cycles, updates, sampling)
+
+
+def wear_of_results(
+    scene: Scene, path: Path, results: Results, *, cycles: int, updates: int, frames: int
+) -> WearReport:
+    """Return the wear of an insert by the motion of results that are at hand.
+
+    Material, law and closing of the cycle are those of the scene's [wear].
+
+    Args:
+        scene: of the results, with the contact they were computed with.
+        path: of its file.
+        results: with their maps.
+        cycles: how many.
+        updates: how often the insert's geometry follows.
+        frames: most frames of a cycle.
+
+    Raises:
+        InputError: whatever of it cannot be used.
+    """
+    check_blocks(cycles, updates)
+    asked = _Asked(None, None, None)
+    asked.check(scene.wear or WearTable(), path)
+    made_of, chosen = asked.material_and_law
+    ready = setup_of_results(scene, path, results, frames)
+    return WearRun(ready, _case(ready, made_of, chosen), made_of, cycles, updates).compute()
+
+
+def _case(ready: WearSetup, made_of: WearMaterial, law: WearLaw) -> WearCase:
+    density, creep = made_of.density_kg_per_m3, made_of.creep
+    return WearCase(ready.engine, ready.articular, ready.motion, law, density, creep)

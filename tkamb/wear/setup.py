@@ -14,6 +14,7 @@ from tkamb.contact.registry import contact_model, contact_options
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.output.maps import ContactMaps
+from tkamb.results import Results
 from tkamb.results_folder import read_results
 from tkamb.run.rerun import overrides_of_run, preset_of_run
 from tkamb.run.summary import files_hash, scene_hash
@@ -134,9 +135,7 @@ def wear_setup(
     check(_wear_table(case.scene), scene_path)
     table = _with_contact(case.scene, contact, resolution_mm, path).contact
     assert table is not None and case.femoral is not None and case.insert is not None
-    if case.post is not None:
-        mend = "leave the key out: the dishes' wear alone is modelled"
-        raise InputError("the post does not wear", "[contact] post", mend)
+    _refuse_post(case)
     engine = _engine(case, table)
     if simulator is not None:
         held = None if springs is None else read_springs(springs)
@@ -157,6 +156,50 @@ def wear_setup(
         uncertainty=case.scene.uncertainty,
         simulated=simulator is not None,
     )
+
+
+def setup_of_results(scene: Scene, path: Path, results: Results, frames: int) -> WearSetup:
+    """Return what is worn by the motion of results that are at hand, all of whose frames count.
+
+    Args:
+        scene: of the results, with the contact they were computed with.
+        path: of its file.
+        results: with their maps.
+        frames: most frames of a cycle.
+
+    Raises:
+        InputError: there is no contact, or one of a post.
+    """
+    case, table = load_case(scene), scene.contact
+    if table is None or results.maps is None or case.insert is None:
+        raise InputError("the scene has no [contact]", path, "add the table: wear needs pressure")
+    _refuse_post(case)
+    motion = _cycle_of_maps(results.maps, scene, frames)
+    return WearSetup(
+        engine=_engine(case, table),
+        articular=ArticularSurface.of_insert(case.insert, table.resolution_mm * MILLIMETRE),
+        motion=motion,
+        side=scene.patient.side,
+        contact=table.model,
+        resolution_mm=table.resolution_mm,
+        source=str(path),
+        scene_sha256=_hashes(case, scene),
+        files_sha256=files_hash(case),
+        uncertainty=scene.uncertainty,
+    )
+
+
+def _refuse_post(case: Case) -> None:
+    if case.post is not None:
+        mend = "leave the key out: the dishes' wear alone is modelled"
+        raise InputError("the post does not wear", "[contact] post", mend)
+
+
+def _cycle_of_maps(maps: ContactMaps, scene: Scene, most: int) -> CycleMotion:
+    """Return the cycle of at most so many frames of a run's."""
+    track = _Track.of_maps(maps)
+    frames = [*chain(*chosen_frames(len(track.time), most))]
+    return _cycle_of(track, frames, scene, track.time, (track.time, track.poses))
 
 
 def _wear_table(scene: Scene) -> WearTable:
@@ -274,9 +317,7 @@ def _of_results(
         what = "was run with another scene than its file says now"
         raise InputError(what, folder, "run it again, or give the scene")
     chosen = (results.summary.get("identity") or {}).get("choice of frames") or ()
-    track = _Track.of_maps(results.maps)
-    frames = [*chain(*chosen_frames(len(track.time), most))]
-    motion = _cycle_of(track, frames, scene, track.time, (track.time, track.poses))
+    motion = _cycle_of_maps(results.maps, scene, most)
     return case, motion, tuple(chosen), scene_path
 
 

@@ -1,0 +1,85 @@
+"""A cohort that holds wear: the same numbers as `tkamb wear`, per run, group and law."""
+
+import csv
+import json
+
+import pytest
+
+pytest.importorskip("pyarrow")
+
+from tkamb.cli import main
+from tkamb.cohort.outcome import Outcome
+from wear_bodies import balls_scene
+
+
+@pytest.fixture(scope="module")
+def cohort(tmp_path_factory):
+    """Two wear factors of one knee, and a third whose law there is not; where it was written."""
+    folder = tmp_path_factory.mktemp("cohort")
+    balls_scene(folder)
+    file = folder / "wear.toml"
+    file.write_text(
+        """
+        title = "Two wear factors"
+        frames = "0:101:50"
+        set = { "contact.resolution_mm" = 6.0, "wear.law" = "archard" }
+        [wear]
+        cycles = 1000
+        updates = 1
+        frames_per_cycle = 6
+        [[trial]]
+        name = "bend"
+        scene = "scene.toml"
+        [[design]]
+        name = "one"
+        set = { "wear.wear_factor_mm3_per_Nm" = 1e-7 }
+        [[design]]
+        name = "two"
+        set = { "wear.wear_factor_mm3_per_Nm" = 2e-7 }
+        [[design]]
+        name = "none"
+        set = { "wear.law" = "pressure-cross-shear" }
+        """,
+        encoding="utf-8",
+    )
+    assert main(["cohort", str(file), "--out", str(folder / "out")]) in (0, 1)
+    return folder
+
+
+def rows(folder, name):
+    with open(folder / "out" / name, encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_each_run_has_its_wear_and_a_run_without_says_why(cohort):
+    one, two, none = rows(cohort, "runs.csv")
+    volume = [float(run["wear_volume_mm3_per_Mc"]) for run in (one, two)]
+    assert volume[1] == pytest.approx(2 * volume[0], rel=1e-3)
+    assert float(one["wear_volume_mm3_per_Mc_high"]) == pytest.approx(2 * volume[0])
+    assert float(one["wear_first_archard_mm3_per_Mc"]) > 0
+    assert none["wear_volume_mm3_per_Mc"] == "" and "no parameters" in none["wear_failed"]
+    assert none["failed"] == "" and float(none["peak_force_total_BW"]) > 0
+    groups = {(row["design"], row["column"]): row for row in rows(cohort, "groups.csv")}
+    assert float(groups["two", "volume_mm3_per_Mc"]["mean"]) == pytest.approx(volume[1])
+    page = (cohort / "out" / "cohort.html").read_text(encoding="utf-8")
+    assert "Worn volume" in page and "the contact area cancels" in page
+
+
+def test_a_run_wears_as_tkamb_wear_says(cohort, capsys):
+    run = ["run", str(cohort / "scene.toml"), "--frames", "0:101:50", "--resolution", "6"]
+    assert main([*run, "--out", str(cohort / "run")]) == 0
+    capsys.readouterr()
+    wear = ["wear", str(cohort / "run"), "--cycles", "1000", "--updates", "1", "--json"]
+    given = ["--set", "wear.law=archard", "--wear-factor", "1e-7", "--frames-per-cycle", "6"]
+    assert main([*wear, *given, "--out", str(cohort / "worn")]) == 0
+    found = json.loads(capsys.readouterr().out)
+    told = rows(cohort, "runs.csv")[0]
+    assert float(told["wear_volume_mm3_per_Mc"]) == pytest.approx(found["volume_mm3_per_Mc"])
+    assert main([*wear, "--set", "patient.mass_kg=80", "--out", str(cohort / "no")]) == 2
+    assert "not of the run in this folder" in capsys.readouterr().err
+
+
+def test_what_is_kept_of_a_run_holds_its_wear():
+    found = Outcome("", {}, ["ok"], None, {"volume_mm3_per_Mc": 1.5}, "")
+    again = Outcome.of(found.shard())
+    assert (dict(again.wear), again.wear_problem) == ({"volume_mm3_per_Mc": 1.5}, "")

@@ -1,0 +1,158 @@
+"""A material of the user's own: [material] of a scene, a file for `press`, and in Python."""
+
+import json
+
+import numpy as np
+import pytest
+
+from scenes import MODEL, write_scene
+from tkamb.cli import main
+from tkamb.contact.given_material import given_material, material_as_json, named_material
+from tkamb.contact.materials import LinearElastic, material
+from tkamb.errors import InputError
+from tkamb.press import press_meshes
+from tkamb.scene import load_scene
+from tkamb.simulation import simulate
+from tkamb.wear.setup import wear_setup
+
+CURVE = {"strain": (0.0, 0.01, 0.05, 0.2), "stress_MPa": (0.0, 6.0, 15.0, 22.0)}
+POSE = (-6.9, 30.7, 0.0, 0.0, 0.0, 0.0)
+FEMORAL, INSERT = MODEL / "femoral_component.stl", MODEL / "insert.stl"
+
+
+def test_each_law_follows_its_own_formula():
+    strain = np.array([-0.05, 0.0, 0.004, 0.05])
+    linear = given_material({"young_modulus_MPa": 800, "poisson_ratio": 0.4})
+    assert isinstance(linear.law, LinearElastic)
+    assert linear.stress(strain) == pytest.approx(800e6 * strain)
+    numbers = {"alpha": 0.05, "reference_stress_MPa": 9.0, "exponent": 4.0}
+    bent = given_material(
+        {"young_modulus_MPa": 800, "poisson_ratio": 0.4, "law": "ramberg-osgood", **numbers}
+    )
+    stress = bent.stress(strain)
+    again = stress / 800e6 + 0.05 * np.abs(stress / 9e6) ** 3 * stress / 800e6
+    assert again == pytest.approx(strain, abs=1e-12)
+    table = given_material({"poisson_ratio": 0.4, "law": "tabulated", **CURVE})
+    assert table.stress(CURVE["strain"]) / 1e6 == pytest.approx(CURVE["stress_MPa"])
+    doubled = {"poisson_ratio": 0.4, "law": "tabulated", **CURVE}
+    doubled["young_modulus_MPa"] = 2 * table.young_modulus / 1e6
+    assert given_material(doubled).stress(strain) == pytest.approx(2 * table.stress(strain))
+
+
+def test_a_base_keeps_what_is_not_given_and_names_its_sources():
+    assert given_material({"base": "polyethylene"}) == material("polyethylene")
+    stiffer = given_material({"base": "polyethylene", "young_modulus_MPa": 900.0})
+    known = material("polyethylene")
+    assert (stiffer.young_modulus, stiffer.poisson_ratio) == (900e6, known.poisson_ratio)
+    assert stiffer.law == known.law and stiffer.name == "polyethylene (changed)"
+    assert any("Halloran" in source for source in stiffer.sources)
+    straight = given_material({"base": "polyethylene", "law": "linear"})
+    assert isinstance(straight.law, LinearElastic)
+    told = material_as_json(stiffer)
+    assert (told["young_modulus_MPa"], told["law"]) == (900.0, "ramberg-osgood")
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"poisson_ratio": 0.4}, "'young_modulus_MPa' is missing"),
+        ({"young_modulus_MPa": 500}, "'poisson_ratio' is missing"),
+        ({"young_modulus_MPa": 500, "poisson_ratio": 0.5}, "Poisson's ratio 0.5"),
+        ({"young_modulus_MPa": "500", "poisson_ratio": 0.4}, "cannot be '500'"),
+        ({"young_modulus_MPa": 500, "poisson_ratio": 0.4, "alpha": 0.1}, "none of the law"),
+        ({"poisson_ratio": 0.4, "law": "tabulated", "strain": (0.0, 0.1)}, "needs 'stress_MPa'"),
+        ({"poisson_ratio": 0.4, "law": "tabulated", **CURVE, "strain": (0, 1, 2, 1)}, "no stress"),
+        ({"base": "polyethilene"}, "did you mean"),
+        ({"base": "polyethylene", "young_modulus": 1.0}, "unknown key"),
+        ({"young_modulus_MPa": 5, "poisson_ratio": 0.4, "name": "polyethylene"}, "built-in"),
+        ({"young_modulus_MPa": 5, "poisson_ratio": 0.4, "law": "hooke"}, "no law 'hooke'"),
+    ],
+)
+def test_what_is_no_material_is_refused(table, words):
+    with pytest.raises(InputError, match=words):
+        given_material(table)
+
+
+@pytest.fixture(scope="module")
+def soft(tmp_path_factory):
+    path = tmp_path_factory.mktemp("material") / "soft.toml"
+    text = 'young_modulus_MPa = 300.0\npoisson_ratio = 0.45\nsources = ["measured here"]\n'
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_press_takes_a_file_a_name_or_a_material_and_says_which(soft, capsys):
+    command = ["press", str(FEMORAL), str(INSERT), "--load", "1500", "--pose"]
+    command += [*map(str, POSE), "--contact", "foundation-linear", "--resolution", "3", "--json"]
+    assert main([*command, "--material", str(soft)]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["material"]["young_modulus_MPa"] == 300.0
+    assert found["material"]["sources"] == ["measured here"]
+    assert found["known_error"] == "not measured"
+    given = {"pose": POSE, "contact": "foundation-linear", "resolution_mm": 3.0}
+    again = press_meshes(FEMORAL, INSERT, 1500.0, material=named_material(soft), **given)
+    assert again.result.approach * 1e3 == pytest.approx(found["approach_mm"])
+    # the layer's pressure is E over h times the depth: half of E and half of the load, same depth
+    half = press_meshes(
+        FEMORAL, INSERT, 1500.0 * 561.5 / 300.0, material="polyethylene-linear", **given
+    )
+    assert half.result.approach == pytest.approx(again.result.approach, rel=1e-3)
+    assert main([*command, "--material", "soft.tml"]) == 2
+    assert "no material 'soft.tml'" in capsys.readouterr().err
+
+
+def test_a_scene_s_material_is_pressed_and_told_and_worn(tmp_path):
+    own = {"young_modulus_MPa": 300.0, "poisson_ratio": 0.45, "yield_stress_MPa": 12.0}
+    changes = {f"material__{key}": value for key, value in own.items()}
+    path = write_scene(
+        tmp_path,
+        contact__material=None,
+        contact__resolution_mm=4.0,
+        output__yield_stress_MPa=None,
+        **changes,
+    )
+    scene, frames = load_scene(path), slice(60, 61)
+    run = simulate(scene, frames=frames)
+    linear = {"contact__material": "polyethylene-linear", "contact__resolution_mm": 4.0}
+    plain = simulate(write_scene(tmp_path / "plain", **linear), frames=frames)
+    peak = "medial_peak_pressure_MPa"
+    assert run[peak][0] < plain[peak][0]
+    told = run.summary["material"]
+    assert (told["name"], told["young_modulus_MPa"], told["law"]) == ("own", 300.0, "linear")
+    assert run.summary["yield_stress_MPa"] == 12.0
+    assert run.summary["known_error"] == "not measured"
+    assert plain.summary["material"]["young_modulus_MPa"] == 561.5
+    assert wear_setup(path, frames=2, resolution_mm=6.0).engine.material.young_modulus == 300e6
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"material__base": "polyethylene"}, "name two materials"),
+        (
+            {"contact__material": None, "material__base": "polyethylene", "material__e": 3},
+            "unknown",
+        ),
+        (
+            {"contact__material": None, "material__base": "polyethylene"}
+            | {"material__yield_stress_MPa": 20.0},
+            "both give yield_stress_MPa",
+        ),
+    ],
+)
+def test_two_declarations_of_one_thing_are_refused(tmp_path, changes, words):
+    with pytest.raises(InputError, match=words):
+        load_scene(write_scene(tmp_path, **changes))
+
+
+def test_wear_keys_change_no_run_and_materials_do(tmp_path):
+    plain = load_scene(write_scene(tmp_path / "a"))
+    worn = load_scene(write_scene(tmp_path / "b", wear__close="as recorded"))
+    other = load_scene(
+        write_scene(tmp_path / "c", contact__material=None, material__base="polyethylene-linear")
+    )
+    texts = [
+        one.identity_json.replace(str(tmp_path / name), "")
+        for one, name in ((plain, "a"), (worn, "b"), (other, "c"))
+    ]
+    assert texts[0] == texts[1] != texts[2]
