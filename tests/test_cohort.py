@@ -94,7 +94,7 @@ def test_a_cohort_is_its_runs_one_by_one_and_lists_what_failed(file, tmp_path, c
 
 
 def test_parts_and_workers_and_an_interrupt_change_nothing(file, tmp_path, monkeypatch):
-    monkeypatch.setattr("tkamb.cohort.folder.cohort_html", lambda *_: "page")
+    monkeypatch.setattr("tkamb.cohort.report.cohort_html", lambda *_: "page")
     whole, parted = tmp_path / "whole", tmp_path / "parted"
 
     with pytest.raises(KeyboardInterrupt, match="1 of 6 runs are kept"):
@@ -261,7 +261,7 @@ def test_two_into_one_folder_and_another_cohort_to_resume_are_refused(file, tmp_
 @pytest.mark.slow
 def test_a_full_disk_leaves_no_table_or_the_whole_of_it(file, tmp_path, monkeypatch):
     cohort, outcomes = load_cohort(file), {n: outcome(1.0, 5) for n in range(4)}
-    monkeypatch.setattr("tkamb.cohort.folder.cohort_html", lambda *_: "page")
+    monkeypatch.setattr("tkamb.cohort.report.cohort_html", lambda *_: "page")
 
     def write(place, number=None):
         place.mkdir()

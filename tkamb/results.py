@@ -130,15 +130,16 @@ class Results:
         Raises:
             InputError: a plot or an axis that does not exist.
         """
-        from tkamb.output.plots import plot
+        from tkamb.run.pages import page
 
-        return plot(self, names, axis)
+        figure: Figure = page("plots")(self, names, axis)
+        return figure
 
     def _repr_html_(self) -> str:
         """Return the report's headline numbers, for notebooks."""
-        from tkamb.output.report import headline_html
+        from tkamb.run.pages import page
 
-        return headline_html(self)
+        return str(page("headline")(self))
 
 
 def _complete_columns(given: Mapping[str, Any]) -> dict[str, Any]:

@@ -118,7 +118,7 @@ def write_results(
     Raises:
         InputError: the folder cannot be claimed (`tkamb.claim`) or written.
     """
-    from tkamb.output.report import report_html
+    from tkamb.run.pages import page
     from tkamb.run.shards import remove_shards
 
     if BANDS_NAME not in (more or {}):
@@ -129,7 +129,7 @@ def write_results(
             for name, write in (more or {}).items():
                 write(files.path(name))
             put_numbers(results, files)
-            write_synced(files.path(REPORT_NAME), report_html(results, progress))
+            write_synced(files.path(REPORT_NAME), page("report")(results, progress))
         remove_shards(folder)
 
 

@@ -12,11 +12,11 @@ import numpy as np
 from tkamb.atomic import replaced_together, write_rows, write_synced
 from tkamb.cohort.outcome import Outcome
 from tkamb.cohort.plan import GROUP_AXES, Cohort, CohortRun
-from tkamb.cohort.report import cohort_html
 from tkamb.cohort.statistics import group_rows, groups_of
 from tkamb.columns import ordered_names
 from tkamb.errors import not_installed
 from tkamb.files import sha256_of
+from tkamb.run.pages import page
 
 try:
     import pyarrow as pa
@@ -45,7 +45,7 @@ def write_cohort(
             pq.write_table(table, file, compression="zstd")
         write_rows(files.path(RUNS_NAME), runs)
         write_rows(files.path(GROUPS_NAME), group_rows(groups, cohort.group_by))
-        write_synced(files.path(REPORT_NAME), cohort_html(cohort, outcomes, groups))
+        write_synced(files.path(REPORT_NAME), page("cohort")(cohort, outcomes, groups))
         names = (TABLE_NAME, RUNS_NAME, GROUPS_NAME, REPORT_NAME)
         summary = {
             "title": cohort.table.title,

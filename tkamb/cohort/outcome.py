@@ -12,8 +12,7 @@ from tkamb.columns import KINDS
 from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array
 from tkamb.memory import give_back
-from tkamb.output.metrics import map_rows
-from tkamb.output.panels import lateral_axis_name
+from tkamb.output.metrics import lateral_axis_name, map_rows
 from tkamb.results import Results
 from tkamb.run.shards import Shard
 from tkamb.run.status import FAILED

@@ -18,10 +18,10 @@ from pydantic import Field, ValidationError, model_validator
 
 from tkamb.errors import InputError, names_near
 from tkamb.files import read_text, sha256_of
+from tkamb.run.frame_choice import frames_slice
 from tkamb.run.summary import files_in
 from tkamb.scene import Scene, load_scene
 from tkamb.scene.table import Count, Number, SceneTable
-from tkamb.scene_options import frames_slice
 
 AXES = ("subject", "trial", "design", "contact")
 GROUP_AXES = ("activity", *AXES[1:])

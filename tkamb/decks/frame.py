@@ -11,8 +11,7 @@ from tkamb.decks.calculix import Deck
 from tkamb.decks.febio import febio_text
 from tkamb.decks.problem import PressProblem, press_problem
 from tkamb.errors import InputError
-from tkamb.output.metrics import map_rows
-from tkamb.output.panels import lateral_axis_name
+from tkamb.output.metrics import lateral_axis_name, map_rows
 from tkamb.results import Results
 from tkamb.results_folder import read_results
 from tkamb.run.rerun import case_of_results

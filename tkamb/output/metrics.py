@@ -155,3 +155,8 @@ def stretches(points: Array) -> list[slice]:
     near = np.concatenate([[False], steps <= longest, [False]])
     ends = np.flatnonzero(np.diff(near.astype(int))).reshape(-1, 2)
     return [slice(int(first), int(last) + 1) for first, last in ends]
+
+
+def lateral_axis_name(results: "Results") -> str:
+    """Return what insert z points to: "lateral" unless the summary's `lateral_axis` is "-z"."""
+    return "lateral" if results.summary.get("lateral_axis", "+z") == "+z" else "medial"

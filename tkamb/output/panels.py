@@ -12,6 +12,7 @@ from tkamb.geometry.frames import Array
 from tkamb.known_errors import is_large, known_error_words
 from tkamb.output.metrics import (
     body_weight,
+    lateral_axis_name,
     medial_share,
     residual_effect,
     residual_share,
@@ -107,11 +108,6 @@ def _without_empty_lines(panel: Panel) -> Panel:
     """Return the panel with only the lines that hold a number."""
     lines = tuple(line for line in panel.lines if np.isfinite(line.values).any())
     return replace(panel, lines=lines)
-
-
-def lateral_axis_name(results: "Results") -> str:
-    """Return what insert z points to: "lateral" unless the summary's `lateral_axis` is "-z"."""
-    return "lateral" if results.summary.get("lateral_axis", "+z") == "+z" else "medial"
 
 
 def _line(

@@ -21,8 +21,7 @@ from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis
 from tkamb.output.levels import PageGrid, pressure_levels, touched_part
 from tkamb.output.maps import ContactMaps
-from tkamb.output.metrics import map_rows, stretches
-from tkamb.output.panels import lateral_axis_name
+from tkamb.output.metrics import lateral_axis_name, map_rows, stretches
 from tkamb.output.style import BLACK, GREY, PRESSURE_MAP, SIDE_COLOURS, new_figure, settings
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 

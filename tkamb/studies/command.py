@@ -105,9 +105,10 @@ def _stability(options: argparse.Namespace) -> int:
 
 
 def _study_stability(options: argparse.Namespace, directory: Path) -> int:
+    from tkamb.output.stability_picture import picture
     from tkamb.studies import stability as study
     from tkamb.studies.kept_rows import KeptRows
-    from tkamb.studies.stability import picture, table
+    from tkamb.studies.stability import table
 
     cases = study.stability_cases(options.quick)
     kept = KeptRows(directory, options.resume)

@@ -12,16 +12,13 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-
 from tkamb.errors import ComputationError, TkambError
-from tkamb.output.style import BLUE, GREY, ORANGE, VERMILLION, new_figure, settings
 from tkamb.studies.closed_forms import ClosedForm, closed_forms
 from tkamb.studies.extremes import Extreme, Shape, beside_calculix, extremes
 from tkamb.studies.kept_rows import KeptRows, row_key
 from tkamb.studies.measures import ONE_THREAD, environment
 from tkamb.studies.scene_extremes import SceneExtreme, judge_scene, scene_extremes
-from tkamb.studies.verdict import KINDS, WRONG, Verdict, judge, judge_closed_form
+from tkamb.studies.verdict import KINDS, Verdict, judge, judge_closed_form
 
 Case = Extreme | ClosedForm | SceneExtreme
 
@@ -41,7 +38,6 @@ QUICK_SHAPES: tuple[Shape, ...] = ("swapped", "lip", "spike")
 QUICK_PEERED = 4
 """The quick study takes one extreme in so many, no finer than this; unusual shapes; the first
 cases beside CalculiX; the first closed forms; no runs."""
-COLOURS = {"converged": BLUE, "flagged": ORANGE}
 
 
 def stability_cases(quick: bool) -> list[Case]:
@@ -235,48 +231,3 @@ def table(verdicts: Sequence[Verdict]) -> list[str]:
 def _line(verdict: Verdict) -> str:
     was = f" (was {verdict.expected})" if verdict.expected not in (None, verdict.kind) else ""
     return f"  {verdict.contact}, {verdict.case}: {verdict.kind}{was}: {verdict.reason}"
-
-
-def picture(verdicts: Sequence[Verdict]) -> Figure:
-    """Return one dot per case: what was driven out against the distance from the reference."""
-    groups = list(dict.fromkeys(_group(v) for v in verdicts))
-    with settings():
-        figure = new_figure(8.0, 1.6 + 0.2 * len(groups))
-        axis = figure.subplots()
-        for kind in KINDS:
-            some = [v for v in verdicts if v.kind == kind]
-            if not some:
-                continue
-            axis.plot(
-                [_distance(v) for v in some],
-                [groups.index(_group(v)) for v in some],
-                "o" if kind in COLOURS else "X",
-                color=COLOURS.get(kind, VERMILLION),
-                ms=4 if kind in COLOURS else 7,
-                alpha=0.75,
-                label=f"{kind.replace('_', ' ')} ({len(some)})",
-            )
-        axis.axvline(WRONG, color=GREY, lw=1, ls="--")
-        top = len(groups) - 0.3
-        words = "wrong beyond 2 %; closed forms beyond their own bound "
-        axis.text(WRONG, top, words, color=GREY, fontsize=7.5, ha="right")
-        axis.text(1.0, top, "no answer", color=GREY, fontsize=7.5, ha="center")
-        axis.set(xscale="log", xlim=(1e-9, 3.0), xlabel="largest distance from the reference")
-        axis.set_yticks(range(len(groups)), groups, fontsize=7.5)
-        axis.set_ylim(-0.7, len(groups) + 0.4)
-        figure.legend(loc="outside upper left", ncols=4)
-    return figure
-
-
-def _distance(verdict: Verdict) -> float:
-    return 1.0 if verdict.error is None else max(verdict.error, 2e-9)
-
-
-def _group(verdict: Verdict) -> str:
-    """Return the quantities that were driven out, or the run's kind."""
-    if verdict.contact == "run":
-        return " ".join(verdict.case.split()[:2])
-    if verdict.contact != "lattice":
-        return f"{verdict.contact}, any"
-    names = [part.split("=")[0].rsplit("_", 1)[0] for part in verdict.case.split(", ")]
-    return " and ".join(names)
