@@ -98,7 +98,7 @@ def _settings(preset: Mapping[str, Any]) -> list[str]:
         if isinstance(value, Mapping):
             told = ", ".join(f"{name} = {item}" for name, item in value.items())
         else:
-            told = "left out" if value is None else str(value).lower()
+            told = "left out" if value is None else (str(value).lower() if value != [] else "none")
         lines.append(f"| `{key}` | {told} |")
     return [*lines, "", SET, ""]
 
@@ -109,13 +109,13 @@ def _elements(values: Mapping[str, float]) -> list[str]:
         "",
         ELEMENTS,
         "",
-        "| section | element | equation | code | test | number |",
-        "| --- | --- | --- | --- | --- | --- |",
+        "| section | element | equation | code, test | number |",
+        "| --- | --- | --- | --- | --- |",
     ]
     for row in facts()["element"]:
         number = row["number"].format(**values)
         lines.append(
-            f"| {row['section']} | {row['name']} | {row['equation']} | `{row['code']}` | "
+            f"| {row['section']} | {row['name']} | {row['equation']} | `{row['code']}`<br>"
             f"`{row['test'].removeprefix('tests/')}` | {number} |"
         )
     return [*lines, "", OPEN, ""]
