@@ -16,17 +16,26 @@ from tkamb.importing.model_motion import MOTION_FILE
 from tkamb.importing.recorded_poses import read_poses
 from tkamb.importing.request import ImportRequest
 from tkamb.importing.scene_text import SceneText
-from tkamb.importing.soft_tissue import soft_tissue
+from tkamb.importing.soft_tissue import soft_tissue, some_names
 from tkamb.importing.standing import with_static_markers
 from tkamb.importing.trial import Trial, from_coordinates, from_markers, from_poses
 from tkamb.importing.urdf import patient_urdf
 from tkamb.inputs.meshes import axes_rotation, load_surface
 from tkamb.inputs.tables import read_table
+from tkamb.opensim.model import OpenSimModel
 from tkamb.opensim.read import read_osim
 from tkamb.scene import load_scene
 from tkamb.scene.case import Case, load_case
 from tkamb.units import DEGREE, MILLIMETRE
 
+LEG_ALONE = 0.6
+"""Share of a model's mass above which thigh, shank and foot are a model of one leg."""
+LEG_SHARE = 0.161
+"""Of the body's mass, thigh 0.100, shank 0.0465, foot 0.0145 (Winter, Biomechanics, 2009)."""
+LEG_SHARES = (0.10, 0.25)
+"""Of the body's mass: from Winter's 0.161 to de Leva's 0.20 (1996), with room for other people."""
+MAX_REASONS = 3
+"""Parts that were not read of which the report gives the reason."""
 SAME_MASS = 0.01
 """A model whose mass is within this share of the subject's is not scaled."""
 
@@ -58,7 +67,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
     Raises:
         InputError: whatever cannot be used, in one line.
     """
-    model = read_osim(request.model)
+    model = read_osim(request.model, partial=True)
     leg = find_leg(model, request.side, request.knee)
     meshes = request.meshes
     insert = placement = None
@@ -93,7 +102,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         request.activity,
         (*_notes(request, scale, found, bool(tissue.bundles)), *request.notes),
     )
-    report = [*_leg_lines(leg), weighed, *links.said, *_patella_line(links)]
+    report = [*_model_lines(model), *_leg_lines(leg), weighed, *links.said, *_patella_line(links)]
     report += [*found.said, *tissue.said]
     if request.static is not None:
         if found.markers is None:
@@ -190,18 +199,70 @@ def marker_lines(case: Case) -> tuple[str, ...]:
 
 
 def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
-    """Return the factor on the model's masses, and a line on it."""
-    ratio = request.mass_kg / leg.model.mass_kg
+    """Return the factor on the model's masses, and a line on it.
+
+    Raises:
+        InputError: masses that cannot be the subject's.
+    """
+    model, subject = leg.model.mass_kg, request.mass_kg
+    own = sum(leg.model.bodies[b].mass_kg for b in (*leg.femur, *leg.tibia, *leg.foot))
+    if own <= 0.0:
+        raise InputError(
+            "gives thigh, shank and foot no mass", request.model, "give its bodies their masses"
+        )
+    if own > LEG_ALONE * model:
+        return _leg_scale(request, own)
+    ratio = subject / model
     scaled = abs(ratio - 1.0) > SAME_MASS if request.scale_mass is None else request.scale_mass
-    said = f"mass: the model's bodies sum to {leg.model.mass_kg:.2f} kg, the subject is "
-    said += f"{request.mass_kg:g} kg: "
+    said = f"mass: the model's bodies sum to {model:.2f} kg, the subject is {subject:g} kg: "
     if not 0.5 < ratio < 2.0:
         raise InputError(
-            f"weighs {leg.model.mass_kg:.1f} kg, the subject {request.mass_kg:g} kg",
+            f"weighs {model:.1f} kg, the subject {subject:g} kg",
             request.model,
             "is --mass-kg in kilograms? else scale the model first",
         )
     return (ratio, said + f"scaled by {ratio:.4f}") if scaled else (1.0, said + "not scaled")
+
+
+def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
+    """Return the factor on the masses of a model that is little more than one leg, and a line.
+
+    Such a model holds the leg's own mass, or, where a scaling tool was told the subject's mass,
+    the whole body's. The leg's own is `LEG_SHARE` of the subject.
+
+    Raises:
+        InputError: neither of the two.
+    """
+    subject = request.mass_kg
+    share, wanted = own / subject, LEG_SHARE * subject
+    low, high = LEG_SHARES
+    whole_body = 0.5 < share < 2.0
+    said = (
+        f"mass: the model is one leg of {own:.2f} kg, {share:.0%} of the subject's {subject:g} kg"
+    )
+    if low <= share <= high and not request.scale_mass:
+        return 1.0, said + ": not scaled"
+    if not (low <= share <= high or whole_body) or (whole_body and request.scale_mass is False):
+        raise InputError(
+            f"is one leg of {own:.1f} kg, the subject weighs {subject:g} kg: a leg has "
+            f"{low:.0%} to {high:.0%} of the body's mass",
+            request.model,
+            "is --mass-kg in kilograms? else give the model's bodies a leg's masses",
+        )
+    why = ", the whole body's" if whole_body else ""
+    return wanted / own, (
+        f"{said}{why}: scaled to {wanted:.2f} kg, the {LEG_SHARE:.1%} of a leg (Winter 2009)"
+    )
+
+
+def _model_lines(model: OpenSimModel) -> list[str]:
+    """Return how the model was read, and what of it was not, because this knee needs none of it."""
+    lines = [f"model: {notice}" for notice in model.notices]
+    unread = [f"{one.kind} '{one.name}'" for one in model.unread]
+    if unread:
+        lines.append(f"not read, and not needed for this knee: {some_names(unread)}")
+        lines += [f"  {one.reason}" for one in model.unread[:MAX_REASONS]]
+    return lines
 
 
 def _leg_lines(leg: Leg) -> list[str]:

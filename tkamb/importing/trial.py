@@ -9,7 +9,7 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.importing.anatomy import OTHER, Leg
+from tkamb.importing.anatomy import OTHER, Leg, way_to_pelvis
 from tkamb.importing.links import Links
 from tkamb.importing.markers import (
     Facing,
@@ -19,7 +19,7 @@ from tkamb.importing.markers import (
     model_segments,
     seen_segments,
 )
-from tkamb.importing.model_motion import MOTION_FILE, ModelMotion, model_motion
+from tkamb.importing.model_motion import COLUMNS, MOTION_FILE, ModelMotion, model_motion
 from tkamb.importing.plates import (
     Load,
     common_surface,
@@ -35,6 +35,8 @@ from tkamb.importing.shank import ShankMarkers, shank_markers
 from tkamb.inputs.c3d import Recording, read_c3d
 from tkamb.inputs.tables import Table, read_table
 
+SMALLEST_BEND = 3.5
+"""deg; a knee that bends by less all along, read in degrees, is likely given in radians (0.06)."""
 FRAMES_PER_CUTOFF = 5.0
 """Frames per period of the cut-off: what is low-passed holds nothing between them."""
 
@@ -94,8 +96,18 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
     Raises:
         InputError: no flexion of the knee in it, or a ground reaction of no foot.
     """
+    for joint in way_to_pelvis(leg):
+        if joint.unread:
+            raise InputError(joint.unread)
     motion = model_motion(links, recorded)
     said = [f"motion: the model's coordinates in {recorded.path.name}, into {MOTION_FILE}"]
+    bend = float(np.abs(motion.values[:, COLUMNS.index("flexion_deg")]).max())
+    if bend < SMALLEST_BEND and len(recorded.time()) > 1:
+        stated = "yes" if recorded.in_degrees else "no"
+        said.append(
+            f"ATTENTION: the knee bends by {bend:.2g} deg at most with inDegrees={stated}: are the "
+            "angles in radians? then write inDegrees=no"
+        )
     if motion.missing:
         said.append(f"not in the motion, so at their defaults: {', '.join(motion.missing)}")
     ground = None

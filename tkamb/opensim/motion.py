@@ -29,6 +29,10 @@ class CoordinateMotion:
     accelerations: Array
 
 
+LARGEST_ANGLE = 2.0 * np.pi
+"""rad; no joint of a leg turns further."""
+
+
 def read_coordinates(kinematics: Kinematics, recorded: Table) -> tuple[Array, tuple[str, ...]]:
     """Return coordinates (f, n) rad and m, and those that a `.mot` or `.sto` does not hold.
 
@@ -39,23 +43,48 @@ def read_coordinates(kinematics: Kinematics, recorded: Table) -> tuple[Array, tu
         recorded: with a column per coordinate, named as in the model or by its path.
 
     Raises:
-        InputError: angles of unknown unit, or a gap.
+        InputError: angles of unknown or impossible unit, or a gap.
     """
     model = kinematics.model
     q = np.tile(kinematics.vector({}), (recorded.rows, 1))
     missing = []
     for name, coordinate in model.coordinates.items():
-        column = next((c for c in recorded.columns if name in (c, *c.split("/")[-2:-1])), None)
+        column = _column(recorded, name)
         if column is None:
             missing.append(name)
             continue
         values = recorded.complete_column(column)
         if coordinate.rotational:
             if recorded.in_degrees is None:
-                raise InputError("does not say inDegrees", recorded.path, "add it to its header")
+                hint = "add inDegrees=yes or inDegrees=no to its header"
+                raise InputError("does not say inDegrees", recorded.path, hint)
             values = values * (DEGREE if recorded.in_degrees else 1.0)
+            largest = float(np.abs(values).max(initial=0.0))
+            if largest > LARGEST_ANGLE and not _turns(name):
+                said = "yes" if recorded.in_degrees else "no"
+                raise InputError(
+                    f"column '{column}' reaches {largest:.3g} rad with inDegrees={said}",
+                    recorded.path,
+                    "are its angles in degrees? then write inDegrees=yes",
+                )
         q[:, kinematics.coordinates[name]] = values
     return q, tuple(missing)
+
+
+def _turns(name: str) -> bool:
+    """Say whether a coordinate may turn without end: the body in the laboratory."""
+    return any(word in name.lower() for word in ("pelvis", "ground", "root"))
+
+
+def _column(recorded: Table, name: str) -> str | None:
+    """Return the column of a coordinate's values: its name, or its path, not that of its speed."""
+    if name in recorded.columns:
+        return name
+    for column in recorded.columns:
+        *above, last = column.strip("/").split("/")
+        if above and (last == name or (last == "value" and above[-1] == name)):
+            return column
+    return None
 
 
 def coordinate_motion(
