@@ -16,8 +16,10 @@ from tkamb.compare.command import add_compare
 from tkamb.datasets.command import add_data
 from tkamb.export_command import add_export
 from tkamb.guard import guarded, log_to_stderr
+from tkamb.help_examples import add_examples
 from tkamb.importing.command import add_import
 from tkamb.mesh_command import add_contact, add_mesh, add_no_cache, add_press, without_cache
+from tkamb.option_rules import check_options
 from tkamb.scene_options import add_scene_options, overrides_of
 from tkamb.starter import add_new
 from tkamb.studies.command import add_stability, add_tradeoff
@@ -42,7 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = argparse.Namespace()
 
     def command() -> int:
-        _parser().parse_args(arguments, options)
+        parser = _parser()
+        parser.parse_args(arguments, options)
+        check_options(parser, sys.argv[1:] if arguments is None else arguments, options)
         threads()  # is refused here where it is no number of threads
         log_to_stderr()
         return int(options.command(options))
@@ -90,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     add_wear(commands)
     add_uncertainty(commands)
     add_cohort(commands)
+    add_examples(parser)
     return parser
 
 
@@ -108,10 +113,10 @@ def _add_run(commands: Any) -> None:
 
 def _add_folder_commands(commands: Any) -> None:
     verify = commands.add_parser("verify", help="is a folder of results what was written?")
-    verify.add_argument("folder", type=Path, metavar="DIR")
+    verify.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
     verify.set_defaults(command=_verify)
     report = commands.add_parser("report", help="write report.html of a folder of results anew")
-    report.add_argument("folder", type=Path, metavar="DIR")
+    report.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
     report.set_defaults(command=_report)
 
 

@@ -1,12 +1,15 @@
 """A patient brought in: model, recording and meshes to a URDF and a scene that runs."""
 
+import os
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from tkamb.atomic import claim_directory, write_text
+from tkamb.atomic import CHOOSE_OUT, claim_directory, write_new_text
 from tkamb.errors import InputError
+from tkamb.files import TABLE_LIMIT, read_bytes
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.surface import Surface
 from tkamb.importing.anatomy import Leg, find_leg
@@ -83,6 +86,10 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
     )
     scale, weighed = _mass_scale(request, leg)
     tissue = soft_tissue(links)
+    if meshes and meshes.femur_bone and not (tissue.quadriceps and tissue.patellar_ligament):
+        hint = "leave it out, or complete the model"
+        what = "is what the quadriceps wraps, and the model gives none"
+        raise InputError(what, "--femur-bone", hint)
     found = _trial(request, leg, links, insert)
     scene = SceneText(
         _title(request),
@@ -141,32 +148,50 @@ def _trial(request: ImportRequest, leg: Leg, links: Links, insert: Surface | Non
 def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[str, ...]:
     """Write URDF and scene, load them as a run would, and return what the markers say.
 
-    Nothing is left behind where that fails.
+    A file that is there already is left as it is: one of the same content may be shared with
+    another scene. Nothing is left behind where anything fails.
 
     Raises:
-        InputError: the folder cannot be written, holds a scene of that name already, or the
-            scene does not load.
+        InputError: the folder cannot be written, holds a file of one of these names with another
+            content, or the scene does not load.
     """
-    urdf, scene = folder / patient.scene.urdf, folder / name
-    if scene.exists():
-        raise InputError("is there already", scene, "choose another --out, or remove it")
-    files = {urdf: patient.urdf, scene: patient.scene.text()}
+    scene = folder / name
+    if os.path.lexists(scene):
+        raise InputError("is there already", scene, CHOOSE_OUT)
+    files = {folder / patient.scene.urdf: patient.urdf, scene: patient.scene.text()}
     if patient.motion is not None:
         files[folder / MOTION_FILE] = patient.motion
+    new = {path: text for path, text in files.items() if not _same_there(path, text)}
     made = [place for place in (folder, *folder.parents) if not place.exists()]
-    claim_directory(folder)
-    before = {p: p.read_text(encoding="utf-8") if p.is_file() else None for p in files}
+    written: list[Path] = []
     try:
-        for path, text in files.items():
-            write_text(path, text)
-        case = load_case(load_scene(scene))
-    except InputError:
-        for path, old in before.items():
-            path.unlink(missing_ok=True) if old is None else write_text(path, old)
-        for place in made:
-            place.rmdir()
+        claim_directory(folder)
+        for path, text in new.items():
+            write_new_text(path, text)
+            written.append(path)
+        return marker_lines(load_case(load_scene(scene)))
+    except BaseException:  # an interrupt too: nothing may stay
+        for path in written:
+            path.unlink(missing_ok=True)
+        with suppress(OSError):  # not empty, or never made
+            for place in made:
+                place.rmdir()
         raise
-    return marker_lines(case)
+
+
+def _same_there(path: Path, text: str) -> bool:
+    """Say whether a file of that content is there.
+
+    Raises:
+        InputError: one of another content is, or something that is no file.
+    """
+    if not os.path.lexists(path):
+        return False
+    with suppress(InputError):
+        if read_bytes(path, TABLE_LIMIT) == text.encode("utf-8", "backslashreplace"):
+            return True
+    what = "is there already with another content; another scene may need it"
+    raise InputError(what, path, CHOOSE_OUT)
 
 
 def marker_lines(case: Case) -> tuple[str, ...]:

@@ -99,8 +99,8 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
     for joint in way_to_pelvis(leg):
         if joint.unread:
             raise InputError(joint.unread)
-    motion = model_motion(links, recorded)
-    said = [f"motion: the model's coordinates in {recorded.path.name}, into {MOTION_FILE}"]
+    motion, part = _part(request, model_motion(links, recorded), recorded)
+    said = [f"motion: the model's coordinates in {recorded.path.name}, into {MOTION_FILE}", *part]
     bend = float(np.abs(motion.values[:, COLUMNS.index("flexion_deg")]).max())
     if bend < SMALLEST_BEND and len(recorded.time()) > 1:
         stated = "yes" if recorded.in_degrees else "no"
@@ -117,6 +117,38 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
     else:
         said.append("no ground reaction given: none is modelled")
     return Trial(ground, tuple(said), motion=motion)
+
+
+def _part(
+    request: ImportRequest, motion: ModelMotion, recorded: Table
+) -> tuple[ModelMotion, list[str]]:
+    """Return the part of a motion that is asked for, or that its forces cover, and a line on it.
+
+    Raises:
+        InputError: no such part, or no time in common with the forces.
+    """
+    time, where, why = motion.time, recorded.path, "the recorded forces cover no more"
+    start, end = request.interval or (float(time[0]), float(time[-1]))
+    if request.interval:
+        _check_within(time, start, end)
+        why = "as given"
+    elif request.grf is not None:
+        forces = read_table(request.grf).time()
+        start, end = max(start, float(forces[0])), min(end, float(forces[-1]))
+        if start >= end:
+            raise InputError(
+                f"ends or begins where the forces do not: it is of {time[0]:g} to {time[-1]:g} s, "
+                f"they are of {forces[0]:g} to {forces[-1]:g} s",
+                where,
+                "give recordings of one trial",
+            )
+    inside = (time >= start - 1e-9) & (time <= end + 1e-9)
+    if inside.all():
+        return motion, []
+    if inside.sum() < 2:
+        raise InputError(f"has no two frames between {start:g} and {end:g} s", where)
+    cut = replace(motion, time=time[inside], values=motion.values[inside])
+    return cut, [f"interval: {cut.time[0]:.4f} to {cut.time[-1]:.4f} s of the motion, {why}"]
 
 
 def _facing(request: ImportRequest, segments: list[ModelSegment], recorded: Table) -> Facing:
@@ -184,14 +216,7 @@ def _thinned(
     The frames are every k-th of the recording, at its own times.
     """
     start, end = interval or (float(time[0]), float(time[-1]))
-    frame = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    if start < time[0] - frame or end > time[-1] + frame:
-        raise InputError(
-            f"{start:g} to {end:g} s is not within the recording, "
-            f"{time[0]:.4f} to {time[-1]:.4f} s",
-            "--interval",
-            "give it on the recording's own clock",
-        )
+    _check_within(time, start, end)
     inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
     if len(inside) < 2:
         raise InputError(
@@ -206,6 +231,18 @@ def _thinned(
     last = float(inside[(count - 1) * every])
     line = f"frames: every {every}th of the recording, {count} at {rate / every:g} Hz"
     return (float(inside[0]), last), count, line
+
+
+def _check_within(time: Array, start: float, end: float) -> None:
+    """Raise unless an interval lies within a recording, but for a frame at either end."""
+    frame = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if start < time[0] - frame or end > time[-1] + frame:
+        raise InputError(
+            f"{start:g} to {end:g} s is not within the recording, "
+            f"{time[0]:.4f} to {time[-1]:.4f} s",
+            "--interval",
+            "give it on the recording's own clock",
+        )
 
 
 def _load_line(load: Load) -> str:
