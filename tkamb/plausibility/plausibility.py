@@ -17,6 +17,7 @@ from tkamb.plausibility.implant import implant_questions
 from tkamb.plausibility.movement import marker_questions, motion_questions, sample_questions
 from tkamb.plausibility.question import Question, some
 from tkamb.plausibility.segments import segment_questions
+from tkamb.plausibility.signs import sign_questions
 
 if TYPE_CHECKING:
     from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
@@ -54,6 +55,7 @@ class Plausibility:
             *posture_questions(case),
             *step_questions(case),
             *implant_questions(case),
+            *sign_questions(case),
         ]
         if case.ligaments or case.muscles:
             found += _line_questions(mechanics)
