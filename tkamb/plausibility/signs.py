@@ -8,15 +8,17 @@ in turn, and asked about where the gaps are much steadier then.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.geometry.condyles import condyle_split
-from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
 from tkamb.plausibility.question import Question
 from tkamb.scene.case import Case
 from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.geometry.first_touch import FirstTouch
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,9 @@ def sign_questions(case: Case, settings: SignSettings | None = None) -> Iterator
     coordinates = case.motion.coordinates
     if case.motion.unrecorded or len(coordinates) < settings.frames:
         return
+    from tkamb.geometry.condyles import condyle_split
+    from tkamb.geometry.first_touch import FirstTouch
+
     rows = np.linspace(0, len(coordinates) - 1, settings.frames).astype(int)
     clearance = FirstTouch(case.femoral, case.insert, condyle_split(case.femoral))
     recorded = _gaps(clearance, coordinates[rows])
@@ -95,13 +100,13 @@ def _found_by_contact(case: Case) -> set[str]:
     return set(KNEE_COORDINATES) if contact is None else set(contact.released)
 
 
-def _gaps(clearance: FirstTouch, coordinates: Array) -> Array:
+def _gaps(clearance: "FirstTouch", coordinates: Array) -> Array:
     """Return the vertical clearance (f, 2) m of the condyles; NaN where one is off the insert."""
     touches = [clearance.at(knee_pose(row)) for row in coordinates]
     return np.array([[np.nan if t is None else t.travel for t in pair] for pair in touches])
 
 
-def _turned_gaps(clearance: FirstTouch, coordinates: Array, name: str) -> Array:
+def _turned_gaps(clearance: "FirstTouch", coordinates: Array, name: str) -> Array:
     """Return the clearances with the sign of one coordinate turned."""
     turned = coordinates.copy()
     turned[:, KNEE_COORDINATES.index(name)] *= -1.0
