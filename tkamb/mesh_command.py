@@ -7,6 +7,7 @@ from typing import Any
 
 from tkamb.defaults import CONTACT_MODEL
 from tkamb.errors import InputError
+from tkamb.scene_options import add_force
 
 UNIT_OPTIONS = ("--units", "--mesh-unit")
 AXES_OPTIONS = ("--axes", "--mesh-axes")
@@ -203,13 +204,6 @@ def _add_side(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--side", choices=("right", "left"), default="right", help="of the knee; default: right"
-    )
-
-
-def add_force(command: argparse.ArgumentParser) -> None:
-    """Add --force to a command that writes one file."""
-    command.add_argument(
-        "--force", action="store_true", help="--out may replace a file that tkamb did not write"
     )
 
 

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tkamb.errors import InputError
-from tkamb.mesh_command import add_force
-from tkamb.scene_options import add_set
+from tkamb.scene_options import add_force, add_set
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -231,8 +231,11 @@ def _bending_role(recorded: Table, source: MotionRecording) -> str:
     """Return the role whose sign is that of flexion: of a pose, the rotation of widest range."""
     if source.interpretation != "pose":
         return "flexion"
-    roles = [f"rotation_{k}" for k in (1, 2, 3)]
-    return max(roles, key=lambda role: np.ptp(recorded.column(source.columns.get(role, role))))
+
+    def range_of(role: str) -> float:
+        return float(np.ptp(recorded.column(source.columns.get(role, role))))
+
+    return max((f"rotation_{k}" for k in (1, 2, 3)), key=range_of)
 
 
 def _check_knee(knee: Array, path: Path, bending: str | None = None) -> None:

@@ -59,7 +59,7 @@ class Frames:
         """Return the frames of a model."""
         offsets: dict[tuple[str, str], tuple[str, Array]] = {}
         stations = _stations(document, model)
-        unread = {}
+        unread: dict[str, str] = {}
         for owner, element in _held_frames(model, ""):
             with document.reading(element):
                 name = document.name(element)
