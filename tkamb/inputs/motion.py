@@ -233,7 +233,7 @@ def _bending_role(recorded: Table, source: MotionRecording) -> str:
         return "flexion"
 
     def range_of(role: str) -> float:
-        return float(np.ptp(recorded.column(source.columns.get(role, role))))
+        return float(np.ptp(recorded.column(source.columns.get(role) or role)))
 
     return max((f"rotation_{k}" for k in (1, 2, 3)), key=range_of)
 
