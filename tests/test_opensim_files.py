@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from opensim_models import OWN
 from pendulum_leg import changed, pendulum_osim, recorded_leg
 from tkamb.cli import main
 from tkamb.errors import InputError
+from tkamb.files import named_files
 from tkamb.importing.anatomy import find_leg
 from tkamb.importing.model_fit import ModelChain
 from tkamb.inputs.tables import read_table
@@ -18,6 +20,7 @@ from tkamb.opensim.model import OpenSimModel
 from tkamb.opensim.motion import read_coordinates
 from tkamb.opensim.read import read_osim
 from tkamb.output.storage import write_storage
+from tkamb.run.summary import files_hash
 
 NEW = OWN["new_layout"].read_text(encoding="utf-8")
 
@@ -68,6 +71,22 @@ def test_a_set_in_a_file_of_its_own_is_read(tmp_path, tag, wrapped):
     read = read_osim(written(tmp_path, rest))
     assert_same(read, read_osim(written(tmp_path, WITH_MARKER, "whole.osim")))
     assert read.notices == (f"{tag} read from parts/{tag}.xml",)
+
+
+def test_a_run_reads_the_files_that_its_model_names(tmp_path):
+    """So that another ForceSet is another run, and `verify` sees it."""
+    held, rest = cut_out(NEW, "ForceSet")
+    (tmp_path / "parts").mkdir()
+    forces = written(tmp_path / "parts", held.replace("<objects>", '<objects file="more.xml">'))
+    forces = forces.rename(forces.with_name("ForceSet.xml"))
+    more = written(tmp_path / "parts", "<objects/>", "more.xml")
+    model = written(tmp_path, rest)
+    assert named_files(model) == [forces, more]
+    scene = SimpleNamespace(model_dump=lambda exclude: {"muscles": {"model": model}})
+    case = SimpleNamespace(femoral=None, scene=scene)
+    before = files_hash(case)
+    more.write_text("<objects> </objects>")
+    assert files_hash(case) != before
 
 
 def test_a_files_own_defaults_hold_for_its_own_elements(tmp_path):

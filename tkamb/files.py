@@ -184,6 +184,30 @@ class _ShallowBuilder(TreeBuilder):
         return super().end(tag)
 
 
+_NAMED = re.compile(rb'<\w+[^<>]*?\sfile="([^"<>]+)"')
+
+
+def named_files(path: Path) -> list[Path]:
+    """Return the files that elements of an XML file name with file="…", and those that these name.
+
+    Args:
+        path: an OpenSim model, whose sets may stand in files of their own.
+
+    Raises:
+        InputError: as `read_bytes`.
+    """
+    found: list[Path] = []
+    waiting = [path]
+    while waiting:
+        here = waiting.pop()
+        for name in _NAMED.findall(read_bytes(here)):
+            other = here.parent / os.fsdecode(name).replace("\\", "/")
+            if other.is_file() and other not in (path, *found):
+                found.append(other)
+                waiting.append(other)
+    return found
+
+
 def check_file(path: str | Path, limit: float, *, what: str = "file") -> None:
     """Raise unless a path leads to a regular file of at most `limit` bytes that can be read.
 
