@@ -148,7 +148,7 @@ def test_poses_out_of_the_sagittal_plane_keep_their_side(block, tmp_path, side):
 
 
 MISTAKES = {
-    "poses of no mesh": ({"femoral": None, "insert": None}, "--poses"),
+    "poses of no mesh": ({"femoral": None, "insert": None}, "needs --insert"),
     "units guessed": ({"pose_units": None}, "--pose-units"),
     "unit of no length": ({"pose_units": "rad,ft"}, "--pose-units"),
     "sequence guessed": ({"pose_sequence": None}, "--pose-sequence"),

@@ -78,9 +78,9 @@ def test_the_time_series_for_paraview_names_a_file_for_each_map(tmp_path, capsys
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--vtp"], "--out belongs to"),
-        (["--sto", "a.sto", "--out", "b"], "--out belongs to"),
-        (["--deck", "ccx", "--out", "a.inp"], "--frame go together"),
+        (["--vtp"], "--vtp: needs --out"),
+        (["--sto", "a.sto", "--out", "b"], "--out: needs --vtp or --deck"),
+        (["--deck", "ccx", "--out", "a.inp"], "--deck: needs --frame"),
         (["--deck", "ccx", "--frame", "0", "--out", "a.feb"], "no .inp file"),
     ],
 )

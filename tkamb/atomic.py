@@ -23,6 +23,7 @@ from tkamb.files import read_json
 MARKER = ".tkamb"
 """Says that a folder is tkamb's (`tkamb.claim`), and what its temporary files are called."""
 JOURNAL = ".tkamb-commit"
+CHOOSE_OUT = "choose another --out, or remove it"
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_.][A-Za-z0-9_.-]*")
 
 
@@ -69,6 +70,24 @@ def write_text(path: Path, text: str) -> None:
     """
     with replaced_file(path) as temporary:
         write_synced(temporary, text)
+
+
+def write_new_text(path: Path, text: str) -> None:
+    """Write `text` as UTF-8 into a file that is not there yet, whole or not at all.
+
+    Raises:
+        InputError: something of that name is there, or the folder cannot be written.
+    """
+    temporary = temporary_path(path.parent)
+    try:
+        write_synced(temporary, text)
+        os.link(temporary, path)  # unlike a rename, it fails where the name is taken
+    except FileExistsError:
+        raise InputError("is there already", path, CHOOSE_OUT) from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be written ({_reason(error)})", path) from None
+    finally:
+        _remove(temporary)
 
 
 def write_synced(path: Path, text: str) -> None:

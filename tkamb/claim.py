@@ -204,6 +204,43 @@ def is_ours(path: Path) -> bool:
     return rows.startswith('{"key": ') and '"row": ' in rows.partition("\n")[0]
 
 
+OWN_MARK = b"tkamb"
+"""Stands at the beginning of every page, map and deck that tkamb writes."""
+MARK_WITHIN = 4096
+"""Bytes of a file in which the mark is looked for."""
+PICTURES = {".png": b"\x89PNG", ".gif": b"GIF8"}
+"""Formats without a mark: a picture takes the place of a picture."""
+
+
+def check_output_file(path: str | Path | None, force: bool = False) -> None:
+    """Raise unless a file may be written here: its place is free, or holds one of tkamb's own.
+
+    Args:
+        path: of the file; None: none is written.
+        force: replace whatever file is there.
+
+    Raises:
+        InputError: there is a file that tkamb did not write, or something that is no file.
+    """
+    if path is None or not os.path.lexists(path):
+        return
+    path = Path(path)
+    if not path.is_file():
+        raise InputError("is there already and no file", path, "give another name")
+    if force or path.suffix.lower() == ".mp4":
+        return
+    try:
+        with open(path, "rb") as file:
+            head = file.read(MARK_WITHIN)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", path, "give another name") from None
+    magic = PICTURES.get(path.suffix.lower())
+    if not head or (OWN_MARK in head if magic is None else head.startswith(magic)):
+        return
+    what = "is there already, and tkamb did not write it"
+    raise InputError(what, path, "give another name, or --force to replace it")
+
+
 def _object(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file; an empty one if there is none."""
     try:

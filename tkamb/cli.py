@@ -16,8 +16,10 @@ from tkamb.compare.command import add_compare
 from tkamb.datasets.command import add_data
 from tkamb.export_command import add_export
 from tkamb.guard import guarded, log_to_stderr
+from tkamb.help_examples import add_examples
 from tkamb.importing.command import add_import
 from tkamb.mesh_command import add_contact, add_mesh, add_no_cache, add_press, without_cache
+from tkamb.option_rules import check_options
 from tkamb.run.settings import add_settings
 from tkamb.scene_options import add_preset, add_scene_options, overrides_of
 from tkamb.starter import add_new
@@ -44,7 +46,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = argparse.Namespace()
 
     def command() -> int:
-        _parser().parse_args(arguments, options)
+        parser = _parser()
+        parser.parse_args(arguments, options)
+        check_options(parser, sys.argv[1:] if arguments is None else arguments, options)
         threads()  # is refused here where it is no number of threads
         log_to_stderr()
         return int(options.command(options))
@@ -94,6 +98,7 @@ def _parser() -> argparse.ArgumentParser:
     add_uncertainty(commands)
     add_cohort(commands)
     add_settings(commands)
+    add_examples(parser)
     return parser
 
 
@@ -113,17 +118,16 @@ def _add_run(commands: Any) -> None:
 
 def _add_folder_commands(commands: Any) -> None:
     verify = commands.add_parser("verify", help="is a folder of results what was written?")
-    verify.add_argument("folder", type=Path, metavar="DIR")
+    verify.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
     verify.set_defaults(command=_verify)
     report = commands.add_parser("report", help="write report.html of a folder of results anew")
-    report.add_argument("folder", type=Path, metavar="DIR")
+    report.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
     report.set_defaults(command=_report)
     methods = commands.add_parser(
         "methods",
         help="the Methods paragraph of a paper, from a folder of results",
-        epilog="examples: tkamb methods out/bend | tkamb methods out/bend > methods.txt",
     )
-    methods.add_argument("folder", type=Path, metavar="DIR")
+    methods.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
     methods.set_defaults(command=_methods)
 
 

@@ -10,7 +10,7 @@ from tkamb.errors import InputError
 def add_export(commands: Any) -> None:
     """Add the command `export` to the parser's commands."""
     export = commands.add_parser("export", help="results for other programs")
-    export.add_argument("folder", type=Path, metavar="DIR")
+    export.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
     kind = export.add_mutually_exclusive_group(required=True)
     kind.add_argument("--sto", type=Path, metavar="F.sto", help="all columns, for OpenSim")
     kind.add_argument(
@@ -31,13 +31,11 @@ def add_export(commands: Any) -> None:
 
 
 def _export(options: argparse.Namespace) -> int:
-    if bool(options.vtp or options.deck) != bool(options.out):
-        mend = "--vtp --out DIR2, --deck ccx --frame K --out F.inp, or --sto F.sto alone"
-        raise InputError("--out belongs to --vtp and --deck, which need it", "export", mend)
-    if bool(options.deck) != (options.frame is not None):
-        raise InputError("--deck and --frame go together", "export", "--deck ccx --frame K")
-    if options.resolution is not None and not options.deck:
-        raise InputError("--resolution belongs to --deck", "export", "leave it out")
+    if (options.vtp or options.deck) and not options.out:
+        hint = "--vtp --out DIR2, or --deck ccx --frame K --out F.inp"
+        raise InputError("needs --out", "--vtp" if options.vtp else "--deck", hint)
+    if options.deck and options.frame is None:
+        raise InputError("needs --frame", "--deck", "--deck ccx --frame K")
     if options.deck:
         return _export_deck(options)
     return _export_maps(options) if options.vtp else _export_storage(options)
@@ -45,6 +43,7 @@ def _export(options: argparse.Namespace) -> int:
 
 def _export_deck(options: argparse.Namespace) -> int:
     from tkamb.atomic import write_text
+    from tkamb.claim import check_output_file
     from tkamb.contact.registry import COARSEST_MM
     from tkamb.decks.frame import SUFFIX, frame_press
 
@@ -53,6 +52,7 @@ def _export_deck(options: argparse.Namespace) -> int:
     if options.resolution is not None and not 0 < options.resolution <= COARSEST_MM:
         mend = f"give more than 0, at most {COARSEST_MM:g} mm"
         raise InputError(f"resolution {options.resolution} mm", "--resolution", mend)
+    check_output_file(options.out, options.force)
     found = frame_press(options.folder, options.frame, options.resolution)
     write_text(options.out, found.deck(options.deck))
     print("\n".join([f"{options.out}: {found.comments()[0]}", *found.comments()[2:]]))

@@ -7,6 +7,7 @@ each is refused before a byte of it is read.
 import hashlib
 import json
 import os
+import re
 import stat
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ TABLE_LIMIT = 512 * MEGABYTE
 """Bytes of a recording: an hour of fifty channels at 200 Hz has 500 MB."""
 MESH_LIMIT = 1000 * MEGABYTE
 """Bytes of a mesh: twenty million triangles in a binary STL."""
+
+SAVE_AS_UTF8 = "save it as UTF-8 text"
 
 DEEPEST = 100
 """Elements of an XML file inside one another; a URDF has 5, an OpenSim model 20."""
@@ -140,8 +143,25 @@ def parse_xml(content: bytes, path: str | Path, *, what: str = "file") -> Elemen
     try:
         parser.Parse(content, True)
         return builder.close()
-    except (expat.ExpatError, ValueError, LookupError) as error:  # the last: an unknown encoding
-        raise InputError(f"is not a readable {what} ({error})", path) from None
+    except expat.ExpatError as error:
+        place = f"{expat.ErrorString(error.code)}: line {error.lineno}, column {error.offset + 1}"
+        what, hint = f"is not a readable {what} ({place})", _xml_hint(content, parser)
+        raise InputError(what, path, hint) from None
+    except (ValueError, LookupError) as error:  # the last: an unknown encoding
+        raise InputError(f"is not a readable {what} ({error})", path, SAVE_AS_UTF8) from None
+
+
+def _xml_hint(content: bytes, parser: expat.XMLParserType) -> str:
+    """Return how to mend what stopped the parser, from the bytes about the place."""
+    at = max(parser.ErrorByteIndex, 0)
+    near = content[max(at - 1, 0) : at + 12]
+    if re.search(rb"&(?!\w{1,8};|#)", near):
+        return "write &amp; for a & in a text"
+    if any(byte > 127 for byte in near):
+        return SAVE_AS_UTF8
+    if not content.strip() or at >= len(content.rstrip()) - 1:
+        return "the file ends too early: get it anew"
+    return "mend that line, or open and save the file in the program that wrote it"
 
 
 class _ShallowBuilder(TreeBuilder):
@@ -162,6 +182,30 @@ class _ShallowBuilder(TreeBuilder):
         """Close an element."""
         self._depth -= 1
         return super().end(tag)
+
+
+_NAMED = re.compile(rb'<\w+[^<>]*?\sfile="([^"<>]+)"')
+
+
+def named_files(path: Path) -> list[Path]:
+    """Return the files that elements of an XML file name with file="…", and those that these name.
+
+    Args:
+        path: an OpenSim model, whose sets may stand in files of their own.
+
+    Raises:
+        InputError: as `read_bytes`.
+    """
+    found: list[Path] = []
+    waiting = [path]
+    while waiting:
+        here = waiting.pop()
+        for name in _NAMED.findall(read_bytes(here)):
+            other = here.parent / os.fsdecode(name).replace("\\", "/")
+            if other.is_file() and other not in (path, *found):
+                found.append(other)
+                waiting.append(other)
+    return found
 
 
 def check_file(path: str | Path, limit: float, *, what: str = "file") -> None:

@@ -7,16 +7,26 @@ from typing import Any
 
 from tkamb.defaults import CONTACT_MODEL
 from tkamb.errors import InputError
-from tkamb.units import LENGTH
+from tkamb.scene_options import add_force
+
+UNIT_OPTIONS = ("--units", "--mesh-unit")
+AXES_OPTIONS = ("--axes", "--mesh-axes")
+"""Either spelling is read by every command that takes meshes."""
 
 
 def add_press(commands: Any) -> None:
     """Add `press` to the command line."""
     press = commands.add_parser("press", help="contact alone: press two meshes together")
-    press.add_argument("femoral", type=Path)
-    press.add_argument("insert", type=Path)
-    press.add_argument("--load", type=float, required=True, metavar="N")
-    press.add_argument("--units", choices=tuple(LENGTH), default="mm", help="of both meshes")
+    press.add_argument("femoral", type=Path, help="mesh of the femoral component")
+    press.add_argument("insert", type=Path, help="mesh of the insert")
+    press.add_argument(
+        "--load",
+        type=float,
+        required=True,
+        metavar="N",
+        help="along the normal of the insert's bottom",
+    )
+    _add_units(press, "of both meshes")
     pose = press.add_mutually_exclusive_group()
     pose.add_argument(
         "--pose",
@@ -27,11 +37,25 @@ def add_press(commands: Any) -> None:
     )
     pose.add_argument("--pose-file", type=Path, metavar="F", help="the same six numbers in a file")
     press.add_argument(
-        "--contact", default=CONTACT_MODEL, metavar="NAME", help="default: %(default)s"
+        "--contact",
+        default=CONTACT_MODEL,
+        metavar="NAME",
+        help="contact model (`tkamb contact list`); default: %(default)s",
     )
     add_no_cache(press)
-    press.add_argument("--resolution", type=float, default=1.0, metavar="MM")
-    press.add_argument("--bearing", choices=("fixed", "mobile"), default="fixed")
+    press.add_argument(
+        "--resolution",
+        type=float,
+        default=1.0,
+        metavar="MM",
+        help="spacing of the map points, the lattice's cell size; default: 1",
+    )
+    press.add_argument(
+        "--bearing",
+        choices=("fixed", "mobile"),
+        default="fixed",
+        help="how the insert is held; default: fixed",
+    )
     press.add_argument(
         "--material",
         default="polyethylene",
@@ -39,22 +63,30 @@ def add_press(commands: Any) -> None:
         help="built-in, or a file of the keys of a scene's [material]; default: %(default)s",
     )
     _add_side(press)
-    press.add_argument("--adjust", action=argparse.BooleanOptionalAction, default=False)
+    press.add_argument(
+        "--adjust",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="first move the femoral mesh until both condyles touch; default: no",
+    )
     press.add_argument(
         "--restore-when",
         choices=("both", "either"),
         help="with --adjust: what must exceed the adjustment for it to be undone; default: both",
     )
     press.add_argument("--out", type=Path, metavar="F.vtp", help="the pressure map, for ParaView")
-    press.add_argument("--json", action="store_true")
+    add_force(press)
+    press.add_argument("--json", action="store_true", help="print the result as JSON")
     press.set_defaults(command=_press)
 
 
 def _press(options: argparse.Namespace) -> int:
+    from tkamb.claim import check_output_file
     from tkamb.press import press_meshes, read_pose
 
     if options.out and options.out.suffix.lower() != ".vtp":
         raise InputError("is no .vtp file", options.out, "name it like map.vtp")
+    check_output_file(options.out, options.force)
     pose = read_pose(options.pose_file) if options.pose_file else options.pose
     report = press_meshes(
         options.femoral,
@@ -83,21 +115,22 @@ def add_mesh(commands: Any) -> None:
     mesh = commands.add_parser("mesh", help="look at a mesh before it is used")
     verbs = mesh.add_subparsers(required=True, metavar="VERB")
     check = verbs.add_parser("check", help="health, and unit and axes as questions")
-    check.add_argument("files", type=Path, nargs="+", metavar="FILE")
-    check.add_argument("--json", action="store_true")
+    check.add_argument("files", type=Path, nargs="+", metavar="FILE", help="meshes")
+    check.add_argument("--json", action="store_true", help="print the findings as JSON")
     check.set_defaults(command=_mesh_check)
     part = verbs.add_parser("part", help="one of several bodies into a file of its own")
-    part.add_argument("file", type=Path, metavar="FILE")
+    part.add_argument("file", type=Path, metavar="FILE", help="mesh of several bodies")
     part.add_argument("number", type=int, metavar="N", help="as `tkamb mesh check` numbers them")
     part.add_argument("--out", type=Path, required=True, metavar="F", help=".stl, .ply or .obj")
     part.set_defaults(command=_mesh_part)
     lattice = verbs.add_parser("lattice", help="the lattice of an insert, and how good it is")
-    lattice.add_argument("insert", type=Path, metavar="INSERT")
+    lattice.add_argument("insert", type=Path, metavar="INSERT", help="mesh of the insert")
     lattice.add_argument("--resolution", type=float, default=1.0, metavar="MM", help="cell size")
-    lattice.add_argument("--units", choices=tuple(LENGTH), default="mm", help="of the mesh")
+    _add_units(lattice, "of the mesh")
     _add_side(lattice)
     lattice.add_argument("--out", type=Path, metavar="F.vtu", help="for ParaView or meshio")
-    lattice.add_argument("--json", action="store_true")
+    add_force(lattice)
+    lattice.add_argument("--json", action="store_true", help="print the report as JSON")
     lattice.set_defaults(command=_mesh_lattice)
 
 
@@ -121,8 +154,10 @@ def _mesh_part(options: argparse.Namespace) -> int:
 
 
 def _mesh_lattice(options: argparse.Namespace) -> int:
+    from tkamb.claim import check_output_file
     from tkamb.mesh_files import lattice_of_file
 
+    check_output_file(options.out, options.force)
     report = lattice_of_file(
         options.insert,
         options.resolution,
@@ -156,15 +191,29 @@ def _contact_list(options: argparse.Namespace) -> int:
     return 0
 
 
+def _add_units(command: argparse.ArgumentParser, what: str) -> None:
+    """Add --units, which `tkamb import` calls --mesh-unit."""
+    command.add_argument(
+        *UNIT_OPTIONS,
+        dest="units",
+        choices=("mm", "cm", "m"),
+        default="mm",
+        help=f"{what}; default: mm",
+    )
+
+
 def _add_side(command: argparse.ArgumentParser) -> None:
     """Add --axes and --side: how a mesh lies in the knee."""
     command.add_argument(
-        "--axes",
+        *AXES_OPTIONS,
+        dest="axes",
         default="+x,+y,+z",
         metavar="ANT,SUP,RIGHT",
         help="mesh axes that point anterior, superior, right; write --axes=-x,+y,-z",
     )
-    command.add_argument("--side", choices=("right", "left"), default="right")
+    command.add_argument(
+        "--side", choices=("right", "left"), default="right", help="of the knee; default: right"
+    )
 
 
 def add_no_cache(command: argparse.ArgumentParser) -> None:

@@ -39,6 +39,13 @@ def add_preset(command: Any) -> None:
     )
 
 
+def add_force(command: argparse.ArgumentParser) -> None:
+    """Add --force to a command that writes one file."""
+    command.add_argument(
+        "--force", action="store_true", help="--out may replace a file that tkamb did not write"
+    )
+
+
 def overrides_of(options: argparse.Namespace) -> dict[str, Any]:
     """Return dotted key -> value of what `add_scene_options` was given."""
     overrides = dict(options.set)

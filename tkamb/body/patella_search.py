@@ -202,7 +202,12 @@ class _Search(PatellaFrame):
             return last.moment
 
         ends = (here.coordinates[2], there.coordinates[2])
-        brentq(moment, *ends, xtol=TURN_TOLERANCE, rtol=1e-12)
+        try:
+            brentq(moment, *ends, xtol=TURN_TOLERANCE, rtol=1e-12)
+        except ValueError:
+            # the patella that is followed from one end lies elsewhere at the other, so that the
+            # moment there has another sign than the one that was found before
+            raise _Lost(PatellaStatus.MOMENT) from None
         return last
 
     def _chord(

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tkamb.errors import InputError
-from tkamb.scene_options import add_set
+from tkamb.scene_options import add_force, add_set
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,17 +29,20 @@ def add_check(commands: Any) -> None:
         "--out", type=Path, metavar="F", help="the leg at three frames: .png, or .html with it all"
     )
     add_set(check)
-    check.add_argument("--json", action="store_true")
+    add_force(check)
+    check.add_argument("--json", action="store_true", help="print the findings as JSON")
     check.set_defaults(command=_check)
 
 
 def _check(options: argparse.Namespace) -> int:
     from tkamb.check.scene_check import check_scene
+    from tkamb.claim import check_output_file
     from tkamb.run.stages import Stages
 
     if options.out and options.out.suffix.lower() not in PICTURES:
         mend = f"name it like check{PICTURES[0]}"
         raise InputError(f"is none of {', '.join(PICTURES)}", options.out, mend)
+    check_output_file(options.out, options.force)
     with Stages(4 if options.out else 3) as stages:
         found = check_scene(options.scene, dict(options.set), stages.begin)
         if options.out:

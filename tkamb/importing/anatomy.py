@@ -97,22 +97,19 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
     Raises:
         InputError: no such joint, or no hip, ankle or patella where the knee wants one.
     """
-    joint = _knee(model, side, knee)
-    groups = _rigid_groups(model)
-    femur = _ordered(model, groups[joint.inboard], "fem")
-    tibia = _ordered(model, groups[joint.outboard], "tib")
-    hip = _one(model, [j for j in _moving(model) if j.outboard in femur], "above the femur", femur)
-    below = [j for j in _moving(model) if j.inboard in tibia]
-    ankles = [j for j in below if "ankle" in j.name.lower()]
-    ankle = _one(
-        model, ankles or [j for j in below if not _is_patella(j)], "below the tibia", tibia
-    )
+    try:
+        joint, hip, ankle, femur, tibia = _joints(model, side, knee)
+    except InputError as error:
+        # what is missing may be what could not be read
+        raise _unread_joint(model) or error from None
     patellas = [
         body
         for body in model.bodies
         if "pat" in body.lower()
         and {*femur, *tibia} & {end for j in model.joints for end in _ends(j) if body in _ends(j)}
     ]
+    foot = tuple(_carried(model, ankle.outboard))
+    _refuse_unread(model, (hip, joint, ankle), {*femur, *tibia, *foot, *patellas[:1]})
     flexion = _flexion(model, joint)
     q = {flexion.name: 0.0} if flexion else {}
     kinematics = Kinematics(model)
@@ -126,13 +123,72 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
         hip,
         femur,
         tibia,
-        tuple(_carried(model, ankle.outboard)),
+        foot,
         patellas[0] if patellas else None,
         hip.inboard,
         {name: poses[k] for name, k in kinematics.bodies.items()},
     )
     _check_lengths(leg)
     return leg
+
+
+def _joints(
+    model: OpenSimModel, side: str, name: str | None
+) -> tuple[Joint, Joint, Joint, tuple[str, ...], tuple[str, ...]]:
+    """Return knee, hip and ankle, and the bodies of femur and tibia."""
+    knee = _knee(model, side, name)
+    groups = _rigid_groups(model)
+    femur = _ordered(model, groups[knee.inboard], "fem")
+    tibia = _ordered(model, groups[knee.outboard], "tib")
+    hip = _one(model, [j for j in _moving(model) if j.outboard in femur], "above the femur", femur)
+    below = [j for j in _moving(model) if j.inboard in tibia]
+    ankles = [j for j in below if "ankle" in j.name.lower()]
+    ankle = _one(
+        model, ankles or [j for j in below if not _is_patella(j)], "below the tibia", tibia
+    )
+    return knee, hip, ankle, femur, tibia
+
+
+def _unread_joint(model: OpenSimModel, bodies: Iterable[str] = ()) -> InputError | None:
+    """Return the refusal of the first joint that could not be read at all, if there is one.
+
+    Args:
+        model: the model.
+        bodies: of the joint; none: of any joint.
+    """
+    there = {joint.name for joint in model.joints}
+    for one in model.unread:
+        of_these = not bodies or one.concerns & {*bodies}
+        if one.kind.endswith("Joint") and one.name not in there and of_these:
+            return InputError(one.reason)
+    return None
+
+
+def _refuse_unread(model: OpenSimModel, joints: Iterable[Joint], bodies: set[str]) -> None:
+    """Raise if a joint or constraint that was not read holds the bodies of a leg.
+
+    Raises:
+        InputError: which, and why it was not read.
+    """
+    for joint in model.joints:
+        if joint.unread and (joint in joints or {*_ends(joint)} <= bodies):
+            raise _unread_joint(model, [joint.outboard]) or InputError(joint.unread)
+    within = {j.name for j in model.joints if {*_ends(j)} & bodies}
+    coordinates = {c.name for c in model.coordinates.values() if c.joint in within}
+    in_the_tree = {joint.name for joint in model.joints}
+    for one in model.unread:
+        if one.constrains and one.name not in in_the_tree and one.concerns & (bodies | coordinates):
+            raise InputError(one.reason)
+
+
+def way_to_pelvis(leg: Leg) -> list[Joint]:
+    """Return the joints between ground and the body above the hip."""
+    carrier = {joint.outboard: joint for joint in leg.model.joints}
+    way, body = [], leg.pelvis
+    while body in carrier:
+        way.append(carrier[body])
+        body = carrier[body].inboard
+    return way
 
 
 def _check_lengths(leg: Leg) -> None:
@@ -178,7 +234,11 @@ def _flexion(model: OpenSimModel, knee: Joint) -> Coordinate | None:
 
 
 def _moving(model: OpenSimModel) -> list[Joint]:
-    return [j for j in model.joints if any(a.coordinate for a in (*j.rotations, *j.translations))]
+    return [
+        joint
+        for joint in model.joints
+        if joint.unread or any(a.coordinate for a in (*joint.rotations, *joint.translations))
+    ]
 
 
 def _rigid_groups(model: OpenSimModel) -> dict[str, set[str]]:

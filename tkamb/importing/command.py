@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def add_import(commands: Any) -> None:
     """Add the command's parser."""
     p = commands.add_parser("import", help="a patient from an OpenSim model and a recording")
-    p.add_argument("model", type=Path, metavar="MODEL.osim")
+    p.add_argument("model", type=Path, metavar="MODEL.osim", help="an OpenSim model")
     source = p.add_mutually_exclusive_group(required=True)
     source.add_argument("--c3d", type=Path, metavar="F", help="markers and force plates")
     source.add_argument("--trc", type=Path, metavar="F", help="markers alone")
@@ -28,28 +28,55 @@ def add_import(commands: Any) -> None:
         help="how the foot's columns in it begin: ground_force_2; several are summed",
     )
     p.add_argument("--static", type=Path, metavar="F", help="standing trial: where markers sit")
-    p.add_argument("--side", choices=("right", "left"), required=True)
+    p.add_argument("--side", choices=("right", "left"), required=True, help="of the knee")
     p.add_argument("--mass-kg", type=float, required=True, metavar="KG", help="of the subject")
     for part in ("femoral", "insert", "patella"):
-        p.add_argument(f"--{part}", type=Path, metavar="F", help="mesh")
+        p.add_argument(f"--{part}", type=Path, metavar="F", help=f"mesh, {part} part")
         p.add_argument(f"--{part}-frame", metavar="NAME", help="body or frame of its mesh")
     p.add_argument("--femur-bone", type=Path, metavar="F", help="mesh that the muscle may wrap")
-    p.add_argument("--mesh-unit", choices=tuple(LENGTH))
+    p.add_argument(
+        "--mesh-unit",
+        "--units",
+        dest="mesh_unit",
+        choices=tuple(LENGTH),
+        help="of all meshes; it is never guessed",
+    )
     p.add_argument(
         "--mesh-axes",
+        "--axes",
+        dest="mesh_axes",
         metavar="ANT,SUP,RIGHT",
         help="mesh axes that point anterior, superior, right; write --mesh-axes=-x,+y,-z",
     )
     _add_poses(p)
     _add_inferred(p)
-    p.add_argument("--out", type=Path, required=True, metavar="DIR")
+    p.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder of scene and patient.urdf"
+    )
     p.add_argument("--scene", default="scene.toml", metavar="NAME", help="name of the scene file")
-    p.add_argument("--contact", choices=("foundation", "lattice"), default="foundation")
+    p.add_argument(
+        "--contact",
+        choices=("foundation", "lattice"),
+        default="foundation",
+        help="the scene's contact model; default: %(default)s",
+    )
     p.add_argument("--activity", choices=get_args(Activity), help="what the report compares with")
     p.add_argument("--note", action="append", default=[], metavar="TEXT", help="for the report")
     scale = p.add_mutually_exclusive_group()
-    scale.add_argument("--scale-mass", dest="scale", action="store_true", default=None)
-    scale.add_argument("--keep-mass", dest="scale", action="store_false", default=None)
+    scale.add_argument(
+        "--scale-mass",
+        dest="scale",
+        action="store_true",
+        default=None,
+        help="scale the model's masses to the subject's; default: where they differ by over 1 %%",
+    )
+    scale.add_argument(
+        "--keep-mass",
+        dest="scale",
+        action="store_false",
+        default=None,
+        help="take the model's masses as they are",
+    )
     p.set_defaults(command=_import)
 
 
@@ -66,8 +93,19 @@ def _add_inferred(p: argparse.ArgumentParser) -> None:
     p.add_argument("--length-unit", choices=("m", "cm", "mm"), help="of a .c3d that lacks it")
     p.add_argument("--force-unit", metavar="N", help="of a .c3d's force channels, likewise")
     p.add_argument("--moment-unit", metavar="Nmm", help="of its moment channels, likewise")
-    p.add_argument("--method", choices=("segments", "chain"), default="segments")
-    p.add_argument("--cutoff-hz", type=float, default=6.0, metavar="HZ")
+    p.add_argument(
+        "--method",
+        choices=("segments", "chain"),
+        default="segments",
+        help="markers of thigh and shank each by itself, or the whole leg; default: segments",
+    )
+    p.add_argument(
+        "--cutoff-hz",
+        type=float,
+        default=6.0,
+        metavar="HZ",
+        help="of the low-pass filter of markers and forces; default: 6",
+    )
 
 
 def _add_poses(p: argparse.ArgumentParser) -> None:
@@ -147,6 +185,9 @@ def import_request(options: argparse.Namespace) -> "ImportRequest":
         raise InputError("is for recordings of markers", "--length-unit", "leave it out")
     if options.grf_force and not options.grf:
         raise InputError("needs --grf", "--grf-force")
+    if Path(options.scene).name != options.scene or not options.scene.endswith(".toml"):
+        hint = "--out names the folder"
+        raise InputError(f"'{options.scene}' is no name of a .toml file", "--scene", hint)
     return ImportRequest(
         options.model,
         options.side,
@@ -183,10 +224,6 @@ def _meshes(options: argparse.Namespace) -> Any:
 
     given = (options.femoral, options.insert)
     if not any(given):
-        for name in ("patella", "femur_bone"):
-            if getattr(options, name):
-                option = f"--{name.replace('_', '-')}"
-                raise InputError("needs --femoral and --insert", option)
         return None
     if not all(given):
         raise InputError("go together", "--femoral and --insert", "give both or none")
@@ -199,11 +236,7 @@ def _meshes(options: argparse.Namespace) -> Any:
 def _poses(options: argparse.Namespace) -> Any:
     from tkamb.importing.recorded_poses import ROLES, PoseRecording
 
-    of_poses = ("pose_columns", "pose_sequence", "pose_units", "pose_signs_turned")
     if options.poses is None:
-        for name in (*of_poses, "stride", "stance"):
-            if getattr(options, name):
-                raise InputError("needs --poses", f"--{name.replace('_', '-')}")
         return None
     columns = options.pose_columns or ROLES
     if len(columns) != len(ROLES):
@@ -215,8 +248,6 @@ def _poses(options: argparse.Namespace) -> Any:
     angle, _, length = ",".join(options.pose_units or ()).partition(",")
     if angle not in ANGLE or length not in LENGTH:
         raise InputError("are not two units, and are not guessed", "--pose-units", "as in rad,m")
-    if options.stride and options.interval:
-        raise InputError("excludes --interval", "--stride", "give one of them")
     return PoseRecording(
         options.poses,
         tuple(columns),

@@ -51,8 +51,11 @@ class ModelChain:
         self._couplers = [
             (index[c.dependent], index[c.independent], c.function) for c in model.couplers
         ]
-        # what moves: the free ones first, then what follows them
-        follow = [d for d, i, _ in self._couplers if i in self.free]
+        # what moves: the free ones first, then what follows them, over others or not
+        follow: list[int] = []
+        for dependent, independent, _ in self._couplers:
+            if independent in self.free or independent in follow:
+                follow.append(dependent)
         self._moving = [*self.free, *follow]
         self._after = [
             (self._moving.index(d), self._moving.index(i), i, f)
@@ -143,10 +146,11 @@ class ModelChain:
     def _free_part(self, values: Array, state: Array) -> Array:
         """Return rows, and columns of a square matrix, by the free coordinates.
 
-        What follows a free coordinate is added to it, by the chain rule.
+        What follows a free coordinate is added to it, by the chain rule; the last in a chain of
+        followers first.
         """
         square, free = values.shape[1] == values.shape[2], len(self.free)
-        for dependent, independent, coordinate, function in self._after:
+        for dependent, independent, coordinate, function in reversed(self._after):
             slope = function.slope(state[:, coordinate])[:, None]
             values[:, independent] += slope * values[:, dependent]
             if square:

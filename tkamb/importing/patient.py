@@ -1,12 +1,15 @@
 """A patient brought in: model, recording and meshes to a URDF and a scene that runs."""
 
+import os
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from tkamb.atomic import claim_directory, write_text
+from tkamb.atomic import CHOOSE_OUT, claim_directory, write_new_text
 from tkamb.errors import InputError
+from tkamb.files import TABLE_LIMIT, read_bytes
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.surface import Surface
 from tkamb.importing.anatomy import Leg, find_leg
@@ -16,17 +19,26 @@ from tkamb.importing.model_motion import MOTION_FILE
 from tkamb.importing.recorded_poses import read_poses
 from tkamb.importing.request import ImportRequest
 from tkamb.importing.scene_text import GROUND_FILE, SceneText
-from tkamb.importing.soft_tissue import soft_tissue
+from tkamb.importing.soft_tissue import soft_tissue, some_names
 from tkamb.importing.standing import with_static_markers
 from tkamb.importing.trial import Trial, from_coordinates, from_markers, from_poses
 from tkamb.importing.urdf import patient_urdf
 from tkamb.inputs.meshes import axes_rotation, load_surface
 from tkamb.inputs.tables import read_table, with_unit
+from tkamb.opensim.model import OpenSimModel
 from tkamb.opensim.read import read_osim
 from tkamb.scene import load_scene
 from tkamb.scene.case import Case, load_case
 from tkamb.units import DEGREE, MILLIMETRE
 
+LEG_ALONE = 0.6
+"""Share of a model's mass above which thigh, shank and foot are a model of one leg."""
+LEG_SHARE = 0.161
+"""Of the body's mass, thigh 0.100, shank 0.0465, foot 0.0145 (Winter, Biomechanics, 2009)."""
+LEG_SHARES = (0.10, 0.25)
+"""Of the body's mass: from Winter's 0.161 to de Leva's 0.20 (1996), with room for other people."""
+MAX_REASONS = 3
+"""Parts that were not read of which the report gives the reason."""
 SAME_MASS = 0.01
 """A model whose mass is within this share of the subject's is not scaled."""
 
@@ -60,7 +72,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
     Raises:
         InputError: whatever cannot be used, in one line.
     """
-    model = read_osim(request.model)
+    model = read_osim(request.model, partial=True)
     leg = find_leg(model, request.side, request.knee)
     meshes = request.meshes
     insert = placement = None
@@ -76,6 +88,10 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
     )
     scale, weighed = _mass_scale(request, leg)
     tissue = soft_tissue(links)
+    if meshes and meshes.femur_bone and not (tissue.quadriceps and tissue.patellar_ligament):
+        hint = "leave it out, or complete the model"
+        what = "is what the quadriceps wraps, and the model gives none"
+        raise InputError(what, "--femur-bone", hint)
     found = _trial(request, leg, links, insert)
     scene = SceneText(
         _title(request),
@@ -95,7 +111,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         request.activity,
         (*_notes(request, scale, found, bool(tissue.bundles)), *request.notes),
     )
-    report = [*_leg_lines(leg), weighed, *links.said, *_patella_line(links)]
+    report = [*_model_lines(model), *_leg_lines(leg), weighed, *links.said, *_patella_line(links)]
     report += [*found.said, *tissue.said]
     if request.static is not None:
         if found.markers is None:
@@ -141,34 +157,52 @@ def _trial(request: ImportRequest, leg: Leg, links: Links, insert: Surface | Non
 def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[str, ...]:
     """Write URDF and scene, load them as a run would, and return what the markers say.
 
-    Nothing is left behind where that fails.
+    A file that is there already is left as it is: one of the same content may be shared with
+    another scene. Nothing is left behind where anything fails.
 
     Raises:
-        InputError: the folder cannot be written, holds a scene of that name already, or the
-            scene does not load.
+        InputError: the folder cannot be written, holds a file of one of these names with another
+            content, or the scene does not load.
     """
-    urdf, scene = folder / patient.scene.urdf, folder / name
-    if scene.exists():
-        raise InputError("is there already", scene, "choose another --out, or remove it")
-    files = {urdf: patient.urdf, scene: patient.scene.text()}
+    scene = folder / name
+    if os.path.lexists(scene):
+        raise InputError("is there already", scene, CHOOSE_OUT)
+    files = {folder / patient.scene.urdf: patient.urdf, scene: patient.scene.text()}
     if patient.motion is not None:
         files[folder / MOTION_FILE] = patient.motion
     if patient.ground is not None:
         files[folder / GROUND_FILE] = patient.ground
+    new = {path: text for path, text in files.items() if not _same_there(path, text)}
     made = [place for place in (folder, *folder.parents) if not place.exists()]
-    claim_directory(folder)
-    before = {p: p.read_text(encoding="utf-8") if p.is_file() else None for p in files}
+    written: list[Path] = []
     try:
-        for path, text in files.items():
-            write_text(path, text)
-        case = load_case(load_scene(scene))
-    except InputError:
-        for path, old in before.items():
-            path.unlink(missing_ok=True) if old is None else write_text(path, old)
-        for place in made:
-            place.rmdir()
+        claim_directory(folder)
+        for path, text in new.items():
+            write_new_text(path, text)
+            written.append(path)
+        return marker_lines(load_case(load_scene(scene)))
+    except BaseException:  # an interrupt too: nothing may stay
+        for path in written:
+            path.unlink(missing_ok=True)
+        with suppress(OSError):  # not empty, or never made
+            for place in made:
+                place.rmdir()
         raise
-    return marker_lines(case)
+
+
+def _same_there(path: Path, text: str) -> bool:
+    """Say whether a file of that content is there.
+
+    Raises:
+        InputError: one of another content is, or something that is no file.
+    """
+    if not os.path.lexists(path):
+        return False
+    with suppress(InputError):
+        if read_bytes(path, TABLE_LIMIT) == text.encode("utf-8", "backslashreplace"):
+            return True
+    what = "is there already with another content; another scene may need it"
+    raise InputError(what, path, CHOOSE_OUT)
 
 
 def marker_lines(case: Case) -> tuple[str, ...]:
@@ -201,18 +235,70 @@ def marker_lines(case: Case) -> tuple[str, ...]:
 
 
 def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
-    """Return the factor on the model's masses, and a line on it."""
-    ratio = request.mass_kg / leg.model.mass_kg
+    """Return the factor on the model's masses, and a line on it.
+
+    Raises:
+        InputError: masses that cannot be the subject's.
+    """
+    model, subject = leg.model.mass_kg, request.mass_kg
+    own = sum(leg.model.bodies[b].mass_kg for b in (*leg.femur, *leg.tibia, *leg.foot))
+    if own <= 0.0:
+        raise InputError(
+            "gives thigh, shank and foot no mass", request.model, "give its bodies their masses"
+        )
+    if own > LEG_ALONE * model:
+        return _leg_scale(request, own)
+    ratio = subject / model
     scaled = abs(ratio - 1.0) > SAME_MASS if request.scale_mass is None else request.scale_mass
-    said = f"mass: the model's bodies sum to {leg.model.mass_kg:.2f} kg, the subject is "
-    said += f"{request.mass_kg:g} kg: "
+    said = f"mass: the model's bodies sum to {model:.2f} kg, the subject is {subject:g} kg: "
     if not 0.5 < ratio < 2.0:
         raise InputError(
-            f"weighs {leg.model.mass_kg:.1f} kg, the subject {request.mass_kg:g} kg",
+            f"weighs {model:.1f} kg, the subject {subject:g} kg",
             request.model,
             "is --mass-kg in kilograms? else scale the model first",
         )
     return (ratio, said + f"scaled by {ratio:.4f}") if scaled else (1.0, said + "not scaled")
+
+
+def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
+    """Return the factor on the masses of a model that is little more than one leg, and a line.
+
+    Such a model holds the leg's own mass, or, where a scaling tool was told the subject's mass,
+    the whole body's. The leg's own is `LEG_SHARE` of the subject.
+
+    Raises:
+        InputError: neither of the two.
+    """
+    subject = request.mass_kg
+    share, wanted = own / subject, LEG_SHARE * subject
+    low, high = LEG_SHARES
+    whole_body = 0.5 < share < 2.0
+    said = (
+        f"mass: the model is one leg of {own:.2f} kg, {share:.0%} of the subject's {subject:g} kg"
+    )
+    if low <= share <= high and not request.scale_mass:
+        return 1.0, said + ": not scaled"
+    if not (low <= share <= high or whole_body) or (whole_body and request.scale_mass is False):
+        raise InputError(
+            f"is one leg of {own:.1f} kg, the subject weighs {subject:g} kg: a leg has "
+            f"{low:.0%} to {high:.0%} of the body's mass",
+            request.model,
+            "is --mass-kg in kilograms? else give the model's bodies a leg's masses",
+        )
+    why = ", the whole body's" if whole_body else ""
+    return wanted / own, (
+        f"{said}{why}: scaled to {wanted:.2f} kg, the {LEG_SHARE:.1%} of a leg (Winter 2009)"
+    )
+
+
+def _model_lines(model: OpenSimModel) -> list[str]:
+    """Return how the model was read, and what of it was not, because this knee needs none of it."""
+    lines = [f"model: {notice}" for notice in model.notices]
+    unread = [f"{one.kind} '{one.name}'" for one in model.unread]
+    if unread:
+        lines.append(f"not read, and not needed for this knee: {some_names(unread)}")
+        lines += [f"  {one.reason}" for one in model.unread[:MAX_REASONS]]
+    return lines
 
 
 def _leg_lines(leg: Leg) -> list[str]:

@@ -85,6 +85,7 @@ def _quadriceps(links: Links, said: list[str]) -> tuple[End, End] | None:
             )
             return _end(femur[-1]), _end(patella[0])
     said.append("no vastus intermedius from femur to patella: no quadriceps")
+    said += [one.reason for one in leg.model.unread if "vasint" in one.name.lower()]
     return None
 
 
@@ -152,7 +153,7 @@ def _bundles(links: Links, said: list[str]) -> tuple[Bundle, ...]:
             "(wraps on bone are left out)"
         )
     for reason, names in out.items():
-        said.append(f"ligaments left out, {reason}: {_some(names)}")
+        said.append(f"ligaments left out, {reason}: {some_names(names)}")
     return tuple(taken)
 
 
@@ -180,9 +181,10 @@ def _name_muscles(links: Links, said: list[str]) -> None:
     if across:
         said.append(
             f"{len(across)} muscles run from thigh or pelvis to the shank; none but the "
-            f"quadriceps line acts: {_some(across)}"
+            f"quadriceps line acts: {some_names(across)}"
         )
 
 
-def _some(names: list[str], most: int = 8) -> str:
+def some_names(names: list[str], most: int = 8) -> str:
+    """Return the first names, and how many more there are."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -7,7 +7,7 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.importing.anatomy import OTHER, Leg
+from tkamb.importing.anatomy import OTHER, Leg, way_to_pelvis
 from tkamb.importing.ground import common_interval, find_ground
 from tkamb.importing.links import Links
 from tkamb.importing.markers import (
@@ -98,6 +98,9 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
     Raises:
         InputError: no flexion of the knee in it, or a ground reaction of no foot.
     """
+    for joint in way_to_pelvis(leg):
+        if joint.unread:
+            raise InputError(joint.unread)
     motion = model_motion(links, recorded)
     said = [f"motion: the model's coordinates in {recorded.path.name}, into {MOTION_FILE}"]
     if motion.missing:
@@ -155,14 +158,6 @@ def _thinned(
     The frames are every k-th of the recording, at its own times.
     """
     start, end = interval or (float(time[0]), float(time[-1]))
-    frame = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    if start < time[0] - frame or end > time[-1] + frame:
-        raise InputError(
-            f"{start:g} to {end:g} s is not within the recording, "
-            f"{time[0]:.4f} to {time[-1]:.4f} s",
-            "--interval",
-            "give it on the recording's own clock",
-        )
     inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
     if len(inside) < 2:
         raise InputError(

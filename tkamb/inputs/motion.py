@@ -132,7 +132,7 @@ def load_motion(
         knee = _read_coordinates(recorded, source, KNEE_COORDINATES, unrecorded)
         if side == "left":
             knee[:, KNEE_COORDINATES.index("ml")] *= -1.0
-    _check_knee(knee, recorded.path)
+    _check_knee(knee, recorded.path, _bending_role(recorded, source))
     named = [c for c in PATELLA_COORDINATES if c in source.columns or c in recorded.columns]
     patella = _read_coordinates(recorded, source, PATELLA_COORDINATES) if named else None
     if patella is not None:
@@ -227,12 +227,33 @@ def _turn_signs(recorded: Table, source: MotionRecording) -> Table:
     return replace(recorded, columns=recorded.columns | turned)
 
 
-def _check_knee(knee: Array, path: Path) -> None:
-    """Raise where knee coordinates (n, 6) are those of no knee."""
+def _bending_role(recorded: Table, source: MotionRecording) -> str:
+    """Return the role whose sign is that of flexion: of a pose, the rotation of widest range."""
+    if source.interpretation != "pose":
+        return "flexion"
+
+    def range_of(role: str) -> float:
+        return float(np.ptp(recorded.column(source.columns.get(role) or role)))
+
+    return max((f"rotation_{k}" for k in (1, 2, 3)), key=range_of)
+
+
+def _check_knee(knee: Array, path: Path, bending: str | None = None) -> None:
+    """Raise where knee coordinates (n, 6) are those of no knee.
+
+    Args:
+        knee: the coordinates.
+        path: of the file, for messages.
+        bending: role of the column whose sign is that of flexion; None without one.
+    """
     for i, name in enumerate(KNEE_COORDINATES):
         if name in LIMITS_DEG:
             question = "check [motion] columns, sequence, angle_unit and the meshes' axes"
             values, limits, unit = knee[:, i] / DEGREE, LIMITS_DEG[name], "deg"
+            low, high = limits
+            turned = name == "flexion" and bending is not None
+            if turned and values.min() < low <= -values.max() and -values.min() <= high:
+                question = f'is bending negative in it? then [motion] signs_turned = ["{bending}"]'
         else:
             question = "check [motion] columns, length_unit and where the meshes have their origin"
             values, limits, unit = knee[:, i] / MILLIMETRE, FARTHEST_MM, "mm"

@@ -132,7 +132,10 @@ def check_extensors(leg: Leg, muscles: tuple[str, ...]) -> None:
     model = leg.model
     joint = next((j for j in model.joints if leg.patella in (j.parent, j.child)), None)
     own = {c.name for c in model.coordinates.values() if joint and c.joint == joint.name}
-    if own & {c.dependent for c in model.couplers if c.independent == leg.flexion}:
+    following = {leg.flexion}
+    for coupler in model.couplers:  # each after those that it follows
+        following |= {coupler.dependent} if coupler.independent in following else set()
+    if own & following:
         return
     ending = [n for n in muscles if model.muscles[n].path.points[-1].body == leg.patella]
     if ending:

@@ -7,7 +7,7 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.importing.anatomy import find_leg
+from tkamb.importing.anatomy import Leg, find_leg
 from tkamb.importing.links import Links, find_links
 from tkamb.importing.model_fit import fit_model
 from tkamb.inputs.filtering import Cutoff
@@ -15,7 +15,7 @@ from tkamb.inputs.ground_reaction import load_ground_reaction
 from tkamb.inputs.recordings import ForceRecording, Side
 from tkamb.inputs.tables import read_table
 from tkamb.muscles.knee_trial import KneeTrial, knee_trial
-from tkamb.muscles.leg import foot_loads, leg_muscles, muscle_groups
+from tkamb.muscles.leg import foot_loads, leg_bones, leg_muscles, muscle_groups
 from tkamb.muscles.sharing import Sharing
 from tkamb.opensim.kinematics import Kinematics
 from tkamb.opensim.motion import CoordinateMotion, coordinate_motion, read_coordinates
@@ -62,8 +62,8 @@ def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial
     Raises:
         InputError: whatever cannot be used.
     """
-    model = read_osim(source.model)
-    leg = find_leg(model, source.side)
+    leg = _read_leg(source.model, source.side)
+    model = leg.model
     links = find_links(leg, source.insert_placement, source.mesh_axes, {}, False)
     motion = _motion(source, Kinematics(model), time)
     loads = {}
@@ -84,8 +84,22 @@ def group_names(model: Path, side: Side) -> tuple[str, ...]:
     Raises:
         InputError: whatever cannot be used.
     """
-    leg = find_leg(read_osim(model), side)
+    leg = _read_leg(model, side)
     return tuple(muscle_groups(leg, [leg.model.muscles[name] for name in leg_muscles(leg)]))
+
+
+def _read_leg(path: Path, side: Side) -> Leg:
+    """Return a leg of a model whose joints and constraints, and this leg's muscles, were read.
+
+    Raises:
+        InputError: one of them was not.
+    """
+    leg = find_leg(read_osim(path, partial=True), side)
+    bodies = {body for group in leg_bones(leg).values() for body in group}
+    for one in leg.model.unread:
+        if one.constrains or (one.concerns & bodies and one.kind != "Marker"):
+            raise InputError(one.reason)
+    return leg
 
 
 def _motion(source: LegRecording, kinematics: Kinematics, time: Array) -> CoordinateMotion:

@@ -2,7 +2,8 @@
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -26,10 +27,28 @@ class Document:
     """An OpenSim document: where it lies, and what its <defaults> say for each class.
 
     OpenSim leaves out what equals the defaults, so that a missing element is looked up there.
+
+    Args:
+        path: the file.
+        defaults: class -> the element that holds its default values.
+        partial: whether what cannot be read is collected in `unread` instead of being refused.
+        unread: elements that could not be read, and why.
     """
 
     path: Path
     defaults: dict[str, Element]
+    partial: bool = False
+    unread: list[tuple[Element, str]] = field(default_factory=list)
+
+    @contextmanager
+    def reading(self, element: Element) -> Iterator[None]:
+        """Read one element; where that fails in a partial reading, it is left out and recorded."""
+        try:
+            yield
+        except InputError as error:
+            if not self.partial:
+                raise
+            self.unread.append((element, str(error)))
 
     def where(self, element: Element) -> str:
         """Return the file and the element for a message."""
@@ -55,6 +74,35 @@ class Document:
         if text or default is not None:
             return text or str(default)
         raise InputError(f"has no <{tags[0]}>", self.where(element))
+
+    def socket(self, element: Element, name: str, *old_tags: str, default: str = "") -> str:
+        """Return what a socket is connected to, as any version since 2.3 writes it.
+
+        Version 4 has <socket_NAME>, documents 30508 to 30515 <connector_NAME_connectee_name> or
+        <socket_NAME_connectee_name>, those before <connectors> with a <connectee_name> for each,
+        and version 3 a tag of its own.
+
+        Args:
+            element: whose socket it is.
+            name: of the socket, such as "parent_frame".
+            old_tags: what version 3 calls it.
+            default: what is returned where it is connected to nothing; "" refuses that.
+
+        Raises:
+            InputError: there is none and no default.
+        """
+        for holder in element.findall("connectors/*"):
+            if holder.get("name") == name:
+                text = (holder.findtext("connectee_name") or "").strip()
+                if text:
+                    return text
+        tags = (
+            f"socket_{name}",
+            f"socket_{name}_connectee_name",
+            f"connector_{name}_connectee_name",
+            *old_tags,
+        )
+        return self.text(element, *tags, default=default or None)
 
     def numbers(
         self, element: Element, *tags: str, count: int | None = None, default: str | None = None

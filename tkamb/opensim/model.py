@@ -88,6 +88,7 @@ class Joint:
         rotations: up to three axes.
         translations: up to three axes.
         backwards: whether the way out from ground leads from child to parent.
+        unread: why its motion could not be read, so that it holds its bodies still; "" if it was.
     """
 
     name: str
@@ -99,6 +100,7 @@ class Joint:
     rotations: tuple[JointAxis, ...]
     translations: tuple[JointAxis, ...]
     backwards: bool = False
+    unread: str = ""
 
     @property
     def inboard(self) -> str:
@@ -142,6 +144,28 @@ class Marker:
     fixed: bool
 
 
+@dataclass(frozen=True)
+class Unread:
+    """Something in the file that could not be read.
+
+    Args:
+        kind: the file's class.
+        name: its name.
+        reason: the refusal, one line.
+        concerns: bodies and coordinates that it names.
+    """
+
+    kind: str
+    name: str
+    reason: str
+    concerns: frozenset[str]
+
+    @property
+    def constrains(self) -> bool:
+        """Whether it holds bodies or coordinates together: a joint or a constraint."""
+        return self.kind.endswith(("Joint", "Constraint"))
+
+
 @dataclass(frozen=True, eq=False)
 class OpenSimModel:
     """An OpenSim model as read.
@@ -152,7 +176,7 @@ class OpenSimModel:
         bodies: by name, ground not among them.
         joints: from ground outwards.
         coordinates: in the file's order, which is that of every vector q.
-        couplers: coordinates that follow others.
+        couplers: coordinates that follow others, each after those that it follows.
         constant_distances: points kept apart.
         markers: by name.
         muscles: by name.
@@ -160,6 +184,8 @@ class OpenSimModel:
         wrap_objects: by name.
         offset_frames: those that hang on bodies: name -> body and pose (4, 4) in it.
         left_out: "class 'name'" of everything in the file that was not taken over.
+        unread: what a partial reading could not read; whoever needs it refuses.
+        notices: lines on how the file was read.
     """
 
     name: str
@@ -175,6 +201,8 @@ class OpenSimModel:
     wrap_objects: dict[str, WrapObject]
     offset_frames: dict[str, tuple[str, Array]]
     left_out: tuple[str, ...]
+    unread: tuple[Unread, ...] = ()
+    notices: tuple[str, ...] = ()
 
     @property
     def mass_kg(self) -> float:

@@ -34,6 +34,10 @@ class CoordinateMotion:
     accelerations: Array
 
 
+LARGEST_ANGLE = 2.0 * np.pi
+"""rad; no joint of a leg turns further."""
+
+
 def read_coordinates(kinematics: Kinematics, recorded: Table) -> tuple[Array, tuple[str, ...]]:
     """Return coordinates (f, n) rad and m, and those that a `.mot` or `.sto` does not hold.
 
@@ -44,7 +48,7 @@ def read_coordinates(kinematics: Kinematics, recorded: Table) -> tuple[Array, tu
         recorded: with a column per coordinate, named as in the model or by its path.
 
     Raises:
-        InputError: angles of unknown unit, or a gap.
+        InputError: angles of unknown or impossible unit, or a gap.
     """
     model = kinematics.model
     q = np.tile(kinematics.vector({}), (recorded.rows, 1))

@@ -28,7 +28,9 @@ MUSCLES = (
     "Thelen2003Muscle_Deprecated",
     "Millard2012EquilibriumMuscle",
     "Millard2012AccelerationMuscle",
+    "Schutte1993Muscle",
     "Schutte1993Muscle_Deprecated",
+    "Delp1990Muscle",
     "Delp1990Muscle_Deprecated",
     "DeGrooteFregly2016Muscle",
     "RigidTendonMuscle",
@@ -55,8 +57,9 @@ def read_wrap_objects(document: Document, model: Element) -> dict[str, WrapObjec
     ground = [] if (element := model.find("Ground")) is None else [element]
     for body in (*ground, *document.objects(model, "BodySet")):
         for entry in document.objects(body, "WrapObjectSet"):
-            wrap = _wrap_object(document, entry, document.name(body))
-            found.setdefault(wrap.name, wrap)
+            with document.reading(entry):
+                wrap = _wrap_object(document, entry, document.name(body))
+                found.setdefault(wrap.name, wrap)
     return found
 
 
@@ -111,19 +114,25 @@ def read_forces(
     reader = _PathReader(document, frames, coordinates, wraps)
     for element in document.objects(model, "ForceSet"):
         name = element.get("name", "")
-        if name in muscles or name in ligaments:
-            raise InputError("is there twice", document.where(element), "rename one")
-        if element.tag in MUSCLES:
-            muscles[name] = _muscle(document, element, reader.path(element))
-        elif element.tag in ("Ligament", "Blankevoort1991Ligament"):
-            ligaments[name] = _ligament(document, element, reader.path(element))
-        elif "Muscle" in element.tag or "Ligament" in element.tag:
-            raise InputError(
-                "is a kind of muscle or ligament that is not read", document.where(element)
-            )
-        else:
-            left_out.append(f"{element.tag} '{name}'")
+        with document.reading(element):
+            if element.tag in MUSCLES:
+                _check_new(document, element, {*muscles, *ligaments})
+                muscles[name] = _muscle(document, element, reader.path(element))
+            elif element.tag in ("Ligament", "Blankevoort1991Ligament"):
+                _check_new(document, element, {*muscles, *ligaments})
+                ligaments[name] = _ligament(document, element, reader.path(element))
+            elif "Muscle" in element.tag or "Ligament" in element.tag:
+                raise InputError(
+                    "is a kind of muscle or ligament that is not read", document.where(element)
+                )
+            else:
+                left_out.append(f"{element.tag} '{name}'")
     return muscles, ligaments, left_out
+
+
+def _check_new(document: Document, element: Element, names: set[str]) -> None:
+    if document.name(element) in names:
+        raise InputError("is there twice", document.where(element), "rename one")
 
 
 def _enabled(document: Document, element: Element) -> bool:
@@ -202,15 +211,15 @@ class _PathReader:
         points = tuple(self._point(element, entry) for entry in entries)
         if len(points) < 2:
             raise InputError("has fewer than two path points", document.where(element))
-        wraps = tuple(
-            self._wrap(element, entry, len(points))
-            for entry in document.objects(geometry, "PathWrapSet")
-        )
-        return Path(points, wraps)
+        wraps = []
+        for entry in document.objects(geometry, "PathWrapSet"):
+            with document.reading(element):  # the line without what lies in its way
+                wraps.append(self._wrap(element, entry, len(points)))
+        return Path(points, tuple(wraps))
 
     def _point(self, owner: Element, entry: Element) -> AnyPathPoint:
         document, name = self.document, entry.get("name", "")
-        socket = document.text(entry, "socket_parent_frame", "body")
+        socket = document.socket(entry, "parent_frame", "body")
         where = f"{document.where(owner)}: point '{name}'"
         if entry.tag == "MovingPathPoint":
             return self._moving_point(entry, socket, where)
@@ -220,7 +229,7 @@ class _PathReader:
         if entry.tag == "PathPoint":
             return PathPoint(name, body, location)
         if entry.tag == "ConditionalPathPoint":
-            coordinate = self._coordinate(entry, "socket_coordinate", "coordinate", where=where)
+            coordinate = self._coordinate(entry, "coordinate", where=where)
             low, high = document.numbers(entry, "range", count=2)
             if coordinate is None:
                 raise InputError("names no coordinate", where)
@@ -237,14 +246,13 @@ class _PathReader:
             function = self.document.held_function(entry, f"{axis}_location")
             if function is None:
                 raise InputError(f"has no <{axis}_location>", where)
-            tags = (f"socket_{axis}_coordinate", f"{axis}_coordinate")
-            coordinates.append(self._coordinate(entry, *tags, where=where))
+            coordinates.append(self._coordinate(entry, f"{axis}_coordinate", where=where))
             functions.append(function)
         return MovingPathPoint(entry.get("name", ""), body, tuple(coordinates), tuple(functions))
 
-    def _coordinate(self, entry: Element, *tags: str, where: str) -> str | None:
+    def _coordinate(self, entry: Element, name: str, *, where: str) -> str | None:
         """Return the name of the coordinate that a socket leads to, None if it is empty."""
-        socket = self.document.text(entry, *tags, default=" ").strip()
+        socket = self.document.socket(entry, name, name, default=" ").strip()
         name = socket.split("/")[-1]
         if name and name not in self.coordinates:
             raise InputError(f"names a coordinate '{socket}' that is not there", where)

@@ -8,7 +8,7 @@ import base64
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
-from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
+from xml.etree.ElementTree import Comment, Element, ElementTree, SubElement, indent
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,5 +137,6 @@ def _append(block: Element, name: str, values: NDArray) -> None:
 
 def _write(root: Element, path: str | Path) -> None:
     indent(root)
+    root.insert(0, Comment("written by tkamb"))
     with replaced_file(Path(path)) as temporary:
         ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)

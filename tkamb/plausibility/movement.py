@@ -57,7 +57,7 @@ def motion_questions(case: Case) -> Iterator[Question]:
             worst = angle[int(np.argmax(np.maximum(low - angle, angle - high)))]
             yield Question(
                 f"{name} reaches {worst:.0f} deg, where few knees go ({low} to {high}): is its "
-                "column, sign or axis another one?",
+                "column, sign ([motion] signs_turned) or axis another one?",
                 f"{name} of {worst:.0f} deg",
                 far,
             )

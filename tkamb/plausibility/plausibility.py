@@ -22,6 +22,7 @@ from tkamb.plausibility.movement import (
 )
 from tkamb.plausibility.question import Question, some
 from tkamb.plausibility.segments import segment_questions
+from tkamb.plausibility.signs import sign_questions
 
 if TYPE_CHECKING:
     from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
@@ -60,6 +61,7 @@ class Plausibility:
             *posture_questions(case),
             *step_questions(case),
             *implant_questions(case),
+            *sign_questions(case),
         ]
         if case.ligaments or case.muscles:
             found += _line_questions(mechanics)

@@ -133,7 +133,6 @@ def add_settings(commands: Any) -> None:
         "settings",
         help="the numbers that decide how things are computed, with their meaning",
         description="Print the settings of every algorithm: name, value, unit and meaning.",
-        epilog="examples: tkamb settings | tkamb settings lattice --json",
     )
     parser.add_argument("words", nargs="*", metavar="WORD", help="only settings that hold a word")
     parser.add_argument("--json", action="store_true", help="print one JSON object")

@@ -15,7 +15,7 @@ from tkamb import __version__
 from tkamb.code_identity import code_identity
 from tkamb.columns import JOINT_MOMENT, RESERVE, belongs, family_column, name_in
 from tkamb.equilibrium.mechanics import STRAIN_FLEXIONS
-from tkamb.files import sha256_of
+from tkamb.files import named_files, sha256_of
 from tkamb.known_errors import as_json, known_error, left_out
 from tkamb.plug_ins import CONTACT_CODE, contact_code
 from tkamb.run.settings import changed_settings
@@ -186,7 +186,9 @@ def input_hashes(case: Case, scene: Path | None) -> dict[str, str]:
 
 def _files_read(case: Case) -> list[Path]:
     unread = {"output"} | ({"implant"} if case.femoral is None else set())
-    return files_in(case.scene.model_dump(exclude=unread))
+    named = files_in(case.scene.model_dump(exclude=unread))
+    models = [path for path in named if path.suffix.lower() == ".osim"]
+    return [*named, *(other for path in models for other in named_files(path))]
 
 
 def files_in(value: Any) -> list[Path]:

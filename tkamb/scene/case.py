@@ -255,9 +255,11 @@ def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, 
     """Return the scene's bundles and the generic ones that it asks for."""
     bundles: tuple[Ligament, ...] = ()
     if scene.ligament:
+        from tkamb.body.ligament_sides import check_collateral_sides
         from tkamb.scene import lines
 
         bundles = lines.ligaments(scene)
+        check_collateral_sides(bundles, chain, scene.patient.side)
     if scene.generic_ligaments:
         from tkamb.body.generic_ligaments import generic_ligaments
 

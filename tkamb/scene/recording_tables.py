@@ -191,7 +191,8 @@ class JointCentreTable(SceneTable):
 
     name: str
     markers_mm: dict[str, Point] = Field(
-        description="the neighbour's markers: name -> position in the neighbour's own frame"
+        min_length=1,
+        description="the neighbour's markers: name -> position in the neighbour's own frame",
     )
     centre_mm: Point = Field(description="the joint centre in the neighbour's own frame")
     tibia_mm: Point = Field(description="the joint centre in the tibia link")

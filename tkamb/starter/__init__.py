@@ -52,8 +52,6 @@ def add_new(commands: Any) -> None:
     new = commands.add_parser(
         "new",
         help="a commented scene with its files, to start from; a patient from mass and height",
-        epilog="examples: tkamb new my_knee | tkamb new p17 --side left --mass-kg 92 "
-        "--height-mm 1830 --sex female",
     )
     new.add_argument("folder", type=Path, metavar="FOLDER", help="new or empty")
     new.add_argument("--side", choices=("left", "right"), help="of the knee; default right")

@@ -23,9 +23,15 @@ def add_tradeoff(commands: Any) -> None:
     tradeoff.add_argument("--peer", choices=("calculix",), help="another program, side by side")
     tradeoff.add_argument("--recompute", action="store_true", help="the references too (slow)")
     tradeoff.add_argument("--resume", action="store_true", help="go on with a stopped study")
-    tradeoff.add_argument("--out", type=Path, default=Path("out/tradeoff"), metavar="DIR")
+    tradeoff.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/tradeoff"),
+        metavar="DIR",
+        help="output folder; default: %(default)s",
+    )
     tradeoff.add_argument("--force", action="store_true", help=NOT_OURS)
-    tradeoff.add_argument("--json", action="store_true")
+    tradeoff.add_argument("--json", action="store_true", help="print the rows as JSON")
     tradeoff.set_defaults(command=_tradeoff)
 
 
@@ -91,9 +97,15 @@ def add_stability(commands: Any) -> None:
     stability.add_argument("--quick", action="store_true", help="a tenth of the contact cases")
     stability.add_argument("--resume", action="store_true", help="go on with a stopped study")
     stability.add_argument("--workers", type=int, default=2, metavar="N", help="cases at a time")
-    stability.add_argument("--out", type=Path, default=Path("out/stability"), metavar="DIR")
+    stability.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/stability"),
+        metavar="DIR",
+        help="output folder; default: %(default)s",
+    )
     stability.add_argument("--force", action="store_true", help=NOT_OURS)
-    stability.add_argument("--json", action="store_true")
+    stability.add_argument("--json", action="store_true", help="print the rows as JSON")
     stability.set_defaults(command=_stability)
 
 

@@ -78,15 +78,11 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     """Print the tornado of one input at a time; quick unless the command line says otherwise."""
     from tqdm import tqdm
 
-    from tkamb.errors import InputError
     from tkamb.run.workers import Crew
     from tkamb.scene import load_scene
     from tkamb.scene.case import load_case
     from tkamb.uncertainty.screening import screen, screen_lines
 
-    for name in ("out", "indices", "resume"):
-        if getattr(options, name):
-            raise InputError("does not go with --screen, which writes nothing", f"--{name}")
     scene, said = load_scene(options.scene, overrides), []
     if scene.contact and not {"contact.model", "contact.resolution_mm"} & set(overrides):
         scene = load_scene(options.scene, overrides | QUICK_CONTACT)

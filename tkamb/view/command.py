@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from tkamb.claim import check_output_file
 from tkamb.errors import InputError
 from tkamb.guard import say
 from tkamb.view import CAMERAS
@@ -38,6 +39,9 @@ def add_view(commands: Any) -> None:
         view.add_argument(
             f"--{kind}", type=Path, metavar="F", help="write all frames as a film (extra: film)"
         )
+    view.add_argument(
+        "--force", action="store_true", help="write over files that tkamb did not write"
+    )
     view.add_argument("--port", type=int, default=0, help="of the live window; default: any free")
     view.set_defaults(command=_view)
 
@@ -106,6 +110,7 @@ def _check(options: argparse.Namespace) -> None:
     for path in (options.html, options.png, options.gif, options.mp4):
         if path is not None and not os.access(path.absolute().parent, os.W_OK):
             raise InputError("cannot be written (no such folder, or not yours)", path)
+        check_output_file(path, options.force)
     for kind in ("gif", "mp4"):
         if path := getattr(options, kind):
             from tkamb.view.film import check_film

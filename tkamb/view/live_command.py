@@ -12,8 +12,6 @@ def add_live(commands: Any) -> None:
     live = commands.add_parser(
         "live",
         help="turn and press a knee by hand; contact is computed as sliders move",
-        epilog="examples: tkamb live models/deep_knee_bend/scene.toml | tkamb live out/bend "
-        "--frame 60 --out kept",
     )
     live.add_argument(
         "path",

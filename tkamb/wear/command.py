@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tkamb.errors import InputError
 from tkamb.scene_options import add_set
 
 if TYPE_CHECKING:
@@ -102,6 +103,8 @@ def _wear(options: argparse.Namespace) -> int:
     folder = options.out or Path("out") / f"{_stem(options.case)}_wear"
     with claimed_directory(folder, options.force, "wear") as claimed:
         crew, run = Crew(options.workers), _prepared(options)
+        if crew.workers > 1 and run.sampling is None:
+            raise InputError("has no samples to compute", "--workers", "give --samples too")
         with tqdm(total=options.cycles, desc="wearing", unit="cycle", disable=None) as bar:
             report = run.compute(
                 claimed,

@@ -1,0 +1,224 @@
+"""Signs that nobody notices in the numbers are asked about; right recordings raise no question."""
+
+import csv
+import shutil
+import tomllib
+from dataclasses import replace
+
+import pytest
+
+from mistakes import DATA, DM
+from scenes import MODEL, as_toml
+from tkamb.body.ligament_sides import check_collateral_sides
+from tkamb.check.scene_check import check_scene
+from tkamb.errors import InputError
+from tkamb.plausibility.ground import direction_questions, load_questions
+from tkamb.plausibility.signs import sign_questions
+from tkamb.scene import load_scene
+from tkamb.scene.case import load_case
+
+needs_dm = pytest.mark.skipif(not DATA.is_dir(), reason="subject DM's files are not there")
+
+
+@pytest.fixture
+def knee(tmp_path):
+    """Return the shipped scene in a folder of its own."""
+    folder = tmp_path / "knee"
+    shutil.copytree(MODEL, folder)
+    return folder / "scene.toml"
+
+
+def turn(path, column):
+    """Turn the sign of a column of a CSV."""
+    rows = list(csv.reader(path.open()))
+    k = rows[0].index(column)
+    for row in rows[1:]:
+        row[k] = repr(-float(row[k]))
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+
+
+def signs_of(scene, **overrides):
+    return [one.text for one in sign_questions(load_case(load_scene(scene, overrides)))]
+
+
+@pytest.mark.parametrize(
+    ("column", "words"),
+    [
+        ("ap_mm", "with the sign of AP turned"),
+        ("axial_rotation_deg", "the sign of axial rotation, or of adduction, turned"),
+        ("adduction_deg", "the sign of axial rotation, or of adduction, turned"),
+    ],
+)
+def test_a_turned_sign_of_the_shipped_knee_is_asked_about(knee, column, words):
+    assert signs_of(knee) == []
+    turn(knee.parent / "motion.csv", column)
+    asked = signs_of(knee)
+    assert len(asked) == 1 and words in asked[0]
+    role = column.rsplit("_", 1)[0]
+    assert signs_of(knee, **{"motion.signs_turned": [role]}) == []
+
+
+def test_what_the_contact_finds_has_no_sign(knee):
+    turn(knee.parent / "motion.csv", "ap_mm")
+    turn(knee.parent / "motion.csv", "axial_rotation_deg")
+    released = {"contact.released": ["ap", "axial_rotation", "adduction", "ml"]}
+    assert signs_of(knee, **released) == []
+
+
+@needs_dm
+@pytest.mark.parametrize("scene", ["scene.toml", "mirrored.toml"])
+def test_both_readings_of_dm_stay_silent(scene):
+    assert signs_of(DM / scene) == []
+
+
+@needs_dm
+@pytest.mark.parametrize(
+    ("scene", "role"),
+    [
+        ("scene.toml", "rotation_1"),
+        ("scene.toml", "rotation_2"),
+        ("mirrored.toml", "rotation_1"),
+        ("mirrored.toml", "rotation_2"),
+    ],
+)
+def test_one_turned_rotation_of_dm_is_asked_about(scene, role):
+    path = DM / scene
+    before = load_scene(path).motion.signs_turned
+    turned = sorted({*before} ^ {role})
+    assert len(signs_of(path, **{"motion.signs_turned": turned})) == 1
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.9, 0.6])
+def test_a_knee_that_bends_with_negative_angles_is_told_the_key(knee, scale):
+    rows = list(csv.reader((knee.parent / "motion.csv").open()))
+    k = rows[0].index("flexion_deg")
+    for row in rows[1:]:
+        row[k] = repr(-scale * float(row[k]))
+    with (knee.parent / "motion.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    with pytest.raises(InputError) as error:
+        load_case(load_scene(knee))
+    assert 'signs_turned = ["flexion"]' in str(error.value)
+    load_case(load_scene(knee, {"motion.signs_turned": ["flexion"]}))
+
+
+@needs_dm
+def test_a_pose_that_bends_with_negative_angles_is_told_its_rotation():
+    with pytest.raises(InputError) as error:
+        load_case(load_scene(DM / "scene.toml", {"motion.signs_turned": ["rotation_3"]}))
+    assert 'signs_turned = ["rotation_3"]' in str(error.value)
+
+
+def test_a_knee_that_bends_too_far_is_not_sent_to_the_sign(knee):
+    rows = list(csv.reader((knee.parent / "motion.csv").open()))
+    k = rows[0].index("flexion_deg")
+    for row in rows[1:]:
+        row[k] = repr(2.0 * float(row[k]))
+    with (knee.parent / "motion.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    with pytest.raises(InputError) as error:
+        load_case(load_scene(knee))
+    assert "signs_turned" not in str(error.value)
+
+
+def test_a_missing_ground_reaction_is_asked_about(knee):
+    text = knee.read_text()
+    ground = slice(text.index("[ground_reaction]"), text.index("[implant.femoral]"))
+    knee.write_text(text[: ground.start] + text[ground.stop :])
+    asked = check_scene(knee, {}, lambda name: None).questions
+    assert any("[ground_reaction] left out" in str(one) for one in asked)
+
+
+def mirrored_force(case):
+    """Mirror the sideways force of a case's ground reaction."""
+    case.ground.force[:, 2] *= -1.0
+    return case
+
+
+@needs_dm
+@pytest.mark.parametrize("applied", ["cop", "ankle"])
+def test_a_mirrored_sideways_force_is_asked_about(applied):
+    case = load_case(load_scene(DM / "scene.toml", {"ground_reaction.applied": applied}))
+    assert not [q for q in direction_questions(case) if "outwards" in q.text]
+    asked = [q.text for q in direction_questions(mirrored_force(case))]
+    assert any("pushes the leg outwards" in text for text in asked)
+
+
+@pytest.mark.parametrize(("share", "asked"), [(0.05, True), (0.025, True), (0.01, False)])
+def test_how_far_outwards_a_force_may_point(knee, share, asked):
+    """Subject JW's stairs have 0.007; a shipped knee with so much sideways force, right side."""
+    case = load_case(load_scene(knee))
+    case.ground.force[:, 2] = share * case.ground.force[:, 1]
+    assert bool([q for q in direction_questions(case) if "outwards" in q.text]) is asked
+    assert not list(load_questions(case))
+
+
+def test_the_shipped_knee_raises_no_question(knee):
+    assert not check_scene(knee, {}, lambda name: None).questions
+
+
+def with_ligaments(scene, change):
+    """Write the scene with [[ligament]] tables changed in place."""
+    content = tomllib.loads(scene.read_text())
+    change(content)
+    scene.write_text(as_toml(content))
+
+
+def mirror_ligaments(content):
+    for bundle in content["ligament"]:
+        for end in ("proximal", "distal"):
+            bundle[end]["point_mm"][2] *= -1.0
+
+
+def one_end(content):
+    content["ligament"][0]["distal"]["point_mm"][2] *= -1.0
+
+
+def renamed(content):
+    content["ligament"][3]["name"] = "tibial_collateral_ligament"
+
+
+@pytest.mark.parametrize("change", [mirror_ligaments, one_end, renamed])
+def test_a_collateral_ligament_on_the_wrong_side_is_refused(knee, change):
+    load_case(load_scene(knee))
+    with_ligaments(knee, change)
+    with pytest.raises(InputError, match="side of this right knee"):
+        load_case(load_scene(knee))
+
+
+@pytest.fixture(scope="module")
+def bundles():
+    case = load_case(load_scene(MODEL / "scene.toml"))
+    return case.ligaments, case.chain
+
+
+@pytest.mark.parametrize(
+    ("name", "sign"),
+    [
+        ("MCL", -1),
+        ("sMCL_2", -1),
+        ("dMCL", -1),
+        ("Medial Collateral", -1),
+        ("LCL", 1),
+        ("popLCL", 0),
+        ("FCL3", 1),
+        ("lateral-collateral", 1),
+        ("PCLal9", 0),
+        ("PCL_posteromedial", 0),
+        ("ACL", 0),
+        ("PFL", 0),
+        ("ALL", 0),
+        ("pCAP", 0),
+    ],
+)
+def test_which_names_have_a_side(bundles, name, sign):
+    ligaments, chain = bundles
+    medial, lateral = (next(b for b in ligaments if b.name == n) for n in ("MCL_deep", "LCL"))
+    for bundle, own in ((medial, -1), (lateral, 1)):
+        named = [replace(bundle, name=name)]
+        if sign in (0, own):
+            check_collateral_sides(named, chain, "right")
+        else:
+            with pytest.raises(InputError):
+                check_collateral_sides(named, chain, "right")
