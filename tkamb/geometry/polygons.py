@@ -9,6 +9,10 @@ ROUNDING = 1e-12
 """Of a polygon's area: a signed area of less is none."""
 
 
+CROSSED = 1e-9
+"""Of the area that a polygon covers: one that encloses less in all crosses itself."""
+
+
 class CrossedPolygonError(ValueError):
     """A polygon crosses itself, so that it has no inside."""
 
@@ -41,6 +45,11 @@ def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
     along = np.einsum("ij,ij->i", cross, total[polygon])
     size = np.einsum("ij,ij->i", total, total)
     turned = np.unique(polygon[along < -ROUNDING * size[polygon]])
+    longest = np.zeros(len(ends))
+    np.maximum.at(longest, polygon, np.einsum("ij,ij->i", c - a, c - a))
+    covered = np.bincount(polygon, np.linalg.norm(cross, axis=1), len(ends))
+    if ((np.sqrt(size) < CROSSED * covered) & (covered > CROSSED * longest)).any():
+        raise CrossedPolygonError("a polygon crosses itself")
     if not len(turned):
         return fans
     cut = [ears(vertices, corners[starts[p] : ends[p]], total[p]) for p in turned]
