@@ -84,7 +84,7 @@ def ears(vertices: Array, ring: Index, normal: Array) -> Index:
             if flat_ears:
                 raise CrossedPolygonError(f"a polygon of {len(ring)} corners crosses itself")
             tried, flat_ears = 0, True
-    triangles.append(tuple(left))
+    triangles.append((left[0], left[1], left[2]))
     return ring[np.array(triangles)]
 
 
@@ -103,7 +103,7 @@ def _is_ear(
     a, b, c = points[list(ear)]
     area = _twice_area(a, b, c)
     if area <= least:
-        return flat and abs(area) <= least
+        return bool(flat and abs(area) <= least)
     others = points[left]
     corner = (others == a).all(axis=1) | (others == b).all(axis=1) | (others == c).all(axis=1)
     sides = np.stack([_twice_area(p, q, others) for p, q in ((a, b), (b, c), (c, a))])
