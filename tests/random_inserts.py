@@ -242,3 +242,10 @@ def share_of_load(design: RandomInsert, contact: str = "lattice-linear") -> floa
         0.0 if part is None else part.force for part in (result.medial, result.lateral)
     )
     return medial / (medial + lateral)
+
+
+def joined_surfaces(*surfaces: Surface) -> Surface:
+    """Return several surfaces as one, unmerged."""
+    first = np.cumsum([0, *(len(each.vertices) for each in surfaces[:-1])])
+    faces = [each.faces + start for each, start in zip(surfaces, first, strict=True)]
+    return Surface(np.concatenate([each.vertices for each in surfaces]), np.concatenate(faces))

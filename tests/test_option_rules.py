@@ -16,9 +16,11 @@ from tkamb.output.storage import write_storage
 PARSERS = dict(leaf_parsers(_parser()))
 
 ALWAYS = {
-    "import": "--grf --c3d --trc --motion --side --mass-kg --femoral --insert --interval --out --scene "
+    "import": "--grf --c3d --trc --motion --side --mass-kg --femoral --insert --interval --out "
+    "--scene "
     "--activity --note --scale-mass --keep-mass --knee --cutoff-hz",
-    "run": "--as --contact --resolution --out --frames --set --no-cache --force --resume --workers "
+    "run": "--as --contact --resolution --out --frames --set --no-cache --force --resume "
+    "--workers "
     "--profile --strict --json",
     "check": "--out --set --json",
     "new": "--side --mass-kg --height-mm --sex",
@@ -40,7 +42,8 @@ ALWAYS = {
     "view": "--contact --frame --camera --lattice --html --png --gif --mp4",
     "tradeoff": "--quick --full --peer --recompute --resume --out --force --json",
     "stability": "--quick --resume --workers --out --force --json",
-    "wear": "--close --set --simulator --cycles --updates --law --material --wear-factor --contact --resolution "
+    "wear": "--close --set --simulator --cycles --updates --law --material --wear-factor "
+    "--contact --resolution "
     "--frames-per-cycle --samples --workers --out --force --resume --json",
     "uncertainty": "--contact --resolution --frames --set --dask --screen",
     "cohort": "--dask --shard --frames --out --force --resume",

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.polygons import ears
 from tkamb.geometry.surface import Surface
-from tkamb.geometry.topology import is_closed, open_edges
+from tkamb.geometry.topology import connected_parts, is_closed, open_edges
 
 BEYOND = 2e-5
 """m outside a triangle, where it is asked whether there is material: wider gaps part two bodies."""
@@ -60,12 +60,18 @@ def facing_material(surface: Surface, faces: Index) -> Mask:
 def find_inner_wall(vertices: Array, faces: Index) -> InnerWall | None:
     """Return the walls inside a closed surface as one; None if there are none.
 
+    Nor where a whole body lies within another one: that is a void wound the wrong way, or not.
+
     Args:
         vertices: (n, 3) m.
         faces: (k, 3), outward.
     """
     surface = Surface(vertices, faces, merged=True)
-    inner = np.flatnonzero(facing_material(surface, np.arange(len(faces))))
+    within = facing_material(surface, np.arange(len(faces)))
+    part = connected_parts(faces)
+    if len(np.setdiff1d(part, part[~within])):
+        return None
+    inner = np.flatnonzero(within)
     area = surface.areas[inner]
     if area.sum() / 2.0 < LEAST_AREA:
         return None

@@ -9,6 +9,10 @@ ROUNDING = 1e-12
 """Of a polygon's area: a signed area of less is none."""
 
 
+CROSSED = 1e-9
+"""Of the area that a polygon covers: one that encloses less in all crosses itself."""
+
+
 class CrossedPolygonError(ValueError):
     """A polygon crosses itself, so that it has no inside."""
 
@@ -41,6 +45,11 @@ def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
     along = np.einsum("ij,ij->i", cross, total[polygon])
     size = np.einsum("ij,ij->i", total, total)
     turned = np.unique(polygon[along < -ROUNDING * size[polygon]])
+    longest = np.zeros(len(ends))
+    np.maximum.at(longest, polygon, np.einsum("ij,ij->i", c - a, c - a))
+    covered = np.bincount(polygon, np.linalg.norm(cross, axis=1), len(ends))
+    if ((np.sqrt(size) < CROSSED * covered) & (covered > CROSSED * longest)).any():
+        raise CrossedPolygonError("a polygon crosses itself")
     if not len(turned):
         return fans
     cut = [ears(vertices, corners[starts[p] : ends[p]], total[p]) for p in turned]
@@ -75,7 +84,7 @@ def ears(vertices: Array, ring: Index, normal: Array) -> Index:
             if flat_ears:
                 raise CrossedPolygonError(f"a polygon of {len(ring)} corners crosses itself")
             tried, flat_ears = 0, True
-    triangles.append(tuple(left))
+    triangles.append((left[0], left[1], left[2]))
     return ring[np.array(triangles)]
 
 
@@ -94,7 +103,7 @@ def _is_ear(
     a, b, c = points[list(ear)]
     area = _twice_area(a, b, c)
     if area <= least:
-        return flat and abs(area) <= least
+        return bool(flat and abs(area) <= least)
     others = points[left]
     corner = (others == a).all(axis=1) | (others == b).all(axis=1) | (others == c).all(axis=1)
     sides = np.stack([_twice_area(p, q, others) for p, q in ((a, b), (b, c), (c, a))])

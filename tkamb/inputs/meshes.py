@@ -112,7 +112,7 @@ def load_surface(
         raise InputError(f"unknown unit '{unit}' of {name}", path, f"one of {', '.join(LENGTH)}")
     vertices, faces = read_triangles(path)
     _check_size(vertices[faces.reshape(-1)], unit, path, name, size)
-    _check_rounding(vertices[faces.reshape(-1)] * LENGTH[unit], LENGTH[unit], path, name)
+    _check_rounding(vertices[faces.reshape(-1)], unit, path, name)
     mended = repair(vertices * LENGTH[unit], faces)
     _check_surface(mended, path, name, unit)
     wall = None
@@ -330,19 +330,19 @@ def _check_knee_width(surface: Surface, path: str | Path) -> None:
         )
 
 
-def _check_rounding(corners: Array, unit: float, path: str | Path, name: str) -> None:
+def _check_rounding(corners: Array, unit: str, path: str | Path, name: str) -> None:
     """Tell or refuse coordinates so far from the origin that the file's digits do not suffice.
 
     Args:
-        corners: (n, 3) m.
-        unit: m.
+        corners: (n, 3), file units.
+        unit: of the file.
         path: the file.
         name: of the part.
     """
-    rounding = coordinate_rounding(corners / unit) * unit
+    rounding = coordinate_rounding(corners) * LENGTH[unit]
     if rounding <= ROUNDING_NOTICE:
         return
-    far = float(np.abs(corners).max()) / MILLIMETRE
+    far = float(np.abs(corners).max()) * LENGTH[unit] / MILLIMETRE
     words = (
         f"{name} lies {far:.3g} mm from the origin of its file, where coordinates are rounded to "
         f"{rounding / MILLIMETRE:.2g} mm"
@@ -357,22 +357,32 @@ def _check_rounding(corners: Array, unit: float, path: str | Path, name: str) ->
 def coordinate_rounding(corners: Array) -> float:
     """Return the step to which coordinates (n, 3) are rounded, in their units; 0: not seen.
 
-    Seen are single precision and text of six or seven digits. Coordinates that all are multiples
-    of four such steps lost nothing: they are round numbers.
+    Seen are single precision and text of six or seven digits, axis by axis. Where half of the
+    coordinates are multiples of several such steps they lost nothing: they are round numbers.
     """
-    largest = float(np.abs(corners).max(initial=0.0))
+    return max((_axis_rounding(values) for values in corners.T), default=0.0)
+
+
+def _axis_rounding(values: Array) -> float:
+    """Return the step to which the coordinates (n,) along an axis are rounded; 0: not seen."""
+    largest = float(np.abs(values).max(initial=0.0))
     if largest == 0.0:
         return 0.0
     digits = np.floor(np.log10(largest))
+    long = values[np.abs(values) >= 10.0**digits]  # those of fewer digits are rounded less
     single = float(np.spacing(np.float32(largest)))
-    for step in (10.0 ** (digits - 5), 10.0 ** (digits - 6), single):
-        multiples = corners / step
-        whole = np.abs(multiples - np.rint(multiples)).max() <= 1e-6 * max(step / largest, 1.0)
-        if whole or (step == single and (corners == corners.astype(np.float32)).all()):
-            coarser = corners / (4.0 * step)
-            round_numbers = np.abs(coarser - np.rint(coarser)).max() <= 1e-6
-            return 0.0 if round_numbers else float(step)
+    if (values == values.astype(np.float32)).all():
+        return 0.0 if _multiples(values, 4.0 * single).mean() > 0.5 else single
+    for step in (10.0 ** (digits - 5), 10.0 ** (digits - 6)):
+        if _multiples(long, step).all():
+            return 0.0 if _multiples(long, 5.0 * step).mean() > 0.5 else step
     return 0.0
+
+
+def _multiples(values: Array, step: float) -> NDArray[np.bool_]:
+    """Say which values (n,) are multiples of a step, but for rounding to double precision."""
+    number = values / step
+    return np.asarray(np.abs(number - np.rint(number)) <= 1e-5)
 
 
 def _check_surface(mended: Repair, path: str | Path, name: str, unit: str) -> None:

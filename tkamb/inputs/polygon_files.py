@@ -7,6 +7,7 @@ polygon file format" (1994). What belongs to the appearance is not even looked f
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,9 +200,11 @@ def _equal_rows(
     content: bytes, start: int, element: _Element, order: str
 ) -> tuple[NDArray | None, int]:
     """Return an element's rows and where they end, if its lists are as long as in the first row."""
-    fields, place = [], start
+    fields: list[tuple[Any, ...]] = []
+    place = start
     for n, (_, kind, length) in enumerate(element.properties):
-        dtype, shape = np.dtype(order + kind), ()
+        dtype = np.dtype(order + kind)
+        shape: tuple[int, ...] = ()
         if length:
             header = np.dtype(order + length)
             if element.count == 0 or len(content) < place + header.itemsize:

@@ -1,0 +1,134 @@
+"""Inserts of several bodies that touch or overlap, and hollow ones: as one solid part."""
+
+import logging
+
+import numpy as np
+import pytest
+import trimesh
+
+from random_inserts import joined_surfaces, voxel_surface
+from tkamb.contact.lattice.meshing.cells import cell_volumes
+from tkamb.contact.lattice.meshing.whole import whole_lattice
+from tkamb.contact.materials import material
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.registry import contact_model
+from tkamb.errors import InputError
+from tkamb.geometry.flat_bottom import insert_placement
+from tkamb.geometry.inner_walls import find_inner_wall
+from tkamb.geometry.surface import Surface
+from tkamb.inputs.meshes import load_surface
+
+LENGTH, WIDTH, HEIGHT = 0.050, 0.076, 0.010
+
+
+def block(x, y, z, counts=(2, 1, 2)):
+    """A closed block between x, y and z (m), its sides divided evenly."""
+    lines = tuple(
+        np.linspace(*limits, count + 1) for limits, count in zip((x, y, z), counts, strict=True)
+    )
+    return voxel_surface(lines, np.ones(counts, bool))
+
+
+def slab(low, high, counts=(5, 1, 8)):
+    return block((-LENGTH / 2, LENGTH / 2), (low, high), (-WIDTH / 2, WIDTH / 2), counts)
+
+
+def side(low, high, counts=(5, 2, 4)):
+    return block((-LENGTH / 2, LENGTH / 2), (0.0, HEIGHT), (low, high), counts)
+
+
+def inside_out(surface):
+    return Surface(surface.vertices, surface.faces[:, ::-1].copy())
+
+
+SOLID = slab(0.0, HEIGHT)
+TOUCHING = {
+    "meshed in two ways": [slab(0, 0.004), slab(0.004, HEIGHT, (10, 1, 16))],
+    "meshed alike": [slab(0, 0.004), slab(0.004, HEIGHT)],
+    "no vertex in common but at the corners": [slab(0, 0.004, (7, 1, 9)), slab(0.004, HEIGHT)],
+    "three layers": [slab(0, 0.003), slab(0.003, 0.006, (10, 1, 4)), slab(0.006, HEIGHT)],
+    "side by side": [side(-WIDTH / 2, 0.0), side(0.0, WIDTH / 2, (10, 4, 3))],
+}
+PRESENT = {
+    "overlapping": [slab(0, 0.006), slab(0.004, HEIGHT, (7, 1, 9))],
+    "overlapping sideways": [side(-WIDTH / 2, 0.01), side(-0.01, WIDTH / 2)],
+}
+
+
+def read(tmp_path, bodies):
+    """The bodies in one STL file, as a run reads them."""
+    both = joined_surfaces(*bodies)
+    path = tmp_path / "insert.stl"
+    trimesh.Trimesh(1e3 * both.vertices, both.faces, process=False).export(path)
+    surface = load_surface(path, "mm", name="insert", closed=True)
+    return surface.moved(insert_placement(surface))
+
+
+def peak(insert, contact):
+    """The peak pressure under a ball of 22 mm at 500 N, Pa."""
+    ball = trimesh.creation.icosphere(4, 0.022)
+    femoral = Surface(np.asarray(ball.vertices), np.asarray(ball.faces, np.int64), "femoral")
+    pair = ContactPair(femoral, insert, material("polyethylene"))
+    model = contact_model(contact, 2.0)
+    return model.press(model.prepare(pair), 500.0, np.eye(4)).pressure.max()
+
+
+@pytest.fixture(scope="module")
+def right(tmp_path_factory):
+    """The peak pressures of the solid block."""
+    insert = read(tmp_path_factory.mktemp("solid"), [SOLID])
+    return {contact: peak(insert, contact) for contact in ("foundation", "lattice-linear")}
+
+
+@pytest.mark.parametrize("name", TOUCHING)
+def test_a_wall_between_touching_bodies_is_taken_out(name, tmp_path, right, caplog):
+    with caplog.at_level(logging.WARNING, "tkamb"):
+        insert = read(tmp_path, TOUCHING[name])
+    if name != "meshed alike":  # whose two sides vanish as triangles back to back
+        assert "inner wall" in caplog.text
+    assert insert.mesh.is_watertight
+    assert insert.volume == pytest.approx(SOLID.volume, rel=1e-6)
+    assert find_inner_wall(insert.vertices, insert.faces) is None
+    for contact, value in right.items():
+        assert peak(insert, contact) == pytest.approx(value, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", PRESENT)
+def test_overlapping_bodies_are_one_in_the_lattice(name, tmp_path, right, caplog):
+    with caplog.at_level(logging.WARNING, "tkamb"):
+        insert = read(tmp_path, PRESENT[name])
+    assert "does not count" in caplog.text
+    assert peak(insert, "lattice-linear") == pytest.approx(right["lattice-linear"], rel=1e-3)
+
+
+def test_a_block_that_stands_on_a_part_of_a_plate_is_one_with_it(tmp_path):
+    """Its underside covers triangles of the plate in part: the wall stays and is not counted."""
+    ridge = block((-LENGTH / 2, LENGTH / 2), (HEIGHT, 0.015), (-0.0067, 0.0067), (5, 1, 2))
+    insert = read(tmp_path, [SOLID, ridge])
+    lattice = whole_lattice(insert, 1.5e-3)
+    volume = cell_volumes(lattice.nodes[lattice.cells]).sum()
+    assert volume == pytest.approx(SOLID.volume + ridge.volume, rel=0.02)
+
+
+@pytest.mark.parametrize("size", [1.5e-3, 2e-3])
+def test_a_void_stays_empty(size, tmp_path):
+    void = inside_out(block((-0.012, 0.012), (0.002, 0.007), (-0.02, 0.02)))
+    insert = read(tmp_path, [SOLID, void])
+    lattice = whole_lattice(insert, size)
+    middle = lattice.nodes[lattice.cells].mean(axis=1)
+    within = np.abs(middle - [0.0, 0.0045, 0.0]) < np.array([0.012, 0.0025, 0.02]) - 1e-4
+    assert not within.all(axis=1).any()
+    assert cell_volumes(lattice.nodes[lattice.cells]).sum() == pytest.approx(
+        SOLID.volume - 0.024 * 0.005 * 0.04, rel=0.02
+    )
+
+
+def test_a_body_within_the_other_may_be_a_void_and_is_refused(tmp_path):
+    within = block((-0.01, 0.01), (0.002, 0.006), (-0.01, 0.01))
+    with pytest.raises(InputError, match="2 separate bodies"):
+        read(tmp_path, [SOLID, within])
+
+
+def test_bodies_a_tenth_of_a_millimetre_apart_are_two(tmp_path):
+    with pytest.raises(InputError, match="2 separate bodies"):
+        read(tmp_path, [slab(0, 0.004), slab(0.0041, HEIGHT)])
