@@ -51,6 +51,7 @@ def rows(folder, name):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_each_run_has_its_wear_and_a_run_without_says_why(cohort):
     one, two, none = rows(cohort, "runs.csv")
     volume = [float(run["wear_volume_mm3_per_Mc"]) for run in (one, two)]
@@ -65,6 +66,7 @@ def test_each_run_has_its_wear_and_a_run_without_says_why(cohort):
     assert "Worn volume" in page and "the contact area cancels" in page
 
 
+@pytest.mark.slow
 def test_a_run_wears_as_tkamb_wear_says(cohort, capsys):
     run = ["run", str(cohort / "scene.toml"), "--frames", "0:101:50", "--resolution", "6"]
     assert main([*run, "--out", str(cohort / "run")]) == 0

@@ -335,7 +335,7 @@ class MaterialTable(SceneTable):
     material and changes what is given; without it the material is given whole.
     """
 
-    base: str | None = Field(None, description="a name of `tkamb contact materials`")
+    base: str | None = Field(None, description="a built-in name, see docs/materials.md")
     name: str | None = Field(
         None, description="what to call it in results; default: 'own', or the base's with 'changed'"
     )
