@@ -172,11 +172,11 @@ def distances(surface, points, reach=1e-4):
 def notch_nodes(lattice):
     """Say which contact nodes may be those of filled notches, a little outside the outline.
 
-    They are corners of one square only.
+    They are corners of one square, or of two where notches meet.
     """
     squares = contact_squares(lattice.contact_triangles)
     count = np.bincount(squares.ravel(), minlength=len(lattice.nodes))
-    return count[lattice.contact_nodes] == 1
+    return count[lattice.contact_nodes] <= 2
 
 
 @pytest.mark.parametrize("name", INSERTS)
