@@ -29,6 +29,8 @@ def tables(rows: Sequence[ErrorRow]) -> list[str]:
                 [r for r in own if r.situation == place and r.errors and r.held_out is held_out]
                 for held_out in (False, True)
             )
+            if not stated and not held:
+                continue
             limits = {
                 name: max((r.errors[name] for r in own if r.errors and not r.held_out), default=0.0)
                 for name in COMPARED

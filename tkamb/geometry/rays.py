@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from tkamb.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
@@ -29,6 +31,8 @@ MANY = 500
 DEEPEST = 64
 """Boxes that wait at one time: one of each level."""
 NO_TRIANGLE = -1
+TOUCHING = 1e-6
+"""m; shells so near to each other have no gap between them."""
 
 
 class RayCaster:
@@ -66,9 +70,11 @@ class RayCaster:
         return distance, face
 
     def last_exit(self, origins: ArrayLike, directions: ArrayLike) -> Array:
-        """Return the distance (n,) m at which each ray leaves the surface for good; inf: never.
+        """Return the distance (n,) m at which each ray leaves the part for good; inf: never.
 
-        Walls and voids within a part, which a ray leaves and enters again, do not count.
+        A wall within the part, where one shell ends and the next begins at once, does not count,
+        nor does a closed void, whose shell is another than the one that the ray came through. An
+        undercut that is open to the outside ends the part.
 
         Args:
             origins: (n, 3) m.
@@ -78,9 +84,37 @@ class RayCaster:
         ray, along, face = self.all(origins, directions)
         way = np.broadcast_to(directions, origins.shape)[ray]
         leaves = np.einsum("ij,ij->i", self.surface.face_normals[face], way) > 0.0
-        last = np.full(len(origins), -np.inf)
-        np.maximum.at(last, ray[leaves], along[leaves])
-        return np.where(np.isfinite(last), last, np.inf)
+        last = np.full(len(origins), np.inf)
+        np.minimum.at(last, ray[leaves], along[leaves])
+        twice = np.flatnonzero(np.bincount(ray[leaves], minlength=len(origins)) > 1)
+        shell = self._shells() if len(twice) else np.empty(0, np.int64)
+        for number in twice:
+            first, end = np.searchsorted(ray, [number, number + 1])
+            own, out = along[first:end], leaves[first:end]
+            shells = shell[face[first:end]]
+            for k in np.flatnonzero(out):
+                last[number] = own[k]
+                entries = np.flatnonzero(
+                    ~out & (own >= own[k] - TOUCHING) & (np.arange(len(own)) != k)
+                )
+                later = entries[own[entries] > own[0] + TOUCHING]
+                if not len(later):
+                    break
+                next_in = later[0]
+                touching = own[next_in] - own[k] <= TOUCHING
+                void = shells[k] == shells[next_in] != shells[0]
+                if not (touching or void):
+                    break
+        return last
+
+    def _shells(self) -> Index:
+        """Return which connected shell each face (k,) belongs to."""
+        _, merged = np.unique(np.round(self.surface.vertices, 9), axis=0, return_inverse=True)
+        corners = np.asarray(merged).reshape(-1)[self.surface.faces]
+        sides = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]]])
+        count = int(corners.max()) + 1
+        graph = coo_array((np.ones(len(sides), bool), tuple(sides.T)), shape=(count, count))
+        return np.asarray(connected_components(graph, directed=False)[1][corners[:, 0]], np.int64)
 
     def first_in_face(
         self, origins: ArrayLike, directions: ArrayLike
