@@ -8,7 +8,6 @@ opens anywhere.
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import numpy as np
 import pinocchio as pin
 import trimesh
 from pinocchio.visualize import MeshcatVisualizer
