@@ -26,12 +26,13 @@ DRAWING = {
     "presets": set(),
     "scene": {"body", "geometry", "inputs", "presets"},
     "equilibrium": {"body", "contact", "geometry", "muscles", "scene"},
+    "knee": {"body", "contact", "equilibrium", "geometry"},
     "plausibility": {"geometry", "inputs", "scene"},
     "check": {*KNEE, "output", "plausibility", "run"},
     "compare": {*SHOWN, "geometry", "plug_ins"},
     "decks": {"contact", "geometry", "output", "results", "results_folder", "run"},
     "importing": {"geometry", "inputs", "opensim", "scene"},
-    "run": {*KNEE, *SHOWN, "plausibility", "plug_ins"} - {"results"},
+    "run": {*KNEE, *SHOWN, "knee", "plausibility", "plug_ins"} - {"results"},
     "output": {"columns", "contact", "geometry", "run"},
     "view": {*KNEE, *SHOWN, "inputs", "run", "simulation"} - {"columns"},
     "studies": {*KNEE, "plug_ins", "decks", "inputs", "output", "run", "simulation"} - {"body"},
@@ -56,7 +57,7 @@ DRAWING = {
 }
 """Which folder knows which folders and which modules beside them: inputs → body → (equilibrium ⇄
 contact) → results → output, view and studies; the scene is where files become bodies."""
-SEES_BODY_AND_CONTACT = {"contact_side.py"}
+SEES_BODY_AND_CONTACT = {"contact_side.py", "read_scene.py"}
 
 
 def imported(path):

@@ -11,7 +11,7 @@ EXAMPLES = sorted(GALLERY.glob("*.py"))
 
 RECORDED = {"dm_gait": "dm", "jw_squat": "jw"}
 """Example -> the subject whose recordings it needs."""
-SLOW = {"cohort", "insert_shapes", *RECORDED}
+SLOW = {"cohort", "insert_shapes", "knee_drop", *RECORDED}
 
 
 def marked(example):

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -34,3 +35,23 @@ def test_python_m_tkamb_is_the_command():
         [sys.executable, "-m", "tkamb", "--version"], capture_output=True, text=True, check=True
     )
     assert ran.stdout.startswith("tkamb ")
+
+
+def test_a_folder_that_holds_the_clone_does_not_hide_the_package(tmp_path):
+    """An editable install is a path: the clone's own folder, without __init__, comes after it."""
+    (tmp_path / "tkamb").symlink_to(ROOT)
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        assert tomllib.load(file)["tool"]["setuptools"]["package-dir"] == {"": "."}
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "editable.pth").write_text(f"{ROOT}\n")
+    code = (
+        "import site, sys\n"
+        f"sys.path = [''] + [p for p in sys.path if p not in ('', {str(ROOT)!r})]\n"
+        f"site.addsitedir({str(tmp_path / 'site')!r})\n"
+        "import tkamb\n"
+        "print(tkamb.__file__)"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert Path(ran.stdout.strip()).resolve() == ROOT / "tkamb" / "__init__.py"

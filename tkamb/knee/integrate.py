@@ -62,10 +62,18 @@ def implicit_step(
     drag = np.zeros(model.nv) if friction_of_joints is None else friction_of_joints
     push = np.zeros(model.nv) if tau is None else tau
     cache, ahead, last = model.createData(), np.array(v, float), np.inf
+    change = np.zeros(model.nv)
     for _ in range(MAX_NEWTON_STEPS):
         middle = (1.0 - theta) * v + theta * ahead
         place = pin.integrate(model, q, theta * step * middle)
-        forces = knee.external_forces(place, middle, tensions, data)
+        try:
+            forces = knee.external_forces(place, middle, tensions, data)
+        except ComputationError:  # too deep: half of Newton's step
+            if not change.any():
+                raise
+            change = change / 2.0
+            ahead = ahead - change
+            continue
         if external is not None:
             forces = pin.StdVec_Force([f + e for f, e in zip(forces, external, strict=True)])
         torque = push - drag * middle
@@ -82,7 +90,8 @@ def implicit_step(
         by_q = cache.ddq_dq - compliance @ jacobian.T @ stiffness @ jacobian
         by_v = cache.ddq_dv - compliance @ (jacobian.T @ damping @ jacobian + np.diag(drag))
         slope = np.eye(model.nv) - step * theta * (by_v + theta * step * by_q)
-        ahead = ahead - np.linalg.solve(slope, missed)
+        change = -np.linalg.solve(slope, missed)
+        ahead = ahead + change
     raise ComputationError(
         f"a step of {step:g} s does not converge (off by {last:.2g} m/s or rad/s)",
         "implicit_step",
