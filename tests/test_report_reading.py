@@ -17,7 +17,7 @@ from tkamb.output.maps import ContactMaps
 from tkamb.output.pages import asset
 from tkamb.output.panels import panels
 from tkamb.output.plots import Sheet
-from tkamb.output.pressure_maps import STEP_MM, TopView, draw_pressure
+from tkamb.output.pressure_maps import PRESSURE_PICTURE, TopView, draw_pressure
 from tkamb.output.reading import conclusions
 from tkamb.output.style import new_figure
 from tkamb.results import Results
@@ -204,6 +204,8 @@ def test_a_contact_s_rim_covers_of_each_grid_cell_what_lies_within():
         axes = new_figure(3.0, 3.0).add_subplot()
         draw_pressure(axes, view, np.maximum(-gap, 0.0), Normalize(0.0, radius**2), 1e-3 * gap)
         opacity = np.asarray(axes.images[0].get_array())[..., 3] / 255
-        assert opacity.sum() * STEP_MM**2 == pytest.approx(np.pi * radius**2, rel=0.02)
+        assert opacity.sum() * PRESSURE_PICTURE.step_mm**2 == pytest.approx(
+            np.pi * radius**2, rel=0.02
+        )
         partly = (opacity > 0) & (opacity < 1)
-        assert partly.sum() * STEP_MM > 2 * np.pi * radius
+        assert partly.sum() * PRESSURE_PICTURE.step_mm > 2 * np.pi * radius

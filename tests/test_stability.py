@@ -121,7 +121,7 @@ def test_a_hang_is_stopped_and_the_next_case_judged(monkeypatch):
 
 
 def test_a_reference_that_takes_too_long_leaves_a_case_unverified(monkeypatch):
-    monkeypatch.setattr("tkamb.studies.stability.LONGEST_REFERENCE_SECONDS", 0.5)
+    monkeypatch.setattr("tkamb.studies.stability.STABILITY.longest_reference_seconds", 0.5)
     slow = Extreme(load_N=20000.0, conformity=0.99)
     (verdict,) = run_stability([slow])
     assert verdict.kind == "unverified" and "no reference in 0.5 s" in verdict.reason

@@ -14,7 +14,7 @@ from tkamb.contact.lattice.active_set import _forces_of, solve_contact
 from tkamb.contact.lattice.linear import cache
 from tkamb.contact.materials import RambergOsgood
 from tkamb.studies.audit import PEER_BOUNDS, complaints, peer_distances
-from tkamb.studies.closed_forms import KEPT_GRID_MM, ClosedForm, closed_forms, press_closed_form
+from tkamb.studies.closed_forms import CLOSED_FORM, ClosedForm, closed_forms, press_closed_form
 from tkamb.studies.extremes import Extreme
 from tkamb.studies.stability import judge_safely, stored_verdicts
 
@@ -65,7 +65,7 @@ def test_a_stiffer_curve_fails(name, monkeypatch):
 
 def test_a_key_without_young_s_modulus_fails(monkeypatch):
     """What is read is held against the stiffness, so that only the files tell."""
-    case = ClosedForm("kept", "lattice-linear", resolution_mm=KEPT_GRID_MM)
+    case = ClosedForm("kept", "lattice-linear", resolution_mm=CLOSED_FORM.kept_grid_mm)
     honest = cache.operator_key
 
     class SameModulus:

@@ -23,7 +23,7 @@ from tkamb.scene.case import load_case
 from tkamb.view import CAMERAS
 from tkamb.view.colours import SLACK, TENDON, rgb
 from tkamb.view.drawing import PressureMap
-from tkamb.view.payload import LEVELS, Block, _insert_transform, map_levels
+from tkamb.view.payload import VIEW_PAYLOAD, Block, _insert_transform, map_levels
 from tkamb.view.run import open_run
 from tkamb.view.shading import shade
 from tkamb.view.show import Show, serve_in_background
@@ -119,7 +119,10 @@ def test_levels_are_the_pressures_and_change_sign_at_the_rim():
     pressure = np.array([[4.0, 2.0, 0, 0, 0, 0]])
     gap = np.array([[0.0, 0, 3e-5, 1e-4, 1e-5, 2e-5]])
     found = map_levels(PressureMap(points, triangles, pressure, gap), 4.0)[0]
-    assert list(found[:2]) == [LEVELS, round(LEVELS / 2)]
+    assert list(found[:2]) == [
+        VIEW_PAYLOAD.pressure_levels,
+        round(VIEW_PAYLOAD.pressure_levels / 2),
+    ]
     assert (found[2:] < 0).all()
     assert found[2] < found[5] < found[4]
 

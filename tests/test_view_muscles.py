@@ -10,7 +10,7 @@ from tkamb.body.load import PointForces
 from tkamb.equilibrium.shared_muscles import SharedMuscles
 from tkamb.geometry.frames import transform
 from tkamb.view.colours import SLACK, activation_scale, pressure_scale, rgb, strain_scale
-from tkamb.view.strands import LEAST_ACTIVATION, SLACK_FORCE, muscle_strands
+from tkamb.view.strands import VIEW_STRAND, muscle_strands
 
 
 def frames():
@@ -43,8 +43,8 @@ def test_colours_rise_with_the_activation_and_slack_ones_are_grey():
     found = frames()
     strands, limit = muscle_strands(found)
     share = found[0].share
-    assert share.force[1:].min() > SLACK_FORCE
-    assert limit == max(share.activation[1:].max(), LEAST_ACTIVATION)
+    assert share.force[1:].min() > VIEW_STRAND.slack_force
+    assert limit == max(share.activation[1:].max(), VIEW_STRAND.least_activation)
     for strand, activation in zip(strands, share.activation[1:], strict=True):
         wanted = activation_scale()[int(activation / limit * 255)]
         np.testing.assert_array_equal(strand.colours[0], [wanted, wanted])

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.frames import inverse, transform
 from tkamb.geometry.surface import Surface
-from tkamb.output.metrics import JUMP
+from tkamb.output.metrics import METRICS
 from tkamb.output.style import PRESSURE_MAP
 from tkamb.scene import load_scene
 from tkamb.scene.case import load_case
@@ -134,14 +134,16 @@ def test_centres_of_pressure_lie_on_the_insert(run, drawing):
 
 
 def test_a_load_path_is_broken_where_it_jumps():
-    x = np.array([0.0, 1e-3, 2e-3, 2e-3 + 1.5 * JUMP, 3e-3 + 1.5 * JUMP, np.nan, 0.0])
+    x = np.array(
+        [0.0, 1e-3, 2e-3, 2e-3 + 1.5 * METRICS.jump, 3e-3 + 1.5 * METRICS.jump, np.nan, 0.0]
+    )
     points = np.column_stack([x, np.zeros(7), np.zeros(7)])
     strands = path_strands({"medial": points})
     assert [strand.points.shape[1] for strand in strands] == [3, 2]
 
 
 def test_a_path_of_few_frames_is_not_broken():
-    x = np.array([0.0, 0.9, 2.1, 3.2]) * 2 * JUMP
+    x = np.array([0.0, 0.9, 2.1, 3.2]) * 2 * METRICS.jump
     points = np.column_stack([x, np.zeros(4), np.zeros(4)])
     assert [strand.points.shape[1] for strand in path_strands({"lateral": points})] == [4]
 

@@ -12,14 +12,7 @@ from tkamb.claim import claimed_directory
 from tkamb.errors import InputError
 from tkamb.guard import interrupt_as_such
 from tkamb.results import Results
-from tkamb.run.frames import (
-    CHUNK,
-    LAST_FRAMES,
-    ChunkSolver,
-    Finished,
-    FrameSolver,
-    finished_in_order,
-)
+from tkamb.run.frames import FRAME_LOOP, ChunkSolver, Finished, FrameSolver, finished_in_order
 from tkamb.run.recorder import FolderRecorder, Recorder, finished_results
 from tkamb.run.summary import input_hashes, run_identity, scene_hash, summary_of
 from tkamb.run.tabulate import join_rows
@@ -94,7 +87,7 @@ def simulate(
     path = None if scene_path is None else Path(scene_path)
     run = _Run(case, indices, identity, input_hashes(case, path), path, start)
     with ExitStack() as stack:
-        team, chunks = None, math.ceil(len(indices) / CHUNK)
+        team, chunks = None, math.ceil(len(indices) / FRAME_LOOP.frames_per_chunk)
         if min(workers, chunks) > 1:
             task = Task(ChunkSolver, (case.scene,))
             team = stack.enter_context(crew.team(task, chunks))  # prepares meanwhile
@@ -195,7 +188,7 @@ class _Run:
             return
         from tkamb.run.recall import recalled
 
-        mechanics, last = self.solver.mechanics, list(earlier.items())[-LAST_FRAMES:]
+        mechanics, last = self.solver.mechanics, list(earlier.items())[-FRAME_LOOP.kept_contacts :]
         self.solver.before = [recalled(side, mechanics, k, arrays) for k, arrays in last]
 
 

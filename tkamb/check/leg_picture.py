@@ -33,15 +33,24 @@ from tkamb.output.style import (
 )  # fmt: skip
 from tkamb.units import DEGREE, MILLIMETRE
 
-METRES_PER_BW = 0.35
-"""Length of the force's arrow."""
-KNEE_HALF_WIDTH = 0.085
-"""m, that the picture of the knee shows around its middle."""
-MARGIN = 0.08
-"""m, around what is shown."""
+
+@dataclass(frozen=True)
+class LegPictureSettings:
+    """Sizes in the picture of a leg."""
+
+    arrow_metres_per_BW: float = 0.35
+    """Length of the force's arrow."""
+    knee_half_width: float = 0.085
+    """m, that the picture of the knee shows around its middle."""
+    margin: float = 0.08
+    """m, around what is shown."""
+
+
+LEG_PICTURE = LegPictureSettings()
+
 LEGEND = (
     f"In the laboratory, y up, grid 0.1 m. Green arrow: force of the plate on the foot, 1 BW = "
-    f"{METRES_PER_BW:g} m.\nGrey: femoral component, light blue: insert and button; "
+    f"{LEG_PICTURE.arrow_metres_per_BW:g} m.\nGrey: femoral component, light blue: insert and button; "  # noqa: E501
     "dark red: quadriceps, pink: patellar ligament, purple: ligaments."
 )
 
@@ -199,7 +208,7 @@ def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
     for points, colour in one.lines:
         axes.plot(*view.page(points).T, color=colour, linewidth=1.3)
     if one.force is not None and one.loaded:
-        tip = one.point + one.force / weight * METRES_PER_BW
+        tip = one.point + one.force / weight * LEG_PICTURE.arrow_metres_per_BW
         arrow = {
             "arrowstyle": "-|>",
             "color": FORCE_COLOURS["ground reaction"],
@@ -213,7 +222,7 @@ def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
     if one.force is not None:
         axes.axhline(one.point[1], color=GREY, linewidth=1)
     extent = view.page(np.concatenate(shown))
-    low, high = extent.min(axis=0) - MARGIN, extent.max(axis=0) + MARGIN
+    low, high = extent.min(axis=0) - LEG_PICTURE.margin, extent.max(axis=0) + LEG_PICTURE.margin
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", adjustable="box")
@@ -241,8 +250,8 @@ def _draw_surface(axes: Axes, surface: Surface, view: View, colour: str) -> None
 def _close_up(axes: Axes, one: LegFrame, view: View) -> None:
     """Show the knee alone."""
     centre = view.page(one.joints[1]) + np.array([0.0, 15 * MILLIMETRE])
-    axes.set_xlim(centre[0] - KNEE_HALF_WIDTH, centre[0] + KNEE_HALF_WIDTH)
-    axes.set_ylim(centre[1] - KNEE_HALF_WIDTH, centre[1] + KNEE_HALF_WIDTH)
+    axes.set_xlim(centre[0] - LEG_PICTURE.knee_half_width, centre[0] + LEG_PICTURE.knee_half_width)
+    axes.set_ylim(centre[1] - LEG_PICTURE.knee_half_width, centre[1] + LEG_PICTURE.knee_half_width)
 
 
 def _same_limits(row: Array) -> None:

@@ -1,6 +1,7 @@
 """The cohort's report: one page that stands by itself, groups side by side."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -37,8 +38,19 @@ SHOWN = {
 """Column -> title, unit and digits."""
 AT_ONCE = len(COLOURS)
 """Groups in one plot."""
-MOST_MAPS = 24
-MOST_FAILED = 100
+
+
+@dataclass(frozen=True)
+class CohortReportSettings:
+    """How much a cohort's page shows."""
+
+    most_maps: int = 24
+    """Pressure maps on the page; more make it slow to open."""
+    most_failed: int = 100
+    """Failed runs that the page lists."""
+
+
+COHORT_REPORT = CohortReportSettings()
 
 
 def cohort_html(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> str:
@@ -56,7 +68,7 @@ def cohort_html(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequenc
         rows=[_row(group, _there(groups)) for group in groups],
         plots=list(_plots(groups)),
         maps=_maps(cohort, outcomes, groups),
-        failed=_failed(cohort, outcomes)[:MOST_FAILED],
+        failed=_failed(cohort, outcomes)[: COHORT_REPORT.most_failed],
         failed_count=sum(bool(one.reason) for one in outcomes.values()),
     )
 
@@ -220,7 +232,7 @@ def _maps(
 ) -> dict[str, Any] | None:
     """Return one map of each group side by side on one scale; None without contact."""
     shown = [(group, _typical(group, outcomes)) for group in groups]
-    with_map = [(group, n) for group, n in shown if n is not None][:MOST_MAPS]
+    with_map = [(group, n) for group, n in shown if n is not None][: COHORT_REPORT.most_maps]
     if not with_map:
         return None
     flexion = cohort.table.map_flexion_deg

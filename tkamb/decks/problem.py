@@ -21,10 +21,18 @@ from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
-TOUCHABLE_WITHIN = 2.0
-"""Nodes whose gap at first touch is within this many times the guessed depth can be touched."""
-LARGEST_NORMAL_Y = -0.3
-"""Largest y of a femoral normal that takes part."""
+
+@dataclass(frozen=True)
+class DeckSettings:
+    """Which nodes of a deck may touch."""
+
+    touchable_depths: float = 2.0
+    """Nodes whose gap at first touch is within this many times the guessed depth can be touched."""
+    largest_normal_y: float = -0.3
+    """Largest y of a femoral normal that takes part."""
+
+
+DECK = DeckSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +87,7 @@ def press_problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -
     if not depth > 0:
         raise ComputationError("needs a load that presses the bodies together", "deck")
     places, _ = floor.over(surface.points, pair.pose_at_approach(pose, 0.0))
-    near = places[:, 1] - surface.points[:, 1] < TOUCHABLE_WITHIN * depth
+    near = places[:, 1] - surface.points[:, 1] < DECK.touchable_depths * depth
     placed = pair.pose_at_approach(pose, depth)
     patch = _patch(pair.femoral.moved(placed), surface.points[near], grid_mm * MILLIMETRE)
     lattice = replace(lattice, nodes=smooth)
@@ -88,7 +96,7 @@ def press_problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -
 
 def _patch(femoral: Surface, points: Array, spacing: float) -> Surface:
     """Return the downward triangles that lie within a cell of points, seen from above."""
-    down = np.flatnonzero(femoral.face_normals[:, 1] < LARGEST_NORMAL_Y)
+    down = np.flatnonzero(femoral.face_normals[:, 1] < DECK.largest_normal_y)
     middle = femoral.triangles[down].mean(axis=1)[:, ::2]
     away, _ = cKDTree(points[:, ::2]).query(middle, distance_upper_bound=spacing)
     used, faces = np.unique(femoral.faces[down[np.isfinite(away)]], return_inverse=True)

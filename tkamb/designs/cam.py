@@ -1,6 +1,6 @@
 """The cam of a posterior-stabilised component: a cylinder across the box, one solid with it.
 
-The cylinder is exact up to `FLANGE` from the walls of the box. From there it widens into a
+The cylinder is exact up to `CAM.flange_mm` from the walls of the box. From there it widens into a
 window of the wall, so that the mesh stays one closed body that does not cut itself.
 """
 
@@ -13,16 +13,25 @@ from numpy.typing import NDArray
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 
-SIDES = 96
-"""Facets around a cam: their chords leave out 0.05 % of the radius."""
-STATIONS = 13
-"""Rings of vertices along it."""
-FLANGE = 1.0
-"""mm from the wall of the box to the cylinder."""
-WINDOW = 22.0
-"""deg about the origin on either side of the cam: what of the wall holds it."""
-IN_WALL = 1e-6
-"""mm; vertices this near the plane of a wall lie in it."""
+
+@dataclass(frozen=True)
+class CamSettings:
+    """The cam of a posterior-stabilised design."""
+
+    sides: int = 96
+    """Facets around a cam: their chords leave out 0.05 % of the radius."""
+    stations: int = 13
+    """Rings of vertices along it."""
+    flange_mm: float = 1.0
+    """mm from the wall of the box to the cylinder."""
+    window_deg: float = 22.0
+    """deg about the origin on either side of the cam: what of the wall holds it."""
+    wall_tolerance_mm: float = 1e-6
+    """mm; vertices this near the plane of a wall lie in it."""
+
+
+CAM = CamSettings()
+
 
 Ids = NDArray[np.int64]
 
@@ -42,11 +51,11 @@ class Cam:
     radius: float
 
     def rings(self, half_length: float) -> Array:
-        """Return points (`STATIONS`, `SIDES`, 3) on the cylinder, by angle from x to y."""
-        turn = np.linspace(0.0, 2.0 * np.pi, SIDES, endpoint=False)
+        """Return points (`CAM.stations`, `CAM.sides`, 3) on the cylinder, by angle from x to y."""
+        turn = np.linspace(0.0, 2.0 * np.pi, CAM.sides, endpoint=False)
         x = self.centre_ap + self.radius * np.cos(turn)
         y = self.centre_si + self.radius * np.sin(turn)
-        z = np.linspace(-half_length, half_length, STATIONS)[:, None]
+        z = np.linspace(-half_length, half_length, CAM.stations)[:, None]
         return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
 
 
@@ -64,15 +73,15 @@ def joined(cam: Cam, box_half: float, vertices: Array, faces: Ids) -> tuple[Arra
     """
     towards = np.arctan2(-cam.centre_ap, -cam.centre_si)
     apart = np.degrees(np.arctan2(-vertices[:, 0], -vertices[:, 1]) - towards)
-    near = np.abs((apart + 180.0) % 360.0 - 180.0) <= WINDOW
+    near = np.abs((apart + 180.0) % 360.0 - 180.0) <= CAM.window_deg
     loops = []
     for wall in (-box_half, box_half):
-        inside = near & (np.abs(vertices[:, 2] - wall) < IN_WALL)
+        inside = near & (np.abs(vertices[:, 2] - wall) < CAM.wall_tolerance_mm)
         window = inside[faces].all(axis=1)
         loops.append(_outline(vertices, faces[window]))
         faces = faces[~window]
-    rings = cam.rings(box_half - FLANGE)
-    ids = len(vertices) + np.arange(rings.shape[0] * SIDES).reshape(-1, SIDES)
+    rings = cam.rings(box_half - CAM.flange_mm)
+    ids = len(vertices) + np.arange(rings.shape[0] * CAM.sides).reshape(-1, CAM.sides)
     vertices = np.concatenate([vertices, rings.reshape(-1, 3)])
     tube = [loops[0], *ids, loops[1]]
     sleeves = [_between(vertices, a, b) for a, b in pairwise(tube)]

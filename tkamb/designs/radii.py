@@ -13,12 +13,21 @@ from tkamb.designs.insert import Insert
 from tkamb.designs.sagittal import SagittalProfile, normal
 from tkamb.geometry.frames import Array
 
-CORONAL_REACH = 6.0
-"""mm on either side of the ridge or the low line."""
-DISH_REACH = 14.0
-"""mm in front of and behind the low point."""
-MARGIN_DEG = 1.5
-"""Left out at both ends of an arc, where the facets of two arcs meet."""
+
+@dataclass(frozen=True)
+class RadiusSettings:
+    """Where the radii of a design are measured."""
+
+    coronal_reach_mm: float = 6.0
+    """mm on either side of the ridge or the low line."""
+    dish_reach_mm: float = 14.0
+    """mm in front of and behind the low point."""
+    arc_margin_deg: float = 1.5
+    """Left out at both ends of an arc, where the facets of two arcs meet."""
+
+
+RADIUS = RadiusSettings()
+
 CONTACT_PHI = (-25.0, 125.0)
 """Arcs between these normals meet the insert."""
 
@@ -88,11 +97,11 @@ def _femoral(
     found = []
     for i, radius in enumerate(profile.radii):
         start, end = max(ends[i], CONTACT_PHI[0]), min(ends[i + 1], CONTACT_PHI[1])
-        if end - start < 4.0 * MARGIN_DEG:
+        if end - start < 4.0 * RADIUS.arc_margin_deg:
             continue
         arm = cut - profile.centres[i]
         phi = np.degrees(np.arctan2(-arm[:, 0], -arm[:, 1]))
-        on_arc = (phi > start + MARGIN_DEG) & (phi < end - MARGIN_DEG)
+        on_arc = (phi > start + RADIUS.arc_margin_deg) & (phi < end - RADIUS.arc_margin_deg)
         on_arc &= np.linalg.norm(arm, axis=1) > radius - 2.0
         name = f"{side} sagittal {start:g} to {end:g} deg"
         found.append(Radius(name, float(radius), circle_radius(cut[on_arc])))
@@ -113,7 +122,7 @@ def _coronal(
     apex = np.append(profile.point(phi), z)
     cut = section(body, along, apex) - apex
     high, across = cut @ outward, cut[:, 2]
-    near = (np.abs(across) < CORONAL_REACH) & (high > -2.0)
+    near = (np.abs(across) < RADIUS.coronal_reach_mm) & (high > -2.0)
     radius = circle_radius(np.column_stack([high, across])[near])
     name = f"{side} coronal at {np.degrees(phi):g} deg"
     return Radius(name, femoral.coronal_radius, radius)
@@ -127,9 +136,9 @@ def _dish(dish: trimesh.Trimesh, insert: Insert, sign: float, side: str) -> list
     found = []
     for radius, way, words in ((radii[0], 1.0, "anterior"), (radii[1], -1.0, "posterior")):
         ahead = way * (cut[:, 0] - low)
-        part = cut[(ahead > 0.7) & (ahead < DISH_REACH)]
+        part = cut[(ahead > 0.7) & (ahead < RADIUS.dish_reach_mm)]
         found.append(Radius(f"{side} dish, {words}", radius, circle_radius(part[:, :2])))
     cut = section(dish, [1.0, 0.0, 0.0], [low, 0.0, 0.0])
-    near = (np.abs(cut[:, 2] - z) < CORONAL_REACH) & (cut[:, 1] > 0.5 * insert.thickness)
+    near = (np.abs(cut[:, 2] - z) < RADIUS.coronal_reach_mm) & (cut[:, 1] > 0.5 * insert.thickness)
     measured = circle_radius(cut[near][:, 1:])
     return [*found, Radius(f"{side} dish, coronal", insert.coronal_radius, measured)]

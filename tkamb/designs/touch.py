@@ -15,9 +15,19 @@ from tkamb.geometry.frames import Array, knee_pose
 
 MEDIAL, LATERAL = -1.0, 1.0
 PHI_REACH, Z_REACH = np.radians(30.0), 9.0
-HALVINGS = 18
-LARGEST_ADDUCTION = 0.04
-"""rad, about a guess."""
+
+
+@dataclass(frozen=True)
+class DesignTouchSettings:
+    """Search for the pose at which a design's condyles touch."""
+
+    halvings: int = 18
+    """Halvings of the bracket around the adduction; 18 leave 3e-7 rad."""
+    largest_adduction: float = 0.04
+    """rad, about a guess."""
+
+
+DESIGN_TOUCH = DesignTouchSettings()
 
 
 @dataclass(frozen=True)
@@ -52,7 +62,7 @@ class Articulation:
         phi, z = flexion, side * self.femoral.ridge_half
         reach = np.array([PHI_REACH, Z_REACH])
         step = np.linspace(-1.0, 1.0, 9)
-        for _ in range(HALVINGS):
+        for _ in range(DESIGN_TOUCH.halvings):
             phis = np.clip(phi + reach[0] * step[:, None], *self.femoral.profile.range)
             zs = z + reach[1] * step[None, :]
             points = self.femoral.surface(phis, zs) @ pose[:3, :3].T + pose[:3, 3]
@@ -76,7 +86,7 @@ class Articulation:
             gaps = [self.lowest(placed, flexion, side)[0] for side in (LATERAL, MEDIAL)]
             return gaps[0] - gaps[1]
 
-        bounds = guess - LARGEST_ADDUCTION, guess + LARGEST_ADDUCTION
+        bounds = guess - DESIGN_TOUCH.largest_adduction, guess + DESIGN_TOUCH.largest_adduction
         adduction = brentq(difference, *bounds, xtol=1e-12)
         placed = pose(adduction)
         medial, lateral = (self.lowest(placed, flexion, side) for side in (MEDIAL, LATERAL))

@@ -1,20 +1,29 @@
 """Bounds of a surface's height that spare closest points most of their rays."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.surface import Surface
 
-CELL_EDGE = 1e-3
-"""m."""
-MOST_CELLS = 400
-"""Cells along an edge of the grid; a larger surface gets larger ones."""
-WIDE_IN_CELLS = 4
-"""Cells along an edge; larger triangles are dealt with one by one."""
-LARGEST_SLOPE = 3.0
-"""Rise over run of a bound's planes."""
+
+@dataclass(frozen=True)
+class HeightBoundSettings:
+    """The grid of planes that bounds a surface's height from below."""
+
+    cell_edge: float = 1e-3
+    """m."""
+    most_cells: int = 400
+    """Cells along an edge of the grid; a larger surface gets larger ones."""
+    wide_triangle_cells: int = 4
+    """Cells along an edge; larger triangles are dealt with one by one."""
+    largest_slope: float = 3.0
+    """Rise over run of a bound's planes."""
+
+
+HEIGHT_BOUND = HeightBoundSettings()
 
 
 class HeightBound:
@@ -32,7 +41,9 @@ class HeightBound:
     def __init__(self, surface: Surface) -> None:
         low, high = surface.bounds[:, [0, 2]]
         self._origin = low
-        self._edge = max(CELL_EDGE, float((high - low).max()) / MOST_CELLS)
+        self._edge = max(
+            HEIGHT_BOUND.cell_edge, float((high - low).max()) / HEIGHT_BOUND.most_cells
+        )
         self._last = ((high - low) // self._edge).astype(np.int64)
         self._cells = self._cell_planes(surface)
 
@@ -58,7 +69,9 @@ class HeightBound:
             np.add.at(total, cells, area[chosen])
         planes = np.full(total.shape, -np.inf)
         upward = np.maximum(total[..., 1:2], 1e-300)
-        planes[..., :2] = np.clip(-total[..., ::2] / upward, -LARGEST_SLOPE, LARGEST_SLOPE)
+        planes[..., :2] = np.clip(
+            -total[..., ::2] / upward, -HEIGHT_BOUND.largest_slope, HEIGHT_BOUND.largest_slope
+        )
         for chosen, cells in covered:
             rise = (planes[cells][:, None, :2] * xz[chosen]).sum(axis=2)
             np.maximum.at(planes[..., 2], cells, (heights[chosen] - rise).max(axis=1))
@@ -67,14 +80,14 @@ class HeightBound:
     def _covered(self, low: Array, high: Array) -> Iterator[tuple[Index, tuple[Index, Index]]]:
         """Yield rectangles (m,) and one cell (m,), (m,) that each of them covers."""
         first, last = self._place(low), self._place(high)
-        wide = (last - first >= WIDE_IN_CELLS).any(axis=1)
+        wide = (last - first >= HEIGHT_BOUND.wide_triangle_cells).any(axis=1)
         for t in np.flatnonzero(wide):
             rows, columns = (np.arange(first[t, k], last[t, k] + 1) for k in (0, 1))
             cells = np.repeat(rows, len(columns)), np.tile(columns, len(rows))
             yield np.full(len(cells[0]), t), cells
         small = np.flatnonzero(~wide)
         first, last = first[small], last[small]
-        for i in range(WIDE_IN_CELLS):
-            for j in range(WIDE_IN_CELLS):
+        for i in range(HEIGHT_BOUND.wide_triangle_cells):
+            for j in range(HEIGHT_BOUND.wide_triangle_cells):
                 inside = (first[:, 0] + i <= last[:, 0]) & (first[:, 1] + j <= last[:, 1])
                 yield small[inside], (first[inside, 0] + i, first[inside, 1] + j)

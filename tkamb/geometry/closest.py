@@ -8,24 +8,35 @@ import numpy as np
 
 from tkamb.compiled import compiled_as_written
 from tkamb.geometry.bounds import HeightBound
-from tkamb.geometry.condyles import FACET_DEPTH, SAMPLE_SPACING, condyle_faces
+from tkamb.geometry.condyles import CONDYLE, condyle_faces
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import Array, Index, inverse, rotate, transform
 from tkamb.geometry.nearest import NearestPoints, sampled
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
-REGION_RADIUS = 1.6e-2
-"""m; the close region ends this far from the closest point."""
-FACING_COSINE = 0.7
-"""Cosine of the angle between the surfaces, above which they face each other."""
-ABOVE = 1e-6
-"""m; a point that far above a bound of the insert's height is outside it, rounding included."""
-NEARLY_AS_CLOSE = 10 * FACET_DEPTH
-"""m; by how much the gap of a sample may exceed the smallest: it then weighs 5e-5 of that."""
-_ROUNDS = 3
-_KEPT = 8
-_BATCH = 64
+
+@dataclass(frozen=True)
+class ClosestPointSettings:
+    """How the closest points of two surfaces are searched and weighted."""
+
+    region_radius: float = 1.6e-2
+    """m; the close region ends this far from the closest point."""
+    facing_cosine: float = 0.7
+    """Cosine of the angle between the surfaces, above which they face each other."""
+    clearance: float = 1e-6
+    """m; a point that far above a bound of the insert's height is outside it, rounding included."""
+    gap_range: float = 10 * CONDYLE.facet_depth
+    """m; by how much the gap of a sample may exceed the smallest: it then weighs 5e-5 of that."""
+    rounds: int = 3
+    """Rounds of projection between the two surfaces."""
+    kept_candidates: int = 8
+    """Triangles that are looked at around each nearest vertex."""
+    batch_size: int = 64
+    """Samples that are projected together, for speed alone."""
+
+
+CLOSEST_POINT = ClosestPointSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +134,9 @@ class ClosestPointQuery:
 
     def _touching(self, condyle: "_Condyle", pose: Array) -> Index:
         """Return the triangles of the condyle that cut or touch the insert's surface."""
-        request = fcl.CollisionRequest(num_max_contacts=_BATCH, enable_contact=True)
+        request = fcl.CollisionRequest(
+            num_max_contacts=CLOSEST_POINT.batch_size, enable_contact=True
+        )
         result = fcl.CollisionResult()
         fcl.collide(condyle.placed(pose), fcl.CollisionObject(self._insert_tree), request, result)
         if result.contacts:
@@ -138,18 +151,18 @@ class ClosestPointQuery:
         that faces up over its place has none.
         """
         near, points = _within_box(condyle.points, pose, *self.insert.bounds)
-        under = points[:, 1] < self._ceiling.over(points) + ABOVE
+        under = points[:, 1] < self._ceiling.over(points) + CLOSEST_POINT.clearance
         near, points = near[under], points[under]
         below = self._depth_along_y(points)
         order = np.argsort(-below)
         order = order[below[order] > 0]
         depth = np.zeros(0)
-        for start in range(0, len(order), _BATCH):
-            batch = order[start : start + _BATCH]
+        for start in range(0, len(order), CLOSEST_POINT.batch_size):
+            batch = order[start : start + CLOSEST_POINT.batch_size]
             if len(depth) and below[batch[0]] < depth.max():
                 break
             depth = np.append(depth, self._nearest.at(points[batch]).distance)
-        return condyle.vertices[near[order[np.argsort(-depth)[:_KEPT]]]]
+        return condyle.vertices[near[order[np.argsort(-depth)[: CLOSEST_POINT.kept_candidates]]]]
 
     def _depth_along_y(self, points: Array) -> Array:
         """Return the distance (n,) up to the insert's surface, 0 for points outside it."""
@@ -163,11 +176,13 @@ class ClosestPointQuery:
         triangles = transform(pose, corners.reshape(-1, 3)).reshape(-1, 3, 3)
         _, first = np.unique(self.femoral.faces[faces], return_index=True)
         points = triangles.reshape(-1, 3)[first]  # corners that triangles share count once
-        for _ in range(_ROUNDS):
+        for _ in range(CLOSEST_POINT.rounds):
             triangles = _quartered(triangles)
             near = self._nearest.at(triangles.mean(axis=1))
             side = np.einsum("ij,ij->i", triangles.mean(axis=1) - near.points, near.normals)
-            triangles = triangles[np.argsort(np.sign(side) * near.distance)[:_KEPT]]
+            triangles = triangles[
+                np.argsort(np.sign(side) * near.distance)[: CLOSEST_POINT.kept_candidates]
+            ]
         points = np.concatenate([points, triangles.reshape(-1, 3), triangles.mean(axis=1)])
         gaps, feet = self._signed_gaps(points)
         best = int(np.argmin(gaps))
@@ -225,7 +240,7 @@ class _CloseRegion:
 
     def __init__(self, surface: Surface, faces: Index) -> None:
         part = Surface(surface.vertices, surface.faces[faces], surface.name)
-        samples, owner, areas = sampled(part, SAMPLE_SPACING)
+        samples, owner, areas = sampled(part, CONDYLE.sample_spacing)
         first, self._areas = _thinned(samples, areas)
         self._samples, self._normals = samples[first], part.face_normals[owner[first]]
 
@@ -241,15 +256,19 @@ class _CloseRegion:
             closest: (3,) m, this body's point with that gap.
         """
         own = transform(inverse(pose), closest)
-        near = _facing_alike(self._samples, self._normals, own, REGION_RADIUS)
+        near = _facing_alike(self._samples, self._normals, own, CLOSEST_POINT.region_radius)
         points = np.concatenate([transform(pose, self._samples[near]), closest[None]])
-        within, found = other.within(points, abs(gap) + NEARLY_AS_CLOSE)
+        within, found = other.within(points, abs(gap) + CLOSEST_POINT.gap_range)
         near, points = near[within[:-1]], points[within[:-1]]
         facing = -np.einsum("ij,ij->i", rotate(pose, self._normals[near]), found.normals[:-1])
         above = np.einsum("ij,ij->i", points - found.points[:-1], found.normals[:-1])
         excess = np.where(above < 0, -1, 1) * found.distance[:-1] - gap
-        excess = np.where(excess < -FACET_DEPTH, np.inf, np.maximum(excess, 0.0))
-        weights = self._areas[near] * (facing > FACING_COSINE) * np.exp(-excess / FACET_DEPTH)
+        excess = np.where(excess < -CONDYLE.facet_depth, np.inf, np.maximum(excess, 0.0))
+        weights = (
+            self._areas[near]
+            * (facing > CLOSEST_POINT.facing_cosine)
+            * np.exp(-excess / CONDYLE.facet_depth)
+        )
         weights = np.append(weights, self._areas.mean())
         mean = weights @ found.normals
         centre = other.at((weights @ found.points / weights.sum())[None]).points[0]
@@ -258,7 +277,7 @@ class _CloseRegion:
 
 def _thinned(samples: Array, areas: Array) -> tuple[Index, Array]:
     """Keep one sample of each cube of the spacing: its index, and the area of them all."""
-    cubes = np.floor(samples / SAMPLE_SPACING).astype(np.int64)
+    cubes = np.floor(samples / CONDYLE.sample_spacing).astype(np.int64)
     cubes -= cubes.min(axis=0)
     number = np.ravel_multi_index(tuple(cubes.T), tuple(cubes.max(axis=0) + 1))
     order = np.argsort(-areas, kind="stable")

@@ -11,20 +11,31 @@ from tkamb.geometry.nearest import sampled
 from tkamb.geometry.surface import Surface
 from tkamb.units import DEGREE, MILLIMETRE
 
-NOTCH_DEPTH = 3e-3
-"""m; a shallower notch does not make two condyles. A single condyle of a real component has up to
+
+@dataclass(frozen=True)
+class CondyleSettings:
+    """How the two condyles of a femoral component are told apart."""
+
+    notch_depth: float = 3e-3
+    """m; a shallower notch makes no two condyles. A single condyle of a real component has up to
 2.4 mm along some direction (DM, JW and the shipped knee cut in halves), two condyles 6 to 14 mm."""
-FACET_DEPTH = 3e-5
-"""m; depth that facets of 1–2 mm cut off a condyle: heights that differ by less are the same."""
-STRIP_WIDTH = 1e-3
-"""m; of the strips along z in which the notch is looked for."""
-SAMPLE_SPACING = 1e-3
-"""m; between the samples of a condyle's surface."""
-HIGHEST_SAMPLE = 10 * FACET_DEPTH
-"""m above the lowest vertex; higher samples weigh nothing."""
-SAMPLES_IN_A_BOX = 32
+    facet_depth: float = 3e-5
+    """m; what facets of 1–2 mm cut off a condyle: heights that differ by less are the same."""
+    strip_width: float = 1e-3
+    """m; of the strips along z in which the notch is looked for."""
+    sample_spacing: float = 1e-3
+    """m; between the samples of a condyle's surface."""
+    highest_sample: float = 10 * facet_depth
+    """m above the lowest vertex; higher samples weigh nothing."""
+    samples_per_box: int = 32
+    """Samples of a surface that share one box of the search tree."""
+    deepest_notch: float = 15e-3
+    """m; how far above the condyles the notch between them is looked for."""
+
+
+CONDYLE = CondyleSettings()
+
 _FLEXIONS = np.radians(np.arange(0.0, 121.0, 15.0))
-_DEEPEST = 15e-3
 
 
 @dataclass(frozen=True)
@@ -70,12 +81,12 @@ def condyle_split(femoral: Surface) -> float | None:
         InputError: the two condyles do not lie side by side along z, so that medial and lateral
             cannot be told.
     """
-    samples = _samples(femoral, STRIP_WIDTH / 2)
-    outline, middles = _mean_outline(samples, STRIP_WIDTH, _FLEXIONS)
+    samples = _samples(femoral, CONDYLE.strip_width / 2)
+    outline, middles = _mean_outline(samples, CONDYLE.strip_width, _FLEXIONS)
     rise = _rise(outline)
     top = int(np.argmax(rise))
     _check_yaw(femoral)
-    if rise[top] < NOTCH_DEPTH:
+    if rise[top] < CONDYLE.notch_depth:
         return None
     high = outline > outline[top] - rise[top] / 2
     first = last = top
@@ -118,7 +129,7 @@ def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float
 def _check_yaw(femoral: Surface) -> None:
     """Raise an InputError where two condyles lie along another direction than z."""
     yaw, notch = condyle_yaw(femoral)
-    if notch < NOTCH_DEPTH or abs(yaw) <= YAW_SEARCH.largest_yaw:
+    if notch < CONDYLE.notch_depth or abs(yaw) <= YAW_SEARCH.largest_yaw:
         return
     raise InputError(
         f"its two condyles lie along a line turned by {abs(yaw) / DEGREE:.0f} deg from the "
@@ -162,7 +173,7 @@ def _mean_outline(samples: Array, width: float, flexions: Array) -> tuple[Array,
         height = samples[:, 0] * np.sin(flexion) + samples[:, 1] * np.cos(flexion)
         outline = np.full(count, np.inf)
         np.minimum.at(outline, strip, height)
-        total += np.minimum(outline - outline.min(), _DEEPEST)
+        total += np.minimum(outline - outline.min(), CONDYLE.deepest_notch)
     middles = low + (np.arange(count) + 0.5) * (high - low) / count
     return total / len(flexions), middles
 
@@ -224,8 +235,8 @@ class _SampledCondyle:
     @classmethod
     def of(cls, condyle: Surface) -> "_SampledCondyle":
         """Return the samples of a condyle's surface."""
-        samples, _, areas = sampled(condyle, SAMPLE_SPACING)
-        begin = np.arange(0, len(samples), SAMPLES_IN_A_BOX)
+        samples, _, areas = sampled(condyle, CONDYLE.sample_spacing)
+        begin = np.arange(0, len(samples), CONDYLE.samples_per_box)
         low = np.minimum.reduceat(samples, begin)
         high = np.maximum.reduceat(samples, begin)
         vertices = condyle.vertices[np.unique(condyle.faces)]
@@ -235,12 +246,12 @@ class _SampledCondyle:
         """Return the lowest point (3,) m, insert frame."""
         heights = self.vertices @ pose[1, :3]
         lowest, bottom = self.vertices[np.argmin(heights)], heights.min()
-        looked_at = self._low_samples(pose[1, :3], bottom + HIGHEST_SAMPLE)
+        looked_at = self._low_samples(pose[1, :3], bottom + CONDYLE.highest_sample)
         above = self.samples[looked_at] @ pose[1, :3] - bottom
-        near = above < HIGHEST_SAMPLE
+        near = above < CONDYLE.highest_sample
         looked_at, above = looked_at[near], above[near]
         weights = np.append(self.areas[looked_at], self.areas.mean()) * np.exp(
-            -np.append(above, 0) / FACET_DEPTH
+            -np.append(above, 0) / CONDYLE.facet_depth
         )
         across = rotate(pose, np.vstack([self.samples[looked_at], lowest]) - lowest)
         step = weights @ across / weights.sum()
@@ -251,5 +262,5 @@ class _SampledCondyle:
         least = self.centres @ up - self.halves @ np.abs(up)
         # a box's rounding is far below the weight's reach
         boxes = np.flatnonzero(least < height)
-        chosen = boxes[:, None] * SAMPLES_IN_A_BOX + np.arange(SAMPLES_IN_A_BOX)
+        chosen = boxes[:, None] * CONDYLE.samples_per_box + np.arange(CONDYLE.samples_per_box)
         return chosen[chosen < len(self.samples)]

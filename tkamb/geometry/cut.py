@@ -1,5 +1,7 @@
 """A closed surface cut by a plane across an axis, its parts closed again by flat fans."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -7,10 +9,18 @@ from scipy.sparse.csgraph import connected_components
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index
 
-APART = 1e-9
-"""m; the plane keeps at least this distance from every vertex ..."""
-NUDGE = 1e-7
-"""m; ... and is moved by this until it does."""
+
+@dataclass(frozen=True)
+class CutSettings:
+    """How a plane that cuts a mesh avoids its vertices."""
+
+    vertex_clearance: float = 1e-9
+    """m; the plane keeps at least this distance from every vertex ..."""
+    plane_shift: float = 1e-7
+    """m; ... and is moved by this until it does."""
+
+
+CUT = CutSettings()
 
 
 def split_faces(
@@ -28,8 +38,8 @@ def split_faces(
         level: m, where it stands; moved by a fraction of a micrometre off the vertices.
     """
     height = vertices[:, axis] - level
-    while (np.abs(height) < APART).any():
-        height -= NUDGE
+    while (np.abs(height) < CUT.vertex_clearance).any():
+        height -= CUT.plane_shift
     above = height[faces] > 0
     count = above.sum(axis=1)
     crossed = np.flatnonzero((count == 1) | (count == 2))

@@ -12,20 +12,29 @@ from tkamb.geometry.frames import Array, Index, Mask, pose
 from tkamb.geometry.inner_walls import facing_material
 from tkamb.geometry.surface import Surface
 
-FLATNESS = 5e-5
-"""m; corners of one flat may lie this far from its plane (noise of the mesh)."""
+
+@dataclass(frozen=True)
+class FlatBottomSettings:
+    """What counts as the flat bottom of an insert."""
+
+    flatness: float = 5e-5
+    """m; corners of one flat may lie this far from its plane (noise of the mesh)."""
+    comparable_share: float = 0.5
+    """Flats whose area is at least this share of the largest compete with it."""
+    clear_share: float = 0.9
+    """Between two flats that face down, the larger wins below this ratio of areas."""
+    uneven_noise: float = 1e-6
+    """m; a bottom that is rougher than this gets a notice: noise, or no flat at all."""
+    level_tilt: float = 1e-6
+    """rad; a smaller tilt is rounding and stays as it is."""
+
+
+FLAT_BOTTOM = FlatBottomSettings()
+
 TILT_LIMIT = math.radians(30.0)
 """A bottom tilted by less than this from -y is turned level."""
-COMPARABLE_SHARE = 0.5
-"""Flats whose area is at least this share of the largest compete with it."""
-CLEAR_SHARE = 0.9
-"""Between two flats that face down, the larger wins below this ratio of areas."""
 INNER_SHARE = 0.5
 """A flat of which a larger share faces material is a wall inside the part."""
-UNEVEN_NOISE = 1e-6
-"""m; a bottom that is rougher than this gets a notice: noise, or no flat at all."""
-_LEVEL_TILT = 1e-6
-"""rad; a smaller tilt is rounding and stays as it is."""
 _CONE = math.radians(15.0)
 
 _log = logging.getLogger("tkamb")
@@ -64,7 +73,7 @@ def find_flats(surface: Surface) -> list[FlatBottom]:
     free = area > 0
     flats: list[FlatBottom] = []
     for _ in range(12):
-        least = COMPARABLE_SHARE * max((f.area for f in flats), default=0.0)
+        least = FLAT_BOTTOM.comparable_share * max((f.area for f in flats), default=0.0)
         flat = _largest_flat(surface, normals, area, free, least) if free.any() else None
         if flat is None or flat.area < least:
             break
@@ -72,7 +81,7 @@ def find_flats(surface: Surface) -> list[FlatBottom]:
         free = free.copy()
         free[flat.faces] = False
     largest = max((flat.area for flat in flats), default=0.0)
-    flats = [flat for flat in flats if flat.area >= COMPARABLE_SHARE * largest]
+    flats = [flat for flat in flats if flat.area >= FLAT_BOTTOM.comparable_share * largest]
     return sorted(flats, key=lambda flat: -flat.area)
 
 
@@ -100,20 +109,20 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
         down = outer or down
     if not down:
         raise _faces_elsewhere(surface.name, flats[0], rotation)
-    if len(down) > 1 and down[1].area >= CLEAR_SHARE * down[0].area:
+    if len(down) > 1 and down[1].area >= FLAT_BOTTOM.clear_share * down[0].area:
         raise InputError(
             f"{surface.name} has two flats that could be its bottom: "
             f"{_described(down[0], rotation)}, and {_described(down[1], rotation)}",
             None,
             "remove one, or give the part without its underside",
         )
-    if down[0].noise > UNEVEN_NOISE:
+    if down[0].noise > FLAT_BOTTOM.uneven_noise:
         _log.warning(
             "%s: the flat bottom is uneven by %.0f µm (root mean square)",
             surface.name,
             1e6 * down[0].noise,
         )
-    if down[0].area < CLEAR_SHARE * flats[0].area:
+    if down[0].area < FLAT_BOTTOM.clear_share * flats[0].area:
         _log.warning(
             "%s: the flat that faces inferior (%s) is taken as the bottom, though another is "
             "larger (%s)",
@@ -189,7 +198,7 @@ def _levelling(normal: Array) -> Array:
     """Return the smallest rotation (3, 3) that turns the normal to -y."""
     axis = np.cross(normal, [0.0, -1.0, 0.0])
     sine = float(np.linalg.norm(axis))
-    if sine < _LEVEL_TILT:
+    if sine < FLAT_BOTTOM.level_tilt:
         return np.eye(3)
     angle = math.atan2(sine, -normal[1])
     return Rotation.from_rotvec(axis / sine * angle).as_matrix()
@@ -233,8 +242,15 @@ def _grown(
 ) -> FlatBottom | None:
     corners, weight = surface.triangles[near], area[near]
     normal, cone = _sharpened(seed, normals[near], weight), _CONE
-    offset = _densest(corners.mean(axis=1) @ normal, weight, 20 * FLATNESS)
-    tolerances = (20 * FLATNESS, 8 * FLATNESS, 3 * FLATNESS, FLATNESS, 0.0, 0.0)
+    offset = _densest(corners.mean(axis=1) @ normal, weight, 20 * FLAT_BOTTOM.flatness)
+    tolerances = (
+        20 * FLAT_BOTTOM.flatness,
+        8 * FLAT_BOTTOM.flatness,
+        3 * FLAT_BOTTOM.flatness,
+        FLAT_BOTTOM.flatness,
+        0.0,
+        0.0,
+    )
     chosen = np.zeros(len(near), bool)
     for tolerance in tolerances:
         if tolerance == 0.0:
@@ -242,7 +258,7 @@ def _grown(
             lean = _median(
                 np.arccos(np.clip(normals[near] @ normal, -1, 1))[chosen], weight[chosen]
             )
-            tolerance = min(max(3 * spread, 1e-6), FLATNESS)
+            tolerance = min(max(3 * spread, 1e-6), FLAT_BOTTOM.flatness)
             cone = min(max(6 * lean, math.radians(0.5)), _CONE)
         apart = np.abs(corners @ normal - offset).max(axis=1)
         chosen = (apart <= tolerance) & (normals[near] @ normal > math.cos(cone))

@@ -25,10 +25,19 @@ from tkamb.geometry.ragged import counted
 from tkamb.geometry.surface import Surface
 from tkamb.geometry.winding import PlanGrid
 
-ODD_SHARE = 0.01
-"""Largest share of lines with an odd number of crossings that is mended, not refused."""
-SAME_HEIGHT = 1e-12
-"""Crossings of duplicate faces, m."""
+
+@dataclass(frozen=True)
+class HeightFieldSettings:
+    """How vertical lines through a surface are read."""
+
+    odd_share: float = 0.01
+    """Largest share of lines with an odd number of crossings that is mended, not refused."""
+    same_height: float = 1e-12
+    """Crossings of duplicate faces, m."""
+
+
+HEIGHT_FIELD = HeightFieldSettings()
+
 SAME_WALL = 1e-7
 """m: two bodies nearer to one another touch; ten times what single precision rounds off."""
 
@@ -211,7 +220,11 @@ def _distinct(line: Index, height: Array, rising: Mask) -> tuple[Index, Array]:
     order = np.lexsort((height, rising, line))
     line, height, rising = line[order], height[order], rising[order]
     keep = np.ones(len(line), bool)
-    keep[1:] = (np.diff(line) > 0) | (np.diff(height) > SAME_HEIGHT) | (rising[1:] != rising[:-1])
+    keep[1:] = (
+        (np.diff(line) > 0)
+        | (np.diff(height) > HEIGHT_FIELD.same_height)
+        | (rising[1:] != rising[:-1])
+    )
     line, height = line[keep], height[keep]
     order = np.lexsort((height, line))
     return line[order], height[order]
@@ -224,7 +237,7 @@ def _mend(
     if not odd.any():
         return line, height
     crossed = np.count_nonzero(np.bincount(line, minlength=odd.size))
-    if odd.sum() > max(ODD_SHARE * crossed, 1):
+    if odd.sum() > max(HEIGHT_FIELD.odd_share * crossed, 1):
         raise InputError(
             f"{odd.sum()} of {crossed} rays cross the surface an odd number of times: it is open",
             name,

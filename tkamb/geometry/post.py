@@ -17,24 +17,33 @@ from tkamb.geometry.height_field import inside_intervals
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
-SPACING = 1e-3
-"""m between the lines along y."""
-POST_RISE = 8e-3
-"""m: what stands higher than this above the dishes may be a post."""
-SIDE_DROP = 3e-3
-"""m: a side of a post falls by this within two lines (56 deg) ..."""
-STEEP_SHARE = 0.75
-"""... on at least this share of its outline."""
-MIDDLE_SHARE = 0.25
-"""The centre of a post lies within this share of the width from the middle."""
+
+@dataclass(frozen=True)
+class PostSettings:
+    """What counts as the post of an insert, and where it is cut off."""
+
+    line_spacing: float = 1e-3
+    """m between the lines along y."""
+    least_rise: float = 8e-3
+    """m: what stands higher than this above the dishes may be a post."""
+    side_drop: float = 3e-3
+    """m: a side of a post falls by this within two lines (56 deg) ..."""
+    steep_share: float = 0.75
+    """... on at least this share of its outline."""
+    middle_share: float = 0.25
+    """The centre of a post lies within this share of the width from the middle."""
+    foot_clearance: float = 0.25e-3
+    """m above that ground: where the post is cut off the dishes."""
+    back_share: float = 0.75
+    """Of the post's height above its foot: where its front is taken to hold it."""
+    least_thickness: float = 2e-3
+    """m: a post with less behind its front is none that carries."""
+
+
+POST = PostSettings()
+
 FOOT_RING = (3, 5)
 """Lines outwards from the patch: the ground around the foot, clear of a post's draft."""
-FOOT_CLEARANCE = 0.25e-3
-"""m above that ground: where the post is cut off the dishes."""
-BACK_SHARE = 0.75
-"""Of the post's height above its foot: where its front is taken to hold it."""
-THINNEST = 2e-3
-"""m: a post with less behind its front is none that carries."""
 
 
 @dataclass(frozen=True)
@@ -76,30 +85,32 @@ def find_post(insert: Surface) -> Post | None:
     3/4 of its outline, in the middle of the width.
     """
     low, high = insert.bounds
-    x, z = (np.arange(low[a] + SPACING / 2, high[a], SPACING) for a in (0, 2))
+    x, z = (np.arange(low[a] + POST.line_spacing / 2, high[a], POST.line_spacing) for a in (0, 2))
     found = inside_intervals(insert, 1, z, x)
     top = np.full((len(x), len(z)), -np.inf)
     np.maximum.at(top, (found.second, found.first), found.upper)
     dish = float(np.percentile(top[np.isfinite(top)], 2.0))
-    patches, count = label(top > dish + POST_RISE)
+    patches, count = label(top > dish + POST.least_rise)
     for number in range(1, count + 1):
         patch = patches == number
         i, k = np.nonzero(patch)
-        centred = abs(z[k].mean() - (low[2] + high[2]) / 2) < MIDDLE_SHARE * (high[2] - low[2]) / 2
-        if centred and patch.sum() >= 9 and _steep_share(top, patch) >= STEEP_SHARE:
+        centred = (
+            abs(z[k].mean() - (low[2] + high[2]) / 2) < POST.middle_share * (high[2] - low[2]) / 2
+        )
+        if centred and patch.sum() >= 9 and _steep_share(top, patch) >= POST.steep_share:
             tip = float(top[patch].max())
-            foot = _ground(top, patch, dish) + FOOT_CLEARANCE
+            foot = _ground(top, patch, dish) + POST.foot_clearance
             if tip <= foot:  # what surrounds it is higher
                 continue
-            high = patch & (top > foot + BACK_SHARE * (tip - foot))
+            high = patch & (top > foot + POST.back_share * (tip - foot))
             return Post(
                 x=float(x[i].mean()),
                 z=float(z[k].mean()),
                 height=tip - dish,
-                area=len(i) * SPACING**2,
+                area=len(i) * POST.line_spacing**2,
                 foot=foot,
                 front=float(x[np.nonzero(high)[0]].max()),
-                half_width=float(np.ptp(z[k]) / 2 + SPACING / 2),
+                half_width=float(np.ptp(z[k]) / 2 + POST.line_spacing / 2),
             )
     return None
 
@@ -127,7 +138,7 @@ def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
     own = number == number[np.hypot(*(middles - [post.x, post.z]).T).argmin()]
     dishes = closed_by_fans(vertices, np.concatenate([below, above[~own]]), insert.name)
     vertices, behind, _ = split_faces(*closed_by_fans(vertices, above[own], "post"), 0, post.front)
-    if not len(behind) or np.ptp(vertices[behind][:, :, 0]) < THINNEST:
+    if not len(behind) or np.ptp(vertices[behind][:, :, 0]) < POST.least_thickness:
         raise InputError("the post has no depth that could carry a cam", where, "leave it out")
     return Surface(*dishes, insert.name), Surface(*closed_by_fans(vertices, behind, "post"), "post")
 
@@ -144,7 +155,7 @@ def _steep_share(top: Array, patch: Mask) -> float:
     near = binary_dilation(patch)
     around = binary_dilation(near, iterations=1) & ~near
     edge = float(np.median(top[patch & ~_eroded(patch)]))
-    return float(np.mean(top[around] < edge - SIDE_DROP)) if around.any() else 0.0
+    return float(np.mean(top[around] < edge - POST.side_drop)) if around.any() else 0.0
 
 
 def _eroded(patch: Mask) -> Mask:

@@ -1,5 +1,6 @@
 """Rays against a triangulated surface, in double precision."""
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,18 +17,26 @@ if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
 
 
-EDGE_TOLERANCE = 1e-9
-"""How far outside a triangle, in barycentric units, a crossing still belongs to it."""
-SAME_CROSSING = 1e-10
-"""Crossings of one ray nearer than this, relative to the part's radius, are one crossing."""
-USUAL = 4
-"""Crossings of a ray that there is room for at first."""
+@dataclass(frozen=True)
+class RaySettings:
+    """Tolerances of the ray caster."""
+
+    edge_tolerance: float = 1e-9
+    """How far outside a triangle, in barycentric units, a crossing still belongs to it."""
+    same_crossing: float = 1e-10
+    """Crossings of one ray nearer than this, relative to the part's radius, are one crossing."""
+    usual_crossings: int = 4
+    """Crossings of a ray that there is room for at first."""
+    threaded_rays: int = 500
+    """Rays from which on two threads share them."""
+
+
+RAY = RaySettings()
+
 STILL = 1e-200
 """A smaller part of a direction is none; its inverse times a length is still a number."""
 PARALLEL = 1e-9
 """Sine of the angle to a triangle's plane below which a ray does not cross it."""
-MANY = 500
-"""Rays from which on two threads share them."""
 DEEPEST = 64
 """Boxes that wait at one time: one of each level."""
 NO_TRIANGLE = -1
@@ -51,7 +60,7 @@ class RayCaster:
         self.surface = surface
         tree = TriangleTree(surface) if tree is None else tree
         lower, upper = surface.bounds
-        self._same = SAME_CROSSING * float(np.linalg.norm(upper - lower)) / 2.0
+        self._same = RAY.same_crossing * float(np.linalg.norm(upper - lower)) / 2.0
         rows = surface.barycentric_rows.reshape(-1, 6)
         planes = np.hstack([surface.triangles[:, 0], surface.face_normals, rows])
         self._tree = tree.boxes, tree.faces, planes[tree.faces]
@@ -128,9 +137,11 @@ class RayCaster:
 
         def crossings(some: slice) -> tuple[Array, Index, Array]:
             along = directions[some] if len(directions) > 1 else directions
-            return _first_crossings(*self._tree, origins[some], along, -self._same, EDGE_TOLERANCE)
+            return _first_crossings(
+                *self._tree, origins[some], along, -self._same, RAY.edge_tolerance
+            )
 
-        if len(origins) < MANY:
+        if len(origins) < RAY.threaded_rays:
             return crossings(slice(0, len(origins)))
         one, other = in_halves(crossings, len(origins))
         distance, face, weights = (np.concatenate(two) for two in zip(one, other, strict=True))
@@ -150,12 +161,12 @@ class RayCaster:
             ray (m,), distance (m,) m and face (m,), sorted by ray, then by distance.
         """
         rays = _rays(origins, directions)
-        number, room = USUAL * len(rays[0]), -1
+        number, room = RAY.usual_crossings * len(rays[0]), -1
         while number > room:
             room = number
             ray, distance, face = (np.empty(room, kind) for kind in (np.int64, float, np.int64))
             number = _all_crossings(
-                *self._tree, *rays, -self._same, EDGE_TOLERANCE, ray, distance, face
+                *self._tree, *rays, -self._same, RAY.edge_tolerance, ray, distance, face
             )
         return self._merged(ray[:number], distance[:number], face[:number], rays[1])
 

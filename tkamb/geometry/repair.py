@@ -20,12 +20,20 @@ from tkamb.geometry.topology import (
     signed_volumes,
 )
 
-WELD_DISTANCE = 5e-5
-"""m; open edges whose ends are closer than this are one edge."""
-GAP_WIDTH = 2e-3
-"""m; a hole up to this wide (about one lattice cell) is closed by a fan of triangles."""
-TRIANGLE_WIDTH = 5e-3
-"""m; a hole of three edges is one lost triangle, and is put back up to this width."""
+
+@dataclass(frozen=True)
+class RepairSettings:
+    """Which openings of a mesh are closed when it is read."""
+
+    weld_distance: float = 5e-5
+    """m; open edges whose ends are closer than this are one edge."""
+    gap_width: float = 2e-3
+    """m; a hole up to this wide (about one lattice cell) is closed by a fan of triangles."""
+    triangle_width: float = 5e-3
+    """m; a hole of three edges is one lost triangle, and is put back up to this width."""
+
+
+REPAIR = RepairSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +181,7 @@ def _welded(vertices: Array, faces: Index) -> tuple[Index, int]:
     loose = np.unique(open_edges(faces))
     if len(loose) == 0:
         return faces, 0
-    pairs = cKDTree(vertices[loose]).query_pairs(WELD_DISTANCE, output_type="ndarray")
+    pairs = cKDTree(vertices[loose]).query_pairs(REPAIR.weld_distance, output_type="ndarray")
     if len(pairs) == 0:
         return faces, 0
     graph = coo_matrix((np.ones(len(pairs), bool), pairs.T), shape=(len(loose), len(loose)))
@@ -190,7 +198,9 @@ def _filled(vertices: Array, faces: Index) -> tuple[Array, Index, int, float]:
     widest, total, filled = 0.0, len(vertices), 0
     for loop in boundary_loops(vertices, faces):
         ring = loop.vertices[::-1]
-        if len(ring) < 3 or loop.width > (TRIANGLE_WIDTH if len(ring) == 3 else GAP_WIDTH):
+        if len(ring) < 3 or loop.width > (
+            REPAIR.triangle_width if len(ring) == 3 else REPAIR.gap_width
+        ):
             continue
         if len(ring) == 3:
             new_faces.append(ring[None])

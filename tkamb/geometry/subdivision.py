@@ -16,11 +16,20 @@ from tkamb.geometry.ragged import Ragged
 from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import edge_use
 
-HALVING_TOLERANCE = 1e-6
-"""Of the surface's size: how far a halved edge's middle may be from its line, as files round."""
-MOST_LEVELS = 8
-MOST_PARTS = 100
-"""Parts of a surface beyond which it is left as it is: no implant has as many."""
+
+@dataclass(frozen=True)
+class SubdivisionSettings:
+    """When coarse triangles of a surface are divided."""
+
+    halving_tolerance: float = 1e-6
+    """Of the surface's size: how far a halved edge's middle may be off its line, as files round."""
+    most_levels: int = 8
+    """Times that a triangle may be divided."""
+    most_parts: int = 100
+    """Parts of a surface beyond which it is left as it is: no implant has as many."""
+
+
+SUBDIVISION = SubdivisionSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +54,7 @@ def coarsened(surface: Surface) -> Coarsened | None:
     None where nothing is to be undone.
     """
     found: Coarsened | None = None
-    for _ in range(MOST_LEVELS):
+    for _ in range(SUBDIVISION.most_levels):
         step = _coarsened_once(surface if found is None else found.surface)
         if step is None:
             break
@@ -61,7 +70,7 @@ def _coarsened_once(surface: Surface) -> Coarsened | None:
     faces = surface.faces
     across = _across(faces)
     count, part = _parts(across)
-    if count > MOST_PARTS:
+    if count > SUBDIVISION.most_parts:
         return None
     search = _Search(surface, across)
     middles = [search.middles_of(np.flatnonzero(part == number)) for number in range(count)]
@@ -91,7 +100,9 @@ class _Search:
 
     def __init__(self, surface: Surface, across: Index) -> None:
         self._faces, self._points, self._across = surface.faces, surface.vertices, across
-        self._near = HALVING_TOLERANCE * float(np.linalg.norm(np.ptp(surface.bounds, axis=0)))
+        self._near = SUBDIVISION.halving_tolerance * float(
+            np.linalg.norm(np.ptp(surface.bounds, axis=0))
+        )
         self._corners = Ragged.by_key(surface.faces.ravel(), len(surface.vertices))
 
     def tips(self, middle: Index) -> Index:

@@ -7,6 +7,7 @@ leaves out boxes beyond what it has found. Triangles are looked at in double pre
 itself: which of them is found does not hang on the way there.
 """
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -19,10 +20,18 @@ from tkamb.geometry.frames import Array, Index
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
 
-LEAF = 4
-"""Triangles in a leaf, at most."""
-MARGIN = 1e-7
-"""Of the surface's size: by so much boxes are wider, whatever the rounding."""
+
+@dataclass(frozen=True)
+class BoxTreeSettings:
+    """The tree of boxes around a surface's triangles."""
+
+    triangles_per_leaf: int = 4
+    """Triangles in a leaf, at most."""
+    margin: float = 1e-7
+    """Of the surface's size: by so much boxes are wider, whatever the rounding."""
+
+
+BOX_TREE = BoxTreeSettings()
 
 
 def rows(vectors: ArrayLike) -> Array:
@@ -53,7 +62,7 @@ class TriangleTree:
         real = chosen[surface.areas[chosen] > 0.0]
         chosen = real if len(real) else chosen
         leaves = chosen[_halved(0.5 * (low + high)[chosen])]
-        margin = MARGIN * float(np.linalg.norm(np.ptp(surface.bounds, axis=0)))
+        margin = BOX_TREE.margin * float(np.linalg.norm(np.ptp(surface.bounds, axis=0)))
         count = len(leaves)
         self.faces = leaves.ravel()
         self.boxes = np.zeros((2 * count, 6))
@@ -94,7 +103,7 @@ class TriangleTree:
 def _halved(centres: Array) -> Index:
     """Return the triangles of the leaves (p, c), p a power of two; some twice, to fill them."""
     leaves = 1
-    while leaves * LEAF < len(centres):
+    while leaves * BOX_TREE.triangles_per_leaf < len(centres):
         leaves *= 2
     room = leaves * -(-len(centres) // leaves)
     order = np.arange(room) * len(centres) // room  # sorted ones stay sorted, and quickly parted

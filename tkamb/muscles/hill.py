@@ -18,6 +18,7 @@ coefficients are those of the authors' code, with which f_l(1) = f_v(0) = 1.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -31,11 +32,21 @@ BELLS = (
 )
 """Height, place, width at length 0 and its growth, of each bell of the active force."""
 VELOCITY = (-0.3211346127989808, -8.149, -0.374, 0.8825327733249912)
-PASSIVE_SHAPE = 4.0
-PASSIVE_STRAIN = 0.6
-"""Strain beyond the optimal length at which the passive force is F_max."""
-LONGEST = 1.8
-"""Fibre length over the optimal one beyond which the curves say nothing (f_p(1.6) is 1)."""
+
+
+@dataclass(frozen=True)
+class HillSettings:
+    """Curves of force, length and velocity of a muscle."""
+
+    passive_shape: float = 4.0
+    """Shape of the passive curve (exponent); Thelen (2003) has 4 for adults under 65."""
+    passive_strain: float = 0.6
+    """Strain beyond the optimal length at which the passive force is F_max."""
+    longest_fibre_ratio: float = 1.8
+    """Fibre length over the optimal one beyond which the curves say nothing (f_p(1.6) is 1)."""
+
+
+HILL = HillSettings()
 
 
 def active_force_length(length: Array) -> Array:
@@ -58,8 +69,8 @@ def force_velocity(velocity: Array) -> Array:
 
 def passive_force_length(length: Array) -> Array:
     """Return f_p at fibre lengths over the optimal one."""
-    growth = PASSIVE_SHAPE * np.maximum(length - 1.0, 0.0) / PASSIVE_STRAIN
-    return np.expm1(growth) / np.expm1(PASSIVE_SHAPE)
+    growth = HILL.passive_shape * np.maximum(length - 1.0, 0.0) / HILL.passive_strain
+    return np.expm1(growth) / np.expm1(HILL.passive_shape)
 
 
 def rigid_tendon_strength(
@@ -73,7 +84,7 @@ def rigid_tendon_strength(
         speeds: (..., m) m/s, of their paths' lengths.
 
     Returns:
-        Both NaN where fibres are longer than `LONGEST`.
+        Both NaN where fibres are longer than `HILL.longest_fibre_ratio`.
     """
     optimal = np.array([muscle.optimal_fibre_length_m for muscle in muscles])
     slack = np.array([muscle.tendon_slack_length_m for muscle in muscles])
@@ -83,6 +94,6 @@ def rigid_tendon_strength(
     along = lengths_m - slack
     fibre = np.hypot(width, along)
     cosine = np.where(along > 0.0, along / np.maximum(fibre, 1e-300), 0.0)
-    length = np.where(fibre > LONGEST * optimal, np.nan, fibre / optimal)
+    length = np.where(fibre > HILL.longest_fibre_ratio * optimal, np.nan, fibre / optimal)
     active = active_force_length(length) * force_velocity(cosine * speeds / fastest)
     return strength * cosine * active, strength * cosine * passive_force_length(length)

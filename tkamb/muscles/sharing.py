@@ -9,7 +9,7 @@ import numpy as np
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
 from tkamb.muscles.emg import EmgGuide
-from tkamb.muscles.hill import LONGEST
+from tkamb.muscles.hill import HILL
 from tkamb.muscles.static_optimisation import LoadSharing, share_load
 from tkamb.opensim.lines import Muscle
 
@@ -101,7 +101,10 @@ class FrameProblems:
             return "an external load is not known"
         for lost, why in (
             (~np.isfinite(self.arms[k]).all(axis=1), "no taut path of"),
-            (~np.isfinite(self.active[k]), f"fibres beyond {LONGEST:g} optimal lengths in"),
+            (
+                ~np.isfinite(self.active[k]),
+                f"fibres beyond {HILL.longest_fibre_ratio:g} optimal lengths in",
+            ),
         ):
             if lost.any():
                 names = [self.muscles[i].name for i in np.flatnonzero(lost)]

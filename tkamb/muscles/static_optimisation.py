@@ -27,13 +27,23 @@ import numpy as np
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
 
-NEWTON_TOLERANCE = 1e-10
-"""Change of the activations at which the sequence for p > 2 has converged."""
-MOST_STEPS = 60
+
+@dataclass(frozen=True)
+class StaticOptimisationSettings:
+    """How one frame's quadratic programme ends."""
+
+    newton_tolerance: float = 1e-10
+    """Change of the activations at which the sequence for p > 2 has converged."""
+    most_steps: int = 60
+    """Quadratic programmes of the sequence for p > 2."""
+    solver_tolerance: float = 1e-11
+    """Primal and dual tolerance handed to DAQP; rows are scaled to about 1."""
+
+
+STATIC_OPTIMISATION = StaticOptimisationSettings()
+
 OPTIMAL = 1
 """DAQP's exit flag of a solution."""
-TIGHT = 1e-11
-"""Primal and dual tolerance handed to DAQP; rows are scaled to about 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +151,9 @@ def share_load(problem: LoadSharing) -> Shared:
         step = _descending(problem, a, aim - a)
         steps += 1
         change, a = float(np.abs(step).max()), a + step
-        if change < NEWTON_TOLERANCE:
+        if change < STATIC_OPTIMISATION.newton_tolerance:
             break
-        if steps == MOST_STEPS:
+        if steps == STATIC_OPTIMISATION.most_steps:
             raise ComputationError("static optimisation does not converge", "muscles")
     shared = Shared(a, problem.others(a), own, other, np.nan, steps)
     return replace(shared, kkt_residual=kkt_residual(problem, shared))
@@ -197,8 +207,8 @@ def _programme(problem: LoadSharing, hessian: Array, gradient: Array) -> tuple[A
         np.concatenate([problem.highest, upper]),
         np.concatenate([problem.lowest, lower]),
         np.where(equal, 5, 0).astype(np.intc),  # 5: an equality
-        primal_tol=TIGHT,
-        dual_tol=TIGHT,
+        primal_tol=STATIC_OPTIMISATION.solver_tolerance,
+        dual_tol=STATIC_OPTIMISATION.solver_tolerance,
     )
     if flag != OPTIMAL:
         raise ComputationError("no muscle forces within their limits carry this frame", "muscles")

@@ -1,9 +1,11 @@
 """The map that follows the report's slider: every frame's pressure as bytes of one grey picture.
 
-A byte is `RIM_BYTE` where the contact ends, above it in contact (the run's largest pressure is
+A byte is `FRAME_MAP.rim_byte` where the contact ends, above it in contact (the run's largest
+pressure is
 255) and below it apart; the page draws between the bytes linearly and colours what lies above.
 """
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,11 +25,20 @@ from tkamb.units import MEGAPASCAL
 if TYPE_CHECKING:
     from tkamb.results import Results
 
-RIM_BYTE = 64
-MOST_FRAMES = 250
-"""A longer run shows, at each place of the slider, the nearest of so many maps."""
-COARSER = 2
-"""The page's grid has every so-manieth point of the picture's."""
+
+@dataclass(frozen=True)
+class FrameMapSettings:
+    """The pressure maps behind the report's frame slider."""
+
+    rim_byte: int = 64
+    """Byte of the page's picture where the contact ends; above it there is pressure."""
+    most_frames: int = 250
+    """A longer run shows, at each place of the slider, the nearest of so many maps."""
+    coarsening: int = 2
+    """The page's grid has every so-manieth point of the picture's."""
+
+
+FRAME_MAP = FrameMapSettings()
 
 
 def draw_insert(view: TopView, largest: float) -> Figure:
@@ -58,7 +69,9 @@ def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
     assert results.maps is not None
     rows = map_rows(results)
     frames = np.array(sorted(rows))
-    kept = frames[np.unique(np.linspace(0, len(frames) - 1, MOST_FRAMES).round().astype(int))]
+    kept = frames[
+        np.unique(np.linspace(0, len(frames) - 1, FRAME_MAP.most_frames).round().astype(int))
+    ]
     largest = largest_pressure(results) * MEGAPASCAL
     tiles, edges = _tiles(results, view, [rows[k] for k in kept], largest)
     across = int(np.ceil(np.sqrt(len(kept))))
@@ -74,7 +87,7 @@ def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
         "shown": [int(kept[n]) for n in nearest],
         "edges": edges,
         "span": [left, right, bottom, top],
-        "rim": RIM_BYTE,
+        "rim": FRAME_MAP.rim_byte,
         "largest": largest / MEGAPASCAL,
         "colours": "".join(to_hex(one)[1:] for one in colormaps[PRESSURE_MAP](np.arange(256))),
         "centres": {side: _centres(results, view, side) for side in SIDES},
@@ -88,10 +101,15 @@ def _tiles(
     maps = results.maps
     assert maps is not None
     levels = pressure_levels(maps.pressure_Pa[rows], maps.gap_m[rows], view.triangles, largest)
-    found = view.grid.sample(levels, COARSER)
+    found = view.grid.sample(levels, FRAME_MAP.coarsening)
     down, over = touched_part(found.max(axis=0) > 0)
-    steps = np.clip(np.round(RIM_BYTE + (255 - RIM_BYTE) * found[:, down, over]), 0, 255)
-    up, across = view.grid.up[::COARSER][down], view.grid.across[::COARSER][over]
+    steps = np.clip(
+        np.round(FRAME_MAP.rim_byte + (255 - FRAME_MAP.rim_byte) * found[:, down, over]), 0, 255
+    )
+    up, across = (
+        view.grid.up[:: FRAME_MAP.coarsening][down],
+        view.grid.across[:: FRAME_MAP.coarsening][over],
+    )
     edges = [round(float(edge), 3) for edge in (across[0], across[-1], up[-1], up[0])]
     return steps.astype(np.uint8), edges
 

@@ -13,21 +13,31 @@ from tkamb.geometry.frames import Array
 from tkamb.known_errors import is_large, known_error_words
 from tkamb.output import metrics
 from tkamb.output.axis import HorizontalAxis
-from tkamb.run.agreement import LARGE_RESIDUAL, SHARES_APART
+from tkamb.run.agreement import AGREEMENT
 
 if TYPE_CHECKING:
     from tkamb.results import Results
 
 BANDED = {"force_total_N": "the total", "medial_force_N": "the medial force"}
 AXIS_NAMES = {"ap": "AP", "si": "SI", "ml": "ML"}
-MOST_INPUTS = 2
-"""How many inputs a sentence names."""
-NOTABLE_FAILED = 0.05
-"""Share of samples: where more fail, the bands leave out a whole tail."""
-AT_REST = 0.05
-"""%, of the SI contact force: what a search for equilibrium may leave of residuals."""
-FRAMES_APART = 5.0
-"""deg: what begins between frames farther apart is said with both."""
+
+
+@dataclass(frozen=True)
+class HeadlineSettings:
+    """What the report's first lines name."""
+
+    most_inputs: int = 2
+    """How many inputs a sentence names."""
+    notable_failed_share: float = 0.05
+    """Share of samples: where more fail, the bands leave out a whole tail."""
+    residual_percent: float = 0.05
+    """%, of the SI contact force: what a search for equilibrium may leave of residuals."""
+    distant_frames_deg: float = 5.0
+    """deg: what begins between frames farther apart is said with both."""
+
+
+HEADLINE = HeadlineSettings()
+
 PRESSURE_AND_AREA = ("peak_pressure", "mean_pressure", "area")
 
 
@@ -150,7 +160,7 @@ def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
     if sampled and sampled["median"] is None:
         parts.append(sampled["words"])
     worst, held = table["largest_failed_share"], table["not_varied"]
-    if worst > NOTABLE_FAILED:
+    if worst > HEADLINE.notable_failed_share:
         why = "".join(f", most often: {text}" for text in [*table.get("causes_of_failure", ())][:1])
         parts.append(f"in up to {worst:.0%} of the samples a frame failed{why}")
     if held:
@@ -163,7 +173,9 @@ def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
 def _largest(table: Mapping[str, Any], result: str) -> str:
     """Return the inputs with the largest shares in a result's variance, in words."""
     shares = (table.get("shares_of_variance") or {}).get(result) or {}
-    first = [(name, share) for name, share in shares.items() if name != "rest"][:MOST_INPUTS]
+    first = [(name, share) for name, share in shares.items() if name != "rest"][
+        : HEADLINE.most_inputs
+    ]
     return ", ".join(f"{_plain(name)} ({share:.0%})" for name, share in first if share >= 0.01)
 
 
@@ -195,7 +207,7 @@ def _shares(results: "Results") -> Card | None:
     share = metrics.medial_share(results, "deformation" if "deformation" in texts else first)
     alone = int(((share <= 0) | (share >= 1)).sum())
     rest += [f"one condyle carries nothing in {alone} frame{'s' * (alone > 1)}"] if alone else []
-    apart = int((metrics.shares_apart(results) > SHARES_APART).sum())
+    apart = int((metrics.shares_apart(results) > AGREEMENT.share_difference).sum())
     rest += [f"the two contradict each other in {apart} frame{'s' * (apart > 1)}"] if apart else []
     rest += _adduction(results, unknown)
     detail = "; ".join([f"by {first}, the rest lateral", *rest])
@@ -293,7 +305,7 @@ def _wraps_from(results: "Results", first: float) -> str:
     """Return where the quadriceps begins to wrap, as well as the frames tell it."""
     flexion, wrap = results["flexion_deg"], results["quadriceps_wrap_deg"]
     last = max(flexion[(wrap == 0.0) & (flexion < first)], default=first)
-    if first - last > FRAMES_APART:
+    if first - last > HEADLINE.distant_frames_deg:
         return f"begins to wrap the femur between {last:.0f}° and {first:.0f}°"
     return f"wraps the femur from {first:.0f}°"
 
@@ -303,7 +315,9 @@ def _residuals(results: "Results") -> Card | None:
     if not np.isfinite(share).any():
         return None
     released = (results.summary.get("contact") or {}).get("released") or ()
-    if {"ap", "ml", "axial_rotation"} <= set(released) and np.nanmax(share) < AT_REST:
+    if {"ap", "ml", "axial_rotation"} <= set(released) and np.nanmax(
+        share
+    ) < HEADLINE.residual_percent:
         at_rest = "AP, ML and axial rotation are released: what they need is part of the solution"
         return Card("Residual force", "none", at_rest)
     middle = f"{np.nanmedian(share):.1f} %"
@@ -315,7 +329,12 @@ def _residuals(results: "Results") -> Card | None:
     axial = np.abs(results["residual_axial_Nm"])
     if np.isfinite(axial).any():
         detail += f"; and a residual axial moment of up to {np.nanmax(axial):.1f}\u00a0N·m"
-    return Card("Residual force", middle, detail, bool(np.nanmax(share) > 100 * LARGE_RESIDUAL))
+    return Card(
+        "Residual force",
+        middle,
+        detail,
+        bool(np.nanmax(share) > 100 * AGREEMENT.large_residual_share),
+    )
 
 
 def _frames(results: "Results") -> Card:

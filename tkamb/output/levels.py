@@ -1,5 +1,6 @@
 """Pressure between a map's points, for the eye: where contact ends, and a grid to draw it on."""
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -9,12 +10,20 @@ from tkamb.geometry.frames import Array, Mask
 from tkamb.geometry.ragged import counted
 from tkamb.units import MILLIMETRE
 
-ON_EDGE = 1e-9
-"""Barycentric distance by which a grid point may lie outside a triangle and still on its edge."""
-FAR = 10 * MILLIMETRE
-"""A gap above this, infinite where nothing lies above, counts as this."""
-MARGIN = 2
-"""Grid points kept around contacts."""
+
+@dataclass(frozen=True)
+class LevelSettings:
+    """How a pressure map becomes a picture."""
+
+    edge_tolerance: float = 1e-9
+    """Barycentric distance by which a grid point may lie outside a triangle, still on its edge."""
+    largest_gap: float = 10 * MILLIMETRE
+    """A gap above this, infinite where nothing lies above, counts as this."""
+    margin_points: int = 2
+    """Grid points kept around contacts."""
+
+
+LEVELS = LevelSettings()
 
 
 def pressure_levels(
@@ -34,7 +43,9 @@ def pressure_levels(
         peak: top of the scale in the pressure's unit; a higher pressure has level 1.
     """
     share = np.clip(np.nan_to_num(pressure) / (peak or 1.0), 0.0, 1.0)
-    apart = np.ones_like(share) if gap is None else np.clip(np.nan_to_num(gap), 0.0, FAR)
+    apart = (
+        np.ones_like(share) if gap is None else np.clip(np.nan_to_num(gap), 0.0, LEVELS.largest_gap)
+    )
     touched = triangles[share.max(axis=0)[triangles].any(axis=1)]  # the others have no rim
     return np.stack(
         [_frame_levels(one, far, touched) for one, far in zip(share, apart, strict=True)]
@@ -133,7 +144,7 @@ def touched_part(touched: Mask) -> tuple[slice, slice]:
 
 def _range(there: NDArray[np.int64]) -> slice:
     low, high = (int(there.min()), int(there.max())) if len(there) else (0, 1)
-    return slice(max(low - MARGIN, 0), high + MARGIN + 1)
+    return slice(max(low - LEVELS.margin_points, 0), high + LEVELS.margin_points + 1)
 
 
 def _covered(
@@ -145,8 +156,8 @@ def _covered(
         corners: (k, 3, 2) rows and columns, in steps of the grid.
         shape: rows and columns of the grid.
     """
-    first = np.maximum(np.ceil(corners.min(axis=1) - ON_EDGE), 0.0).astype(np.int64)
-    last = np.minimum(np.floor(corners.max(axis=1) + ON_EDGE), np.array(shape) - 1)
+    first = np.maximum(np.ceil(corners.min(axis=1) - LEVELS.edge_tolerance), 0.0).astype(np.int64)
+    last = np.minimum(np.floor(corners.max(axis=1) + LEVELS.edge_tolerance), np.array(shape) - 1)
     size = np.maximum(last.astype(np.int64) - first + 1, 0)
     face, rank = counted(size.prod(axis=1))
     row, column = first[face, 0] + rank // size[face, 1], first[face, 1] + rank % size[face, 1]
@@ -155,7 +166,7 @@ def _covered(
     with np.errstate(divide="ignore", invalid="ignore"):  # one seen from its side covers nothing
         second, third = _area(a, point, c) / _area(a, b, c), _area(a, b, point) / _area(a, b, c)
     weights = np.stack([1.0 - second - third, second, third], axis=1)
-    inside = weights.min(axis=1) >= -ON_EDGE
+    inside = weights.min(axis=1) >= -LEVELS.edge_tolerance
     return face[inside], (row * shape[1] + column)[inside], weights[inside]
 
 

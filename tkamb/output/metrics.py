@@ -8,18 +8,27 @@ from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import SIDES, Array
-from tkamb.run.agreement import UNLOADED
+from tkamb.run.agreement import AGREEMENT
 from tkamb.units import MILLIMETRE, STANDARD_GRAVITY
 
 if TYPE_CHECKING:
     from tkamb.results import Results
 
-JUMP = 8.0 * MILLIMETRE
-MANY_STEPS = 5.0
-"""A centre of pressure that moves by more than JUMP, and by many median steps, from one frame to
+
+@dataclass(frozen=True)
+class MetricSettings:
+    """What counts as a jump of a centre of pressure, and as an unloaded quadriceps."""
+
+    jump: float = 8.0 * MILLIMETRE
+    """m; a centre of pressure that moves farther between two frames may have jumped."""
+    jump_steps: float = 5.0
+    """A centre of pressure that moves by more than `jump`, and by many median steps, from a frame to
 the next has not travelled there."""
-SMALLEST_TENSION = 1.0
-"""N: below this quadriceps tension its ratios are not shown."""
+    least_tension: float = 1.0
+    """N: below this quadriceps tension its ratios are not shown."""
+
+
+METRICS = MetricSettings()
 
 
 @dataclass(frozen=True)
@@ -86,7 +95,7 @@ def moved_per_half_degree(results: "Results") -> Array:
     share = medial_share(results, "deformation")
     moved = 0.5 * np.abs(results["medial_force_per_adduction_N_per_deg"])
     moved = np.minimum(moved, np.abs(results["force_si_N"]))
-    return np.where(np.abs(share - 0.5) < 0.5 - UNLOADED, moved, np.nan)
+    return np.where(np.abs(share - 0.5) < 0.5 - AGREEMENT.unloaded_share, moved, np.nan)
 
 
 def shares_apart(results: "Results") -> Array:
@@ -98,7 +107,7 @@ def tension_ratio(results: "Results", column: str) -> Array:
     """Return a force (f,) relative to the quadriceps tension."""
     quadriceps = results["quadriceps_N"]
     with np.errstate(invalid="ignore"):
-        taut = np.where(quadriceps > SMALLEST_TENSION, quadriceps, np.nan)
+        taut = np.where(quadriceps > METRICS.least_tension, quadriceps, np.nan)
     return results[column] / taut
 
 
@@ -151,7 +160,7 @@ def stretches(points: Array) -> list[slice]:
     """Return the parts, of two points or more, of a path (n, k) m that neither lacks nor jumps."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     known = steps[np.isfinite(steps)]
-    longest = max(JUMP, MANY_STEPS * float(np.median(known))) if len(known) else 0.0
+    longest = max(METRICS.jump, METRICS.jump_steps * float(np.median(known))) if len(known) else 0.0
     near = np.concatenate([[False], steps <= longest, [False]])
     ends = np.flatnonzero(np.diff(near.astype(int))).reshape(-1, 2)
     return [slice(int(first), int(last) + 1) for first, last in ends]

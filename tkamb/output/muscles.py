@@ -19,15 +19,7 @@ from tkamb.geometry.frames import Array
 from tkamb.output.axis import HorizontalAxis
 from tkamb.output.metrics import body_weight
 from tkamb.output.panels import Line, Panel
-from tkamb.output.places import (
-    EDGE,
-    TICK_LABEL,
-    TICKS,
-    label_width,
-    leave_unmeasured,
-    overhang,
-    set_place,
-)
+from tkamb.output.places import LABEL_PLACE, label_width, leave_unmeasured, overhang, set_place
 from tkamb.output.style import (
     BLACK,
     GREY,
@@ -169,8 +161,8 @@ def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
             axes.tick_params(labelbottom=below, labelleft=k % CELLS_ACROSS == 0)
         first.set_ylim(0, HIGHEST)
         first.set_yticks([0, 0.5, 1])
-        low = EDGE / 72 / figure.get_figheight()
-        figure.supxlabel(axis.label, fontsize=TICK_LABEL, y=low, va="bottom")
+        low = LABEL_PLACE.edge_points / 72 / figure.get_figheight()
+        figure.supxlabel(axis.label, fontsize=LABEL_PLACE.tick_label_points, y=low, va="bottom")
         _place_cells((first, *others), rows)
     return figure
 
@@ -178,10 +170,13 @@ def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
 def _place_cells(cells: Sequence[Axes], rows: int) -> None:
     """Put small plots beside and below each other, with room for what stands around them."""
     width, height = 72 * CELLS_ACROSS * CELL[0], 72 * (rows * CELL[1] + MARGIN)
-    left = EDGE + TICKS + label_width(cells[0].yaxis)
+    left = LABEL_PLACE.edge_points + LABEL_PLACE.tick_points + label_width(cells[0].yaxis)
     beyond = overhang(cells[0].xaxis, width / CELLS_ACROSS - left)
-    left, right = max(left, EDGE + beyond[0]), EDGE + beyond[1]
-    gap = max(BETWEEN[0], sum(beyond) + 2 * EDGE)
+    left, right = (
+        max(left, LABEL_PLACE.edge_points + beyond[0]),
+        LABEL_PLACE.edge_points + beyond[1],
+    )
+    gap = max(BETWEEN[0], sum(beyond) + 2 * LABEL_PLACE.edge_points)
     labels_within = LABELS if len(cells) % CELLS_ACROSS and rows > 1 else 0.0
     wide = (width - left - right + gap) / CELLS_ACROSS - gap
     tall = (height - FOOT - TITLE - labels_within + BETWEEN[1]) / rows - BETWEEN[1]

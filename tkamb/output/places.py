@@ -1,16 +1,26 @@
 """Where plots stand in their figures: what their labels need is known, no layout looks for it."""
 
+from dataclasses import dataclass
+
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 
 from tkamb.output.svg import text_width
 
-EDGE = 3.0
-"""Points around all labels of a figure."""
-TICKS = 6.5
-"""Points that ticks with their gap take."""
-TICK_LABEL = 9.0
-"""Points, size of letters."""
+
+@dataclass(frozen=True)
+class LabelPlaceSettings:
+    """Room around the labels of a figure."""
+
+    edge_points: float = 3.0
+    """Points around all labels of a figure."""
+    tick_points: float = 6.5
+    """Points that ticks with their gap take."""
+    tick_label_points: float = 9.0
+    """Points, size of letters."""
+
+
+LABEL_PLACE = LabelPlaceSettings()
 
 
 def set_place(axes: Axes, left: float, bottom: float, wide: float, tall: float) -> None:
@@ -36,7 +46,7 @@ def shown_labels(axis: Axis) -> list[tuple[float, float]]:
     labels = axis.get_major_formatter().format_ticks(list(ticks))
     places = [(tick - low) / (high - low) for tick in ticks]
     return [
-        (place, text_width(label, TICK_LABEL))
+        (place, text_width(label, LABEL_PLACE.tick_label_points))
         for place, label in zip(places, labels, strict=True)
         if 0.0 <= place <= 1.0
     ]

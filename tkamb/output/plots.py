@@ -1,5 +1,6 @@
 """Line plots of a run, drawn in time order against flexion, cycle or time."""
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from tkamb.errors import InputError
 from tkamb.output.axis import HorizontalAxis, horizontal_axis
 from tkamb.output.metrics import failed, flagged
 from tkamb.output.panels import Line, Panel, centre_panel, panels
-from tkamb.output.places import EDGE, TICKS, label_width, leave_unmeasured, set_place
+from tkamb.output.places import LABEL_PLACE, label_width, leave_unmeasured, set_place
 from tkamb.output.style import (
     BLACK,
     GREY,
@@ -40,14 +41,25 @@ FOOT, OVERHANG, AXIS_LABEL = 31.5, 13.0, 13.0
 vertical axis' label."""
 SIDE_LABEL, LEGEND = 8.0, 8.5
 """Points, sizes of letters."""
-LABEL = 12.0
-"""Points from a plot's edge to the near side of an axis' label."""
-SIDE_GAP = 0.01
-"""Of the width, between the axes and what is written beside them."""
+
+
+@dataclass(frozen=True)
+class PlotSettings:
+    """Looks of the report's plots."""
+
+    label_offset_points: float = 12.0
+    """Points from a plot's edge to the near side of an axis' label."""
+    side_gap: float = 0.01
+    """Of the width, between the axes and what is written beside them."""
+    band_opacity: float = 0.16
+    """Opacity of the band around a line, 0 to 1."""
+
+
+PLOT = PlotSettings()
+
 HANDLE, COLUMN_GAP = 2.7, 1.4
 """Of a legend's letters: a handle with its gap, and the gap between columns."""
 DASHES = (0, (4, 2))
-BAND_OPACITY = 0.16
 SPAN = "#e2e2e2"
 
 
@@ -151,7 +163,10 @@ def _place_alone(axes: Axes, panel: Panel) -> bool:
     if any(side.get_major_formatter().get_offset() for side in sides):
         return False
     left, *others = (
-        EDGE + TICKS + width + (AXIS_LABEL if side.get_label_text() else 0.0)
+        LABEL_PLACE.edge_points
+        + LABEL_PLACE.tick_points
+        + width
+        + (AXIS_LABEL if side.get_label_text() else 0.0)
         for side, width in zip(sides, widths, strict=True)
     )
     words = [one[-1] for one in (panel.level, panel.span) if one]
@@ -160,16 +175,18 @@ def _place_alone(axes: Axes, panel: Panel) -> bool:
     figure = axes.get_figure(root=True)
     assert figure is not None
     width, height = 72 * figure.get_size_inches()
-    right = max(EDGE + outside + SIDE_GAP * width, OVERHANG, *others)
+    right = max(LABEL_PLACE.edge_points + outside + PLOT.side_gap * width, OVERHANG, *others)
     columns = _legend_columns(panel)
-    if _legend_width(panel, columns) > width - left - EDGE:
+    if _legend_width(panel, columns) > width - left - LABEL_PLACE.edge_points:
         return False
     rows = -(-len(panel.lines) // columns)
-    top = EDGE + LEGEND * (1.0 + rows + 0.5 * (rows - 1))
+    top = LABEL_PLACE.edge_points + LEGEND * (1.0 + rows + 0.5 * (rows - 1))
     wide, tall = width - left - right, height - FOOT - top
     set_place(axes, left, FOOT, wide, tall)
-    axes.xaxis.set_label_coords(0.5, (LABEL - FOOT) / tall)
-    for side, place in zip(sides, (LABEL, width - LABEL), strict=False):
+    axes.xaxis.set_label_coords(0.5, (PLOT.label_offset_points - FOOT) / tall)
+    for side, place in zip(
+        sides, (PLOT.label_offset_points, width - PLOT.label_offset_points), strict=False
+    ):
         side.set_label_coords((place - left) / wide, 0.5, axes.transAxes)
     for axis in (axes.xaxis, *sides):
         leave_unmeasured(axis)
@@ -221,7 +238,7 @@ def _draw_band(axes: Axes, line: Line, axis: HorizontalAxis) -> None:
     """Shade a line's 5 to 95 % and dot its median."""
     assert line.band is not None
     (x, low), (_, middle), (_, high) = (axis.broken(one) for one in line.band)
-    opacity, name = BAND_OPACITY, f"band-{line.name}"
+    opacity, name = PLOT.band_opacity, f"band-{line.name}"
     axes.fill_between(x, low, high, color=line.colour, alpha=opacity, linewidth=0, gid=name)
     axes.plot(x, middle, color=line.colour, linestyle=":", linewidth=1, gid=f"median-{line.name}")
 

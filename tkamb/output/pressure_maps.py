@@ -5,6 +5,7 @@ insert; for a left knee, which is mirrored at input, the picture is mirrored bac
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,10 +29,22 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 if TYPE_CHECKING:
     from tkamb.results import Results
 
-MARGIN_MM = 2.0
-"""Around the insert in a picture."""
-STEP_MM = 0.3
-"""Between the points of the grid that pressures are drawn on."""
+
+@dataclass(frozen=True)
+class PressurePictureSettings:
+    """Looks of the pressure maps."""
+
+    margin_mm: float = 2.0
+    """Around the insert in a picture."""
+    step_mm: float = 0.3
+    """Between the points of the grid that pressures are drawn on."""
+    rim_share: float = 0.03
+    """Share of the scale over which a flat map fades at its rim; elsewhere it fades from
+one point of the grid to the next, so that no steps are seen there."""
+
+
+PRESSURE_PICTURE = PressurePictureSettings()
+
 LABEL_GAP_MM, LABEL_STEP_MM = 4.0, 2.6
 """From a path to its labels, and between two of them."""
 EDGE, ABOVE, BELOW, BETWEEN = 3.0, 17.0, 18.0, 6.0
@@ -39,9 +52,6 @@ EDGE, ABOVE, BELOW, BETWEEN = 3.0, 17.0, 18.0, 6.0
 other."""
 BAR_LABELS, BAR_RATIO = 41.0, 30.0
 """Points right of a colour bar for its labels; its height over its width."""
-RIM = 0.03
-"""Share of the scale over which a map fades at its rim where it is flat; elsewhere it fades from
-one point of the grid to the next, so that no steps are seen there."""
 
 
 class TopView:
@@ -60,7 +70,7 @@ class TopView:
         self.across = self.sign * points[:, 2] / MILLIMETRE
         self.up = points[:, 0] / MILLIMETRE
         self.triangles = maps.triangles
-        self.grid = PageGrid(points, self.triangles, self.sign, STEP_MM)
+        self.grid = PageGrid(points, self.triangles, self.sign, PRESSURE_PICTURE.step_mm)
         self.grey = self.grid.sample(_shade(points, self.triangles))
 
     def page_coordinates(self, ap: Array, ml: Array) -> tuple[Array, Array]:
@@ -70,12 +80,16 @@ class TopView:
     @property
     def across_limits(self) -> tuple[float, float]:
         """Left and right end of the picture, mm."""
-        return float(self.across.min() - MARGIN_MM), float(self.across.max() + MARGIN_MM)
+        return float(self.across.min() - PRESSURE_PICTURE.margin_mm), float(
+            self.across.max() + PRESSURE_PICTURE.margin_mm
+        )
 
     @property
     def up_limits(self) -> tuple[float, float]:
         """Lower and upper end of the picture, mm."""
-        return float(self.up.min() - MARGIN_MM), float(self.up.max() + MARGIN_MM)
+        return float(self.up.min() - PRESSURE_PICTURE.margin_mm), float(
+            self.up.max() + PRESSURE_PICTURE.margin_mm
+        )
 
     def draw_insert(self, axes: Axes) -> None:
         """Draw the insert in greys that show its dishes, and dress the axes."""
@@ -251,7 +265,9 @@ def draw_pressure(
         level = level[part]
         picture = colormaps[PRESSURE_MAP](np.maximum(level, 0.0), bytes=True)
         change = np.hypot(*np.gradient(level))  # from point to point of the grid
-        picture[..., 3] = 255 * np.clip(0.5 + level / np.maximum(change, RIM), 0.0, 1.0)
+        picture[..., 3] = 255 * np.clip(
+            0.5 + level / np.maximum(change, PRESSURE_PICTURE.rim_share), 0.0, 1.0
+        )
         _show(axes, picture, view.grid.extent(*part), 1.5)
 
 

@@ -8,7 +8,7 @@ from tkamb.geometry.frames import Mask
 from tkamb.known_errors import is_large, known_error_words
 from tkamb.output import metrics
 from tkamb.output.headline import PRESSURE_AND_AREA
-from tkamb.run.agreement import SHARES_APART
+from tkamb.run.agreement import AGREEMENT
 
 if TYPE_CHECKING:
     from tkamb.results import Results
@@ -65,7 +65,7 @@ def _split(results: "Results") -> tuple[list[str], list[str]]:
     if not np.isfinite(metrics.medial_share(results, "equilibrium")).any():
         return [], []
     unknown = metrics.split_undetermined(results)
-    apart = (metrics.shares_apart(results) > SHARES_APART) & ~unknown
+    apart = (metrics.shares_apart(results) > AGREEMENT.share_difference) & ~unknown
     bad = []
     if unknown.any():
         bad = [

@@ -6,6 +6,7 @@ needs a large force that nothing modelled gives, or where a condyle carries noth
 asked for that, something in the input is wrong or unknown: the frame is flagged.
 """
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,17 +18,26 @@ if TYPE_CHECKING:
     from tkamb.equilibrium.mechanics import FrameLoads
     from tkamb.scene.case import Case
 
-SHARES_APART = 0.25
-"""Two estimates of the medial share that differ by more contradict each other."""
-LARGE_RESIDUAL = 0.10
-"""Of the superior-inferior contact force: a larger AP and ML residual is flagged."""
-UNLOADED = 0.01
-"""Of the load: a condyle that carries less carries nothing."""
-ADDUCTION_KNOWN = 0.5 * DEGREE
-"""How well fluoroscopy knows the adduction."""
-MOVED_SHARE = 0.25
-"""Of the load: where the adduction's error moves more, the split by deformation is not
+
+@dataclass(frozen=True)
+class AgreementSettings:
+    """When two estimates contradict each other."""
+
+    share_difference: float = 0.25
+    """Two estimates of the medial share that differ by more contradict each other."""
+    large_residual_share: float = 0.10
+    """Of the superior-inferior contact force: a larger AP and ML residual is flagged."""
+    unloaded_share: float = 0.01
+    """Of the load: a condyle that carries less carries nothing."""
+    adduction_error: float = 0.5 * DEGREE
+    """How well fluoroscopy knows the adduction."""
+    moved_load_share: float = 0.25
+    """Of the load: where the adduction's error moves more, the split by deformation is not
 determined by the recorded pose."""
+
+
+AGREEMENT = AgreementSettings()
+
 
 NAN = float("nan")
 
@@ -40,17 +50,17 @@ def contradictions(case: "Case", body: "FrameLoads", contact: "FrameContact | No
     values = body.loads.values
     load = abs(float(body.loads.contact_force[1]))
     residual = float(np.hypot(values.get("residual_ap", 0.0), values.get("residual_ml", 0.0)))
-    if residual > LARGE_RESIDUAL * load:
+    if residual > AGREEMENT.large_residual_share * load:
         words.append(f"residual AP and ML force is {_percent(residual, load)} of the contact force")
     if contact is None or contact.result is None or case.split is None:
         return words
     share, balanced = share_by_deformation(contact), share_by_equilibrium(body)
-    if abs(share - balanced) > SHARES_APART:
+    if abs(share - balanced) > AGREEMENT.share_difference:
         words.append(
             f"medial share {share:.2f} by deformation contradicts {balanced:.2f} by equilibrium"
         )
     for side, own in (("medial", share), ("lateral", 1.0 - share)):
-        if own < UNLOADED and side not in body.loads.lifted:
+        if own < AGREEMENT.unloaded_share and side not in body.loads.lifted:
             words.append(f"{side} condyle carries nothing by deformation")
     return words
 
@@ -90,11 +100,11 @@ def split_determined(body: "FrameLoads", contact: "FrameContact") -> float:
     """
     if np.isnan(contact.sensitivity):
         return NAN
-    moved = abs(contact.sensitivity) * ADDUCTION_KNOWN
+    moved = abs(contact.sensitivity) * AGREEMENT.adduction_error
     load = abs(float(body.loads.contact_force[1]))
     share, balanced = share_by_deformation(contact), share_by_equilibrium(body)
-    alone = min(share, 1.0 - share) < UNLOADED < abs(share - balanced)
-    return float(moved <= MOVED_SHARE * load and not alone)
+    alone = min(share, 1.0 - share) < AGREEMENT.unloaded_share < abs(share - balanced)
+    return float(moved <= AGREEMENT.moved_load_share * load and not alone)
 
 
 def _percent(part: float, whole: float) -> str:

@@ -9,6 +9,7 @@ import pickle
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +19,20 @@ if TYPE_CHECKING:
     from tkamb.run.workers import Numbered, Task
 
 LOCAL = "local"
-PATIENCE = 10.0
-"""s that a scheduler may take to answer."""
-MOST_DEATHS = 5
-"""Workers that may die under one job before it is taken to be what kills them."""
+
+
+@dataclass(frozen=True)
+class ClusterSettings:
+    """Patience with a Dask cluster."""
+
+    answer_seconds: float = 10.0
+    """s that a scheduler may take to answer."""
+    most_deaths: int = 5
+    """Workers that may die under one job before it is taken to be what kills them."""
+
+
+CLUSTER = ClusterSettings()
+
 LOST = "what is finished is kept: go on with --resume"
 
 
@@ -68,14 +79,14 @@ def _library() -> Any:
     except ImportError:
         mend = "pip install 'tkamb[cluster]'"
         raise InputError("Dask is not installed", "--dask", mend) from None
-    dask.config.set({"distributed.scheduler.allowed-failures": MOST_DEATHS})
+    dask.config.set({"distributed.scheduler.allowed-failures": CLUSTER.most_deaths})
     return distributed
 
 
 def _connected(distributed: Any, place: Any, address: str) -> Any:
     """Return a client of the scheduler."""
     try:
-        return distributed.Client(place, timeout=PATIENCE)
+        return distributed.Client(place, timeout=CLUSTER.answer_seconds)
     except (OSError, ValueError, TypeError) as error:  # no answer; no address
         raise InputError(
             f"no Dask scheduler answers at '{address}' ({type(error).__name__})",
@@ -97,7 +108,7 @@ def _answers(
                 raise ComputationError("the Dask scheduler is gone", "--dask", LOST)
             yield futures.pop(future), future.result()
     except distributed.KilledWorker:
-        what = f"a job killed {MOST_DEATHS} workers"
+        what = f"a job killed {CLUSTER.most_deaths} workers"
         raise ComputationError(what, "--dask", f"is there memory for it? {LOST}") from None
     except OSError as error:  # dask's CommClosedError among them
         raise ComputationError(f"the Dask scheduler is gone ({error})", "--dask", LOST) from None

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -22,14 +22,22 @@ if TYPE_CHECKING:
     from tkamb.equilibrium.contact_side import ContactSide
     from tkamb.equilibrium.frame_contact import FrameContact
 
-LAST_FRAMES = 20
-"""How many contacts are kept as guesses for the next."""
 
-CHUNK = 10
-"""Frames that a worker computes in a row: the first of them has no guess from the one before.
+@dataclass(frozen=True)
+class FrameLoopSettings:
+    """How frames are shared and which contacts are kept as guesses."""
+
+    kept_contacts: int = 20
+    """How many contacts are kept as guesses for the next."""
+    frames_per_chunk: int = 10
+    """Frames that a worker computes in a row: the first of them has no guess from the one before.
 
 The same for any number of workers, so that their number changes no answer.
 """
+
+
+FRAME_LOOP = FrameLoopSettings()
+
 
 Finished = tuple[int, Row, dict[str, Array] | None]
 """Number, row and the contact's arrays (`tkamb.run.recall`; None if it failed or is not there)."""
@@ -82,7 +90,7 @@ class FrameSolver:
         if contact.result is not None:
             self.before = [_without_warm_start(earlier) for earlier in self.before]
         self.before.append(contact)
-        del self.before[:-LAST_FRAMES]
+        del self.before[: -FRAME_LOOP.kept_contacts]
 
     @cached_property
     def side(self) -> "ContactSide | None":
@@ -152,7 +160,7 @@ def finished_in_order(
     """
     chunks: dict[int, Chunk] = {}
     for k in left:
-        chunks.setdefault(indices.index(k) // CHUNK, ([], slips))[0].append(k)
+        chunks.setdefault(indices.index(k) // FRAME_LOOP.frames_per_chunk, ([], slips))[0].append(k)
     early: dict[int, list[Finished]] = {}
     turn = iter(chunks)
     expected: Any = next(turn, None)

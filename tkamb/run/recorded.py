@@ -4,6 +4,7 @@ Nothing of this is imported unless the scene has [measured] or [muscles.emg].
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,10 +27,19 @@ PREDICTED = {
 """What is measured -> the columns that predict it, the first that holds a number."""
 LAGS = np.arange(-40, 41) * 0.005
 """s: where the largest cross-correlation is sought, 0.2 s to either side."""
-FLAT = 1e-6
-"""By how much the largest correlation exceeds those at the ends, where it is a maximum."""
-FEWEST_FRAMES = 8
-"""Frames below which nothing is said of correlation and lag."""
+
+
+@dataclass(frozen=True)
+class ComparisonSettings:
+    """How predicted and measured courses are compared."""
+
+    least_correlation_rise: float = 1e-6
+    """By how much the largest correlation exceeds those at the ends, where it is a maximum."""
+    fewest_frames: int = 8
+    """Frames below which nothing is said of correlation and lag."""
+
+
+COMPARISON = ComparisonSettings()
 
 
 def recorded_row(case: Case, k: int) -> dict[str, float]:
@@ -202,7 +212,7 @@ def _pearson(a: Array, b: Array) -> float:
 
 def _correlations(a: Array, rows: Array) -> Array:
     """Return Pearson's r (m,) of a (n,) and each row (m, n); NaN as `_pearson`."""
-    if len(a) < FEWEST_FRAMES:
+    if len(a) < COMPARISON.fewest_frames:
         return np.full(len(rows), np.nan)
     varied = (np.ptp(rows, axis=1) > 0.0) & (np.ptp(a) > 0.0)
     own, others = a - a.mean(), rows - rows.mean(axis=1, keepdims=True)
@@ -215,6 +225,6 @@ def _lag(envelopes: "Envelopes", muscle: str, time: Array, activation: Array) ->
     shifted = envelopes.at(muscle, time - LAGS[:, None])
     known = np.isfinite(shifted).all(axis=0)
     r = _correlations(activation[known], shifted[:, known])
-    if not r.max() > max(r[0], r[-1]) + FLAT:  # NaN too
+    if not r.max() > max(r[0], r[-1]) + COMPARISON.least_correlation_rise:  # NaN too
         return np.nan
     return float(LAGS[r.argmax()])

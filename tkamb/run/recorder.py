@@ -11,6 +11,7 @@ import threading
 import time as clock
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,10 +25,19 @@ if TYPE_CHECKING:
     from tkamb.results import Results
 
 MAPS = ("pressure", "gap", "nodal_force", "pose", *CONTACT_PLACES)
-SHORTEST_PAUSE = 1.0
-"""s to the first copy of what is finished, and between two."""
-DEAREST_SHARE = 0.02
-"""Of the computing time that the copies may take."""
+
+
+@dataclass(frozen=True)
+class RecorderSettings:
+    """How often finished frames are written."""
+
+    shortest_pause_seconds: float = 1.0
+    """s to the first copy of what is finished, and between two."""
+    largest_time_share: float = 0.02
+    """Of the computing time that the copies may take."""
+
+
+RECORDER = RecorderSettings()
 
 
 class Recorder:
@@ -120,7 +130,7 @@ class FolderRecorder(Recorder):
         self._directory = directory
         self._shards = Shards(directory, identity, resume)
         self._maps_path = self._shards.folder / MAPS_NAME
-        self._pause, self._shown = SHORTEST_PAUSE, clock.perf_counter()
+        self._pause, self._shown = RECORDER.shortest_pause_seconds, clock.perf_counter()
         self._map_arguments: tuple[Any, ...] | None = None
 
     def begin_maps(self, points: Array, triangles: Array, labels: Mapping[str, Any]) -> None:
@@ -179,7 +189,9 @@ class FolderRecorder(Recorder):
             put_numbers(results, files)
             files.remove(REPORT_NAME)
         self._shown = clock.perf_counter()
-        self._pause = max(SHORTEST_PAUSE, (self._shown - start) / DEAREST_SHARE)
+        self._pause = max(
+            RECORDER.shortest_pause_seconds, (self._shown - start) / RECORDER.largest_time_share
+        )
         return results
 
 

@@ -1,6 +1,7 @@
 """The status of a frame in words: "ok", why it failed, or what a reader must know."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,19 +14,26 @@ from tkamb.units import DEGREE, MILLIMETRE
 if TYPE_CHECKING:
     from tkamb.equilibrium.frame_contact import FrameContact
 
-FILTER_TRANSLATION = 0.5 * MILLIMETRE
-FILTER_ROTATION = 0.5 * DEGREE
-"""Where filtering moves a pose by more than fluoroscopy errs, the frame is flagged."""
 
-FLANK = 20.0 * DEGREE
-"""A condyle whose contact normal leans by more than this runs against eminence or lip: the
+@dataclass(frozen=True)
+class StatusSettings:
+    """Limits beyond which a frame's status carries a flag."""
+
+    filter_translation: float = 0.5 * MILLIMETRE
+    """m; where filtering moves a pose by more than fluoroscopy errs, the frame is flagged."""
+    filter_rotation: float = 0.5 * DEGREE
+    """Where filtering moves a pose by more than fluoroscopy errs, the frame is flagged."""
+    flank_angle: float = 20.0 * DEGREE
+    """A condyle whose contact normal leans by more than this runs against eminence or lip: the
 recorded position, the ML one above all, deserves a look."""
+    adjusted_total_BW: float = 0.01
+    """BW: a femoral adjustment that changes the total force by more decides more than the split."""
+    marker_distance: float = 20.0 * MILLIMETRE
+    """Skin that has moved by more than this against the other segment's: at 700 N 14 N·m."""
 
-ADJUSTED_TOTAL = 0.01
-"""BW: a femoral adjustment that changes the total force by more decides more than the split."""
 
-MARKERS_APART = 20.0 * MILLIMETRE
-"""Skin that has moved by more than this against the other segment's: at 700 N 14 N·m."""
+STATUS = StatusSettings()
+
 
 PATELLA_ACROSS = 0.03
 """Share of the patellofemoral force that may act across the button's normal where the patella's
@@ -92,7 +100,7 @@ def _flank_flags(body: FrameLoads) -> list[str]:
     found = []
     for side, condyle in body.geometry.condyles.items():
         lean = float(np.arccos(np.clip(condyle.normal[1], -1.0, 1.0)))
-        if lean > FLANK and side not in body.loads.lifted:
+        if lean > STATUS.flank_angle and side not in body.loads.lifted:
             found.append(f"{side} contact on a flank, normal {lean / DEGREE:.0f} deg from vertical")
     return found
 
@@ -101,7 +109,7 @@ def _adjustment_flags(case: Case, body: FrameLoads) -> list[str]:
     if body.effect is None or body.loads.problems:
         return []
     change = abs(body.effect.force) / case.body_weight
-    if change <= ADJUSTED_TOTAL:
+    if change <= STATUS.adjusted_total_BW:
         return []
     return [f"femoral adjustment changes the total force by {change:.2f} BW: {body.effect.cause}"]
 
@@ -124,15 +132,15 @@ def _patella_flags(case: Case, body: FrameLoads) -> list[str]:
 
 def _motion_flags(case: Case, k: int) -> list[str]:
     motion = case.motion
-    far = motion.deviation_translation[k] > FILTER_TRANSLATION
-    turned = motion.deviation_rotation[k] > FILTER_ROTATION
+    far = motion.deviation_translation[k] > STATUS.filter_translation
+    turned = motion.deviation_rotation[k] > STATUS.filter_rotation
     found = ["filter moves the recorded pose beyond 0.5 mm or 0.5 deg"] if far or turned else []
     if motion.markers is not None:
         time = motion.time[k : k + 1]
         if motion.markers.at(motion.markers.missing.astype(float), time)[0] > 0:
             found.append("a marker of shank or thigh is missing")
         apart = motion.markers.at(motion.markers.centre_distance, time)[0]
-        if apart > MARKERS_APART:
+        if apart > STATUS.marker_distance:
             found.append(
                 f"knee centres of shank and thigh markers {apart / MILLIMETRE:.0f} mm apart"
             )

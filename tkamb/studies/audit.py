@@ -14,6 +14,7 @@ bounds are the largest of those distances as measured, rounded up.
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -25,11 +26,20 @@ from tkamb.studies.cases import content_hash
 from tkamb.studies.extremes import Extreme
 from tkamb.studies.quantities import Quantities, errors, quantities
 
-CARRIED = 0.005
-"""Relative: forces, pressures and condyles against the load."""
-PASSED = 5e-3
-"""Of the approach: how far a node may be inside the femoral component, a few times the solver's
+
+@dataclass(frozen=True)
+class AuditSettings:
+    """What an answer must fulfil whatever its reference."""
+
+    force_tolerance: float = 0.005
+    """Relative: forces, pressures and condyles against the load."""
+    penetration_tolerance: float = 5e-3
+    """Of the approach: how far a node may be inside the femoral component, a few times the solver's
 tolerance."""
+
+
+AUDIT = AuditSettings()
+
 PEER_ANSWERS = Path(__file__).with_name("peer_answers.json")
 PEER_BOUNDS = {"approach": 0.035, "force": 0.01, "mean_pressure": 0.09, "peak_pressure": 0.09}
 """Largest relative distance from CalculiX."""
@@ -63,18 +73,21 @@ def complaints(result: ContactResult, load: float, solved: bool, source_rule: bo
     ]
     if result.pressure.min() < 0:
         found.append("a pressure is negative")
-    if by_sides < (1 - CARRIED) * load or by_sides > (1 + CARRIED) * force.sum():
+    if (
+        by_sides < (1 - AUDIT.force_tolerance) * load
+        or by_sides > (1 + AUDIT.force_tolerance) * force.sum()
+    ):
         found.append(f"the condyles carry {by_sides:.4g} N of {load:.4g} N")
-    if solved and abs(peak - highest) > CARRIED * highest:
+    if solved and abs(peak - highest) > AUDIT.force_tolerance * highest:
         found.append(f"the condyles' peak is {peak / highest:.4g} of the map's")
     deepest = -float(np.nanmin(result.gap))
-    if solved and deepest > PASSED * result.approach:
+    if solved and deepest > AUDIT.penetration_tolerance * result.approach:
         found.append(f"a node is {1e6 * deepest:.3g} µm inside the femoral component")
     return [words for words in found if words]
 
 
 def _off(what: str, found: float, wanted: float) -> str:
-    if math.isclose(found, wanted, rel_tol=CARRIED):
+    if math.isclose(found, wanted, rel_tol=AUDIT.force_tolerance):
         return ""
     return f"{what} {found / wanted:.4f} of what they must"
 

@@ -19,11 +19,21 @@ from tkamb.memory import peak_rss
 from tkamb.studies.measures import ONE_THREAD
 
 PROGRAM = "ccx"
-LONGEST_SECONDS = 600.0
-"""A run that takes longer is stopped and says so."""
+
+
+@dataclass(frozen=True)
+class CalculixSettings:
+    """How long CalculiX may take."""
+
+    longest_seconds: float = 600.0
+    """A run that takes longer is stopped and says so."""
+    poll_seconds: float = 0.05
+    """Between two looks at the process's memory."""
+
+
+CALCULIX = CalculixSettings()
+
 OUTPUT_FILE = "output"
-POLL_SECONDS = 0.05
-"""Between two looks at the process's memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +65,7 @@ def find_program() -> str:
     return found
 
 
-def run_calculix(text: str, longest: float = LONGEST_SECONDS) -> PeerRun:
+def run_calculix(text: str, longest: float = CALCULIX.longest_seconds) -> PeerRun:
     """Run a deck.
 
     Args:
@@ -97,7 +107,7 @@ def _wait(command: list[str], place: Path, longest: float) -> float:
                 if clock.perf_counter() - start > longest:
                     raise ComputationError(f"stopped after {longest:g} s", "CalculiX")
                 with suppress(subprocess.TimeoutExpired):
-                    process.wait(POLL_SECONDS)
+                    process.wait(CALCULIX.poll_seconds)
         finally:
             process.kill()
     if process.returncode:

@@ -43,14 +43,24 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 CURVE = {"alpha": 0.0389, "reference_stress": 8.4194 * MEGAPASCAL, "exponent": 4.5485}
 """Of the polyethylene of these cases, as published; see `docs/contact.md`."""
-SIDE_MM = 24.0
-"""Of the block under the plate: divides by the cells of 2 and 3 mm."""
-KEPT_GRID_MM = 0.9
-"""Cells small enough that the operator of the block is worth a file."""
-SHARMA_APPROACH = 0.6808
-"""Approach of Sharma's springs under the plate over that of the solid they stand for: nu is
+
+
+@dataclass(frozen=True)
+class ClosedFormSettings:
+    """Bodies with an analytic solution."""
+
+    block_side_mm: float = 24.0
+    """Of the block under the plate: divides by the cells of 2 and 3 mm."""
+    kept_grid_mm: float = 0.9
+    """Cells small enough that the operator of the block is worth a file."""
+    sharma_approach_ratio: float = 0.6808
+    """Approach of Sharma's springs under the plate over that of the solid they stand for: nu is
 0.35 whatever the material, and they are too stiff at free sides. A number of its own, kept so
 that a change is seen."""
+
+
+CLOSED_FORM = ClosedFormSettings()
+
 TOLERANCES: dict[str, tuple[float, float]] = {
     "plate": (5e-3, 0.01),
     "kept": (5e-3, 0.01),
@@ -108,7 +118,11 @@ class ClosedForm:
     def pair(self) -> ContactPair:
         """The two bodies."""
         thick = self.thickness_mm * MILLIMETRE
-        side = SIDE_MM * MILLIMETRE if self.plate else 2.5 * self.radius_mm**0.5 * 1.6e-3 + 6e-3
+        side = (
+            CLOSED_FORM.block_side_mm * MILLIMETRE
+            if self.plate
+            else 2.5 * self.radius_mm**0.5 * 1.6e-3 + 6e-3
+        )
         side = 6e-3 * round(side / 6e-3)
         insert = block(flat(thick), (side, side), 3e-3)
         femoral = _plate(2 * side) if self.plate else balls(self.radius_mm * MILLIMETRE, 0.0)
@@ -167,12 +181,12 @@ def solution(case: ClosedForm) -> tuple[float, float]:
     load, thick = case.load_N, case.thickness_mm * MILLIMETRE
     young, radius = case.modulus_MPa * MEGAPASCAL, case.radius_mm * MILLIMETRE
     if case.plate:
-        stress = load / (SIDE_MM * MILLIMETRE) ** 2
+        stress = load / (CLOSED_FORM.block_side_mm * MILLIMETRE) ** 2
         strain = _strain(case, stress)
         if case.model == "foundation":
             strain = 1.0 - np.exp(-strain)
         if case.model == "lattice-source":
-            strain *= SHARMA_APPROACH
+            strain *= CLOSED_FORM.sharma_approach_ratio
         return thick * strain, stress
     if case.kind == "layer":
         layer = sphere_on_layer(radius, thick, load, young, case.nu)
@@ -195,7 +209,7 @@ def closed_forms(quick: bool) -> Iterator[ClosedForm]:
     for model in (*solids, "lattice-source", "foundation", "foundation-linear"):
         yield ClosedForm("plate", model)
     yield ClosedForm("slide", "lattice", 10000.0, nu=0.45)
-    yield ClosedForm("kept", "lattice-linear", resolution_mm=KEPT_GRID_MM)
+    yield ClosedForm("kept", "lattice-linear", resolution_mm=CLOSED_FORM.kept_grid_mm)
     yield ClosedForm("hertz", "hertz", 100.0, 10.0, nu=0.45, radius_mm=22.0, resolution_mm=1.0)
     yield _wide("layer", "lattice-linear", linear=True)
     for model in ("foundation", "foundation-linear"):
@@ -228,7 +242,7 @@ def _more_closed_forms(solids: tuple[str, ...]) -> Iterator[ClosedForm]:
         yield _wide("bed", model, load)
     for load, nu in product((100.0, 1000.0), (0.0, 0.4999)):
         yield ClosedForm("hertz", "hertz", load, 30.0, nu=nu, radius_mm=22.0, resolution_mm=1.0)
-    yield ClosedForm("kept", "fe", resolution_mm=KEPT_GRID_MM)
+    yield ClosedForm("kept", "fe", resolution_mm=CLOSED_FORM.kept_grid_mm)
 
 
 def _strain(case: ClosedForm, stress: float) -> float:
@@ -261,7 +275,7 @@ def _column(case: ClosedForm) -> Callable[[float], float]:
 def _inner(result: ContactResult) -> Mask:
     """Return the points a fifth of the block's side away from its edges."""
     across = np.abs(result.points[:, [0, 2]]).max(axis=1)
-    inner: Mask = across < 0.3 * SIDE_MM * MILLIMETRE
+    inner: Mask = across < 0.3 * CLOSED_FORM.block_side_mm * MILLIMETRE
     return inner
 
 

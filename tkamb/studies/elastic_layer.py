@@ -16,9 +16,18 @@ from scipy.special import ellipe, ellipk, j0, j1
 
 from tkamb.geometry.frames import Array
 
-RINGS = 160
-WIDEST = 60.0
-"""Wave number times thickness beyond which the layer is a half space."""
+
+@dataclass(frozen=True)
+class ElasticLayerSettings:
+    """The numerical solution of a layer under a sphere."""
+
+    rings: int = 160
+    """Rings of constant pressure under the sphere."""
+    half_space_wave_number: float = 60.0
+    """Wave number times thickness beyond which the layer is a half space."""
+
+
+ELASTIC_LAYER = ElasticLayerSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,18 +71,20 @@ def _indented(
     radius: float, thickness: float, contact: float, young: float, nu: float
 ) -> tuple[LayerContact, float]:
     """Return the contact of a given radius and its load (N)."""
-    angle = np.linspace(0.0, np.pi / 2, RINGS + 1)
+    angle = np.linspace(0.0, np.pi / 2, ELASTIC_LAYER.rings + 1)
     edges, middles = contact * np.sin(angle), contact * np.sin((angle[1:] + angle[:-1]) / 2)
     disk = _disks(middles, edges[1:], thickness, young, nu)
-    full = np.zeros((RINGS + 1, RINGS + 1))
-    full[:RINGS, :RINGS] = disk - np.column_stack([np.zeros(RINGS), disk[:, :-1]])
-    full[:RINGS, RINGS] = -1.0
+    full = np.zeros((ELASTIC_LAYER.rings + 1, ELASTIC_LAYER.rings + 1))
+    full[: ELASTIC_LAYER.rings, : ELASTIC_LAYER.rings] = disk - np.column_stack(
+        [np.zeros(ELASTIC_LAYER.rings), disk[:, :-1]]
+    )
+    full[: ELASTIC_LAYER.rings, ELASTIC_LAYER.rings] = -1.0
     root = np.sqrt(1 - (middles[-2:] / contact) ** 2)
-    full[RINGS, RINGS - 2 : RINGS] = [root[1], -root[0]]
+    full[ELASTIC_LAYER.rings, ELASTIC_LAYER.rings - 2 : ELASTIC_LAYER.rings] = [root[1], -root[0]]
     solution = np.linalg.solve(full, np.append(-(middles**2) / (2 * radius), 0.0))
-    pressure = solution[:RINGS]
+    pressure = solution[: ELASTIC_LAYER.rings]
     force = float(pressure @ (np.pi * np.diff(edges**2)))
-    return LayerContact(contact, float(solution[RINGS]), middles, pressure), force
+    return LayerContact(contact, float(solution[ELASTIC_LAYER.rings]), middles, pressure), force
 
 
 def _disks(at: Array, radii: Array, thickness: float, young: float, nu: float) -> Array:
@@ -84,12 +95,12 @@ def _disks(at: Array, radii: Array, thickness: float, young: float, nu: float) -
     outside = 4 * r / np.pi * (ellipe(share) - (1 - share) * ellipk(share))
     half_space = np.where(r < b, inside, outside) / 2
     nodes, weights = np.polynomial.legendre.leggauss(400)
-    w = (nodes + 1) * WIDEST / 2
+    w = (nodes + 1) * ELASTIC_LAYER.half_space_wave_number / 2
     k, kappa = w / thickness, 3 - 4 * nu
     layer = (2 * kappa * np.sinh(2 * w) - 4 * w) / (
         2 * kappa * np.cosh(2 * w) + 1 + kappa**2 + 4 * w**2
     ) - 1
     transform = radii[:, None] * j1(k[None] * radii[:, None]) / k
-    step = layer * weights * WIDEST / 2 / thickness
+    step = layer * weights * ELASTIC_LAYER.half_space_wave_number / 2 / thickness
     rest = j0(k[None] * at[:, None]) @ (step * transform).T
     return 2 * (1 - nu**2) / young * (half_space + rest)

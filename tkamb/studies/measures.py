@@ -27,13 +27,23 @@ from tkamb.memory import peak_rss
 from tkamb.studies.cases import StudyCase, study_case
 from tkamb.studies.quantities import Quantities, quantities, raster_map
 
-LONGEST_SECONDS = 300.0
-"""A job that takes longer is stopped and says so."""
-REPEATS = 3
-"""Of preparing and pressing for the first time; of warm presses at least."""
-WARM_PRESSES = 7
-ENOUGH_SECONDS = 3.0
-"""No more repeats once this much was measured; warm presses: `REPEATS` in any case."""
+
+@dataclass(frozen=True)
+class MeasureSettings:
+    """How times of the trade-off study are measured."""
+
+    longest_seconds: float = 300.0
+    """A job that takes longer is stopped and says so."""
+    repeats: int = 3
+    """Of preparing and pressing for the first time; of warm presses at least."""
+    warm_presses: int = 7
+    """Presses from a neighbouring pose that are timed."""
+    enough_seconds: float = 3.0
+    """No more repeats once this much was measured; warm presses: `REPEATS` in any case."""
+
+
+MEASURE = MeasureSettings()
+
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", threads.VARIABLE), "1"
 )
@@ -102,7 +112,7 @@ class Measure:
     map: dict[str, float] = field(default_factory=dict)
 
 
-def measure_apart(job: Job, longest: float = LONGEST_SECONDS) -> Measure:
+def measure_apart(job: Job, longest: float = MEASURE.longest_seconds) -> Measure:
     """Measure in a new process."""
     command = [sys.executable, "-m", "tkamb.studies.measures"]
     try:
@@ -166,13 +176,15 @@ def _first(
         cold, result = _timed(model.press, state, case.load, case.pose)
         prepares.append(prepare)
         colds.append(cold)
-        if len(colds) == REPEATS or sum(prepares) + sum(colds) > ENOUGH_SECONDS:
+        if len(colds) == MEASURE.repeats or sum(prepares) + sum(colds) > MEASURE.enough_seconds:
             return (median(prepares), median(colds)), (case, state, result)
 
 
 def _warm(model: ContactModel, state: Any, case: StudyCase, guess: ContactResult) -> float:
     seconds: list[float] = []
-    while len(seconds) < REPEATS or (len(seconds) < WARM_PRESSES and sum(seconds) < ENOUGH_SECONDS):
+    while len(seconds) < MEASURE.repeats or (
+        len(seconds) < MEASURE.warm_presses and sum(seconds) < MEASURE.enough_seconds
+    ):
         pose = case.nearby(len(seconds) + 1)
         spent, guess = _timed(model.press, state, case.load, pose, guess)
         seconds.append(spent)

@@ -25,7 +25,7 @@ from tkamb.decks.calculix import ELEMENT, Deck
 from tkamb.decks.problem import PressProblem, press_problem
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
-from tkamb.studies.calculix import LONGEST_SECONDS, PeerRun, run_calculix
+from tkamb.studies.calculix import CALCULIX, PeerRun, run_calculix
 from tkamb.studies.cases import StudyCase
 from tkamb.studies.measures import Measure
 from tkamb.studies.quantities import quantities, raster_map
@@ -55,7 +55,7 @@ class PeerAnswer:
 
 
 def measure_by_calculix(
-    case: StudyCase, grid_mm: float, longest: float = LONGEST_SECONDS
+    case: StudyCase, grid_mm: float, longest: float = CALCULIX.longest_seconds
 ) -> Measure:
     """Return CalculiX's measure of a case; its status says why there is none.
 
@@ -88,7 +88,7 @@ def press_by_calculix(
     pose: Array,
     grid_mm: float,
     element: str = ELEMENT,
-    longest: float = LONGEST_SECONDS,
+    longest: float = CALCULIX.longest_seconds,
 ) -> PeerAnswer:
     """Press a femoral component on an insert by CalculiX.
 

@@ -34,11 +34,21 @@ STORED = Path(__file__).with_name("references.json")
 FAMILIES = ("fe", "lattice")
 GRIDS_MM = (1.5, 1.25, 1.0, 0.8)
 LARGE_GRIDS_MM = (2.0, 1.5, 1.25, 1.0)
-LARGE = 2e-5
-"""m³: of an insert's bounding box from which on the coarser grids must do."""
-TOLERANCE = 1e-6
-WIDTH_EFFECT = 0.005
-"""Relative: a block 3.4 times as wide as high against an endless layer."""
+
+
+@dataclass(frozen=True)
+class ReferenceSettings:
+    """How the studies' reference solutions are computed."""
+
+    large_volume: float = 2e-5
+    """m³: of an insert's bounding box from which on the coarser grids must do."""
+    tolerance: float = 1e-6
+    """Relative tolerance of the reference solutions."""
+    width_effect: float = 0.005
+    """Relative: a block 3.4 times as wide as high against an endless layer."""
+
+
+REFERENCE = ReferenceSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +88,13 @@ def compute_reference(case: StudyCase, grids_mm: tuple[float, ...] | None = None
         ComputationError: a grid did not converge.
     """
     if grids_mm is None:
-        large = float(np.prod(np.ptp(case.pair.insert.vertices, axis=0))) > LARGE
+        large = float(np.prod(np.ptp(case.pair.insert.vertices, axis=0))) > REFERENCE.large_volume
         grids_mm = LARGE_GRIDS_MM if large else GRIDS_MM
     solved: dict[str, Quantities] = {}
     finest: dict[str, float] = {}
     for family in FAMILIES:
         for grid in grids_mm:
-            model = contact_model(family, grid, tolerance=TOLERANCE, cache=False)
+            model = contact_model(family, grid, tolerance=REFERENCE.tolerance, cache=False)
             result = model.press(model.prepare(case.pair), case.load, case.pose)
             if result.status is not ContactStatus.OK:
                 why = "; ".join(result.flags)
@@ -161,7 +171,7 @@ def _by_layer(case: StudyCase, sphere: Sphere) -> tuple[Quantities, Quantities]:
         "medial_area": area,
     }
     values |= {name.replace("medial", "lateral"): 0.0 for name in list(values) if "medial" in name}
-    return values, {name: WIDTH_EFFECT * value for name, value in values.items()}
+    return values, {name: REFERENCE.width_effect * value for name, value in values.items()}
 
 
 def read_references(path: Path = STORED) -> dict[str, Reference]:

@@ -5,7 +5,7 @@ import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection
 from multiprocessing.forkserver import ensure_running
 from multiprocessing.process import BaseProcess
@@ -25,29 +25,43 @@ Case = Extreme | ClosedForm | SceneExtreme
 STORED = Path(__file__).with_name("verdicts.json")
 """Verdict on each case, as last accepted; `scripts/make_stability_verdicts` writes it."""
 
-LONGEST_SECONDS = 120.0
-"""A case whose model takes longer hangs."""
-LONGEST_REFERENCE_SECONDS = 900.0
-"""A case whose reference takes longer is unverified."""
+
+@dataclass(frozen=True)
+class StabilitySettings:
+    """Limits of the stability study."""
+
+    longest_seconds: float = 120.0
+    """A case whose model takes longer hangs."""
+    longest_reference_seconds: float = 900.0
+    """A case whose reference takes longer is unverified."""
+    workers: int = 2
+    """Processes of the study."""
+    quick_share: int = 13
+    """The quick study takes one case in so many."""
+    quick_grid_mm: float = 3.0
+    """mm; the quick study takes no finer grid."""
+    quick_with_peer: int = 4
+    """The quick study takes one extreme in so many, no finer than this; unusual shapes; the first
+cases beside CalculiX; the first closed forms; no runs."""
+
+
+STABILITY = StabilitySettings()
+
 PRESSED = "pressed"
 """What a process sends once the model has answered."""
-WORKERS = 2
-QUICK_SHARE = 13
-QUICK_GRID_MM = 3.0
 QUICK_SHAPES: tuple[Shape, ...] = ("swapped", "lip", "spike")
-QUICK_PEERED = 4
-"""The quick study takes one extreme in so many, no finer than this; unusual shapes; the first
-cases beside CalculiX; the first closed forms; no runs."""
 
 
 def stability_cases(quick: bool) -> list[Case]:
     """Return the cases of the study."""
     if not quick:
         return [*closed_forms(False), *extremes(), *scene_extremes()]
-    coarse = (replace(c, resolution_mm=max(c.resolution_mm, QUICK_GRID_MM)) for c in extremes())
-    some = [*dict.fromkeys(coarse)][::QUICK_SHARE]
-    shapes = [Extreme(resolution_mm=QUICK_GRID_MM, shape=shape) for shape in QUICK_SHAPES]
-    peered = list(beside_calculix())[:QUICK_PEERED]
+    coarse = (
+        replace(c, resolution_mm=max(c.resolution_mm, STABILITY.quick_grid_mm)) for c in extremes()
+    )
+    some = [*dict.fromkeys(coarse)][:: STABILITY.quick_share]
+    shapes = [Extreme(resolution_mm=STABILITY.quick_grid_mm, shape=shape) for shape in QUICK_SHAPES]
+    peered = list(beside_calculix())[: STABILITY.quick_with_peer]
     return [*closed_forms(True), *dict.fromkeys((*peered, *shapes, *some))]
 
 
@@ -61,9 +75,9 @@ def stored_verdicts(path: Path = STORED) -> dict[str, str]:
 
 def run_stability(
     cases: Sequence[Case],
-    longest: float = LONGEST_SECONDS,
+    longest: float = STABILITY.longest_seconds,
     kept: KeptRows | None = None,
-    workers: int = WORKERS,
+    workers: int = STABILITY.workers,
 ) -> Iterator[Verdict]:
     """Judge all cases; yield their verdicts in order.
 
@@ -85,7 +99,7 @@ def run_stability(
 
 
 def kept_verdicts(
-    cases: Sequence[Case], kept: KeptRows, longest: float = LONGEST_SECONDS
+    cases: Sequence[Case], kept: KeptRows, longest: float = STABILITY.longest_seconds
 ) -> list[Verdict]:
     """Return the verdicts that are kept, in the cases' order: those finished before others, too."""
     rows, stored = (kept.get(_row_key(case, longest)) for case in cases), stored_verdicts()
@@ -162,8 +176,8 @@ class _Judges:
             return _ended(case, "hang", f"no answer in {self.limit(case):g} s")
         found = receiver.recv()
         if found == PRESSED:
-            if not receiver.poll(LONGEST_REFERENCE_SECONDS):
-                reason = f"no reference in {LONGEST_REFERENCE_SECONDS:g} s"
+            if not receiver.poll(STABILITY.longest_reference_seconds):
+                reason = f"no reference in {STABILITY.longest_reference_seconds:g} s"
                 return _ended(case, "unverified", reason)
             found = receiver.recv()
         verdict: Verdict = found

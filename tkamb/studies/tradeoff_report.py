@@ -1,6 +1,7 @@
 """The trade-off for a reader: table, picture, the fastest model for an error, comparisons."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from statistics import median
 
 from matplotlib.artist import Artist
@@ -14,10 +15,20 @@ from tkamb.studies.references import Reference
 from tkamb.studies.row import FRONT_ERRORS, KEYS, TIMING_NOISE, Row
 
 MARKERS = "osD^vPX*<>"
-UNLABELLED_MM = 2.0
-"""The cell size at which most points lie."""
-SHORT_AXIS = 30.0
-"""Largest over smallest value up to which a logarithmic axis has numbers within its decades."""
+
+
+@dataclass(frozen=True)
+class TradeoffPictureSettings:
+    """Looks of the trade-off's picture."""
+
+    unlabelled_mm: float = 2.0
+    """The cell size at which most points lie."""
+    short_axis_ratio: float = 30.0
+    """Largest over smallest value up to which a logarithmic axis has numbers within its decades."""
+
+
+TRADEOFF_PICTURE = TradeoffPictureSettings()
+
 LIMITS = {
     "approach": (0.05,),
     "force": (0.03,),
@@ -107,7 +118,8 @@ def picture(rows: Sequence[Row]) -> Figure:
             list(found),
             loc="outside upper left",
             ncols=2 * columns,
-            title=f"numbers at the points: cell size, mm; {UNLABELLED_MM:g} mm where there is none",
+            title="numbers at the points: cell size, mm; "
+            f"{TRADEOFF_PICTURE.unlabelled_mm:g} mm where there is none",
             alignment="left",
         )
     return figure
@@ -130,7 +142,7 @@ def _panel(axis: Axes, rows: Sequence[Row], labels: Sequence[str]) -> None:
             label=label,
         )
         for row in some:
-            if row.job.resolution_mm == UNLABELLED_MM:
+            if row.job.resolution_mm == TRADEOFF_PICTURE.unlabelled_mm:
                 continue
             axis.annotate(
                 f"{row.job.resolution_mm:g}",
@@ -148,7 +160,7 @@ def _panel(axis: Axes, rows: Sequence[Row], labels: Sequence[str]) -> None:
 def _plain_ticks(axis: Axes) -> None:
     """Write 1, 2, 5, 10 and so on where a logarithmic axis is short; of all panels that share."""
     for side, (low, high) in ((axis.xaxis, axis.get_xlim()), (axis.yaxis, axis.get_ylim())):
-        if high < SHORT_AXIS * low:
+        if high < TRADEOFF_PICTURE.short_axis_ratio * low:
             side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             side.set_major_formatter("{x:g}")
             side.set_minor_formatter(NullFormatter())

@@ -10,6 +10,7 @@ import gzip
 import json
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -43,14 +44,21 @@ from tkamb.view.drawing import (
 )
 from tkamb.view.shading import MOST_TRIANGLES, Shaded, shade
 
-METRES_PER_BODY_WEIGHT = 0.03
-"""Length of an arrow of one body weight."""
 
-LEVELS = 32767
-"""Steps from no pressure to the largest."""
+@dataclass(frozen=True)
+class ViewPayloadSettings:
+    """What the viewer's page is given."""
 
-MOST_COLOURED = 100_000
-"""Triangles of a surface that its colours divide: merged ones would blur them."""
+    arrow_metres_per_body_weight: float = 0.03
+    """Length of an arrow of one body weight."""
+    pressure_levels: int = 32767
+    """Steps from no pressure to the largest."""
+    most_coloured_triangles: int = 100_000
+    """Triangles of a surface that its colours divide: merged ones would blur them."""
+
+
+VIEW_PAYLOAD = ViewPayloadSettings()
+
 
 WHITE = "#ffffff"
 """Of a material whose vertices have colours of their own."""
@@ -103,7 +111,7 @@ def pack(drawings: Sequence[Drawing]) -> bytes:
         {
             "layers": list(LAYERS),
             "hidden": list(HIDDEN_AT_FIRST),
-            "metres_per_body_weight": METRES_PER_BODY_WEIGHT,
+            "metres_per_body_weight": VIEW_PAYLOAD.arrow_metres_per_body_weight,
             "peak_MPa": peak,
             "strain_limit": limit,
             "activation_limit": max(one.activation_limit for one in drawings),
@@ -140,7 +148,10 @@ def _view(
     root = f"/tkamb/{number}"
     commands, moving, notes = [_insert_transform(root, drawing.side)], [], list(drawing.notes)
     for solid in drawing.solids:
-        shape = shade(solid.surface, MOST_TRIANGLES if solid.wear is None else MOST_COLOURED)
+        shape = shade(
+            solid.surface,
+            MOST_TRIANGLES if solid.wear is None else VIEW_PAYLOAD.most_coloured_triangles,
+        )
         if shape.error:
             notes.append(
                 f"{solid.name.capitalize()}: drawn with {len(shape.faces)} of "
@@ -221,7 +232,7 @@ def map_levels(found: PressureMap, peak: float) -> NDArray[np.int16]:
         peak: MPa, top of the scale; a higher pressure has the top level.
     """
     level = pressure_levels(found.pressure, found.gap, found.triangles, peak)
-    whole = np.maximum(np.round(np.abs(level) * LEVELS), 1.0)
+    whole = np.maximum(np.round(np.abs(level) * VIEW_PAYLOAD.pressure_levels), 1.0)
     return np.where(level > 0, whole, -whole).astype(np.int16)
 
 

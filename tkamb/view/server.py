@@ -8,7 +8,7 @@ user's terminal shows.
 import json
 import secrets
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Lock
@@ -27,10 +27,22 @@ from tkamb.view.payload import packed_lattice, packed_map
 from tkamb.view.run import CaseResults
 
 HOST = "127.0.0.1"
-LARGEST_QUESTION = 10_000
-LONGEST_SILENCE = 15.0
-"""s: without a byte from a client that is connected, before it is cut off."""
-TOKEN_BYTES = 18
+
+
+@dataclass(frozen=True)
+class ViewServerSettings:
+    """Limits of the viewer's local server."""
+
+    most_request_bytes: int = 10_000
+    """Bytes of a request; a longer one is refused."""
+    idle_seconds: float = 15.0
+    """s: without a byte from a client that is connected, before it is cut off."""
+    token_bytes: int = 18
+    """Random bytes of the token in the address."""
+
+
+VIEW_SERVER = ViewServerSettings()
+
 HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -173,7 +185,7 @@ class ViewServer:
         bench: "Callable[[str, dict[str, Any]], bytes] | None" = None,
     ) -> None:
         self.switch = switch
-        self._token = secrets.token_urlsafe(TOKEN_BYTES)
+        self._token = secrets.token_urlsafe(VIEW_SERVER.token_bytes)
         content = {
             "": ("text/html; charset=utf-8", html.encode()),
             "scene.bin": ("application/octet-stream", packed),
@@ -214,7 +226,7 @@ class _Handler(BaseHTTPRequestHandler):
     names: set[str]
     root: str
 
-    timeout = LONGEST_SILENCE
+    timeout = VIEW_SERVER.idle_seconds
 
     def do_GET(self) -> None:
         if not self._is_allowed():
@@ -269,7 +281,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _question(self) -> dict[str, Any]:
         length = int(self.headers.get("Content-Length") or 0)
-        if not 0 < length <= LARGEST_QUESTION:
+        if not 0 < length <= VIEW_SERVER.most_request_bytes:
             raise TkambError("a question of no or too many bytes")
         question = json.loads(self.rfile.read(length))
         if not isinstance(question, dict):

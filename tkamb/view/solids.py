@@ -7,6 +7,7 @@ where the shank does, so that the arrow of the ground reaction does not hang in 
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,11 +57,20 @@ SOLE = (
 )
 """Balls in whose hull the foot lies: anterior of the ankle, above the sole, right; radius; mm."""
 
-ANKLE_RADIUS = 20.0
-"""mm."""
+
+@dataclass(frozen=True)
+class ViewSolidSettings:
+    """Sizes of what the viewer draws beside the implant."""
+
+    ankle_radius_mm: float = 20.0
+    """mm."""
+    plate_centre: float = 60.0 * MILLIMETRE
+    """m, anterior of the ankle."""
+
+
+VIEW_SOLID = ViewSolidSettings()
+
 PLATE = np.array([340.0, 5.0, 200.0]) * MILLIMETRE
-PLATE_CENTRE = 60.0 * MILLIMETRE
-"""m, anterior of the ankle."""
 GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 """rad: successive points of a spiral turned by it cover a sphere evenly."""
 
@@ -230,12 +240,14 @@ def _floor_pose(geometry: KneeGeometry, tibia_in_laboratory: Array, floor: float
 
 
 def _floor_surface() -> Surface:
-    return box(PLATE, "floor").moved(pose(np.eye(3), [PLATE_CENTRE, -0.5 * PLATE[1], 0.0]))
+    return box(PLATE, "floor").moved(
+        pose(np.eye(3), [VIEW_SOLID.plate_centre, -0.5 * PLATE[1], 0.0])
+    )
 
 
 def _foot_surface(height: float) -> Surface:
     """Return a foot whose ankle is `height` (m) above the sole."""
-    ankle = (0.0, height / MILLIMETRE, 0.0, ANKLE_RADIUS)
+    ankle = (0.0, height / MILLIMETRE, 0.0, VIEW_SOLID.ankle_radius_mm)
     sole, leg = _hull((*SOLE, INSTEP)), _hull((INSTEP, ankle))
     faces = np.concatenate([sole.faces, leg.faces + len(sole.vertices)])
     return Surface(np.concatenate([sole.vertices, leg.vertices]), faces, "foot")

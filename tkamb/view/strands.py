@@ -1,6 +1,7 @@
 """The lines of a drawing: ligaments, tendons, muscles, and paths of the centres of pressure."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,13 +33,22 @@ if TYPE_CHECKING:
 BUNDLE, TENDON_RADIUS, PATH = 1.0 * MILLIMETRE, 1.5 * MILLIMETRE, 0.35 * MILLIMETRE
 """m, radii; bundles are thinner where a ligament has many."""
 
-MUSCLE_RADIUS = 2.0 * MILLIMETRE
-SLACK_FORCE = 1.0
-"""N."""
-LEAST_ACTIVATION = 0.1
-"""Upper end of the colour scale, where no muscle is more active."""
 
-MANY_BUNDLES = 20
+@dataclass(frozen=True)
+class ViewStrandSettings:
+    """How muscles and ligaments are drawn."""
+
+    muscle_radius: float = 2.0 * MILLIMETRE
+    """m; radius of a muscle's tube."""
+    slack_force: float = 1.0
+    """N."""
+    least_activation: float = 0.1
+    """Upper end of the colour scale, where no muscle is more active."""
+    many_bundles: int = 20
+    """Ligament bundles from which on they are drawn thinner."""
+
+
+VIEW_STRAND = ViewStrandSettings()
 
 
 def ligament_strands(
@@ -56,7 +66,7 @@ def ligament_strands(
     lost = failed(results)
     strains = [np.where(lost, np.nan, one.strain(one.length(poses))) for one in bundles]
     limit = float(np.nanmax(strains, initial=0.01))
-    radius = BUNDLE * (0.5 if len(bundles) > MANY_BUNDLES else 1.0)
+    radius = BUNDLE * (0.5 if len(bundles) > VIEW_STRAND.many_bundles else 1.0)
     strands = []
     for bundle, strain in zip(bundles, strains, strict=True):
         points = np.stack(bundle.ends(poses), axis=1)
@@ -83,7 +93,9 @@ def extensor_strands(
             paths.append((None, None))
     muscle, ligament = (list(found) for found in zip(*paths, strict=True))
     name = extensor.muscle.name.replace("_", " ")
-    slack = [results[f"{one}_N"] < SLACK_FORCE for one in ("quadriceps", "patellar_ligament")]
+    slack = [
+        results[f"{one}_N"] < VIEW_STRAND.slack_force for one in ("quadriceps", "patellar_ligament")
+    ]
     return (
         _tendon(name, muscle, slack[0]),
         _tendon("patellar ligament", ligament, slack[1]),
@@ -108,15 +120,15 @@ def muscle_strands(geometries: Sequence[KneeGeometry]) -> tuple[tuple[Strand, ..
             ends[k, :, 0] = transform(one.state.pose("tibia"), share.lines.shank)
             ends[k, :, 1] = transform(one.state.pose("femur"), share.lines.thigh)
             activation[k], force[k] = share.activation[share.crossing], share.force[share.crossing]
-    limit = max(float(activation.max()), LEAST_ACTIVATION)
-    colours = activation_colours(np.where(force < SLACK_FORCE, 0.0, activation), limit)
+    limit = max(float(activation.max()), VIEW_STRAND.least_activation)
+    colours = activation_colours(np.where(force < VIEW_STRAND.slack_force, 0.0, activation), limit)
     strands = tuple(
         Strand(
             first.muscles[muscle],
             "muscles",
             ends[:, i],
             np.repeat(colours[:, i, None], 2, axis=1),
-            MUSCLE_RADIUS,
+            VIEW_STRAND.muscle_radius,
         )
         for i, muscle in enumerate(first.crossing)
     )
