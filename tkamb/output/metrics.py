@@ -22,7 +22,7 @@ class MetricSettings:
     jump: float = 8.0 * MILLIMETRE
     """m; a centre of pressure that moves farther between two frames may have jumped."""
     jump_steps: float = 5.0
-    """A centre of pressure that moves by more than `jump`, and by many median steps, from a frame to
+    """A centre of pressure that moves by more than `jump` and by many median steps from a frame to
 the next has not travelled there."""
     least_tension: float = 1.0
     """N: below this quadriceps tension its ratios are not shown."""
