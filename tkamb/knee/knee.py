@@ -9,7 +9,7 @@ call changes the next: what may save time is a `KneeData` that the caller makes 
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import pinocchio as pin
@@ -175,7 +175,7 @@ class Knee:
         self.ligaments = tuple(self._bundle(bundle) for bundle in ligaments)
         self._crossing, self._others = self._divided()
         self._lines = {muscle.name: self._line(muscle) for muscle in muscles}
-        self.extensor, self._extensor_lines = extensor, None
+        self.extensor, self._extensor_lines = extensor, cast(Any, None)
         if extensor is not None:
             self._extensor_lines = self._build_extensor(extensor, left)
         self._query: ClosestPointQuery | None = None
