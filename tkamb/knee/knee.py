@@ -902,21 +902,13 @@ class Knee:
         return found | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
 
     def _rest(self, search: Any, instant: Instant, points: dict[str, Array]) -> "KneeEquilibrium":
-        """Return the knee at rest, from q and, where that leads nowhere, from first touch."""
-        from tkamb.equilibrium.starts import ASTRAY, FIRST_DEPTH
+        """Return the knee at rest, from first touch at the other coordinates of q."""
+        from tkamb.equilibrium.starts import Starts
 
-        contact, recorded = self._need_contact(), instant.coordinates
-        height = contact.pair.first_touch_height(knee_pose(recorded))
-        if not np.isfinite(height):
+        pair, recorded = self._need_contact().pair, instant.coordinates
+        if not np.isfinite(pair.first_touch_height(knee_pose(recorded))):
             raise ComputationError("the femoral component does not lie over the insert", "q")
-        touching = recorded.copy()
-        touching[1] = height - FIRST_DEPTH
-        starts = [touching] if recorded[1] > height else [recorded, touching]
-        knee: KneeEquilibrium = search.find(0, starts[0], points)
-        for start in starts[1:]:
-            if knee.balance.status in ASTRAY or knee.problem:
-                knee = search.find(0, start, points)
-        return knee
+        return Starts(recorded[None], search, pair, None).rest(0, (), points)
 
     def _loaded(
         self, knee: "KneeEquilibrium", instant: Instant, points: dict[str, Array]
