@@ -270,6 +270,21 @@ def test_equilibrium_leaves_no_force_and_its_contact_carries_the_loads(read):
         assert forces[place.joint].vector == pytest.approx(asked, abs=apart)
 
 
+def test_files_and_object_find_the_same_equilibrium():
+    """A frame that no other goes before, with released coordinates."""
+    free = ["adduction", "axial_rotation", "ap", "ml"]
+    scene = tkamb.load_scene(SCENE, FOUNDATION | {"contact.released": free})
+    read = tkamb.read_scene(scene)
+    results = tkamb.simulate(scene, frames=slice(60, 61))
+    found = read[0].equilibrium(*at(read, 60), released=free)
+    for name, value in columns(found.loads).items():
+        assert value == pytest.approx(results[name][0], rel=1e-9, abs=1e-9), name
+    for k, axis in enumerate(("ap", "si", "ml")):
+        assert 1e3 * found.coordinates[k] == pytest.approx(results[f"{axis}_mm"][0], abs=1e-9)
+    peak = 1e6 * results["medial_peak_pressure_MPa"][0]
+    assert found.contact.medial.peak_pressure == pytest.approx(peak, rel=1e-9)
+
+
 def test_equilibrium_in_a_whole_body_is_the_same(read):
     plain = read[0]
     body = whole_body(plain)

@@ -97,7 +97,8 @@ class ContactSide:
 
             probe = self._probe if self.post is None else self.post.probe_with(self._probe)
             self.released = ReleasedKnee(mechanics, probe, table.released)
-            self.starts = Starts(case, self.released, self.state.pair, self.post)
+            recorded = case.motion.coordinates
+            self.starts = Starts(recorded, self.released, self.state.pair, self.post)
 
     def frame(self, k: int, before: Sequence[FrameContact] = ()) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact of frame k, as coupled as the scene asks.

@@ -17,26 +17,29 @@ the forces from having a potential.
 The contact comes as a probe; this file does not know the models.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from tkamb.body.joint_equilibrium import JointEquilibrium, external_wrench, joint_equilibrium
 from tkamb.body.knee import KneeGeometry
 from tkamb.equilibrium.balance import Balance, BalanceStatus
-from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.equilibrium.relaxation import Relaxation
 from tkamb.equilibrium.released_forces import SCALE, ReleasedForces
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_axes, knee_pose
 
 if TYPE_CHECKING:
+    from tkamb.body.contact_points import CondylePoint
     from tkamb.body.crossing import MuscleShare
+    from tkamb.body.ligaments import Ligament
+    from tkamb.body.load import PointForces
     from tkamb.body.patella import PatellaState
-    from tkamb.contact.probe import Probe, ProbedContact
+    from tkamb.contact.probe import CondyleWrench, Probe, ProbedContact
+    from tkamb.equilibrium.shared_muscles import SharedMuscles
 
 KNEE_CHANGE = 2e-6
 """m: the knee moves less than this when the patella is found anew."""
@@ -93,8 +96,39 @@ def released_indices(names: Sequence[str]) -> tuple[int, ...]:
     return tuple(i for i, name in enumerate(KNEE_COORDINATES) if name == "si" or name in names)
 
 
+class Body(Protocol):
+    """What the search asks of a body, frame by frame: of a whole motion, or of one instant."""
+
+    friction: float
+    ligaments: "Sequence[Ligament]"
+    extensor: Any
+    muscles: "SharedMuscles | None"
+
+    @property
+    def sides(self) -> set[str]:
+        """Names of the condyles that may carry load."""
+
+    def geometry(
+        self, k: int, coordinates: Array | None = None, patella: "PatellaState | None" = None
+    ) -> KneeGeometry:
+        """Return frame k without its contact, perhaps at other coordinates (6,)."""
+
+    def sliding(self, k: int, coordinates: Array, point: Array) -> Array:
+        """Return the velocity (3,) m/s of the femur's point relative to the insert's."""
+
+    def resultants(
+        self, k: int, coordinates: Array, condyles: "Mapping[str, CondyleWrench]"
+    ) -> "dict[str, CondylePoint]":
+        """Return the resultants of a contact as the contact points of the equations."""
+
+    def post_loads(
+        self, k: int, coordinates: Array, post: "CondyleWrench | None"
+    ) -> "tuple[PointForces, ...]":
+        """Return what a cam on the post does to tibia and femur."""
+
+
 class ReleasedKnee:
-    """Finds the released coordinates of a case, frame by frame.
+    """Finds the released coordinates of a body, frame by frame.
 
     Args:
         mechanics: the body side.
@@ -106,7 +140,7 @@ class ReleasedKnee:
         muscles: the load is shared among muscles.
     """
 
-    def __init__(self, mechanics: Mechanics, probe: "Probe", names: Sequence[str]) -> None:
+    def __init__(self, mechanics: Body, probe: "Probe", names: Sequence[str]) -> None:
         self._mechanics, self._probe = mechanics, probe
         self.muscles = mechanics.muscles is not None
         self.released = released_indices(names)

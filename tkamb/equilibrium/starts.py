@@ -12,7 +12,6 @@ from tkamb.equilibrium.released import KneeEquilibrium, ReleasedKnee
 from tkamb.equilibrium.released_forces import SCALE
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
-from tkamb.scene.case import Case
 
 if TYPE_CHECKING:
     from tkamb.contact.cam_post import CamPost
@@ -31,19 +30,19 @@ AP = KNEE_COORDINATES.index("ap")
 
 
 class Starts:
-    """The starts of the frames of a case, from the likeliest on.
+    """The starts of the frames of a motion, from the likeliest on.
 
     Args:
-        case: for the recorded motion.
+        recorded: (f, 6) knee coordinates of the motion, m and rad.
         knee: searches from a start.
         pair: femoral component and insert.
         post: cam and post, if they are modelled.
     """
 
     def __init__(
-        self, case: Case, knee: ReleasedKnee, pair: ContactPair, post: "CamPost | None"
+        self, recorded: Array, knee: ReleasedKnee, pair: ContactPair, post: "CamPost | None"
     ) -> None:
-        self._case, self._knee, self._pair, self._post = case, knee, pair, post
+        self._recorded, self._knee, self._pair, self._post = recorded, knee, pair, post
 
     def rest(
         self, k: int, found: Sequence[KneeEquilibrium], points: dict[str, Array]
@@ -78,7 +77,7 @@ class Starts:
 
         The first keeps its height, the others just touch.
         """
-        recorded, rows = self._case.motion.coordinates[k], list(self._knee.released)
+        recorded, rows = self._recorded[k], list(self._knee.released)
         for number, place in enumerate([carried_on(found), found[-1]] if found else []):
             start = recorded.copy()
             start[rows] = place[rows]

@@ -9,7 +9,7 @@ call changes the next: what may save time is a `KneeData` that the caller makes 
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import pinocchio as pin
@@ -175,7 +175,7 @@ class Knee:
         self.ligaments = tuple(self._bundle(bundle) for bundle in ligaments)
         self._crossing, self._others = self._divided()
         self._lines = {muscle.name: self._line(muscle) for muscle in muscles}
-        self.extensor, self._extensor_lines = extensor, None
+        self.extensor, self._extensor_lines = extensor, cast(Any, None)
         if extensor is not None:
             self._extensor_lines = self._build_extensor(extensor, left)
         self._query: ClosestPointQuery | None = None
@@ -902,21 +902,13 @@ class Knee:
         return found | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
 
     def _rest(self, search: Any, instant: Instant, points: dict[str, Array]) -> "KneeEquilibrium":
-        """Return the knee at rest, from q and, where that leads nowhere, from first touch."""
-        from tkamb.equilibrium.starts import ASTRAY, FIRST_DEPTH
+        """Return the knee at rest, from first touch at the other coordinates of q."""
+        from tkamb.equilibrium.starts import Starts
 
-        contact, recorded = self._need_contact(), instant.coordinates
-        height = contact.pair.first_touch_height(knee_pose(recorded))
-        if not np.isfinite(height):
+        pair, recorded = self._need_contact().pair, instant.coordinates
+        if not np.isfinite(pair.first_touch_height(knee_pose(recorded))):
             raise ComputationError("the femoral component does not lie over the insert", "q")
-        touching = recorded.copy()
-        touching[1] = height - FIRST_DEPTH
-        starts = [touching] if recorded[1] > height else [recorded, touching]
-        knee: KneeEquilibrium = search.find(0, starts[0], points)
-        for start in starts[1:]:
-            if knee.balance.status in ASTRAY or knee.problem:
-                knee = search.find(0, start, points)
-        return knee
+        return Starts(recorded[None], search, pair, None).rest(0, (), points)
 
     def _loaded(
         self, knee: "KneeEquilibrium", instant: Instant, points: dict[str, Array]

@@ -147,14 +147,16 @@ def link_point(point: Point) -> LinkPoint:
     Raises:
         InputError: not a frame's name and three finite numbers.
     """
+    link: object = None
+    position: object = ()
     if isinstance(point, LinkPoint):
         link, position = point.link, point.position
-    else:
-        try:
-            link, position = point
-        except (TypeError, ValueError):
-            link, position = "", ()
-    place = np.asarray(position, float)
+    elif isinstance(point, tuple | list) and len(point) == 2:
+        link, position = point
+    try:
+        place = np.asarray(position, float)
+    except (TypeError, ValueError):
+        place = np.empty(0)
     if not isinstance(link, str) or place.shape != (3,) or not np.isfinite(place).all():
         raise InputError(
             f"{point!r} is no point on a frame", "Knee", "give (frame name, (x, y, z)) in metres"
