@@ -9,8 +9,8 @@ from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.geometry.frames import knee_pose, pose
 from tkamb.geometry.surface import Surface
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
 
 BEND = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
 AXES = np.diag([-1.0, 1.0, -1.0])

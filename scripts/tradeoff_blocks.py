@@ -6,13 +6,8 @@ from statistics import median
 from typing import Any
 
 from tkamb.errors import InputError
-from tkamb.known_errors import KnownError
-from tkamb.studies.body_trade import HEADS as BODY_HEADS
-from tkamb.studies.body_trade import BodyRow
-from tkamb.studies.error_cases import SITUATIONS
-from tkamb.studies.error_rows import ErrorRow
-from tkamb.studies.row import KEYS, TIMING_NOISE, Row, beats, on_front
-from tkamb.studies.tradeoff_report import (
+from tkamb.run.known_errors import KnownError
+from tkamb.show.tradeoff_report import (
     Setting,
     bodies_of,
     comparison,
@@ -21,6 +16,11 @@ from tkamb.studies.tradeoff_report import (
     setting_of,
     warm_by_bodies,
 )
+from tkamb.studies.body_trade import HEADS as BODY_HEADS
+from tkamb.studies.body_trade import BodyRow
+from tkamb.studies.error_cases import SITUATIONS
+from tkamb.studies.error_rows import ErrorRow
+from tkamb.studies.row import KEYS, TIMING_NOISE, Row, beats, on_front
 
 MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
 HEADS = ("approach", "condyle force", "mean p", "peak p", "area", "map L2")
@@ -80,7 +80,7 @@ def short_block(rows: Sequence[Row]) -> list[str]:
 
 
 def known_errors_json(rows: Sequence[Row], cases: Sequence[ErrorRow] = ()) -> str:
-    """Return the text of `tkamb/known_errors.json`, setting by setting.
+    """Return the text of `tkamb/run/known_errors.json`, setting by setting.
 
     Settings that failed on a case of the study, or that belong to another program, are left out:
     nothing is known of them that would hold for every run.

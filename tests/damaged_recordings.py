@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.importing.force_columns import table_forces
-from tkamb.inputs.c3d import read_c3d
-from tkamb.inputs.tables import read_table
+from tkamb.io.importing.force_columns import table_forces
+from tkamb.io.recordings.c3d import read_c3d
+from tkamb.io.recordings.tables import read_table
 
 WORDS = [b"\x00", b"\xff", b"\x7f", b"\x80", b"\x01", b"\x00\x00\x80\x7f", b"\xff\xff\xff\x7f"]
 TEXTS = [b"", b" ", b"\t\t", b",", b"1e308", b"nan", b"-", b"\n", b"\x00", b"\xe9", b"9" * 400]

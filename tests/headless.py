@@ -14,7 +14,10 @@ READY = "document.body && document.body.dataset.ready"
 @contextmanager
 def chromium():
     """Give a browser; the test is skipped where there is none."""
-    from tkamb.view.page import SOFTWARE_GRAPHICS, find_browser  # late: conftest imports this file
+    from tkamb.show.view.page import (  # late: conftest imports this file
+        SOFTWARE_GRAPHICS,
+        find_browser,
+    )
 
     sync = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     try:

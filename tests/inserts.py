@@ -7,7 +7,7 @@ import pytest
 
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.surface import Surface
-from tkamb.inputs.meshes import load_surface
+from tkamb.io.recordings.meshes import load_surface
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 

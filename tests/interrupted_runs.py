@@ -3,7 +3,7 @@
 import threading
 from contextlib import contextmanager
 
-from tkamb.claim import claimed_directory
+from tkamb.io.claim import claimed_directory
 
 
 def broken_off(after):

@@ -3,13 +3,13 @@
 import numpy as np
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
-from tkamb.body.joint_equilibrium import JointEquilibrium, unit_keeper
-from tkamb.body.ligaments import BundleArrays
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
-from tkamb.equilibrium.released import released_indices
-from tkamb.equilibrium.released_forces import SCALE, ReleasedForces
 from tkamb.geometry.frames import KNEE_COORDINATES
+from tkamb.knee.equilibrium.released import released_indices
+from tkamb.knee.equilibrium.released_forces import SCALE, ReleasedForces
+from tkamb.knee.joint_equilibrium import JointEquilibrium, unit_keeper
+from tkamb.knee.ligaments import BundleArrays
 
 BALL, HALF, HEIGHT = 25e-3, 20e-3, 10e-3
 """Radius of the spheres, half their distance, thickness of the insert under them, m."""

@@ -9,16 +9,16 @@ import pytest
 from scipy.interpolate import make_interp_spline
 
 from tkamb.geometry.frames import Array
-from tkamb.importing.model_fit import fit_model
-from tkamb.inputs.filtering import differentiate_coordinates
-from tkamb.inputs.ground_reaction import GroundReaction, load_ground_reaction
-from tkamb.inputs.tables import read_table
-from tkamb.muscles.leg import foot_loads
-from tkamb.opensim.kinematics import Kinematics
-from tkamb.opensim.motion import CoordinateMotion
-from tkamb.opensim.read import read_osim
-from tkamb.scene.recording_tables import GroundReactionTable
-from tkamb.scene.si import in_si
+from tkamb.io.importing.model_fit import fit_model
+from tkamb.io.opensim.kinematics import Kinematics
+from tkamb.io.opensim.motion import CoordinateMotion
+from tkamb.io.opensim.read import read_osim
+from tkamb.io.recordings.filtering import differentiate_coordinates
+from tkamb.io.recordings.ground_reaction import GroundReaction, load_ground_reaction
+from tkamb.io.recordings.tables import read_table
+from tkamb.io.scene.recording_tables import GroundReactionTable
+from tkamb.io.scene.si import in_si
+from tkamb.run.muscles.leg import foot_loads
 
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw"
 AXES = "-x,+z,+y"

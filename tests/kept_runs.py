@@ -1,9 +1,9 @@
 """Folders of results without a report, which takes longer to draw than all the rest."""
 
 from tkamb.atomic import replaced_together
-from tkamb.claim import claimed_directory
-from tkamb.output.maps import write_maps
-from tkamb.results_folder import put_numbers
+from tkamb.io.claim import claimed_directory
+from tkamb.run.maps import write_maps
+from tkamb.run.results_folder import put_numbers
 
 
 def keep(results, folder, maps=None):

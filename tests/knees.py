@@ -3,12 +3,12 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tkamb.body.chain import Chain, ChainMotion
-from tkamb.body.contact_points import CondylePoint
-from tkamb.body.knee import Extensor, KneeGeometry
-from tkamb.body.load import PointForces
-from tkamb.body.unknowns import Unknown
 from tkamb.geometry.frames import pose, transform
+from tkamb.knee.chain import Chain, ChainMotion
+from tkamb.knee.contact_points import CondylePoint
+from tkamb.knee.equations import Extensor, KneeGeometry
+from tkamb.knee.load import PointForces
+from tkamb.knee.unknowns import Unknown
 
 INERTIA = {
     "tibia": (4.2, "0.01 0.22 0.005", "0.06 0.008 0.061 0.001 0.0004 -0.0006"),

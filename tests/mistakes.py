@@ -17,12 +17,12 @@ import numpy as np
 from scenes import MODEL, as_toml
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
-from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import TkambError
-from tkamb.plausibility.plausibility import Plausibility
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.run.mechanics import Mechanics
+from tkamb.run.plausibility.plausibility import Plausibility
 from tkamb.run.status import frame_status
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
 
 DM = MODEL.parent / "dm"
 DATA = MODEL.parents[2] / "shared" / "data" / "dm"
@@ -69,9 +69,9 @@ def keep_meshes(monkeypatch):
     """Have meshes, their repair and their search trees made once."""
     store = {}
     for module, name in (
-        ("tkamb.inputs.meshes", "load_surface"),
+        ("tkamb.io.recordings.meshes", "load_surface"),
         ("tkamb.geometry.closest", "ClosestPointQuery"),
-        ("tkamb.body.extensor", "PatellofemoralContact"),
+        ("tkamb.knee.extensor", "PatellofemoralContact"),
     ):
         place = __import__(module, fromlist=[name])
         monkeypatch.setattr(place, name, kept(getattr(place, name), store))

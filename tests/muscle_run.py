@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from synthetic_run import MASS_KG, WEIGHT_N, make_run
-from tkamb.results import Results
 from tkamb.run.recorded import compare_measured
+from tkamb.run.results import Results
 
 GROUPS = {
     "knee extensors": ("recfem", "vasint", "vaslat", "vasmed"),

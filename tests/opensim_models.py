@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from tkamb.opensim.kinematics import Kinematics
-from tkamb.opensim.model import OpenSimModel
-from tkamb.opensim.read import read_osim
+from tkamb.io.opensim.kinematics import Kinematics
+from tkamb.io.opensim.model import OpenSimModel
+from tkamb.io.opensim.read import read_osim
 
 HERE = Path(__file__).parent / "data"
 DATA = Path(__file__).parents[2] / "shared" / "data"

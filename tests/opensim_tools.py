@@ -8,8 +8,8 @@ import numpy as np
 
 from jw_gait import JW, Gait
 from tkamb.geometry.frames import Array
-from tkamb.inputs.tables import read_table
-from tkamb.output.storage import write_storage
+from tkamb.io.recordings.tables import read_table
+from tkamb.show.storage import write_storage
 
 UNBALANCED = 1e4
 """N or N·m: optimal force of the actuators of coordinates that no muscle balances."""

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tkamb.importing.model_fit import ModelChain
-from tkamb.opensim.read import read_osim
-from tkamb.output.storage import write_trc
+from tkamb.io.importing.model_fit import ModelChain
+from tkamb.io.opensim.read import read_osim
+from tkamb.show.storage import write_trc
 
 
 def pendulum_osim(path: Path, changes: dict[str, str] | None = None) -> Path:

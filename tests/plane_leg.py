@@ -3,9 +3,9 @@
 import numpy as np
 
 from tkamb.geometry.frames import pose
-from tkamb.opensim.functions import Linear
-from tkamb.opensim.lines import Muscle, Path, PathPoint
-from tkamb.opensim.model import Body, Coordinate, Joint, JointAxis, OpenSimModel
+from tkamb.io.opensim.functions import Linear
+from tkamb.io.opensim.lines import Muscle, Path, PathPoint
+from tkamb.io.opensim.model import Body, Coordinate, Joint, JointAxis, OpenSimModel
 
 Z = np.array([0.0, 0.0, 1.0])
 THIGH, SHANK = 0.4, 0.42

@@ -1,7 +1,7 @@
 """Raw files of a scene, read and smoothed with numpy and scipy alone: nothing of tkamb.
 
 Tables (.csv, .sto), markers (.trc), binary STL; the quintic smoothing spline that
-`tkamb.inputs.filtering` documents, written anew.
+`tkamb.io.recordings.filtering` documents, written anew.
 """
 
 from pathlib import Path

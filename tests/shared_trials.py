@@ -3,8 +3,8 @@
 import numpy as np
 
 from plane_leg import muscle
-from tkamb.muscles.knee_trial import KneeTrial
-from tkamb.muscles.sharing import FrameProblems, Sharing
+from tkamb.run.muscles.knee_trial import KneeTrial
+from tkamb.run.muscles.sharing import FrameProblems, Sharing
 
 STRENGTHS = (6000.0, 1800.0, 1200.0)
 """N, of quadriceps, hamstring and gastrocnemius."""

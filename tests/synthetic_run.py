@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from tkamb.geometry.frames import Array, knee_pose
-from tkamb.output.maps import ContactMaps
-from tkamb.results import Results
+from tkamb.run.maps import ContactMaps
+from tkamb.run.results import Results
 
 MASS_KG = 75.0
 WEIGHT_N = MASS_KG * 9.80665

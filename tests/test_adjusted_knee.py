@@ -5,9 +5,9 @@ import pytest
 
 from scenes import write_scene
 from tkamb import load_scene, simulate
-from tkamb.equilibrium.contact_side import ContactSide
-from tkamb.equilibrium.mechanics import Mechanics
-from tkamb.scene.case import load_case
+from tkamb.io.scene.case import load_case
+from tkamb.run.contact_side import ContactSide
+from tkamb.run.mechanics import Mechanics
 
 FRAMES = slice(3, 26, 10)
 

@@ -13,12 +13,12 @@ from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult
-from tkamb.equilibrium.adjusted_press import press_adjusted
 from tkamb.errors import InputError
 from tkamb.geometry.adjustment import Adjustment, AdjustmentSettings, RestoreRule, adjust
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import Array, pose, transform
 from tkamb.geometry.surface import Surface
+from tkamb.knee.equilibrium.adjusted_press import press_adjusted
 
 RADIUS, HALF = 0.02, 0.022
 HEIGHT = 1.5e-4

@@ -12,15 +12,15 @@ from tkamb import simulate
 from tkamb.contact.probe import Probe
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult
-from tkamb.equilibrium.contact_side import ContactSide
-from tkamb.equilibrium.mechanics import Mechanics
-from tkamb.equilibrium.split_sensitivity import split_sensitivity, split_tangent
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_pose
-from tkamb.output.axis import horizontal_axis
-from tkamb.output.headline import cards
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.knee.equilibrium.split_sensitivity import split_sensitivity, split_tangent
 from tkamb.run.agreement import contradictions
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.run.contact_side import ContactSide
+from tkamb.run.mechanics import Mechanics
+from tkamb.show.axis import horizontal_axis
+from tkamb.show.headline import cards
 from tkamb.studies.cases import change_recording
 
 DM = Path(__file__).parents[1] / "models" / "dm" / "scene.toml"

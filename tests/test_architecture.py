@@ -1,4 +1,4 @@
-"""Data flows one way: which module may import which, read from the code itself."""
+"""Data flows one way: which folder may import which, read from the code itself."""
 
 import ast
 from pathlib import Path
@@ -7,57 +7,12 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "tkamb"
 
-KNOWN_TO_ALL = {
-    *("atomic", "claim", "code_identity", "compiled", "defaults", "errors", "files", "guard"),
-    *("activities", "known_errors", "memory", "named_classes", "occupants", "scene_options"),
-    *("threads", "units"),
-}
-"""Modules without knees: numbers, files, memory, messages."""
-KNEE = {"body", "contact", "equilibrium", "geometry", "scene"}
-SHOWN = {"columns", "output", "results", "results_folder"}
-DRAWING = {
-    "datasets": set(),
-    "starter": {"geometry", "inputs"},
-    "geometry": set(),
-    "opensim": {"geometry", "inputs"},
-    "body": {"geometry"},
-    "contact": {"geometry"},
-    "inputs": {"geometry"},
-    "presets": set(),
-    "scene": {"body", "geometry", "inputs", "presets"},
-    "equilibrium": {"body", "contact", "geometry", "muscles", "scene"},
-    "knee": {"body", "contact", "equilibrium", "geometry"},
-    "plausibility": {"geometry", "inputs", "scene"},
-    "check": {*KNEE, "output", "plausibility", "run"},
-    "compare": {*SHOWN, "geometry", "plug_ins"},
-    "decks": {"contact", "geometry", "output", "results", "results_folder", "run"},
-    "importing": {"geometry", "inputs", "opensim", "scene"},
-    "run": {*KNEE, *SHOWN, "knee", "plausibility", "plug_ins"} - {"results"},
-    "output": {"columns", "contact", "geometry", "run"},
-    "view": {*KNEE, *SHOWN, "inputs", "run", "simulation"} - {"columns"},
-    "studies": {*KNEE, "plug_ins", "decks", "inputs", "output", "run", "simulation"} - {"body"},
-    "muscles": {"geometry", "importing", "inputs", "opensim"},
-    "designs": {"contact", "geometry"},
-    "wear": {"contact", "equilibrium", "geometry", "inputs", "output", "results_folder", "run"}
-    | {"plug_ins", "results", "scene", "simulation", "uncertainty"},
-    "uncertainty": {*KNEE, "columns", "inputs", "results", "results_folder", "run", "simulation"},
-    "cohort": {
-        "columns",
-        "geometry",
-        "output",
-        "plug_ins",
-        "results",
-        "run",
-        "scene",
-        "simulation",
-        "wear",
-    },
-    "validation": {"body", "contact", "designs", "geometry", "press", "scene", "simulation"}
-    | {"studies"},
-}
-"""Which folder knows which folders and which modules beside them: inputs → body → (equilibrium ⇄
-contact) → results → output, view and studies; the scene is where files become bodies."""
-SEES_BODY_AND_CONTACT = {"contact_side.py", "read_scene.py"}
+ORDER = ("geometry", "contact", "knee", "io", "run", "studies", "show", "commands")
+"""From the lowest folder to the highest: each imports from those before it, and from itself."""
+SERVES_ALL = {"atomic", "code_identity", "errors", "files", "memory", "units"}
+"""Modules beside the folders, without knees: numbers, files, memory, messages."""
+ON_TOP = {"__init__", "__main__", "cli", "testing"}
+"""Modules that may import all."""
 
 
 def imported(path):
@@ -85,42 +40,37 @@ def part_of(name):
     return parts[1] if len(parts) > 1 and parts[1] != "__version__" else ""
 
 
-@pytest.mark.parametrize("folder", sorted(DRAWING))
-def test_a_folder_knows_only_what_the_drawing_says(folder):
+@pytest.mark.parametrize("folder", ORDER)
+def test_every_arrow_points_down(folder):
+    lower = {*ORDER[: ORDER.index(folder) + 1], *SERVES_ALL, ""}
     for path in (PACKAGE / folder).rglob("*.py"):
         for name in imported(path):
-            allowed = DRAWING[folder] | KNOWN_TO_ALL | {folder, ""}
-            assert part_of(name) in allowed, f"{path.name} imports {name}"
+            assert part_of(name) in lower, f"{path.relative_to(PACKAGE)} imports {name}"
 
 
-def test_every_folder_is_in_the_drawing():
+def test_modules_that_serve_all_import_no_folder():
+    for module in SERVES_ALL:
+        for name in imported(PACKAGE / f"{module}.py"):
+            assert part_of(name) in SERVES_ALL | {""}, f"{module} imports {name}"
+
+
+def test_there_are_no_other_folders_and_modules():
     folders = {path.name for path in PACKAGE.iterdir() if any(path.glob("*.py"))}
-    assert folders <= set(DRAWING)
-
-
-def test_body_and_contact_know_geometry_alone():
-    assert DRAWING["body"] == DRAWING["contact"] == {"geometry"}
+    assert folders == set(ORDER)
+    assert {path.stem for path in PACKAGE.glob("*.py")} == SERVES_ALL | ON_TOP
 
 
 def test_the_layer_test_can_fail():
-    assert "tkamb.body.chain" in imported(PACKAGE / "equilibrium" / "mechanics.py")
-    assert part_of("tkamb.body.chain") == "body"
+    names = imported(PACKAGE / "run" / "mechanics.py")
+    assert "tkamb.knee.chain" in names
+    assert part_of("tkamb.knee.chain") == "knee"
 
 
-def test_only_two_files_see_body_and_contact():
-    folders = ("equilibrium", "run", "scene")
-    for path in [*PACKAGE.glob("*.py"), *(p for f in folders for p in (PACKAGE / f).glob("*.py"))]:
-        names = imported(path)
-        sees = {
-            layer
-            for layer in ("body", "contact")
-            for name in names
-            if name.startswith(f"tkamb.{layer}.")
-        }
-        through = {"tkamb.equilibrium.mechanics": "body"}
-        sees |= {layer for module, layer in through.items() if module in names}
-        if len(sees) == 2:
-            assert path.name in SEES_BODY_AND_CONTACT, f"{path.name} sees {sees}"
+def test_the_physics_knows_no_scene():
+    """Geometry, contact and knee take arrays and objects; only `io` knows a file."""
+    for folder in ("geometry", "contact", "knee"):
+        for path in (PACKAGE / folder).rglob("*.py"):
+            assert not any(part_of(name) in ("io", "run") for name in imported(path)), path
 
 
 def module_name(path):
@@ -155,7 +105,7 @@ def circles(graph):
 def test_no_circle_of_imports_late_ones_counted():
     files = {module_name(path): path for path in PACKAGE.rglob("*.py")}
     graph = {name: imported(path) & set(files) for name, path in files.items()}
-    assert graph["tkamb.simulation"]
+    assert graph["tkamb.run.simulation"]
     assert circles(graph) == []
 
 

@@ -12,7 +12,7 @@ from surface_arcs import arc_lengths, draw_uv_lines
 from tkamb.contact.lattice.meshing.grid import build_grid
 from tkamb.errors import InputError
 from tkamb.geometry.surface import Surface
-from tkamb.inputs.meshes import load_surface
+from tkamb.io.recordings.meshes import load_surface
 
 
 def torus_dish(major=0.03, minor=0.02, spacing=5e-4):

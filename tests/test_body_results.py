@@ -7,14 +7,14 @@ import pytest
 
 from scenes import fast_scene, write_scene
 from tkamb import load_scene, simulate
-from tkamb.body.chain import Chain
-from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import knee_pose
-from tkamb.output.tables import strain_table
+from tkamb.io.scene.case import load_case
+from tkamb.knee.chain import Chain
+from tkamb.run.mechanics import Mechanics
 from tkamb.run.tabulate import WHY_IT_FAILED
-from tkamb.scene.case import load_case
+from tkamb.show.tables import strain_table
 
 FEW = {"motion.frames": 26}
 FRAMES = slice(10, 91, 40)

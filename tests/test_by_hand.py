@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import tkamb.body.knee as knee_module
+import tkamb.knee.equations as knee_module
 from lattice_bodies import above, box_insert, pair, sphere_cap
 from scenes import MODEL, fast_scene
 from tkamb import simulate
-from tkamb.body.contact_points import CondylePoint
-from tkamb.body.knee import RESIDUAL_SHIFT, solve_knee
-from tkamb.body.ligaments import quadratic_toe_force, two_line_force
-from tkamb.body.unknowns import residuals
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
-from tkamb.equilibrium.mechanics import Mechanics
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.knee.contact_points import CondylePoint
+from tkamb.knee.equations import RESIDUAL_SHIFT, solve_knee
+from tkamb.knee.ligaments import quadratic_toe_force, two_line_force
+from tkamb.knee.unknowns import residuals
+from tkamb.run.mechanics import Mechanics
 
 FRICTION = 0.05
 ROWS = slice(30, 91, 30)

@@ -9,14 +9,14 @@ import pytest
 
 from recordings import AMTI_CORNERS, standing_markers, write_c3d
 from tkamb.errors import InputError
-from tkamb.inputs.c3d import read_c3d
-from tkamb.inputs.ground_reaction import load_ground_reaction
-from tkamb.inputs.markers import matched_labels
-from tkamb.inputs.samples import OddSample
-from tkamb.inputs.tables import read_table
-from tkamb.plausibility.movement import sample_questions
-from tkamb.scene.recording_tables import GroundReactionTable
-from tkamb.scene.si import in_si
+from tkamb.io.recordings.c3d import read_c3d
+from tkamb.io.recordings.ground_reaction import load_ground_reaction
+from tkamb.io.recordings.markers import matched_labels
+from tkamb.io.recordings.samples import OddSample
+from tkamb.io.recordings.tables import read_table
+from tkamb.io.scene.recording_tables import GroundReactionTable
+from tkamb.io.scene.si import in_si
+from tkamb.run.plausibility.movement import sample_questions
 
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw" / "motion"
 COUNT, RATIO = 20, 10

@@ -12,8 +12,8 @@ from damaged_recordings import TEXTS, WORDS, damaged, read_all
 from raw_c3d import MACHINES, RawC3d
 from recordings import standing_markers, write_c3d
 from tkamb.errors import InputError
-from tkamb.inputs.c3d import read_c3d
-from tkamb.output.storage import write_trc
+from tkamb.io.recordings.c3d import read_c3d
+from tkamb.show.storage import write_trc
 
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw" / "motion"
 POINTS = np.round(np.random.default_rng(3).normal(0.0, 400.0, (12, 3, 3)), 1)  # mm

@@ -12,23 +12,23 @@ from contact_bodies import joined
 from mirrored_patient import mirror_mesh, write_mirrored_patient
 from scenes import write_scene
 from tkamb import simulate
-from tkamb.body.joint_equilibrium import external_wrench
-from tkamb.body.load import total_wrench, wrench_of
 from tkamb.cli import main
 from tkamb.contact.cam_post import CamPost, twist_matrix
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
-from tkamb.designs.design import CAM_MESH, INSERT_MESH, load_design
-from tkamb.equilibrium.contact_side import ContactSide
-from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_pose, rotate
 from tkamb.geometry.post import divide_insert
 from tkamb.geometry.surface import Surface
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.knee.joint_equilibrium import external_wrench
+from tkamb.knee.load import total_wrench, wrench_of
+from tkamb.run.contact_side import ContactSide
+from tkamb.run.mechanics import Mechanics
 from tkamb.run.tabulate import frame_row
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.studies.designs.design import CAM_MESH, INSERT_MESH, load_design
 from tkamb.units import MILLIMETRE
 
 DESIGN = load_design(Path(__file__).parents[1] / "models" / "designs" / "lps_flex")

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from knees import leg, random_motion
-from tkamb.body import unknowns
-from tkamb.body.load import PointForces, total_wrench
-from tkamb.body.unknowns import Unknown, solve
 from tkamb.geometry.frames import inverse, rotate, transform
+from tkamb.knee import unknowns
+from tkamb.knee.load import PointForces, total_wrench
+from tkamb.knee.unknowns import Unknown, solve
 
 
 def mujoco_twin(chain):

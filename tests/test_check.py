@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from tkamb.check.command import check_html
-from tkamb.check.inventory import _listed
-from tkamb.check.leg_picture import leg_frame, shown_frames
-from tkamb.check.scene_check import check_scene
 from tkamb.cli import main
-from tkamb.starter import lay_out
+from tkamb.commands.check import check_html
+from tkamb.io.starter import lay_out
+from tkamb.show.check.inventory import _listed
+from tkamb.show.check.leg_picture import leg_frame, shown_frames
+from tkamb.show.check.scene_check import check_scene
 
 
 @pytest.fixture(scope="module")

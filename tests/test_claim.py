@@ -10,14 +10,14 @@ import pytest
 
 from tkamb import atomic
 from tkamb.atomic import JOURNAL, MARKER, folder_token, replaced_file, replaced_together
-from tkamb.claim import claimed_directory, settle
 from tkamb.errors import InputError
+from tkamb.io.claim import claimed_directory, settle
 
 ROOT = Path(__file__).parents[1]
 
 HOLD = """
 import sys
-from tkamb.claim import claimed_directory
+from tkamb.io.claim import claimed_directory
 with claimed_directory(sys.argv[1]):
     print("held", flush=True)
     sys.stdin.read()

@@ -15,7 +15,7 @@ from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
 from tkamb.geometry.nearest import NearestPoints, sampled
 from tkamb.geometry.surface import Surface
-from tkamb.inputs.meshes import axes_rotation, load_surface
+from tkamb.io.recordings.meshes import axes_rotation, load_surface
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real data are not here")

@@ -16,7 +16,7 @@ from tkamb.cli import main
 from tkamb.errors import ComputationError, InputError
 from tkamb.run import cluster
 from tkamb.run.workers import Crew, Task
-from tkamb.uncertainty.run import estimate_uncertainty
+from tkamb.studies.uncertainty.run import estimate_uncertainty
 
 
 class Adder:
@@ -150,7 +150,7 @@ def test_a_scheduler_started_anew_and_a_client_gone_and_back_lose_and_double_not
             sys.executable,
             "-c",
             "from test_uncertainty import bodies_alone\n"
-            "from tkamb.uncertainty.run import estimate_uncertainty\n"
+            "from tkamb.studies.uncertainty.run import estimate_uncertainty\n"
             "estimate_uncertainty(bodies_alone(uncertainty__ligament_strain=0.02), samples=120, "
             f"resume=True, directory={str(folder)!r}, dask={address!r})",
         ],

@@ -16,18 +16,18 @@ import pytest
 from faults import Faults
 from interrupted_runs import broken_off, held_elsewhere
 from synthetic_run import make_run
-from tkamb.claim import claimed_directory, settle
 from tkamb.cli import main
-from tkamb.cohort.folder import frame_table, write_cohort
-from tkamb.cohort.outcome import Outcome, chosen_map
-from tkamb.cohort.plan import CohortTable, load_cohort
-from tkamb.cohort.report import _told_apart, cohort_html, draw_groups
-from tkamb.cohort.run import run_cohort
-from tkamb.cohort.statistics import Group, groups_of, spread
 from tkamb.errors import InputError
+from tkamb.io.claim import claimed_directory, settle
 from tkamb.memory import give_back
+from tkamb.run.simulation import simulate
 from tkamb.run.workers import Crew
-from tkamb.simulation import simulate
+from tkamb.show.cohort_report import _told_apart, cohort_html, draw_groups
+from tkamb.studies.cohort.folder import frame_table, write_cohort
+from tkamb.studies.cohort.outcome import Outcome, chosen_map
+from tkamb.studies.cohort.plan import CohortTable, load_cohort
+from tkamb.studies.cohort.run import run_cohort
+from tkamb.studies.cohort.statistics import Group, groups_of, spread
 
 KNEE = Path(__file__).parents[1] / "models" / "deep_knee_bend"
 WRITTEN = {"cohort.parquet", "runs.csv", "groups.csv", "cohort.json", "cohort.html"}
@@ -94,7 +94,7 @@ def test_a_cohort_is_its_runs_one_by_one_and_lists_what_failed(file, tmp_path, c
 
 
 def test_parts_and_workers_and_an_interrupt_change_nothing(file, tmp_path, monkeypatch):
-    monkeypatch.setattr("tkamb.cohort.report.cohort_html", lambda *_: "page")
+    monkeypatch.setattr("tkamb.show.cohort_report.cohort_html", lambda *_: "page")
     whole, parted = tmp_path / "whole", tmp_path / "parted"
 
     with pytest.raises(KeyboardInterrupt, match="1 of 6 runs are kept"):
@@ -261,7 +261,7 @@ def test_two_into_one_folder_and_another_cohort_to_resume_are_refused(file, tmp_
 @pytest.mark.slow
 def test_a_full_disk_leaves_no_table_or_the_whole_of_it(file, tmp_path, monkeypatch):
     cohort, outcomes = load_cohort(file), {n: outcome(1.0, 5) for n in range(4)}
-    monkeypatch.setattr("tkamb.cohort.report.cohort_html", lambda *_: "page")
+    monkeypatch.setattr("tkamb.show.cohort_report.cohort_html", lambda *_: "page")
 
     def write(place, number=None):
         place.mkdir()

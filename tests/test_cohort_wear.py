@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("pyarrow")
 
 from tkamb.cli import main
-from tkamb.cohort.outcome import Outcome
+from tkamb.studies.cohort.outcome import Outcome
 from wear_bodies import balls_scene
 
 

@@ -9,10 +9,10 @@ import pytest
 from kept_runs import keep
 from synthetic_run import make_run
 from tkamb.cli import main
-from tkamb.compare import page
-from tkamb.compare.comparison import compare_folders
-from tkamb.compare.figures import shown_frame
-from tkamb.results import Results
+from tkamb.run.results import Results
+from tkamb.show.compare import page
+from tkamb.show.compare.comparison import compare_folders
+from tkamb.show.compare.figures import shown_frame
 
 
 def written(folder, results, **summary):

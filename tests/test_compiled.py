@@ -8,7 +8,7 @@ from pathlib import Path
 import tkamb
 
 NOWHERE = """
-from tkamb.compiled import compiled
+from tkamb.geometry.compiled import compiled
 
 @compiled
 def doubled(x):

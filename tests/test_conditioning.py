@@ -8,14 +8,14 @@ import pytest
 
 from scenes import MODEL, write_scene
 from tkamb import simulate
-from tkamb.body.knee import solve_knee
-from tkamb.body.load import PointForces
-from tkamb.body.unknowns import LARGEST_CONDITION
-from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.geometry.frames import transform
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.knee.equations import solve_knee
+from tkamb.knee.load import PointForces
+from tkamb.knee.unknowns import LARGEST_CONDITION
+from tkamb.run.mechanics import FrameLoads, Mechanics
 from tkamb.run.status import FAILED, frame_status
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
 
 MIDDLE = 60
 

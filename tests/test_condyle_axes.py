@@ -20,8 +20,8 @@ from tkamb.contact.pair import ContactPair
 from tkamb.errors import InputError
 from tkamb.geometry.condyles import condyle_split, condyle_yaw
 from tkamb.geometry.surface import Surface
-from tkamb.inputs.meshes import load_surface
-from tkamb.press import press_meshes
+from tkamb.io.recordings.meshes import load_surface
+from tkamb.run.press import press_meshes
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data"

@@ -11,10 +11,7 @@ import numpy as np
 import pytest
 
 from scenes import write_scene
-from tkamb import named_classes
-from tkamb.cohort import run as cohort_run
-from tkamb.cohort.plan import load_cohort
-from tkamb.compare.comparison import compare_folders
+from tkamb.contact import named_classes
 from tkamb.contact.foundation import ElasticFoundation
 from tkamb.contact.registry import (
     BUILT_IN,
@@ -24,11 +21,14 @@ from tkamb.contact.registry import (
     contact_names,
 )
 from tkamb.errors import InputError
-from tkamb.plug_ins import CONTACT_CODE, contact_code, foreign_code
-from tkamb.results_folder import verify_results, write_results
-from tkamb.scene import load_scene
-from tkamb.simulation import simulate
+from tkamb.io.scene import load_scene
+from tkamb.run.plug_ins import CONTACT_CODE, contact_code, foreign_code
+from tkamb.run.results_folder import verify_results, write_results
+from tkamb.run.simulation import simulate
+from tkamb.show.compare.comparison import compare_folders
 from tkamb.studies import tradeoff
+from tkamb.studies.cohort import run as cohort_run
+from tkamb.studies.cohort.plan import load_cohort
 from tkamb.studies.measures import Job
 from tkamb.testing import ConformanceError, check_contact_model
 

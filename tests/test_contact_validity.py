@@ -10,7 +10,7 @@ from tkamb.contact.pressing import thickness_near
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
 from tkamb.geometry.surface import Surface
-from tkamb.press import PressReport
+from tkamb.run.press import PressReport
 
 MODELS = ["foundation", "foundation-linear", "hertz", "lattice", "lattice-linear", "fe"]
 FEW = ["foundation-linear", "hertz", "lattice", "lattice-linear"]

@@ -7,16 +7,16 @@ import pytest
 
 from knees import UP, bent_knee
 from shared_trials import two_flexors
-from tkamb.body.contributions import (
+from tkamb.knee.contributions import (
     EXTENSORS,
     EXTERNAL,
     LIGAMENTS,
     POST,
     condyle_contributions,
 )
-from tkamb.body.load import PointForces, wrench_of
-from tkamb.body.unknowns import AXES
-from tkamb.equilibrium.shared_muscles import SharedMuscles
+from tkamb.knee.load import PointForces, wrench_of
+from tkamb.knee.unknowns import AXES
+from tkamb.run.muscles.shared_muscles import SharedMuscles
 
 FRICTION = 0.05
 PLACES = {"taut": [-0.06, -0.45, 0.0], "slack": [0.06, -0.45, 0.0], "one side": [-0.05, -0.45, 0.3]}

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from scenes import fast_scene
-from tkamb.equilibrium.contact_side import LOAD_CHANGE, POINT_CHANGE, ContactSide
-from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
-from tkamb.simulation import simulate
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.run.contact_side import LOAD_CHANGE, POINT_CHANGE, ContactSide
+from tkamb.run.mechanics import Mechanics
+from tkamb.run.simulation import simulate
 
 SCENE = fast_scene()
 FRAMES = slice(0, 101, 20)

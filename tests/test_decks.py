@@ -11,12 +11,12 @@ from kept_runs import keep
 from scenes import write_scene
 from tkamb.cli import main
 from tkamb.contact.materials import material
-from tkamb.decks.febio import contact_quads
-from tkamb.decks.frame import frame_press
 from tkamb.errors import InputError
-from tkamb.results_folder import read_results
-from tkamb.simulation import simulate
-from tkamb.starter import lay_out
+from tkamb.io.starter import lay_out
+from tkamb.run.decks.febio import contact_quads
+from tkamb.run.decks.frame import frame_press
+from tkamb.run.results_folder import read_results
+from tkamb.run.simulation import simulate
 from tkamb.studies.calculix import run_calculix
 from tkamb.studies.peer import peer_result
 

@@ -11,11 +11,11 @@ import pinocchio as pin
 import pytest
 import trimesh
 
-from tkamb.designs.sagittal import normal
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
-from tkamb.inputs.meshes import load_surface
-from tkamb.scene import load_scene
+from tkamb.io.recordings.meshes import load_surface
+from tkamb.io.scene import load_scene
+from tkamb.studies.designs.sagittal import normal
 
 ROOT = Path(__file__).parents[1]
 MODEL = ROOT / "models" / "deep_knee_bend"
@@ -248,8 +248,8 @@ def test_ground_reaction_fits_a_whole_body_in_balance(motion):
 
 
 def test_package_finds_the_patella_where_the_script_put_it(motion):
-    from tkamb.equilibrium.known import extensor_frames
-    from tkamb.scene.case import load_case
+    from tkamb.io.scene.case import load_case
+    from tkamb.run.known import extensor_frames
 
     case = load_case(load_scene(MODEL / "scene.toml", {"patella.motion": "solved"}))
     frames = np.arange(0, 101, 5)

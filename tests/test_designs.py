@@ -9,15 +9,15 @@ import trimesh
 
 from tkamb.cli import main
 from tkamb.contact.registry import contact_model
-from tkamb.designs.design import load_design
-from tkamb.designs.radii import circle_radius, measured_radii
-from tkamb.designs.sagittal import SagittalProfile
 from tkamb.errors import InputError
 from tkamb.geometry.post import find_post
-from tkamb.inputs.meshes import load_surface
-from tkamb.validation.design_cells import Assumption, PressedDesign, nominal, table_force
-from tkamb.validation.design_tables import FOLDERS, pairs_in_order
-from tkamb.validation.dissertation import designs
+from tkamb.io.recordings.meshes import load_surface
+from tkamb.studies.designs.design import load_design
+from tkamb.studies.designs.radii import circle_radius, measured_radii
+from tkamb.studies.designs.sagittal import SagittalProfile
+from tkamb.studies.validation.design_cells import Assumption, PressedDesign, nominal, table_force
+from tkamb.studies.validation.design_tables import FOLDERS, pairs_in_order
+from tkamb.studies.validation.dissertation import designs
 
 ROOT = Path(__file__).parents[1] / "models" / "designs"
 

@@ -7,20 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tkamb.body.ligaments import build_ligaments, quadratic_toe_force
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
-from tkamb.inputs.ground_reaction import load_ground_reaction
-from tkamb.inputs.markers import marker_trajectories
-from tkamb.inputs.meshes import axes_rotation, load_surface
-from tkamb.inputs.motion import load_motion
-from tkamb.inputs.tables import read_table
-from tkamb.inputs.tibia import load_tibia
-from tkamb.plausibility.movement import marker_questions
-from tkamb.scene import load_scene
-from tkamb.scene.case import Case, load_case
-from tkamb.scene.si import in_si
+from tkamb.io.recordings.ground_reaction import load_ground_reaction
+from tkamb.io.recordings.markers import marker_trajectories
+from tkamb.io.recordings.meshes import axes_rotation, load_surface
+from tkamb.io.recordings.motion import load_motion
+from tkamb.io.recordings.tables import read_table
+from tkamb.io.recordings.tibia import load_tibia
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import Case, load_case
+from tkamb.io.scene.si import in_si
+from tkamb.knee.ligaments import build_ligaments, quadratic_toe_force
+from tkamb.run.plausibility.movement import marker_questions
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data" / "dm"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from test_load_states import FRICTION, UP, knee, loaded  # noqa: F401
-from tkamb.body.knee import dome_sensitivity, solve_knee
+from tkamb.knee.equations import dome_sensitivity, solve_knee
 
 
 def test_quadriceps_follows_the_arms_about_the_shifted_contact(knee):  # noqa: F811

@@ -11,12 +11,12 @@ from scipy.signal import butter, sosfiltfilt
 from recordings import write_c3d
 from shared_trials import STRENGTHS, two_flexors
 from tkamb.errors import InputError
-from tkamb.inputs.emg import Envelopes, envelope, load_envelopes
-from tkamb.muscles.emg import EmgGuide
-from tkamb.muscles.sharing import KKT_LIMIT
+from tkamb.io.recordings.emg import Envelopes, envelope, load_envelopes
+from tkamb.io.scene.measured import EmgTable
+from tkamb.io.scene.si import in_si
+from tkamb.run.muscles.emg import EmgGuide
+from tkamb.run.muscles.sharing import KKT_LIMIT
 from tkamb.run.recorded import compare_emg, fitted_normalisation
-from tkamb.scene.measured import EmgTable
-from tkamb.scene.si import in_si
 
 RATE = 1200.0
 TIME = np.arange(int(4 * RATE)) / RATE

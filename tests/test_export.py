@@ -9,8 +9,8 @@ import pytest
 
 from synthetic_run import make_run
 from tkamb.cli import main
-from tkamb.inputs.tables import read_table
-from tkamb.results_folder import write_results
+from tkamb.io.recordings.tables import read_table
+from tkamb.run.results_folder import write_results
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ from lattice_blocks import block
 from scenes import write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.output.vtk import write_hexahedra
-from tkamb.results_folder import read_results, verify_results
-from tkamb.scene import Scene
+from tkamb.io.scene import Scene
+from tkamb.io.vtk import write_hexahedra
+from tkamb.run.results_folder import read_results, verify_results
 from tkamb.studies.kept_rows import KeptRows
 
 MOST = 400
@@ -23,15 +23,14 @@ MOST = 400
 def plain_report(monkeypatch):
     """The report's drawing takes a second and writes nothing."""
     monkeypatch.setattr(
-        "tkamb.output.report.report_html", lambda results, progress=None: "<html></html>"
+        "tkamb.show.report.report_html", lambda results, progress=None: "<html></html>"
     )
 
 
 @pytest.fixture
 def quick_case(monkeypatch):
     """Scenes are read, and their bodies built, once."""
-    from tkamb import simulation
-    from tkamb.run import frames
+    from tkamb.run import frames, simulation
 
     parts = ((simulation, "load_case", Scene.model_dump_json), (frames, "Mechanics", id))
     for module, name, key_of in parts:

@@ -8,7 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, pose
-from tkamb.inputs.filtering import check_frames, differentiate_coordinates, differentiate_poses
+from tkamb.io.recordings.filtering import (
+    check_frames,
+    differentiate_coordinates,
+    differentiate_poses,
+)
 
 CUTOFF = 6.0
 

@@ -12,7 +12,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import FLAT_BOTTOM, find_flat_bottom, find_flats, insert_placement
 from tkamb.geometry.frames import pose, transform
 from tkamb.geometry.surface import Surface
-from tkamb.inputs.meshes import axes_rotation, load_surface
+from tkamb.io.recordings.meshes import axes_rotation, load_surface
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real data are not here")

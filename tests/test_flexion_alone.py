@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tkamb.equilibrium.contact_side import ContactSide
-from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
 from tkamb.geometry.condyles import LowestPoints
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import knee_pose
-from tkamb.inputs.tables import read_table
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.recordings.tables import read_table
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.run.contact_side import ContactSide
+from tkamb.run.mechanics import Mechanics
 
 BEND = Path(__file__).parents[1] / "models" / "deep_knee_bend"
 ALL = ["ap", "ml", "axial_rotation", "adduction"]

@@ -371,7 +371,7 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 @pytest.mark.skipif(not DATA.is_dir(), reason="the data folder shared/data is not here")
 def test_a_real_implant_is_loaded_on_both_dishes():
     """JW's components aligned, 1500 N: even split, centres in the dishes."""
-    from tkamb.press import press_meshes
+    from tkamb.run.press import press_meshes
 
     folder = DATA / "jw" / "geometry"
     report = press_meshes(

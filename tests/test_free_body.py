@@ -22,13 +22,13 @@ import pytest
 from free_body import FreeBodies, Lent
 from raw_leg import Leg
 from shared_trials import two_flexors
-from tkamb.equilibrium.mechanics import Mechanics
-from tkamb.equilibrium.shared_muscles import SharedMuscles
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import pose
-from tkamb.inputs.meshes import axes_rotation, load_surface
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.recordings.meshes import axes_rotation, load_surface
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.run.mechanics import Mechanics
+from tkamb.run.muscles.shared_muscles import SharedMuscles
 
 MODELS = Path(__file__).parents[1] / "models"
 DATA = Path(__file__).parents[2] / "shared" / "data" / "dm"

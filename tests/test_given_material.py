@@ -10,10 +10,10 @@ from tkamb.cli import main
 from tkamb.contact.given_material import given_material, material_as_json, named_material
 from tkamb.contact.materials import LinearElastic, material
 from tkamb.errors import InputError
-from tkamb.press import press_meshes
-from tkamb.scene import load_scene
-from tkamb.simulation import simulate
-from tkamb.wear.setup import wear_setup
+from tkamb.io.scene import load_scene
+from tkamb.run.press import press_meshes
+from tkamb.run.simulation import simulate
+from tkamb.studies.wear.setup import wear_setup
 
 CURVE = {"strain": (0.0, 0.01, 0.05, 0.2), "stress_MPa": (0.0, 6.0, 15.0, 22.0)}
 POSE = (-6.9, 30.7, 0.0, 0.0, 0.0, 0.0)

@@ -5,9 +5,9 @@ import pytest
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR
-from tkamb.inputs.ground_reaction import load_ground_reaction
-from tkamb.scene.recording_tables import GroundReactionTable
-from tkamb.scene.si import in_si
+from tkamb.io.recordings.ground_reaction import load_ground_reaction
+from tkamb.io.scene.recording_tables import GroundReactionTable
+from tkamb.io.scene.si import in_si
 
 STAMPS = np.arange(2401) / 1200
 AT = np.linspace(0.2, 1.8, 33)

@@ -12,8 +12,8 @@ from tkamb import files
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.files import read_bytes, read_xml
-from tkamb.guard import interrupt_as_such
-from tkamb.inputs.tables import read_table
+from tkamb.io.recordings.tables import read_table
+from tkamb.run.guard import interrupt_as_such
 
 ROOT = Path(__file__).parents[1]
 MESHES = [str(MODEL / name) for name in ("femoral_component.stl", "insert.stl")]
@@ -156,7 +156,7 @@ def test_what_nobody_foresaw_is_one_line_and_a_log(tmp_path, monkeypatch, capfd,
     def fails(*_):
         raise error
 
-    monkeypatch.setattr("tkamb.simulation.load_case", fails)
+    monkeypatch.setattr("tkamb.run.simulation.load_case", fails)
     scene = write_scene(tmp_path / "scene", ("contact",))
     assert main(["run", str(scene), "--out", str(tmp_path / "out")]) == 1
     said = capfd.readouterr().err

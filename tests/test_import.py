@@ -13,19 +13,19 @@ from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import inverse
-from tkamb.importing.anatomy import find_leg
-from tkamb.importing.links import find_links, quarter_turn
-from tkamb.importing.model_fit import ModelChain, fit_model
-from tkamb.importing.soft_tissue import soft_tissue
-from tkamb.importing.urdf import link_inertias, patient_urdf
-from tkamb.inputs.markers import matched_labels
-from tkamb.inputs.meshes import axes_rotation, load_surface
-from tkamb.inputs.tables import read_table
-from tkamb.opensim.read import read_osim
-from tkamb.output.storage import write_storage, write_trc
-from tkamb.plausibility.movement import marker_questions
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.importing.anatomy import find_leg
+from tkamb.io.importing.links import find_links, quarter_turn
+from tkamb.io.importing.model_fit import ModelChain, fit_model
+from tkamb.io.importing.soft_tissue import soft_tissue
+from tkamb.io.importing.urdf import link_inertias, patient_urdf
+from tkamb.io.opensim.read import read_osim
+from tkamb.io.recordings.markers import matched_labels
+from tkamb.io.recordings.meshes import axes_rotation, load_surface
+from tkamb.io.recordings.tables import read_table
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.run.plausibility.movement import marker_questions
+from tkamb.show.storage import write_storage, write_trc
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data"
@@ -336,7 +336,7 @@ def test_the_script_writes_the_scenes_that_are_shipped(tmp_path):
     loader = SourceFileLoader("make_jw_scenes", str(ROOT / "scripts/make_jw_scenes"))
     script = module_from_spec(spec_from_loader("make_jw_scenes", loader))
     loader.exec_module(script)
-    from tkamb.importing.patient import import_patient
+    from tkamb.io.importing.patient import import_patient
 
     patient = import_patient(script.request(JW, "ngait_og3"), ROOT / "models/jw")
     assert patient.scene.text() == (ROOT / "models/jw/ngait_og3.toml").read_text()

@@ -14,16 +14,16 @@ from pendulum_leg import changed, moving_leg, pendulum_osim
 from tkamb.cli import main
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
-from tkamb.importing.anatomy import find_leg
-from tkamb.importing.links import find_links
-from tkamb.importing.model_fit import ModelChain
-from tkamb.importing.patient import import_patient
-from tkamb.importing.recorded_poses import ROLES, PoseRecording, read_poses
-from tkamb.inputs.meshes import axes_rotation, load_surface
-from tkamb.opensim.read import read_osim
-from tkamb.output.storage import write_storage, write_trc
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.importing.anatomy import find_leg
+from tkamb.io.importing.links import find_links
+from tkamb.io.importing.model_fit import ModelChain
+from tkamb.io.importing.patient import import_patient
+from tkamb.io.importing.recorded_poses import ROLES, PoseRecording, read_poses
+from tkamb.io.opensim.read import read_osim
+from tkamb.io.recordings.meshes import axes_rotation, load_surface
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.show.storage import write_storage, write_trc
 
 ROOT = Path(__file__).parents[1]
 DM = ROOT.parent / "shared" / "data" / "dm"

@@ -16,7 +16,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.inner_walls import find_inner_wall
 from tkamb.geometry.surface import Surface
-from tkamb.inputs.meshes import load_surface
+from tkamb.io.recordings.meshes import load_surface
 
 LENGTH, WIDTH, HEIGHT = 0.050, 0.076, 0.010
 

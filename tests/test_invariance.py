@@ -9,18 +9,20 @@ import pinocchio as pin
 import pytest
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
+from tkamb.scene import Scene, load_scene
 
 from scenes import MODEL, write_scene
-from tkamb.body import contact_points, knee, patellofemoral
-from tkamb.body.chain import Chain
-from tkamb.equilibrium.mechanics import FrameLoads, Mechanics
 from tkamb.geometry import closest, condyles
 from tkamb.geometry.frames import pose
 from tkamb.geometry.surface import Surface
-from tkamb.inputs.patient import load_urdf
-from tkamb.scene import Scene, lines, load_scene
-from tkamb.scene.case import Case, load_case
-from tkamb.scene.si import in_si
+from tkamb.io.recordings.patient import load_urdf
+from tkamb.io.scene import lines
+from tkamb.io.scene.case import Case, load_case
+from tkamb.io.scene.si import in_si
+from tkamb.knee import contact_points, patellofemoral
+from tkamb.knee import equations as knee
+from tkamb.knee.chain import Chain
+from tkamb.run.mechanics import FrameLoads, Mechanics
 
 FEW = 26
 FRAMES = (0, 9, 15, 23)

@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_coordinates, knee_pose, pose, transform
-from tkamb.inputs.inverse_kinematics import fit_chain
-from tkamb.inputs.leg_chain import FLEXION, LegChain, LegState, Segment
-from tkamb.inputs.markers import fit_rigid, fit_seen
+from tkamb.io.recordings.inverse_kinematics import fit_chain
+from tkamb.io.recordings.leg_chain import FLEXION, LegChain, LegState, Segment
+from tkamb.io.recordings.markers import fit_rigid, fit_seen
 
 FRAMES = 7
 NEUTRAL = np.array([-0.002, 0.042, 0.001, 0.03, -0.02, 0.0])

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from tkamb.cli import main
-from tkamb.inputs.c3d import read_c3d
-from tkamb.output.storage import write_storage, write_trc
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.recordings.c3d import read_c3d
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.show.storage import write_storage, write_trc
 
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw"
 TRIAL = JW / "motion" / "jw_ngait_og3.c3d"

@@ -8,15 +8,15 @@ from jw_gait import JW, gait, needs_jw
 from opensim_models import PUBLISHED, model
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import MIRROR, inverse, transform
-from tkamb.importing.anatomy import find_leg
-from tkamb.importing.links import find_links
-from tkamb.inputs.meshes import axes_rotation, load_surface
-from tkamb.muscles import Sharing
-from tkamb.muscles.knee_trial import knee_trial
-from tkamb.muscles.recording import LegRecording, load_knee_trial
-from tkamb.muscles.trial import trial_problems
-from tkamb.opensim.motion import CoordinateMotion
-from tkamb.output.storage import write_storage
+from tkamb.io.importing.anatomy import find_leg
+from tkamb.io.importing.links import find_links
+from tkamb.io.opensim.motion import CoordinateMotion
+from tkamb.io.recordings.meshes import axes_rotation, load_surface
+from tkamb.run.muscles import Sharing
+from tkamb.run.muscles.knee_trial import knee_trial
+from tkamb.run.muscles.recording import LegRecording, load_knee_trial
+from tkamb.run.muscles.trial import trial_problems
+from tkamb.show.storage import write_storage
 
 EXTENSORS = {"recfem", "vasint", "vaslat", "vasmed"}
 CROSSING = {"bflh", "bfsh", "gaslat", "gasmed", "grac", "sart", "semimem", "semiten", "tfl"}

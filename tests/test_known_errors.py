@@ -1,6 +1,6 @@
 """When the known error of a contact model is called large."""
 
-from tkamb.known_errors import is_large
+from tkamb.run.known_errors import is_large
 
 EDGE = {"edge": {"peak_pressure": 0.3, "area": 0.2}}
 

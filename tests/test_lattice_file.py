@@ -7,7 +7,7 @@ import pytest
 
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.mesh_files import lattice_of_file
+from tkamb.io.mesh_files import lattice_of_file
 
 INSERT = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "insert.stl"
 

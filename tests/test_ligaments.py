@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from tkamb.body.generic_ligaments import condylar_axis, generic_ligaments
-from tkamb.body.ligaments import (
+from tkamb.errors import InputError
+from tkamb.geometry.frames import inverse, knee_pose
+from tkamb.geometry.surface import Surface
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.io.scene.lines import ligament
+from tkamb.io.scene.tables import LigamentTable
+from tkamb.knee.generic_ligaments import condylar_axis, generic_ligaments
+from tkamb.knee.ligaments import (
     TOE_STRAIN,
     Ligament,
     build_ligaments,
@@ -16,14 +23,7 @@ from tkamb.body.ligaments import (
     strain_table,
     two_line_force,
 )
-from tkamb.body.load import total_wrench
-from tkamb.errors import InputError
-from tkamb.geometry.frames import inverse, knee_pose
-from tkamb.geometry.surface import Surface
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
-from tkamb.scene.lines import ligament
-from tkamb.scene.tables import LigamentTable
+from tkamb.knee.load import total_wrench
 
 SLACK = 0.05
 FLEXION = np.deg2rad(np.arange(0.0, 101.0, 5.0))

@@ -13,11 +13,11 @@ from mirrored_patient import write_mirrored_patient
 from scenes import MODEL
 from tkamb.cli import main
 from tkamb.errors import InputError, TkambError
-from tkamb.scene.case import load_case
-from tkamb.view.bench import BenchRequest, Placement
-from tkamb.view.live import LiveKnee
-from tkamb.view.live_window import LiveWindow
-from tkamb.view.show import serve_in_background
+from tkamb.io.scene.case import load_case
+from tkamb.show.view.bench import BenchRequest, Placement
+from tkamb.show.view.live import LiveKnee
+from tkamb.show.view.live_window import LiveWindow
+from tkamb.show.view.show import serve_in_background
 
 COARSE = {"contact": "foundation", "resolution_mm": 3.0}
 

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from knees import HALF, UP, bent_knee
-from tkamb.body.knee import solve_knee
-from tkamb.body.load import PointForces
-from tkamb.body.load_state import LoadState, wrong_signs
-from tkamb.body.unknowns import Solution
+from tkamb.knee.equations import solve_knee
+from tkamb.knee.load import PointForces
+from tkamb.knee.load_state import LoadState, wrong_signs
+from tkamb.knee.unknowns import Solution
 
 FRICTION = 0.05
 CARRIED = (

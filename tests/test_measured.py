@@ -6,15 +6,15 @@ from pydantic import ValidationError
 
 from synthetic_run import make_run
 from tkamb.errors import InputError
-from tkamb.inputs.measured_force import load_measured_force
-from tkamb.output.axis import horizontal_axis
-from tkamb.output.comparison import comparison_words
-from tkamb.output.headline import cards
-from tkamb.output.panels import panels
-from tkamb.results import Results
+from tkamb.io.recordings.measured_force import load_measured_force
+from tkamb.io.scene.measured import MeasuredTable
+from tkamb.io.scene.si import in_si
 from tkamb.run.recorded import compare_measured, measured_column
-from tkamb.scene.measured import MeasuredTable
-from tkamb.scene.si import in_si
+from tkamb.run.results import Results
+from tkamb.show.axis import horizontal_axis
+from tkamb.show.comparison import comparison_words
+from tkamb.show.headline import cards
+from tkamb.show.panels import panels
 
 POUND = 0.45359237 * 9.80665
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from jw_gait import needs_jw
-from tkamb.columns import CONTRIBUTIONS, belongs
-from tkamb.simulation import simulate
+from tkamb.run.columns import CONTRIBUTIONS, belongs
+from tkamb.run.simulation import simulate
 
 SCENE = Path(__file__).parents[1] / "models" / "jw" / "ngait_og3_measured.toml"
 LATE_STANCE = 15

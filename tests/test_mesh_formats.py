@@ -13,8 +13,13 @@ from tkamb.errors import InputError
 from tkamb.geometry.polygons import CrossedPolygonError, triangulated
 from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import is_closed
-from tkamb.inputs.mesh_check import check_mesh
-from tkamb.inputs.meshes import coordinate_rounding, load_surface, plausible_units, read_triangles
+from tkamb.io.recordings.mesh_check import check_mesh
+from tkamb.io.recordings.meshes import (
+    coordinate_rounding,
+    load_surface,
+    plausible_units,
+    read_triangles,
+)
 from tkamb.units import LENGTH
 
 NOTCHED = [(-25, -38), (25, -38), (25, 38), (-25, 38), (-25, 8), (-7, 8), (-7, -8), (-25, -8)]

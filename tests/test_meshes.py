@@ -17,8 +17,14 @@ from tkamb.geometry.normals import corner_angles, corner_normals
 from tkamb.geometry.repair import repair
 from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import boundary_loops
-from tkamb.inputs.mesh_check import check_mesh
-from tkamb.inputs.meshes import BONE_SIZE, axes_rotation, load_surface, mirrored, read_triangles
+from tkamb.io.recordings.mesh_check import check_mesh
+from tkamb.io.recordings.meshes import (
+    BONE_SIZE,
+    axes_rotation,
+    load_surface,
+    mirrored,
+    read_triangles,
+)
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real data are not here")

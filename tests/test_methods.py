@@ -8,7 +8,7 @@ import tkamb
 from scenes import MODEL
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.output.methods import methods
+from tkamb.show.methods import methods
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ print(json.dumps({
 
 SHOWN = """
 import sys
-import tkamb.output.report, tkamb.results_folder
+import tkamb.show.report, tkamb.run.results_folder
 heavy = ("scipy", "trimesh", "pinocchio", "pydantic", "fcl", "numba")
 print([name for name in heavy if name in sys.modules])
 """
@@ -53,11 +53,11 @@ def test_patient_and_motion_alone_touch_nothing_else(tmp_path):
     names = {name.rsplit("/", 1)[-1] for name in seen["files"]}
     assert names == {"scene.toml", "patient.urdf", "motion.csv"}
     for module in seen["modules"]:
-        assert not module.startswith(("tkamb.contact", "tkamb.output.maps"))
+        assert not module.startswith(("tkamb.contact", "tkamb.run.maps"))
         assert module not in (
-            "tkamb.body.ligaments",
-            "tkamb.body.extensor",
-            "tkamb.inputs.meshes",
+            "tkamb.knee.ligaments",
+            "tkamb.knee.extensor",
+            "tkamb.io.recordings.meshes",
         )
     assert seen["others"] == []
     assert seen["status"] == ["ok"] * 3
@@ -67,12 +67,12 @@ def test_without_contact_no_mesh_is_read_and_no_contact_imported(tmp_path):
     seen = watched(write_scene(tmp_path, ("contact", *MUSCLES)))
     assert not any(name.endswith(".stl") for name in seen["files"])
     assert not any(module.startswith("tkamb.contact") for module in seen["modules"])
-    assert "tkamb.body.ligaments" in seen["modules"]
+    assert "tkamb.knee.ligaments" in seen["modules"]
 
 
 def test_without_ligaments_no_ligament_module(tmp_path):
     seen = watched(write_scene(tmp_path, ("ligament",)))
-    assert "tkamb.body.ligaments" not in seen["modules"]
+    assert "tkamb.knee.ligaments" not in seen["modules"]
     assert "tkamb.contact.foundation" in seen["modules"]
     assert not any("lattice" in module or "hertz" in module for module in seen["modules"])
 

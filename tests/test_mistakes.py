@@ -12,7 +12,7 @@ from random_mistakes import random_mistakes
 from scenes import MODEL, write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.results import Results
+from tkamb.run.results import Results
 
 needs_dm = pytest.mark.skipif(not DATA.is_dir(), reason="needs the data of subject DM")
 

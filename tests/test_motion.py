@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, knee_pose, mirrored_pose, pose
-from tkamb.inputs.motion import load_motion
-from tkamb.scene.recording_tables import MotionTable
-from tkamb.scene.si import in_si
+from tkamb.io.recordings.motion import load_motion
+from tkamb.io.scene.recording_tables import MotionTable
+from tkamb.io.scene.si import in_si
 
 TIME = np.linspace(0, 3, 101)
 EYE = np.eye(4)

@@ -8,11 +8,11 @@ from opensim_models import kinematics
 from plane_leg import muscle, plane_leg
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, rotate
-from tkamb.importing.anatomy import find_leg
-from tkamb.muscles import Sharing, solve_trial
-from tkamb.muscles.leg import leg_bones
-from tkamb.opensim.motion import CoordinateMotion
-from tkamb.opensim.paths import LineSet
+from tkamb.io.importing.anatomy import find_leg
+from tkamb.io.opensim.motion import CoordinateMotion
+from tkamb.io.opensim.paths import LineSet
+from tkamb.run.muscles import Sharing, solve_trial
+from tkamb.run.muscles.leg import leg_bones
 
 STEP = 3e-5
 KNEE_AXES = tuple(f"knee_{axis}" for axis in ("flexion", "adduction", "rotation", "tx", "ty", "tz"))

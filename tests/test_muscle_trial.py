@@ -6,14 +6,14 @@ import pytest
 from jw_gait import gait, needs_jw
 from plane_leg import COORDINATES, MASSES, SHANK, muscle, plane_leg
 from tkamb.errors import InputError
-from tkamb.importing.anatomy import find_leg
-from tkamb.inputs.tables import Table
-from tkamb.muscles import Sharing, solve_trial
-from tkamb.muscles.leg import leg_muscles, length_twins
-from tkamb.opensim.functions import Linear
-from tkamb.opensim.kinematics import Kinematics
-from tkamb.opensim.model import CoordinateCoupler
-from tkamb.opensim.motion import CoordinateMotion, coordinate_motion, read_coordinates
+from tkamb.io.importing.anatomy import find_leg
+from tkamb.io.opensim.functions import Linear
+from tkamb.io.opensim.kinematics import Kinematics
+from tkamb.io.opensim.model import CoordinateCoupler
+from tkamb.io.opensim.motion import CoordinateMotion, coordinate_motion, read_coordinates
+from tkamb.io.recordings.tables import Table
+from tkamb.run.muscles import Sharing, solve_trial
+from tkamb.run.muscles.leg import leg_muscles, length_twins
 
 G = 9.80665
 KNEE = COORDINATES[1:2]

@@ -5,11 +5,11 @@ import pytest
 
 from scenes import write_scene
 from tkamb import simulate
-from tkamb.body.muscles import muscle_line
-from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.knee.muscles import muscle_line
+from tkamb.run.mechanics import Mechanics
 
 ORIGIN = {"link": "femur", "point_mm": [32.0, 205.0, 0.0]}
 INSERTION = {"link": "patella", "point_mm": [8.0, 20.0, 0.0]}

@@ -7,8 +7,8 @@ import pytest
 import tkamb
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.starter import lay_out
-from tkamb.starter.person import Person
+from tkamb.io.starter import lay_out
+from tkamb.io.starter.person import Person
 
 FRAMES = slice(0, 6, 5)
 

@@ -7,11 +7,11 @@ import pytest
 from kept_runs import keep
 from scenes import fast_scene
 from synthetic_run import make_run
-from tkamb.claim import claimed_directory
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.occupants import BESIDE, WRITTEN, occupants
-from tkamb.results_folder import write_results
+from tkamb.io.claim import claimed_directory
+from tkamb.io.occupants import BESIDE, WRITTEN, occupants
+from tkamb.run.results_folder import write_results
 from tkamb.studies.kept_rows import KeptRows
 
 SCENE = str(fast_scene())

@@ -12,15 +12,15 @@ from pendulum_leg import changed, pendulum_osim, recorded_leg
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.files import named_files
-from tkamb.importing.anatomy import find_leg
-from tkamb.importing.model_fit import ModelChain
-from tkamb.inputs.tables import read_table
-from tkamb.opensim.kinematics import Kinematics
-from tkamb.opensim.model import OpenSimModel
-from tkamb.opensim.motion import read_coordinates
-from tkamb.opensim.read import read_osim
-from tkamb.output.storage import write_storage
+from tkamb.io.importing.anatomy import find_leg
+from tkamb.io.importing.model_fit import ModelChain
+from tkamb.io.opensim.kinematics import Kinematics
+from tkamb.io.opensim.model import OpenSimModel
+from tkamb.io.opensim.motion import read_coordinates
+from tkamb.io.opensim.read import read_osim
+from tkamb.io.recordings.tables import read_table
 from tkamb.run.summary import files_hash
+from tkamb.show.storage import write_storage
 
 NEW = OWN["new_layout"].read_text(encoding="utf-8")
 

@@ -5,7 +5,7 @@ import pytest
 
 from opensim_models import OWN, model
 from tkamb.errors import InputError
-from tkamb.opensim.read import read_osim
+from tkamb.io.opensim.read import read_osim
 
 
 def test_both_layouts_hold_the_same_model():

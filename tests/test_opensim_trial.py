@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from jw_gait import gait, needs_jw
-from tkamb.inputs.filtering import differentiate_coordinates
-from tkamb.muscles import Sharing, solve_trial
-from tkamb.muscles.sharing import FrameProblems
-from tkamb.opensim.inverse_dynamics import inverse_dynamics
-from tkamb.opensim.read import read_osim
+from tkamb.io.opensim.inverse_dynamics import inverse_dynamics
+from tkamb.io.opensim.read import read_osim
+from tkamb.io.recordings.filtering import differentiate_coordinates
+from tkamb.run.muscles import Sharing, solve_trial
+from tkamb.run.muscles.sharing import FrameProblems
 
 RESERVE = 10.0
 SHARING = Sharing(reserve=RESERVE, weights="equal")

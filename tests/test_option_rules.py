@@ -8,10 +8,10 @@ import pytest
 
 from pendulum_leg import changed, recorded_leg
 from tkamb.cli import _parser, main
-from tkamb.help_examples import EXAMPLES
-from tkamb.inputs.tables import read_table
-from tkamb.option_rules import RULES, Rule, check_options, leaf_parsers
-from tkamb.output.storage import write_storage
+from tkamb.commands.help_examples import EXAMPLES
+from tkamb.commands.option_rules import RULES, Rule, check_options, leaf_parsers
+from tkamb.io.recordings.tables import read_table
+from tkamb.show.storage import write_storage
 
 PARSERS = dict(leaf_parsers(_parser()))
 

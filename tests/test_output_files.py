@@ -7,10 +7,10 @@ import pytest
 import trimesh
 
 from pendulum_leg import changed, recorded_leg
-from tkamb.claim import check_output_file
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.importing import patient as importing
+from tkamb.io.claim import check_output_file
+from tkamb.io.importing import patient as importing
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -38,7 +38,7 @@ def test_import_replaces_no_file_of_somebody_else(tmp_path, capsys, name, conten
     arguments = recorded_leg(tmp_path)
     if name == "motion.csv":
         time = np.linspace(0.0, 1.0, 41)
-        from tkamb.output.storage import write_storage
+        from tkamb.show.storage import write_storage
 
         write_storage(tmp_path / "b.mot", {"time": time, "knee_r_0": -time}, False)
         arguments = changed(arguments, trc=None, motion=str(tmp_path / "b.mot"))

@@ -8,21 +8,21 @@ import pytest
 import trimesh
 from scipy.optimize import fsolve
 
-from tkamb import starter as starter_package
-from tkamb.body.patella import (
+from tkamb.geometry.frames import Array, inverse, knee_pose, transform
+from tkamb.geometry.surface import Surface
+from tkamb.io import starter as starter_package
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.knee.patella import (
     ExtensorMechanism,
     PatellaState,
     PatellaStatus,
     patella_at,
 )
-from tkamb.body.patella_search import solve_patella
-from tkamb.body.patellofemoral import PatellofemoralContact
-from tkamb.equilibrium.known import extensor_frames
-from tkamb.equilibrium.mechanics import Mechanics
-from tkamb.geometry.frames import Array, inverse, knee_pose, transform
-from tkamb.geometry.surface import Surface
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.knee.patella_search import solve_patella
+from tkamb.knee.patellofemoral import PatellofemoralContact
+from tkamb.run.known import extensor_frames
+from tkamb.run.mechanics import Mechanics
 
 TROCHLEA, DOME = 0.025, 0.02
 CENTRE = np.array([0.004, 0.0, 0.0])
@@ -162,7 +162,7 @@ def test_conditions_hold_and_guess_does_not_matter(mechanism: ExtensorMechanism)
 
 def test_quadriceps_is_shortest_there(mechanism: ExtensorMechanism) -> None:
     """Virtual work: turning the patella with contact and ligament kept lengthens the muscle."""
-    from tkamb.body.patella_search import _Search
+    from tkamb.knee.patella_search import _Search
 
     state = solve_patella(mechanism, knee_at(25.0))
     frame = _Search(mechanism, knee_at(25.0))

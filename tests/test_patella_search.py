@@ -10,14 +10,14 @@ import pytest
 from scenes import MODEL, write_scene
 from test_patella import INSERTION, knee_at, mechanism  # noqa: F401
 from tkamb import simulate
-from tkamb.body import extensor
-from tkamb.body.patella import ExtensorMechanism, PatellaStatus
-from tkamb.body.patella_search import solve_patella
-from tkamb.equilibrium.known import Known, extensor_frames
-from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.frames import knee_pose
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.knee import extensor
+from tkamb.knee.patella import ExtensorMechanism, PatellaStatus
+from tkamb.knee.patella_search import solve_patella
+from tkamb.run.known import Known, extensor_frames
+from tkamb.run.mechanics import Mechanics
 
 FEW = {"motion.frames": 11, "patella.motion": "solved", "contact.resolution_mm": 3.0}
 

@@ -7,13 +7,13 @@ import pinocchio as pin
 import pytest
 
 from knees import INERTIA, leg_urdf, random_motion
-from tkamb.body.chain import Chain, ChainMotion
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, mirrored_pose
-from tkamb.inputs.patient import load_urdf
-from tkamb.inputs.segments import segment_inertia
-from tkamb.scene.si import in_si
-from tkamb.scene.tables import PatientTable
+from tkamb.io.recordings.patient import load_urdf
+from tkamb.io.recordings.segments import segment_inertia
+from tkamb.io.scene.si import in_si
+from tkamb.io.scene.tables import PatientTable
+from tkamb.knee.chain import Chain, ChainMotion
 
 LOOP = '<joint name="loop" type="fixed"><parent link="femur"/><child link="tibia"/></joint>'
 

@@ -13,11 +13,11 @@ from tkamb.contact.lattice.meshing.grid import build_grid
 from tkamb.contact.materials import material, tabulated_material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
-from tkamb.decks.calculix import Deck
-from tkamb.decks.problem import press_problem
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.surface import Surface
+from tkamb.run.decks.calculix import Deck
+from tkamb.run.decks.problem import press_problem
 from tkamb.studies import peer
 from tkamb.studies.bodies import balls, block, dishes
 from tkamb.studies.calculix import PeerRun, run_calculix

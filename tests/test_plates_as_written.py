@@ -6,12 +6,12 @@ import pytest
 from recordings import AMTI_CORNERS, standing_markers, write_c3d
 from test_c3d import COUNT, RATIO, plate_signals, pushes
 from tkamb.errors import InputError
-from tkamb.inputs.c3d import read_c3d
-from tkamb.inputs.ground_reaction import load_ground_reaction
-from tkamb.inputs.unit_words import GivenUnits, metres, newton_metres, newtons
-from tkamb.plausibility.movement import drift_questions
-from tkamb.scene.recording_tables import GroundReactionTable
-from tkamb.scene.si import in_si
+from tkamb.io.recordings.c3d import read_c3d
+from tkamb.io.recordings.ground_reaction import load_ground_reaction
+from tkamb.io.recordings.unit_words import GivenUnits, metres, newton_metres, newtons
+from tkamb.io.scene.recording_tables import GroundReactionTable
+from tkamb.io.scene.si import in_si
+from tkamb.run.plausibility.movement import drift_questions
 
 ORIGIN = np.array([0.003, -0.002, -0.03])
 PER_UNIT = {"mm": 1e3, "m": 1.0}
@@ -271,8 +271,8 @@ def test_a_bad_plate_concerns_who_needs_it(tmp_path, fault):
 def test_equal_labels_are_refused_only_where_one_is_needed(tmp_path, name):
     import ezc3d
 
-    from tkamb.inputs.markers import marker_trajectories
-    from tkamb.inputs.tables import read_table
+    from tkamb.io.recordings.markers import marker_trajectories
+    from tkamb.io.recordings.tables import read_table
 
     markers = standing_markers() | {"x": np.ones((20, 3)), "y": 2 * np.ones((20, 3))}
     path = write_c3d(tmp_path / "a.c3d", markers)

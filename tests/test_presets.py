@@ -8,16 +8,17 @@ from types import SimpleNamespace
 import pytest
 
 from scenes import write_scene
-from tkamb import load_scene, named_classes, simulate
+from tkamb import load_scene, simulate
 from tkamb.cli import main
+from tkamb.contact import named_classes
 from tkamb.errors import InputError
-from tkamb.output.report import report_html
-from tkamb.presets.preset import Preset
-from tkamb.presets.registry import find_preset, preset_names
-from tkamb.results_folder import read_results
+from tkamb.io.presets.preset import Preset
+from tkamb.io.presets.registry import find_preset, preset_names
+from tkamb.io.scene import with_preset
+from tkamb.io.scene.case import load_case
 from tkamb.run.rerun import case_of_results, run_again
-from tkamb.scene import with_preset
-from tkamb.scene.case import load_case
+from tkamb.run.results_folder import read_results
+from tkamb.show.report import report_html
 
 SOURCE = "sharma-2008"
 FAST = {"contact.model": "hertz", "motion.frames": 11}
@@ -151,7 +152,7 @@ class MyStudy(Preset):
 
 
 def test_another_package_can_offer_one(scene_file, monkeypatch):
-    points = [EntryPoint("my-study", f"{__name__}:MyStudy", "tkamb.presets")]
+    points = [EntryPoint("my-study", f"{__name__}:MyStudy", "tkamb.io.presets")]
     monkeypatch.setitem(sys.modules, __name__, SimpleNamespace(MyStudy=MyStudy))
     monkeypatch.setattr(named_classes, "entry_points", lambda group: points)
     assert preset_names() == (SOURCE, "my-study")

@@ -13,14 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
 from scenes import write_scene
-from tkamb import press, simulate
+from tkamb import simulate
 from tkamb.cli import main
+from tkamb.commands.mesh import add_mesh, add_press
 from tkamb.contact.registry import contact_class, contact_names
 from tkamb.errors import InputError
 from tkamb.geometry.surface import Surface
-from tkamb.inputs.vtp import read_vtp
-from tkamb.mesh_command import add_mesh, add_press
-from tkamb.press import read_pose
+from tkamb.io.recordings.vtp import read_vtp
+from tkamb.run import press
+from tkamb.run.press import read_pose
 from tkamb.units import LENGTH, MILLIMETRE
 
 FOUNDATION = ["--contact", "foundation"]

@@ -13,7 +13,7 @@ from kept_runs import keep
 from synthetic_run import make_run
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.inputs.meshes import read_triangles
+from tkamb.io.recordings.meshes import read_triangles
 
 RUN = make_run("gait", frames=11)
 
@@ -114,7 +114,7 @@ def touches(one, other):
 
 
 def test_what_one_meets_first_says_itself_in_a_line():
-    from tkamb.press import press_meshes
+    from tkamb.run.press import press_meshes
 
     files = Path(tkamb.__file__).parent / "starter" / "files"
     report = press_meshes(

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scenes import MODEL, as_toml, fast_scene
 from tkamb.cli import main
 from tkamb.errors import TkambError
-from tkamb.scene import load_scene
+from tkamb.io.scene import load_scene
 
 GENTLE = settings(
     max_examples=25,

@@ -10,19 +10,19 @@ from jw_gait import JW, needs_jw
 from mirrored_patient import write_mirrored_patient
 from scenes import MODEL, write_scene
 from shared_trials import two_flexors
-from tkamb.body.crossing import CrossingLines, MuscleShare
-from tkamb.body.joint_equilibrium import external_wrench
-from tkamb.body.load import total_wrench
 from tkamb.contact.foundation import ElasticFoundation
-from tkamb.equilibrium.contact_side import ContactSide
-from tkamb.equilibrium.mechanics import Mechanics
-from tkamb.equilibrium.relaxation import Relaxation
-from tkamb.equilibrium.released_forces import SCALE, ReleasedForces
-from tkamb.equilibrium.shared_muscles import SharedMuscles
 from tkamb.geometry.frames import MIRROR
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
-from tkamb.simulation import simulate
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.knee.crossing import CrossingLines, MuscleShare
+from tkamb.knee.equilibrium.relaxation import Relaxation
+from tkamb.knee.equilibrium.released_forces import SCALE, ReleasedForces
+from tkamb.knee.joint_equilibrium import external_wrench
+from tkamb.knee.load import total_wrench
+from tkamb.run.contact_side import ContactSide
+from tkamb.run.mechanics import Mechanics
+from tkamb.run.muscles.shared_muscles import SharedMuscles
+from tkamb.run.simulation import simulate
 
 OG3 = MODEL.parent / "jw" / "ngait_og3.toml"
 CONTACT = {
@@ -238,7 +238,7 @@ def test_all_results_of_a_left_leg_with_muscles_are_the_right_ones(tmp_path, mon
             trial = replace(trial, shank=trial.shank @ MIRROR, thigh=trial.thigh @ MIRROR)
         return SharedMuscles(trial, left)
 
-    monkeypatch.setattr("tkamb.equilibrium.shared_muscles.load_muscles", given)
+    monkeypatch.setattr("tkamb.run.muscles.shared_muscles.load_muscles", given)
     settings = CONTACT | {"muscles.model": "patient.urdf"}  # read by what is replaced here
     left_scene = write_mirrored_patient(tmp_path / "left")
     right, left = (

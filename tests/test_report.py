@@ -16,17 +16,17 @@ from synthetic_run import MASS_KG, make_run
 from tkamb.contact.articular_edge import AT_EDGE
 from tkamb.contact.narrow import TOO_NARROW
 from tkamb.errors import InputError
-from tkamb.output import metrics
-from tkamb.output.axis import horizontal_axis, round_step
-from tkamb.output.headline import cards
-from tkamb.output.metrics import map_rows
-from tkamb.output.panels import Line, Panel, panels
-from tkamb.output.plots import WIDTH, Sheet
-from tkamb.output.pressure_maps import draw_maps, mapped_frames, top_view
-from tkamb.output.report import THIRD, report_html, write_report
-from tkamb.output.style import BLACK, PRESSURE_MAP, svg_text
-from tkamb.output.tables import flag_rows, motion_table, reasons
-from tkamb.results import PERCENTILES, Results
+from tkamb.run import metrics
+from tkamb.run.metrics import map_rows
+from tkamb.run.results import PERCENTILES, Results
+from tkamb.show.axis import horizontal_axis, round_step
+from tkamb.show.headline import cards
+from tkamb.show.panels import Line, Panel, panels
+from tkamb.show.plots import WIDTH, Sheet
+from tkamb.show.pressure_maps import draw_maps, mapped_frames, top_view
+from tkamb.show.report import THIRD, report_html, write_report
+from tkamb.show.style import BLACK, PRESSURE_MAP, svg_text
+from tkamb.show.tables import flag_rows, motion_table, reasons
 
 VOID = {"meta", "br", "input", "img", "link", "hr"}
 
@@ -44,7 +44,7 @@ def gait():
 @pytest.fixture
 def unwritten(monkeypatch):
     """Pages whose plots are drawn but not written as SVG, which takes the time."""
-    monkeypatch.setattr("tkamb.output.report.svg_text", lambda *_: "<svg></svg>")
+    monkeypatch.setattr("tkamb.show.report.svg_text", lambda *_: "<svg></svg>")
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ from matplotlib.transforms import Bbox
 from muscle_run import ACROSS, CHANNELS, GROUPS, muscle_run
 from synthetic_run import WEIGHT_N
 from test_report import measure_labels
-from tkamb.output.axis import horizontal_axis
-from tkamb.output.muscles import activation_cells, draw_activations, muscle_panels, reserve_words
-from tkamb.output.report import report_html
+from tkamb.show.axis import horizontal_axis
+from tkamb.show.muscles import activation_cells, draw_activations, muscle_panels, reserve_words
+from tkamb.show.report import report_html
 
 
 @pytest.fixture(scope="module")

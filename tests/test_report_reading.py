@@ -9,18 +9,18 @@ import pytest
 from matplotlib.colors import Normalize
 
 from synthetic_run import make_run
-from tkamb.activities import PEAKS_BW, Activity
-from tkamb.output import style
-from tkamb.output.axis import horizontal_axis
-from tkamb.output.levels import PageGrid, pressure_levels
-from tkamb.output.maps import ContactMaps
-from tkamb.output.pages import asset
-from tkamb.output.panels import panels
-from tkamb.output.plots import Sheet
-from tkamb.output.pressure_maps import PRESSURE_PICTURE, TopView, draw_pressure
-from tkamb.output.reading import conclusions
-from tkamb.output.style import new_figure
-from tkamb.results import Results
+from tkamb.io.activities import PEAKS_BW, Activity
+from tkamb.run.maps import ContactMaps
+from tkamb.run.results import Results
+from tkamb.show import style
+from tkamb.show.axis import horizontal_axis
+from tkamb.show.levels import PageGrid, pressure_levels
+from tkamb.show.pages import asset
+from tkamb.show.panels import panels
+from tkamb.show.plots import Sheet
+from tkamb.show.pressure_maps import PRESSURE_PICTURE, TopView, draw_pressure
+from tkamb.show.reading import conclusions
+from tkamb.show.style import new_figure
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,7 @@ def test_colours_that_meet_in_a_plot_are_told_apart(vision):
 
 
 def test_text_stands_out_from_its_ground():
-    css = asset("tkamb.output", "report.css")
+    css = asset("tkamb.show", "report.css")
     bright, dark = (
         dict(re.findall(r"--(\w+): (#\w+)", block))
         for block in re.findall(r":root \{(.*?)\}", css, re.DOTALL)

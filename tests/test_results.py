@@ -13,11 +13,11 @@ import pytest
 
 from synthetic_run import make_run
 from tkamb.atomic import claim_directory
-from tkamb.columns import COLUMNS, columns_as_markdown, is_ligament, ligament_of
 from tkamb.errors import InputError
-from tkamb.output.maps import ContactMaps, MapWriter, read_maps, write_maps
-from tkamb.results import Results, csv_text, read_csv
-from tkamb.results_folder import read_results, write_results
+from tkamb.run.columns import COLUMNS, columns_as_markdown, is_ligament, ligament_of
+from tkamb.run.maps import ContactMaps, MapWriter, read_maps, write_maps
+from tkamb.run.results import Results, csv_text, read_csv
+from tkamb.run.results_folder import read_results, write_results
 
 ROOT = Path(__file__).parents[1]
 
@@ -159,7 +159,7 @@ def test_failed_frame_is_nan_in_the_maps(tmp_path):
 
 WRITER = """
 import sys, numpy as np
-from tkamb.output.maps import MapWriter
+from tkamb.run.maps import MapWriter
 n = 500
 rng = np.random.default_rng(1)
 noise = rng.normal(size=n)

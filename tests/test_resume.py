@@ -14,12 +14,12 @@ import pytest
 from scenes import fast_scene, write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.output.maps import read_maps
-from tkamb.results import Results
-from tkamb.results_folder import read_results
+from tkamb.run.maps import read_maps
 from tkamb.run.recorder import interrupt_later
+from tkamb.run.results import Results
+from tkamb.run.results_folder import read_results
 from tkamb.run.shards import Shard, Shards
-from tkamb.simulation import simulate
+from tkamb.run.simulation import simulate
 
 ROOT = Path(__file__).parents[1]
 CLOCKS = ("body_seconds", "query_seconds", "contact_seconds")

@@ -8,12 +8,12 @@ import pytest
 
 from scenes import fast_scene, write_scene
 from tkamb.cli import main
-from tkamb.columns import KINDS
 from tkamb.errors import InputError
-from tkamb.results_folder import read_results
+from tkamb.io.scene import load_scene
+from tkamb.run.columns import KINDS
+from tkamb.run.results_folder import read_results
+from tkamb.run.simulation import simulate
 from tkamb.run.workers import Crew, Task
-from tkamb.scene import load_scene
-from tkamb.simulation import simulate
 
 SCENE = fast_scene()
 EFFORT = ("body_seconds", "query_seconds", "contact_seconds", "iterations")

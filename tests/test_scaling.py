@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.errors import InputError
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.run.mechanics import Mechanics
 
 SCENE = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
 S = 1.1

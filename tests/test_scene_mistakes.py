@@ -12,8 +12,8 @@ import pytest
 
 from mistakes import keep_meshes
 from scenes import MODEL, as_toml
-from tkamb.body import patella_search
-from tkamb.body.patella import PatellaStatus
+from tkamb.knee import patella_search
+from tkamb.knee.patella import PatellaStatus
 
 ROOT = Path(__file__).parents[1]
 SCENE = MODEL / "scene.toml"

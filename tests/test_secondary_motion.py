@@ -6,18 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tkamb.body.joint_equilibrium import external_wrench
-from tkamb.body.knee import unsolved
-from tkamb.body.load import total_wrench
 from tkamb.contact.probe import condyle_wrenches
-from tkamb.equilibrium.balance import BalanceStatus
-from tkamb.equilibrium.contact_side import ContactSide
-from tkamb.equilibrium.mechanics import Mechanics
-from tkamb.equilibrium.released_forces import SCALE
 from tkamb.geometry.frames import knee_pose
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.knee.equations import unsolved
+from tkamb.knee.equilibrium.balance import BalanceStatus
+from tkamb.knee.equilibrium.released_forces import SCALE
+from tkamb.knee.joint_equilibrium import external_wrench
+from tkamb.knee.load import total_wrench
+from tkamb.run.contact_side import ContactSide
 from tkamb.run.frames import FrameSolver
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.run.mechanics import Mechanics
 
 ROOT = Path(__file__).parents[1]
 BEND = ROOT / "models" / "deep_knee_bend" / "scene.toml"
@@ -184,7 +184,7 @@ def test_a_frame_at_rest_whose_equations_fail_has_no_numbers(monkeypatch):
     overrides = COARSE | {"contact.released": ALL}
     solver = FrameSolver(load_case(load_scene(BEND, overrides)))
     monkeypatch.setattr(
-        "tkamb.equilibrium.contact_side.solve_knee", lambda *_: unsolved(["no signs are right"])
+        "tkamb.run.contact_side.solve_knee", lambda *_: unsolved(["no signs are right"])
     )
     _, row, arrays = solver.solve(60)
     assert row["status"].startswith("failed: no signs are right")

@@ -12,15 +12,22 @@ from scipy.spatial.transform import Rotation
 
 from knees import UP, bent_knee
 from shared_trials import SHANK, STRENGTHS, THIGH, two_flexors
-from tkamb.body.crossing import CrossingLines, MuscleShare
-from tkamb.body.knee import solve_knee
-from tkamb.body.load import PointForces, total_wrench
-from tkamb.columns import MUSCLE_FORCE, RESERVE, belongs, family_column, in_a_family, ordered_names
-from tkamb.equilibrium.shared_muscles import SharedMuscles
 from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_axes, knee_pose, pose, transform
+from tkamb.io.scene import load_scene
+from tkamb.knee.crossing import CrossingLines, MuscleShare
+from tkamb.knee.equations import solve_knee
+from tkamb.knee.load import PointForces, total_wrench
+from tkamb.run.columns import (
+    MUSCLE_FORCE,
+    RESERVE,
+    belongs,
+    family_column,
+    in_a_family,
+    ordered_names,
+)
+from tkamb.run.muscles.shared_muscles import SharedMuscles
 from tkamb.run.summary import reserves
-from tkamb.scene import load_scene
 
 FRICTION = 0.05
 SHIPPED = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
@@ -85,8 +92,8 @@ def test_two_flexors_share_by_strength_and_the_arms_of_the_knee():
 
 def _taut_quadriceps(geometry):
     """Return the quadriceps' tension, negative where it would push."""
-    from tkamb.body.knee import KneeSystem
-    from tkamb.body.load_state import LoadState
+    from tkamb.knee.equations import KneeSystem
+    from tkamb.knee.load_state import LoadState
 
     taut = LoadState(frozenset(), frozenset())
     return KneeSystem(geometry, FRICTION, taut).solution.values["muscle_quadriceps"]
@@ -150,15 +157,15 @@ def test_a_scene_with_muscles_needs_its_own_patella(tmp_path):
 
 def test_without_the_tables_neither_muscles_nor_emg_nor_measurements_are_imported():
     own = (
-        "tkamb.muscles",
-        "tkamb.opensim",
-        "tkamb.inputs.emg",
-        "tkamb.inputs.measured",
+        "tkamb.run.muscles",
+        "tkamb.io.opensim",
+        "tkamb.io.recordings.emg",
+        "tkamb.io.recordings.measured",
         "tkamb.run.",
     )
     code = (
-        "import sys; from tkamb.scene import load_scene; from tkamb.scene.case import load_case; "
-        "from tkamb.equilibrium.mechanics import Mechanics; "
+        "import sys; from tkamb.io.scene import load_scene; from tkamb.io.scene.case import load_case; "
+        "from tkamb.run.mechanics import Mechanics; "
         f"m = Mechanics(load_case(load_scene({str(SHIPPED)!r}))); assert m.muscles is None; "
         f"print([n for n in sys.modules if n.startswith({own})])"
     )

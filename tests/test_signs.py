@@ -9,13 +9,13 @@ import pytest
 
 from mistakes import DATA, DM
 from scenes import MODEL, as_toml
-from tkamb.body.ligament_sides import check_collateral_sides
-from tkamb.check.scene_check import check_scene
 from tkamb.errors import InputError
-from tkamb.plausibility.ground import direction_questions, load_questions
-from tkamb.plausibility.signs import sign_questions
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.knee.ligament_sides import check_collateral_sides
+from tkamb.run.plausibility.ground import direction_questions, load_questions
+from tkamb.run.plausibility.signs import sign_questions
+from tkamb.show.check.scene_check import check_scene
 
 needs_dm = pytest.mark.skipif(not DATA.is_dir(), reason="subject DM's files are not there")
 

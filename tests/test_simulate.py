@@ -9,13 +9,13 @@ import pytest
 import tkamb
 from scenes import fast_scene, write_scene
 from tkamb import load_scene, simulate
-from tkamb.body.patellofemoral import PatellofemoralContact
-from tkamb.columns import COLUMNS
 from tkamb.contact.foundation import ElasticFoundation
 from tkamb.contact.result import ContactStatus
 from tkamb.errors import InputError
 from tkamb.geometry.condyles import LowestPoints
-from tkamb.scene.case import load_case
+from tkamb.io.scene.case import load_case
+from tkamb.knee.patellofemoral import PatellofemoralContact
+from tkamb.run.columns import COLUMNS
 
 EVERY_TENTH = slice(0, 101, 10)
 

@@ -8,7 +8,12 @@ import trimesh
 
 from condyle_profiles import condyle_profile
 from surface_arcs import arc_lengths
-from tkamb.body.slip import (
+from tkamb.geometry.condyles import LowestPoints
+from tkamb.geometry.frames import Array, inverse, knee_pose, knee_twist, transform
+from tkamb.geometry.surface import Surface
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.knee.slip import (
     CondyleSlip,
     InsertProfile,
     arc,
@@ -18,11 +23,6 @@ from tkamb.body.slip import (
     roll_slip_motion,
     sliding_velocity,
 )
-from tkamb.geometry.condyles import LowestPoints
-from tkamb.geometry.frames import Array, inverse, knee_pose, knee_twist, transform
-from tkamb.geometry.surface import Surface
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
 
 RADIUS, TROUGH, DEPTH = 0.02, 0.05, 0.012
 FRAMES = 61

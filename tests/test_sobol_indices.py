@@ -7,12 +7,12 @@ from scipy.stats import sobol_indices as scipy_indices
 
 from test_uncertainty import SCENE, SLOPES, bodies_alone
 from tkamb.cli import main
-from tkamb.uncertainty.bands import influences
-from tkamb.uncertainty.command import headline
-from tkamb.uncertainty.indices import sobol_indices
-from tkamb.uncertainty.run import estimate_uncertainty
-from tkamb.uncertainty.sampling import crossed_points, noise, noise_of_point, normal_samples
-from tkamb.uncertainty.screening import screen, screen_lines
+from tkamb.commands.uncertainty import headline
+from tkamb.studies.uncertainty.bands import influences
+from tkamb.studies.uncertainty.indices import sobol_indices
+from tkamb.studies.uncertainty.run import estimate_uncertainty
+from tkamb.studies.uncertainty.sampling import crossed_points, noise, noise_of_point, normal_samples
+from tkamb.studies.uncertainty.screening import screen, screen_lines
 
 A, B = 7.0, 0.1
 
@@ -111,7 +111,7 @@ def stiff_knee():
 
 
 def test_indices_of_a_scene_add_up_where_loads_add_up(tmp_path, monkeypatch):
-    monkeypatch.setattr("tkamb.output.report.report_html", lambda results, progress=None: "page")
+    monkeypatch.setattr("tkamb.show.report.report_html", lambda results, progress=None: "page")
     folder = tmp_path / "out"
     found = estimate_uncertainty(
         stiff_knee(),

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from jw_gait import needs_jw
-from tkamb.plausibility.ground import step_questions
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.run.plausibility.ground import step_questions
 
 WEIGHT, PEAK = 700.0, 750.0
 TIME = np.arange(0.0, 2.4, 0.01)

@@ -15,8 +15,8 @@ from tkamb.geometry.curved import CurvedSurface
 from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.subdivision import coarsened
 from tkamb.geometry.surface import Surface
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
 
 UP = np.array([0.0, 1.0, 0.0])
 LINEAR = material("polyethylene-linear")

@@ -5,9 +5,9 @@ import pytest
 
 from scenes import MODEL, write_scene
 from tkamb.errors import InputError
-from tkamb.inputs.tables import READERS, Table, read_table
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.recordings.tables import READERS, Table, read_table
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
 
 TRC = (
     "PathFileType\t4\t(X/Y/Z)\tshank.trc\n"

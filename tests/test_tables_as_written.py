@@ -7,14 +7,14 @@ from pendulum_leg import changed, moving_leg, pendulum_osim, recorded_leg
 from plane_leg import plane_leg
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.importing.force_columns import table_forces
-from tkamb.inputs.tables import Table, read_table
-from tkamb.opensim.kinematics import Kinematics
-from tkamb.opensim.motion import angle_lines, read_coordinates
-from tkamb.opensim.read import read_osim
-from tkamb.output.storage import write_storage, write_trc
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
+from tkamb.io.importing.force_columns import table_forces
+from tkamb.io.opensim.kinematics import Kinematics
+from tkamb.io.opensim.motion import angle_lines, read_coordinates
+from tkamb.io.opensim.read import read_osim
+from tkamb.io.recordings.tables import Table, read_table
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.show.storage import write_storage, write_trc
 
 HEAD = "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\n"
 ROWS = ["1\t0.00\t1\t2\t3\t4\t5\t6", "2\t0.01\t1.5\t2\t3\t\t\t", "3\t0.02\t2\t2\t3\t4\t5\t6"]

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from lattice_bodies import condyles, dished_insert, pair
-from tkamb import threads
 from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
+from tkamb.geometry import threads
 from tkamb.geometry.frames import knee_pose
 
 

@@ -6,10 +6,10 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, mirrored_pose, pose, transform
-from tkamb.inputs.markers import fit_rigid
-from tkamb.inputs.tibia import load_tibia
-from tkamb.scene.recording_tables import JointCentreTable, TibiaTable
-from tkamb.scene.si import in_si
+from tkamb.io.recordings.markers import fit_rigid
+from tkamb.io.recordings.tibia import load_tibia
+from tkamb.io.scene.recording_tables import JointCentreTable, TibiaTable
+from tkamb.io.scene.si import in_si
 
 STAMPS = np.arange(241) / 120
 AT = np.linspace(0.5, 1.5, 21)

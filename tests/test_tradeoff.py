@@ -13,9 +13,9 @@ from scenes import write_scene
 from tkamb.cli import main
 from tkamb.contact.registry import BUILT_IN, contact_model
 from tkamb.errors import InputError
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
 from tkamb.memory import peak_rss
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
 from tkamb.studies import tradeoff
 from tkamb.studies.body_trade import CHANGES, body_table, run_body_trade
 from tkamb.studies.cases import case_names, copied_scene, study_case, thin_out

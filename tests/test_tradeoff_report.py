@@ -9,22 +9,22 @@ import pytest
 
 from known_error_tables import tables
 from tkamb.errors import InputError
-from tkamb.known_errors import (
+from tkamb.run.known_errors import (
     STORED,
     known_error,
     known_error_words,
     known_errors,
 )
-from tkamb.known_errors import (
+from tkamb.run.known_errors import (
     as_json as error_json,
 )
+from tkamb.show.tradeoff_report import comparison, picture, recommendations, table
 from tkamb.studies.body_trade import read_body_rows
 from tkamb.studies.error_cases import SITUATIONS
 from tkamb.studies.error_rows import read_error_rows
 from tkamb.studies.measures import Job, Measure
 from tkamb.studies.references import read_references
 from tkamb.studies.row import KEYS, TIMES, Row, as_json, read_rows, with_fronts
-from tkamb.studies.tradeoff_report import comparison, picture, recommendations, table
 from tradeoff_blocks import (
     MARKERS,
     block,

@@ -9,22 +9,22 @@ import pytest
 from knees import UP, bent_knee
 from shared_trials import STRENGTHS, two_flexors
 from test_uncertainty import SCENE, bodies_alone, knee
-from tkamb.body.load import PointForces
 from tkamb.cli import main
-from tkamb.equilibrium.mechanics import Mechanics
-from tkamb.equilibrium.shared_muscles import SharedMuscles
 from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, MIRROR, knee_pose, transform
-from tkamb.scene.case import load_case
-from tkamb.scene.recording_tables import MarkersTable
-from tkamb.scene.uncertainty import CorrelationTable
-from tkamb.uncertainty.bands import influences
-from tkamb.uncertainty.correlation import correlation_root
-from tkamb.uncertainty.inputs import AXES, Draw, VariedInput, varied_inputs
-from tkamb.uncertainty.run import estimate_uncertainty
-from tkamb.uncertainty.sample import Sampler
-from tkamb.uncertainty.sampling import Point, normal_samples, one_at_a_time
-from tkamb.uncertainty.varied_case import displaced_by_markers, varied_case, varied_muscles
+from tkamb.io.scene.case import load_case
+from tkamb.io.scene.recording_tables import MarkersTable
+from tkamb.io.scene.uncertainty import CorrelationTable
+from tkamb.knee.load import PointForces
+from tkamb.run.mechanics import Mechanics
+from tkamb.run.muscles.shared_muscles import SharedMuscles
+from tkamb.studies.uncertainty.bands import influences
+from tkamb.studies.uncertainty.correlation import correlation_root
+from tkamb.studies.uncertainty.inputs import AXES, Draw, VariedInput, varied_inputs
+from tkamb.studies.uncertainty.run import estimate_uncertainty
+from tkamb.studies.uncertainty.sample import Sampler
+from tkamb.studies.uncertainty.sampling import Point, normal_samples, one_at_a_time
+from tkamb.studies.uncertainty.varied_case import displaced_by_markers, varied_case, varied_muscles
 
 NAMES = ["a", "b", "c"]
 

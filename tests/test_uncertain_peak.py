@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from scenes import write_scene
-from tkamb.body.muscles import SagittalWrap
-from tkamb.output.axis import horizontal_axis
-from tkamb.output.headline import cards
-from tkamb.results import Results
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
-from tkamb.simulation import simulate
-from tkamb.uncertainty.bands import band_columns, peak_band
-from tkamb.uncertainty.command import headline
-from tkamb.uncertainty.inputs import Draw, VariedInput, varied_inputs
-from tkamb.uncertainty.run import estimate_uncertainty
-from tkamb.uncertainty.varied_case import varied_case
+from tkamb.commands.uncertainty import headline
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.knee.muscles import SagittalWrap
+from tkamb.run.results import Results
+from tkamb.run.simulation import simulate
+from tkamb.show.axis import horizontal_axis
+from tkamb.show.headline import cards
+from tkamb.studies.uncertainty.bands import band_columns, peak_band
+from tkamb.studies.uncertainty.inputs import Draw, VariedInput, varied_inputs
+from tkamb.studies.uncertainty.run import estimate_uncertainty
+from tkamb.studies.uncertainty.varied_case import varied_case
 
 NOMINAL = np.array([1.0, 3.39, 2.0])
 

@@ -8,25 +8,25 @@ import pytest
 
 from faults import Faults
 from interrupted_runs import broken_off, held_elsewhere
-from tkamb.claim import settle
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.results_folder import BANDS_NAME, UNCERTAINTY_NAMES, write_results
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
-from tkamb.simulation import simulate
-from tkamb.uncertainty.bands import (
+from tkamb.io.claim import settle
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.run.results_folder import BANDS_NAME, UNCERTAINTY_NAMES, write_results
+from tkamb.run.simulation import simulate
+from tkamb.studies.uncertainty.bands import (
     band_columns,
     causes,
     influences,
     measured_inside,
     percentiles,
 )
-from tkamb.uncertainty.folder import write_uncertainty
-from tkamb.uncertainty.inputs import Draw
-from tkamb.uncertainty.run import estimate_uncertainty
-from tkamb.uncertainty.sample import Sampler
-from tkamb.uncertainty.sampling import Point, noise, normal_samples
+from tkamb.studies.uncertainty.folder import write_uncertainty
+from tkamb.studies.uncertainty.inputs import Draw
+from tkamb.studies.uncertainty.run import estimate_uncertainty
+from tkamb.studies.uncertainty.sample import Sampler
+from tkamb.studies.uncertainty.sampling import Point, noise, normal_samples
 
 SCENE = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
 SLOPES = np.array([3.0, -2.0, 1.0, 0.5])
@@ -247,7 +247,7 @@ def test_two_runs_into_one_folder_are_refused_before_anything_is_computed(tmp_pa
 
 def test_a_full_disk_leaves_no_bands_or_all_of_them(tmp_path, monkeypatch):
     found = estimate_uncertainty(bodies_alone(), samples=20, frames=slice(0, 1))
-    monkeypatch.setattr("tkamb.output.report.report_html", lambda results, progress=None: "page")
+    monkeypatch.setattr("tkamb.show.report.report_html", lambda results, progress=None: "page")
 
     def write(folder, number=None):
         folder.mkdir()

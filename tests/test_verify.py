@@ -9,7 +9,7 @@ import pytest
 from scenes import write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.results_folder import read_results
+from tkamb.run.results_folder import read_results
 from tkamb.run.shards import Shard, Shards
 
 
@@ -113,7 +113,7 @@ def test_inputs_that_changed_are_named(finished, tmp_path, capfd):
 
 
 def test_other_code_is_a_note(run, capfd, monkeypatch):
-    monkeypatch.setattr("tkamb.results_folder.code_identity", lambda: "other")
+    monkeypatch.setattr("tkamb.run.results_folder.code_identity", lambda: "other")
     status, said = verified(run[1], capfd)
     code = json.loads((run[1] / "summary.json").read_text())["identity"]["code of tkamb"]
     assert status == 0 and "computed by other code" in said
@@ -172,7 +172,7 @@ def test_a_frames_folder_that_is_a_link_is_not_followed(tmp_path):
 
 
 def test_one_of_two_runs_at_once_is_refused(run, capfd):
-    from tkamb import claim
+    from tkamb.io import claim
 
     scene, out = run
     descriptor = claim._acquire_lock(out)  # as another process would hold it

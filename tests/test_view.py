@@ -13,21 +13,21 @@ import h5py
 import numpy as np
 import pytest
 
-from tkamb.body.wrapping import TautPath
 from tkamb.cli import main
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.surface import Surface
-from tkamb.output.maps import ContactMaps
-from tkamb.results_folder import read_results
-from tkamb.scene.case import load_case
-from tkamb.view import CAMERAS
-from tkamb.view.colours import SLACK, TENDON, rgb
-from tkamb.view.drawing import PressureMap
-from tkamb.view.payload import VIEW_PAYLOAD, Block, _insert_transform, map_levels
-from tkamb.view.run import open_run
-from tkamb.view.shading import shade
-from tkamb.view.show import Show, serve_in_background
-from tkamb.view.strands import _tendon, ligament_strands
+from tkamb.io.scene.case import load_case
+from tkamb.knee.wrapping import TautPath
+from tkamb.run.maps import ContactMaps
+from tkamb.run.results_folder import read_results
+from tkamb.show.view import CAMERAS
+from tkamb.show.view.colours import SLACK, TENDON, rgb
+from tkamb.show.view.drawing import PressureMap
+from tkamb.show.view.payload import VIEW_PAYLOAD, Block, _insert_transform, map_levels
+from tkamb.show.view.run import open_run
+from tkamb.show.view.shading import shade
+from tkamb.show.view.show import Show, serve_in_background
+from tkamb.show.view.strands import _tendon, ligament_strands
 from viewed import copied_scene, shipped_run, short_results
 
 
@@ -328,7 +328,7 @@ def test_without_a_browser_one_line_says_so(folder, monkeypatch, tmp_path, capsy
 def test_bad_options_are_one_line_before_anything_is_drawn(
     folder, tmp_path, capsys, monkeypatch, options, word
 ):
-    monkeypatch.setattr("tkamb.view.run.match_frames", None)
+    monkeypatch.setattr("tkamb.show.view.run.match_frames", None)
     page = tmp_path / "x.html"
     written = [] if "--port" in options else ["--html", str(page)]
     assert main(["view", str(folder), *written, *options]) == 2
@@ -349,9 +349,9 @@ def test_a_scene_that_is_run_for_the_viewer_is_read_once(folder, tmp_path, monke
         return results
 
     monkeypatch.chdir(tmp_path)  # no results of the scene stand there
-    for module in ("tkamb.view.run", "tkamb.simulation"):
+    for module in ("tkamb.show.view.run", "tkamb.run.simulation"):
         monkeypatch.setattr(f"{module}.load_case", counted)
-    monkeypatch.setattr("tkamb.view.run.simulate", simulated)
+    monkeypatch.setattr("tkamb.show.view.run.simulate", simulated)
     page = tmp_path / "x.html"
     scene = results.summary["scene"]
     assert main(["view", str(scene), "--frame", "1", "--html", str(page)]) == 0
@@ -408,6 +408,6 @@ def test_a_coupled_run_is_drawn_where_its_forces_act(tmp_path):
 
 
 def test_the_cameras_of_the_command_line_are_the_pages():
-    text = files("tkamb.view").joinpath("assets", "controls.js").read_text(encoding="utf-8")
+    text = files("tkamb.show.view").joinpath("assets", "controls.js").read_text(encoding="utf-8")
     block = text.split("const CAMERAS = {")[1].split("\n};")[0]
     assert tuple(re.findall(r'^  "([^"]+)":', block, re.MULTILINE)) == CAMERAS

@@ -9,9 +9,9 @@ from matplotlib import colormaps
 from PIL import Image
 
 from tkamb.errors import InputError
-from tkamb.view import film
-from tkamb.view.run import open_run
-from tkamb.view.show import Show
+from tkamb.show.view import film
+from tkamb.show.view.run import open_run
+from tkamb.show.view.show import Show
 from viewed import shipped_run
 
 

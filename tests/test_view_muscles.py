@@ -6,11 +6,11 @@ import numpy as np
 
 from knees import UP, bent_knee
 from shared_trials import SHANK, THIGH, two_flexors
-from tkamb.body.load import PointForces
-from tkamb.equilibrium.shared_muscles import SharedMuscles
 from tkamb.geometry.frames import transform
-from tkamb.view.colours import SLACK, activation_scale, pressure_scale, rgb, strain_scale
-from tkamb.view.strands import VIEW_STRAND, muscle_strands
+from tkamb.knee.load import PointForces
+from tkamb.run.muscles.shared_muscles import SharedMuscles
+from tkamb.show.view.colours import SLACK, activation_scale, pressure_scale, rgb, strain_scale
+from tkamb.show.view.strands import VIEW_STRAND, muscle_strands
 
 
 def frames():

@@ -5,10 +5,10 @@ import pytest
 
 import tkamb
 from headless import Page
-from tkamb.output.maps import read_maps
-from tkamb.results_folder import read_results
-from tkamb.view.run import open_run
-from tkamb.view.show import Show, serve_in_background
+from tkamb.run.maps import read_maps
+from tkamb.run.results_folder import read_results
+from tkamb.show.view.run import open_run
+from tkamb.show.view.show import Show, serve_in_background
 from viewed import SCENE, force, levels, matrix, move_slider, shipped_run, short_results
 
 FRAMES = (0, 2, 5)

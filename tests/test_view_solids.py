@@ -8,19 +8,19 @@ import trimesh
 from matplotlib import colormaps
 from scipy.spatial import cKDTree
 
-from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.frames import inverse, transform
 from tkamb.geometry.surface import Surface
-from tkamb.output.metrics import METRICS
-from tkamb.output.style import PRESSURE_MAP
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
-from tkamb.view import colours
-from tkamb.view.draw import draw
-from tkamb.view.run import open_run
-from tkamb.view.shading import MOST_TRIANGLES, decimate, shade
-from tkamb.view.solids import box, floor_and_foot, hull, revolved, solids, sphere_points
-from tkamb.view.strands import path_strands
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.run.mechanics import Mechanics
+from tkamb.run.metrics import METRICS
+from tkamb.show.style import PRESSURE_MAP
+from tkamb.show.view import colours
+from tkamb.show.view.draw import draw
+from tkamb.show.view.run import open_run
+from tkamb.show.view.shading import MOST_TRIANGLES, decimate, shade
+from tkamb.show.view.solids import box, floor_and_foot, hull, revolved, solids, sphere_points
+from tkamb.show.view.strands import path_strands
 from viewed import MODELS, shipped_run
 
 DM = MODELS / "dm" / "scene.toml"

@@ -13,16 +13,16 @@ from interrupted_runs import broken_off
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_coordinates
+from tkamb.io.scene.uncertainty import UncertaintyTable
 from tkamb.run.shards import Shards
 from tkamb.run.workers import Crew
-from tkamb.scene.uncertainty import UncertaintyTable
-from tkamb.uncertainty.inputs import Draw, VariedInput
-from tkamb.wear.bands import Sampling, check_samples
-from tkamb.wear.creep import LogarithmicCreep
-from tkamb.wear.laws import Archard
-from tkamb.wear.sample import moved_case, varied_wear_inputs
-from tkamb.wear.simulation import WearCase, simulate_wear
-from tkamb.wear.worn_surface import ArticularSurface
+from tkamb.studies.uncertainty.inputs import Draw, VariedInput
+from tkamb.studies.wear.bands import Sampling, check_samples
+from tkamb.studies.wear.creep import LogarithmicCreep
+from tkamb.studies.wear.laws import Archard
+from tkamb.studies.wear.sample import moved_case, varied_wear_inputs
+from tkamb.studies.wear.simulation import WearCase, simulate_wear
+from tkamb.studies.wear.worn_surface import ArticularSurface
 from wear_bodies import DENSITY, MM, Pressed, always, ball_case, balls_scene, stroke, swing
 
 FACTOR = VariedInput("wear_factor", 0.44, "relative")

@@ -14,15 +14,15 @@ from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_coordinates, knee_pose
-from tkamb.wear import run as wear_run
-from tkamb.wear.engine import ContactEngine
-from tkamb.wear.force_control import ForceDrive, RestingPoses
-from tkamb.wear.laws import Archard
-from tkamb.wear.motion import CycleMotion
-from tkamb.wear.profile import read_profile, zero_at
-from tkamb.wear.simulation import WearCase, simulate_wear
-from tkamb.wear.springs import Spring, Springs, read_springs
-from tkamb.wear.worn_surface import ArticularSurface
+from tkamb.studies.wear import run as wear_run
+from tkamb.studies.wear.engine import ContactEngine
+from tkamb.studies.wear.force_control import ForceDrive, RestingPoses
+from tkamb.studies.wear.laws import Archard
+from tkamb.studies.wear.motion import CycleMotion
+from tkamb.studies.wear.profile import read_profile, zero_at
+from tkamb.studies.wear.simulation import WearCase, simulate_wear
+from tkamb.studies.wear.springs import Spring, Springs, read_springs
+from tkamb.studies.wear.worn_surface import ArticularSurface
 from wear_bodies import DENSITY, MM, balls, balls_scene
 
 AP, SI, ML, TURN = 0, 1, 2, 3

@@ -13,16 +13,16 @@ from headless import Page, chromium
 from synthetic_run import make_run
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR
-from tkamb.inputs.vtp import read_vtp, read_vtp_values
-from tkamb.output.report import report_html
-from tkamb.output.vtk import write_triangles
-from tkamb.output.wear import OTHER, wear_section
-from tkamb.results_folder import read_results
-from tkamb.view.colours import INSERT, rgb, wear_colours, wear_scale
-from tkamb.view.payload import pack
-from tkamb.view.run import open_run
-from tkamb.view.show import Show
-from tkamb.view.solids import worn_insert
+from tkamb.io.recordings.vtp import read_vtp, read_vtp_values
+from tkamb.io.vtk import write_triangles
+from tkamb.run.results_folder import read_results
+from tkamb.show.report import report_html
+from tkamb.show.view.colours import INSERT, rgb, wear_colours, wear_scale
+from tkamb.show.view.payload import pack
+from tkamb.show.view.run import open_run
+from tkamb.show.view.show import Show
+from tkamb.show.view.solids import worn_insert
+from tkamb.show.wear import OTHER, wear_section
 from viewed import shipped_run
 
 PIXEL = bytes.fromhex(
@@ -101,7 +101,7 @@ def worn(tmp_path):
 
 
 def test_the_report_shows_wear_with_its_band_and_says_first_how_sure_it_is(worn, monkeypatch):
-    monkeypatch.setattr("tkamb.output.report.svg_text", lambda *_: "<svg></svg>")
+    monkeypatch.setattr("tkamb.show.report.svg_text", lambda *_: "<svg></svg>")
     page = report_html(worn)
     section = page[page.index("<h2>Wear</h2>") :]
     section = section[: section.index("</section>")]

@@ -9,9 +9,9 @@ import shapes
 from contact_bodies import dished_insert
 from tkamb.errors import InputError
 from tkamb.geometry.surface import Surface
-from tkamb.wear.creep import LogarithmicCreep
-from tkamb.wear.laws import Archard, ContactArea, CrossShear, PressureCrossShear
-from tkamb.wear.simulation import simulate_wear
+from tkamb.studies.wear.creep import LogarithmicCreep
+from tkamb.studies.wear.laws import Archard, ContactArea, CrossShear, PressureCrossShear
+from tkamb.studies.wear.simulation import simulate_wear
 from wear_bodies import DENSITY, MM, ball_case, plate_case, stroke, swing, swinging_case
 
 K = 1e-6

@@ -12,8 +12,8 @@ from tkamb.contact.pair import ContactPair
 from tkamb.contact.samples import sample_surface
 from tkamb.errors import InputError
 from tkamb.geometry.frames import pose
-from tkamb.wear.viscoelastic import PronySeries, ViscoelasticBed
-from tkamb.wear.viscoelastic_lattice import ViscoelasticLattice
+from tkamb.studies.wear.viscoelastic import PronySeries, ViscoelasticBed
+from tkamb.studies.wear.viscoelastic_lattice import ViscoelasticLattice
 
 SERIES = PronySeries((0.4, 0.3), (0.5, 20.0))
 

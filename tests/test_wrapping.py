@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from tkamb.body.load import LinkPoint, total_wrench
-from tkamb.body.muscles import Line, Wrap
-from tkamb.body.wrapping import is_inside, taut_path
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
 from tkamb.geometry.sections import convex_outline, sagittal_outline, sagittal_section
 from tkamb.geometry.surface import Surface
+from tkamb.knee.load import LinkPoint, total_wrench
+from tkamb.knee.muscles import Line, Wrap
+from tkamb.knee.wrapping import is_inside, taut_path
 
 RADIUS = 0.03
 CIRCLE = RADIUS * np.column_stack(

@@ -7,12 +7,12 @@ import pytest
 
 from joints import BALL, HEIGHT, LINEAR, flat_joint
 from tkamb.contact.foundation import LinearFoundation
-from tkamb.equilibrium import released
-from tkamb.equilibrium.balance import BalanceStatus, Trial, find_balance
-from tkamb.equilibrium.released import KNEE_CHANGE, ReleasedKnee, ahead
-from tkamb.equilibrium.released_forces import SCALE
-from tkamb.equilibrium.starts import FARTHEST_AHEAD, carried_on
 from tkamb.geometry.frames import knee_pose
+from tkamb.knee.equilibrium import released
+from tkamb.knee.equilibrium.balance import BalanceStatus, Trial, find_balance
+from tkamb.knee.equilibrium.released import KNEE_CHANGE, ReleasedKnee, ahead
+from tkamb.knee.equilibrium.released_forces import SCALE
+from tkamb.knee.equilibrium.starts import FARTHEST_AHEAD, carried_on
 
 CELL = 1e-3
 

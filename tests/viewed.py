@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from scenes import fast_scene
-from tkamb.results_folder import write_results
-from tkamb.simulation import simulate
+from tkamb.run.results_folder import write_results
+from tkamb.run.simulation import simulate
 
 MODELS = Path(__file__).parents[1] / "models"
 SCENE = fast_scene()

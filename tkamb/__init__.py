@@ -12,20 +12,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tkamb.body.ligaments import Ligament
-    from tkamb.body.load import LinkPoint
-    from tkamb.body.muscles import Muscle, PatellarLigament, SagittalWrap
     from tkamb.contact.registry import contact_model
+    from tkamb.io.scene import Scene, load_scene
     from tkamb.knee.knee import Knee
+    from tkamb.knee.ligaments import Ligament
+    from tkamb.knee.load import LinkPoint
     from tkamb.knee.loads import KneeLoads
+    from tkamb.knee.muscles import Muscle, PatellarLigament, SagittalWrap
     from tkamb.knee.parts import Extensor, Implant
-    from tkamb.results import Results
-    from tkamb.results_folder import read_results
     from tkamb.run.read_scene import read_scene
-    from tkamb.scene import Scene, load_scene
-    from tkamb.simulation import simulate
-    from tkamb.view.live_window import live
-    from tkamb.view.show import show
+    from tkamb.run.results import Results
+    from tkamb.run.results_folder import read_results
+    from tkamb.run.simulation import simulate
+    from tkamb.show.view.live_window import live
+    from tkamb.show.view.show import show
 
 __all__ = [
     "Extensor",
@@ -54,20 +54,20 @@ _HOMES = {
     "Implant": "tkamb.knee.parts",
     "Knee": "tkamb.knee.knee",
     "KneeLoads": "tkamb.knee.loads",
-    "Ligament": "tkamb.body.ligaments",
-    "LinkPoint": "tkamb.body.load",
-    "Muscle": "tkamb.body.muscles",
-    "PatellarLigament": "tkamb.body.muscles",
-    "SagittalWrap": "tkamb.body.muscles",
-    "Results": "tkamb.results",
-    "Scene": "tkamb.scene",
+    "Ligament": "tkamb.knee.ligaments",
+    "LinkPoint": "tkamb.knee.load",
+    "Muscle": "tkamb.knee.muscles",
+    "PatellarLigament": "tkamb.knee.muscles",
+    "SagittalWrap": "tkamb.knee.muscles",
+    "Results": "tkamb.run.results",
+    "Scene": "tkamb.io.scene",
     "contact_model": "tkamb.contact.registry",
-    "live": "tkamb.view.live_window",
-    "load_scene": "tkamb.scene",
-    "read_results": "tkamb.results_folder",
+    "live": "tkamb.show.view.live_window",
+    "load_scene": "tkamb.io.scene",
+    "read_results": "tkamb.run.results_folder",
     "read_scene": "tkamb.run.read_scene",
-    "show": "tkamb.view.show",
-    "simulate": "tkamb.simulation",
+    "show": "tkamb.show.view.show",
+    "simulate": "tkamb.run.simulation",
 }
 
 __version__ = "0.1.0"

@@ -21,7 +21,7 @@ from tkamb.errors import InputError
 from tkamb.files import read_json
 
 MARKER = ".tkamb"
-"""Says that a folder is tkamb's (`tkamb.claim`), and what its temporary files are called."""
+"""Says that a folder is tkamb's (`tkamb.io.claim`), and what its temporary files are called."""
 JOURNAL = ".tkamb-commit"
 CHOOSE_OUT = "choose another --out, or remove it"
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_.][A-Za-z0-9_.-]*")

@@ -10,28 +10,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from tkamb import __version__
-from tkamb.check.command import add_check
-from tkamb.cohort.command import add_cohort
-from tkamb.compare.command import add_compare
-from tkamb.datasets.command import add_data
-from tkamb.export_command import add_export
-from tkamb.guard import guarded, log_to_stderr
-from tkamb.help_examples import add_examples
-from tkamb.importing.command import add_import
-from tkamb.mesh_command import add_contact, add_mesh, add_no_cache, add_press, without_cache
-from tkamb.option_rules import check_options
+from tkamb.commands.check import add_check
+from tkamb.commands.cohort import add_cohort
+from tkamb.commands.compare import add_compare
+from tkamb.commands.datasets import add_data
+from tkamb.commands.export import add_export
+from tkamb.commands.help_examples import add_examples
+from tkamb.commands.import_model import add_import
+from tkamb.commands.live import add_live
+from tkamb.commands.mesh import add_contact, add_mesh, add_no_cache, add_press, without_cache
+from tkamb.commands.option_rules import check_options
+from tkamb.commands.scene_options import add_preset, add_scene_options, overrides_of
+from tkamb.commands.studies import add_stability, add_tradeoff
+from tkamb.commands.uncertainty import add_uncertainty
+from tkamb.commands.view import add_view
+from tkamb.commands.wear import add_wear
+from tkamb.geometry.threads import threads
+from tkamb.io.starter import add_new
+from tkamb.run.guard import guarded, log_to_stderr
 from tkamb.run.settings import add_settings
-from tkamb.scene_options import add_preset, add_scene_options, overrides_of
-from tkamb.starter import add_new
-from tkamb.studies.command import add_stability, add_tradeoff
-from tkamb.threads import threads
-from tkamb.uncertainty.command import add_uncertainty
-from tkamb.view.command import add_view
-from tkamb.view.live_command import add_live
-from tkamb.wear.command import add_wear
 
 if TYPE_CHECKING:
-    from tkamb.scene import Scene
+    from tkamb.io.scene import Scene
 
 COLLECTED_AT = (20_000, 100)
 """Objects more than before at which Python looks for those that refer to each other only, and looks
@@ -141,13 +141,13 @@ def _run(options: argparse.Namespace) -> int:
     from tkamb.run.profiling import Profile, profile_lines
 
     profile = Profile() if options.profile else None
-    from tkamb.claim import claimed_directory
-    from tkamb.output.axis import horizontal_axis
-    from tkamb.output.headline import cards
-    from tkamb.results_folder import write_results
+    from tkamb.io.claim import claimed_directory
+    from tkamb.run.results_folder import write_results
+    from tkamb.run.simulation import simulate
     from tkamb.run.stages import Stages
     from tkamb.run.status import FAILED
-    from tkamb.simulation import simulate
+    from tkamb.show.axis import horizontal_axis
+    from tkamb.show.headline import cards
 
     scene = _scene_of(options)
     directory = options.out or scene.output.directory or _default_directory(options.scene)
@@ -182,7 +182,7 @@ def _run(options: argparse.Namespace) -> int:
 
 def _scene_of(options: argparse.Namespace) -> "Scene":
     """Return the scene of `run` with what the command line overrides."""
-    from tkamb.scene import load_scene
+    from tkamb.io.scene import load_scene
 
     overrides = overrides_of(options)
     scene = load_scene(options.scene, overrides, options.preset)
@@ -201,7 +201,7 @@ def _default_directory(scene: Path) -> Path:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from tkamb.results_folder import verify_results
+    from tkamb.run.results_folder import verify_results
 
     verdict = verify_results(options.folder)
     print("\n".join(f"{options.folder}: {line}" for line in verdict.lines()))
@@ -209,9 +209,9 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from tkamb.claim import claimed_directory
-    from tkamb.output.report import write_report
-    from tkamb.results_folder import REPORT_NAME, read_results
+    from tkamb.io.claim import claimed_directory
+    from tkamb.run.results_folder import REPORT_NAME, read_results
+    from tkamb.show.report import write_report
 
     results = read_results(options.folder)  # before a folder is made or marked
     with claimed_directory(options.folder) as folder:
@@ -221,15 +221,15 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _methods(options: argparse.Namespace) -> int:
-    from tkamb.output.methods import methods
-    from tkamb.results_folder import read_results
+    from tkamb.run.results_folder import read_results
+    from tkamb.show.methods import methods
 
     print(methods(read_results(options.folder).summary).text())
     return 0
 
 
 def _scene(options: argparse.Namespace) -> int:
-    from tkamb.scene import scene_schema
+    from tkamb.io.scene import scene_schema
 
     print(json.dumps(scene_schema(), indent=2))
     return 0

@@ -5,7 +5,7 @@ from functools import lru_cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).parent
-NO_NUMBERS = ("output", "view")
+NO_NUMBERS = ("show", "commands")
 """Subpackages that change how results look, not what they are."""
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow.parquet as parquet
 
 import tkamb
-from tkamb.cohort.run import run_cohort
+from tkamb.studies.cohort.run import run_cohort
 
 SCENE = Path(tkamb.__file__).parent / "starter" / "files" / "scene.toml"
 SIZES = {"small": 0.9, "middle": 1.0, "large": 1.1}

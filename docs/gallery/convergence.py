@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import tkamb
-from tkamb.press import press_meshes
+from tkamb.run.press import press_meshes
 
 MESHES = Path(tkamb.__file__).parent / "starter" / "files"
 SPACINGS = np.array([4.0, 2.0, 1.0, 0.5])  # mm

@@ -14,9 +14,9 @@ import numpy as np
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
-from tkamb.designs.design import load_design
 from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.surface import Surface
+from tkamb.studies.designs.design import load_design
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 DESIGN = load_design(Path(__file__).parents[2] / "models" / "designs" / "lps_flex")

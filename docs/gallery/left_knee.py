@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 
 import tkamb
-from tkamb.press import press_meshes
+from tkamb.run.press import press_meshes
 
 MESHES = Path(tkamb.__file__).parent / "starter" / "files"
 NAMES = ("femoral_component.stl", "insert.stl")

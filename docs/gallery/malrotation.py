@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import tkamb
-from tkamb.press import press_meshes
+from tkamb.run.press import press_meshes
 
 MESHES = Path(tkamb.__file__).parent / "starter" / "files"
 ROTATIONS = np.array([-5.0, -2.5, 0.0, 2.5, 5.0])  # deg

@@ -9,7 +9,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 
 import tkamb
-from tkamb.press import press_meshes
+from tkamb.run.press import press_meshes
 
 MESHES = Path(tkamb.__file__).parent / "starter" / "files"
 

@@ -16,7 +16,7 @@ import tkamb
 from tkamb.contact.model import ContactModel
 from tkamb.contact.result import ContactResult
 from tkamb.contact.samples import gaps_along_normals
-from tkamb.press import load_pair
+from tkamb.run.press import load_pair
 
 MESHES = Path(tkamb.__file__).parent / "starter" / "files"
 

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import tkamb
-from tkamb.columns import is_ligament
+from tkamb.run.columns import is_ligament
 
 SCENE = Path(tkamb.__file__).parent / "starter" / "files" / "scene.toml"
 

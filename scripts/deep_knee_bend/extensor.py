@@ -15,11 +15,11 @@ from scipy.optimize import brentq
 from deep_knee_bend import button
 from deep_knee_bend import dimensions as d
 from deep_knee_bend.implant import FEMORAL
-from tkamb.body.wrapping import taut_path
-from tkamb.designs.sagittal import normal as normal_at
 from tkamb.geometry.frames import inverse, knee_pose, transform
 from tkamb.geometry.sections import sagittal_outline
 from tkamb.geometry.surface import Surface
+from tkamb.knee.wrapping import taut_path
+from tkamb.studies.designs.sagittal import normal as normal_at
 
 STEP = 1e-6
 BETA_RANGE = (-0.3, 0.4)

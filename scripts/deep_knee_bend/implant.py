@@ -1,9 +1,10 @@
-"""The shipped knee's implant from `dimensions`; tkamb.designs says how the surfaces are made."""
+"""The shipped knee's implant from `dimensions`; tkamb.studies.designs says how the surfaces are
+made."""
 
 from deep_knee_bend import dimensions as d
-from tkamb.designs.femoral import FemoralComponent
-from tkamb.designs.insert import Insert
-from tkamb.designs.touch import Articulation
+from tkamb.studies.designs.femoral import FemoralComponent
+from tkamb.studies.designs.insert import Insert
+from tkamb.studies.designs.touch import Articulation
 
 FEMORAL = FemoralComponent(
     medial_arcs=d.SAGITTAL_ARCS,

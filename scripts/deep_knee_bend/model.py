@@ -5,7 +5,7 @@ from deep_knee_bend.extensor import patella_motion
 from deep_knee_bend.implant import FEMORAL, INSERT
 from deep_knee_bend.motion import knee_motion
 from deep_knee_bend.squat import squat
-from tkamb.designs import solids
+from tkamb.studies.designs import solids
 
 
 def make(folder):

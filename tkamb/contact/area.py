@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from tkamb.compiled import compiled_as_written
 from tkamb.contact.materials import Material
+from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
 
 NO_EDGE = 0.5

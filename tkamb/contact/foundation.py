@@ -5,7 +5,6 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from tkamb.compiled import compiled_as_written
 from tkamb.contact.materials import Material
 from tkamb.contact.model import ContactModel
 from tkamb.contact.narrow import narrow_flags
@@ -20,6 +19,7 @@ from tkamb.contact.samples import (
     gaps_along_normals,
     gaps_and_facets,
 )
+from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import SIDES, Array, Index, Mask, inverse, rotate, transform
 
 Law = Literal["nonlinear", "linear"]

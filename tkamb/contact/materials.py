@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 
-from tkamb.compiled import compiled_as_written
 from tkamb.errors import InputError, names_near
+from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array
 from tkamb.units import MEGAPASCAL
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from tkamb.compiled import compiled_as_written
 from tkamb.contact.samples import SampledContact, SurfaceSamples, gaps_and_facets
+from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index, inverse, transform
 
 NEAR = 3e-4

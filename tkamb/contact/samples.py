@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from tkamb.compiled import compiled_as_written
 from tkamb.contact.pair import ContactSurface, PreparedContact
 from tkamb.errors import InputError
+from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index, Mask, inverse, rotate
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface

@@ -6,8 +6,8 @@ from functools import cached_property
 import fcl
 import numpy as np
 
-from tkamb.compiled import compiled_as_written
 from tkamb.geometry.bounds import HeightBound
+from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.condyles import CONDYLE, condyle_faces
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import Array, Index, inverse, rotate, transform

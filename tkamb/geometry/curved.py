@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from tkamb.compiled import compiled_as_written
+from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.subdivision import Coarsened, coarsened
 from tkamb.geometry.surface import Surface

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tkamb.compiled import compiled_as_written
+from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.condyles import condyle_faces
 from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tkamb.compiled import compiled_as_written
+from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.normals import NO_CREASE, corner_normals, mean_normals
 from tkamb.geometry.tree import TriangleTree, rows

@@ -8,10 +8,10 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tkamb.compiled import compiled_as_written
+from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
+from tkamb.geometry.threads import in_halves
 from tkamb.geometry.tree import TriangleTree, rows
-from tkamb.threads import in_halves
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.compiled import compiled_as_written
+from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index, Mask
 
 if TYPE_CHECKING:

@@ -1,4 +1,5 @@
-"""The knee as an object on a Pinocchio model: contact, ligaments and extensor mechanism.
+"""The knee: chain, loads, ligaments, muscles' lines, patella and the equations of one instant.
 
-`tkamb.Knee` is the entry; docs/plug_in.md shows how it is used. Nothing here reads a file.
+`tkamb.Knee` (`tkamb.knee.knee`) is the entry; docs/plug_in.md shows how it is used. Nothing here
+reads a file.
 """

@@ -20,8 +20,6 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from tkamb.body.chain import Chain, ChainMotion, ChainState
-from tkamb.body.load import LinkPoint, PointForces, wrenches
 from tkamb.errors import InputError
 from tkamb.geometry.frames import (
     KNEE_JOINT_NAMES,
@@ -32,6 +30,8 @@ from tkamb.geometry.frames import (
     mirrored_pose,
 )
 from tkamb.knee.anatomy import Anatomy, Place
+from tkamb.knee.chain import Chain, ChainMotion, ChainState
+from tkamb.knee.load import LinkPoint, PointForces, wrenches
 
 _TWIST_MIRROR = np.array([1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
 """Signs of a twist or wrench (linear or force first) in the mirror image (z to -z)."""

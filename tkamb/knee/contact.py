@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tkamb.body.contact_points import CondylePoint
-from tkamb.body.load import wrench_of
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.probe import CondyleWrench, ProbedContact
 from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, cross, pose
+from tkamb.knee.contact_points import CondylePoint
+from tkamb.knee.load import wrench_of
 
 
 @dataclass(frozen=True)

@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.body.chain import Chain, ChainMotion
-from tkamb.body.contact_points import CondylePoint
-from tkamb.body.knee import KneeGeometry
-from tkamb.body.load import PointForces
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import SIDES, Array, cross, knee_pose, knee_twist
 from tkamb.knee.canonical import canonical_state
+from tkamb.knee.chain import Chain, ChainMotion
+from tkamb.knee.contact_points import CondylePoint
+from tkamb.knee.equations import KneeGeometry
+from tkamb.knee.load import PointForces
 
 if TYPE_CHECKING:
-    from tkamb.body.extensor import ExtensorLines
-    from tkamb.body.ligaments import Ligament
-    from tkamb.body.patella import PatellaState
     from tkamb.contact.probe import CondyleWrench
+    from tkamb.knee.extensor import ExtensorLines
+    from tkamb.knee.ligaments import Ligament
+    from tkamb.knee.patella import PatellaState
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,8 @@ class PatellaAt:
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """A knee at one instant; has what `tkamb.equilibrium.released.ReleasedKnee` asks of a body.
+    """A knee at one instant; has what `tkamb.knee.equilibrium.released.ReleasedKnee` asks of a
+    body.
 
     Args:
         chain: the canonical chain.
@@ -128,7 +129,7 @@ class Instant:
     def _pulls(self, state: object) -> tuple[dict[str, float], tuple[PointForces, ...]]:
         if not self.ligaments:
             return {}, ()
-        from tkamb.body.ligaments import ligament_loads
+        from tkamb.knee.ligaments import ligament_loads
 
         links = {end.link for one in self.ligaments for end in (one.proximal, one.distal)}
         poses = {link: state.pose(link) for link in links}  # type: ignore[attr-defined]

@@ -14,10 +14,6 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 import pinocchio as pin
 
-from tkamb.body.contact_points import NO_CONTACT, CondylePoint, contact_points
-from tkamb.body.knee import KneeGeometry, solve_knee, solved_unknowns, unsolved
-from tkamb.body.load import PointForces
-from tkamb.body.muscles import Muscle
 from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import (
     KNEE_COORDINATES,
@@ -30,8 +26,12 @@ from tkamb.geometry.frames import (
 )
 from tkamb.knee.anatomy import Place, find_anatomy, knee_size
 from tkamb.knee.canonical import Bridge, CanonicalChain, KneePlace, mirrored_spatial, se3, summed
+from tkamb.knee.contact_points import NO_CONTACT, CondylePoint, contact_points
+from tkamb.knee.equations import KneeGeometry, solve_knee, solved_unknowns, unsolved
 from tkamb.knee.instant import Instant, PatellaAt
+from tkamb.knee.load import PointForces
 from tkamb.knee.loads import KneeLoads, knee_loads
+from tkamb.knee.muscles import Muscle
 from tkamb.knee.parts import (
     Extensor,
     Implant,
@@ -41,15 +41,15 @@ from tkamb.knee.parts import (
 )
 
 if TYPE_CHECKING:
-    from tkamb.body.ligaments import BundleArrays, Ligament
-    from tkamb.body.patella import PatellaState
     from tkamb.contact.model import ContactModel
     from tkamb.contact.probe import ProbedContact
     from tkamb.contact.result import ContactResult
-    from tkamb.equilibrium.released import KneeEquilibrium
     from tkamb.geometry.closest import ClosestPointQuery
     from tkamb.geometry.surface import Surface
     from tkamb.knee.contact import KneeContact
+    from tkamb.knee.equilibrium.released import KneeEquilibrium
+    from tkamb.knee.ligaments import BundleArrays, Ligament
+    from tkamb.knee.patella import PatellaState
 
 PATELLAR_LIGAMENT = "patellar_ligament"
 """Its name among the tensions."""
@@ -253,7 +253,7 @@ class Knee:
                 patella = self._find_patella(place, data)
             poses = self._link_poses(place, patella)
             if self._others:
-                from tkamb.body.ligaments import ligament_loads
+                from tkamb.knee.ligaments import ligament_loads
 
                 total += ligament_loads(self._others, poses)[1]
             if patella is not None and self._pulls(pulled):
@@ -452,7 +452,7 @@ class Knee:
                 few degrees of freedom to reach the pose.
             ComputationError: the femur does not lie over the insert.
         """
-        from tkamb.equilibrium.released import ReleasedKnee
+        from tkamb.knee.equilibrium.released import ReleasedKnee
 
         contact, allowed = self._need_contact(), [n for n in KNEE_COORDINATES if n != "flexion"]
         for name in released:
@@ -603,7 +603,7 @@ class Knee:
         others = tuple(bundle for bundle in self.ligaments if bundle not in across)
         if not across:
             return None, others
-        from tkamb.body.ligaments import BundleArrays
+        from tkamb.knee.ligaments import BundleArrays
 
         shank = inverse(self.chain.insert_in_tibia)
         ends: dict[str, list[Array]] = {"femur": [], "tibia": []}
@@ -626,8 +626,8 @@ class Knee:
         return _Line(places, tuple(point.position for point in points))
 
     def _build_extensor(self, extensor: Extensor, left: bool) -> Any:
-        from tkamb.body.extensor import ExtensorLines, ExtensorParts
-        from tkamb.body.muscles import check_muscles
+        from tkamb.knee.extensor import ExtensorLines, ExtensorParts
+        from tkamb.knee.muscles import check_muscles
 
         assert self.femoral is not None and self.button is not None
         muscle, ligament = extensor.quadriceps, extensor.patellar_ligament
@@ -903,7 +903,7 @@ class Knee:
 
     def _rest(self, search: Any, instant: Instant, points: dict[str, Array]) -> "KneeEquilibrium":
         """Return the knee at rest, from first touch at the other coordinates of q."""
-        from tkamb.equilibrium.starts import Starts
+        from tkamb.knee.equilibrium.starts import Starts
 
         pair, recorded = self._need_contact().pair, instant.coordinates
         if not np.isfinite(pair.first_touch_height(knee_pose(recorded))):

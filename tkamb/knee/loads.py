@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from tkamb.body.knee import KneeGeometry
-from tkamb.body.knee import KneeLoads as SolvedLoads
-from tkamb.body.unknowns import MUSCLE, muscle_load
 from tkamb.geometry.frames import SIDES, Array
+from tkamb.knee.equations import KneeGeometry
+from tkamb.knee.equations import KneeLoads as SolvedLoads
+from tkamb.knee.unknowns import MUSCLE, muscle_load
 
 MIRRORED = ("ml", "axial", "coronal")
 """Parts of a load's name that change sign between a left knee and its mirror image: force along

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from tkamb.body.load import LinkPoint
-from tkamb.body.muscles import Muscle, PatellarLigament
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.geometry.surface import Surface
+from tkamb.knee.load import LinkPoint
+from tkamb.knee.muscles import Muscle, PatellarLigament
 
 if TYPE_CHECKING:
     import pinocchio as pin

@@ -1,1 +1,1 @@
-"""What surrounds the frames of a run: recording, resuming, rows, statuses, summary, profile."""
+"""A motion through a knee: frames, recording, resuming, statuses, columns, results."""

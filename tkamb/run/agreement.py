@@ -14,9 +14,9 @@ import numpy as np
 from tkamb.units import DEGREE
 
 if TYPE_CHECKING:
-    from tkamb.equilibrium.frame_contact import FrameContact
-    from tkamb.equilibrium.mechanics import FrameLoads
-    from tkamb.scene.case import Case
+    from tkamb.io.scene.case import Case
+    from tkamb.knee.equilibrium.frame_contact import FrameContact
+    from tkamb.run.mechanics import FrameLoads
 
 
 @dataclass(frozen=True)

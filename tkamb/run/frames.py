@@ -7,20 +7,20 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.frames import Array
-from tkamb.plausibility.plausibility import Plausibility
+from tkamb.io.scene import Scene
+from tkamb.io.scene.case import Case, load_case
+from tkamb.run.mechanics import Mechanics
+from tkamb.run.plausibility.plausibility import Plausibility
 from tkamb.run.shards import Row
 from tkamb.run.status import frame_status
 from tkamb.run.tabulate import frame_row
 from tkamb.run.workers import Team
-from tkamb.scene import Scene
-from tkamb.scene.case import Case, load_case
 
 if TYPE_CHECKING:
-    from tkamb.body.slip import CondyleSlip
-    from tkamb.equilibrium.contact_side import ContactSide
-    from tkamb.equilibrium.frame_contact import FrameContact
+    from tkamb.knee.equilibrium.frame_contact import FrameContact
+    from tkamb.knee.slip import CondyleSlip
+    from tkamb.run.contact_side import ContactSide
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class FrameSolver:
         """The contact side, prepared when it is first asked for; None without [contact]."""
         if self._case.scene.contact is None:
             return None
-        from tkamb.equilibrium.contact_side import ContactSide
+        from tkamb.run.contact_side import ContactSide
 
         return ContactSide(self._case, self.mechanics)
 

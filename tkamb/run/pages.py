@@ -8,10 +8,10 @@ from importlib import import_module
 from typing import Any
 
 PAGES = {
-    "cohort": "tkamb.cohort.report:cohort_html",
-    "headline": "tkamb.output.report:headline_html",
-    "plots": "tkamb.output.plots:plot",
-    "report": "tkamb.output.report:report_html",
+    "cohort": "tkamb.show.cohort_report:cohort_html",
+    "headline": "tkamb.show.report:headline_html",
+    "plots": "tkamb.show.plots:plot",
+    "report": "tkamb.show.report:report_html",
 }
 
 

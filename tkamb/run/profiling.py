@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tkamb.results import Results
+    from tkamb.run.results import Results
 
 HEAVY = ("pinocchio", "trimesh", "scipy", "fcl", "numba", "h5py", "matplotlib", "pydantic")
 """Libraries worth naming."""

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from tkamb.equilibrium.mechanics import Mechanics
 from tkamb.geometry.frames import Array
+from tkamb.io.scene import Scene, load_scene
+from tkamb.io.scene.case import Case, load_case
 from tkamb.knee.knee import Knee
 from tkamb.knee.parts import Extensor, Implant
-from tkamb.scene import Scene, load_scene
-from tkamb.scene.case import Case, load_case
+from tkamb.run.mechanics import Mechanics
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,16 +14,16 @@ import numpy as np
 from tkamb.contact.pair import PreparedContact
 from tkamb.contact.probe import ProbedContact
 from tkamb.contact.result import ContactResult
-from tkamb.equilibrium.balance import Balance, BalanceStatus
-from tkamb.equilibrium.contact_side import ContactSide
-from tkamb.equilibrium.frame_contact import FrameContact
-from tkamb.equilibrium.released import KneeEquilibrium
 from tkamb.geometry.frames import SIDES, Array
+from tkamb.knee.equilibrium.balance import Balance, BalanceStatus
+from tkamb.knee.equilibrium.frame_contact import FrameContact
+from tkamb.knee.equilibrium.released import KneeEquilibrium
+from tkamb.run.contact_side import ContactSide
 from tkamb.run.shards import CONTACT_PLACES
 
 if TYPE_CHECKING:
-    from tkamb.body.knee import KneeGeometry
-    from tkamb.equilibrium.mechanics import Mechanics
+    from tkamb.knee.equations import KneeGeometry
+    from tkamb.run.mechanics import Mechanics
 
 RESULT_ARRAYS = ("pose", "normals", "pressure", "area", "gap", "nodal_force", "wrench_on_insert")
 

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.columns import ACTIVATION, ENVELOPE, family_column
 from tkamb.geometry.frames import Array
+from tkamb.io.scene.case import Case
+from tkamb.run.columns import ACTIVATION, ENVELOPE, family_column
 from tkamb.run.status import FAILED
-from tkamb.scene.case import Case
 
 if TYPE_CHECKING:
-    from tkamb.inputs.emg import Envelopes
+    from tkamb.io.recordings.emg import Envelopes
 
 
 PREDICTED = {

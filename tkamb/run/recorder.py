@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 
 from tkamb.atomic import replaced_together
 from tkamb.geometry.frames import Array
-from tkamb.results_folder import MAPS_NAME, REPORT_NAME, SUMMARY_NAME, put_numbers, read_results
+from tkamb.run.results_folder import MAPS_NAME, REPORT_NAME, SUMMARY_NAME, put_numbers, read_results
 from tkamb.run.shards import CONTACT_PLACES, Row, Shard, Shards, check_same_run
 
 if TYPE_CHECKING:
-    from tkamb.output.maps import ContactMaps, MapWriter
-    from tkamb.results import Results
+    from tkamb.run.maps import ContactMaps, MapWriter
+    from tkamb.run.results import Results
 
 MAPS = ("pressure", "gap", "nodal_force", "pose", *CONTACT_PLACES)
 
@@ -54,7 +54,7 @@ class Recorder:
 
     def begin_maps(self, points: Array, triangles: Array, labels: Mapping[str, Any]) -> None:
         """Make ready for pressure maps on these points; not called without contact."""
-        from tkamb.output.maps import MapWriter
+        from tkamb.run.maps import MapWriter
 
         self._writer = MapWriter(self._maps_path, points, triangles, labels)
         self._stack.enter_context(self._writer)
@@ -117,7 +117,7 @@ class FolderRecorder(Recorder):
     Nothing in the folder changes before the first frame is finished.
 
     Args:
-        directory: a folder that this process has claimed (`tkamb.claim`).
+        directory: a folder that this process has claimed (`tkamb.io.claim`).
         identity: what makes two runs the same.
         resume: go on with the frames that an earlier run left there.
 
@@ -169,7 +169,7 @@ class FolderRecorder(Recorder):
     @property
     def maps(self) -> "ContactMaps | None":
         """See `Recorder`; as they stand in the output folder."""
-        from tkamb.output.maps import ContactMaps
+        from tkamb.run.maps import ContactMaps
 
         return None if self._writer is None else ContactMaps(self._directory / MAPS_NAME)
 

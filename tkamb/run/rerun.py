@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tkamb.errors import InputError
+from tkamb.io.scene import Scene, load_scene
+from tkamb.io.scene.case import Case, load_case
 from tkamb.run.summary import files_hash, scene_hash
-from tkamb.scene import Scene, load_scene
-from tkamb.scene.case import Case, load_case
 
 if TYPE_CHECKING:
-    from tkamb.results import Results
+    from tkamb.run.results import Results
 
 RUN_AGAIN = "run it again: tkamb run"
 

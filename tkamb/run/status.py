@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.equilibrium.mechanics import FrameLoads
+from tkamb.io.scene.case import Case
 from tkamb.run.agreement import contradictions
-from tkamb.scene.case import Case
+from tkamb.run.mechanics import FrameLoads
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
-    from tkamb.equilibrium.frame_contact import FrameContact
+    from tkamb.knee.equilibrium.frame_contact import FrameContact
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def frame_status(
         k: frame.
         body: its body side.
         contact: its contact side; None when not modelled.
-        doubts: flags of the questions that concern it (`tkamb.plausibility`).
+        doubts: flags of the questions that concern it (`tkamb.run.plausibility`).
     """
     failures = failures_of(body, contact)
     words = [*_motion_flags(case, k), *_flank_flags(body), *_adjustment_flags(case, body)]

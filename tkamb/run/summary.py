@@ -13,16 +13,16 @@ import numpy as np
 
 from tkamb import __version__
 from tkamb.code_identity import code_identity
-from tkamb.columns import JOINT_MOMENT, RESERVE, belongs, family_column, name_in
-from tkamb.equilibrium.mechanics import STRAIN_FLEXIONS
 from tkamb.files import named_files, sha256_of
-from tkamb.known_errors import as_json, known_error, left_out
-from tkamb.plug_ins import CONTACT_CODE, contact_code
+from tkamb.io.scene.case import Case
+from tkamb.io.scene.scene import Scene, scene_files
+from tkamb.io.scene.tables import ContactTable, MusclesTable
+from tkamb.run.columns import JOINT_MOMENT, RESERVE, belongs, family_column, name_in
+from tkamb.run.known_errors import as_json, known_error, left_out
+from tkamb.run.mechanics import STRAIN_FLEXIONS
+from tkamb.run.plug_ins import CONTACT_CODE, contact_code
 from tkamb.run.settings import changed_settings
 from tkamb.run.status import FAILED
-from tkamb.scene.case import Case
-from tkamb.scene.scene import Scene, scene_files
-from tkamb.scene.tables import ContactTable, MusclesTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 RESIDUALS = (
@@ -79,7 +79,7 @@ def summary_of(
         summary |= compare_recorded(case, columns)
     if scene.contact:
         table = scene.contact
-        from tkamb.equilibrium.contact_side import insert_material_as_json
+        from tkamb.run.contact_side import insert_material_as_json
 
         chosen = insert_material_as_json(scene)
         error = known_error(table.model, table.resolution_mm, chosen["name"], table.options)

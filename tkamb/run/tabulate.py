@@ -5,9 +5,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.body.contributions import condyle_contributions
-from tkamb.body.knee import dome_sensitivity
-from tkamb.columns import (
+from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, knee_coordinates
+from tkamb.io.scene.case import Case
+from tkamb.knee.contributions import condyle_contributions
+from tkamb.knee.equations import dome_sensitivity
+from tkamb.run.agreement import normal_force, share_by_equilibrium, split_determined
+from tkamb.run.columns import (
     ACTIVATION,
     CONTRIBUTIONS,
     JOINT_MOMENT,
@@ -16,20 +19,17 @@ from tkamb.columns import (
     family_column,
     ligament_column,
 )
-from tkamb.equilibrium.mechanics import FrameLoads
-from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, knee_coordinates
-from tkamb.run.agreement import normal_force, share_by_equilibrium, split_determined
+from tkamb.run.mechanics import FrameLoads
 from tkamb.run.status import FAILED
-from tkamb.scene.case import Case
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 if TYPE_CHECKING:
-    from tkamb.body.contact_points import CondylePoint
-    from tkamb.body.crossing import MuscleShare
-    from tkamb.body.slip import CondyleSlip
     from tkamb.contact.cam_post import PostContact
-    from tkamb.equilibrium.frame_contact import FrameContact
-    from tkamb.inputs.marker_motion import MarkerKinematics
+    from tkamb.io.recordings.marker_motion import MarkerKinematics
+    from tkamb.knee.contact_points import CondylePoint
+    from tkamb.knee.crossing import MuscleShare
+    from tkamb.knee.equilibrium.frame_contact import FrameContact
+    from tkamb.knee.slip import CondyleSlip
 
 NAN = float("nan")
 WHY_IT_FAILED = (
@@ -195,7 +195,7 @@ def _slip_row(
 ) -> dict[str, float]:
     """Return how one condyle moves on the insert at one frame.
 
-    - slip and its rate, from arcs of successive lowest points (`tkamb.body.slip`);
+    - slip and its rate, from arcs of successive lowest points (`tkamb.knee.slip`);
     - the same rate without arcs: the rigid-body velocity of the femur's contact point relative
       to the insert, forwards, less its axial part;
     - that velocity along the contact normal. Surfaces that stay in touch have none: what is
@@ -206,7 +206,7 @@ def _slip_row(
         "slip_velocity_mm_per_s": slip.slip_velocity(case.motion.time)[k],
     }
     if contact is not None:
-        from tkamb.body.slip import forward_sliding
+        from tkamb.knee.slip import forward_sliding
 
         assert case.femoral is not None
         centre, motion = case.femoral.bounds.mean(axis=0), case.motion

@@ -17,9 +17,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import IO, Any
 
-from tkamb import threads
 from tkamb.errors import ComputationError, InputError, TkambError
-from tkamb.guard import log_to_stderr
+from tkamb.geometry import threads
+from tkamb.run.guard import log_to_stderr
 
 MOST_WORKERS = 256
 Numbered = tuple[int, Any]

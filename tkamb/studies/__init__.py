@@ -1,1 +1,1 @@
-"""Two studies of the contact models: speed against accuracy, and stability at the extremes."""
+"""Studies on top of runs: trade-off, stability, uncertainty, cohort, wear, designs."""

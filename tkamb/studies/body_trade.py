@@ -17,14 +17,14 @@ import numpy as np
 
 from tkamb.errors import InputError, TkambError
 from tkamb.geometry.frames import Array
-from tkamb.scene import load_scene
-from tkamb.scene.case import load_case
-from tkamb.simulation import simulate
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
+from tkamb.run.simulation import simulate
 from tkamb.studies.cases import copied_scene, thin_out
 from tkamb.studies.kept_rows import KeptRows, row_key
 
 if TYPE_CHECKING:
-    from tkamb.results import Results
+    from tkamb.run.results import Results
 
 RECORDED = 101
 STEP = 10

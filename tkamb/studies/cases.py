@@ -144,7 +144,7 @@ def _shipped(name: str) -> StudyCase:
     motion or muscles are changed.
     """
     from tkamb.geometry.flat_bottom import insert_placement
-    from tkamb.inputs.meshes import load_surface
+    from tkamb.io.recordings.meshes import load_surface
 
     stored = json.loads(KNEE_CASES.read_text(encoding="utf-8"))[name]
     folder = SHIPPED_SCENE.parent
@@ -156,9 +156,9 @@ def _shipped(name: str) -> StudyCase:
 
 
 def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
-    from tkamb.equilibrium.mechanics import Mechanics
-    from tkamb.scene import load_scene
-    from tkamb.scene.case import load_case
+    from tkamb.io.scene import load_scene
+    from tkamb.io.scene.case import load_case
+    from tkamb.run.mechanics import Mechanics
 
     case = load_case(load_scene(path))
     table, insert = case.scene.contact, case.scene.implant.insert

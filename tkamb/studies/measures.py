@@ -17,13 +17,13 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from tkamb import threads
 from tkamb.contact.model import ContactModel
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import TkambError
-from tkamb.known_errors import setting_label
+from tkamb.geometry import threads
 from tkamb.memory import peak_rss
+from tkamb.run.known_errors import setting_label
 from tkamb.studies.cases import StudyCase, study_case
 from tkamb.studies.quantities import Quantities, quantities, raster_map
 

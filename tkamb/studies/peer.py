@@ -21,10 +21,10 @@ from tkamb.contact.area import covered_areas
 from tkamb.contact.lattice.meshing.contact_map import ContactMap, contact_map
 from tkamb.contact.pair import ContactPair, PreparedContact
 from tkamb.contact.result import ContactResult
-from tkamb.decks.calculix import ELEMENT, Deck
-from tkamb.decks.problem import PressProblem, press_problem
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
+from tkamb.run.decks.calculix import ELEMENT, Deck
+from tkamb.run.decks.problem import PressProblem, press_problem
 from tkamb.studies.calculix import CALCULIX, PeerRun, run_calculix
 from tkamb.studies.cases import StudyCase
 from tkamb.studies.measures import Measure

@@ -27,7 +27,7 @@ from tkamb.studies.cases import SHIPPED_SCENE, change_recording, copied_scene, s
 from tkamb.studies.verdict import WRONG, Verdict
 
 if TYPE_CHECKING:
-    from tkamb.results import Results
+    from tkamb.run.results import Results
 
 CONTACT = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
 FRAMES = slice(20, 101, 40)
@@ -99,8 +99,8 @@ def judge_scene(extreme: SceneExtreme) -> Verdict:
 
 
 def _run(scene: Path, overrides: dict[str, Any]) -> "Results":
-    from tkamb.scene import load_scene
-    from tkamb.simulation import simulate
+    from tkamb.io.scene import load_scene
+    from tkamb.run.simulation import simulate
 
     return simulate(load_scene(scene, CONTACT | overrides), frames=FRAMES)
 

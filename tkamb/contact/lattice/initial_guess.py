@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tkamb.compiled import compiled
 from tkamb.contact.lattice.linear.compliance import ComplianceCache, ContactResponse
 from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes
+from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index, Mask
 
 MARGIN = 0.25

@@ -36,13 +36,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.code_identity import code_identity
-from tkamb.compiled import compiled
 from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor
 from tkamb.contact.lattice.linear.operator import ElasticOperator, operator_error
 from tkamb.contact.lattice.linear.response import HalfResponse
 from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.errors import InputError
 from tkamb.files import open_regular
+from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Index, Mask
 
 MAGIC = b"tkamb operator 9"

@@ -26,10 +26,10 @@ import scipy.sparse as sparse
 from numpy.typing import DTypeLike, NDArray
 from scipy.linalg import blas, get_blas_funcs, lapack
 
-from tkamb.compiled import compiled
 from tkamb.errors import ComputationError
+from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
-from tkamb.threads import both
+from tkamb.geometry.threads import both
 
 CUTS = 16
 """Ways in which fronts are divided between two threads, to take the best."""

@@ -10,7 +10,6 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
-from tkamb.compiled import compiled
 from tkamb.contact.lattice.linear.memory_need import check_memory, factor_memory
 from tkamb.contact.lattice.linear.multifrontal import (
     CholeskyFactor,
@@ -22,6 +21,7 @@ from tkamb.contact.lattice.linear.multifrontal import (
 from tkamb.contact.lattice.linear.response import HalfResponse, HalfSolves
 from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.contact.pair import Bearing
+from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index, Mask
 
 SEED = 20_240_501

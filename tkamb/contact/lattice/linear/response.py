@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import get_blas_funcs
 
-from tkamb.compiled import compiled
 from tkamb.contact.lattice.linear.multifrontal import Front, joined
+from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
-from tkamb.threads import both, in_halves
+from tkamb.geometry.threads import both, in_halves
 
 Precision = type[np.floating[Any]]
 

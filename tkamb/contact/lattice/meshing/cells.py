@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.compiled import compiled
+from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
 
 CORNERS = np.array(

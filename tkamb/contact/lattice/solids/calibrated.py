@@ -36,7 +36,7 @@ from tkamb.contact.lattice.solids.curve import LEAST_STRAIN, ShearCurve
 from tkamb.contact.lattice.solids.solid import SMALL_STRAIN, Noticed, Solid, chunks
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array, Index
-from tkamb.threads import in_halves
+from tkamb.geometry.threads import in_halves
 
 
 def spring_families(edges: Array, body_diagonal: float) -> Array:

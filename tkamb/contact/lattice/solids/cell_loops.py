@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tkamb.compiled import compiled
+from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
 
 NOTHING = 1e-300

@@ -10,10 +10,10 @@ import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
-from tkamb.compiled import compiled
 from tkamb.contact.lattice.meshing.cells import mean_gradient
 from tkamb.contact.materials import Material
 from tkamb.errors import InputError
+from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
 
 CHUNK = 2000

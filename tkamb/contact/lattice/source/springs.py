@@ -19,10 +19,10 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sparse
 
-from tkamb.compiled import compiled
 from tkamb.contact.lattice.meshing.cells import DIRECTIONS
 from tkamb.contact.lattice.solids.solid import Pattern, Scatter, Solid
 from tkamb.contact.materials import Material
+from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
 
 VERTICAL = 1

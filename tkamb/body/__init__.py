@@ -1,1 +1,0 @@
-"""The rigid-body side: chain, loads, ligaments, muscles and inverse dynamics."""

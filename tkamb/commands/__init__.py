@@ -1,0 +1,1 @@
+"""The commands of `tkamb`: arguments in, exit status out; nothing is computed here."""

@@ -1,0 +1,83 @@
+"""`tkamb check`: arguments in; out come lines, a picture or a page, and the exit status."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tkamb.commands.scene_options import add_force, add_set
+from tkamb.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from tkamb.show.check.scene_check import SceneCheck
+
+PICTURES = (".png", ".html")
+POLICY = (
+    "default-src 'none'; style-src-elem {style}; style-src-attr 'unsafe-inline'; "
+    "img-src data:; base-uri 'none'; form-action 'none'"
+)
+"""Content security of the page, which stands by itself."""
+
+
+def add_check(commands: Any) -> None:
+    """Add `check` to the command line."""
+    check = commands.add_parser("check", help="read a scene's files and look at them; no run")
+    check.add_argument("scene", type=Path, help="scene.toml")
+    check.add_argument(
+        "--out", type=Path, metavar="F", help="the leg at three frames: .png, or .html with it all"
+    )
+    add_set(check)
+    add_force(check)
+    check.add_argument("--json", action="store_true", help="print the findings as JSON")
+    check.set_defaults(command=_check)
+
+
+def _check(options: argparse.Namespace) -> int:
+    from tkamb.io.claim import check_output_file
+    from tkamb.run.stages import Stages
+    from tkamb.show.check.scene_check import check_scene
+
+    if options.out and options.out.suffix.lower() not in PICTURES:
+        mend = f"name it like check{PICTURES[0]}"
+        raise InputError(f"is none of {', '.join(PICTURES)}", options.out, mend)
+    check_output_file(options.out, options.force)
+    with Stages(4 if options.out else 3) as stages:
+        found = check_scene(options.scene, dict(options.set), stages.begin)
+        if options.out:
+            stages.begin("drawing the leg")
+            _write_picture(found, options.out)
+    written = [f"picture: {options.out}"] if options.out else []
+    lines = [*found.lines(), *written, f"next: tkamb run {options.scene}"]
+    print(json.dumps(found.as_dict(), indent=2) if options.json else "\n".join(lines))
+    return 0
+
+
+def _write_picture(found: "SceneCheck", path: Path) -> None:
+    from tkamb.atomic import replaced_file, write_text
+    from tkamb.show.check.leg_picture import draw_leg
+
+    figure = draw_leg(found.mechanics)
+    if path.suffix.lower() == ".html":
+        write_text(path, check_html(found, figure))
+        return
+    with replaced_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=130)
+
+
+def check_html(found: "SceneCheck", figure: "Figure") -> str:
+    """Return the page: questions first, then the picture, then what each file gave."""
+    from tkamb.show.pages import asset, policy_sources, render
+    from tkamb.show.style import svg_text
+
+    style = asset("tkamb.show", "report.css")
+    return render(
+        "tkamb.show.check",
+        "check.html",
+        policy=POLICY.format(style=policy_sources(style)),
+        style=style,
+        title=f"Check of {found.scene.resolve().parent.name}/{found.scene.name}",
+        found=found,
+        picture=svg_text(figure, "leg"),
+    )

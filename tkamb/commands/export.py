@@ -1,0 +1,85 @@
+"""`tkamb export`: a folder of results in other programs' formats."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from tkamb.errors import InputError
+
+
+def add_export(commands: Any) -> None:
+    """Add the command `export` to the parser's commands."""
+    export = commands.add_parser("export", help="results for other programs")
+    export.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
+    kind = export.add_mutually_exclusive_group(required=True)
+    kind.add_argument("--sto", type=Path, metavar="F.sto", help="all columns, for OpenSim")
+    kind.add_argument(
+        "--vtp", action="store_true", help="pressure maps over time, for ParaView; needs --out"
+    )
+    kind.add_argument(
+        "--deck", choices=("ccx", "feb"), help="one frame's contact, for CalculiX or FEBio 4"
+    )
+    export.add_argument(
+        "--out", type=Path, metavar="DIR2", help="folder of --vtp; file of --deck (.inp, .feb)"
+    )
+    export.add_argument("--frame", type=int, metavar="K", help="of --deck: row of results.csv")
+    export.add_argument(
+        "--resolution", type=float, metavar="MM", help="of --deck: edge of its hexahedra"
+    )
+    export.add_argument("--force", action="store_true", help="--out may be a folder not tkamb's")
+    export.set_defaults(command=_export)
+
+
+def _export(options: argparse.Namespace) -> int:
+    if (options.vtp or options.deck) and not options.out:
+        hint = "--vtp --out DIR2, or --deck ccx --frame K --out F.inp"
+        raise InputError("needs --out", "--vtp" if options.vtp else "--deck", hint)
+    if options.deck and options.frame is None:
+        raise InputError("needs --frame", "--deck", "--deck ccx --frame K")
+    if options.deck:
+        return _export_deck(options)
+    return _export_maps(options) if options.vtp else _export_storage(options)
+
+
+def _export_deck(options: argparse.Namespace) -> int:
+    from tkamb.atomic import write_text
+    from tkamb.contact.registry import COARSEST_MM
+    from tkamb.io.claim import check_output_file
+    from tkamb.run.decks.frame import SUFFIX, frame_press
+
+    if options.out.suffix.lower() != SUFFIX[options.deck]:
+        raise InputError(f"is no {SUFFIX[options.deck]} file", options.out, "name it so")
+    if options.resolution is not None and not 0 < options.resolution <= COARSEST_MM:
+        mend = f"give more than 0, at most {COARSEST_MM:g} mm"
+        raise InputError(f"resolution {options.resolution} mm", "--resolution", mend)
+    check_output_file(options.out, options.force)
+    found = frame_press(options.folder, options.frame, options.resolution)
+    write_text(options.out, found.deck(options.deck))
+    print("\n".join([f"{options.out}: {found.comments()[0]}", *found.comments()[2:]]))
+    return 0
+
+
+def _export_storage(options: argparse.Namespace) -> int:
+    from tkamb.run.results_folder import read_results
+    from tkamb.show.storage import write_results_storage
+
+    results = read_results(options.folder)
+    print(f"{options.sto}: {write_results_storage(results, options.sto)}")
+    return 0
+
+
+def _export_maps(options: argparse.Namespace) -> int:
+    from tkamb.io.claim import claimed_directory
+    from tkamb.io.vtk import write_map_series
+    from tkamb.run.results_folder import read_results
+
+    results = read_results(options.folder)
+    if results.maps is None:
+        raise InputError("holds no contact.h5", options.folder, "run the scene with [contact]")
+    with claimed_directory(options.out, options.force) as folder:
+        names = write_map_series(results.maps, folder)
+    more = "; a left knee's mirror image" if results.summary.get("side") == "left" else ""
+    more += "; without the post's pressure" if "post_force_N" in results.columns else ""
+    frames = f"{len(names) - 1} of {len(results)} frames"
+    print(f"{options.out / names[0]}: {frames}, m and Pa in the insert frame{more}")
+    return 0

@@ -1,0 +1,260 @@
+"""`tkamb import`: its arguments, and what it prints."""
+
+import argparse
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+from tkamb.errors import InputError
+from tkamb.io.activities import Activity
+from tkamb.units import ANGLE, LENGTH
+
+if TYPE_CHECKING:
+    from tkamb.io.importing.request import ImportRequest
+
+
+def add_import(commands: Any) -> None:
+    """Add the command's parser."""
+    p = commands.add_parser("import", help="a patient from an OpenSim model and a recording")
+    p.add_argument("model", type=Path, metavar="MODEL.osim", help="an OpenSim model")
+    source = p.add_mutually_exclusive_group(required=True)
+    source.add_argument("--c3d", type=Path, metavar="F", help="markers and force plates")
+    source.add_argument("--trc", type=Path, metavar="F", help="markers alone")
+    source.add_argument("--motion", type=Path, metavar="F", help="the model's coordinates")
+    p.add_argument("--grf", type=Path, metavar="F", help=".mot or .sto of the ground reactions")
+    p.add_argument(
+        "--grf-force",
+        metavar="NAME,NAME",
+        help="how the foot's columns in it begin: ground_force_2; several are summed",
+    )
+    p.add_argument("--static", type=Path, metavar="F", help="standing trial: where markers sit")
+    p.add_argument("--side", choices=("right", "left"), required=True, help="of the knee")
+    p.add_argument("--mass-kg", type=float, required=True, metavar="KG", help="of the subject")
+    for part in ("femoral", "insert", "patella"):
+        p.add_argument(f"--{part}", type=Path, metavar="F", help=f"mesh, {part} part")
+        p.add_argument(f"--{part}-frame", metavar="NAME", help="body or frame of its mesh")
+    p.add_argument("--femur-bone", type=Path, metavar="F", help="mesh that the muscle may wrap")
+    p.add_argument(
+        "--mesh-unit",
+        "--units",
+        dest="mesh_unit",
+        choices=tuple(LENGTH),
+        help="of all meshes; it is never guessed",
+    )
+    p.add_argument(
+        "--mesh-axes",
+        "--axes",
+        dest="mesh_axes",
+        metavar="ANT,SUP,RIGHT",
+        help="mesh axes that point anterior, superior, right; write --mesh-axes=-x,+y,-z",
+    )
+    _add_poses(p)
+    _add_inferred(p)
+    p.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder of scene and patient.urdf"
+    )
+    p.add_argument("--scene", default="scene.toml", metavar="NAME", help="name of the scene file")
+    p.add_argument(
+        "--contact",
+        choices=("foundation", "lattice"),
+        default="foundation",
+        help="the scene's contact model; default: %(default)s",
+    )
+    p.add_argument("--activity", choices=get_args(Activity), help="what the report compares with")
+    p.add_argument("--note", action="append", default=[], metavar="TEXT", help="for the report")
+    scale = p.add_mutually_exclusive_group()
+    scale.add_argument(
+        "--scale-mass",
+        dest="scale",
+        action="store_true",
+        default=None,
+        help="scale the model's masses to the subject's; default: where they differ by over 1 %%",
+    )
+    scale.add_argument(
+        "--keep-mass",
+        dest="scale",
+        action="store_false",
+        default=None,
+        help="take the model's masses as they are",
+    )
+    p.set_defaults(command=_import)
+
+
+def _add_inferred(p: argparse.ArgumentParser) -> None:
+    """Add the options that stand instead of what is inferred."""
+    p.add_argument("--knee", metavar="JOINT", help="the femorotibial joint of the model")
+    p.add_argument("--plates", type=_numbers, metavar="2,3", help="under the foot; or none")
+    p.add_argument("--interval", type=_interval, metavar="A:B", help="s, part of the recording")
+    p.add_argument("--laboratory-axes", metavar="FORWARD,UP,RIGHT", help="of the recording")
+    p.add_argument("--without", type=_names, default=(), metavar="A,B", help="markers not used")
+    p.add_argument(
+        "--marker-prefix", metavar="NAME", help="of the labels that are used: JW of JW:RHeel"
+    )
+    p.add_argument("--length-unit", choices=("m", "cm", "mm"), help="of a .c3d that lacks it")
+    p.add_argument("--force-unit", metavar="N", help="of a .c3d's force channels, likewise")
+    p.add_argument("--moment-unit", metavar="Nmm", help="of its moment channels, likewise")
+    p.add_argument(
+        "--method",
+        choices=("segments", "chain"),
+        default="segments",
+        help="markers of thigh and shank each by itself, or the whole leg; default: segments",
+    )
+    p.add_argument(
+        "--cutoff-hz",
+        type=float,
+        default=6.0,
+        metavar="HZ",
+        help="of the low-pass filter of markers and forces; default: 6",
+    )
+
+
+def _add_poses(p: argparse.ArgumentParser) -> None:
+    """Add the options of recorded poses of the implant."""
+    p.add_argument("--poses", type=Path, metavar="F", help="of the femoral mesh in the insert mesh")
+    p.add_argument(
+        "--pose-columns", type=_names, metavar="R1,R2,R3,X,Y,Z", help="its angles and places"
+    )
+    p.add_argument("--pose-sequence", metavar="XYZ", help="upper case: intrinsic (Rx Ry Rz)")
+    p.add_argument("--pose-units", type=_names, metavar="rad,m", help="of angles and places")
+    p.add_argument(
+        "--pose-signs-turned", type=_names, default=(), metavar="ROLES", help="rotation_1, …"
+    )
+    p.add_argument(
+        "--stride",
+        type=_interval,
+        metavar="A:B",
+        help="s of the recording where 0 and 100 %% of the poses' time lie",
+    )
+    p.add_argument(
+        "--stance",
+        type=_interval,
+        metavar="A:B",
+        help="part of the poses' time over which the knee centre in the shank is averaged",
+    )
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(","))
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    if text == "none":
+        return ()
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not numbers like 2,3, or none") from None
+
+
+def _interval(text: str) -> tuple[float, float]:
+    try:
+        start, end = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not two numbers A:B") from None
+    return start, end
+
+
+def _import(options: argparse.Namespace) -> int:
+    from tkamb.io.importing.patient import import_patient, write_patient
+
+    patient = import_patient(import_request(options), options.out)
+    markers = write_patient(patient, options.out, options.scene)
+    scene = options.out / options.scene
+    print("\n".join([*patient.report, *markers, f"scene: {scene}", f"next: tkamb check {scene}"]))
+    return 0
+
+
+def import_request(options: argparse.Namespace) -> "ImportRequest":
+    """Return what a command line asks for.
+
+    Raises:
+        InputError: options that do not go together, or numbers that cannot be.
+    """
+    from tkamb.io.importing.request import ImportRequest
+    from tkamb.io.recordings.unit_words import GivenUnits
+
+    if not options.mass_kg > 0:
+        raise InputError(f"{options.mass_kg:g} kg is no mass", "--mass-kg")
+    if not options.cutoff_hz > 0:
+        raise InputError(f"{options.cutoff_hz:g} Hz is no frequency", "--cutoff-hz")
+    for name in ("force_unit", "moment_unit"):
+        if getattr(options, name) and not (options.c3d and options.grf is None):
+            option = f"--{name.replace('_', '-')}"
+            raise InputError("is for the plates of a .c3d: tables are in N and N·m", option)
+    if options.length_unit and options.motion:
+        raise InputError("is for recordings of markers", "--length-unit", "leave it out")
+    if options.grf_force and not options.grf:
+        raise InputError("needs --grf", "--grf-force")
+    if Path(options.scene).name != options.scene or not options.scene.endswith(".toml"):
+        hint = "--out names the folder"
+        raise InputError(f"'{options.scene}' is no name of a .toml file", "--scene", hint)
+    return ImportRequest(
+        options.model,
+        options.side,
+        options.mass_kg,
+        options.c3d or options.trc or options.motion,
+        grf=options.grf,
+        grf_force=options.grf_force,
+        poses=_poses(options),
+        without=options.without,
+        static=options.static,
+        meshes=_meshes(options),
+        knee=options.knee,
+        frames={
+            "femoral component": options.femoral_frame,
+            "insert": options.insert_frame,
+            "patellar button": options.patella_frame,
+        },
+        plates=options.plates,
+        interval=options.interval,
+        laboratory_axes=options.laboratory_axes,
+        scale_mass=options.scale,
+        method=options.method,
+        cutoff_Hz=options.cutoff_hz,
+        contact=options.contact,
+        activity=options.activity,
+        notes=tuple(options.note),
+        prefix=options.marker_prefix,
+        units=GivenUnits(options.length_unit, options.force_unit, options.moment_unit),
+    )
+
+
+def _meshes(options: argparse.Namespace) -> Any:
+    from tkamb.io.importing.scene_text import Meshes
+
+    given = (options.femoral, options.insert)
+    if not any(given):
+        return None
+    if not all(given):
+        raise InputError("go together", "--femoral and --insert", "give both or none")
+    if options.mesh_unit is None or options.mesh_axes is None:
+        missing = "--mesh-unit" if options.mesh_unit is None else "--mesh-axes"
+        raise InputError("is not given, and is not guessed", missing, "`tkamb mesh check` helps")
+    return Meshes(*given, options.patella, options.mesh_unit, options.mesh_axes, options.femur_bone)
+
+
+def _poses(options: argparse.Namespace) -> Any:
+    from tkamb.io.importing.recorded_poses import ROLES, PoseRecording
+
+    if options.poses is None:
+        return None
+    columns = options.pose_columns or ROLES
+    if len(columns) != len(ROLES):
+        raise InputError(
+            f"has {len(columns)} names", "--pose-columns", "three angles, then x, y, z"
+        )
+    if not re.fullmatch("[xyz]{3}|[XYZ]{3}", options.pose_sequence or ""):
+        raise InputError("is not three axes, and is not guessed", "--pose-sequence", "as in XYZ")
+    angle, _, length = ",".join(options.pose_units or ()).partition(",")
+    if angle not in ANGLE or length not in LENGTH:
+        raise InputError("are not two units, and are not guessed", "--pose-units", "as in rad,m")
+    return PoseRecording(
+        options.poses,
+        tuple(columns),
+        options.pose_sequence,
+        angle,
+        length,
+        options.pose_signs_turned,
+        options.stride,
+        options.stance,
+    )

@@ -1,0 +1,238 @@
+"""Commands on meshes, without a scene (`press`, `mesh`, `contact`): arguments in, status out."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from tkamb.commands.scene_options import add_force
+from tkamb.errors import InputError
+from tkamb.io.defaults import CONTACT_MODEL
+
+UNIT_OPTIONS = ("--units", "--mesh-unit")
+AXES_OPTIONS = ("--axes", "--mesh-axes")
+"""Either spelling is read by every command that takes meshes."""
+
+
+def add_press(commands: Any) -> None:
+    """Add `press` to the command line."""
+    press = commands.add_parser("press", help="contact alone: press two meshes together")
+    press.add_argument("femoral", type=Path, help="mesh of the femoral component")
+    press.add_argument("insert", type=Path, help="mesh of the insert")
+    press.add_argument(
+        "--load",
+        type=float,
+        required=True,
+        metavar="N",
+        help="along the normal of the insert's bottom",
+    )
+    _add_units(press, "of both meshes")
+    pose = press.add_mutually_exclusive_group()
+    pose.add_argument(
+        "--pose",
+        type=float,
+        nargs=6,
+        metavar=("X", "Y", "Z", "RX", "RY", "RZ"),
+        help="femoral mesh in the insert mesh's axes: mesh units, degrees (intrinsic x-y-z)",
+    )
+    pose.add_argument("--pose-file", type=Path, metavar="F", help="the same six numbers in a file")
+    press.add_argument(
+        "--contact",
+        default=CONTACT_MODEL,
+        metavar="NAME",
+        help="contact model (`tkamb contact list`); default: %(default)s",
+    )
+    add_no_cache(press)
+    press.add_argument(
+        "--resolution",
+        type=float,
+        default=1.0,
+        metavar="MM",
+        help="spacing of the map points, the lattice's cell size; default: 1",
+    )
+    press.add_argument(
+        "--bearing",
+        choices=("fixed", "mobile"),
+        default="fixed",
+        help="how the insert is held; default: fixed",
+    )
+    press.add_argument(
+        "--material",
+        default="polyethylene",
+        metavar="NAME|F.toml",
+        help="built-in, or a file of the keys of a scene's [material]; default: %(default)s",
+    )
+    _add_side(press)
+    press.add_argument(
+        "--adjust",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="first move the femoral mesh until both condyles touch; default: no",
+    )
+    press.add_argument(
+        "--restore-when",
+        choices=("both", "either"),
+        help="with --adjust: what must exceed the adjustment for it to be undone; default: both",
+    )
+    press.add_argument("--out", type=Path, metavar="F.vtp", help="the pressure map, for ParaView")
+    add_force(press)
+    press.add_argument("--json", action="store_true", help="print the result as JSON")
+    press.set_defaults(command=_press)
+
+
+def _press(options: argparse.Namespace) -> int:
+    from tkamb.io.claim import check_output_file
+    from tkamb.run.press import press_meshes, read_pose
+
+    if options.out and options.out.suffix.lower() != ".vtp":
+        raise InputError("is no .vtp file", options.out, "name it like map.vtp")
+    check_output_file(options.out, options.force)
+    pose = read_pose(options.pose_file) if options.pose_file else options.pose
+    report = press_meshes(
+        options.femoral,
+        options.insert,
+        options.load,
+        units=options.units,
+        pose=None if pose is None else tuple(pose),
+        contact=options.contact,
+        resolution_mm=options.resolution,
+        bearing=options.bearing,
+        material=options.material,
+        axes=options.axes,
+        side=options.side,
+        adjust=options.adjust,
+        restore_when=options.restore_when,
+        options=without_cache(options.contact) if options.no_cache else None,
+    )
+    if options.out:
+        report.write_map(options.out)
+    print(json.dumps(report.as_dict(), indent=2) if options.json else "\n".join(report.lines()))
+    return 0 if report.carried else 1
+
+
+def add_mesh(commands: Any) -> None:
+    """Add the command `mesh` and its verbs to the parser's commands."""
+    mesh = commands.add_parser("mesh", help="look at a mesh before it is used")
+    verbs = mesh.add_subparsers(required=True, metavar="VERB")
+    check = verbs.add_parser("check", help="health, and unit and axes as questions")
+    check.add_argument("files", type=Path, nargs="+", metavar="FILE", help="meshes")
+    check.add_argument("--json", action="store_true", help="print the findings as JSON")
+    check.set_defaults(command=_mesh_check)
+    part = verbs.add_parser("part", help="one of several bodies into a file of its own")
+    part.add_argument("file", type=Path, metavar="FILE", help="mesh of several bodies")
+    part.add_argument("number", type=int, metavar="N", help="as `tkamb mesh check` numbers them")
+    part.add_argument("--out", type=Path, required=True, metavar="F", help=".stl, .ply or .obj")
+    part.set_defaults(command=_mesh_part)
+    lattice = verbs.add_parser("lattice", help="the lattice of an insert, and how good it is")
+    lattice.add_argument("insert", type=Path, metavar="INSERT", help="mesh of the insert")
+    lattice.add_argument("--resolution", type=float, default=1.0, metavar="MM", help="cell size")
+    _add_units(lattice, "of the mesh")
+    _add_side(lattice)
+    lattice.add_argument("--out", type=Path, metavar="F.vtu", help="for ParaView or meshio")
+    add_force(lattice)
+    lattice.add_argument("--json", action="store_true", help="print the report as JSON")
+    lattice.set_defaults(command=_mesh_lattice)
+
+
+def _mesh_check(options: argparse.Namespace) -> int:
+    from tkamb.io.recordings.mesh_check import check_mesh
+
+    found = [check_mesh(path) for path in options.files]
+    if options.json:
+        print(json.dumps([health.as_dict() for health in found], indent=2))
+    else:
+        print("\n".join(line for health in found for line in health.lines()))
+    return 0
+
+
+def _mesh_part(options: argparse.Namespace) -> int:
+    from tkamb.io.mesh_files import write_body
+
+    line = write_body(options.file, options.number, options.out)
+    print(f"{options.out}: {line}")
+    return 0
+
+
+def _mesh_lattice(options: argparse.Namespace) -> int:
+    from tkamb.io.claim import check_output_file
+    from tkamb.io.mesh_files import lattice_of_file
+
+    check_output_file(options.out, options.force)
+    report = lattice_of_file(
+        options.insert,
+        options.resolution,
+        units=options.units,
+        axes=options.axes,
+        side=options.side,
+        out=options.out,
+    )
+    print(json.dumps(report.as_dict(), indent=2) if options.json else "\n".join(report.lines()))
+    return 0
+
+
+def add_contact(commands: Any) -> None:
+    """Add the command `contact` and its verb."""
+    contact = commands.add_parser("contact", help="contact models")
+    verbs = contact.add_subparsers(required=True, metavar="VERB")
+    verbs.add_parser("list", help="names, what each assumes and needs").set_defaults(
+        command=_contact_list
+    )
+
+
+def _contact_list(options: argparse.Namespace) -> int:
+    from tkamb.contact.registry import contact_descriptions
+
+    for name, line in contact_descriptions().items():
+        print(f"{name:18s} {line}")
+    print(
+        "times are those of one press; a frame is one press, with released coordinates twenty to "
+        "eighty"
+    )
+    return 0
+
+
+def _add_units(command: argparse.ArgumentParser, what: str) -> None:
+    """Add --units, which `tkamb import` calls --mesh-unit."""
+    command.add_argument(
+        *UNIT_OPTIONS,
+        dest="units",
+        choices=("mm", "cm", "m"),
+        default="mm",
+        help=f"{what}; default: mm",
+    )
+
+
+def _add_side(command: argparse.ArgumentParser) -> None:
+    """Add --axes and --side: how a mesh lies in the knee."""
+    command.add_argument(
+        *AXES_OPTIONS,
+        dest="axes",
+        default="+x,+y,+z",
+        metavar="ANT,SUP,RIGHT",
+        help="mesh axes that point anterior, superior, right; write --axes=-x,+y,-z",
+    )
+    command.add_argument(
+        "--side", choices=("right", "left"), default="right", help="of the knee; default: right"
+    )
+
+
+def add_no_cache(command: argparse.ArgumentParser) -> None:
+    """Add --no-cache to a command."""
+    command.add_argument(
+        "--no-cache", action="store_true", help="neither read nor keep prepared operators on disk"
+    )
+
+
+def without_cache(contact: str | None) -> dict[str, Any]:
+    """Return the options of a contact model that then keeps nothing on disk.
+
+    Raises:
+        InputError: there is no such model, or it keeps nothing anyway.
+    """
+    from tkamb.contact.registry import contact_options
+
+    if contact is None:
+        raise InputError("no contact is modelled", "--no-cache", "leave it out")
+    if "cache" not in contact_options(contact):
+        raise InputError(f"'{contact}' keeps nothing on disk", "--no-cache", "leave it out")
+    return {"cache": False}

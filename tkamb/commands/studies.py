@@ -1,0 +1,187 @@
+"""`tkamb tradeoff` and `tkamb stability`: arguments in, exit status out."""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+NOT_OURS = "write into a folder that is not tkamb's, or another command's"
+
+
+def add_tradeoff(commands: Any) -> None:
+    """Add `tradeoff` to the command line."""
+    tradeoff = commands.add_parser("tradeoff", help="speed against accuracy of the contact models")
+    tradeoff.add_argument(
+        "scene", type=Path, nargs="?", metavar="SCENE", help="measure on your own scene too"
+    )
+    size = tradeoff.add_mutually_exclusive_group()
+    size.add_argument("--quick", action="store_true", help="two cases, 2 mm, within a minute")
+    size.add_argument("--full", action="store_true", help="every setting on every case")
+    tradeoff.add_argument("--peer", choices=("calculix",), help="another program, side by side")
+    tradeoff.add_argument("--recompute", action="store_true", help="the references too (slow)")
+    tradeoff.add_argument("--resume", action="store_true", help="go on with a stopped study")
+    tradeoff.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/tradeoff"),
+        metavar="DIR",
+        help="output folder; default: %(default)s",
+    )
+    tradeoff.add_argument("--force", action="store_true", help=NOT_OURS)
+    tradeoff.add_argument("--json", action="store_true", help="print the rows as JSON")
+    tradeoff.set_defaults(command=_tradeoff)
+
+
+def _tradeoff(options: argparse.Namespace) -> int:
+    from tkamb.io.claim import claimed_directory
+
+    if options.peer:
+        from tkamb.studies.calculix import find_program
+
+        find_program()
+    with claimed_directory(options.out, options.force, "tradeoff") as directory:
+        return _study_tradeoff(options, directory)
+
+
+def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
+    from tkamb.atomic import write_text
+    from tkamb.show.tradeoff_report import (
+        DEFAULT,
+        comparison,
+        picture,
+        recommendations,
+        table,
+    )
+    from tkamb.studies import tradeoff as study
+    from tkamb.studies.body_trade import CHANGES, BodyRow, body_json, body_table, run_body_trade
+    from tkamb.studies.kept_rows import KeptRows
+    from tkamb.studies.row import as_json, with_fronts
+
+    wanted = study.jobs(options.quick, options.scene, options.full)
+    cases = study.cases_of(wanted)
+    kept = KeptRows(directory, options.resume)
+    references = study.references_for(cases, options.recompute, _announce, kept)
+    rows, whole = gather(
+        study.run_tradeoff(wanted, references, kept), study.expected_seconds(wanted, cases)
+    )
+    found = len(rows)
+    if whole and options.peer:
+        sizes = {job.resolution_mm for job in wanted if job.label == DEFAULT}
+        more, whole = gather(study.run_peer(cases, references, kept, sizes), [1.0] * len(cases))
+        rows += more
+    body: list[BodyRow] = []
+    planned = 0
+    if whole and not options.quick:
+        planned = len(CHANGES)
+        body, whole = gather(run_body_trade(kept), [1.0] * planned)
+    rows = with_fronts(rows)
+    lines = [*unfinished(found + len(body), len(wanted) + planned), *table(rows, references)]
+    lines += ["", *comparison(rows), "", *recommendations(rows)]
+    if body:
+        lines += ["", *body_table(body)]
+        write_text(directory / "body.json", body_json(body))
+    text = as_json(rows)
+    _write(directory, "tradeoff", text, lines, picture(rows) if rows else None)
+    print(text if options.json else "\n".join([*lines, f"picture: {directory / 'tradeoff.png'}"]))
+    if not whole:
+        raise KeyboardInterrupt(_goes_on(directory))
+    return 0 if any(row.errors for row in rows) else 1
+
+
+def add_stability(commands: Any) -> None:
+    """Add `stability` to the command line."""
+    stability = commands.add_parser("stability", help="the contact models at the extremes")
+    stability.add_argument("--quick", action="store_true", help="a tenth of the contact cases")
+    stability.add_argument("--resume", action="store_true", help="go on with a stopped study")
+    stability.add_argument("--workers", type=int, default=2, metavar="N", help="cases at a time")
+    stability.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/stability"),
+        metavar="DIR",
+        help="output folder; default: %(default)s",
+    )
+    stability.add_argument("--force", action="store_true", help=NOT_OURS)
+    stability.add_argument("--json", action="store_true", help="print the rows as JSON")
+    stability.set_defaults(command=_stability)
+
+
+def _stability(options: argparse.Namespace) -> int:
+    from tkamb.io.claim import claimed_directory
+
+    with claimed_directory(options.out, options.force, "stability") as directory:
+        return _study_stability(options, directory)
+
+
+def _study_stability(options: argparse.Namespace, directory: Path) -> int:
+    from tkamb.show.stability_picture import picture
+    from tkamb.studies import stability as study
+    from tkamb.studies.kept_rows import KeptRows
+    from tkamb.studies.stability import table
+
+    cases = study.stability_cases(options.quick)
+    kept = KeptRows(directory, options.resume)
+    judged = study.run_stability(cases, kept=kept, workers=max(1, options.workers))
+    verdicts, whole = gather(judged, [1.0] * len(cases))
+    if not whole:
+        verdicts = study.kept_verdicts(cases, kept)
+    text = json.dumps(study.summary(verdicts), indent=1, allow_nan=False)
+    lines = [*unfinished(len(verdicts), len(cases)), *table(verdicts)]
+    _write(directory, "stability", text, lines, picture(verdicts) if verdicts else None)
+    print(text if options.json else "\n".join([*lines, f"picture: {directory / 'stability.png'}"]))
+    if not whole:
+        raise KeyboardInterrupt(_goes_on(directory))
+    return 1 if any(verdict.failed for verdict in verdicts) else 0
+
+
+def gather(found: Iterable[T], costs: Sequence[float]) -> tuple[list[T], bool]:
+    """Collect rows under a progress bar with the time left.
+
+    Args:
+        found: the rows as they come.
+        costs: how long each is expected to take, in any unit.
+
+    Returns:
+        The rows, and whether they are all: Ctrl-C ends the collecting, not the command.
+    """
+    from tqdm import tqdm
+
+    rows: list[T] = []
+    look = "{desc} {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
+    with tqdm(total=sum(costs), bar_format=look, smoothing=0.05, disable=None) as bar:
+        bar.set_description_str(f"0 of {len(costs)} rows")
+        try:
+            for row, cost in zip(found, costs, strict=False):
+                rows.append(row)
+                bar.set_description_str(f"{len(rows)} of {len(costs)} rows", refresh=False)
+                bar.update(cost)
+        except KeyboardInterrupt:
+            return rows, False
+    return rows, True
+
+
+def unfinished(count: int, total: int) -> list[str]:
+    """Return the line that heads the table of a study that was stopped; none of a whole one."""
+    return [] if count == total else [f"stopped: {count} of {total} rows", ""]
+
+
+def _goes_on(directory: Path) -> str:
+    return f"what was finished is in {directory}; --resume goes on from there"
+
+
+def _write(directory: Path, name: str, text: str, lines: list[str], figure: Any) -> None:
+    """Write a study's JSON, table and picture, each whole or not at all."""
+    from tkamb.atomic import replaced_file, write_text
+
+    write_text(directory / f"{name}.json", text + "\n")
+    write_text(directory / f"{name}.txt", "\n".join(lines) + "\n")
+    if figure is not None:
+        with replaced_file(directory / f"{name}.png") as temporary:
+            figure.savefig(temporary, format="png", dpi=150)
+
+
+def _announce(line: str) -> None:
+    print(f"tkamb: {line}", file=sys.stderr, flush=True)

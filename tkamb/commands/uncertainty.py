@@ -1,0 +1,174 @@
+"""`tkamb uncertainty`: arguments in, exit status out."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tkamb.commands.scene_options import add_scene_options, overrides_of
+
+if TYPE_CHECKING:
+    from tkamb.studies.uncertainty.run import Uncertainty
+
+SHOWN = 5
+"""Inputs of the tornado table that are printed."""
+QUICK_CONTACT = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
+QUICK_FRAMES = 11
+"""What a screening takes where nothing else is asked for."""
+LEAST_SHOWN = 0.01
+"""Share of a result's variance."""
+TERMS = 2
+"""Of each input in the regression, its value and its square: each explains 1/n by chance."""
+NOTABLE_FAILED = 0.05
+"""Share of samples: where more fail, the bands leave out a whole tail."""
+
+
+def add_uncertainty(commands: Any) -> None:
+    """Add `uncertainty` to the command line."""
+    command = commands.add_parser("uncertainty", help="bands beside every result of a scene")
+    add_scene_options(command)
+    command.add_argument("--samples", type=int, default=256, metavar="N", help="default 256")
+    command.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default 1")
+    command.add_argument("--dask", metavar="ADDRESS|local", help="have a Dask cluster compute")
+    command.add_argument("--method", default="lhs", metavar="lhs|sobol", help="default lhs")
+    command.add_argument(
+        "--indices", action="store_true", help="Sobol' indices too: N (d + 2) samples of d inputs"
+    )
+    command.add_argument(
+        "--screen", action="store_true", help="one input at a time, seconds; nothing is written"
+    )
+    command.add_argument(
+        "--force", action="store_true", help="write into a folder that is not tkamb's"
+    )
+    command.add_argument("--resume", action="store_true", help="go on with an interrupted run")
+    command.set_defaults(command=_uncertainty)
+
+
+def _uncertainty(options: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from tkamb.io.scene import load_scene
+    from tkamb.studies.uncertainty.run import estimate_uncertainty
+
+    overrides = overrides_of(options)
+    if options.screen:
+        return _screen(options, overrides)
+    directory = options.out or Path("out") / f"{options.scene.resolve().parent.name}_uncertainty"
+    found = estimate_uncertainty(
+        load_scene(options.scene, overrides),
+        samples=options.samples,
+        workers=options.workers,
+        dask=options.dask,
+        method=options.method,
+        indices=options.indices,
+        frames=options.frames,
+        directory=directory,
+        scene_path=options.scene,
+        resume=options.resume,
+        force=options.force,
+        progress=lambda samples, count: tqdm(samples, total=count, unit="sample", disable=None),
+    )
+    for line in warnings_of(found):
+        print(f"tkamb: {line}", file=sys.stderr)
+    print("\n".join([*headline(found), f"bands: {directory / 'bands.csv'}"]))
+    return 1 if all(one.failed.all() for one in found.samples) else 0
+
+
+def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
+    """Print the tornado of one input at a time; quick unless the command line says otherwise."""
+    from tqdm import tqdm
+
+    from tkamb.io.scene import load_scene
+    from tkamb.io.scene.case import load_case
+    from tkamb.run.workers import Crew
+    from tkamb.studies.uncertainty.screening import screen, screen_lines
+
+    scene, said = load_scene(options.scene, overrides), []
+    if scene.contact and not {"contact.model", "contact.resolution_mm"} & set(overrides):
+        scene = load_scene(options.scene, overrides | QUICK_CONTACT)
+        said.append("contact by foundation at 2 mm; --contact and --resolution choose another")
+    frames = options.frames
+    if frames is None:
+        step = -(-len(load_case(scene).motion.time) // QUICK_FRAMES)
+        frames = slice(None, None, step)
+        if step > 1:
+            said.append(f"frames ::{step}; --frames chooses others")
+    rows = screen(
+        scene,
+        frames=frames,
+        crew=Crew(options.workers, options.dask),
+        progress=lambda samples, count: tqdm(samples, total=count, unit="sample", disable=None),
+    )
+    said.append("one input at a time by one standard deviation: minus, plus; no interactions")
+    said.append(
+        "an offset either way may raise a force: it climbs one flank of the insert or other"
+    )
+    print("\n".join([*screen_lines(rows), *(f"({line})" for line in said)]))
+    return 0 if rows else 1
+
+
+def headline(found: "Uncertainty") -> list[str]:
+    """Return the peak's band and what moves it most, in lines of text."""
+    from numpy import isfinite, nanargmax
+
+    total = found.results["force_total_BW"]
+    if not isfinite(total).any():
+        return ["no frame of the nominal run has a force"]
+    peak = int(nanargmax(total))
+    flexion = found.results["flexion_deg"][peak]
+    of_samples = found.results.summary["uncertainty"]["peak_force_total_BW"]
+    words = of_samples["words"]
+    if of_samples["median"] is None:
+        why = found.results.why_no_band(peak)
+        value = f"{total[peak]:.2f} BW as the inputs stand, no median or band: {why}"
+    else:
+        value = (
+            f"median {of_samples['median']:.2f} BW, 5 to 95 %: {of_samples['p05']:.2f} to "
+            f"{of_samples['p95']:.2f}"
+        )
+    lines = [f"peak total force at {flexion:.0f} deg: {value} ({words})"]
+    of_chance = TERMS / found.results.summary["uncertainty"]["samples"]
+    chance = f"; up to {of_chance:.0%} each is chance" if of_chance >= LEAST_SHOWN else ""
+    for result in ("force_total_N", "medial_force_N"):
+        rows = [row for row in found.tornado if row.result == result][:SHOWN]
+        parts = ", ".join(f"{row.name} {row.share:.0%}" for row in rows if row.share >= LEAST_SHOWN)
+        if parts:
+            lines.append(f"{result} varies by {parts} (shares of variance, by regression{chance})")
+    for name, one in found.results.summary["uncertainty"].get("measured_inside", {}).items():
+        lines.append(
+            f"the measured {name} force lies within 5 to 95 % in {one['share']:.0%} of "
+            f"{one['frames']} frames"
+        )
+    for result in ("force_total_N", "medial_force_N"):
+        parts = ", ".join(
+            f"{one.name} {_with_error(one.first, one.first_error)} alone, "
+            f"{_with_error(one.total, one.total_error)} in all"
+            for one in [row for row in found.indices if row.result == result][:SHOWN]
+        )
+        if parts:
+            lines.append(f"{result}, Sobol' indices and standard errors: {parts}")
+    return lines
+
+
+def _with_error(value: float, error: float) -> str:
+    return f"{value:.2f} ± {error:.2f}".replace("-", "−")
+
+
+def warnings_of(found: "Uncertainty") -> list[str]:
+    """Return what the bands leave out."""
+    lines, summary = [], found.results.summary["uncertainty"]
+    if summary["not_varied"]:
+        names = ", ".join(summary["not_varied"])
+        lines.append(f"not varied, so the bands are too narrow for them: {names}")
+    share = found.bands["failed_share"]
+    if (share > NOTABLE_FAILED).any():
+        causes = summary["causes_of_failure"].items()
+        why = ", ".join(f"{text} ({part:.0%} of the failures)" for text, part in causes)
+        lines.append(
+            f"in {(share > NOTABLE_FAILED).sum()} of {len(share)} frames more than "
+            f"{NOTABLE_FAILED:.0%} of the samples failed (at most {share.max():.0%}), most often: "
+            f"{why}; their bands hold for the poses that are possible, see failed_share"
+        )
+    if not found.tornado:
+        lines.append("too few samples for tornado.csv: give 6 per input or more")
+    return lines

@@ -1,0 +1,132 @@
+"""`tkamb view`: arguments in, exit status out."""
+
+import argparse
+import os
+from pathlib import Path
+from typing import Any
+
+from tkamb.errors import InputError
+from tkamb.io.claim import check_output_file
+from tkamb.run.guard import say
+from tkamb.show.view import CAMERAS
+
+HIGHEST_PORT = 65535
+
+
+def add_view(commands: Any) -> None:
+    """Add `view` to the command line."""
+    view = commands.add_parser("view", help="see a run and turn it around")
+    view.add_argument(
+        "runs",
+        type=Path,
+        nargs="+",
+        metavar="SCENE|RESULTS",
+        help="scene.toml or a folder that `tkamb run` wrote; several: side by side",
+    )
+    view.add_argument(
+        "--contact",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="contact model of a scene; several: side by side",
+    )
+    view.add_argument("--frame", type=int, default=0, metavar="K", help="shown first")
+    view.add_argument("--camera", default="oblique", metavar="NAME", help=", ".join(CAMERAS))
+    view.add_argument("--lattice", action="store_true", help="draw the lattice too")
+    view.add_argument("--html", type=Path, metavar="F", help="write one file instead of a window")
+    view.add_argument("--png", type=Path, metavar="F", help="write a picture of the frame")
+    for kind in ("gif", "mp4"):
+        view.add_argument(
+            f"--{kind}", type=Path, metavar="F", help="write all frames as a film (extra: film)"
+        )
+    view.add_argument(
+        "--force", action="store_true", help="write over files that tkamb did not write"
+    )
+    view.add_argument("--port", type=int, default=0, help="of the live window; default: any free")
+    view.set_defaults(command=_view)
+
+
+def _view(options: argparse.Namespace) -> int:
+    _check(options)
+    say(f"reading {', '.join(map(str, options.runs))}")
+    from tqdm import tqdm
+
+    from tkamb.show.view.run import check_frame, read_source
+    from tkamb.show.view.show import Show
+
+    def progress(frames: Any) -> Any:
+        return tqdm(frames, "drawing", unit="frame", disable=None)
+
+    sources = [
+        read_source(path, contact) for path in options.runs for contact in options.contact or [None]
+    ]
+    check_frame(sources, options.frame)
+    runs = [source.open(progress, say) for source in sources]
+    show = Show(
+        runs,
+        frame=options.frame,
+        camera=options.camera,
+        lattice=options.lattice,
+        progress=progress,
+    )
+    if options.html:
+        show.write_html(options.html)
+        print(f"page: {options.html}")
+    if options.png:
+        show.write_png(options.png)
+        print(f"picture: {options.png}")
+    films = [path for path in (options.gif, options.mp4) if path]
+    for path in films:
+        from tkamb.show.view.film import write_film
+
+        write_film(show, path, lambda frames: tqdm(frames, "filming", unit="frame", disable=None))
+        print(f"film: {path}")
+    if not (options.html or options.png or films):
+        show.open(say, options.port)
+    return 0
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Refuse what is wrong whatever the runs hold, before they are read.
+
+    Raises:
+        InputError: an option that cannot be, or a file that cannot be written.
+        ComputationError: a picture is wanted and there is no browser.
+    """
+    check_port(options.port)
+    if options.camera not in CAMERAS:
+        mend = f"there are: {', '.join(CAMERAS)}"
+        raise InputError(f"no view '{options.camera}'", "--camera", mend)
+    if options.contact:
+        from tkamb.contact.registry import contact_class
+
+        for name in options.contact:
+            contact_class(name)
+        for path in options.runs:
+            if os.path.isdir(path):
+                raise InputError(
+                    "has its own contact model", path, "give the scene to choose another"
+                )
+    for path in (options.html, options.png, options.gif, options.mp4):
+        if path is not None and not os.access(path.absolute().parent, os.W_OK):
+            raise InputError("cannot be written (no such folder, or not yours)", path)
+        check_output_file(path, options.force)
+    for kind in ("gif", "mp4"):
+        if path := getattr(options, kind):
+            from tkamb.show.view.film import check_film
+
+            check_film(path, f"--{kind}")
+    if options.png:
+        from tkamb.show.view.page import find_browser
+
+        find_browser()
+
+
+def check_port(port: int) -> None:
+    """Raise where a number is no port.
+
+    Raises:
+        InputError: it is not 0 to 65535.
+    """
+    if not 0 <= port <= HIGHEST_PORT:
+        raise InputError(f"no port {port}", "--port", f"give 0 (any) to {HIGHEST_PORT}")

@@ -1,1 +1,0 @@
-"""Body and contact brought to agree: `contact_side` is the only file that sees both."""

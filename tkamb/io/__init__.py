@@ -1,0 +1,1 @@
+"""Files to objects and back: scenes, recordings, OpenSim models, meshes, datasets."""

@@ -1,0 +1,257 @@
+"""Whose an output folder is, and that one process at a time writes into it.
+
+The file `.tkamb` marks a folder as tkamb's; whoever writes holds a lock on it (flock), which
+the system drops when the process ends, however it ends. A folder with other things in it is
+not touched unless that is asked for, and nothing in it is ever removed but what tkamb names.
+"""
+
+import fcntl
+import json
+import os
+import secrets
+import stat
+import threading
+import time as clock
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from tkamb import __version__
+from tkamb.atomic import (
+    MARKER,
+    claim_directory,
+    finish_replacement,
+    folder_token,
+    replacement_pending,
+)
+from tkamb.errors import InputError
+from tkamb.files import TABLE_LIMIT, read_json, read_text
+from tkamb.io.occupants import check_occupants
+
+CHOOSE = "choose another folder with --out"
+LONGEST_WAIT = 5.0
+"""s that a reader waits for a writer that is just putting files in their places."""
+
+_held: set[tuple[int, int, int]] = set()
+"""(thread, device, inode) of the folders that this process holds."""
+
+
+@contextmanager
+def claimed_directory(path: str | Path, force: bool = False, command: str = "") -> Iterator[Path]:
+    """Hold an output folder: it is there, can be written, is tkamb's, and nobody else's now.
+
+    What a killed process left unfinished in it is finished or removed. After bad input the
+    folder is as it was: what was made for it is gone again. A thread may claim a folder that
+    it holds already.
+
+    Args:
+        path: of the folder; made if it is not there.
+        force: take it even if it holds things that are not tkamb's, which are left alone, or
+            another command's output.
+        command: of tkamb that writes there; without one any output of tkamb's may be there.
+
+    Raises:
+        InputError: it cannot be made or written, is not tkamb's, holds another command's output
+            (`tkamb.io.occupants`), or another process holds it; or from the block.
+    """
+    path = Path(path)
+    made = [folder for folder in (path, *path.parents) if not _exists(folder)]
+    fresh = None
+    try:
+        claim_directory(path)
+        status = path.stat()
+        key = (threading.get_ident(), status.st_dev, status.st_ino)
+        if key in _held:
+            yield path
+            return
+        _check_ours(path, force)
+        fresh = not os.path.lexists(path / MARKER)
+        with _holding_lock(path):
+            _held.add(key)
+            try:
+                _mark(path)
+                finish_replacement(path)
+                _remove_temporaries(path)
+                if command and not force:
+                    check_occupants(path, command)
+                yield path
+            except InputError:
+                if fresh:
+                    (path / MARKER).unlink(missing_ok=True)
+                raise
+            finally:
+                _held.discard(key)
+    except InputError:
+        with suppress(OSError, ValueError):  # no longer empty, or never made
+            for folder in made:
+                folder.rmdir()
+        raise
+
+
+def settle(folder: Path) -> None:
+    """Have what a killed process left half done in a folder finished, before it is read.
+
+    Raises:
+        InputError: it cannot be finished.
+    """
+    deadline = clock.monotonic() + LONGEST_WAIT
+    while replacement_pending(folder):
+        try:
+            with _holding_lock(folder):
+                finish_replacement(folder)
+        except BusyFolderError:  # the one who holds it is about to finish it
+            if clock.monotonic() > deadline:
+                raise
+            clock.sleep(0.02)
+
+
+class BusyFolderError(InputError):
+    """Another process writes into the folder."""
+
+
+@contextmanager
+def _holding_lock(path: Path) -> Iterator[None]:
+    """Hold the lock of a folder's marker, which is made if it is not there."""
+    descriptor = _acquire_lock(path)
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _acquire_lock(path: Path) -> int:
+    marker = path / MARKER
+    while True:
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        try:
+            descriptor = os.open(marker, flags, 0o644)
+        except OSError as error:
+            raise InputError(f"cannot be opened ({error.strerror})", marker, CHOOSE) from None
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            what = "another tkamb is writing into this folder"
+            raise BusyFolderError(what, path, f"wait for it, or {CHOOSE}") from None
+        except OSError as error:
+            os.close(descriptor)
+            what = f"cannot be locked ({error.strerror})"
+            raise InputError(what, marker, CHOOSE) from None
+        # Whoever held it before may have removed the marker: then the lock is on a file that
+        # nobody else can find any more.
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(descriptor), marker.lstat()):
+                return descriptor
+        os.close(descriptor)
+
+
+def _mark(path: Path) -> None:
+    """Write the marker if it says nothing yet."""
+    if folder_token(path):
+        return
+    content = {
+        "tkamb": __version__,
+        "token": secrets.token_hex(8),
+        "note": "tkamb writes its results into this folder and may replace them",
+    }
+    marker = path / MARKER
+    try:
+        with open(marker, "r+", encoding="utf-8") as file:  # in place: its inode bears the lock
+            file.truncate()
+            file.write(json.dumps(content) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", marker, CHOOSE) from None
+
+
+def _remove_temporaries(path: Path) -> None:
+    """Remove what a killed process left of files that it did not finish: those of our token."""
+    token = folder_token(path)
+    for entry in path.glob(f".tkamb-{token}-*.part"):
+        if stat.S_ISREG(entry.lstat().st_mode):
+            entry.unlink(missing_ok=True)
+
+
+def _check_ours(path: Path, force: bool) -> None:
+    """Raise if a folder holds things and none of them says that it is tkamb's."""
+    if force or is_ours(path):
+        return
+    others = sorted(entry.name for entry in path.iterdir())
+    if others:
+        what = f"is not empty and not tkamb's own (it holds {others[0]!r})"
+        raise InputError(what, path, "choose another folder with --out, or give --force")
+
+
+def is_ours(path: Path) -> bool:
+    """Say whether tkamb has written into a folder before: this release or an earlier one.
+
+    Releases before the marker left a summary.json that names tkamb's version, the identity of
+    an unfinished run, or the rows of a study.
+    """
+    if (path / MARKER).is_file() and not (path / MARKER).is_symlink():
+        return True
+    versions = _object(path / "summary.json").get("versions")
+    if isinstance(versions, dict) and "tkamb" in versions:
+        return True
+    if "version of tkamb" in _object(path / ".frames" / "run.json"):
+        return True
+    try:
+        rows = read_text(path / "rows.jsonl", TABLE_LIMIT)
+    except InputError:
+        return False
+    return rows.startswith('{"key": ') and '"row": ' in rows.partition("\n")[0]
+
+
+OWN_MARK = b"tkamb"
+"""Stands at the beginning of every page, map and deck that tkamb writes."""
+MARK_WITHIN = 4096
+"""Bytes of a file in which the mark is looked for."""
+PICTURES = {".png": b"\x89PNG", ".gif": b"GIF8"}
+"""Formats without a mark: a picture takes the place of a picture."""
+
+
+def check_output_file(path: str | Path | None, force: bool = False) -> None:
+    """Raise unless a file may be written here: its place is free, or holds one of tkamb's own.
+
+    Args:
+        path: of the file; None: none is written.
+        force: replace whatever file is there.
+
+    Raises:
+        InputError: there is a file that tkamb did not write, or something that is no file.
+    """
+    if path is None or not os.path.lexists(path):
+        return
+    path = Path(path)
+    if not path.is_file():
+        raise InputError("is there already and no file", path, "give another name")
+    if force or path.suffix.lower() == ".mp4":
+        return
+    try:
+        with open(path, "rb") as file:
+            head = file.read(MARK_WITHIN)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", path, "give another name") from None
+    magic = PICTURES.get(path.suffix.lower())
+    if not head or (OWN_MARK in head if magic is None else head.startswith(magic)):
+        return
+    what = "is there already, and tkamb did not write it"
+    raise InputError(what, path, "give another name, or --force to replace it")
+
+
+def _object(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file; an empty one if there is none."""
+    try:
+        found = read_json(path)
+    except InputError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):  # a name that is too long, or with NUL: said when it is made
+        return True

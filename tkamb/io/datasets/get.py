@@ -1,0 +1,156 @@
+"""Files of a data set into its folder: downloaded or copied, by their SHA-256, each whole or not.
+
+What is there already with the right content is kept, so that an interrupted download goes on.
+"""
+
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tkamb.atomic import claim_directory, replaced_file
+from tkamb.errors import InputError
+from tkamb.files import sha256_of
+from tkamb.io.datasets.dataset import DataFile, Dataset
+
+TIMEOUT_S = 30
+"""s without an answer after which a server counts as gone."""
+
+
+@dataclass
+class Got:
+    """What became of the files: names, by what was done."""
+
+    kept: list[str] = field(default_factory=list)
+    written: list[str] = field(default_factory=list)
+    absent: list[str] = field(default_factory=list)
+
+
+def download(dataset: Dataset, to: Path, url: str | None = None) -> Got:
+    """Download what is missing of a data set.
+
+    Args:
+        dataset: what to get.
+        to: its folder, made if need be.
+        url: of a mirror with the same paths; default the data set's own.
+
+    Returns:
+        What was kept, what was written, and what is not published at a known address.
+
+    Raises:
+        InputError: pooch is not installed, no answer, another content than registered, or a
+            file that is there with another content. Files that were complete stay.
+    """
+    try:
+        import pooch
+    except ImportError:
+        raise InputError(
+            "needs pooch, which is not installed",
+            "tkamb data get",
+            "pip install 'tkamb[data]', or give what you downloaded by hand with --from DIR",
+        ) from None
+    pooch.get_logger().setLevel("ERROR")
+    base = url or dataset.url
+
+    def fetch(file: DataFile, beside: Path) -> Path | None:
+        address = file.url(base)
+        return _retrieved(address, file, beside) if address else None
+
+    return _get(dataset, to, fetch)
+
+
+def take_from(dataset: Dataset, to: Path, folder: Path) -> Got:
+    """Copy what is missing of a data set from a folder of downloads, or from a clone.
+
+    Args:
+        dataset: what to get.
+        to: its folder, made if need be.
+        folder: holds the files under their names here or those of the repository, with the
+            folders around them or without.
+
+    Returns:
+        What was kept, what was written, and what the folder does not hold.
+
+    Raises:
+        InputError: no such folder, none of the files in it, one of another content than
+            registered, or a file that is there with another content.
+    """
+    if not folder.is_dir():
+        raise InputError("is not a folder", folder, "give the folder of what you downloaded")
+
+    found = {file.name: _found(file, folder) for file in dataset.files}  # all, before any is copied
+    if not any(found.values()):
+        mend = f"download or clone {dataset.repository} first"
+        raise InputError("holds none of the files of this data set", folder, mend)
+    return _get(dataset, to, lambda file, beside: found[file.name])
+
+
+def _get(dataset: Dataset, to: Path, fetch: Callable[[DataFile, Path], Path | None]) -> Got:
+    """Write what is missing. `fetch`, given a folder to use, returns a file's content or None."""
+    missing = [file for file in dataset.files if not _is_there(file, to)]
+    got = Got(kept=[file.name for file in dataset.files if file not in missing])
+    for file in missing:
+        with tempfile.TemporaryDirectory(prefix="tkamb-data-") as beside:
+            source = fetch(file, Path(beside))
+            if source is None:
+                got.absent.append(file.name)
+                continue
+            target = to / file.name
+            claim_directory(target.parent)
+            with replaced_file(target) as temporary:
+                shutil.copyfile(source, temporary)
+                if sha256_of(temporary) != file.sha256:
+                    raise _other_content(source, file)
+        got.written.append(file.name)
+    return got
+
+
+def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
+    """Download a file into a folder, and check its content."""
+    import pooch
+    from requests.exceptions import HTTPError, RequestException
+
+    fetch = pooch.HTTPDownloader(timeout=TIMEOUT_S)
+    known = f"sha256:{file.sha256}"
+    mend = "run it again: what is complete is kept; or --from DIR for what you downloaded by hand"
+    try:
+        return Path(pooch.retrieve(address, known, "whole", folder, downloader=fetch))
+    except HTTPError as error:
+        status = error.response.status_code if error.response is not None else "unknown"
+        raise InputError(f"cannot be downloaded (HTTP status {status})", address, mend) from None
+    except RequestException as error:
+        what = type(error).__name__  # its text is a page of nested causes
+        raise InputError(f"cannot be downloaded (no network? {what})", address, mend) from None
+    except OSError as error:
+        raise InputError(f"cannot be downloaded ({error.strerror})", address, mend) from None
+    except ValueError as error:
+        if "hash" not in str(error):
+            raise InputError(f"cannot be downloaded ({error})", address, mend) from None
+        raise _other_content(address, file) from None
+
+
+def _found(file: DataFile, folder: Path) -> Path | None:
+    """Return where a folder of downloads holds a file; None where it does not."""
+    there = [place for place in file.places(folder) if place.is_file()]
+    for place in there:
+        if sha256_of(place) == file.sha256:
+            return place
+    if there:
+        raise _other_content(there[0], file)
+    return None
+
+
+def _other_content(where: str | Path, file: DataFile) -> InputError:
+    what = f"is not {file.name} as registered: its SHA-256 is not {file.sha256[:12]}..."
+    return InputError(what, where, "cut short, or another version? nothing of it is kept")
+
+
+def _is_there(file: DataFile, to: Path) -> bool:
+    target = to / file.name
+    if not target.exists() and not target.is_symlink():
+        return False
+    if sha256_of(target) == file.sha256:
+        return True
+    mend = "move it away: nothing of yours is replaced"
+    raise InputError("is there with another content than the published file's", target, mend)

@@ -1,0 +1,294 @@
+"""One leg found in an OpenSim model: its joints, the bodies that move together, its links.
+
+Links are those of docs/patient.md. Each stands in a body of the model:
+
+- femur: the femoral component's mesh frame, turned to x anterior, y superior, z right; without
+  an implant the knee joint's centre in the femur with the femur's axes.
+- tibia: the ankle joint's centre, with the tibia's axes.
+- patella: the patella's origin, its axes turned to those of the femur, quarter turns only.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, inverse, transform
+from tkamb.io.opensim.kinematics import Kinematics
+from tkamb.io.opensim.model import Coordinate, Joint, OpenSimModel
+
+OTHER = {"right": "left", "left": "right"}
+SEGMENT_LENGTH = (0.15, 0.75)
+"""m; thigh and shank of a child of six (about 0.25) to the tallest (about 0.6), with room."""
+SUFFIX = {"right": ("_r", "_R", ".r"), "left": ("_l", "_L", ".l")}
+
+
+@dataclass(frozen=True, eq=False)
+class Leg:
+    """A leg of a model.
+
+    Args:
+        model: the model.
+        side: "right" or "left".
+        knee: the femorotibial joint.
+        flexion: its coordinate of flexion; None if the knee is locked throughout.
+        ankle: the joint below the tibia.
+        hip: the joint above the femur.
+        femur: bodies that move with the femur, the femur first.
+        tibia: bodies that move with the tibia, the tibia first.
+        foot: bodies below the ankle.
+        patella: the patella's body; None if the model has none.
+        pelvis: the body above the hip.
+        neutral: body -> (4, 4) pose in ground at the defaults with the knee straight.
+    """
+
+    model: OpenSimModel
+    side: str
+    knee: Joint
+    flexion: str | None
+    ankle: Joint
+    hip: Joint
+    femur: tuple[str, ...]
+    tibia: tuple[str, ...]
+    foot: tuple[str, ...]
+    patella: str | None
+    pelvis: str
+    neutral: dict[str, Array]
+
+    def in_body(self, body: str, other: str) -> Array:
+        """Return pose_body_in_other (4, 4) at the neutral pose."""
+        return inverse(self.neutral[other]) @ self.neutral[body]
+
+    @property
+    def knee_centre(self) -> Array:
+        """(3,) m, the knee's centre in ground at the neutral pose.
+
+        The joint's end on the femur; where that is the hip, because the joint's translation
+        carries the thigh's length (Delp's models), its end on the tibia.
+        """
+        hip = transform(self.neutral[self.hip_centre[0]], self.hip_centre[1])
+        for group in (self.femur, self.tibia):
+            body, point = _end(self.knee, group)
+            centre = transform(self.neutral[body], point)
+            if np.linalg.norm(centre - hip) > SEGMENT_LENGTH[0]:
+                break
+        return np.asarray(centre)
+
+    @property
+    def hip_centre(self) -> tuple[str, Array]:
+        """Body and point (3,) m of the hip joint's centre in the femur."""
+        return _end(self.hip, self.femur)
+
+    @property
+    def ankle_centre(self) -> tuple[str, Array]:
+        """Body and point (3,) m of the ankle joint's centre in the tibia."""
+        return _end(self.ankle, self.tibia)
+
+
+def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
+    """Return the leg of a side.
+
+    Args:
+        model: the model.
+        side: "right" or "left".
+        knee: the femorotibial joint, if it is not to be found by its name.
+
+    Raises:
+        InputError: no such joint, or no hip, ankle or patella where the knee wants one.
+    """
+    try:
+        joint, hip, ankle, femur, tibia = _joints(model, side, knee)
+    except InputError as error:
+        # what is missing may be what could not be read
+        raise _unread_joint(model) or error from None
+    patellas = [
+        body
+        for body in model.bodies
+        if "pat" in body.lower()
+        and {*femur, *tibia} & {end for j in model.joints for end in _ends(j) if body in _ends(j)}
+    ]
+    foot = tuple(_carried(model, ankle.outboard))
+    _refuse_unread(model, (hip, joint, ankle), {*femur, *tibia, *foot, *patellas[:1]})
+    flexion = _flexion(model, joint)
+    q = {flexion.name: 0.0} if flexion else {}
+    kinematics = Kinematics(model)
+    poses = kinematics.poses(kinematics.coupled(q))
+    leg = Leg(
+        model,
+        side,
+        joint,
+        flexion.name if flexion else None,
+        ankle,
+        hip,
+        femur,
+        tibia,
+        foot,
+        patellas[0] if patellas else None,
+        hip.inboard,
+        {name: poses[k] for name, k in kinematics.bodies.items()},
+    )
+    _check_lengths(leg)
+    return leg
+
+
+def _joints(
+    model: OpenSimModel, side: str, name: str | None
+) -> tuple[Joint, Joint, Joint, tuple[str, ...], tuple[str, ...]]:
+    """Return knee, hip and ankle, and the bodies of femur and tibia."""
+    knee = _knee(model, side, name)
+    groups = _rigid_groups(model)
+    femur = _ordered(model, groups[knee.inboard], "fem")
+    tibia = _ordered(model, groups[knee.outboard], "tib")
+    hip = _one(model, [j for j in _moving(model) if j.outboard in femur], "above the femur", femur)
+    below = [j for j in _moving(model) if j.inboard in tibia]
+    ankles = [j for j in below if "ankle" in j.name.lower()]
+    ankle = _one(
+        model, ankles or [j for j in below if not _is_patella(j)], "below the tibia", tibia
+    )
+    return knee, hip, ankle, femur, tibia
+
+
+def _unread_joint(model: OpenSimModel, bodies: Iterable[str] = ()) -> InputError | None:
+    """Return the refusal of the first joint that could not be read at all, if there is one.
+
+    Args:
+        model: the model.
+        bodies: of the joint; none: of any joint.
+    """
+    there = {joint.name for joint in model.joints}
+    for one in model.unread:
+        of_these = not bodies or one.concerns & {*bodies}
+        if one.kind.endswith("Joint") and one.name not in there and of_these:
+            return InputError(one.reason)
+    return None
+
+
+def _refuse_unread(model: OpenSimModel, joints: Iterable[Joint], bodies: set[str]) -> None:
+    """Raise if a joint or constraint that was not read holds the bodies of a leg.
+
+    Raises:
+        InputError: which, and why it was not read.
+    """
+    for joint in model.joints:
+        if joint.unread and (joint in joints or {*_ends(joint)} <= bodies):
+            raise _unread_joint(model, [joint.outboard]) or InputError(joint.unread)
+    within = {j.name for j in model.joints if {*_ends(j)} & bodies}
+    coordinates = {c.name for c in model.coordinates.values() if c.joint in within}
+    in_the_tree = {joint.name for joint in model.joints}
+    for one in model.unread:
+        if one.constrains and one.name not in in_the_tree and one.concerns & (bodies | coordinates):
+            raise InputError(one.reason)
+
+
+def way_to_pelvis(leg: Leg) -> list[Joint]:
+    """Return the joints between ground and the body above the hip."""
+    carrier = {joint.outboard: joint for joint in leg.model.joints}
+    way, body = [], leg.pelvis
+    while body in carrier:
+        way.append(carrier[body])
+        body = carrier[body].inboard
+    return way
+
+
+def _check_lengths(leg: Leg) -> None:
+    """Raise unless thigh and shank are as long as a person's: else the knee is another joint."""
+    centre = leg.knee_centre
+    for name, (other, point) in {"thigh": leg.hip_centre, "shank": leg.ankle_centre}.items():
+        length = float(np.linalg.norm(transform(leg.neutral[other], point) - centre))
+        if not SEGMENT_LENGTH[0] < length < SEGMENT_LENGTH[1]:
+            raise InputError(
+                f"has a {name} of {length * 1e3:.0f} mm with joint '{leg.knee.name}' as the knee",
+                leg.model.name,
+                "give the femorotibial joint with --knee, or mend the model's lengths",
+            )
+
+
+def _knee(model: OpenSimModel, side: str, name: str | None) -> Joint:
+    there = {j.name: j for j in model.joints}
+    if name is not None:
+        if name not in there:
+            raise InputError(f"has no joint '{name}'", model.name, f"it has {', '.join(there)}")
+        return there[name]
+    named = [
+        j for j in _moving(model) if "knee" in j.name.lower() or "femorotibial" in j.name.lower()
+    ]
+    own = [j for j in named if j.name.endswith(SUFFIX[side])]
+    if not own:  # a model of one side may leave its joints without a suffix
+        own = [j for j in named if not j.name.endswith(SUFFIX["right"] + SUFFIX["left"])]
+    if len(own) != 1:
+        found = f"{len(own)} joints" if own else "no joint"
+        listed = ", ".join(j.name for j in named) or ", ".join(there)
+        raise InputError(
+            f"has {found} that could be the {side} knee", model.name, f"give --knee, of {listed}"
+        )
+    return own[0]
+
+
+def _flexion(model: OpenSimModel, knee: Joint) -> Coordinate | None:
+    own = [model.coordinates[a.coordinate] for a in knee.rotations if a.coordinate]
+    for coordinate in own:
+        if "flex" in coordinate.name or "angle" in coordinate.name:
+            return coordinate
+    return own[0] if own else None
+
+
+def _moving(model: OpenSimModel) -> list[Joint]:
+    return [
+        joint
+        for joint in model.joints
+        if joint.unread or any(a.coordinate for a in (*joint.rotations, *joint.translations))
+    ]
+
+
+def _rigid_groups(model: OpenSimModel) -> dict[str, set[str]]:
+    """Return body -> bodies welded to it, itself among them."""
+    groups = {body: {body} for body in ("ground", *model.bodies)}
+    moving = _moving(model)
+    for joint in model.joints:
+        if joint not in moving:
+            both = groups[joint.parent] | groups[joint.child]
+            for body in both:
+                groups[body] = both
+    return groups
+
+
+def _ordered(model: OpenSimModel, group: set[str], stem: str) -> tuple[str, ...]:
+    """Return the group's bodies, the heaviest with the stem in its name first."""
+    return tuple(sorted(group, key=lambda b: (stem not in b.lower(), -model.bodies[b].mass_kg, b)))
+
+
+def _carried(model: OpenSimModel, body: str) -> list[str]:
+    """Return a body and all that hang on it outwards."""
+    found = [body]
+    for joint in model.joints:  # from ground outwards
+        if joint.inboard in found:
+            found.append(joint.outboard)
+    return found
+
+
+def _is_patella(joint: Joint) -> bool:
+    return any("pat" in body.lower() for body in _ends(joint))
+
+
+def _ends(joint: Joint) -> tuple[str, str]:
+    return joint.parent, joint.child
+
+
+def _one(model: OpenSimModel, joints: list[Joint], where: str, bodies: Iterable[str]) -> Joint:
+    joints = [joint for joint in joints if not _is_patella(joint)]
+    if len(joints) != 1:
+        found = ", ".join(j.name for j in joints) or "none"
+        raise InputError(
+            f"has not one joint {where} ({', '.join(bodies)}), but {found}",
+            model.name,
+            "is the right joint taken for the knee? give --knee",
+        )
+    return joints[0]
+
+
+def _end(joint: Joint, group: tuple[str, ...]) -> tuple[str, Array]:
+    """Return the end of a joint that lies in a group of bodies: body and point (3,)."""
+    if joint.parent in group:
+        return joint.parent, joint.pose_parent_frame[:3, 3]
+    return joint.child, joint.pose_child_frame[:3, 3]

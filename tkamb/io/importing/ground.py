@@ -1,0 +1,317 @@
+"""The ground reaction of an import: a recording's plates, or forces of a table."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.io.importing.force_columns import TableForce, table_forces
+from tkamb.io.importing.plates import (
+    Feet,
+    Load,
+    RecordedForce,
+    common_surface,
+    feet_loads,
+    known_interval,
+    own_plates,
+    plate_forces,
+    unmeasured,
+)
+from tkamb.io.importing.request import ImportRequest
+from tkamb.io.importing.scene_text import GroundFile
+from tkamb.io.recordings.c3d import read_c3d
+from tkamb.io.recordings.ground_reaction import (
+    recorded_wrench,
+    summed_reaction,
+)
+from tkamb.io.recordings.plate_loads import PLATE_LOAD, around_load, unloaded_level
+from tkamb.io.recordings.recordings import ForceRecording
+from tkamb.io.recordings.tables import Table, read_table
+
+UNLOADED_N = 40.0
+"""Vertical force below which a scene that an import writes holds the centre of pressure."""
+COLUMNS = ("time", *(f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)))
+"""Of a table of summed forces: s, N, m, N·m about the point; x forward, y up, z right."""
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class FoundGround:
+    """A foot's ground reaction.
+
+    Args:
+        ground: where it stands; None: none is modelled.
+        interval: s, in which all that the foot stands on was measured; None: nobody knows.
+        span: s, first and last sample of a table; None: the recording's own.
+        said: lines on it.
+    """
+
+    ground: GroundFile | None
+    interval: Interval | None
+    span: Interval | None
+    said: list[str]
+
+
+def find_ground(request: ImportRequest, side: str, axes: str, feet: Feet | None) -> FoundGround:
+    """Return the ground reaction under a foot.
+
+    Args:
+        request: recording, table, plates and interval.
+        side: of the knee.
+        axes: the recording's and the table's that point forward, up and right.
+        feet: where the feet are; None: nobody knows.
+
+    Raises:
+        InputError: plates or columns that cannot be used, or that bear both feet.
+    """
+    if request.grf is not None:
+        return _from_table(request, request.grf, side, axes, feet)
+    if request.recording.suffix.lower() == ".c3d" and feet is not None:
+        return _from_plates(request, side, axes, feet)
+    return FoundGround(None, request.interval, None, ["no ground reaction given: none is modelled"])
+
+
+def _from_plates(request: ImportRequest, side: str, axes: str, feet: Feet) -> FoundGround:
+    recording = read_c3d(request.recording, request.units)
+    unread = recording.unread_plates
+    if request.plates == ():
+        said = ["ATTENTION: no ground reaction is modelled, as given"]
+        return FoundGround(None, request.interval, None, said)
+    if request.plates is not None:
+        for number in request.plates:
+            recording.plate(number)
+        said = [f"force plates {_listed(request.plates)} under the {side} foot, as given"]
+        ground = GroundFile(request.recording, axes, request.plates, units=request.units)
+        return FoundGround(ground, request.interval, None, said)
+    if not recording.plates:
+        if unread:
+            raise next(iter(unread.values()))
+        raise InputError(
+            "holds no force plates",
+            request.recording,
+            "give the ground reaction with --grf, or --plates none to model none",
+        )
+    forces = plate_forces(recording, axes)
+    loads = feet_loads(forces, feet)
+    plates = own_plates(loads, side, request.recording)
+    interval = request.interval or known_interval(loads, plates, feet)
+    lines = [*(_load_line(load) for load in loads), _interval_line(request, interval)]
+    lines += _unmeasured_line(loads, plates, feet, side, interval)
+    lines += _drift_lines(forces, plates)
+    surface = common_surface(loads, plates)
+    numbers = tuple(int(plate) for plate in plates)
+    ground = GroundFile(request.recording, axes, numbers, surface=surface, units=request.units)
+    return FoundGround(ground, interval, None, lines)
+
+
+def _from_table(
+    request: ImportRequest, path: Path, side: str, axes: str, feet: Feet | None
+) -> FoundGround:
+    """Return a foot's forces in a table: as given, by their names, or by where they act."""
+    table = read_table(path)
+    forces = table_forces(table)
+    time = table.time()
+    span = (float(time[0]), float(time[-1]))
+    notices = [f"notice: {path.name}: {notice}" for notice in table.notices]
+    own_axes = _axes_of_table(table, forces, axes)
+    if own_axes != axes:
+        notices.append(f"{path.name}: y points up; forward, up, right are its {own_axes}")
+        axes = own_axes
+    if request.plates is not None:
+        raise InputError("is for the plates of a .c3d", "--plates", "give --grf-force for a table")
+    chosen = _named(forces, side, request.grf_force, table)
+    if chosen:
+        why = "as given" if request.grf_force else "by their name"
+        recorded = [_recorded(table, one, axes) for one in chosen] if len(chosen) > 1 else []
+        ground = _table_file(path, axes, chosen, recorded)
+        lines = [_columns_line(path, side, chosen, why), *notices]
+        return FoundGround(ground, request.interval, span, lines)
+    placed = all(force.has("point") or force.has("moment") for force in forces)
+    if feet is None or not forces or not placed:
+        raise _which_foot(forces, side, table)
+    recorded = [_recorded(table, one, axes) for one in forces]
+    loads = feet_loads(recorded, feet)
+    own = own_plates(loads, side, path, "give --grf-force")
+    interval = request.interval or known_interval(loads, own, feet)
+    chosen = [one for one in forces if one.name in own]
+    under = [one for one in recorded if one.key in own]
+    lines = [*(_load_line(load) for load in loads), _interval_line(request, interval)]
+    lines += [_columns_line(path, side, chosen, "by where they act"), *notices]
+    lines += [*_unmeasured_line(loads, own, feet, side, interval), *_drift_lines(recorded, own)]
+    return FoundGround(_table_file(path, axes, chosen, under), interval, span, lines)
+
+
+def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
+    """Return the axes of a table whose y points up beside a recording whose z does.
+
+    OpenSim turns recordings about x: its x, y, z are the recording's x, z, -y.
+    """
+    if not forces or axes.split(",")[1][-1] != "z":
+        return axes
+    columns = [[table.column(force.columns[f"force_{k}"]) for k in (1, 2, 3)] for force in forces]
+    size = np.nansum(np.abs(np.array(columns)), axis=(0, 2))
+    if int(np.argmax(size)) != 1:
+        return axes
+    turned = {"x": "+x", "z": "+y", "y": "-z"}
+    found = []
+    for axis in axes.split(","):
+        own = turned[axis[-1]]
+        found.append(("+" if own[0] == axis[0] else "-") + own[1])
+    return ",".join(found)
+
+
+def _named(
+    forces: list[TableForce], side: str, given: str | None, table: Table
+) -> list[TableForce]:
+    """Return the forces that are given, or the one that is named after the foot; else none."""
+    there = ", ".join(force.name for force in forces) or "none"
+    if given is not None:
+        chosen = []
+        for name in given.split(","):
+            plain = name.strip().removesuffix("_v").rstrip("_")
+            own = [force for force in forces if force.name == plain]
+            if len(own) != 1:
+                raise InputError(
+                    f"has no force '{name.strip()}' (it has {there})", table.path, "--grf-force"
+                )
+            chosen += own
+        return chosen
+    own = [f for f in forces if re.search(rf"(^|_){side[0]}(_|$)|{side}", f.name.lower())]
+    return own if len(own) == 1 else []
+
+
+def _which_foot(forces: list[TableForce], side: str, table: Table) -> InputError:
+    there = ", ".join(force.name for force in forces) or "none"
+    return InputError(
+        f"does not say which force is the {side} foot's (it has {there})",
+        table.path,
+        f"give --grf-force, or name its columns after the foot: ground_force_{side[0]}_vx",
+    )
+
+
+def _recorded(table: Table, force: TableForce, axes: str) -> RecordedForce:
+    """Return a table's force with its wrench in the laboratory."""
+    columns = {"time": "time", **force.columns}
+    source = ForceRecording(
+        table.path, "none", None, (), columns, "m", axes, "on the foot", UNLOADED_N, 0.0
+    )
+    time, wrench, level = recorded_wrench(source)
+    on = around_load(np.linalg.norm(wrench[:, :3], axis=1), time)
+    drift = unloaded_level(wrench[:, 1], on, time)
+    return RecordedForce(force.name, f"force {force.name}", time, wrench, level, drift)
+
+
+def _table_file(
+    path: Path, axes: str, chosen: list[TableForce], recorded: list[RecordedForce]
+) -> GroundFile:
+    """Return where the scene finds the forces: their own columns, or a table of their sum."""
+    if len(chosen) == 1:
+        own = chosen[0].columns
+        columns = (("time", "time"), *((role, own[role]) for role in COLUMNS[1:] if role in own))
+        return GroundFile(path, axes, (), columns, "m")
+    return GroundFile(path, "+x,+y,+z", (), (), "m", made=_summed(recorded, path))
+
+
+def _summed(recorded: list[RecordedForce], path: Path) -> str:
+    """Return the table of the sum of forces, each while it is loaded, as CSV."""
+    time = recorded[0].time
+    levels = [one.level for one in recorded]
+    wrenches = []
+    for one in recorded:
+        on = around_load(np.linalg.norm(one.wrench[:, :3], axis=1), time)
+        wrenches.append(np.where(on[:, None], one.wrench, 0.0))
+    level = float(np.mean(levels))
+    point, moment, force = summed_reaction(time, wrenches, level, UNLOADED_N, path)
+    rows = np.column_stack([time, force, point, moment])
+    lines = [",".join(f"{value:.9g}" for value in row) for row in rows]
+    return "\n".join([",".join(COLUMNS), *lines, ""])
+
+
+def common_interval(
+    time: Array, interval: Interval | None, span: Interval | None
+) -> tuple[Interval | None, list[str]]:
+    """Return the part of an interval in which both clocks run, and a line where that is shorter.
+
+    Args:
+        time: (n,) s, of the motion.
+        interval: s, wanted; None: all of the motion.
+        span: s, first and last sample of the ground reaction; None: of the same recording.
+
+    Raises:
+        InputError: the two share less than two frames.
+    """
+    start, end = interval or (float(time[0]), float(time[-1]))
+    if span is None or (span[0] <= start + 1e-9 and span[1] >= end - 1e-9):
+        return interval, []
+    inside = time[(time >= max(start, span[0]) - 1e-9) & (time <= min(end, span[1]) + 1e-9)]
+    if len(inside) < 2:
+        raise InputError(
+            f"the motion lasts from {start:.4f} to {end:.4f} s, the ground reaction from "
+            f"{span[0]:.4f} to {span[1]:.4f} s",
+            "--grf",
+            "do they belong to one trial, on one clock?",
+        )
+    common = (float(inside[0]), float(inside[-1]))
+    return common, [
+        f"ATTENTION: the ground reaction was recorded from {span[0]:.4f} to {span[1]:.4f} s, the "
+        f"motion from {start:.4f} to {end:.4f} s: {common[0]:.4f} to {common[1]:.4f} s are used"
+    ]
+
+
+def _load_line(load: Load) -> str:
+    if not load.side:
+        return (
+            f"ATTENTION: {load.title}: loaded from {load.start:.3f} to {load.end:.3f} s, and no "
+            "foot's markers are near: not used"
+        )
+    other = "" if np.isnan(load.other) else f", {load.other * 1e3:.0f} mm from the other's"
+    step = (
+        f"; the foot stands on a step, about {load.surface:.2f} m above the plate: the wrench is "
+        "taken as it is, with its point on that level"
+        if load.surface
+        else ""
+    )
+    return (
+        f"{load.title}: {load.side} foot from {load.start:.3f} to {load.end:.3f} s "
+        f"(centre of pressure {load.distance * 1e3:.0f} mm from that foot's markers{other}){step}"
+    )
+
+
+def _interval_line(request: ImportRequest, interval: Interval) -> str:
+    why = "as given" if request.interval else "from the first to the last load on these plates"
+    return f"interval: {interval[0]:.4f} to {interval[1]:.4f} s of the recording's clock, {why}"
+
+
+def _unmeasured_line(
+    loads: list[Load], plates: tuple[int | str, ...], feet: Feet, side: str, interval: Interval
+) -> list[str]:
+    times = unmeasured(loads, plates, feet, side, interval)
+    if not len(times):
+        return []
+    return [
+        f"ATTENTION: off its plates the foot is nearly still in {len(times)} frames, first at "
+        f"{times[0]:.3f} s: does it stand on something that was not measured?"
+    ]
+
+
+def _drift_lines(forces: list[RecordedForce], plates: tuple[int | str, ...]) -> list[str]:
+    return [
+        f"ATTENTION: {one.title} reads {one.drift:.1f} N while nobody stands on it: it drifts, and "
+        "bears as much too much under the foot"
+        for one in forces
+        if one.key in plates and abs(one.drift) > PLATE_LOAD.drift_N
+    ]
+
+
+def _columns_line(path: Path, side: str, chosen: list[TableForce], why: str) -> str:
+    names = ", ".join(f"{force.name}_v*, {force.name}_p*" for force in chosen)
+    moments = [name for force in chosen for name in force.moments]
+    free = f"moments {', '.join(moments)}" if moments else "no moments"
+    return f"ground reaction of the {side} foot: {names} of {path.name}, N and m, {why}; {free}"
+
+
+def _listed(numbers: tuple[int, ...]) -> str:
+    return ", ".join(map(str, numbers))

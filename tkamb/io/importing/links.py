@@ -1,0 +1,248 @@
+"""The links of docs/patient.md in the bodies of an OpenSim model, and where the implant sits."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, inverse, knee_coordinates, pose, transform
+from tkamb.io.importing.anatomy import Leg
+from tkamb.io.recordings.meshes import axes_rotation
+from tkamb.units import DEGREE
+
+MOST_TURNED = 35.0 * DEGREE
+"""An implant's axes lie within this of the bone's; a wrong axis is 90 deg off."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeshFrame:
+    """Where a mesh's own frame stands in a body of the model.
+
+    Args:
+        body: the body.
+        pose: (4, 4) in it; None: at its origin, with the axes that anatomy says.
+        why: how it was found, for the reader.
+    """
+
+    body: str
+    pose: Array | None
+    why: str
+
+
+_STEMS = {
+    "femoral component": ("femur_implant", "femoral_implant", "femoral_component"),
+    "insert": ("tibia_implant", "tibial_implant", "insert", "tibial_tray", "tray"),
+    "patellar button": ("patella_implant", "patellar_implant", "button"),
+}
+
+
+def mesh_frame(leg: Leg, part: str, given: str | None) -> MeshFrame:
+    """Return where a part's mesh frame stands: as given, or by the name of a frame or body.
+
+    Args:
+        leg: the leg.
+        part: "femoral component", "insert" or "patellar button".
+        given: name of an offset frame or body; None: look for one.
+
+    Raises:
+        InputError: no such frame, or none that is named after the part.
+    """
+    model = leg.model
+    group = {
+        "femoral component": leg.femur,
+        "insert": leg.tibia,
+        "patellar button": (leg.patella,),
+    }[part]
+    there = {name: (body, at) for name, (body, at) in model.offset_frames.items() if body in group}
+    there |= {body: (body, np.eye(4)) for body in group if body}
+    if given is not None:
+        if given not in there:
+            raise InputError(
+                f"has no frame '{given}' on {', '.join(filter(None, group))}",
+                model.name,
+                f"it has {', '.join(there)}",
+            )
+        return MeshFrame(*there[given], f"frame '{given}', as given")
+    for stem in _STEMS[part]:
+        for name in there:
+            if stem in name.lower():
+                return MeshFrame(*there[name], f"'{name}', by its name")
+    if part == "patellar button" and leg.patella:
+        return MeshFrame(leg.patella, None, "the patella's origin, for want of a frame")
+    option = {"femoral component": "--femoral-frame", "insert": "--insert-frame"}.get(
+        part, "--patella-frame"
+    )
+    raise InputError(
+        f"says nowhere how the {part}'s mesh stands on the bone",
+        model.name,
+        f"give {option}, one of {', '.join(there)}",
+    )
+
+
+def quarter_turn(rotation: Array) -> tuple[Array, float]:
+    """Return the nearest rotation (3, 3) by quarter turns, and how far (rad) it is."""
+    best = np.zeros((3, 3))
+    left = np.abs(rotation).copy()
+    for _ in range(3):
+        i, j = np.unravel_index(int(np.argmax(left)), (3, 3))
+        best[i, j] = np.sign(rotation[i, j])
+        left[i, :], left[:, j] = -1.0, -1.0
+    angle = np.arccos(np.clip((np.trace(best.T @ rotation) - 1.0) / 2.0, -1.0, 1.0))
+    return best, float(angle)
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """The links in the model's bodies, m.
+
+    Args:
+        leg: the leg.
+        femur: (4, 4) femur link in the femur's body.
+        tibia: (4, 4) tibia link in the tibia's body.
+        patella: (4, 4) patella link in the patella's body; None without a patella.
+        insert_in_tibia: (4, 4) insert frame in the tibia link.
+        button_in_patella: (4, 4) the button's anatomical axes in the patella link; None
+            without a button.
+        patella_error: rad, between the patella's axes by quarter turns and the femur's.
+        said: lines on where the implant sits.
+    """
+
+    leg: Leg
+    femur: Array
+    tibia: Array
+    patella: Array | None
+    insert_in_tibia: Array
+    button_in_patella: Array | None
+    patella_error: float
+    said: tuple[str, ...]
+
+    def body_in_link(self, body: str) -> tuple[str, Array]:
+        """Return the link that a body moves with, and the body's pose (4, 4) in it.
+
+        Raises:
+            InputError: a body of no link.
+        """
+        leg = self.leg
+        for link, bodies, own in (
+            ("femur", leg.femur, self.femur),
+            ("tibia", leg.tibia, self.tibia),
+            ("patella", (leg.patella,), self.patella),
+        ):
+            if body in bodies and own is not None:
+                return link, inverse(own) @ leg.in_body(body, str(bodies[0]))
+        raise InputError(f"body '{body}' moves with no link of the leg", leg.model.name)
+
+    def point_in_link(self, body: str, point: Array) -> tuple[str, Array]:
+        """Return the link that a body moves with, and a point (3,) of the body in it."""
+        link, there = self.body_in_link(body)
+        return link, transform(there, point)
+
+    @property
+    def neutral(self) -> Array:
+        """(6,) knee coordinates at the model's defaults with the knee straight."""
+        leg = self.leg
+        tibia = leg.neutral[leg.tibia[0]] @ self.tibia @ self.insert_in_tibia
+        femur = leg.neutral[leg.femur[0]] @ self.femur
+        return knee_coordinates(inverse(tibia) @ femur)
+
+    @property
+    def hip(self) -> Array:
+        """(3,) m, hip centre in the femur link."""
+        body, point = self.leg.hip_centre
+        return self.point_in_link(body, point)[1]
+
+    @property
+    def patella_in_femur(self) -> Array | None:
+        """(4, 4) patella link in the femur link at the neutral pose."""
+        leg = self.leg
+        if leg.patella is None or self.patella is None:
+            return None
+        femur = leg.neutral[leg.femur[0]] @ self.femur
+        return inverse(femur) @ leg.neutral[leg.patella] @ self.patella
+
+
+def find_links(
+    leg: Leg,
+    placement: Array | None,
+    axes: str,
+    frames: dict[str, str | None],
+    with_button: bool,
+) -> Links:
+    """Return the links of a leg.
+
+    Args:
+        leg: the leg.
+        placement: (4, 4) of the insert's mesh, in anatomical axes about its own origin, in the
+            insert frame; None without implant.
+        axes: the meshes' axes that point anterior, superior and right.
+        frames: part -> frame of its mesh, where that is given.
+        with_button: whether there is a patellar button.
+
+    Raises:
+        InputError: no frame for a mesh, or axes that do not agree with the bone's.
+    """
+    turn = pose(axes_rotation(axes), np.zeros(3))
+    said: list[str] = []
+    if placement is None:
+        femur = pose(np.eye(3), transform(inverse(leg.neutral[leg.femur[0]]), leg.knee_centre))
+    else:
+        found = mesh_frame(leg, "femoral component", frames.get("femoral component"))
+        femur = _anatomical(leg, found, leg.femur[0], turn, "femoral component", said)
+    body, centre = leg.ankle_centre
+    tibia = pose(np.eye(3), transform(leg.in_body(body, leg.tibia[0]), centre))
+    if placement is None:
+        straight = inverse(leg.neutral[leg.tibia[0]] @ tibia) @ leg.neutral[leg.femur[0]] @ femur
+        insert_in_tibia = pose(np.eye(3), straight[:3, 3])
+        said.append("no implant: the 'insert' frame is the tibia's at the knee's centre")
+    else:
+        found = mesh_frame(leg, "insert", frames.get("insert"))
+        mesh = _anatomical(leg, found, leg.tibia[0], turn, "insert", said)
+        insert_in_tibia = inverse(tibia) @ mesh @ inverse(placement)
+    patella, button, error = _patella(leg, femur, turn, frames, with_button, said)
+    return Links(leg, femur, tibia, patella, insert_in_tibia, button, error, tuple(said))
+
+
+def _anatomical(
+    leg: Leg, frame: MeshFrame, body: str, turn: Array, part: str, said: list[str]
+) -> Array:
+    """Return the part's frame (4, 4) in a body, turned to anatomical axes, checked against it."""
+    assert frame.pose is not None
+    there = leg.in_body(frame.body, body) @ frame.pose @ inverse(turn)
+    nearest, _ = quarter_turn(there[:3, :3])
+    angle = np.arccos(np.clip((np.trace(there[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
+    if not np.allclose(nearest, np.eye(3)) or angle > MOST_TURNED:
+        raise InputError(
+            f"the {part} stands turned by {angle / DEGREE:.0f} deg on '{body}' with these axes "
+            f"({frame.why})",
+            "--mesh-axes",
+            "name the mesh's axes that point anterior, superior and right, like -x,+y,-z",
+        )
+    place = ", ".join(f"{v * 1e3:.1f}" for v in there[:3, 3])
+    said.append(
+        f"{part} on '{body}' at ({place}) mm, turned by {angle / DEGREE:.1f} deg ({frame.why})"
+    )
+    return there
+
+
+def _patella(
+    leg: Leg,
+    femur: Array,
+    turn: Array,
+    frames: dict[str, str | None],
+    with_button: bool,
+    said: list[str],
+) -> tuple[Array | None, Array | None, float]:
+    """Return the patella link in its body, the button in the link, and the axes' error (rad)."""
+    if leg.patella is None:
+        return None, None, 0.0
+    anatomical = leg.neutral[leg.patella][:3, :3].T @ (leg.neutral[leg.femur[0]] @ femur)[:3, :3]
+    axes, error = quarter_turn(anatomical)
+    patella = pose(axes, np.zeros(3))
+    if not with_button:
+        return patella, None, error
+    found = mesh_frame(leg, "patellar button", frames.get("patellar button"))
+    mesh = patella @ turn if found.pose is None else found.pose
+    button = inverse(patella) @ mesh @ inverse(turn)
+    place = ", ".join(f"{v * 1e3:.1f}" for v in button[:3, 3])
+    said.append(f"patellar button on the patella at ({place}) mm ({found.why})")
+    return patella, button, error

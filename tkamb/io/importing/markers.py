@@ -1,0 +1,264 @@
+"""The leg's markers in a recording: matched to the model's, and what they say of the laboratory."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, transform
+from tkamb.io.importing.anatomy import Leg, find_leg
+from tkamb.io.importing.links import Links
+from tkamb.io.recordings.markers import fit_seen, marker_trajectories, matched_labels, plain_label
+from tkamb.io.recordings.tables import Table
+from tkamb.units import DEGREE
+
+
+@dataclass(frozen=True, eq=False)
+class ModelSegment:
+    """A segment's markers that the recording holds.
+
+    Args:
+        name: "shank", "thigh", "foot" or "pelvis".
+        points: label in the recording -> (3,) m in the segment's link (shank, thigh) or body.
+        missing: markers of the model that the recording does not show.
+        joined_to: "shank" or "thigh" for a neighbour.
+        joint: (3,) m, the ball joint in that segment's link.
+        centre: (3,) m, the same in the neighbour's body.
+    """
+
+    name: str
+    points: dict[str, Array]
+    missing: tuple[str, ...]
+    joined_to: str = ""
+    joint: Array | None = None
+    centre: Array | None = None
+
+
+def model_segments(
+    links: Links, recorded: Table, without: Sequence[str] = ()
+) -> list[ModelSegment]:
+    """Return shank, thigh, and of foot and pelvis those with three markers or more.
+
+    Args:
+        links: of the leg.
+        recorded: table of markers.
+        without: labels that are not to be used.
+
+    Raises:
+        InputError: shank or thigh with fewer than three markers in the recording.
+    """
+    found = seen_segments(links, recorded, without)
+    for name in ("shank", "thigh"):
+        segment = found[name]
+        if len(segment.points) < 3:
+            labels = recorded_labels(recorded)
+            if prefixes := _clashing_prefixes(labels, segment.missing):
+                raise InputError(
+                    f"holds the markers of the {name} under several prefixes: "
+                    f"{', '.join(prefixes)}",
+                    recorded.path,
+                    f"say which with --marker-prefix, like --marker-prefix {prefixes[0]}",
+                )
+            raise InputError(
+                f"the model and the recording share {len(segment.points)} markers of the "
+                f"{segment.name}, three are needed",
+                recorded.path,
+                f"the model has {', '.join(segment.missing) or 'no others'}; "
+                f"the recording {', '.join(labels[:12])}, …{_equal_line(recorded)}",
+            )
+    return [segment for segment in found.values() if len(segment.points) >= 3]
+
+
+def seen_segments(
+    links: Links, recorded: Table, without: Sequence[str] = ()
+) -> dict[str, ModelSegment]:
+    """Return shank, thigh, foot and pelvis with those of their markers that were ever seen.
+
+    Args:
+        links: of the leg.
+        recorded: table of markers.
+        without: labels that are not to be used.
+
+    Raises:
+        InputError: a label of `without` that the recording does not hold.
+    """
+    leg = links.leg
+    foot = _with_most_markers(leg, leg.foot)
+    body, ankle = leg.ankle_centre
+    in_foot = transform(leg.in_body(body, foot), ankle)
+    hip_body, hip = leg.hip_centre
+    in_pelvis = transform(leg.in_body(hip_body, leg.pelvis), hip)
+    wanted = [
+        ("shank", leg.tibia, "", None, None),
+        ("thigh", leg.femur, "", None, None),
+        ("foot", (foot,), "shank", np.zeros(3), in_foot),
+        ("pelvis", (leg.pelvis,), "thigh", links.hip, in_pelvis),
+    ]
+    labels, dropped = _seen_labels(recorded, without)
+    found = {}
+    for name, bodies, joined_to, joint, centre in wanted:
+        own = {m.name: m for m in leg.model.markers.values() if m.body in bodies}
+        match = matched_labels(own, labels)
+        points = {
+            match[m]: own[m].location
+            if joined_to
+            else links.point_in_link(own[m].body, own[m].location)[1]
+            for m in own
+            if m in match
+        }
+        left_out = matched_labels(own, dropped)
+        missing = tuple(m for m in own if m not in match and m not in left_out)
+        found[name] = ModelSegment(name, points, missing, joined_to, joint, centre)
+    return found
+
+
+def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the labels of the markers that were ever seen, and those that are left out."""
+    there = recorded_labels(recorded)
+    dropped = matched_labels(without, there)
+    if unknown := [name for name in without if name not in dropped]:
+        raise InputError(
+            f"holds no marker '{unknown[0]}', which is to be left out",
+            recorded.path,
+            f"it has {', '.join(there[:12])}, …",
+        )
+    left_out = list(dropped.values())
+    seen = [name for name in there if np.isfinite(recorded.columns[f"{name}_x"]).any()]
+    return [name for name in seen if name not in left_out], left_out
+
+
+def segments_of(recorded: Table, segments: list[ModelSegment]) -> list[ModelSegment]:
+    """Return the segments with the labels of another recording, those that it holds."""
+    labels = recorded_labels(recorded)
+    found = []
+    for segment in segments:
+        match = matched_labels(segment.points, labels)
+        points = {match[name]: p for name, p in segment.points.items() if name in match}
+        found.append(replace(segment, points=points))
+    return found
+
+
+def _equal_line(recorded: Table) -> str:
+    """Return which labels stand twice, and are not used; empty without any."""
+    names = list(dict.fromkeys(column[:-2] for column in recorded.equal))
+    return f"; it has two markers {', '.join(names)}: rename one of each" if names else ""
+
+
+def _clashing_prefixes(labels: list[str], wanted: Sequence[str]) -> list[str]:
+    """Return the prefixes under which a wanted marker stands more than once."""
+    plain = {plain_label(name) for name in wanted}
+    found: dict[str, list[str]] = {}
+    for label in labels:
+        if plain_label(label) in plain:
+            found.setdefault(plain_label(label), []).append(label.rpartition(":")[0])
+    clashing = [prefix for prefixes in found.values() if len(prefixes) > 1 for prefix in prefixes]
+    return list(dict.fromkeys(clashing))
+
+
+def with_prefix(recorded: Table, prefix: str) -> Table:
+    """Return a table of markers with those of one prefix alone, like "JW" in "JW:RHeel".
+
+    Raises:
+        InputError: no label begins with it.
+    """
+    wanted = prefix.rstrip(":")
+    labels = recorded_labels(recorded)
+    there = list(dict.fromkeys(label.rpartition(":")[0] for label in labels))
+    if wanted not in there:
+        listed = ", ".join(name or "none" for name in there[:8])
+        raise InputError(
+            f"has no marker with the prefix '{prefix}'", recorded.path, f"its prefixes: {listed}"
+        )
+    other = {label for label in labels if label.rpartition(":")[0] != wanted}
+    columns = {k: v for k, v in recorded.columns.items() if k[:-2] not in other}
+    return replace(recorded, columns=columns)
+
+
+def recorded_labels(recorded: Table) -> list[str]:
+    """Return the labels of a table of markers."""
+    return [column[:-2] for column in recorded.columns if column.endswith("_x")]
+
+
+def _with_most_markers(leg: Leg, bodies: tuple[str, ...]) -> str:
+    counts = {b: sum(m.body == b for m in leg.model.markers.values()) for b in bodies}
+    return max(counts, key=lambda b: counts[b])
+
+
+@dataclass(frozen=True)
+class Facing:
+    """Which of a recording's axes point where, and how far the subject is from them.
+
+    Args:
+        axes: those that point forward, up and to the right, like "-x,+z,+y".
+        up_deg: between the mean upward axis of shank, thigh and pelvis and the file's.
+        forward_deg: between the mean forward axis and the file's, in the horizontal plane.
+    """
+
+    axes: str
+    up_deg: float
+    forward_deg: float
+
+
+def facing(segments: list[ModelSegment], recorded: Table) -> Facing:
+    """Return the laboratory's axes from how thigh, shank and pelvis stand in the recording.
+
+    The segments' own y axes point up, their x axes forward; both are averaged over frames and
+    taken to the nearest axis of the file.
+
+    Raises:
+        InputError: the segments do not stand, or face no direction.
+    """
+    upright = [s for s in segments if s.name in ("shank", "thigh", "pelvis")]
+    turns = []
+    for segment in upright:
+        points = marker_trajectories(recorded, list(segment.points), 1.0)
+        reference = np.array(list(segment.points.values()))
+        scale = recorded.unit_scale(None, "length_unit")
+        poses, _ = fit_seen(points * scale, reference, np.ones(len(reference)), segment.name)
+        known = np.isfinite(poses[:, 0, 3])
+        if known.any():
+            turns.append(poses[known][:, :3, :3].mean(axis=0))
+    mean = np.mean(turns, axis=0) if turns else np.zeros((3, 3))
+    up, up_angle = _nearest_axis(mean[:, 1])
+    level = mean[:, 0] * (np.abs(up) < 0.5)
+    forward, forward_angle = _nearest_axis(level)
+    if up_angle > 40.0 or np.linalg.norm(level) < 0.3 or forward_angle > 50.0:
+        raise InputError(
+            "the subject does not stand upright and face one way on average",
+            recorded.path,
+            "give --laboratory-axes, the file's axes that point forward, up and right",
+        )
+    right = np.cross(forward, up)
+    names = ",".join(_axis_name(axis) for axis in (forward, up, right))
+    return Facing(names, up_angle, forward_angle)
+
+
+def _nearest_axis(vector: Array) -> tuple[Array, float]:
+    """Return the signed axis nearest to a vector (3,), and the angle (deg) between them."""
+    k = int(np.argmax(np.abs(vector)))
+    axis = np.zeros(3)
+    axis[k] = np.sign(vector[k])
+    cosine = abs(vector[k]) / max(float(np.linalg.norm(vector)), 1e-12)
+    return axis, float(np.arccos(np.clip(cosine, -1.0, 1.0)) / DEGREE)
+
+
+def _axis_name(axis: Array) -> str:
+    k = int(np.argmax(np.abs(axis)))
+    return f"{'+' if axis[k] > 0 else '-'}{'xyz'[k]}"
+
+
+def feet(leg: Leg, recorded: Table, other: str) -> dict[str, list[str]]:
+    """Return side -> labels of the recording on that side's foot; the other side if there."""
+    labels = recorded_labels(recorded)
+    found = {leg.side: _foot_labels(leg, labels)}
+    try:
+        found[other] = _foot_labels(find_leg(leg.model, other), labels)
+    except InputError:
+        found[other] = []  # a model of one leg
+    return found
+
+
+def _foot_labels(leg: Leg, labels: list[str]) -> list[str]:
+    own = [m.name for m in leg.model.markers.values() if m.body in leg.foot]
+    return list(matched_labels(own, labels).values())

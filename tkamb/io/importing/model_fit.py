@@ -1,0 +1,262 @@
+"""An OpenSim model's own chain fitted to markers: what OpenSim's InverseKinematicsTool does.
+
+All coordinates that are not locked are free, those that follow others by an enforced coupler
+follow. Ranges are not imposed. The same least squares as for a leg
+(`tkamb.io.recordings.inverse_kinematics`), with the model's joints.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.io.importing.markers import recorded_labels
+from tkamb.io.opensim.kinematics import Kinematics, cross
+from tkamb.io.opensim.model import Joint, OpenSimModel
+from tkamb.io.recordings.inverse_kinematics import ChainFit, Index, NormalEquations, fit_chain, put
+from tkamb.io.recordings.laboratory import laboratory_rotation
+from tkamb.io.recordings.markers import marker_trajectories, matched_labels
+from tkamb.io.recordings.tables import Table
+
+BLOCK = 128
+"""Frames that are fitted at once."""
+COARSE = 8
+"""Frames between those that are fitted first."""
+
+
+class ModelChain:
+    """The free coordinates of a model and some of its markers.
+
+    Args:
+        model: the model.
+        markers: names of the markers.
+        locked: coordinates that stay at their default beside those that the model locks.
+    """
+
+    def __init__(
+        self, model: OpenSimModel, markers: Sequence[str], locked: Sequence[str] = ()
+    ) -> None:
+        self.kinematics = Kinematics(model)
+        self._at = [self.kinematics.bodies[model.markers[name].body] for name in markers]
+        self._points = np.array([model.markers[name].location for name in markers])
+        index = self.kinematics.coordinates
+        followers = {coupler.dependent for coupler in model.couplers}
+        self.free = [
+            index[name]
+            for name, coordinate in model.coordinates.items()
+            if not (coordinate.locked or name in followers or name in locked)
+        ]
+        self._couplers = [
+            (index[c.dependent], index[c.independent], c.function) for c in model.couplers
+        ]
+        # what moves: the free ones first, then what follows them, over others or not
+        follow: list[int] = []
+        for dependent, independent, _ in self._couplers:
+            if independent in self.free or independent in follow:
+                follow.append(dependent)
+        self._moving = [*self.free, *follow]
+        self._after = [
+            (self._moving.index(d), self._moving.index(i), i, f)
+            for d, i, f in self._couplers
+            if d in follow
+        ]
+        carries, above = _tree(self.kinematics, self._at)
+        self._carries, self._above = (
+            carries[self._moving],
+            above[np.ix_(self._moving, self._moving)],
+        )
+
+    def default(self, frames: int) -> Array:
+        """Return the coordinates (f, n) at their defaults."""
+        return np.tile(self.kinematics.coupled({}), (frames, 1))
+
+    def places(self, state: Array) -> Array:
+        """Return the markers (f, m, 3) m."""
+        return self._markers_at(self.kinematics.poses(state))
+
+    def _markers_at(self, poses: Array) -> Array:
+        own = poses[:, self._at]
+        return np.asarray(
+            np.einsum("fmij,mj->fmi", own[..., :3, :3], self._points) + own[..., :3, 3]
+        )
+
+    def normal(self, state: Array, target: Array, weights: Array) -> NormalEquations:
+        """Return the least squares to markers (f, m, 3) m with weights (f, m).
+
+        With s = (a, b) a coordinate's twist in ground (rotation a, velocity b of ground's
+        origin), a marker at x that hangs on its joint moves by u = b + a × x. For i above j in
+        the chain, sums over the markers that j carries,
+
+            (Jᵀ W J)_ij = s_i · Σ w (x × u_j, u_j)
+            residuals' curvature_ij = -Σ w r · (a_i × u_j) = -a_i · Σ w u_j × r,   r = p - x
+
+        so that a coordinate needs the moments Σ w, Σ w x, Σ w x xᵀ, Σ w r and Σ w x rᵀ of what
+        it carries, and no marker needs its own Jacobian. How the splines of a joint bend is
+        left out of the curvature.
+        """
+        poses, twists = self.kinematics.joint_twists(state)
+        twists = twists[:, self._moving]
+        x = self._markers_at(poses)
+        off = target - x
+        pull = weights[:, :, None] * off
+        moments = np.concatenate(
+            [
+                weights[:, :, None],
+                weights[:, :, None] * x,
+                pull,
+                (x[..., :, None] * (weights[:, :, None] * x)[..., None, :]).reshape(
+                    *x.shape[:2], 9
+                ),
+                (x[..., :, None] * pull[..., None, :]).reshape(*x.shape[:2], 9),
+            ],
+            axis=2,
+        )
+        return self._assembled(
+            state, twists, self._carries @ moments, np.einsum("fmi,fmi->f", pull, off)
+        )
+
+    def _assembled(
+        self, state: Array, twists: Array, carried: Array, cost: Array
+    ) -> NormalEquations:
+        """Return the equations of the free coordinates from what each coordinate carries."""
+        a, b = twists[..., :3], twists[..., 3:]
+        weight, first, pull = carried[..., :1], carried[..., 1:4], carried[..., 4:7]
+        second = carried[..., 7:16].reshape(*weight.shape[:2], 3, 3)
+        turning = carried[..., 16:25].reshape(*weight.shape[:2], 3, 3)
+        force = weight * b + cross(a, first)
+        moment = cross(first, b) + _trace(second) * a - _product(second, a)
+        matrix = twists @ np.concatenate([moment, force], axis=-1).swapaxes(1, 2)
+        # Σ w u_j × r, of which (a × x) × r = x (a·r) - a (x·r)
+        lever = cross(b, pull) + _product(turning, a) - _trace(turning) * a
+        bent = -a @ lever.swapaxes(1, 2)
+        torque = np.stack(
+            [turning[..., i, j] - turning[..., j, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=-1
+        )
+        right = np.einsum("fni,fni->fn", a, torque) + np.einsum("fni,fni->fn", b, pull)
+        matrix, bent = (self._free_part(self._symmetric(part), state) for part in (matrix, bent))
+        return NormalEquations(cost, matrix, self._free_part(right[..., None], state)[..., 0], bent)
+
+    def _symmetric(self, matrix: Array) -> Array:
+        """Return the matrix (f, n, n) whose rows i are right where i is above column j."""
+        upper = matrix * self._above
+        return np.asarray(upper + upper.swapaxes(1, 2))
+
+    def _free_part(self, values: Array, state: Array) -> Array:
+        """Return rows, and columns of a square matrix, by the free coordinates.
+
+        What follows a free coordinate is added to it, by the chain rule; the last in a chain of
+        followers first.
+        """
+        square, free = values.shape[1] == values.shape[2], len(self.free)
+        for dependent, independent, coordinate, function in reversed(self._after):
+            slope = function.slope(state[:, coordinate])[:, None]
+            values[:, independent] += slope * values[:, dependent]
+            if square:
+                values[:, :, independent] += slope * values[:, :, dependent]
+        return values[:, :free, :free] if square else values[:, :free]
+
+    def moved(self, state: Array, step: Array) -> Array:
+        """Return the coordinates (f, n) after a step (f, free) of the free ones."""
+        moved = state.copy()
+        moved[:, self.free] += step
+        return self.kinematics.coupled(moved) if self._couplers else moved
+
+    def chosen(self, state: Array, frames: Index) -> Array:
+        """Return the coordinates of some frames."""
+        return np.asarray(state[frames])
+
+    def replaced(self, state: Array, frames: Index, part: Array) -> Array:
+        """Return the coordinates with some frames as in `part`."""
+        return put(state, frames, part)
+
+
+def _tree(kinematics: Kinematics, at: Sequence[int]) -> tuple[Array, Array]:
+    """Return which markers hang on a coordinate's joint (n, m), and which coordinate is above.
+
+    The second (n, n) is 1 at i, j where i turns the axis of j, and 1/2 where i is j. Within a
+    joint the translations come first, for they are along axes of its inner frame; in one that
+    is passed backwards the order is turned round.
+    """
+    model, bodies = kinematics.model, kinematics.bodies
+    hanging: dict[Joint, set[int]] = {}  # bodies outboard of each joint
+    for joint in reversed(model.joints):  # from the ends inwards
+        own = {bodies[joint.outboard]}
+        own.update(*(h for j, h in hanging.items() if j.inboard == joint.outboard))
+        hanging[joint] = own
+    count = len(kinematics.coordinates)
+    carries, above = np.zeros((count, len(at))), 0.5 * np.eye(count)
+    order = []  # coordinates from ground outwards, with what hangs on them
+    for joint in model.joints:
+        axes = (*joint.translations, *joint.rotations)[:: -1 if joint.backwards else 1]
+        names = dict.fromkeys(axis.coordinate for axis in axes if axis.coordinate)
+        order += [(kinematics.coordinates[name], joint) for name in names]
+    for k, (i, joint) in enumerate(order):
+        carries[i] = [body in hanging[joint] for body in at]
+        for j, other in order[k + 1 :]:
+            above[i, j] = bodies[other.outboard] in hanging[joint]
+    return carries, above
+
+
+def _trace(matrix: Array) -> Array:
+    return np.trace(matrix, axis1=-2, axis2=-1)[..., None]
+
+
+def _product(matrix: Array, vector: Array) -> Array:
+    return np.einsum("...ij,...j->...i", matrix, vector)
+
+
+def fit_model(
+    model: OpenSimModel,
+    recorded: Table,
+    weights: Mapping[str, float] | None = None,
+    locked: Sequence[str] = (),
+    laboratory_axes: str = "+x,+y,+z",
+) -> tuple[ModelChain, ChainFit[Array]]:
+    """Return a model's chain fitted to a recording, all frames at once.
+
+    Args:
+        model: the model.
+        recorded: table of markers.
+        weights: marker -> weight of its squared distance, where not 1.
+        locked: coordinates kept at their default.
+        laboratory_axes: axes of the file that are the model's ground x, y and z (forward, up
+            and right), as "-x,+z,+y".
+
+    Raises:
+        InputError: fewer than three markers in common.
+    """
+    match = matched_labels(model.markers, recorded_labels(recorded))
+    if len(match) < 3:
+        raise InputError(
+            f"shares {len(match)} markers with the model '{model.name}'",
+            recorded.path,
+            f"the model has {', '.join(list(model.markers)[:8])}, …",
+        )
+    chain = ModelChain(model, list(match), locked)
+    scale = recorded.unit_scale(None, "length_unit")
+    turn = laboratory_rotation(laboratory_axes, recorded.path)
+    measured = marker_trajectories(recorded, list(match.values()), scale) @ turn.T
+    values = np.array([(weights or {}).get(name, 1.0) for name in match])
+    first = int(np.argmax(np.isfinite(measured).all(axis=2).sum(axis=1)))
+    begin = fit_chain(chain, measured[first : first + 1], values, chain.default(1))
+    # some frames first, from the best seen; between them the others are nearly there
+    coarse = np.unique(np.append(np.arange(0, len(measured), COARSE), len(measured) - 1))
+    start = np.tile(begin.state, (len(coarse), 1))
+    knots = fit_in_blocks(chain, measured[coarse], values, start).state
+    between = CubicSpline(coarse, knots)(np.arange(len(measured))) if len(coarse) > 2 else start
+    return chain, fit_in_blocks(chain, measured, values, between)
+
+
+def fit_in_blocks(
+    chain: ModelChain, measured: Array, weights: Array, start: Array
+) -> ChainFit[Array]:
+    """Return `fit_chain` of many frames, so many at once as the processor's cache holds."""
+    parts = [slice(k, k + BLOCK) for k in range(0, len(measured), BLOCK)]
+    fits = [fit_chain(chain, measured[part], weights, start[part]) for part in parts]
+    state, rms, distance, solved = (
+        np.concatenate([getattr(fit, name) for fit in fits])
+        for name in ("state", "rms", "distance", "solved")
+    )
+    return ChainFit(state, rms, distance, solved, max(fit.steps for fit in fits))

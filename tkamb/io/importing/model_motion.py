@@ -1,0 +1,148 @@
+"""A motion in a model's coordinates (`.mot`, `.sto`) as the scene's knee and shank."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import (
+    KNEE_COORDINATES,
+    Array,
+    inverse,
+    knee_coordinates,
+    mirrored_pose,
+)
+from tkamb.io.importing.anatomy import OTHER, find_leg
+from tkamb.io.importing.links import Links
+from tkamb.io.importing.plates import Feet
+from tkamb.io.opensim.kinematics import Kinematics
+from tkamb.io.opensim.motion import angle_lines, read_coordinates
+from tkamb.io.recordings.tables import Table
+from tkamb.units import DEGREE, MILLIMETRE
+
+MOTION_FILE = "motion.csv"
+COLUMNS = (
+    *("ap_mm", "si_mm", "ml_mm", "axial_rotation_deg", "adduction_deg", "flexion_deg"),
+    *(f"tibia_rotation_{k}_deg" for k in (1, 2, 3)),
+    *(f"tibia_translation_{k}_mm" for k in (1, 2, 3)),
+)
+"""Of `motion.csv`, after time_s: the knee's coordinates and the tibia link in the model's ground,
+rotations intrinsic x-y-z."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelMotion:
+    """Knee and shank of a motion.
+
+    Args:
+        time: (n,) s.
+        values: (n, 12) of `COLUMNS`.
+        missing: coordinates of the model that the file does not hold: at their defaults.
+        said: lines on how the file was read.
+    """
+
+    time: Array
+    values: Array
+    missing: tuple[str, ...]
+    said: tuple[str, ...] = ()
+
+    def part(self, start: float, end: float) -> "ModelMotion":
+        """Return the rows from one time to another.
+
+        Raises:
+            InputError: fewer than two.
+        """
+        inside = (self.time >= start - 1e-9) & (self.time <= end + 1e-9)
+        if inside.sum() < 2:
+            raise InputError(
+                f"has no two frames between {start:g} and {end:g} s, the motion lasts from "
+                f"{self.time[0]:g} to {self.time[-1]:g} s",
+                "--interval",
+                "choose another",
+            )
+        return replace(self, time=self.time[inside], values=self.values[inside])
+
+    def text(self) -> str:
+        """Return the table as CSV."""
+        rows = np.column_stack([self.time, self.values])
+        lines = [",".join(f"{value:.9g}" for value in row) for row in rows]
+        return "\n".join([",".join(("time_s", *COLUMNS)), *lines, ""])
+
+
+def model_motion(links: Links, recorded: Table) -> ModelMotion:
+    """Return the knee and the shank of a motion in the model's coordinates.
+
+    Args:
+        links: of the leg.
+        recorded: with a column per coordinate, named as in the model or by its path.
+
+    Raises:
+        InputError: no coordinate of the knee, or angles of unknown unit.
+    """
+    leg = links.leg
+    kinematics = Kinematics(leg.model)
+    time = recorded.time()
+    q, missing = read_coordinates(kinematics, recorded)
+    if leg.flexion is None or leg.flexion in missing:
+        raise InputError(f"has no column '{leg.flexion}' for the knee's flexion", recorded.path)
+    poses = kinematics.poses(kinematics.coupled(q))
+    tibia = poses[:, kinematics.bodies[leg.tibia[0]]] @ links.tibia
+    femur = poses[:, kinematics.bodies[leg.femur[0]]] @ links.femur
+    knee_pose = inverse(tibia @ links.insert_in_tibia) @ femur
+    left = leg.side == "left"
+    knee = knee_coordinates(mirrored_pose(knee_pose) if left else knee_pose)
+    knee[:, 2] *= -1.0 if left else 1.0  # the file's ML points to the right on both sides
+    turns = np.unwrap(Rotation.from_matrix(tibia[:, :3, :3]).as_euler("XYZ"), axis=0)
+    values = np.concatenate(
+        [
+            knee[:, :3] / MILLIMETRE,
+            knee[:, 3:] / DEGREE,
+            turns / DEGREE,
+            tibia[:, :3, 3] / MILLIMETRE,
+        ],
+        axis=1,
+    )
+    return ModelMotion(time, values, missing, angle_lines(kinematics, recorded, q))
+
+
+def model_feet(links: Links, recorded: Table) -> Feet:
+    """Return where the feet are in a motion: the mean origin of each foot's bodies, m."""
+    leg = links.leg
+    kinematics = Kinematics(leg.model)
+    q, _ = read_coordinates(kinematics, recorded)
+    poses = kinematics.poses(kinematics.coupled(q))
+    bodies = {leg.side: leg.foot}
+    try:
+        bodies[OTHER[leg.side]] = find_leg(leg.model, OTHER[leg.side]).foot
+    except InputError:
+        bodies[OTHER[leg.side]] = ()  # a model of one leg
+    middles = {
+        side: np.mean([poses[:, kinematics.bodies[body], :3, 3] for body in own], axis=0)
+        if own
+        else np.full((recorded.rows, 3), np.nan)
+        for side, own in bodies.items()
+    }
+    return Feet(recorded.path, recorded.time(), middles)
+
+
+def motion_tables(flexion_alone: bool) -> list[str]:
+    """Return the scene's [motion] columns, of flexion or all six, and [tibia] for `motion.csv`."""
+    columns = dict(zip(KNEE_COORDINATES, COLUMNS, strict=False))
+    taken = ("flexion",) if flexion_alone else KNEE_COORDINATES
+    lines = ["[motion.columns]", 'time = "time_s"']
+    lines += [f'{role} = "{columns[role]}"' for role in taken]
+    lines += [
+        "",
+        "[tibia]",
+        'kind = "pose"',
+        f'file = "{MOTION_FILE}"',
+        'sequence = "XYZ"',
+        'angle_unit = "deg"',
+        'length_unit = "mm"',
+        "",
+        "[tibia.columns]",
+        'time = "time_s"',
+    ]
+    kinds = [f"{kind}_{k}" for kind in ("rotation", "translation") for k in (1, 2, 3)]
+    return lines + [f'{role} = "{name}"' for role, name in zip(kinds, COLUMNS[6:], strict=True)]

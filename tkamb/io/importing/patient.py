@@ -1,0 +1,382 @@
+"""A patient brought in: model, recording and meshes to a URDF and a scene that runs."""
+
+import os
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.atomic import CHOOSE_OUT, claim_directory, write_new_text
+from tkamb.errors import InputError
+from tkamb.files import TABLE_LIMIT, read_bytes
+from tkamb.geometry.flat_bottom import insert_placement
+from tkamb.geometry.surface import Surface
+from tkamb.io.importing.anatomy import Leg, find_leg
+from tkamb.io.importing.links import Links, find_links
+from tkamb.io.importing.markers import recorded_labels, with_prefix
+from tkamb.io.importing.model_motion import MOTION_FILE
+from tkamb.io.importing.recorded_poses import read_poses
+from tkamb.io.importing.request import ImportRequest
+from tkamb.io.importing.scene_text import GROUND_FILE, SceneText
+from tkamb.io.importing.soft_tissue import soft_tissue, some_names
+from tkamb.io.importing.standing import with_static_markers
+from tkamb.io.importing.trial import Trial, from_coordinates, from_markers, from_poses
+from tkamb.io.importing.urdf import patient_urdf
+from tkamb.io.opensim.model import OpenSimModel
+from tkamb.io.opensim.read import read_osim
+from tkamb.io.recordings.meshes import axes_rotation, load_surface
+from tkamb.io.recordings.tables import read_table, with_unit
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import Case, load_case
+from tkamb.units import DEGREE, MILLIMETRE
+
+LEG_ALONE = 0.6
+"""Share of a model's mass above which thigh, shank and foot are a model of one leg."""
+LEG_SHARE = 0.161
+"""Of the body's mass, thigh 0.100, shank 0.0465, foot 0.0145 (Winter, Biomechanics, 2009)."""
+LEG_SHARES = (0.10, 0.25)
+"""Of the body's mass: from Winter's 0.161 to de Leva's 0.20 (1996), with room for other people."""
+MAX_REASONS = 3
+"""Parts that were not read of which the report gives the reason."""
+SAME_MASS = 0.01
+"""A model whose mass is within this share of the subject's is not scaled."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedPatient:
+    """What an import gives.
+
+    Args:
+        urdf: text of patient.urdf.
+        scene: the scene, to be written as text.
+        motion: text of motion.csv; None where markers are read from the recording.
+        ground: text of ground_reaction.csv; None where the ground reaction has one file.
+        report: lines on what was understood and assumed.
+    """
+
+    urdf: str
+    scene: SceneText
+    motion: str | None
+    report: tuple[str, ...]
+    ground: str | None = None
+
+
+def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
+    """Return a patient's URDF and scene.
+
+    Args:
+        request: files and what is known.
+        folder: where the scene will stand.
+
+    Raises:
+        InputError: whatever cannot be used, in one line.
+    """
+    model = read_osim(request.model, partial=True)
+    leg = find_leg(model, request.side, request.knee)
+    meshes = request.meshes
+    insert = placement = None
+    if meshes:
+        insert = load_surface(meshes.insert, meshes.unit, meshes.axes, name="insert", closed=True)
+        placement = insert_placement(insert, axes_rotation(meshes.axes))
+    links = find_links(
+        leg,
+        placement,
+        meshes.axes if meshes else "+x,+y,+z",
+        request.frames,
+        bool(meshes and meshes.patella),
+    )
+    scale, weighed = _mass_scale(request, leg)
+    tissue = soft_tissue(links)
+    if meshes and meshes.femur_bone and not (tissue.quadriceps and tissue.patellar_ligament):
+        hint = "leave it out, or complete the model"
+        what = "is what the quadriceps wraps, and the model gives none"
+        raise InputError(what, "--femur-bone", hint)
+    found = _trial(request, leg, links, insert)
+    scene = SceneText(
+        _title(request),
+        folder,
+        request.side,
+        request.mass_kg,
+        "patient.urdf",
+        request.cutoff_Hz,
+        links,
+        found.markers,
+        found.poses,
+        found.shank,
+        found.ground,
+        meshes,
+        tissue,
+        request.contact,
+        request.activity,
+        (*_notes(request, scale, found, bool(tissue.bundles)), *request.notes),
+    )
+    report = [*_model_lines(model), *_leg_lines(leg), weighed, *links.said, *_patella_line(links)]
+    report += [*found.said, *tissue.said]
+    if request.static is not None:
+        if found.markers is None:
+            raise InputError(
+                "is for a knee whose motion comes from markers", "--static", "leave it out"
+            )
+        segments = list(found.markers.segments)
+        unit = request.units.length
+        scene, lines = with_static_markers(scene, request.static, segments, unit)
+        report += lines
+    comment = f"Made by tkamb import from {request.model.name}, {request.side} leg (m, kg)"
+    motion = found.motion.text() if found.motion else None
+    ground = found.ground.made if found.ground else None
+    return ImportedPatient(
+        patient_urdf(links, scale, comment), scene, motion, tuple(report), ground
+    )
+
+
+def _trial(request: ImportRequest, leg: Leg, links: Links, insert: Surface | None) -> Trial:
+    """Return the recording: markers, poses with markers, or the model's coordinates."""
+    recorded = with_unit(read_table(request.recording), request.units.length)
+    if request.prefix is not None:
+        recorded = with_prefix(recorded, request.prefix)
+    labels = recorded_labels(recorded)
+    if request.poses is not None:
+        if insert is None or request.meshes is None or not labels:
+            raise InputError(
+                "needs the meshes whose poses these are, and a recording of markers",
+                "--poses",
+                "give --femoral, --insert, and --c3d or --trc",
+            )
+        poses = read_poses(
+            request.poses, links, insert, request.meshes.axes, request.cutoff_Hz, request.interval
+        )
+        return from_poses(request, leg, links, recorded, poses)
+    if labels:
+        return from_markers(request, leg, links, recorded)
+    if request.without:
+        raise InputError("holds no markers to be left out", recorded.path, "drop --without")
+    return from_coordinates(request, leg, links, recorded)
+
+
+def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[str, ...]:
+    """Write URDF and scene, load them as a run would, and return what the markers say.
+
+    A file that is there already is left as it is: one of the same content may be shared with
+    another scene. Nothing is left behind where anything fails.
+
+    Raises:
+        InputError: the folder cannot be written, holds a file of one of these names with another
+            content, or the scene does not load.
+    """
+    scene = folder / name
+    if os.path.lexists(scene):
+        raise InputError("is there already", scene, CHOOSE_OUT)
+    files = {folder / patient.scene.urdf: patient.urdf, scene: patient.scene.text()}
+    if patient.motion is not None:
+        files[folder / MOTION_FILE] = patient.motion
+    if patient.ground is not None:
+        files[folder / GROUND_FILE] = patient.ground
+    new = {path: text for path, text in files.items() if not _same_there(path, text)}
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    written: list[Path] = []
+    try:
+        claim_directory(folder)
+        for path, text in new.items():
+            write_new_text(path, text)
+            written.append(path)
+        return marker_lines(load_case(load_scene(scene)))
+    except BaseException:  # an interrupt too: nothing may stay
+        for path in written:
+            path.unlink(missing_ok=True)
+        with suppress(OSError):  # not empty, or never made
+            for place in made:
+                place.rmdir()
+        raise
+
+
+def _same_there(path: Path, text: str) -> bool:
+    """Say whether a file of that content is there.
+
+    Raises:
+        InputError: one of another content is, or something that is no file.
+    """
+    if not os.path.lexists(path):
+        return False
+    with suppress(InputError):
+        if read_bytes(path, TABLE_LIMIT) == text.encode("utf-8", "backslashreplace"):
+            return True
+    what = "is there already with another content; another scene may need it"
+    raise InputError(what, path, CHOOSE_OUT)
+
+
+def marker_lines(case: Case) -> tuple[str, ...]:
+    """Return how well the markers fit, by both readings, and how far the knee centres are apart."""
+    found = case.motion.markers
+    if found is None:
+        rms = case.tibia.residual if case.tibia else None
+        if rms is None:
+            return ()
+        return (
+            f"markers and joint centres of the shank: rms {np.median(rms) / MILLIMETRE:.1f} mm "
+            f"(at most {rms.max() / MILLIMETRE:.1f})",
+        )
+    lines = []
+    for method, words in (("segments", "rigid fits of shank and thigh"), ("chain", "the chain")):
+        rms = found.at(found.rms[method], case.motion.time) / MILLIMETRE  # type: ignore[index]
+        flexion = found.at(found.flexion[method], case.motion.time) / DEGREE  # type: ignore[index]
+        used = ", used" if found.method == method else ""
+        lines.append(
+            f"markers, {words}{used}: rms {np.nanmedian(rms):.1f} mm (at most {np.nanmax(rms):.1f})"
+            f", flexion {np.nanmin(flexion):.1f} to {np.nanmax(flexion):.1f} deg"
+        )
+    apart = found.at(found.centre_distance, case.motion.time) / MILLIMETRE
+    turned = found.at(found.flexion["segments"] - found.flexion["chain"], case.motion.time) / DEGREE
+    lines.append(
+        f"knee centres of shank and thigh markers: {np.nanmedian(apart):.1f} mm apart (at most "
+        f"{np.nanmax(apart):.1f}); flexions differ by at most {np.nanmax(np.abs(turned)):.1f} deg"
+    )
+    return tuple(lines)
+
+
+def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
+    """Return the factor on the model's masses, and a line on it.
+
+    Raises:
+        InputError: masses that cannot be the subject's.
+    """
+    model, subject = leg.model.mass_kg, request.mass_kg
+    own = sum(leg.model.bodies[b].mass_kg for b in (*leg.femur, *leg.tibia, *leg.foot))
+    if own <= 0.0:
+        raise InputError(
+            "gives thigh, shank and foot no mass", request.model, "give its bodies their masses"
+        )
+    if own > LEG_ALONE * model:
+        return _leg_scale(request, own)
+    ratio = subject / model
+    scaled = abs(ratio - 1.0) > SAME_MASS if request.scale_mass is None else request.scale_mass
+    said = f"mass: the model's bodies sum to {model:.2f} kg, the subject is {subject:g} kg: "
+    if not 0.5 < ratio < 2.0:
+        raise InputError(
+            f"weighs {model:.1f} kg, the subject {subject:g} kg",
+            request.model,
+            "is --mass-kg in kilograms? else scale the model first",
+        )
+    return (ratio, said + f"scaled by {ratio:.4f}") if scaled else (1.0, said + "not scaled")
+
+
+def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
+    """Return the factor on the masses of a model that is little more than one leg, and a line.
+
+    Such a model holds the leg's own mass, or, where a scaling tool was told the subject's mass,
+    the whole body's. The leg's own is `LEG_SHARE` of the subject.
+
+    Raises:
+        InputError: neither of the two.
+    """
+    subject = request.mass_kg
+    share, wanted = own / subject, LEG_SHARE * subject
+    low, high = LEG_SHARES
+    whole_body = 0.5 < share < 2.0
+    said = (
+        f"mass: the model is one leg of {own:.2f} kg, {share:.0%} of the subject's {subject:g} kg"
+    )
+    if low <= share <= high and not request.scale_mass:
+        return 1.0, said + ": not scaled"
+    if not (low <= share <= high or whole_body) or (whole_body and request.scale_mass is False):
+        raise InputError(
+            f"is one leg of {own:.1f} kg, the subject weighs {subject:g} kg: a leg has "
+            f"{low:.0%} to {high:.0%} of the body's mass",
+            request.model,
+            "is --mass-kg in kilograms? else give the model's bodies a leg's masses",
+        )
+    why = ", the whole body's" if whole_body else ""
+    return wanted / own, (
+        f"{said}{why}: scaled to {wanted:.2f} kg, the {LEG_SHARE:.1%} of a leg (Winter 2009)"
+    )
+
+
+def _model_lines(model: OpenSimModel) -> list[str]:
+    """Return how the model was read, and what of it was not, because this knee needs none of it."""
+    lines = [f"model: {notice}" for notice in model.notices]
+    unread = [f"{one.kind} '{one.name}'" for one in model.unread]
+    if unread:
+        lines.append(f"not read, and not needed for this knee: {some_names(unread)}")
+        lines += [f"  {one.reason}" for one in model.unread[:MAX_REASONS]]
+    return lines
+
+
+def _leg_lines(leg: Leg) -> list[str]:
+    backwards = ", which runs backwards, from shank to thigh" if leg.knee.backwards else ""
+    return [
+        f"{leg.side} leg of '{leg.model.name}': knee '{leg.knee.name}'{backwards}, hip "
+        f"'{leg.hip.name}', ankle '{leg.ankle.name}'",
+        f"thigh = {', '.join(leg.femur)}; shank = {', '.join((*leg.tibia, *leg.foot))} (foot at "
+        "its neutral angles); patella = " + (leg.patella or "none"),
+    ]
+
+
+def _patella_line(links: Links) -> list[str]:
+    if links.patella is None:
+        return []
+    turn = links.patella[:3, :3]
+    names = ("anterior", "superior", "right")
+    axes = []
+    for k, axis in enumerate("xyz"):
+        j = int(np.argmax(np.abs(turn[k])))
+        axes.append(f"{axis} {'' if turn[k, j] > 0 else '-'}{names[j]}")
+    return [
+        f"patella's axes: {', '.join(axes)} (within {links.patella_error / DEGREE:.0f} deg at the "
+        "neutral pose); its mass is 0.1 kg, not the model's"
+    ]
+
+
+def _title(request: ImportRequest) -> tuple[str, ...]:
+    poses = f", poses of {request.poses.file.name}" if request.poses else ""
+    return (
+        f"The {request.side} knee of {request.model.name}, {request.recording.name}{poses}.",
+        "Written by `tkamb import`; what it inferred stands here as given. The recording and the",
+        "meshes are read where they lie.",
+    )
+
+
+def _notes(
+    request: ImportRequest, scale: float, found: Trial, own_ligaments: bool
+) -> tuple[str, ...]:
+    notes = [
+        "Without [muscles] only the quadriceps acts: where hamstrings and gastrocnemius act too, "
+        "the contact force is too low and the quadriceps force is what the joint moment needs at "
+        "least.",
+        *_motion_notes(request, found),
+        "Foot and shank are one body with the ankle at its neutral angle.",
+    ]
+    if request.meshes and not found.poses:
+        notes.append(
+            "Adduction, axial rotation, AP and ML of the femur are where contact, ligaments and "
+            "muscle line leave them; nobody recorded them."
+        )
+    if request.meshes and not own_ligaments:
+        notes.append("The ligaments are a generic set scaled to the implant, nobody's own.")
+    if scale != 1.0:
+        notes.append(f"Segment masses are the model's times {scale:.4f}.")
+    if found.ground is None:
+        notes.append("No ground reaction: the shank hangs in the air.")
+    return tuple(notes)
+
+
+def _motion_notes(request: ImportRequest, found: Trial) -> list[str]:
+    if request.poses is None or found.shank is None:
+        return [
+            "Shank and flexion come from skin markers; the columns marker_rms_*, flexion_* and "
+            "knee_centre_distance_mm say how far the skin has moved."
+        ]
+    notes = []
+    if request.poses.turned:
+        turned = ", ".join(request.poses.turned)
+        notes.append(f"The poses are read with the other sign of {turned}.")
+    if request.poses.stride:
+        notes.append(
+            "The knee's motion is of another recording than ground reaction and shank, laid on "
+            "one stride of theirs phase for phase: an assumption."
+        )
+    if centres := [centre.name.replace("_", " ") for centre in found.shank.centres]:
+        notes.append(
+            f"The shank shows {len(found.shank.points)} markers; {' and '.join(centres)}, which "
+            "the neighbours' markers carry, complete it. Its lean is less certain for that."
+        )
+    return notes

@@ -1,0 +1,267 @@
+"""Which foot bore which force, and while which part of a recording all of its load is known.
+
+The forces are those of a C3D file's plates, or of a table of ground reactions.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.io.recordings.c3d import Recording
+from tkamb.io.recordings.laboratory import laboratory_rotation
+from tkamb.io.recordings.markers import marker_trajectories
+from tkamb.io.recordings.plate_loads import around_load, unloaded_level
+from tkamb.io.recordings.tables import Table
+
+LOADED_N = 40.0
+"""Vertical force at which a plate counts as stood upon."""
+SHORTEST_S = 0.1
+"""A load that lasts less is a knock."""
+UNDER_FOOT = 0.25
+"""m; horizontally, between a centre of pressure and the middle of the foot's markers."""
+ON_A_STEP = 0.15
+"""m; a foot whose markers are this far above the plate stands on something."""
+MIDDLE = 0.055
+"""m; the middle of a foot's markers is about as high above what it stands on."""
+SAME_STEP = 0.05
+"""m; heights that differ by less are those of one step."""
+STILL = 0.15
+"""m/s; a foot that moves less, off the plates, stands on something that nobody measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedForce:
+    """A force that was recorded, in the laboratory.
+
+    Args:
+        key: number of the plate, or name of the table's force.
+        title: what to call it.
+        time: (k,) s.
+        wrench: (k, 6) N and N·m about the laboratory's origin.
+        level: m, height of the surface.
+        drift: N, what it reads while nobody stands on it.
+    """
+
+    key: int | str
+    title: str
+    time: Array
+    wrench: Array
+    level: float
+    drift: float = 0.0
+
+    @property
+    def point(self) -> Array:
+        """(k, 3) m, centre of pressure on the level; NaN where it is not loaded."""
+        force, moment = self.wrench[:, :3], self.wrench[:, 3:]
+        vertical = np.where(self.loaded, force[:, 1], np.nan)
+        x = (moment[:, 2] + self.level * force[:, 0]) / vertical
+        z = (self.level * force[:, 2] - moment[:, 0]) / vertical
+        return np.stack([x, np.full_like(x, self.level), z], axis=1)
+
+    @property
+    def loaded(self) -> np.ndarray:
+        """(k,) whether somebody stands on it."""
+        return np.asarray(self.wrench[:, 1] - self.drift > LOADED_N)
+
+
+@dataclass(frozen=True)
+class Load:
+    """A force under a foot.
+
+    Args:
+        plate: number of the plate, or name of the table's force.
+        title: what to call it.
+        side: whose foot; empty: nobody's whose markers are known.
+        start: s.
+        end: s.
+        distance: m, median, between the centre of pressure and that foot's markers.
+        other: m, the same to the other foot's; NaN if that has no markers.
+        surface: m, about how high above the plate that foot stands: zero, or a step.
+    """
+
+    plate: int | str
+    title: str
+    side: str
+    start: float
+    end: float
+    distance: float
+    other: float
+    surface: float
+
+
+@dataclass(frozen=True, eq=False)
+class Feet:
+    """Where the feet are.
+
+    Args:
+        path: the recording, for messages.
+        time: (n,) s.
+        middles: side -> (n, 3) m, laboratory, the middle of the foot's markers; NaN unseen.
+    """
+
+    path: Path
+    time: Array
+    middles: dict[str, Array]
+
+
+def marked_feet(recorded: Table, axes: str, labels: dict[str, list[str]]) -> Feet:
+    """Return the feet of a recording of markers.
+
+    Args:
+        recorded: the markers.
+        axes: the file's that point forward, up and right.
+        labels: side -> labels of the foot's markers.
+    """
+    rotation = laboratory_rotation(axes, recorded.path)
+    middles = {side: _middle(recorded, own) @ rotation.T for side, own in labels.items()}
+    return Feet(recorded.path, recorded.time(), middles)
+
+
+def plate_forces(recording: Recording, axes: str) -> list[RecordedForce]:
+    """Return the forces of a recording's plates."""
+    rotation = laboratory_rotation(axes, recording.path)
+    time = recording.analog_time
+    forces = []
+    for plate in recording.plates:
+        wrench = (plate.wrench.reshape(-1, 2, 3) @ rotation.T).reshape(-1, 6)
+        on = around_load(np.linalg.norm(wrench[:, :3], axis=1), time)
+        drift = unloaded_level(wrench[:, 1], on, time)
+        level = float((rotation @ plate.centre)[1])
+        title = f"force plate {plate.number}"
+        forces.append(RecordedForce(plate.number, title, time, wrench, level, drift))
+    return forces
+
+
+def feet_loads(forces: list[RecordedForce], feet: Feet) -> list[Load]:
+    """Return every load of every force, with the foot that is nearest to it."""
+    loads = []
+    for one in forces:
+        middles = {s: _interpolated(m, feet.time, one.time) for s, m in feet.middles.items()}
+        point = one.point
+        for first, last in _runs(one.loaded):
+            if one.time[last] - one.time[first] >= SHORTEST_S:
+                part = slice(first, last + 1)
+                own = {side: middle[part] for side, middle in middles.items()}
+                line = (one.time[part], point[part], one.wrench[part, :3])
+                loads.append(_load(one, *line, own))
+    return sorted(loads, key=lambda load: load.start)
+
+
+def _load(
+    one: RecordedForce, time: Array, point: Array, force: Array, middles: dict[str, Array]
+) -> Load:
+    """Return a load; a foot on a step is compared with the force's line on the step's level."""
+    away, surface = {}, {}
+    for side, middle in middles.items():
+        above = middle[:, 1] - point[:, 1]
+        height = float(np.nanmedian(above)) if np.isfinite(above).any() else 0.0
+        surface[side] = height - MIDDLE if height > ON_A_STEP else 0.0
+        there = point + force / force[:, 1:2] * surface[side]
+        distance = np.linalg.norm((there - middle)[:, [0, 2]], axis=1)
+        away[side] = float(np.nanmedian(distance)) if np.isfinite(distance).any() else np.nan
+    nearest = min(away, key=lambda side: np.nan_to_num(away[side], nan=np.inf))
+    rest = [distance for side, distance in away.items() if side != nearest]
+    whose = nearest if away[nearest] < UNDER_FOOT else ""
+    start, end = float(time[0]), float(time[-1])
+    return Load(one.key, one.title, whose, start, end, away[nearest], rest[0], surface[nearest])
+
+
+def own_plates(
+    loads: list[Load], side: str, path: Path, hint: str = "give --plates and --interval"
+) -> tuple[int | str, ...]:
+    """Return the plates that one foot stood on, and no other.
+
+    Raises:
+        InputError: none, or a plate that both feet stood on.
+    """
+    own = list(dict.fromkeys(load.plate for load in loads if load.side == side))
+    others = {load.plate for load in loads if load.side != side}
+    shared = [load.title for load in loads if load.plate in own and load.plate in others]
+    if shared:
+        what = f"both feet stood on {shared[0]}"
+        if any(load.plate in own and not load.side for load in loads):
+            what = f"{shared[0]} is also loaded by a foot without markers"
+        raise InputError(what, path, f"{hint}, or take another trial")
+    if not own:
+        lost = [load for load in loads if not load.side]
+        what = f"no force plate was under the {side} foot"
+        if lost:
+            what += (
+                f": {lost[0].title} is stood upon from {lost[0].start:.2f} to {lost[0].end:.2f} s, "
+                f"but no foot's markers are within {UNDER_FOOT:g} m of its centre of pressure"
+            )
+            hint = f"check --laboratory-axes and the foot's labels, or {hint}"
+        raise InputError(what, path, f"{hint}, or take another trial")
+    return tuple(sorted(own, key=str))
+
+
+def common_surface(loads: list[Load], plates: tuple[int | str, ...]) -> float:
+    """Return how high (m) the foot stands above its plates; zero where that differs."""
+    heights = [load.surface for load in loads if load.plate in plates]
+    return float(np.mean(heights)) if np.ptp(heights) < SAME_STEP else 0.0
+
+
+def known_interval(
+    loads: list[Load], plates: tuple[int | str, ...], feet: Feet
+) -> tuple[float, float]:
+    """Return the frames' times (s) from the first to the last load of the foot's plates.
+
+    Raises:
+        InputError: fewer than two frames between them.
+    """
+    own = [load for load in loads if load.plate in plates]
+    start, end = min(load.start for load in own), max(load.end for load in own)
+    inside = feet.time[(feet.time >= start - 1e-9) & (feet.time <= end + 1e-9)]
+    if len(inside) < 2:
+        raise InputError(
+            f"has no two frames while the foot is loaded, {start:.3f} to {end:.3f} s",
+            feet.path,
+            "do the force and the markers belong to one trial?",
+        )
+    return float(inside[0]), float(inside[-1])
+
+
+def unmeasured(
+    loads: list[Load],
+    plates: tuple[int | str, ...],
+    feet: Feet,
+    side: str,
+    interval: tuple[float, float],
+) -> Array:
+    """Return the times (s) in an interval at which the foot is still but on none of the plates."""
+    time = feet.time
+    speed = np.linalg.norm(np.gradient(feet.middles[side], time, axis=0), axis=1)
+    on = np.zeros(len(time), bool)
+    for load in loads:
+        if load.plate in plates:
+            on |= (time >= load.start - 0.02) & (time <= load.end + 0.02)
+    inside = (time >= interval[0]) & (time <= interval[1])
+    return np.asarray(time[inside & ~on & (speed < STILL)])
+
+
+def _middle(table: Table, labels: list[str]) -> Array:
+    """Return the mean (n, 3) m of the markers that are seen; NaN without any."""
+    rows = table.rows
+    if not labels:
+        return np.full((rows, 3), np.nan)
+    points = marker_trajectories(table, labels, table.unit_scale(None, "length_unit"))
+    seen = np.asarray(np.isfinite(points).all(axis=2))
+    total = np.where(seen[:, :, None], points, 0.0).sum(axis=1)
+    count = seen.sum(axis=1).astype(float)
+    count[count == 0] = np.nan
+    return np.asarray(total / count[:, None])
+
+
+def _interpolated(values: Array, time: Array, at: Array) -> Array:
+    """Return values (n, 3) at other times; NaN outside the recording."""
+    columns = [np.interp(at, time, values[:, k], left=np.nan, right=np.nan) for k in range(3)]
+    return np.stack(columns, axis=1)
+
+
+def _runs(loaded: np.ndarray) -> list[tuple[int, int]]:
+    """Return first and last index of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], loaded, [False]]).astype(int)))
+    return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]

@@ -1,0 +1,180 @@
+"""Recorded poses of the femoral component in the insert (fluoroscopy, biplane X-ray)."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.flat_bottom import insert_placement
+from tkamb.geometry.frames import Array, inverse, knee_pose, mirrored_pose, pose
+from tkamb.geometry.surface import Surface
+from tkamb.io.importing.links import Links
+from tkamb.io.importing.toml_text import toml_text
+from tkamb.io.recordings.meshes import axes_rotation
+from tkamb.io.recordings.motion import KneeMotion, load_motion
+from tkamb.io.scene.recording_tables import MotionTable
+from tkamb.io.scene.si import in_si
+from tkamb.units import DEGREE
+
+ROLES = tuple(f"{kind}_{k}" for kind in ("rotation", "translation") for k in (1, 2, 3))
+"""Of the columns, in their order."""
+
+
+@dataclass(frozen=True)
+class PoseRecording:
+    """Poses of the femoral mesh in the insert mesh's own axes, and what is known of them.
+
+    Args:
+        file: the table.
+        columns: of `ROLES`: three angles in the order of the sequence, then x, y, z.
+        sequence: of the rotations, as in scipy: "XYZ" is Rx Ry Rz.
+        angle_unit: "deg" or "rad".
+        length_unit: "m", "cm" or "mm".
+        turned: roles that are read with the other sign.
+        stride: s, where 0 and 100 % of the file's time column lie on the recording's clock;
+            None: the file has that clock itself.
+        stance: part of the file's time column, in which the foot is loaded; None: all of it.
+    """
+
+    file: Path
+    columns: tuple[str, ...]
+    sequence: str
+    angle_unit: str
+    length_unit: str
+    turned: tuple[str, ...] = ()
+    stride: tuple[float, float] | None = None
+    stance: tuple[float, float] | None = None
+
+    def keys(self) -> dict[str, Any]:
+        """Return the keys of the scene's [motion] but its file, cut-off and columns."""
+        found: dict[str, Any] = {
+            "interpretation": "pose",
+            "sequence": self.sequence,
+            "angle_unit": self.angle_unit,
+            "length_unit": self.length_unit,
+        }
+        if self.turned:
+            found["signs_turned"] = list(self.turned)
+        if self.stride:
+            found["cycle_s"] = list(self.stride)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedPoses:
+    """Poses that were read.
+
+    Args:
+        given: where they come from.
+        interval: s, the part that is computed; None: all of it.
+        time: (n,) s, on the recording's clock.
+        femur: (n, 4, 4) m, the femur's body in the tibia link.
+        in_stance: (n,) whether the foot is loaded.
+        said: lines on them.
+    """
+
+    given: PoseRecording
+    interval: tuple[float, float] | None
+    time: Array
+    femur: Array
+    in_stance: Array
+    said: tuple[str, ...]
+
+    def motion_lines(self, path: str, cutoff_Hz: float) -> list[str]:
+        """Return the scene's [motion]; `path` is the file's, as TOML."""
+        lines = ["[motion]", f"file = {path}", f"cutoff_Hz = {cutoff_Hz:g}"]
+        for key, value in self.given.keys().items():
+            if key == "cycle_s":
+                lines.append("# 0 and 100 % on the recording's clock: an assumption, as given")
+            lines.append(f"{key} = {_toml(value)}")
+        if self.interval:
+            lines.append(f"interval_s = {_toml(list(self.interval))}")
+        lines += ["", "# the femoral mesh in the insert mesh's own axes", "[motion.columns]"]
+        named = zip(ROLES, self.given.columns, strict=True)
+        return lines + [f"{role} = {toml_text(column)}" for role, column in named]
+
+
+def read_poses(
+    given: PoseRecording,
+    links: Links,
+    insert: Surface,
+    axes: str,
+    cutoff_Hz: float,
+    interval: tuple[float, float] | None,
+) -> RecordedPoses:
+    """Return recorded poses as those of the femur's body in the tibia link.
+
+    With P the recorded pose of the femoral mesh in the insert mesh,
+    T_femur_in_tibia = T_insert_in_tibia T_insert_mesh_in_insert P T_femur_in_femoral_mesh.
+
+    Args:
+        given: where they come from.
+        links: of the leg.
+        insert: its mesh about its own origin, in anatomical axes.
+        axes: the meshes' axes that point anterior, superior and right.
+        cutoff_Hz: low-pass of the scene.
+        interval: s, the part that is computed; None: all of it.
+
+    Raises:
+        InputError: file, columns, units or times cannot be used.
+    """
+    turn = pose(axes_rotation(axes), np.zeros(3))
+    placement = insert_placement(insert, axes_rotation(axes)) @ turn
+    side: Literal["right", "left"] = "left" if links.leg.side == "left" else "right"
+    motion = load_motion(_motion_table(given, cutoff_Hz, interval), side, placement, turn)
+    knee = knee_pose(motion.raw_coordinates)
+    own_side = mirrored_pose(knee) if side == "left" else knee  # the motion is a right knee's
+    femur = links.insert_in_tibia @ own_side @ inverse(links.femur)
+    stance = _in_stance(given, motion)
+    return RecordedPoses(given, interval, motion.time, femur, stance, _said(given, motion))
+
+
+def _motion_table(
+    given: PoseRecording, cutoff_Hz: float, interval: tuple[float, float] | None
+) -> Any:
+    keys = given.keys() | {"file": given.file, "cutoff_Hz": cutoff_Hz, "interval_s": interval}
+    keys["columns"] = dict(zip(ROLES, given.columns, strict=True))
+    return in_si(MotionTable.model_validate(keys))
+
+
+def _in_stance(given: PoseRecording, motion: KneeMotion) -> Array:
+    clock = motion.time if motion.cycle_percent is None else motion.cycle_percent
+    if given.stance is None:
+        return np.ones(len(clock), bool)
+    start, end = given.stance
+    inside = (clock >= start - 1e-9) & (clock <= end + 1e-9)
+    if not inside.any():
+        raise InputError(
+            f"holds no pose: the file's time runs from {clock[0]:g} to {clock[-1]:g}",
+            "--stance",
+            "give the part in which the foot is loaded, in the unit of that column",
+        )
+    return np.asarray(inside)
+
+
+def _said(given: PoseRecording, motion: KneeMotion) -> tuple[str, ...]:
+    flexion = motion.raw_coordinates[:, 5] / DEGREE
+    angles, places = ", ".join(given.columns[:3]), ", ".join(given.columns[3:])
+    said = [
+        f"knee: {len(flexion)} poses of the femoral mesh in the insert mesh from "
+        f"{given.file.name}, rotations {given.sequence} = {angles} in {given.angle_unit}, x, y, z "
+        f"= {places} in {given.length_unit}: flexion {flexion.min():.1f} to {flexion.max():.1f} "
+        f"deg; all six coordinates as recorded"
+    ]
+    if given.turned:
+        said.append(f"read with the other sign, as given: {', '.join(given.turned)}")
+    if given.stride:
+        closed = "a closed cycle" if motion.closed_cycle else "not closed"
+        said.append(
+            f"phase: its 0 and 100 % are laid on {given.stride[0]:g} and {given.stride[1]:g} s of "
+            f"the recording, as given: an assumption ({closed})"
+        )
+    return tuple(said)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(_toml(v) for v in value)}]"
+    return toml_text(value) if isinstance(value, str) else f"{value:.9g}"

@@ -1,0 +1,321 @@
+"""The scene file that an import writes: TOML with what was inferred, as given."""
+
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tkamb.geometry.frames import Array
+from tkamb.io.importing.links import Links
+from tkamb.io.importing.markers import ModelSegment
+from tkamb.io.importing.model_motion import MOTION_FILE, motion_tables
+from tkamb.io.importing.recorded_poses import RecordedPoses
+from tkamb.io.importing.shank import ShankMarkers
+from tkamb.io.importing.soft_tissue import SoftTissue
+from tkamb.io.importing.toml_text import toml_end, toml_markers, toml_mm, toml_numbers, toml_text
+from tkamb.io.importing.urdf import body_link
+from tkamb.io.recordings.unit_words import GivenUnits
+from tkamb.units import DEGREE
+
+GROUND_FILE = "ground_reaction.csv"
+"""Beside the scene: a foot's ground reaction, where it is a sum of several of a table's forces."""
+
+
+@dataclass(frozen=True)
+class Meshes:
+    """The implant's files, their unit and axes; the femur's bone, in its body's own axes."""
+
+    femoral: Path
+    insert: Path
+    patella: Path | None
+    unit: str
+    axes: str
+    femur_bone: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class GroundFile:
+    """Where the ground reaction stands: plates of a C3D file, or columns of a table.
+
+    A foot on a step stands `surface` (m) above its plates. `made` is the text of a table that the
+    import writes: forces in turn, summed.
+    """
+
+    path: Path
+    axes: str
+    plates: tuple[int, ...] = ()
+    columns: tuple[tuple[str, str], ...] = ()
+    length_unit: str | None = None
+    surface: float = 0.0
+    units: GivenUnits = field(default_factory=GivenUnits)
+    made: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerFile:
+    """A recording of markers and how they are read.
+
+    `whole_labels`: the scene names markers with their prefix, since the recording has several.
+    """
+
+    path: Path
+    axes: str
+    segments: tuple[ModelSegment, ...]
+    method: str
+    knee: str
+    interval: tuple[float, float] | None
+    frames: int | None = None
+    length_unit: str | None = None
+    whole_labels: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class SceneText:
+    """Everything that the scene says.
+
+    Args:
+        title: comment lines at the top.
+        folder: where the scene will stand; paths are relative to it.
+        side: of the knee.
+        mass_kg: of the subject.
+        urdf: name of the URDF beside the scene.
+        cutoff_Hz: of markers and plates.
+        links: of the leg.
+        markers: the recording of the knee's markers, if they are the motion.
+        poses: of the femoral component, if they are; the model's own coordinates, in
+            `motion.csv`, if neither is.
+        shank: markers that place the shank, with poses.
+        ground: the ground reaction; None without.
+        meshes: the implant; None without.
+        tissue: muscles and ligaments.
+        contact: the contact model.
+        activity: what the report compares with; None: with nothing.
+        notes: for the report.
+    """
+
+    title: tuple[str, ...]
+    folder: Path
+    side: str
+    mass_kg: float
+    urdf: str
+    cutoff_Hz: float
+    links: Links
+    markers: MarkerFile | None
+    poses: RecordedPoses | None
+    shank: ShankMarkers | None
+    ground: GroundFile | None
+    meshes: Meshes | None
+    tissue: SoftTissue
+    contact: str
+    activity: str | None
+    notes: tuple[str, ...]
+
+    def text(self) -> str:
+        """Return the TOML."""
+        tables = [
+            [f"# {line}" for line in self.title],
+            self._patient(),
+            self._motion(),
+            *self._segments(),
+            self.shank.lines(self._path(self.shank.path)) if self.shank else [],
+            self._ground(),
+            *self._implant(),
+            self._muscles(),
+            self._ligaments(),
+            self._contact(),
+            self._output(),
+        ]
+        return "\n\n".join("\n".join(lines) for lines in tables if lines) + "\n"
+
+    def _path(self, path: Path) -> str:
+        return toml_text(Path(os.path.relpath(path.absolute(), self.folder.absolute())).as_posix())
+
+    def _patient(self) -> list[str]:
+        return [
+            "[patient]",
+            f"urdf = {toml_text(self.urdf)}",
+            f'side = "{self.side}"',
+            f"mass_kg = {self.mass_kg:g}",
+        ]
+
+    def _motion(self) -> list[str]:
+        m, neutral = self.markers, self.links.neutral
+        if self.poses is not None:
+            return self.poses.motion_lines(self._path(self.poses.given.file), self.cutoff_Hz)
+        if m is None:
+            head = ["[motion]", f'file = "{MOTION_FILE}"', 'interpretation = "coordinates"']
+            head += ['angle_unit = "deg"', 'length_unit = "mm"', f"cutoff_Hz = {self.cutoff_Hz:g}"]
+            return [*head, "", *motion_tables(self.meshes is not None)]
+        lines = ["[motion]", f"file = {self._path(m.path)}", 'interpretation = "markers"']
+        lines += [f'length_unit = "{m.length_unit}"'] if m.length_unit else []
+        lines.append(f"cutoff_Hz = {self.cutoff_Hz:g}")
+        if m.interval:
+            lines.append("# the part in which all that the foot stands on was measured, own clock")
+            lines.append(f"interval_s = [{m.interval[0]:.9f}, {m.interval[1]:.9f}]")
+        if m.frames:
+            lines.append(
+                "# every so many frames of the recording: five times the cut-off is enough"
+            )
+            lines.append(f"frames = {m.frames}")
+        coordinates = ["flexion"] if self.meshes else _ALL
+        lines += [
+            "",
+            "[motion.markers]",
+            f'method = "{m.method}"  # "segments": shank and thigh each by itself; or "chain"',
+            f'knee = "{m.knee}"',
+            f"coordinates = {json.dumps(coordinates)}",
+            "# where the model keeps the straight knee",
+            f"neutral_mm = {toml_mm(neutral[:3])}",
+            f"neutral_deg = {toml_numbers(neutral[3:5] / DEGREE)}",
+            f'laboratory_axes = "{m.axes}"',
+        ]
+        return lines
+
+    def _segments(self) -> list[list[str]]:
+        m = self.markers
+        return [_segment(segment, m.whole_labels) for segment in m.segments] if m else []
+
+    def _ground(self) -> list[str]:
+        g = self.ground
+        if g is None:
+            return []
+        file = toml_text(GROUND_FILE) if g.made else self._path(g.path)
+        lines = ["[ground_reaction]", f"file = {file}"]
+        lines += [f"plates = {list(g.plates)}"] if g.plates else []
+        length = g.length_unit or g.units.length
+        lines += [f'length_unit = "{length}"'] if length else []
+        for key, unit in (("force_unit", g.units.force), ("moment_unit", g.units.moment)):
+            lines += [f"{key} = {toml_text(unit)}"] if unit else []
+        lines += [
+            f'laboratory_axes = "{g.axes}"',
+            f"cutoff_Hz = {self.cutoff_Hz:g}",
+            "unloaded_N = 40.0",
+        ]
+        if g.surface:
+            lines.append("# the foot stands on a step, about as high above the plate")
+            lines.append(f"surface_mm = {round(g.surface * 1e3, -1):.0f}")
+        if g.columns:
+            lines += ["", "[ground_reaction.columns]"]
+            lines += [f"{role} = {toml_text(column)}" for role, column in g.columns]
+        return lines
+
+    def _implant(self) -> list[list[str]]:
+        m = self.meshes
+        if m is None:
+            return []
+        parts: list[list[str]] = []
+        for name, path in (("femoral", m.femoral), ("insert", m.insert), ("patella", m.patella)):
+            if path is None:
+                continue
+            lines = [f"[implant.{name}]", f"mesh = {self._path(path)}", f'unit = "{m.unit}"']
+            lines.append(f'axes = "{m.axes}"')
+            if name == "insert":
+                lines.append('bearing = "fixed"')
+            if name == "patella":
+                lines += _button(self.links.button_in_patella)
+            parts.append(lines)
+        return parts
+
+    def _muscles(self) -> list[str]:
+        t = self.tissue
+        if not self._with_patella:
+            return []
+        assert t.quadriceps is not None and t.patellar_ligament is not None
+        return [
+            "[quadriceps]",
+            toml_end("origin", t.quadriceps[0]),
+            toml_end("insertion", t.quadriceps[1]),
+            *self._bone(),
+            "",
+            "[patellar_ligament]",
+            toml_end("proximal", t.patellar_ligament[0]),
+            toml_end("distal", t.patellar_ligament[1]),
+            f"length_mm = {t.ligament_length * 1e3:.3f}",
+            "",
+            "[patella]",
+            'motion = "solved"',
+        ]
+
+    def _bone(self) -> list[str]:
+        m = self.meshes
+        if m is None or m.femur_bone is None:
+            return []
+        link = toml_text(body_link(self.links.leg.femur[0]))
+        mesh = f'mesh = {self._path(m.femur_bone)}, unit = "{m.unit}"'
+        return [
+            "# what the line may wrap besides the component",
+            f"bone = {{ {mesh}, link = {link} }}",
+        ]
+
+    @property
+    def _with_patella(self) -> bool:
+        t, m = self.tissue, self.meshes
+        return bool(m and m.patella and t.quadriceps and t.patellar_ligament)
+
+    def _ligaments(self) -> list[str]:
+        if self.tissue.bundles:
+            lines: list[str] = []
+            for b in self.tissue.bundles:
+                lines += [
+                    "",
+                    "[[ligament]]",
+                    f"name = {toml_text(b.name)}",
+                    'law = "quadratic-toe"',
+                ]
+                lines += [toml_end("proximal", b.proximal), toml_end("distal", b.distal)]
+                lines.append(f"stiffness_N_per_strain = {b.stiffness_N:g}")
+                lines.append(f"slack_length_mm = {b.slack_length_m * 1e3:.4f}")
+            return lines[1:]
+        if self.meshes is None:
+            return []
+        return [
+            "# The model has none: a generic set, nobody's, scaled to the implant.",
+            "[generic_ligaments]",
+            'ligaments = ["MCL", "LCL", "PCL"]',
+        ]
+
+    def _contact(self) -> list[str]:
+        if self.meshes is None:
+            return []
+        lines = [
+            "[contact]",
+            f'model = "{self.contact}"',
+            "resolution_mm = 1.0",
+            'material = "polyethylene"',
+        ]
+        if self.poses is not None:
+            return lines
+        return [
+            *lines,
+            "# nobody recorded these: contact, ligaments and muscle line find them",
+            'released = ["adduction", "axial_rotation", "ap", "ml"]',
+        ]
+
+    def _output(self) -> list[str]:
+        cycle = self.poses is not None and self.poses.given.stride is not None
+        lines = ["[output]", f'axis = "{"cycle" if cycle else "time"}"']
+        lines += [f"activity = {toml_text(self.activity)}"] if self.activity else []
+        return [*lines, "notes = [", *(f"    {toml_text(note)}," for note in self.notes), "]"]
+
+
+_ALL = ["flexion", "adduction", "axial_rotation", "ap", "si", "ml"]
+
+
+def _segment(segment: ModelSegment, whole_labels: bool) -> list[str]:
+    lines = ["[[motion.markers.segment]]", f'name = "{segment.name}"']
+    if segment.joint is not None and segment.centre is not None:
+        lines += [
+            f'joined_to = "{segment.joined_to}"',
+            f"joint_mm = {toml_mm(segment.joint)}",
+            f"centre_mm = {toml_mm(segment.centre)}",
+        ]
+    return [*lines, f"markers_mm = {toml_markers(segment.points, whole_labels)}"]
+
+
+def _button(in_patella: Array | None) -> list[str]:
+    from scipy.spatial.transform import Rotation
+
+    if in_patella is None:
+        return []
+    angles = Rotation.from_matrix(in_patella[:3, :3]).as_euler("XYZ") / DEGREE
+    return [f"position_mm = {toml_mm(in_patella[:3, 3])}", f"rotation_deg = {toml_numbers(angles)}"]

@@ -1,0 +1,190 @@
+"""What of a model's muscles and ligaments the scene can take over, and why the rest is left out."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tkamb.geometry.frames import Array
+from tkamb.io.importing.links import Links
+from tkamb.io.importing.urdf import body_link
+from tkamb.io.opensim.lines import Ligament, Path, PathPoint
+
+TOE = 0.06
+"""Strain at which the toe of law "quadratic-toe" ends: twice eps1 = 0.03 (Blankevoort 1991)."""
+
+
+@dataclass(frozen=True, eq=False)
+class End:
+    """A point (3,) m of a link of the URDF."""
+
+    link: str
+    point: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """A ligament of the model that the scene's law describes exactly."""
+
+    name: str
+    proximal: End
+    distal: End
+    stiffness_N: float
+    slack_length_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class SoftTissue:
+    """What is taken over.
+
+    Args:
+        quadriceps: origin and insertion; None without a patella or a vastus intermedius.
+        patellar_ligament: ends on patella and tibia; None without.
+        ligament_length: m, of the patellar ligament.
+        bundles: femorotibial ligaments.
+        said: lines on what was taken and what was left out, and why.
+    """
+
+    quadriceps: tuple[End, End] | None
+    patellar_ligament: tuple[End, End] | None
+    ligament_length: float
+    bundles: tuple[Bundle, ...]
+    said: tuple[str, ...]
+
+
+def soft_tissue(links: Links) -> SoftTissue:
+    """Return the soft tissue of a leg's knee that the scene can hold."""
+    said: list[str] = []
+    quadriceps = _quadriceps(links, said)
+    ligament, length = _patellar_ligament(links, said)
+    bundles = _bundles(links, said)
+    _name_muscles(links, said)
+    return SoftTissue(quadriceps, ligament, length, bundles, tuple(said))
+
+
+def _end(point: PathPoint) -> End:
+    return End(body_link(point.body), point.location)
+
+
+def _fixed(path: Path, bodies: tuple[str, ...]) -> list[PathPoint]:
+    """Return the path's plain points on some bodies."""
+    return [p for p in path.points if type(p) is PathPoint and p.body in bodies]
+
+
+def _quadriceps(links: Links, said: list[str]) -> tuple[End, End] | None:
+    leg = links.leg
+    if leg.patella is None:
+        said.append("no patella in the model: no quadriceps")
+        return None
+    for muscle in leg.model.muscles.values():
+        femur, patella = _fixed(muscle.path, leg.femur), _fixed(muscle.path, (leg.patella,))
+        plain = muscle.name.lower().replace("_", "")
+        if "vasint" in plain and "real" not in plain and femur and patella:
+            said.append(
+                f"quadriceps: one line along {muscle.name}, from its last point on the femur to "
+                "its first on the patella"
+            )
+            return _end(femur[-1]), _end(patella[0])
+    said.append("no vastus intermedius from femur to patella: no quadriceps")
+    said += [one.reason for one in leg.model.unread if "vasint" in one.name.lower()]
+    return None
+
+
+def _patellar_ligament(links: Links, said: list[str]) -> tuple[tuple[End, End] | None, float]:
+    leg = links.leg
+    if leg.patella is None:
+        return None, np.nan
+    for constraint in leg.model.constant_distances:
+        points = dict(zip(constraint.bodies, constraint.points, strict=True))
+        on_tibia = [body for body in constraint.bodies if body in leg.tibia]
+        if leg.patella in points and on_tibia:
+            length = constraint.distance
+            said.append(
+                f"patellar ligament: {length * 1e3:.1f} mm long, by the constraint "
+                f"'{constraint.name}'; resting lengths of its strands are not used"
+            )
+            upper = End(body_link(leg.patella), points[leg.patella])
+            return (upper, End(body_link(on_tibia[0]), points[on_tibia[0]])), length
+    strands = [
+        (patella[0], tibia[-1], ligament)
+        for ligament in leg.model.ligaments.values()
+        if (patella := _fixed(ligament.path, (leg.patella,)))
+        and (tibia := _fixed(ligament.path, leg.tibia))
+        and not _fixed(ligament.path, leg.femur)
+    ]
+    if not strands:
+        said.append("no patellar ligament in the model: no quadriceps")
+        return None, np.nan
+    length = float(np.mean([ligament.slack_length_m for *_, ligament in strands]))
+    said.append(
+        f"patellar ligament: {length * 1e3:.1f} mm long, mean slack length of {len(strands)} "
+        "strands, between their mean ends"
+    )
+    ends = [
+        End(body_link(points[0].body), np.mean([p.location for p in points], axis=0))
+        for points in ([s[0] for s in strands], [s[1] for s in strands])
+    ]
+    return (ends[0], ends[1]), length
+
+
+def _bundles(links: Links, said: list[str]) -> tuple[Bundle, ...]:
+    leg = links.leg
+    taken: list[Bundle] = []
+    out: dict[str, list[str]] = {}
+    for ligament in leg.model.ligaments.values():
+        femur, tibia = _fixed(ligament.path, leg.femur), _fixed(ligament.path, leg.tibia)
+        if not (femur and tibia):
+            continue
+        reason = _reason_against(ligament, len(femur) + len(tibia))
+        if reason or ligament.stiffness_N is None:
+            out.setdefault(reason, []).append(ligament.name)
+            continue
+        taken.append(
+            Bundle(
+                ligament.name,
+                _end(femur[0]),
+                _end(tibia[-1]),
+                ligament.stiffness_N,
+                ligament.slack_length_m,
+            )
+        )
+    if taken:
+        said.append(
+            f"{len(taken)} femorotibial ligament strands taken, straight from end to end "
+            "(wraps on bone are left out)"
+        )
+    for reason, names in out.items():
+        said.append(f"ligaments left out, {reason}: {some_names(names)}")
+    return tuple(taken)
+
+
+def _reason_against(ligament: Ligament, fixed: int) -> str:
+    if not ligament.enabled:
+        return "switched off in the model"
+    if fixed != 2 or len(ligament.path.points) != 2:
+        return "which run by more than two points"
+    if ligament.stiffness_N is None:
+        return f"of class {ligament.kind}, whose law the scene does not have"
+    if ligament.transition_strain is None or abs(ligament.transition_strain - TOE) > 1e-6:
+        return f"whose toe does not end at a strain of {TOE}"
+    return ""
+
+
+def _name_muscles(links: Links, said: list[str]) -> None:
+    """Say which muscles cross the knee and do not act."""
+    leg = links.leg
+    across = [
+        muscle.name
+        for muscle in leg.model.muscles.values()
+        if {p.body for p in muscle.path.points} & {*leg.tibia, *leg.foot}
+        and {p.body for p in muscle.path.points} & {*leg.femur, leg.pelvis}
+    ]
+    if across:
+        said.append(
+            f"{len(across)} muscles run from thigh or pelvis to the shank; none but the "
+            f"quadriceps line acts: {some_names(across)}"
+        )
+
+
+def some_names(names: list[str], most: int = 8) -> str:
+    """Return the first names, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,0 +1,174 @@
+"""A trial: markers or coordinates, which way the subject faces, which plates bear the foot."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.io.importing.anatomy import OTHER, Leg, way_to_pelvis
+from tkamb.io.importing.ground import common_interval, find_ground
+from tkamb.io.importing.links import Links
+from tkamb.io.importing.markers import (
+    Facing,
+    ModelSegment,
+    facing,
+    feet,
+    model_segments,
+    seen_segments,
+)
+from tkamb.io.importing.model_motion import MOTION_FILE, ModelMotion, model_feet, model_motion
+from tkamb.io.importing.plates import marked_feet
+from tkamb.io.importing.recorded_poses import RecordedPoses
+from tkamb.io.importing.request import ImportRequest
+from tkamb.io.importing.scene_text import GroundFile, MarkerFile
+from tkamb.io.importing.shank import ShankMarkers, shank_markers
+from tkamb.io.recordings.c3d import read_c3d
+from tkamb.io.recordings.tables import Table
+
+FRAMES_PER_CUTOFF = 5.0
+"""Frames per period of the cut-off: what is low-passed holds nothing between them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What a recording gives: markers or coordinates, ground reaction, and lines on them."""
+
+    ground: GroundFile | None
+    said: tuple[str, ...]
+    markers: MarkerFile | None = None
+    motion: ModelMotion | None = None
+    poses: RecordedPoses | None = None
+    shank: ShankMarkers | None = None
+
+
+def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> Trial:
+    """Return a recording of markers: C3D with its plates, or markers and a table of forces.
+
+    Raises:
+        InputError: markers, plates or interval that cannot be used.
+    """
+    segments = model_segments(links, recorded, request.without)
+    seen = _facing(request, segments, recorded)
+    feet_there = marked_feet(recorded, seen.axes, feet(leg, recorded, OTHER[leg.side]))
+    found = find_ground(request, leg.side, seen.axes, feet_there)
+    time = recorded.time()
+    interval, joined = common_interval(time, found.interval, found.span)
+    interval, frames, thinned = _thinned(time, interval, request.cutoff_Hz)
+    markers = MarkerFile(
+        request.recording,
+        seen.axes,
+        tuple(segments),
+        request.method,
+        "hinge",
+        interval,
+        frames,
+        recorded.length_unit if recorded.unit_given else None,
+        request.prefix is not None,
+    )
+    matched = [*_notices(request, recorded), *_segment_lines(segments, request.without)]
+    said = (*matched, _facing_line(request, seen), *found.said, *joined, thinned)
+    return Trial(found.ground, said, markers)
+
+
+def from_poses(
+    request: ImportRequest, leg: Leg, links: Links, recorded: Table, poses: RecordedPoses
+) -> Trial:
+    """Return recorded poses of the knee, with a recording of markers that place the shank.
+
+    Raises:
+        InputError: markers or plates that cannot be used.
+    """
+    segments = seen_segments(links, recorded, request.without)
+    seen = _facing(request, [s for s in segments.values() if len(s.points) >= 3], recorded)
+    stance = poses.femur[poses.in_stance]
+    shank = shank_markers(links, segments, stance, request.recording, seen.axes)
+    covered = replace(request, interval=(float(poses.time[0]), float(poses.time[-1])))
+    feet_there = marked_feet(recorded, seen.axes, feet(leg, recorded, OTHER[leg.side]))
+    found = find_ground(covered, leg.side, seen.axes, feet_there)
+    matched = [*_notices(request, recorded), *_segment_lines(segments.values(), request.without)]
+    said = (*poses.said, *matched, _facing_line(request, seen), *shank.said, *found.said)
+    return Trial(found.ground, said, poses=poses, shank=shank)
+
+
+def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> Trial:
+    """Return a motion in the model's own coordinates.
+
+    Raises:
+        InputError: no flexion of the knee in it, or a ground reaction of no foot.
+    """
+    for joint in way_to_pelvis(leg):
+        if joint.unread:
+            raise InputError(joint.unread)
+    motion = model_motion(links, recorded)
+    said = [f"motion: the model's coordinates in {recorded.path.name}, into {MOTION_FILE}"]
+    if motion.missing:
+        said.append(f"not in the motion, so at their defaults: {', '.join(motion.missing)}")
+    said += [*_notices(request, recorded), *motion.said]
+    there = model_feet(links, recorded) if request.grf is not None else None
+    found = find_ground(request, leg.side, "+x,+y,+z", there)
+    said += found.said
+    if found.ground is not None:
+        said.append("laboratory: the model's ground, x forward, y up")
+    interval, joined = common_interval(motion.time, found.interval, found.span)
+    if interval is not None:
+        motion = motion.part(*interval)
+    return Trial(found.ground, (*said, *joined), motion=motion)
+
+
+def _notices(request: ImportRequest, recorded: Table) -> list[str]:
+    """Return lines on what of the recording is not used or was read otherwise than stated."""
+    notices = recorded.notices
+    if recorded.path.suffix.lower() == ".c3d":
+        notices = read_c3d(recorded.path, request.units).all_notices
+    return [f"notice: {recorded.path.name}: {notice}" for notice in notices]
+
+
+def _facing(request: ImportRequest, segments: list[ModelSegment], recorded: Table) -> Facing:
+    if request.laboratory_axes is not None:
+        return Facing(request.laboratory_axes, np.nan, np.nan)
+    return facing(segments, recorded)
+
+
+def _facing_line(request: ImportRequest, seen: Facing) -> str:
+    line = f"laboratory: forward, up, right are the file's {seen.axes}"
+    if request.laboratory_axes is not None:
+        return line + ", as given"
+    return line + (
+        f" (the subject faces {seen.forward_deg:.0f} deg off that axis and leans by "
+        f"{seen.up_deg:.0f} deg, on average)"
+    )
+
+
+def _segment_lines(segments: Iterable[ModelSegment], without: tuple[str, ...]) -> list[str]:
+    lines = []
+    for segment in segments:
+        missing = f"; not recorded: {', '.join(segment.missing)}" if segment.missing else ""
+        own = ", ".join(segment.points) or "none"
+        lines.append(f"markers of the {segment.name}: {own}{missing}")
+    return lines + ([f"markers left out, as given: {', '.join(without)}"] if without else [])
+
+
+def _thinned(
+    time: Array, interval: tuple[float, float] | None, cutoff_Hz: float
+) -> tuple[tuple[float, float], int | None, str]:
+    """Return interval and number of frames at about five times the cut-off, and a line on it.
+
+    The frames are every k-th of the recording, at its own times.
+    """
+    start, end = interval or (float(time[0]), float(time[-1]))
+    inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
+    if len(inside) < 2:
+        raise InputError(
+            f"has no two frames between {start:g} and {end:g} s", "--interval", "choose another"
+        )
+    rate = 1.0 / float(np.median(np.diff(inside)))
+    every = max(int(rate / (FRAMES_PER_CUTOFF * cutoff_Hz) + 1e-9), 1)
+    count = (len(inside) - 1) // every + 1
+    even = np.ptp(np.diff(inside)) < 1e-6
+    if every == 1 or not even or count < 8:
+        return (float(inside[0]), float(inside[-1])), None, f"frames: all {len(inside)}"
+    last = float(inside[(count - 1) * every])
+    line = f"frames: every {every}th of the recording, {count} at {rate / every:g} Hz"
+    return (float(inside[0]), last), count, line

@@ -1,0 +1,130 @@
+"""Files made from a mesh: the lattice of an insert, and one of several bodies."""
+
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import trimesh
+
+from tkamb.atomic import replaced_file
+from tkamb.contact.lattice.meshing.grid import Lattice
+from tkamb.contact.lattice.meshing.quality import LatticeQuality, measure_quality
+from tkamb.contact.lattice.meshing.whole import whole_lattice
+from tkamb.contact.registry import COARSEST_MM
+from tkamb.errors import InputError
+from tkamb.geometry.flat_bottom import insert_placement
+from tkamb.geometry.topology import separate_bodies
+from tkamb.io.recordings.mesh_check import mended_mesh
+from tkamb.io.recordings.meshes import axes_rotation, load_surface, mirrored
+from tkamb.io.vtk import write_lattice
+from tkamb.units import MILLIMETRE
+
+BODY_FORMATS = (".stl", ".ply", ".obj")
+
+
+@dataclass(frozen=True, eq=False)
+class LatticeReport:
+    """A lattice, how good it is and where it was written.
+
+    Args:
+        lattice: in the insert frame.
+        quality: its measures.
+        out: the .vtu file, None when none was asked for.
+        side: of the knee; a left insert's lattice is its mirror image.
+    """
+
+    lattice: Lattice
+    quality: LatticeQuality
+    out: Path | None
+    side: str
+
+    def lines(self) -> list[str]:
+        """Return the report as lines of text."""
+        left = "; the left insert's mirror image" if self.side == "left" else ""
+        written = [] if self.out is None else [f"written to {self.out}{left}"]
+        return [*self.quality.lines(), *written]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report for JSON; SI units, angles in rad."""
+        values = asdict(self.quality)
+        return {
+            **values,
+            "volume_error": self.quality.volume_error,
+            "out": self.out and str(self.out),
+            "mirrored": self.side == "left",
+        }
+
+
+def lattice_of_file(
+    insert: str | Path,
+    resolution_mm: float,
+    units: str = "mm",
+    axes: str = "+x,+y,+z",
+    side: str = "right",
+    out: str | Path | None = None,
+) -> LatticeReport:
+    """Build the lattice of an insert's mesh and write it as .vtu if `out` is given.
+
+    Args:
+        insert: STL, OBJ or PLY file, closed.
+        resolution_mm: wanted edge of a cell.
+        units: of the mesh: "m", "cm", "mm" or "inch".
+        axes: mesh axes that point anterior, superior and right.
+        side: of the knee; a left one is mirrored.
+        out: .vtu file (metres, insert frame).
+
+    Raises:
+        InputError: bad file, unit, axes, side or resolution, or a mesh that is open.
+    """
+    if out is not None and Path(out).suffix != ".vtu":
+        raise InputError(f"'{out}' is no .vtu file", "out", "name it like lattice.vtu")
+    if not 0 < resolution_mm <= COARSEST_MM:
+        mend = f"give more than 0, at most {COARSEST_MM:g} mm"
+        raise InputError(f"resolution {resolution_mm} mm", "mesh lattice", mend)
+    surface = load_surface(insert, units, axes, name="insert", closed=True)
+    if side == "left":
+        surface = mirrored(surface)
+    elif side != "right":
+        raise InputError(f"'{side}' is no side", "side", "give right or left")
+    surface = surface.moved(insert_placement(surface, axes_rotation(axes)))
+    lattice = whole_lattice(surface, resolution_mm * MILLIMETRE)
+    if out is not None:
+        write_lattice(lattice, out)
+    return LatticeReport(
+        lattice, measure_quality(lattice, surface), None if out is None else Path(out), side
+    )
+
+
+def write_body(path: str | Path, number: int, out: str | Path) -> str:
+    """Write a separate body of a mesh, mended as loading would, in the file's units and axes.
+
+    Args:
+        path: the mesh.
+        number: of the body, as `tkamb mesh check` counts: 1 is the one with the largest skin.
+        out: a new file, .stl, .ply or .obj.
+
+    Returns:
+        What was written, in a line.
+
+    Raises:
+        InputError: the mesh cannot be read, it has no such body, or `out` is there already, of
+            another format, or cannot be written.
+    """
+    out = Path(out)
+    if out.suffix.lower() not in BODY_FORMATS:
+        raise InputError(f"is none of {', '.join(BODY_FORMATS)}", out, "name a file that ends so")
+    if os.path.exists(out):
+        raise InputError("is there already", out, "give a new file: nothing of yours is replaced")
+    mended, scale = mended_mesh(path)
+    bodies = separate_bodies(mended.vertices, mended.faces)
+    if not 1 <= number <= len(bodies):
+        raise InputError(
+            f"has no body {number}", path, f"it has {len(bodies)}; `tkamb mesh check` lists them"
+        )
+    faces = mended.faces[bodies[number - 1].faces]
+    body = trimesh.Trimesh(mended.vertices / scale, faces, process=False)
+    body.remove_unreferenced_vertices()
+    with replaced_file(out) as temporary:
+        body.export(temporary, file_type=out.suffix.lower()[1:])
+    return f"body {number} of {len(bodies)}, {len(faces)} triangles"

@@ -1,0 +1,231 @@
+"""The taut string over an ellipsoid: straight, a geodesic, straight again.
+
+With the ellipsoid Σ x²/a² = 1, gradient g = x/a², a geodesic x(s) of unit speed v obeys
+
+    x'' = -(v·(v/a²) / g·g) g,
+
+and a neighbour at the distance j across it obeys j'' = -K j with the Gaussian curvature
+K = 1/(a₁a₂a₃ g·g)². Seen from a point P the string can leave for any point of a closed curve
+(the contour, where P lies in the tangent plane); one angle φ along it and the geodesic's
+length s are the unknowns, and the string arrives when Q lies in the tangent plane at its end
+and straight ahead: two equations, solved by Newton's method with the Jacobi field j.
+
+Affine maps keep straight lines and tangency, so that contours and plane sections are circles
+once x is scaled to the unit sphere. The start is the shortest string that stays in one plane
+through P and Q, of all such planes.
+
+Reference: Scholz et al., Multibody Syst Dyn 36:195 (2016), doi:10.1007/s11044-015-9451-1, for
+Newton's method with Jacobi fields.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import DOP853
+
+from tkamb.geometry.compiled import compiled
+from tkamb.geometry.frames import Array
+from tkamb.io.opensim.plane_strings import dot, planar_starts
+
+ITERATIONS = 30
+TOLERANCE = 1e-11
+"""Of the direction in which the string arrives, rad."""
+PAST = 0.05
+"""Of the same: below, a string that arrives backwards is one that has gone too far."""
+
+
+@dataclass(frozen=True, eq=False)
+class Strings:
+    """Strings over an ellipsoid, in its frame.
+
+    Args:
+        entry: (f, 3) m, where they meet it.
+        exit: (f, 3) m, where they leave it.
+        arc_m: (f,) length on it.
+        length_m: (f,) whole length.
+        converged: (f,) whether they are taut.
+    """
+
+    entry: Array
+    exit: Array
+    arc_m: Array
+    length_m: Array
+    converged: NDArray[np.bool_]
+
+
+def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None = None) -> Strings:
+    """Return the shortest strings around an ellipsoid that the straight line would cut.
+
+    Args:
+        start: (f, 3) m, outside.
+        end: (f, 3) m, outside; the segment between them passes through the ellipsoid.
+        axes: (3,) m, semi-axes.
+        half: (3,) direction of the half on which the string must touch; None: either.
+
+    Returns:
+        Strings; where none is taut on that half they have not converged.
+    """
+    count = len(start)
+    contour, pieces, rival = planar_starts(start / axes, end / axes, axes, half)
+    rows = np.concatenate([np.arange(count), np.flatnonzero(rival)])
+    second = np.append(np.zeros(count, int), np.ones(len(rows) - count, int))
+    found = _taut(start[rows], end[rows], axes, contour[rows, second], pieces[rows, second])
+    converged = found.converged
+    if half is not None:
+        converged = converged & ((found.entry + found.exit) @ half > 0.0)
+    lengths = np.full((count, 2), np.inf)
+    lengths[rows, second] = np.where(converged, found.length_m, np.inf)
+    place = np.column_stack([np.arange(count), count + np.cumsum(rival) - 1])
+    chosen = np.where(lengths[:, 1] < lengths[:, 0], place[:, 1], place[:, 0])
+    return Strings(
+        found.entry[chosen],
+        found.exit[chosen],
+        found.arc_m[chosen],
+        found.length_m[chosen],
+        converged[chosen],
+    )
+
+
+def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) -> Strings:
+    """Return the strings that Newton's method finds from a contour point and a length."""
+    p = start / axes
+    squared = (p**2).sum(axis=1, keepdims=True)
+    hub = p / squared
+    radial = contour - hub
+    radial -= (radial * p).sum(axis=1, keepdims=True) * hub
+    size = np.sqrt(np.maximum(1.0 - 1.0 / squared, 0.0))
+    radial *= size / np.maximum(np.linalg.norm(radial, axis=1, keepdims=True), 1e-300)
+    sideways = np.cross(p / np.sqrt(squared), radial)
+    shares = pieces / pieces.sum(axis=1, keepdims=True)
+    angle, arc = np.zeros(len(p)), pieces.sum(axis=1)
+    converged = np.zeros(len(p), bool)
+    limit = 0.3 * axes.max()
+    entry, leave = np.empty_like(start), np.empty_like(start)
+    waiting = np.arange(len(p))
+    for _ in range(ITERATIONS):
+        turned = angle[waiting]
+        shot = _Shot(
+            start[waiting], end[waiting], axes, hub[waiting], radial[waiting], sideways[waiting]
+        )
+        residual, jacobian, entry[waiting], leave[waiting], ahead = shot.fire(
+            turned, arc[waiting, None] * shares[waiting]
+        )
+        small = np.abs(residual).max(axis=1)
+        done = (small < TOLERANCE) & (ahead > 0.0)
+        converged[waiting[done]] = True
+        if done.all():
+            break
+        step = -np.linalg.solve(jacobian[~done], residual[~done][..., None])[..., 0]
+        # a string that would turn back has gone past where it leaves, by as far as it must return
+        past = ((small < PAST) & (ahead <= 0.0))[~done]
+        step[past] = np.column_stack([np.zeros(past.sum()), 2.0 * ahead[~done][past]])
+        waiting = waiting[~done]
+        # A long step is cut short: far from the solution the derivatives mislead.
+        share = np.minimum(1.0, 0.4 / np.maximum(np.abs(step[:, 0]), 1e-300))
+        share = np.minimum(share, limit / np.maximum(np.abs(step[:, 1]), 1e-300))
+        angle[waiting] += share * step[:, 0]
+        arc[waiting] = np.maximum(arc[waiting] + share * step[:, 1], -limit)
+    converged &= arc > -TOLERANCE
+    straight = np.linalg.norm(entry - start, axis=1) + np.linalg.norm(end - leave, axis=1)
+    return Strings(entry, leave, arc, straight + arc, converged)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """Geodesics from the contour of `start`, and how far they miss `end`."""
+
+    start: Array
+    end: Array
+    axes: Array
+    hub: Array
+    radial: Array
+    sideways: Array
+
+    def fire(self, angle: Array, pieces: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """Return residuals (f, 2), their derivatives (f, 2, 2), entries and exits (f, 3).
+
+        Last how far ahead `end` lies (f,) m: where that is negative, the string would turn back.
+        """
+        cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+        entry = self.axes * (self.hub + cosine * self.radial + sine * self.sideways)
+        moved = self.axes * (cosine * self.sideways - sine * self.radial)
+        distance = np.linalg.norm(entry - self.start, axis=1, keepdims=True)
+        ahead = (entry - self.start) / distance
+        across = (np.cross(_normal(entry, self.axes)[0], ahead) * moved).sum(axis=1)
+        state = np.column_stack([entry, ahead, across, across / distance[:, 0]])
+        _follow_geodesics(state, pieces, self.axes, DOP853.A, DOP853.B)
+        leave, direction = state[:, :3], state[:, 3:6]
+        field, rate = state[:, 6], state[:, 7]
+        normal, slope = _normal(leave, self.axes)
+        binormal = np.cross(normal, direction)
+        rest = self.end - leave
+        reach = np.linalg.norm(rest, axis=1, keepdims=True)
+        rest = rest / reach
+        shift = (moved * ahead).sum(axis=1)[:, None] * direction + field[:, None] * binormal
+        by_arc, by_angle = (self._turn(v, normal, slope) for v in (direction, shift))
+        residual = np.stack([dot(rest, normal), dot(rest, binormal)], axis=1)
+        jacobian = np.empty((len(angle), 2, 2))
+        jacobian[:, 0, 0] = dot(rest, by_angle)
+        jacobian[:, 0, 1] = dot(rest, by_arc)
+        jacobian[:, 1, 0] = (
+            dot(rest, np.cross(by_angle, direction))
+            - field / reach[:, 0]
+            - rate * dot(rest, direction)
+        )
+        jacobian[:, 1, 1] = dot(rest, np.cross(by_arc, direction))
+        return residual, jacobian, entry, leave, reach[:, 0] * dot(rest, direction)
+
+    def _turn(self, velocity: Array, normal: Array, slope: Array) -> Array:
+        """Return the rate (f, 3) of the unit normal where a point moves with a velocity."""
+        bent = velocity / self.axes**2
+        return (bent - dot(bent, normal)[:, None] * normal) / slope[:, None]
+
+
+def _normal(points: Array, axes: Array) -> tuple[Array, Array]:
+    """Return outward unit normals (f, 3) and the length (f,) of x/a²."""
+    gradient = points / axes**2
+    slope = np.linalg.norm(gradient, axis=1)
+    return gradient / slope[:, None], slope
+
+
+@compiled
+def _follow_geodesics(
+    states: Array, pieces: Array, axes: Array, weights: Array, last_weights: Array
+) -> None:
+    """Carry states (f, 8) = (x, v, j, j') along to the ends of their geodesics.
+
+    Args:
+        states: at the starts; written.
+        pieces: (f, STEPS) m, lengths of the steps of a Runge-Kutta rule.
+        axes: (3,) m.
+        weights: (s, s) of the rule's stages before each stage.
+        last_weights: (s,) of all stages in a step.
+    """
+    count = len(last_weights)
+    stages, here, gradient = np.empty((count, 8)), np.empty(8), np.empty(3)
+    inverse_squares = 1.0 / axes**2
+    curvature = inverse_squares[0] * inverse_squares[1] * inverse_squares[2]
+    for n in range(len(states)):
+        state = states[n]
+        for step in pieces[n]:
+            for k in range(count):
+                for i in range(8):
+                    here[i] = state[i]
+                for before in range(k):
+                    share = step * weights[k, before]
+                    for i in range(8):
+                        here[i] += share * stages[before, i]
+                squared = bend = 0.0
+                for i in range(3):
+                    gradient[i] = here[i] * inverse_squares[i]
+                    squared += gradient[i] * gradient[i]
+                    bend += here[3 + i] * here[3 + i] * inverse_squares[i]
+                for i in range(3):
+                    stages[k, i] = here[3 + i]
+                    stages[k, 3 + i] = -bend / squared * gradient[i]
+                stages[k, 6] = here[7]
+                stages[k, 7] = -curvature / (squared * squared) * here[6]
+            for k in range(count):
+                for i in range(8):
+                    state[i] += step * last_weights[k] * stages[k, i]

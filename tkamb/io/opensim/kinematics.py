@@ -1,0 +1,286 @@
+"""Where an OpenSim model's bodies are, and how points move with its coordinates.
+
+Everything is computed for many coordinate sets at once: q has shape (..., n), in the order of
+`model.coordinates`. With J the twist of a body per unit of each coordinate, in ground and at
+ground's origin (angular above linear velocity), a point p of it moves with
+
+    ∂p/∂q = J_linear + J_angular × p.
+
+A joint adds to its outboard body's twist one column per axis: for a rotation by u(q) about
+the line through c along d, (d, c × d) du/dq; for a translation (0, d) du/dq; with the sign
+turned where the joint is passed backwards.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, inverse, pose
+from tkamb.io.opensim.functions import Linear
+from tkamb.io.opensim.model import GROUND, JointAxis, OpenSimModel
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Bodies in ground at coordinate sets of leading shape (...).
+
+    Args:
+        bodies: names, ground first.
+        poses: (..., b, 4, 4) of each body in ground.
+        twists: (..., b, 6, n) twist at ground's origin per unit of each coordinate.
+        axes: (..., a, 6) twist of child against parent frame per unit of each joint axis.
+    """
+
+    bodies: dict[str, int]
+    poses: Array
+    twists: Array
+    axes: Array
+
+    def points(self, bodies: Sequence[str], locations: ArrayLike) -> tuple[Array, Array]:
+        """Return points of bodies in ground and their Jacobian.
+
+        Args:
+            bodies: m names.
+            locations: (m, 3) or (..., m, 3) m, in the bodies.
+
+        Returns:
+            Positions (..., m, 3) m, and their derivatives (..., m, 3, n) by the coordinates.
+        """
+        index = [self.bodies[name] for name in bodies]
+        poses, twists = self.poses[..., index, :, :], self.twists[..., index, :, :]
+        rotated = np.einsum("...ij,...j->...i", poses[..., :3, :3], np.asarray(locations, float))
+        positions = rotated + poses[..., :3, 3]
+        return positions, velocities(twists, positions)
+
+
+def velocities(twists: Array, positions: Array) -> Array:
+    """Return ∂p/∂q (..., 3, n) of points (..., 3) that move with twists (..., 6, n)."""
+    return twists[..., 3:, :] + np.cross(twists[..., :3, :], positions[..., None], axis=-2)
+
+
+class Kinematics:
+    """The chain of an OpenSim model, prepared for many evaluations.
+
+    Args:
+        model: the model.
+    """
+
+    def __init__(self, model: OpenSimModel) -> None:
+        self.model = model
+        self.coordinates = {name: k for k, name in enumerate(model.coordinates)}
+        self.bodies = {name: k for k, name in enumerate((GROUND, *model.bodies))}
+        self._axes = [a for j in model.joints for a in (*j.rotations, *j.translations)]
+        # What a linear function needs is one product for all axes; the rest is added after.
+        self._gradients = np.zeros((len(self._axes), len(self.coordinates)))
+        self._offsets = np.zeros(len(self._axes))
+        self._curved: list[tuple[int, int, JointAxis]] = []
+        for k, axis in enumerate(self._axes):
+            if axis.coordinate is None:
+                self._offsets[k] = axis.function(np.zeros(1))[0]
+            elif isinstance(axis.function, Linear):
+                self._gradients[k, self.coordinates[axis.coordinate]] = axis.function.gradient
+                self._offsets[k] = axis.function.offset
+            else:
+                self._curved.append((k, self.coordinates[axis.coordinate], axis))
+        directions = np.array([axis.direction for axis in self._axes]).reshape(-1, 3)
+        self._directions = directions
+        self._crosses = np.cross(directions[:, None, :], -np.eye(3)[None])
+        self._squares = self._crosses @ self._crosses
+        self._index_joints(model)
+
+    def _index_joints(self, model: OpenSimModel) -> None:
+        """Keep what the joints' axes belong to, and the frames at both ends of each joint."""
+        joints = model.joints
+        self._ends = [(self.bodies[j.inboard], self.bodies[j.outboard]) for j in joints]
+        self._backwards = np.array([j.backwards for j in joints], bool).reshape(-1, 1, 1)
+        parent = np.array([j.pose_parent_frame for j in joints]).reshape(-1, 4, 4)
+        child = np.array([j.pose_child_frame for j in joints]).reshape(-1, 4, 4)
+        self._inboard_frames = np.where(self._backwards, child, parent)
+        self._outboard_frames = inverse(np.where(self._backwards, parent, child))
+        counts = [(len(j.rotations), len(j.translations)) for j in joints]
+        self._owner = np.repeat(np.arange(len(joints)), [r + t for r, t in counts])
+        rank = [k for r, t in counts for k in (*range(r), *[-1] * t)]  # of rotations
+        self._turning = np.array(rank, int) >= 0
+        self._ranks = [
+            np.flatnonzero(np.array(rank) == k) for k in range(max(rank, default=-1) + 1)
+        ]
+        self._sums = (self._owner == np.arange(len(joints))[:, None]).astype(float)
+        self._signs = np.where(self._backwards[self._owner, 0, 0], -1.0, 1.0)
+        self._signed_gradients = self._signs[:, None] * self._gradients
+
+    def vector(self, q: Mapping[str, float] | ArrayLike) -> Array:
+        """Return coordinates (..., n); a mapping fills in what it names over the defaults.
+
+        Raises:
+            InputError: an unknown coordinate or a wrong number of them.
+        """
+        if isinstance(q, Mapping):
+            values = np.array([c.default for c in self.model.coordinates.values()])
+            for name, value in q.items():
+                if name not in self.coordinates:
+                    raise InputError(f"has no coordinate '{name}'", self.model.name)
+                values[self.coordinates[name]] = value
+            return values
+        values = np.asarray(q, float)
+        if values.shape[-1:] != (len(self.coordinates),):
+            given = values.shape[-1] if values.ndim else 1
+            wanted = f"{len(self.coordinates)} coordinates, {given} are given"
+            raise InputError(f"has {wanted}", self.model.name)
+        return values
+
+    def coupled(self, q: Mapping[str, float] | ArrayLike) -> Array:
+        """Return the coordinates (..., n) with those that follow others set from them."""
+        values = self.vector(q).copy()
+        for coupler in self.model.couplers:
+            independent = values[..., self.coordinates[coupler.independent]]
+            values[..., self.coordinates[coupler.dependent]] = coupler.function(independent)
+        return values
+
+    def coupling(self, q: ArrayLike) -> Array:
+        """Return ∂q/∂q (..., n, n): one coordinate's own change, and that of what follows it.
+
+        The column of a coordinate that follows another is zero: it is none of its own.
+        """
+        values = self.vector(q)
+        result = np.broadcast_to(np.eye(values.shape[-1]), (*values.shape, values.shape[-1])).copy()
+        for coupler in self.model.couplers:
+            dependent = self.coordinates[coupler.dependent]
+            independent = self.coordinates[coupler.independent]
+            slope = coupler.function.slope(values[..., independent])
+            result[..., dependent, :] = slope[..., None] * result[..., independent, :]
+        return result
+
+    def poses(self, q: Mapping[str, float] | ArrayLike) -> Array:
+        """Return the poses (..., b, 4, 4) of ground and all bodies in ground."""
+        return self._chain(self.axis_values(self.vector(q)))[0]
+
+    def motion(self, q: Mapping[str, float] | ArrayLike) -> Motion:
+        """Return poses and twists of ground and all bodies."""
+        q = self.vector(q)
+        poses, axis_twists = self._chain(self.axis_values(q))
+        slopes = self.axis_slopes(q)
+        twists = np.zeros((*q.shape[:-1], len(self.bodies), 6, q.shape[-1]))
+        first = 0
+        for joint in self.model.joints:
+            last = first + len(joint.rotations) + len(joint.translations)
+            added = axis_twists[..., first:last, :].swapaxes(-1, -2) @ slopes[..., first:last, :]
+            inboard, outboard = self.bodies[joint.inboard], self.bodies[joint.outboard]
+            sign = -1.0 if joint.backwards else 1.0
+            twists[..., outboard, :, :] = twists[..., inboard, :, :] + sign * added
+            first = last
+        return Motion(self.bodies, poses, twists, axis_twists)
+
+    def joint_twists(self, q: Array) -> tuple[Array, Array]:
+        """Return poses of all bodies, and what each coordinate does to its own joint alone.
+
+        Args:
+            q: (..., n) coordinates.
+
+        Returns:
+            Poses (..., b, 4, 4) in ground; twists (..., n, 6) in ground, at its origin, of all
+            that hangs on the coordinate's joint, per unit of it (zero without a joint).
+        """
+        poses, axes = self._chain(self.axis_values(q))
+        twists = self._signed_gradients.T @ axes
+        for k, c, axis in self._curved:
+            sign = self._signs[k]
+            twists[..., c, :] += sign * axis.function.slope(q[..., c])[..., None] * axes[..., k, :]
+        return poses, twists
+
+    def axis_values(self, q: Array) -> Array:
+        """Return the angles and translations u (..., a) of all joint axes."""
+        values = q @ self._gradients.T + self._offsets
+        for k, c, axis in self._curved:
+            values[..., k] = axis.function(q[..., c])
+        return values
+
+    def axis_slopes(self, q: Array) -> Array:
+        """Return du/dq (..., a, n)."""
+        slopes = np.broadcast_to(self._gradients, (*q.shape[:-1], *self._gradients.shape)).copy()
+        for k, c, axis in self._curved:
+            slopes[..., k, c] = axis.function.slope(q[..., c])
+        return slopes
+
+    def axis_rates(self, q: Array, rates: Array, accelerations: Array) -> tuple[Array, Array]:
+        """Return du/dt and d²u/dt² (..., a) from the coordinates' own (..., n)."""
+        slopes = self.axis_slopes(q)
+        speeds = (slopes @ rates[..., None])[..., 0]
+        second = (slopes @ accelerations[..., None])[..., 0]
+        for k, c, axis in self._curved:
+            second[..., k] += axis.function.curvature(q[..., c]) * rates[..., c] ** 2
+        return speeds, second
+
+    def _chain(self, values: Array) -> tuple[Array, Array]:
+        """Return body poses (..., b, 4, 4) and each axis's twist in ground (..., a, 6).
+
+        What a joint does is computed for all joints at once; only its place in the chain is
+        found joint by joint, from ground outwards.
+        """
+        moved, before = self._joint_poses(values)
+        steps = np.where(self._backwards, inverse(moved), moved)
+        steps = self._inboard_frames @ steps @ self._outboard_frames
+        poses = np.zeros((*values.shape[:-1], len(self.bodies), 4, 4))
+        poses[..., 0, :, :] = np.eye(4)
+        for k, (inboard, outboard) in enumerate(self._ends):
+            poses[..., outboard, :, :] = poses[..., inboard, :, :] @ steps[..., k, :, :]
+        inner = [inboard for inboard, _ in self._ends]
+        to_frame = poses[..., inner, :, :] @ self._axis_frames(moved)
+        centre = (to_frame @ moved)[..., :3, 3]
+        spins = (to_frame[..., self._owner, :3, :3] @ before[..., None])[..., 0]
+        twists = np.zeros((*values.shape, 6))
+        turning, centres = self._turning, centre[..., self._owner[self._turning], :]
+        twists[..., turning, :3] = spins[..., turning, :]
+        twists[..., turning, 3:] = cross(centres, spins[..., turning, :])
+        twists[..., ~turning, 3:] = spins[..., ~turning, :]
+        return poses, twists
+
+    def _axis_frames(self, moved: Array) -> Array:
+        """Return the frames (..., j, 4, 4) in which joints' axes stand, in the inboard bodies.
+
+        The frame on the parent; where the joint is passed backwards that is the outer one.
+        """
+        return np.asarray(
+            np.where(self._backwards, self._inboard_frames @ inverse(moved), self._inboard_frames)
+        )
+
+    def _joint_poses(self, values: Array) -> tuple[Array, Array]:
+        """Return child frames in parent frames (..., j, 4, 4), axes in parent frames (..., a, 3).
+
+        A joint's rotations by u follow each other, each I + sin u K + (1 - cos u) K².
+        """
+        sine = np.sin(values)[..., None, None]
+        versine = 2.0 * np.sin(0.5 * values)[..., None, None] ** 2
+        turns = np.eye(3) + sine * self._crosses + versine * self._squares
+        shape = values.shape[:-1]
+        rotation = np.broadcast_to(np.eye(3), (*shape, len(self._ends), 3, 3)).copy()
+        before = np.broadcast_to(self._directions, (*shape, *self._directions.shape)).copy()
+        for axes in self._ranks:  # first rotations of all joints, then second, then third
+            owners = self._owner[axes]
+            here = rotation[..., owners, :, :]
+            before[..., axes, :] = (here @ self._directions[axes][..., None])[..., 0]
+            rotation[..., owners, :, :] = here @ turns[..., axes, :, :]
+        shift = np.where(self._turning, 0.0, values)[..., None] * self._directions
+        return pose(rotation, self._sums @ shift), before
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Return a × b of (..., 3): numpy's own takes three times as long."""
+    x, y, z = np.moveaxis(a, -1, 0)
+    u, v, w = np.moveaxis(b, -1, 0)
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
+
+
+def frame_poses(model: OpenSimModel, q: Mapping[str, float] | ArrayLike) -> dict[str, Array]:
+    """Return each body's pose (..., 4, 4) in ground, ground among them.
+
+    Args:
+        model: the model.
+        q: coordinates (..., n) in the order of `model.coordinates`, or some of them by name;
+            the others stand at their defaults.
+    """
+    kinematics = Kinematics(model)
+    poses = kinematics.poses(q)
+    return {name: poses[..., k, :, :] for name, k in kinematics.bodies.items()}

@@ -1,0 +1,232 @@
+"""Lengths and moment arms of muscles and ligaments, by the virtual work of a taut string.
+
+A unit tension pulls each point that the string passes by the change of its direction there,
+and so it does the wrap objects at the places where it meets and leaves them. With the wrench
+w_b of all these on body b and its twist J_b per unit of the coordinates,
+
+    -dL/dq = Σ_b w_b · J_b,
+
+the moment arms about q. That is exact where the string is taut, since sliding along a surface
+does not change its length to first order. Path points that move in their body add the work
+of the pull on their own motion.
+
+Reference: Sherman, Seth & Delp, Proc ASME IDETC (2013), doi:10.1115/DETC2013-13633.
+"""
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.io.opensim.kinematics import Kinematics, Motion
+from tkamb.io.opensim.lines import ConditionalPathPoint, Ligament, MovingPathPoint, Muscle, Path
+from tkamb.io.opensim.strings import strings_over
+from tkamb.io.opensim.tension import StraightParts, Tension
+from tkamb.io.opensim.wrapping import Index
+
+CONDITION_SLACK = 1e-5
+"""rad or m by which OpenSim widens the range of a conditional point."""
+
+FRAMES_AT_ONCE = 256
+"""Keeps the arrays of one evaluation to some tens of megabytes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Taut paths at coordinate sets of leading shape (...).
+
+    Args:
+        names: m muscles or ligaments.
+        lengths_m: (..., m); NaN where no taut string was found.
+        moment_arms: (..., m, n) -dL/dq, m per rad or per m, coordinates in the model's order.
+    """
+
+    names: tuple[str, ...]
+    lengths_m: Array
+    moment_arms: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Pulls(Lines):
+    """Taut paths, and what unit tension in them does to g groups of bodies.
+
+    Args:
+        wrenches: (..., m, g, 6) moment above force, N per N and N·m per N, on each group, in
+            ground at ground's origin.
+        crossings: straight parts from one group to another; `bodies` holds groups, -1 for
+            bodies of no group.
+    """
+
+    wrenches: Array
+    crossings: StraightParts
+
+
+class LineSet:
+    """Muscles and ligaments of an OpenSim model, prepared for many poses.
+
+    Args:
+        kinematics: of the model.
+        names: which of its muscles and ligaments; None: all muscles.
+
+    Raises:
+        InputError: a name that is neither.
+    """
+
+    def __init__(self, kinematics: Kinematics, names: Iterable[str] | None = None) -> None:
+        self.kinematics, model = kinematics, kinematics.model
+        self.names = tuple(model.muscles if names is None else names)
+        owners: dict[str, Muscle | Ligament] = {**model.ligaments, **model.muscles}
+        for name in self.names:
+            if name not in owners:
+                raise InputError(f"has no muscle or ligament '{name}'", model.name)
+        paths: list[Path] = [owners[name].path for name in self.names]
+        self._paths = paths
+        self._points = [point for path in paths for point in path.points]
+        self._first = np.cumsum([0] + [len(path.points) for path in paths])[:-1]
+        owner = np.repeat(np.arange(len(paths)), [len(path.points) for path in paths])
+        self._body = np.array([kinematics.bodies[point.body] for point in self._points], int)
+        self._last = np.append(np.flatnonzero(np.diff(owner)), len(owner) - 1)
+        self._owner = owner
+        self._locations = np.array(
+            [np.zeros(3) if isinstance(p, MovingPathPoint) else p.location for p in self._points]
+        )
+
+    def at(self, q: Mapping[str, float] | ArrayLike) -> Lines:
+        """Return lengths and moment arms at coordinates q (..., n)."""
+        q = self.kinematics.vector(q)
+        chunks = [self._measure(chunk)[:2] for _, chunk in self._chunks(q)]
+        length, arm = self._joined(q, *zip(*chunks, strict=True))
+        return Lines(self.names, length, arm)
+
+    def pulls(self, q: Mapping[str, float] | ArrayLike, groups: Sequence[Collection[str]]) -> Pulls:
+        """Return lengths, moment arms, wrenches on groups of bodies and where paths cross.
+
+        Args:
+            q: (..., n) coordinates.
+            groups: names of the bodies that move together, g times.
+        """
+        q = self.kinematics.vector(q)
+        group = np.full(len(self.kinematics.bodies), -1)
+        for k, bodies in enumerate(groups):
+            group[[self.kinematics.bodies[name] for name in bodies]] = k
+        member = (group[:, None] == np.arange(len(groups))).astype(float)
+        lengths, arms, wrenches, parts = [], [], [], []
+        for first, chunk in self._chunks(q):
+            length, arm, work = self._measure(chunk)
+            lengths.append(length)
+            arms.append(arm)
+            wrenches.append(np.einsum("fmbi,bg->fmgi", work.wrenches, member))
+            part = work.parts()
+            ends = group[part.bodies]
+            part = StraightParts(part.frame + first, part.line, ends, part.ends)
+            parts.append(part.chosen(np.flatnonzero(ends[:, 0] != ends[:, 1])))
+        length, arm, wrench = self._joined(q, lengths, arms, wrenches)
+        return Pulls(self.names, length, arm, wrench, StraightParts.joined(parts))
+
+    def _chunks(self, q: Array) -> Iterator[tuple[int, Array]]:
+        """Yield (first, q (f, n)) of a few frames at a time."""
+        flat = q.reshape(-1, q.shape[-1])
+        for first in range(0, len(flat), FRAMES_AT_ONCE):
+            yield first, flat[first : first + FRAMES_AT_ONCE]
+
+    def _joined(self, q: Array, *columns: Sequence[Array]) -> list[Array]:
+        """Return chunks (f, m, ...) put together again, with the leading shape of q."""
+        whole = [np.concatenate(parts) for parts in columns]
+        return [values.reshape(*q.shape[:-1], *values.shape[1:]) for values in whole]
+
+    def _measure(self, q: Array) -> tuple[Array, Array, Tension]:
+        """Return lengths (f, m), moment arms (f, m, n) and tensions at q (f, n)."""
+        motion = self.kinematics.motion(q)
+        locations, rates = self._own_motion(q)
+        poses = motion.poses[:, self._body]
+        points = np.einsum("fkij,fkj->fki", poses[..., :3, :3], locations) + poses[..., :3, 3]
+        follower = self._followers(q)
+        rows, here = np.nonzero(follower >= 0)
+        there = follower[rows, here]
+        wrapped = np.zeros(len(rows), bool)
+        count = len(self.names), len(self.kinematics.bodies)
+        work = Tension(points, self._owner, self._body, count)
+        for path, first in zip(self._paths, self._first, strict=True):
+            for k in range(first, first + len(path.points) - 1) if path.wraps else ():
+                chosen = here == k
+                wrapped |= chosen
+                self._wrap(path, first, k, rows[chosen], there[chosen], motion, work)
+        straight = ~wrapped
+        work.pull(rows[straight], here[straight], there[straight])
+        work.press_points()
+        shape = len(q), len(self.names), -1
+        twists = motion.twists.reshape(len(q), -1, q.shape[1])
+        arms = work.wrenches.reshape(shape) @ twists
+        for k, c, rate in rates:
+            moved = np.einsum("fij,fj->fi", poses[:, k, :3, :3], rate)
+            arms[:, self._owner[k], c] += (work.pulls[:, k] * moved).sum(axis=1)
+        lengths = np.add.reduceat(work.lengths, self._first, axis=1)
+        arms[np.isnan(lengths)] = np.nan
+        return lengths, arms, work
+
+    def _own_motion(self, q: Array) -> tuple[Array, list[tuple[int, int, Array]]]:
+        """Return points (f, k, 3) in their bodies, and (point, coordinate, dp/dq (f, 3))."""
+        locations = np.broadcast_to(self._locations, (len(q), *self._locations.shape)).copy()
+        rates = []
+        for k, point in enumerate(self._points):
+            if isinstance(point, MovingPathPoint):
+                for axis, (name, function) in enumerate(
+                    zip(point.coordinates, point.functions, strict=True)
+                ):
+                    c = -1 if name is None else self.kinematics.coordinates[name]
+                    value = np.zeros(len(q)) if name is None else q[:, c]
+                    locations[:, k, axis] = function(value)
+                    if name is not None:
+                        rates.append((k, c, np.outer(function.slope(value), np.eye(3)[axis])))
+        return locations, rates
+
+    def _followers(self, q: Array) -> Index:
+        """Return the next active point (f, k) of each active one on its path; -1: none."""
+        follower = np.full((len(q), len(self._points)), -1)
+        ends = set(self._last.tolist())
+        upcoming = np.full(len(q), -1)
+        for k in range(len(self._points) - 1, -1, -1):
+            if k in ends:
+                upcoming = np.full(len(q), -1)
+            point = self._points[k]
+            if isinstance(point, ConditionalPathPoint):
+                value = q[:, self.kinematics.coordinates[point.coordinate]]
+                low, high = point.range
+                active = (value >= low - CONDITION_SLACK) & (value <= high + CONDITION_SLACK)
+                follower[:, k] = np.where(active, upcoming, -1)
+                upcoming = np.where(active, k, upcoming)
+            else:
+                follower[:, k] = upcoming
+                upcoming = np.full(len(q), k)
+        return follower
+
+    def _wrap(
+        self,
+        path: Path,
+        first: int,
+        k: int,
+        rows: Index,
+        there: Index,
+        motion: Motion,
+        work: Tension,
+    ) -> None:
+        """Add the strings from point k to points `there` of some rows, over the path's wraps."""
+        objects = self.kinematics.model.wrap_objects
+        usable = [w for w in path.wraps if first + w.first <= k and objects[w.wrap_object].active]
+        wraps = [objects[w.wrap_object] for w in usable]
+        if not wraps:
+            work.pull(rows, np.full(len(rows), k), there)
+            return
+        bodies = [self.kinematics.bodies[wrap.body] for wrap in wraps]
+        poses = motion.poses[rows[:, None], np.array(bodies)] @ np.stack(
+            [wrap.pose for wrap in wraps]
+        )
+        allowed = there[:, None] <= first + np.array([w.last for w in usable])
+        start, end = work.points[rows, k], work.points[rows, there]
+        ends = np.stack([np.full(len(rows), self._body[k]), self._body[there]], axis=1)
+        moves = ends[:, None, :] != np.array(bodies)[:, None]
+        found = strings_over(wraps, poses, start, end, allowed, moves)
+        work.pull_wrapped(rows, k, there, found, np.array(bodies))

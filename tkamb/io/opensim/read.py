@@ -1,0 +1,273 @@
+"""An .osim file read into an OpenSimModel; OpenSim itself is not needed.
+
+Both layouts are read: that of OpenSim 4 (sockets, offset frames, sets of joints) and the older
+one (joints nested in their bodies), and sets that stand in files of their own. What cannot be
+read is refused by name, or, in a partial reading, listed in `unread` for whoever needs it; forces
+and the like that play no part here are listed in `left_out`.
+"""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.io.opensim.document import open_document
+from tkamb.io.opensim.elements import Document, Element
+from tkamb.io.opensim.functions import Scaled
+from tkamb.io.opensim.model import (
+    GROUND,
+    Body,
+    ConstantDistance,
+    Coordinate,
+    CoordinateCoupler,
+    Marker,
+    OpenSimModel,
+    Unread,
+)
+from tkamb.io.opensim.read_joints import Frames, outwards, read_joints
+from tkamb.io.opensim.read_paths import read_forces, read_wrap_objects
+
+UNITS = {
+    "length_units": ("meters", "meter", "metres", "metre", "m"),
+    "force_units": ("n", "newton", "newtons"),
+}
+"""Spellings of metre and newton in public models."""
+
+OLDEST_VERSION = 20302
+"""Of OpenSim 2.3.2; what is older names things differently."""
+
+
+MASSLESS = 2e-14
+"""kg; a body of less has no inertia, whatever the file says (OpenSim's Body::getInertia)."""
+
+
+def read_osim(path: str | Path, partial: bool = False) -> OpenSimModel:
+    """Return the model in an .osim file.
+
+    Args:
+        path: the file.
+        partial: list joints, constraints, forces, wrap objects and markers that cannot be read
+            in `unread` instead of refusing the file. A joint of which only the motion cannot be
+            read holds its bodies still.
+
+    Raises:
+        InputError: no such file, no OpenSim model, or something in it that cannot be read.
+    """
+    path = Path(path)
+    root, notices = open_document(path)
+    document, model = _opened(root, path, partial)
+    bodies = _bodies(document, model)
+    frames = Frames.of(document, model, (GROUND, *bodies))
+    joints, coordinates = read_joints(document, model, frames)
+    wraps = read_wrap_objects(document, model)
+    muscles, ligaments, left_out = read_forces(document, model, frames, coordinates, wraps)
+    couplers, distances, not_enforced = _constraints(document, model, frames, coordinates)
+    left_out = [*left_out, *not_enforced]
+    for tag in ("ContactGeometrySet", "ControllerSet", "ProbeSet", "ComponentSet"):
+        left_out += [f"{e.tag} '{e.get('name', '')}'" for e in document.objects(model, tag)]
+    ordered = outwards(document, joints, bodies)
+    markers = _markers(document, model, frames)
+    return OpenSimModel(
+        name=model.get("name", path.stem),
+        gravity=document.numbers(model, "gravity", count=3, default="0 -9.80665 0"),
+        bodies=bodies,
+        joints=ordered,
+        coordinates=coordinates,
+        couplers=couplers,
+        constant_distances=distances,
+        markers=markers,
+        muscles=muscles,
+        ligaments=ligaments,
+        wrap_objects=wraps,
+        offset_frames={
+            name: frames.resolve(model, name, owner)
+            for owner, name in frames.offsets
+            if owner in bodies
+        },
+        left_out=tuple(left_out),
+        unread=tuple(
+            Unread(e.tag, e.get("name", ""), reason, _concerns(e, frames, coordinates))
+            for e, reason in document.unread
+        ),
+        notices=tuple(notices),
+    )
+
+
+def _concerns(
+    element: Element, frames: Frames, coordinates: Mapping[str, Coordinate]
+) -> frozenset[str]:
+    """Return bodies and coordinates that are named anywhere in an element."""
+    texts = [part for e in element.iter() for part in ((e.text or ""), e.get("name", ""))]
+    words = {word for text in texts for word in text.replace("/", " ").split()}
+    named = {word for word in words if word in frames.bodies or word in coordinates}
+    own = element.get("name", "")
+    for owner, name in frames.offsets:
+        if name in words and (owner == own or (own, name) not in frames.offsets):
+            with suppress(InputError):
+                named.add(frames.resolve(element, name, owner)[0])
+    return frozenset(named - {GROUND})
+
+
+def _opened(root: Element, path: Path, partial: bool) -> tuple[Document, Element]:
+    """Return the document and its <Model>, of a version that can be read."""
+    model = root.find("Model")
+    if root.tag != "OpenSimDocument" or model is None:
+        raise InputError(f"is not an OpenSim model: its root is <{root.tag}>", path)
+    version = root.get("Version", "")
+    if not version.isdigit() or int(version) < OLDEST_VERSION:
+        raise InputError(
+            f"has Version '{version}', {OLDEST_VERSION} (OpenSim 2.3.2) is the oldest that is read",
+            path,
+            "open it in OpenSim 3.3 or 4 and save it",
+        )
+    for tag, units in UNITS.items():
+        found = (model.findtext(tag) or units[0]).strip()
+        if found.lower() not in (*units, ""):
+            hint = "scale the model to metres and newtons in OpenSim"
+            raise InputError(f"has {tag} '{found}', only '{units[0]}' is read", path, hint)
+    defaults = root.find("defaults")
+    defaults = model.find("defaults") if defaults is None else defaults
+    by_class = {} if defaults is None else {e.tag: e for e in defaults}
+    return Document(path, by_class, partial), model
+
+
+def _bodies(document: Document, model: Element) -> dict[str, Body]:
+    bodies: dict[str, Body] = {}
+    for element in document.objects(model, "BodySet"):
+        name = document.name(element)
+        if element.tag != "Body":
+            raise InputError("is a kind of body that is not read", document.where(element))
+        if name in bodies:
+            raise InputError("is there twice", document.where(element), "rename one")
+        if name != GROUND:
+            mass = document.number(element, "mass")
+            centre = document.numbers(element, "mass_center", count=3, default="0 0 0")
+            if mass < 0.0:
+                raise InputError(f"has a mass of {mass:g} kg", document.where(element))
+            inertia = _inertia(document, element) if mass > MASSLESS else np.zeros((3, 3))
+            bodies[name] = Body(name, mass, centre, inertia)
+    if not bodies:
+        raise InputError("has no bodies", document.path)
+    return bodies
+
+
+def _inertia(document: Document, element: Element) -> Array:
+    """Return the (3, 3) inertia about the mass centre, from either layout."""
+    if document.find(element, "inertia") is not None:
+        xx, yy, zz, xy, xz, yz = document.numbers(element, "inertia", count=6)
+    else:
+        keys = ("xx", "yy", "zz", "xy", "xz", "yz")
+        xx, yy, zz, xy, xz, yz = (
+            document.number(element, f"inertia_{key}", default=0.0) for key in keys
+        )
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _constraints(
+    document: Document, model: Element, frames: Frames, coordinates: Mapping[str, Coordinate]
+) -> tuple[tuple[CoordinateCoupler, ...], tuple[ConstantDistance, ...], list[str]]:
+    couplers: list[CoordinateCoupler] = []
+    distances: list[ConstantDistance] = []
+    not_enforced = []
+    for element in document.objects(model, "ConstraintSet"):
+        with document.reading(element):
+            enforced = document.flag(element, "isEnforced", True)
+            enforced = enforced and not document.flag(element, "isDisabled", False)
+            if element.tag == "ConstantDistanceConstraint":
+                distances.append(_constant_distance(document, element, frames, enforced))
+            elif not enforced:
+                not_enforced.append(f"{element.tag} '{element.get('name', '')}' (not enforced)")
+            elif element.tag == "CoordinateCouplerConstraint":
+                coupler = _coupler(document, element, coordinates)
+                _check_follower(document, element, coupler, couplers)
+                couplers.append(coupler)
+            else:
+                raise InputError(
+                    "is a constraint that is not read",
+                    document.where(element),
+                    "CoordinateCouplerConstraint and ConstantDistanceConstraint are",
+                )
+    return _followers_last(couplers), tuple(distances), not_enforced
+
+
+def _check_follower(
+    document: Document, element: Element, new: CoordinateCoupler, others: list[CoordinateCoupler]
+) -> None:
+    """Raise where a coordinate would follow two, or, over others, itself."""
+    leads = {coupler.dependent: coupler.independent for coupler in others}
+    if new.dependent in leads:
+        raise InputError(
+            f"lets '{new.dependent}' follow a second coordinate", document.where(element)
+        )
+    above: str | None = new.independent
+    while above is not None and above != new.dependent:
+        above = leads.get(above)
+    if above is not None:
+        raise InputError(f"lets '{new.dependent}' follow itself", document.where(element))
+
+
+def _followers_last(couplers: list[CoordinateCoupler]) -> tuple[CoordinateCoupler, ...]:
+    """Return the couplers such that each stands after the one that moves its independent."""
+    ordered: list[CoordinateCoupler] = []
+    waiting = list(couplers)
+    while waiting:
+        still_to_be_set = {coupler.dependent for coupler in waiting}
+        ready = [c for c in waiting if c.independent not in still_to_be_set]
+        ordered += ready
+        waiting = [c for c in waiting if c not in ready]
+    return tuple(ordered)
+
+
+def _coupler(
+    document: Document, element: Element, coordinates: Mapping[str, Coordinate]
+) -> CoordinateCoupler:
+    independent = document.text(element, "independent_coordinate_names").split()
+    dependent = document.text(element, "dependent_coordinate_name")
+    for name in (*independent, dependent):
+        if name not in coordinates:
+            raise InputError(
+                f"names a coordinate '{name}' that is not there", document.where(element)
+            )
+    function = document.held_function(element, "coupled_coordinates_function")
+    if len(independent) != 1 or function is None:
+        raise InputError("needs one independent coordinate and a function", document.where(element))
+    scale = document.number(element, "scale_factor", default=1.0)
+    scaled = function if scale == 1.0 else Scaled(function, scale)
+    return CoordinateCoupler(element.get("name", ""), dependent, independent[0], scaled)
+
+
+def _constant_distance(
+    document: Document, element: Element, frames: Frames, enforced: bool
+) -> ConstantDistance:
+    ends = []
+    for k in (1, 2):
+        socket = document.socket(element, f"body_{k}", f"body_{k}")
+        location = document.numbers(element, f"location_body_{k}", count=3, default="0 0 0")
+        ends.append(frames.point(element, socket, location))
+    (body_1, point_1), (body_2, point_2) = ends
+    distance = document.number(element, "constant_distance")
+    name = element.get("name", "")
+    return ConstantDistance(name, (body_1, body_2), (point_1, point_2), distance, enforced)
+
+
+def _markers(document: Document, model: Element, frames: Frames) -> dict[str, Marker]:
+    markers: dict[str, Marker] = {}
+    for element in document.objects(model, "MarkerSet"):
+        with document.reading(element):
+            name = document.name(element)
+            socket = document.socket(element, "parent_frame", "body")
+            location = document.numbers(element, "location", count=3)
+            fixed = document.flag(element, "fixed", False)
+            marker = Marker(name, *frames.point(element, socket, location), fixed)
+            other = markers.pop(name, None)
+            if other is not None and not _same_place(marker, other):
+                raise InputError("is there twice", document.where(element), "rename one")
+            markers[name] = marker
+    return markers
+
+
+def _same_place(one: Marker, other: Marker) -> bool:
+    return one.body == other.body and np.allclose(one.location, other.location, atol=1e-9, rtol=0)

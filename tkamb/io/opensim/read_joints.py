@@ -1,0 +1,370 @@
+"""Frames and joints of an OpenSim document, and the order in which joints lead out from ground."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, pose, transform
+from tkamb.io.opensim.elements import Document, Element
+from tkamb.io.opensim.functions import Linear
+from tkamb.io.opensim.model import GROUND, Coordinate, Joint, JointAxis
+
+X, Y, Z = np.eye(3)
+
+FRAMES = ("PhysicalOffsetFrame", "StationDefinedFrame")
+"""Frames that hang on a body or on another frame."""
+
+STANDARD_JOINTS: dict[str, tuple[tuple[Array, ...], tuple[Array, ...]]] = {
+    "WeldJoint": ((), ()),
+    "PinJoint": ((Z,), ()),
+    "SliderJoint": ((), (X,)),
+    "UniversalJoint": ((X, Y), ()),
+    "PlanarJoint": ((Z,), (X, Y)),
+    "BallJoint": ((X, Y, Z), ()),
+    "GimbalJoint": ((X, Y, Z), ()),
+    "FreeJoint": ((X, Y, Z), (X, Y, Z)),
+}
+"""Rotation and translation axes, one coordinate each, in this order."""
+
+
+def offset_pose(rotation_xyz: Array, translation: Array) -> Array:
+    """Return the pose (4, 4) with body-fixed x, y, z rotations (rad) and a translation (m)."""
+    return pose(Rotation.from_euler("XYZ", rotation_xyz).as_matrix(), translation)
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Bodies and the offset frames that hang on them.
+
+    A frame's name is only unique within its owner: the same name may stand in several joints
+    with different values. Frames are therefore kept by owner and name.
+
+    Args:
+        document: for messages.
+        bodies: names of the bodies, ground among them.
+        offsets: (owner, frame) -> the frame's own parent and pose in it.
+        unread: frame -> why it could not be read.
+    """
+
+    document: Document
+    bodies: frozenset[str]
+    offsets: Mapping[tuple[str, str], tuple[str, Array]]
+    unread: Mapping[str, str]
+
+    @classmethod
+    def of(cls, document: Document, model: Element, bodies: Iterable[str]) -> "Frames":
+        """Return the frames of a model."""
+        offsets: dict[tuple[str, str], tuple[str, Array]] = {}
+        stations = _stations(document, model)
+        unread: dict[str, str] = {}
+        for owner, element in _held_frames(model, ""):
+            with document.reading(element):
+                name = document.name(element)
+                if element.tag == "StationDefinedFrame":
+                    offsets[owner, name] = _station_defined(document, element, owner, stations)
+                    continue
+                rotation = document.numbers(element, "orientation", count=3, default="0 0 0")
+                translation = document.numbers(element, "translation", count=3, default="0 0 0")
+                parent = document.socket(element, "parent")
+                offsets[owner, name] = (parent, offset_pose(rotation, translation))
+                continue
+            unread[element.get("name", "")] = document.unread[-1][1]
+        return cls(document, frozenset(bodies), offsets, unread)
+
+    def resolve(self, user: Element, socket: str, owner: str = "") -> tuple[str, Array]:
+        """Return the body a socket leads to, and the pose (4, 4) of its frame in that body.
+
+        Args:
+            user: whose socket it is, for messages.
+            socket: "/bodyset/tibia", "tibia", "tibia_offset", "/jointset/knee/tibia_offset" …
+            owner: joint whose own frames go first.
+
+        Raises:
+            InputError: no such frame.
+        """
+        steps = [step for step in socket.split("/") if step not in ("", ".", "..")]
+        in_body = np.eye(4)
+        for _ in range(len(self.offsets) + 1):
+            name = steps[-1] if steps else owner  # ".." is who holds the frame
+            above = steps[-2] if len(steps) > 1 else owner
+            key = (above, name) if (above, name) in self.offsets else ("", name)
+            if key not in self.offsets:
+                if name in self.bodies:
+                    return name, in_body
+                if name in self.unread:
+                    raise InputError(self.unread[name])
+                break
+            parent, pose_in_parent = self.offsets[key]
+            in_body = pose_in_parent @ in_body
+            steps = [step for step in parent.split("/") if step not in ("", ".", "..")]
+            owner = key[0]
+        raise InputError(f"names a frame '{socket}' that is not there", self.document.where(user))
+
+    def point(self, user: Element, socket: str, location: Array) -> tuple[str, Array]:
+        """Return the body a socket leads to, and a point (3,) of the socket's frame in it."""
+        body, in_body = self.resolve(user, socket)
+        return body, transform(in_body, location)
+
+
+def _held_frames(element: Element, owner: str) -> Iterator[tuple[str, Element]]:
+    """Yield every frame in another one with the body, joint or frame that holds it."""
+    for child in element:
+        if child.tag in FRAMES:
+            yield owner, child
+        held = child.tag in ("Body", "Ground", *FRAMES) or child.tag.endswith("Joint")
+        yield from _held_frames(child, child.get("name", "") if held else owner)
+
+
+def _stations(document: Document, model: Element) -> dict[str, list[Element]]:
+    """Return name -> stations and markers of that name, wherever they stand."""
+    found: dict[str, list[Element]] = {}
+    for element in model.iter():
+        if element.tag in ("Station", "Marker"):
+            found.setdefault(element.get("name", ""), []).append(element)
+    return found
+
+
+def _station_defined(
+    document: Document, element: Element, owner: str, stations: Mapping[str, list[Element]]
+) -> tuple[str, Array]:
+    """Return the parent of a frame that four stations define, and its pose (4, 4) there.
+
+    With the points a, b, c: e1 along b - a, e2 along (b - a) × (c - a), e3 = e1 × e2. The frame's
+    axis `ab_axis` lies along e1, `ab_x_ac_axis` along e2, and the third completes them (OpenSim's
+    StationDefinedFrame, https://opensim-org.github.io).
+
+    Raises:
+        InputError: no such station, stations in different frames, or points on a line.
+    """
+    where, points, parents = document.where(element), [], set()
+    for name in ("point_a", "point_b", "point_c", "origin_point"):
+        socket = document.socket(element, name)
+        there = stations.get(socket.rstrip("/").split("/")[-1], [])
+        own = [s for s in there if s in element.iter()] or there
+        if len(own) != 1:
+            raise InputError(f"names a station '{socket}' that is there {len(own)} times", where)
+        points.append(document.numbers(own[0], "location", count=3))
+        parents.add(document.socket(own[0], "parent_frame", "body", default=".."))
+    if len(parents) != 1:
+        raise InputError("has stations in different frames, which is not read", where)
+    a, b, c, origin = points
+    normal = np.cross(b - a, c - a)
+    if np.linalg.norm(normal) < 1e-12:
+        raise InputError("has its stations on one line", where)
+    basis = np.zeros((3, 3))
+    named = []
+    for tag, default, vector in (("ab_axis", "+x", b - a), ("ab_x_ac_axis", "+y", normal)):
+        text = document.text(element, tag, default=default).lower()
+        if text.lstrip("+-") not in ("x", "y", "z"):
+            raise InputError(f"<{tag}>{text}</{tag}> is no axis", where)
+        axis, sign = "xyz".index(text[-1]), -1.0 if text[0] == "-" else 1.0
+        basis[:, axis] = sign * vector / np.linalg.norm(vector)
+        named.append(axis)
+    if named[0] == named[1]:
+        raise InputError("has its two axes along one", where)
+    third = 3 - sum(named)
+    basis[:, third] = np.cross(basis[:, (third + 1) % 3], basis[:, (third + 2) % 3])
+    parent = parents.pop()
+    return owner if parent.strip("/") == ".." else parent, pose(basis, origin)
+
+
+def read_joints(
+    document: Document, model: Element, frames: Frames
+) -> tuple[list[Joint], dict[str, Coordinate]]:
+    """Return the joints and coordinates in the file's order.
+
+    Raises:
+        InputError: a joint that is not read or does not make sense.
+    """
+    joints: list[Joint] = []
+    coordinates: dict[str, Coordinate] = {}
+    for element, child in _joint_elements(document, model):
+        with document.reading(element):
+            joint, own = _joint(document, element, frames, child)
+            if twice := [name for name in own if name in coordinates]:
+                where = f"{document.where(element)}: Coordinate '{twice[0]}'"
+                raise InputError("is there twice", where, "rename one")
+            joints.append(joint)
+            coordinates |= own
+    return joints, coordinates
+
+
+def _joint(
+    document: Document, element: Element, frames: Frames, child: str | None
+) -> tuple[Joint, dict[str, Coordinate]]:
+    """Return a joint and its coordinates; in a partial reading one that holds still, if need be."""
+    (parent, in_parent), (body, in_child) = _joint_frames(document, element, frames, child)
+    entries = [*document.objects(element, "CoordinateSet"), *element.findall("coordinates/*")]
+    names = [document.name(entry) for entry in entries]
+    axes: tuple[tuple[JointAxis, ...], tuple[JointAxis, ...]] = ((), ())
+    read_before = len(document.unread)
+    with document.reading(element):
+        custom = element.tag == "CustomJoint"
+        axes = (_custom_axes if custom else _standard_axes)(document, element, names)
+    unread = "; ".join(reason for _, reason in document.unread[read_before:])
+    name = document.name(element)
+    moved = {axis.coordinate for kind in axes for axis in kind}
+    own = {}
+    for entry in entries:
+        coordinate = _coordinate(document, entry, name, axes[0])
+        if coordinate.name in own:
+            raise InputError("is there twice", document.where(entry), "rename one")
+        still = coordinate.name not in moved  # it moves nothing: none that a motion could find
+        own[coordinate.name] = replace(coordinate, locked=True) if still else coordinate
+    return Joint(name, element.tag, parent, body, in_parent, in_child, *axes, unread=unread), own
+
+
+def _joint_elements(document: Document, model: Element) -> Iterator[tuple[Element, str | None]]:
+    """Yield each joint; in the old layout with the body that it stands in, its child."""
+    for element in document.objects(model, "JointSet"):
+        yield element, None
+    for body in document.objects(model, "BodySet"):
+        for element in (*body.findall("Joint/*"), *body.findall("joint/*")):
+            yield element, document.name(body)
+
+
+def _joint_frames(
+    document: Document, element: Element, frames: Frames, child: str | None
+) -> tuple[tuple[str, Array], tuple[str, Array]]:
+    """Return (body, pose of the joint's frame in it) for parent and child."""
+    if child is None:
+        name = document.name(element)
+        sockets = (document.socket(element, f"{end}_frame") for end in ("parent", "child"))
+        parent_frame, child_frame = (frames.resolve(element, s, name) for s in sockets)
+        return parent_frame, child_frame
+    if document.flag(element, "reverse", False):
+        raise InputError("has <reverse>, which is not read", document.where(element))
+    values = [
+        document.numbers(element, tag, count=3, default="0 0 0")
+        for tag in ("orientation_in_parent", "location_in_parent", "orientation", "location")
+    ]
+    parent, _ = frames.resolve(element, document.socket(element, "parent_body", "parent_body"))
+    return (parent, offset_pose(*values[:2])), (child, offset_pose(*values[2:]))
+
+
+def _standard_axes(
+    document: Document, element: Element, names: list[str]
+) -> tuple[tuple[JointAxis, ...], tuple[JointAxis, ...]]:
+    axes = STANDARD_JOINTS.get(element.tag)
+    if axes is None:
+        raise InputError(
+            "is a joint that is not read",
+            document.where(element),
+            f"CustomJoint, {', '.join(STANDARD_JOINTS)} are",
+        )
+    rotations, translations = axes
+    if len(names) != len(rotations) + len(translations):
+        wanted = len(rotations) + len(translations)
+        raise InputError(f"has {len(names)} coordinates, not {wanted}", document.where(element))
+    made = [
+        JointAxis(axis, name, Linear(1.0, 0.0))
+        for axis, name in zip((*rotations, *translations), names, strict=True)
+    ]
+    return tuple(made[: len(rotations)]), tuple(made[len(rotations) :])
+
+
+def _custom_axes(
+    document: Document, element: Element, names: list[str]
+) -> tuple[tuple[JointAxis, ...], tuple[JointAxis, ...]]:
+    """Return the axes of a <SpatialTransform>, those that never move anything left out."""
+    kinds: dict[str, list[JointAxis]] = {"rotation": [], "translation": []}
+    transform_element = document.find(element, "SpatialTransform")
+    if transform_element is None:
+        raise InputError("has no <SpatialTransform>", document.where(element))
+    for k, entry in enumerate(transform_element.findall("TransformAxis")):
+        axis = _axis(document, element, entry, names)
+        if k >= 6:
+            raise InputError("has more than six axes", document.where(element))
+        at_rest = axis.coordinate is None and axis.function(np.zeros(1))[0] == 0.0
+        if not at_rest:
+            kinds["rotation" if k < 3 else "translation"].append(axis)
+    return tuple(kinds["rotation"]), tuple(kinds["translation"])
+
+
+def _axis(document: Document, joint: Element, entry: Element, names: list[str]) -> JointAxis:
+    where = f"{document.where(joint)}: {entry.get('name', 'axis')}"
+    used = document.text(entry, "coordinates", "coordinate", default=" ").split()
+    direction = document.numbers(entry, "axis", count=3)
+    length = float(np.linalg.norm(direction))
+    function = document.held_function(entry, "function")
+    if length == 0.0:
+        raise InputError("has an axis of no length", where)
+    if len(used) > 1 or any(name not in names for name in used):
+        raise InputError(f"'{' '.join(used)}' is not one of the joint's coordinates", where)
+    if function is None:
+        function = Linear(1.0 if used else 0.0, 0.0)
+    return JointAxis(direction / length, used[0] if used else None, function)
+
+
+def _coordinate(
+    document: Document, entry: Element, joint: str, rotations: tuple[JointAxis, ...]
+) -> Coordinate:
+    low, high = document.numbers(entry, "range", count=2, default="-10 10")
+    return Coordinate(
+        name=document.name(entry),
+        joint=joint,
+        rotational=any(_is_angle_of(axis, entry.get("name", "")) for axis in rotations),
+        default=document.number(entry, "default_value", default=0.0),
+        range=(float(low), float(high)),
+        clamped=document.flag(entry, "clamped", False),
+        locked=document.flag(entry, "locked", False),
+    )
+
+
+def _is_angle_of(axis: JointAxis, coordinate: str) -> bool:
+    """Say whether a coordinate is a rotation's own angle; one that only drives it is not."""
+    function = axis.function
+    straight = isinstance(function, Linear) and abs(function.gradient) == 1.0
+    return axis.coordinate == coordinate and straight
+
+
+def outwards(document: Document, joints: list[Joint], bodies: Iterable[str]) -> tuple[Joint, ...]:
+    """Return the joints in an order that leads out from ground, each the way it is passed.
+
+    In a partial reading a joint that closes a loop is left out, and a body that nothing joins to
+    ground stands still in it, held by a joint that is marked as unread.
+
+    Raises:
+        InputError: a loop, or a body that no chain of joints joins to ground.
+    """
+    path = document.path
+    reached, waiting, ordered = {GROUND}, list(joints), []
+    while waiting:
+        for joint in waiting:
+            forwards, backwards = joint.parent in reached, joint.child in reached
+            if forwards or backwards:
+                waiting.remove(joint)
+                if not (forwards and backwards):
+                    ordered.append(replace(joint, backwards=backwards))
+                    reached |= {joint.parent, joint.child}
+                    break
+                closing = Element(joint.kind, {"name": joint.name})
+                closing.text = f"{joint.parent} {joint.child}"
+                with document.reading(closing):
+                    raise InputError(f"joint '{joint.name}' closes a loop, which is not read", path)
+                break
+        else:
+            joint = waiting[0]
+            reason = f"joint '{joint.name}' is not joined to ground"
+            _hold_still(document, joint.parent, reason, ordered)
+            reached.add(joint.parent)
+    for body in bodies:
+        if body not in reached:
+            _hold_still(document, body, f"body '{body}' has no joint", ordered, "add one")
+    return tuple(ordered)
+
+
+def _hold_still(
+    document: Document, body: str, reason: str, ordered: list[Joint], hint: str | None = None
+) -> None:
+    """Weld a body to ground in a partial reading, and record why; else raise."""
+    weld = Element("WeldJoint", {"name": f"{body} held still"})
+    weld.text = body
+    with document.reading(weld):
+        raise InputError(reason, document.path, hint)
+    why = document.unread[-1][1]
+    name = weld.get("name", "")
+    ordered.append(Joint(name, weld.tag, GROUND, body, np.eye(4), np.eye(4), (), (), unread=why))

@@ -1,0 +1,439 @@
+"""The container of a C3D file: header, parameters, and the numbers of its frames.
+
+Everything is read with bounds from one block of bytes, so that a damaged file ends in one
+message. Nothing here knows what a marker or a force plate is; `tkamb.io.recordings.c3d` does.
+
+A file begins with a header of 512 bytes. Its parameter section is a chain of records: a group,
+or a parameter with type, dimensions and values. Its data section holds frame after frame: four
+words per marker (x, y, z, residual and cameras), then the analog samples of that frame, channel
+by channel. Words are 16-bit integers or 32-bit floats, by the sign of the scale, in the number
+format of the machine that wrote the file.
+
+Format: C3D user guide, https://www.c3d.org.
+"""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+
+BLOCK = 512
+"""Bytes of a block: the unit in which the format counts places."""
+LARGEST_16_BIT = 65535
+"""The largest frame number that the header can hold; longer recordings state theirs in TRIAL."""
+EXPORT = "export the trial again as C3D"
+MOST_DIMENSIONS = 7
+"""Of a parameter, by the format."""
+_KEY = 0x50
+_DEC, _MIPS, _INTEL = 85, 86, 84
+_SIZES = {-1: 1, 1: 1, 2: 2, 4: 4}
+"""Type of a parameter -> bytes per value: text, byte, integer, float."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the first block says.
+
+    Args:
+        markers: per frame.
+        analog: analog values per frame.
+        samples: analog samples per channel and frame.
+        first: number of the first frame, from 1.
+        last: number of the last frame.
+        scale: units per integer; negative: the data are floats.
+        data_block: first block of the data, from 1.
+        rate_Hz: frames per second.
+    """
+
+    markers: int
+    analog: int
+    samples: int
+    first: int
+    last: int
+    scale: float
+    data_block: int
+    rate_Hz: float
+
+    @property
+    def channels(self) -> int:
+        """Analog channels."""
+        return self.analog // self.samples if self.analog else 0
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters:
+    """Groups of named values.
+
+    Args:
+        path: the file, for messages.
+        values: "GROUP:NAME" -> array of numbers (the first index runs fastest in the file), or
+            list of texts.
+        damaged: names of parameters whose record does not hold what it states.
+    """
+
+    path: Path
+    values: dict[str, Any] = field(default_factory=dict)
+    damaged: set[str] = field(default_factory=set)
+
+    def get(self, name: str) -> Any:
+        """Return the values of "GROUP:NAME"; None without.
+
+        Raises:
+            InputError: the parameter is there, but damaged.
+        """
+        if name in self.damaged:
+            raise InputError(f"has a damaged parameter {name}", self.path, EXPORT)
+        return self.values.get(name)
+
+    def number(self, name: str) -> float | None:
+        """Return the first number of a parameter; None without any."""
+        value = self.get(name)
+        if value is None or isinstance(value, list) or not value.size:
+            return None
+        return float(value.ravel(order="F")[0])
+
+    def numbers(self, name: str) -> Array | None:
+        """Return the numbers of a parameter, in the shape that it states; None without any."""
+        value = self.get(name)
+        return None if value is None or isinstance(value, list) else np.asarray(value, float)
+
+    def integers(self, name: str) -> list[int]:
+        """Return whole numbers without sign, as counts are; empty without any."""
+        value = self.numbers(name)
+        found: list[float] = [] if value is None else value.ravel(order="F").tolist()
+        return [int(v) & 0xFFFF if -32768 <= v < 0 else int(v) for v in found if math.isfinite(v)]
+
+    def series(self, name: str) -> Array:
+        """Return NAME, NAME2, ... in one row: each holds at most 255 values."""
+        parts = [self.numbers(key) for key in self._numbered(name)]
+        return np.concatenate([np.empty(0), *(p.ravel(order="F") for p in parts if p is not None)])
+
+    def texts(self, name: str) -> list[str]:
+        """Return NAME, NAME2, ... in one list, stripped."""
+        found: list[str] = []
+        for key in self._numbered(name):
+            value = self.get(key)
+            found += value if isinstance(value, list) else []
+        return found
+
+    def _numbered(self, name: str) -> list[str]:
+        keys = [k for k in (*self.values, *self.damaged) if k.startswith(name)]
+        numbered = {k: k[len(name) :] for k in keys if k == name or k[len(name) :].isdigit()}
+        return sorted(numbered, key=lambda k: int(numbered[k] or 1))
+
+
+@dataclass(frozen=True, eq=False)
+class C3dFile:
+    """The content of a file.
+
+    Args:
+        header: as the file has it.
+        parameters: all groups.
+        first_frame: number of the first frame, counted from zero.
+        points: (n, m, 3) in the file's length unit, gaps NaN.
+        residual: (n, m) in the file's length unit; NaN in gaps.
+        raw_analog: (k, c) analog words before offset and scale.
+        notices: remarks on what was read otherwise than stated.
+    """
+
+    header: Header
+    parameters: Parameters
+    first_frame: int
+    points: Array
+    residual: Array
+    raw_analog: Array
+    notices: tuple[str, ...]
+
+
+def parse_c3d(content: bytes, path: Path) -> C3dFile:
+    """Return what the bytes of a C3D file hold.
+
+    Raises:
+        InputError: not C3D, cut short, or header and parameters that contradict each other.
+    """
+    if len(content) < BLOCK or content[1] != _KEY:
+        raise InputError("is not a C3D file", path, "give a recording in C3D")
+    start = (content[0] - 1) * BLOCK
+    if start < BLOCK or len(content) < start + 4:
+        raise InputError("is cut short: its parameters are missing", path, "copy it again")
+    machine = content[start + 3]
+    if machine not in (_DEC, _MIPS, _INTEL):
+        raise InputError(f"is of an unknown machine ({machine})", path, EXPORT)
+    header = _header(content, machine)
+    end = (header.data_block - 1) * BLOCK
+    records = _parameters(content, start + 4, end if end > start else len(content), machine)
+    parameters = Parameters(path, *records)
+    _check_agreement(header, parameters, path)
+    return _Data(content, header, parameters, machine, path).read()
+
+
+def _header(content: bytes, machine: int) -> Header:
+    """Return the header; numbers that no recording has are left to the checks."""
+    words = np.frombuffer(content, ">u2" if machine == _MIPS else "<u2", 10)
+    scale = _floats(content[12:16], machine)[0]
+    rate = _floats(content[20:24], machine)[0]
+    _, markers, analog, first, last, _, _, _, block, samples = (int(word) for word in words)
+    return Header(markers, analog, samples, first, last, float(scale), block, float(rate))
+
+
+def _floats(content: bytes, machine: int) -> Array:
+    """Return 32-bit floats of a machine; those of DEC have exchanged halves and a bias of two."""
+    if machine != _DEC:
+        kind = ">f4" if machine == _MIPS else "<f4"
+        return np.frombuffer(content, kind).astype(float)
+    halves = np.frombuffer(content, "<u2").reshape(-1, 2)[:, ::-1]
+    return np.ascontiguousarray(halves).view("<f4").ravel().astype(float) / 4.0
+
+
+def _parameters(content: bytes, at: int, end: int, machine: int) -> tuple[dict[str, Any], set[str]]:
+    """Return the values of the chain of records between two places, and those damaged."""
+    order = "big" if machine == _MIPS else "little"
+    groups: dict[int, str] = {}
+    records: list[tuple[int, str, int, int]] = []
+    end = min(end, len(content))
+    while at + 2 <= end:
+        size, group = (int(v) for v in np.frombuffer(content, "i1", 2, at))
+        size = abs(size)
+        link = at + 2 + size
+        if size == 0 or link + 2 > end:
+            break
+        name = _text(content[at + 2 : link]).upper()
+        offset = int.from_bytes(content[link : link + 2], order)  # type: ignore[arg-type]
+        after = link + offset if offset else end
+        if group < 0:
+            groups[-group] = name
+        elif group > 0:
+            records.append((group, name, link + 2, min(after, end)))
+        if offset < 2:
+            break
+        at = after
+    values: dict[str, Any] = {}
+    damaged: set[str] = set()
+    for group, name, first, last in records:
+        key = f"{groups.get(group, group)}:{name}"
+        value = _value(content[first:last], machine)
+        if value is None:
+            damaged.add(key)
+        else:
+            values[key] = value
+    return values, damaged - set(values)
+
+
+def _text(content: bytes) -> str:
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    return text.replace("\x00", " ").strip()
+
+
+def _value(record: bytes, machine: int) -> Any:
+    """Return the values of a parameter's record; None if it does not hold what it states."""
+    if len(record) < 2:
+        return None
+    kind, dimensions = int(np.frombuffer(record, "i1", 1)[0]), record[1]
+    shape = tuple(record[2 : 2 + dimensions])
+    if kind not in _SIZES or len(shape) != dimensions or dimensions > MOST_DIMENSIONS:
+        return None
+    count = math.prod(shape)
+    first = 2 + dimensions
+    body = record[first : first + count * _SIZES[kind]]
+    if len(body) < count * _SIZES[kind]:
+        return None
+    if kind == -1:
+        width = shape[0] if shape else 1
+        rows = count // width if width else 0
+        return [_text(body[k * width : (k + 1) * width]) for k in range(rows)]
+    if kind == 4:
+        return _floats(body, machine).reshape(shape, order="F")
+    number = {1: "i1", 2: ">i2" if machine == _MIPS else "<i2"}[kind]
+    return np.frombuffer(body, number).astype(float).reshape(shape, order="F")
+
+
+def _check_agreement(header: Header, parameters: Parameters, path: Path) -> None:
+    """Raise where header and parameters lay out the data differently."""
+    used = parameters.integers("POINT:USED")
+    if used and used[0] != header.markers:
+        raise InputError(
+            f"holds {header.markers} markers by its header, {used[0]} by POINT:USED", path, EXPORT
+        )
+    if header.analog and (not header.samples or header.analog % header.samples):
+        raise InputError(
+            f"holds {header.analog} analog values a frame in {header.samples} samples", path, EXPORT
+        )
+    channels = parameters.integers("ANALOG:USED")
+    if channels and header.analog and channels[0] != header.channels:
+        raise InputError(
+            f"holds {header.channels} analog channels by its header, {channels[0]} by ANALOG:USED",
+            path,
+            EXPORT,
+        )
+    scale = parameters.number("POINT:SCALE")
+    if not math.isfinite(header.scale) or (header.scale == 0 and header.markers):
+        raise InputError(f"has a scale of {header.scale:g} for its markers", path, EXPORT)
+    stored_otherwise = scale is not None and (scale < 0) != (header.scale < 0)
+    if stored_otherwise and (header.markers or header.analog):
+        raise InputError(
+            "holds floats by its header and integers by POINT:SCALE, or the reverse", path, EXPORT
+        )
+    differs = scale is not None and not math.isclose(scale, header.scale, rel_tol=1e-3)
+    if header.scale > 0 and header.markers and differs:
+        raise InputError(
+            f"has a scale of {header.scale:g} by its header, {scale:g} by POINT:SCALE", path, EXPORT
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Data:
+    """The data section, about to be read."""
+
+    content: bytes
+    header: Header
+    parameters: Parameters
+    machine: int
+    path: Path
+
+    @property
+    def _word(self) -> int:
+        return 4 if self.header.scale < 0 else 2
+
+    @property
+    def _frame(self) -> int:
+        """Bytes of a frame."""
+        return (4 * self.header.markers + self.header.analog) * self._word
+
+    def read(self) -> C3dFile:
+        """Return the file with its frames."""
+        if not self._frame:
+            raise InputError("holds neither markers nor analog channels", self.path, EXPORT)
+        notices: list[str] = []
+        start = self._start(notices)
+        held = max(len(self.content) - start, 0) // self._frame
+        count = self._count(held, notices)
+        words = self._words(self.content[start : start + count * self._frame]).reshape(count, -1)
+        markers = 4 * self.header.markers
+        points, residual = self._points(words[:, :markers].reshape(count, markers // 4, 4))
+        samples = count * self.header.samples if self.header.analog else count
+        analog = words[:, markers:].reshape(samples, self.header.channels)
+        first = self._first()
+        return C3dFile(
+            self.header, self.parameters, first, points, residual, analog, tuple(notices)
+        )
+
+    def _start(self, notices: list[str]) -> int:
+        """Return the first byte of the data; POINT:DATA_START decides where the header fails."""
+        stated = self.parameters.integers("POINT:DATA_START")
+        blocks = list(dict.fromkeys([self.header.data_block, *stated[:1]]))
+        after = self.content[0]
+        usable = [b for b in blocks if b > after and (b - 1) * BLOCK <= len(self.content)]
+        if not usable:
+            raise InputError("is cut short: its data are missing", self.path, "copy it again")
+        fitting = [b for b in usable if self._fits((b - 1) * BLOCK)]
+        if len(blocks) > 1 and len(fitting) != 1 and blocks[1] != 0:
+            raise InputError(
+                f"has its data at block {blocks[0]} by its header, {blocks[1]} by POINT:DATA_START",
+                self.path,
+                EXPORT,
+            )
+        chosen = fitting[0] if fitting else usable[0]
+        if chosen != self.header.data_block:
+            notices.append(f"its data begin at block {chosen}, as POINT:DATA_START says")
+        return (chosen - 1) * BLOCK
+
+    def _fits(self, start: int) -> bool:
+        """Return whether the frames fill the file from a byte on, but for less than a block."""
+        spare = len(self.content) - start - self._stated() * self._frame
+        return 0 <= spare < BLOCK
+
+    def _first(self) -> int:
+        """Return the number of the first frame, from zero."""
+        trial = self.parameters.integers("TRIAL:ACTUAL_START_FIELD")
+        first = self.header.first
+        if len(trial) == 2:
+            number = trial[0] + (LARGEST_16_BIT + 1) * trial[1]
+            if number & LARGEST_16_BIT == first:
+                first = number
+        return max(first - 1, 0)
+
+    def _stated(self) -> int:
+        """Return how many frames the file states.
+
+        TRIAL's two words count beyond 16 bits, as LONG_FRAMES does; POINT:FRAMES is believed
+        where it exceeds them.
+        """
+        wrap = LARGEST_16_BIT + 1
+        begin, end = (
+            self.parameters.integers(f"TRIAL:ACTUAL_{name}_FIELD") for name in ("START", "END")
+        )
+        header = self.header.last - self.header.first + 1
+        if len(begin) == 2 and len(end) == 2:
+            count = end[0] + wrap * end[1] - begin[0] - wrap * begin[1] + 1
+            saturated = self.header.last >= LARGEST_16_BIT
+            if count > 0 and (saturated or (count - header) % wrap == 0):
+                return count
+        for name in ("POINT:LONG_FRAMES", "POINT:FRAMES"):
+            longer = self.parameters.number(name)
+            if longer and math.isfinite(longer) and longer > max(header, LARGEST_16_BIT):
+                return int(longer)
+        return header
+
+    def _count(self, held: int, notices: list[str]) -> int:
+        """Return how many of `held` frames are read.
+
+        Raises:
+            InputError: none, fewer than the file states, or more than 16 bits count.
+        """
+        stated = self._stated()
+        other = self.parameters.integers("POINT:FRAMES")
+        spare = math.ceil(BLOCK / self._frame)
+        if other and other[0] != stated and held - spare <= other[0] <= held != stated:
+            notices.append(f"it holds {other[0]} frames, as POINT:FRAMES says, not {stated}")
+            stated = other[0]
+        uncounted = self.header.last >= LARGEST_16_BIT or held > stated + LARGEST_16_BIT
+        if uncounted and held > stated + spare:
+            raise InputError(
+                f"states {stated} frames, which 16 bits can count, and is long enough for {held}",
+                self.path,
+                "export it with TRIAL:ACTUAL_END_FIELD, or cut the trial",
+            )
+        if stated < 1:
+            raise InputError(f"states {stated} frames", self.path, EXPORT)
+        if held < stated:
+            share = 100.0 * held / stated
+            raise InputError(
+                f"is cut short: it holds {share:.0f} % of its {stated} frames",
+                self.path,
+                "copy it again",
+            )
+        return stated
+
+    def _words(self, body: bytes) -> Array:
+        if self._word == 4:
+            return _floats(body, self.machine)
+        signs = self.parameters.texts("ANALOG:FORMAT")
+        words = np.frombuffer(body, ">i2" if self.machine == _MIPS else "<i2").astype(float)
+        if signs and signs[0].upper() == "UNSIGNED":
+            analog = words.reshape(-1, self._frame // 2)[:, 4 * self.header.markers :]
+            analog[analog < 0] += LARGEST_16_BIT + 1
+        return words
+
+    def _points(self, words: Array) -> tuple[Array, Array]:
+        """Return places (n, m, 3) and residuals (n, m), gaps NaN.
+
+        The fourth word of a marker holds cameras in its high byte and the residual, in units of
+        the scale, in its low byte; it is negative where the marker was not seen.
+        """
+        scale = abs(self.header.scale)
+        places = words[:, :, :3] * (1.0 if self._word == 4 else scale)
+        fourth = words[:, :, 3]
+        known = np.isfinite(fourth) & (np.abs(fourth) < 2**31)
+        low_byte = np.where(known, fourth, 0.0).astype(np.int64) & 0xFF
+        residual = np.asarray(low_byte * scale, float)
+        gap = ~np.isfinite(places).all(axis=2) | (fourth < 0) | (places == 0).all(axis=2)
+        places[gap], residual[gap] = np.nan, np.nan
+        return places, residual

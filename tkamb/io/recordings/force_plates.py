@@ -1,0 +1,311 @@
+"""Force plates of a C3D file: channels to the wrench that the ground exerts on the foot.
+
+A plate's axes follow from its corners, in the order of the format: x from corner 2 to corner 1,
+y from corner 4 to corner 1, z = x × y, down for a plate that lies. The channels give the force
+and the moment about the transducers' origin in these axes:
+
+    type 1   Fx Fy Fz Px Py Tz: the force, its point on the surface and the free moment
+    type 2   Fx Fy Fz Mx My Mz
+    type 3   Fx12 Fx34 Fy14 Fy23 Fz1 Fz2 Fz3 Fz4, with a, b, z0 = ORIGIN:
+             M = (b (Fz1 + Fz2 - Fz3 - Fz4), a (Fz2 + Fz3 - Fz1 - Fz4),
+                  b (Fx34 - Fx12) + a (Fy14 - Fy23))
+    type 4   as type 2 after the calibration matrix (6, 6)
+    type 5   as type 2 after a calibration matrix (6, 8) of eight channels
+
+A calibration matrix gives forces in N (or FORCE_PLATFORM:UNITS) and moments in that unit times
+POINT:UNITS. Where the channels of a type 4 plate themselves state units of force and moment,
+these count; if both readings differ, the one that puts the centre of pressure on the plate does.
+
+With o = ORIGIN from the transducers' origin to the surface's centre the moment there is
+M - o × F. A centre of pressure is a quotient and is left to who knows the threshold.
+
+FORCE_PLATFORM:ZERO names frames in which nobody stands on the plates. The mean of each channel
+over them is subtracted, unless the plate is loaded in them.
+
+Source: C3D user guide, FORCE_PLATFORM; Kistler's formulae for four three-component sensors.
+"""
+
+import logging
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.io.recordings.unit_words import GivenUnits, metres, newton_metres, newtons
+
+CHANNELS = {1: 6, 2: 6, 3: 8, 4: 6, 5: 8}
+"""Plate types that are read -> number of channels."""
+_CALIBRATED = (4, 5)
+_log = logging.getLogger("tkamb")
+
+
+@dataclass(frozen=True)
+class PlateSettings:
+    """What decides how a plate's channels are read.
+
+    Args:
+        steady_N: largest standard deviation of the vertical force over the frames of ZERO; a
+            foot that comes or goes makes more.
+        baseline_N: a vertical force over these frames up to this is drift of the amplifier.
+        baseline_share: so is a larger one that is at most this share of the largest change that
+            the plate shows; who stands on it in these frames makes more.
+        loaded_N: force on a plate that shows where its centre of pressure lies.
+        beside: share of the plate's half width by which that may lie outside the corners.
+    """
+
+    steady_N: float = 10.0
+    baseline_N: float = 20.0
+    baseline_share: float = 0.2
+    loaded_N: float = 100.0
+    beside: float = 0.2
+
+
+SETTINGS = PlateSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class PlateRecord:
+    """What a file says of one plate.
+
+    Args:
+        number: of the plate, from 1.
+        kind: its type, 1 to 5.
+        corners: (4, 3) m.
+        origin: (3,) m, the file's ORIGIN.
+        names: of the channels.
+        signals: (c, k) in the file's units.
+        units: of the channels, as in the file.
+        calibration: (6, c), types 4 and 5: channels to force and moment; None without.
+        force_unit: of calibrated forces.
+        metres_per_unit: of the file's length unit.
+        zero: samples in which the file says that nobody stands on the plate; None: none.
+        given: units that the user states.
+        where: file and plate, for messages.
+    """
+
+    number: int
+    kind: int
+    corners: Array
+    origin: Array
+    names: tuple[str, ...]
+    signals: Array
+    units: tuple[str, ...]
+    calibration: Array | None
+    force_unit: str
+    metres_per_unit: float
+    zero: slice | None
+    given: GivenUnits
+    where: str
+
+
+@dataclass(frozen=True, eq=False)
+class ForcePlate:
+    """One plate, in the axes of the file.
+
+    Args:
+        number: as the file counts, from 1.
+        channels: names of its channels.
+        corners: (4, 3) m, of the surface.
+        force: (k, 3) N, on the foot; NaN where the file has no number.
+        moment: (k, 3) N·m, on the foot, about the centre of the surface.
+        notices: remarks on how it was read.
+    """
+
+    number: int
+    channels: tuple[str, ...]
+    corners: Array
+    force: Array
+    moment: Array
+    notices: tuple[str, ...] = field(default=())
+
+    @property
+    def centre(self) -> Array:
+        """(3,) m, of the surface."""
+        return np.asarray(self.corners.mean(axis=0))
+
+    @property
+    def wrench(self) -> Array:
+        """(k, 6) force (N) and moment about the file's origin (N·m)."""
+        return np.concatenate([self.force, self.moment + np.cross(self.centre, self.force)], axis=1)
+
+
+def force_plate(record: PlateRecord) -> ForcePlate:
+    """Return the wrench that a plate measured.
+
+    Raises:
+        InputError: a type or unit that is not read, too few channels, no surface or no
+            calibration.
+    """
+    kind, where = record.kind, record.where
+    if kind not in CHANNELS:
+        raise InputError(f"is of type {kind}", where, "types 1 to 5 are read")
+    if len(record.signals) < CHANNELS[kind]:
+        have = f"has {len(record.signals)} of {CHANNELS[kind]} channels"
+        raise InputError(have, where, "export again")
+    if not np.isfinite(record.signals).any():
+        raise InputError("holds no value that is a number", where, "export the trial again")
+    axes = _axes(record.corners, where)
+    origin = record.origin
+    if origin[2] > 0 and kind != 1:
+        _log.warning("%s: ORIGIN points below the surface; its sign is taken as turned", where)
+        origin = origin * (np.array([1.0, 1.0, -1.0]) if kind == 3 else -1.0)
+    record = replace(record, origin=origin)
+    force, moment, notices = _read(record)
+    if record.zero is not None:
+        level = record.signals[:, record.zero].mean(axis=1)
+        if kind == 1:
+            level[3:5] = 0.0  # a place has no baseline
+        what = _loaded_in_zero(record, force)
+        if what:
+            notices += (what,)
+        elif np.isfinite(level).all():
+            signals = record.signals - level[:, None]
+            force, moment, notices = _read(replace(record, signals=signals))
+    return ForcePlate(
+        record.number, record.names, record.corners, force @ axes.T, moment @ axes.T, notices
+    )
+
+
+def _loaded_in_zero(record: PlateRecord, force: Array) -> str:
+    """Return why the frames of ZERO are no baseline; empty if they are."""
+    assert record.zero is not None
+    vertical = force[:, 2]
+    window = vertical[record.zero]
+    level, spread = float(window.mean()), float(window.std())
+    change = np.nanmax(np.abs(vertical - level)) if np.isfinite(level) else 0.0
+    drift = abs(level) <= max(SETTINGS.baseline_N, SETTINGS.baseline_share * change)
+    if drift and spread <= SETTINGS.steady_N:
+        return ""
+    return (
+        f"force plate {record.number} bears {abs(level):.0f} N in the frames that "
+        "FORCE_PLATFORM:ZERO calls unloaded: no baseline is subtracted"
+    )
+
+
+def _read(record: PlateRecord) -> tuple[Array, Array, tuple[str, ...]]:
+    """Return force (k, 3) N and moment (k, 3) N·m about the surface's centre, plate's axes."""
+    if record.kind not in _CALIBRATED:
+        signals = record.signals * _scales(record)[:, None]
+        return (*_wrench(record.kind, signals, record.origin), ())
+    matrix = record.calibration
+    stated = _stated_scales(record) if record.kind == 4 else None
+    if matrix is None and stated is not None:
+        matrix = np.eye(6)  # channels that state force and moment are calibrated
+    if matrix is None or matrix.shape != (6, len(record.signals)):
+        what = f"is of type {record.kind} without CAL_MATRIX"
+        raise InputError(what, record.where, "export it with the matrix")
+    unit = newtons(record.given.force or record.force_unit)
+    if unit is None:
+        raise _no_unit(record, record.force_unit, "force_unit", "N")
+    scales = np.repeat([unit, unit * record.metres_per_unit], 3)
+    if record.given.moment is not None:
+        scales[3:] = _given_moment(record)
+    wrench = matrix @ record.signals
+    found = _wrench(2, wrench * scales[:, None], record.origin)
+    if stated is None or np.allclose(stated, scales, rtol=1e-9):
+        return (*found, ())
+    other = _wrench(2, wrench * stated[:, None], record.origin)
+    inside = [_on_plate(record.corners, *one) for one in (found, other)]
+    if inside[0] == inside[1]:
+        raise InputError(
+            f"is of type {record.kind}, and its channels state another unit of moment than "
+            "POINT:UNITS gives",
+            record.where,
+            "state the unit with --moment-unit or [ground_reaction] moment_unit",
+        )
+    return (*(found if inside[0] else other), ())
+
+
+def _on_plate(corners: Array, force: Array, moment: Array) -> bool:
+    """Return whether the centre of pressure lies on the plate while that is loaded."""
+    loaded = np.abs(force[:, 2]) > SETTINGS.loaded_N
+    if not loaded.any():
+        return True
+    half = 0.5 * np.linalg.norm([corners[0] - corners[1], corners[0] - corners[3]], axis=1)
+    point = np.stack([-moment[loaded, 1], moment[loaded, 0]], axis=1) / force[loaded, 2:3]
+    away = np.median(np.abs(point), axis=0) / half
+    return bool((away <= 1.0 + SETTINGS.beside).all() and (away > 1e-3).any())
+
+
+def _wrench(kind: int, s: Array, origin: Array) -> tuple[Array, Array]:
+    """Return force and moment about the surface's centre, each (k, 3), in the plate's axes."""
+    if kind == 3:
+        a, b = origin[0], origin[1]
+        force = np.stack([s[0] + s[1], s[2] + s[3], s[4:8].sum(axis=0)], axis=1)
+        moment = np.stack(
+            [
+                b * (s[4] + s[5] - s[6] - s[7]),
+                a * (s[5] + s[6] - s[4] - s[7]),
+                b * (s[1] - s[0]) + a * (s[2] - s[3]),
+            ],
+            axis=1,
+        )
+        return force, moment - np.cross([0.0, 0.0, origin[2]], force)
+    force = s[:3].T
+    if kind == 1:
+        point = np.stack([s[3], s[4], np.zeros_like(s[3])], axis=1)
+        moment = np.cross(point, force)
+        moment[:, 2] += s[5]
+        return force, moment
+    return force, s[3:6].T - np.cross(origin, force)
+
+
+def _axes(corners: Array, where: str) -> Array:
+    """Return the plate's axes (3, 3) as columns."""
+    x, y = corners[0] - corners[1], corners[0] - corners[3]
+    z = np.cross(x, y)
+    if not np.isfinite(corners).all() or not np.linalg.norm(z) >= 1e-4:
+        raise InputError("has corners that span no surface", where, "export the trial again")
+    y = np.cross(z, x)
+    return np.stack([axis / np.linalg.norm(axis) for axis in (x, y, z)], axis=1)
+
+
+def _stated_scales(record: PlateRecord) -> Array | None:
+    """Return SI per unit of six channels that state force and moment; None if one does not."""
+    readers = (newtons,) * 3 + (newton_metres,) * 3
+    found = [read(unit) for read, unit in zip(readers, record.units, strict=False)]
+    return None if None in found or len(found) < 6 else np.array(found, float)
+
+
+def _given_moment(record: PlateRecord) -> float:
+    unit = newton_metres(record.given.moment or "")
+    if unit is None:
+        raise InputError(f"'{record.given.moment}' is no unit of moment", "moment_unit", "as in Nm")
+    return unit
+
+
+def _scales(record: PlateRecord) -> Array:
+    """Return SI per unit of each channel."""
+    kinds = {1: "fffllm", 3: "ffffffff"}.get(record.kind, "fffmmm")
+    readers = {"f": newtons, "m": newton_metres, "l": metres}
+    keys = {"f": "force_unit", "m": "moment_unit", "l": "length_unit"}
+    given = {"f": record.given.force, "m": record.given.moment, "l": record.given.length}
+    examples = {"f": "N", "m": "Nmm", "l": "mm"}
+    scales = []
+    for quantity, unit in zip(kinds, record.units, strict=False):
+        scale = readers[quantity](unit)
+        said = given[quantity]
+        told = None if said is None else readers[quantity](said)
+        if said is not None and told is None:
+            raise InputError(f"'{said}' is no unit of it", keys[quantity], examples[quantity])
+        if scale is not None and told is not None and quantity != "l" and told != scale:
+            raise InputError(
+                f"has a channel in '{unit}', but {keys[quantity]} says '{said}'",
+                record.where,
+                f"correct {keys[quantity]}",
+            )
+        if scale is None and told is None:
+            raise _no_unit(record, unit, keys[quantity], examples[quantity])
+        scales.append(told if scale is None else scale)
+    return np.array(scales, float)
+
+
+def _no_unit(record: PlateRecord, unit: str, key: str, example: str) -> InputError:
+    stated = f"the unit '{unit}'" if unit else "no unit"
+    option = f"--{key.replace('_', '-')}"
+    return InputError(
+        f"has a channel with {stated} (ANALOG:UNITS), which is not understood",
+        record.where,
+        f"state what it means with {option} or [ground_reaction] {key}, as in {example}",
+    )

@@ -1,0 +1,277 @@
+"""Knee and shank from skin markers: rigid fits and a chain, side by side.
+
+Two readings of the same markers, both computed, one of them used:
+
+- segments: shank and thigh are each fitted rigidly, by themselves. The joint between them may
+  come apart, and by how much says how far the skin has moved.
+- chain: shank, knee, thigh and their neighbours are fitted at once, held together by their
+  joints. Nothing comes apart; the skin's movement is spread over the segments instead.
+
+The neighbour's knee centre as the thigh carries it against the same as the shank carries it is
+their disagreement: it acts on the knee's moments as a lever of that length.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import (
+    MIRROR,
+    Array,
+    inverse,
+    knee_coordinates,
+    transform,
+)
+from tkamb.io.recordings.filtering import Cutoff, differentiate_poses
+from tkamb.io.recordings.inverse_kinematics import ChainFit, fit_chain
+from tkamb.io.recordings.laboratory import laboratory_rotation
+from tkamb.io.recordings.leg_chain import FLEXION, LegChain, LegState, Segment
+from tkamb.io.recordings.markers import WRONG_MARKERS, fit_seen, marker_trajectories
+from tkamb.io.recordings.recordings import MarkerSet, MotionRecording, Side
+from tkamb.io.recordings.tables import Table, read_table
+from tkamb.io.recordings.tibia import BodyMotion
+from tkamb.units import MILLIMETRE
+
+Method = Literal["segments", "chain"]
+KNEE_SEGMENTS = ("shank", "thigh")
+JOINT_APART = 0.1
+"""m; skin moves by a third of this at the hip, the other foot is farther."""
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerKinematics:
+    """What skin markers say of a leg, as a right one's, SI.
+
+    Args:
+        time: (n,) s, frames that `method` could place without a break.
+        method: the reading that is used.
+        tibia: (n, 4, 4) pose_tibia_in_laboratory by it.
+        coordinates: (n, 6) knee coordinates by it.
+        flexion: method -> (n,) rad; NaN where the segments could not be fitted.
+        rms: method -> (n,) m, of the markers: those of shank and thigh, or all of the chain.
+        centre_distance: (n,) m, between the knee centre of the shank's and of the thigh's
+            markers, each segment fitted by itself.
+        missing: (n,) how many markers of shank and thigh are not seen.
+    """
+
+    time: Array
+    method: Method
+    tibia: Array
+    coordinates: Array
+    flexion: dict[Method, Array]
+    rms: dict[Method, Array]
+    centre_distance: Array
+    missing: np.ndarray
+
+    def at(self, values: Array, time: Array) -> Array:
+        """Return values (n,) at other times, between frames linearly."""
+        return np.asarray(np.interp(time, self.time, values))
+
+    def shank_motion(self, cutoff_Hz: Cutoff, time: Array, name: str) -> BodyMotion:
+        """Return the shank in the laboratory, filtered, at the frames' times."""
+        filtered, velocity, acceleration = differentiate_poses(
+            self.time, self.tibia, cutoff_Hz, time, name
+        )
+        residual = self.at(self.rms[self.method], time)
+        return BodyMotion(time, filtered, velocity, acceleration, residual)
+
+
+def load_marker_motion(
+    source: MotionRecording, side: Side, pose_insert_in_tibia: Array
+) -> MarkerKinematics:
+    """Return knee and shank of a recording's markers.
+
+    Args:
+        source: what to read, with its markers.
+        side: of the knee; a left leg is mirrored, laboratory and all.
+        pose_insert_in_tibia: (4, 4), of the (mirrored) patient.
+
+    Raises:
+        InputError: file, labels or markers cannot be used, markers that fit nowhere, or a gap
+            in the interval.
+    """
+    assert source.markers is not None
+    recorded = read_table(source.file, source.format)
+    time = recorded.time()
+    segments, measured = leg_segments(source.markers, recorded, source.length_unit, side)
+    neutral = neutral_coordinates(source.markers, side)
+    chain = LegChain(segments, pose_insert_in_tibia, source.markers.knee == "free")
+    fits, whole = both_fits(chain, segments, measured, neutral, recorded)
+    if not whole.solved.all():
+        raise InputError(
+            f"the chain of segments does not settle at {time[int(np.argmin(whole.solved))]:.4f} s",
+            recorded.path,
+            "are labels swapped? check labels and joints in [motion.markers]",
+        )
+    blind = np.isnan(whole.rms)[:, None, None]
+    readings: dict[Method, tuple[Array, Array]] = {
+        "segments": (fits["shank"][0], fits["thigh"][0]),
+        "chain": (
+            np.where(blind, np.nan, whole.state.shank),
+            np.where(blind, np.nan, whole.state.thigh),
+        ),
+    }
+    rms: dict[Method, Array] = {"segments": _joint_rms(fits, measured), "chain": whole.rms}
+    return _compare_readings(source, recorded, time, readings, rms, chain, measured, neutral)
+
+
+def both_fits(
+    chain: LegChain,
+    segments: list[Segment],
+    measured: dict[str, Array],
+    neutral: Array,
+    recorded: Table,
+) -> tuple[dict[str, tuple[Array, Array]], ChainFit[LegState]]:
+    """Return each segment's own fit (poses and rms), and that of the chain."""
+    fits = {s.name: fit_seen(measured[s.name], s.points, s.weights, s.name) for s in segments}
+    _check_fits({name: fit[1] for name, fit in fits.items()}, recorded)
+    _check_joints(segments, {name: fit[0] for name, fit in fits.items()}, recorded)
+    points = np.concatenate([measured[s.name] for s in segments], axis=1)
+    weights = np.concatenate([s.weights for s in segments])
+    start = chain.start({name: fit[0] for name, fit in fits.items()}, neutral)
+    return fits, fit_chain(chain, points, weights, start)
+
+
+def leg_segments(
+    markers: MarkerSet, recorded: Table, length_unit: str | None, side: str
+) -> tuple[list[Segment], dict[str, Array]]:
+    """Return the segments, and segment -> its markers (n, m, 3) m, laboratory, gaps NaN.
+
+    Raises:
+        InputError: a marker that the recording does not hold.
+    """
+    scale = recorded.unit_scale(length_unit, "length_unit")
+    rotation = laboratory_rotation(markers.laboratory_axes, recorded.path)
+    mirror = MIRROR if side == "left" else np.eye(3)
+    segments, measured = [], {}
+    for own in markers.segment:
+        labels = tuple(own.markers)
+        seen = marker_trajectories(recorded, list(labels), scale) @ rotation.T
+        measured[own.name] = seen @ mirror
+        ends = [None if end is None else mirror @ end for end in (own.joint, own.centre)]
+        segments.append(
+            Segment(
+                own.name,
+                labels,
+                np.array(list(own.markers.values())) @ mirror,
+                np.array([own.weights.get(label, 1.0) for label in labels]),
+                own.joined_to or "",
+                *ends,
+            )
+        )
+    return segments, measured
+
+
+def neutral_coordinates(markers: MarkerSet, side: str) -> Array:
+    """Return the knee coordinates (6,), m and rad, that a hinge keeps; flexion is zero."""
+    ap, si, ml = markers.neutral_translation
+    axial, adduction = markers.neutral_rotation
+    return np.array([ap, si, -ml if side == "left" else ml, axial, adduction, 0.0])
+
+
+def _check_fits(rms: dict[str, Array], recorded: Table) -> None:
+    for name, values in rms.items():
+        known = values[np.isfinite(values)]
+        if not len(known) and name in ("shank", "thigh"):
+            raise InputError(
+                f"fewer than three markers of the {name} are seen together",
+                recorded.path,
+                "check the labels in [motion.markers], or use another trial",
+            )
+        if len(known) and np.median(known) > WRONG_MARKERS:
+            raise InputError(
+                f"markers of the {name} fit only to {np.median(known) / MILLIMETRE:.0f} mm",
+                recorded.path,
+                "check names and positions in [motion.markers], and length_unit",
+            )
+
+
+def _check_joints(segments: list[Segment], poses: dict[str, Array], recorded: Table) -> None:
+    """Raise where a segment's markers put its joint far from where its neighbour has it."""
+    for own in segments:
+        if own.joint is None or own.centre is None:
+            continue
+        ends = transform(poses[own.joined_to], own.joint) - transform(poses[own.name], own.centre)
+        apart = np.linalg.norm(ends, axis=1)
+        if np.isfinite(apart).any() and np.nanmedian(apart) > JOINT_APART:
+            raise InputError(
+                f"markers of the {own.name} put its joint with the {own.joined_to} "
+                f"{np.nanmedian(apart) / MILLIMETRE:.0f} mm from where the {own.joined_to}'s do",
+                recorded.path,
+                "are left and right labels swapped? check the labels in [motion.markers]",
+            )
+
+
+def _compare_readings(
+    source: MotionRecording,
+    recorded: Table,
+    time: Array,
+    readings: dict[Method, tuple[Array, Array]],
+    rms: dict[Method, Array],
+    chain: LegChain,
+    measured: dict[str, Array],
+    neutral: Array,
+) -> MarkerKinematics:
+    """Return both readings, (shank, thigh) in the laboratory, where the one in use is whole."""
+    assert source.markers is not None
+    used = source.markers.method
+    knees = {name: _knee(low @ chain.insert, high) for name, (low, high) in readings.items()}
+    gone = np.concatenate([np.isnan(measured[name]).any(axis=2) for name in KNEE_SEGMENTS], axis=1)
+    run = _run(time, np.isnan(knees[used][:, 0]), source.interval, recorded)
+    return MarkerKinematics(
+        time[run],
+        used,
+        readings[used][0][run],
+        knees[used][run],
+        {name: knee[run, FLEXION] for name, knee in knees.items()},
+        {name: values[run] for name, values in rms.items()},
+        np.linalg.norm(knees["segments"][run, :3] - neutral[:3], axis=1),
+        gone.sum(axis=1)[run],
+    )
+
+
+def _joint_rms(fits: dict[str, tuple[Array, Array]], measured: dict[str, Array]) -> Array:
+    """Return the root mean square distance (n,) of shank and thigh markers together."""
+    counts = [np.isfinite(measured[name]).all(axis=2).sum(axis=1) for name in KNEE_SEGMENTS]
+    squares = [fits[name][1] ** 2 * k for name, k in zip(KNEE_SEGMENTS, counts, strict=True)]
+    return np.asarray(np.sqrt(np.sum(squares, axis=0) / np.maximum(np.sum(counts, axis=0), 1)))
+
+
+def _knee(insert: Array, femur: Array) -> Array:
+    """Return knee coordinates (n, 6) of frames that are known, NaN elsewhere."""
+    known = np.isfinite(insert[:, 0, 3]) & np.isfinite(femur[:, 0, 3])
+    result = np.full((len(insert), 6), np.nan)
+    if known.any():
+        result[known] = knee_coordinates(inverse(insert[known]) @ femur[known])
+    return result
+
+
+def _run(
+    time: Array, lost: np.ndarray, interval: tuple[float, float] | None, recorded: Table
+) -> slice:
+    """Return the longest run of frames around the interval in which none is lost.
+
+    Without an interval that is all from the first to the last frame.
+    """
+    start, end = interval or (time[0], time[-1])
+    if start < time[0] - 1e-9 or end > time[-1] + 1e-9:
+        raise InputError(
+            f"covers {time[0]:.4f} to {time[-1]:.4f} s, but {start:.4f} to {end:.4f} s is needed",
+            recorded.path,
+            "choose [motion] interval_s inside the recording",
+        )
+    inside = (time >= start - 1e-9) & (time <= end + 1e-9)
+    if (inside & lost).any():
+        k = int(np.argmax(inside & lost))
+        raise InputError(
+            f"too few markers of shank and thigh are seen at {time[k]:.4f} s",
+            recorded.path,
+            "choose [motion] interval_s between the gaps, or method = 'chain'",
+        )
+    first, last = int(np.argmax(inside)), len(time) - int(np.argmax(inside[::-1]))
+    before, after = np.flatnonzero(lost[:first]), np.flatnonzero(lost[last:])
+    return slice(
+        int(before[-1]) + 1 if len(before) else 0, last + int(after[0]) if len(after) else None
+    )

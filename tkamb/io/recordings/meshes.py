@@ -1,0 +1,406 @@
+"""Mesh files into surfaces: SI units, anatomical axes, mended with a notice or refused."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.errors import InputError
+from tkamb.files import MESH_LIMIT, check_file
+from tkamb.geometry.condyles import condyle_split
+from tkamb.geometry.frames import MIRROR, Array
+from tkamb.geometry.inner_walls import InnerWall, find_inner_wall, touching_groups
+from tkamb.geometry.polygons import triangulated
+from tkamb.geometry.repair import Repair, repair
+from tkamb.geometry.surface import Surface
+from tkamb.geometry.topology import Body, BoundaryLoop, connected_parts, separate_bodies
+from tkamb.io.recordings.polygon_files import read_obj, read_ply
+from tkamb.io.recordings.stl import read_binary_stl
+from tkamb.io.recordings.vtp import read_vtp
+from tkamb.units import LENGTH, MILLIMETRE
+
+Indices = NDArray[np.int64]
+
+IMPLANT_SIZE = (0.010, 0.250)
+"""m; least and greatest length of a part of a knee implant."""
+BONE_SIZE = (0.010, 0.650)
+"""m; least and greatest length of a bone at the knee, whole or in part."""
+
+SMALLEST_KNEE = 0.034
+"""m; no whole component of a person's knee is shorter (the smallest are 50 mm wide)."""
+USUAL_SIZE = (0.040, 0.120)
+"""m; length of usual components, partial ones included."""
+ROUNDING_NOTICE = 1e-6
+"""m; a mesh rounded more coarsely gets a notice: forces change by about half a per cent."""
+ROUNDING_LIMIT = 5e-6
+"""m; a mesh rounded more coarsely is refused: 8 µm change forces by 4 %."""
+
+SHEET_WIDTH = 1.0 / 3.0
+"""An opening wider than this share of a part's length makes it a sheet."""
+
+_log = logging.getLogger("tkamb")
+
+
+def axes_rotation(axes: str) -> Array:
+    """Return the rotation (3, 3) from mesh axes to anatomical axes.
+
+    Args:
+        axes: the mesh axes that point anterior, superior and to the right, like "-x,+y,-z".
+
+    Returns:
+        R with p_anatomical = R p_mesh; its rows are the named axes. Entries are 0 and ±1,
+        so that a permutation changes no digit of a coordinate.
+
+    Raises:
+        InputError: not three different axes, or a left-handed system (a mirror image).
+    """
+    names = [name.strip() for name in axes.split(",")]
+    letters = sorted(name[1:] if name[:1] in ("+", "-") else name for name in names)
+    if letters != ["x", "y", "z"]:
+        raise InputError(
+            f"'{axes}' does not name three different axes",
+            "axes",
+            "give the mesh axes that point anterior, superior and right, like '-x,+y,-z'",
+        )
+    rotation = np.zeros((3, 3))
+    for row, name in enumerate(names):
+        rotation[row, "xyz".index(name[-1])] = -1.0 if name[0] == "-" else 1.0
+    if np.linalg.det(rotation) < 0:
+        raise InputError(
+            f"'{axes}' is left-handed: it would turn the part into its mirror image",
+            "axes",
+            f"flip the sign of one axis, like '{_opposite(names)}'; a left knee is declared by "
+            "its side, not by its axes",
+        )
+    return rotation
+
+
+def load_surface(
+    path: str | Path,
+    unit: str,
+    axes: str = "+x,+y,+z",
+    *,
+    name: str,
+    closed: bool = False,
+    size: tuple[float, float] = IMPLANT_SIZE,
+) -> Surface:
+    """Read an STL, OBJ, PLY or VTP file as a surface in anatomical axes and metres.
+
+    Mended with one warning on the logger "tkamb": duplicate, degenerate and wrongly wound
+    faces, loose vertices, cracks and small holes (`tkamb.geometry.repair`).
+
+    Args:
+        path: the file.
+        unit: its unit of length, "m", "cm", "mm" or "inch".
+        axes: its axes that point anterior, superior and to the right.
+        name: what to call the part in messages.
+        closed: whether the surface must enclose a volume.
+        size: m, least and greatest plausible length; another one means a wrong unit.
+
+    Returns:
+        The surface about the mesh's own origin: x anterior, y superior, z right, m.
+
+    Raises:
+        InputError: no such file, no mesh, no triangles, NaN, a size that no knee part has,
+            not a surface, or open where it must be closed; a part of an implant that is an
+            open sheet or, where it must be closed, several separate bodies.
+    """
+    rotation = axes_rotation(axes)
+    if unit not in LENGTH:
+        raise InputError(f"unknown unit '{unit}' of {name}", path, f"one of {', '.join(LENGTH)}")
+    vertices, faces = read_triangles(path)
+    _check_size(vertices[faces.reshape(-1)], unit, path, name, size)
+    _check_rounding(vertices[faces.reshape(-1)], unit, path, name)
+    mended = repair(vertices * LENGTH[unit], faces)
+    _check_surface(mended, path, name, unit)
+    wall = None
+    if closed and size == IMPLANT_SIZE and not mended.holes:
+        mended, wall = _without_inner_wall(mended, unit)
+    if size == IMPLANT_SIZE:
+        _check_part(mended, path, name, rotation[2], wall)
+    if closed and mended.holes:
+        raise InputError(
+            f"{name} is not closed: {describe_holes(mended.holes, unit)}", path, _CLOSE
+        )
+    if mended.notices:
+        _log.warning("%s: %s mesh repaired: %s", path, name, "; ".join(mended.notices))
+    surface = Surface(mended.vertices @ rotation.T + 0.0, mended.faces, name, merged=True)
+    if size == IMPLANT_SIZE:
+        _check_knee_width(surface, path)
+    return surface
+
+
+def mirrored(surface: Surface) -> Surface:
+    """Return the mirror image in the sagittal plane (z to -z), normals still outward.
+
+    It turns a part of a left knee, in anatomical axes, into that of a right one.
+    """
+    vertices, faces = surface.vertices @ MIRROR + 0.0, surface.faces[:, ::-1].copy()
+    return Surface(vertices, faces, surface.name, surface.merged)
+
+
+def read_triangles(path: str | Path) -> tuple[Array, Indices]:
+    """Return vertices (n, 3) in file units and faces (k, 3) as the file has them.
+
+    Raises:
+        InputError: no such file, not a mesh, no triangles, or NaN.
+    """
+    path = Path(path)
+    vertices, faces = read_vtp(path) if path.suffix.lower() == ".vtp" else _read_mesh(path)
+    if len(faces) == 0:
+        raise InputError(_NO_TRIANGLES, path, _FORMATS)
+    bad = ~np.isfinite(vertices[faces]).all(axis=(1, 2))
+    if bad.any():
+        raise InputError(
+            f"{int(bad.sum())} triangle(s) have a coordinate that is not a number "
+            f"(first: triangle {int(np.flatnonzero(bad)[0])})",
+            path,
+            "export the mesh again",
+        )
+    return np.where(np.isfinite(vertices), vertices, 0.0), faces
+
+
+def _read_mesh(path: Path) -> tuple[Array, Indices]:
+    """Return vertices and triangles of a mesh file; OBJ and PLY ones may hold polygons."""
+    try:
+        check_file(path, MESH_LIMIT, what="mesh file")
+        suffix = path.suffix.lower()
+        if suffix == ".stl" and (corners := read_binary_stl(path)) is not None:
+            return corners, np.arange(len(corners)).reshape(-1, 3)
+        if suffix in (".obj", ".ply"):
+            vertices, corners, ends = read_obj(path) if suffix == ".obj" else read_ply(path)
+            return vertices, triangulated(vertices, corners, ends)
+        return _read_by_trimesh(path)
+    except InputError:
+        raise
+    except ImportError:  # an STL that is not binary goes to the reader of text, which is extra
+        raise InputError("cannot be read as a mesh (cut short, or text)", path, _FORMATS) from None
+    except Exception as error:  # readers of many formats: each raises what it likes
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise InputError(f"cannot be read as a mesh ({reason})", path, _FORMATS) from None
+
+
+def _read_by_trimesh(path: Path) -> tuple[Array, Indices]:
+    """Return vertices and triangles of a text STL file, or of another format."""
+    import trimesh  # a quarter of a second, which the usual mesh need not wait for
+
+    mesh = trimesh.load(path, force="mesh", process=False)
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise InputError(_NO_TRIANGLES, path, _FORMATS)
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+
+
+def plausible_units(extent: float, size: tuple[float, float] = IMPLANT_SIZE) -> list[str]:
+    """Return the units in which the largest extent (file units) is within `size` (m).
+
+    One that makes a part of an implant smaller than any knee's is left out if another one makes
+    it as large as they are: inches taken for centimetres give a knee of 30 mm.
+    """
+    lengths = {unit: extent * metres for unit, metres in LENGTH.items()}
+    fits = [unit for unit, length in lengths.items() if size[0] <= length <= size[1]]
+    if size != IMPLANT_SIZE:
+        return fits
+    usual = [unit for unit in fits if USUAL_SIZE[0] <= lengths[unit] <= USUAL_SIZE[1]]
+    return [unit for unit in fits if lengths[unit] >= SMALLEST_KNEE or not usual]
+
+
+def body_size(body: Body, unit: float) -> str:
+    """Return the extents of a body along the mesh's axes, in a unit of `unit` m."""
+    return " × ".join(f"{extent / unit:.3g}" for extent in body.extents)
+
+
+def describe_holes(holes: tuple[BoundaryLoop, ...], unit: str) -> str:
+    """Return the number of holes and the widest one, its centre in file axes and units."""
+    widest, more = holes[0], len(holes) - 1
+    where = ", ".join(f"{value / LENGTH[unit]:.4g}" for value in widest.centre)
+    text = (
+        f"hole of {len(widest.vertices)} edges, {widest.width / MILLIMETRE:.3g} mm wide, "
+        f"at ({where}) {unit}"
+    )
+    return text if more == 0 else f"{text}, and {more} more"
+
+
+_NO_TRIANGLES = "holds no triangles: is it cut short, or text?"
+_FORMATS = "give an STL, OBJ, PLY or VTP file of triangles"
+_CLOSE = "close it in a mesh editor; holes up to about a lattice cell (2 mm) are closed for you"
+
+
+def _opposite(names: list[str]) -> str:
+    last = names[2]
+    turned = f"-{last[-1]}" if last[0] != "-" else f"+{last[-1]}"
+    return ",".join([*names[:2], turned])
+
+
+def _without_inner_wall(mended: Repair, unit: str) -> tuple[Repair, InnerWall | None]:
+    """Return the part without a wall inside it, and a wall that has to stay; both are told."""
+    wall = find_inner_wall(mended.vertices, mended.faces)
+    if wall is None:
+        return mended, None
+    where = ", ".join(f"{round(value / LENGTH[unit], 2) + 0.0:g}" for value in wall.centre)
+    words = f"inner wall of {1e6 * wall.area:.0f} mm² at ({where}) {unit} between touching bodies"
+    if wall.without is None:
+        return replace(mended, notices=(*mended.notices, f"{words} does not count")), wall
+    vertices, faces = wall.without
+    notices = (*mended.notices, f"{words} removed")
+    return replace(mended, vertices=vertices, faces=faces, notices=notices), None
+
+
+def _check_part(
+    mended: Repair, path: str | Path, name: str, right: Array, wall: InnerWall | None
+) -> None:
+    """Refuse an open sheet, such as a contact surface, and several bodies in one file.
+
+    Bodies that touch or overlap, on the two sides of a wall, are one.
+    """
+    extent = float(np.ptp(mended.vertices, axis=0).max())
+    if mended.holes and mended.holes[0].width > SHEET_WIDTH * extent:
+        raise InputError(
+            f"{name} is an open sheet, like a contact surface: its opening is "
+            f"{mended.holes[0].width / MILLIMETRE:.3g} mm wide, so that nothing tells its inside "
+            "(where another part overlaps it) from its outside",
+            path,
+            "give the whole closed part that the sheet was cut from",
+        )
+    if not connected_parts(mended.faces).any():
+        return
+    bodies = separate_bodies(mended.vertices, mended.faces)
+    if wall is not None and len(bodies) > 1:
+        own = [body.faces for body in bodies]
+        if touching_groups(mended.vertices, own, mended.faces, wall.faces) == 1:
+            return
+    if len(bodies) > 1 and not _two_condyles(bodies, right):
+        sizes = ", ".join(body_size(body, MILLIMETRE) for body in bodies[:3])
+        more = f", and {len(bodies) - 3} more" if len(bodies) > 3 else ""
+        raise InputError(
+            f"{name} is {len(bodies)} separate bodies ({sizes}{more}; mm), not one",
+            path,
+            "`tkamb mesh check` numbers them, `tkamb mesh part` writes one into a file of its own"
+            + ("; or are they two condyles, and the axes wrong?" if len(bodies) == 2 else ""),
+        )
+
+
+def _two_condyles(bodies: list[Body], right: Array) -> bool:
+    """Say whether there are two bodies of like size, one beside the other (`right`, a unit axis).
+
+    So are the components of a bicompartmental knee; a tray or an insert lies below, a pair
+    from both legs further apart than either is wide.
+    """
+    if len(bodies) != 2:
+        return False
+    widths = [float(np.abs(right) @ body.extents) for body in bodies]
+    lengths = sorted(float(body.extents.max()) for body in bodies)
+    apart = abs(float(right @ (bodies[0].centre - bodies[1].centre)))
+    gap = apart - sum(widths) / 2.0
+    return -0.1 * min(widths) <= gap <= max(widths) and lengths[0] >= lengths[1] / 2.0
+
+
+def _check_size(
+    corners: Array, unit: str, path: str | Path, name: str, size: tuple[float, float]
+) -> None:
+    extent = float(np.ptp(corners, axis=0).max())
+    fits = plausible_units(extent, size)
+    if unit in fits:
+        return
+    advice = ", ".join(
+        f"'{u}' would make it {extent * LENGTH[u] / MILLIMETRE:.4g} mm" for u in fits
+    )
+    why = (
+        f"which no such part of a knee is ({size[0] / MILLIMETRE:g} to {size[1] / MILLIMETRE:g} mm)"
+    )
+    if size[0] <= extent * LENGTH[unit] <= size[1]:
+        why = "smaller than any person's knee"
+    raise InputError(
+        f"{name} is {extent * LENGTH[unit] / MILLIMETRE:.4g} mm long in unit '{unit}', {why}",
+        path,
+        f"is the unit right? {advice}" if fits else "check the mesh and its unit",
+    )
+
+
+def _check_knee_width(surface: Surface, path: str | Path) -> None:
+    """Refuse a component with two condyles that no person's knee is small enough for."""
+    extents = np.ptp(surface.bounds, axis=0)
+    if extents.max() < SMALLEST_KNEE and condyle_split(surface) is not None:
+        raise InputError(
+            f"{surface.name} has two condyles and is {extents[2] / MILLIMETRE:.3g} mm wide, "
+            "smaller than any person's knee",
+            path,
+            f"is the unit right? one of {', '.join(LENGTH)}; or was the mesh scaled before?",
+        )
+
+
+def _check_rounding(corners: Array, unit: str, path: str | Path, name: str) -> None:
+    """Tell or refuse coordinates so far from the origin that the file's digits do not suffice.
+
+    Args:
+        corners: (n, 3), file units.
+        unit: of the file.
+        path: the file.
+        name: of the part.
+    """
+    rounding = coordinate_rounding(corners) * LENGTH[unit]
+    if rounding <= ROUNDING_NOTICE:
+        return
+    far = float(np.abs(corners).max()) * LENGTH[unit] / MILLIMETRE
+    words = (
+        f"{name} lies {far:.3g} mm from the origin of its file, where coordinates are rounded to "
+        f"{rounding / MILLIMETRE:.2g} mm"
+    )
+    if rounding > ROUNDING_LIMIT:
+        raise InputError(
+            words, path, "move it to the origin where it was made, and export it again"
+        )
+    _log.warning("%s: %s", path, words)
+
+
+def coordinate_rounding(corners: Array) -> float:
+    """Return the step to which coordinates (n, 3) are rounded, in their units; 0: not seen.
+
+    Seen are single precision and text of six or seven digits, axis by axis. Where half of the
+    coordinates are multiples of several such steps they lost nothing: they are round numbers.
+    """
+    return max((_axis_rounding(values) for values in corners.T), default=0.0)
+
+
+def _axis_rounding(values: Array) -> float:
+    """Return the step to which the coordinates (n,) along an axis are rounded; 0: not seen."""
+    largest = float(np.abs(values).max(initial=0.0))
+    if largest == 0.0:
+        return 0.0
+    digits = np.floor(np.log10(largest))
+    long = values[np.abs(values) >= 10.0**digits]  # those of fewer digits are rounded less
+    single = float(np.spacing(np.float32(largest)))
+    if (values == values.astype(np.float32)).all():
+        return 0.0 if _multiples(values, 4.0 * single).mean() > 0.5 else single
+    for step in (10.0 ** (digits - 5), 10.0 ** (digits - 6)):
+        if _multiples(long, step).all():
+            return 0.0 if _multiples(long, 5.0 * step).mean() > 0.5 else step
+    return 0.0
+
+
+def _multiples(values: Array, step: float) -> NDArray[np.bool_]:
+    """Say which values (n,) are multiples of a step, but for rounding to double precision."""
+    number = values / step
+    return np.asarray(np.abs(number - np.rint(number)) <= 1e-5)
+
+
+def _check_surface(mended: Repair, path: str | Path, name: str, unit: str) -> None:
+    if mended.one_sided:
+        raise InputError(f"{name} is not a surface: it has only one side", path, _REMESH)
+    if len(mended.faces) < 4:
+        raise InputError(
+            f"{name} is not a surface: {len(mended.faces)} triangles left", path, _REMESH
+        )
+    if len(mended.forks):
+        point = mended.vertices[mended.forks[0]] / LENGTH[unit]
+        where = ", ".join(f"{value:.4g}" for value in point)
+        raise InputError(
+            f"{name} is not a surface: three or more sheets meet in {len(mended.forks)} vertices, "
+            f"first at ({where}) {unit}",
+            path,
+            _REMESH,
+        )
+
+
+_REMESH = "export the part's outer skin as one triangulated surface"

@@ -1,0 +1,201 @@
+"""The patient's URDF: read, mirrored if left, completed with segment inertias, checked.
+
+Links that must exist: `tibia` (shank and foot, its origin at the ankle centre), `femur`,
+`patella`, and `hip`, a frame fixed to the femur at the hip centre. Joints: `ankle` (or the
+tibia as root), the six single-axis knee joints of `tkamb.io.recordings.urdf_check` in their
+order, and the patella's three.
+The origin of `knee_ap` is the insert frame in the tibia; the femur link's frame is that of
+the femoral component. Any other link fixed to these may carry attachment points.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tkamb.errors import InputError
+from tkamb.files import read_xml
+from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, pose
+from tkamb.io.recordings.recordings import Patient
+from tkamb.io.recordings.segments import RigidInertia, Sex, combined, segment_inertia
+from tkamb.io.recordings.urdf_check import (
+    check_chain,
+    check_elements,
+    check_inertia,
+    check_links,
+    check_tree,
+    numbers_of,
+)
+
+PATELLA_MASS = 0.1
+"""kg, at the patella link's origin unless the URDF says otherwise."""
+
+PATELLA_RADIUS_OF_GYRATION = 0.015
+"""m: about that of a disc 40 mm across and 20 mm thick."""
+
+
+THIGH = (0.2, 0.7)
+"""m, from the femoral component's flexion axis to the hip centre: a child's to a giant's."""
+
+SHANK = (0.15, 0.65)
+"""m, from the ankle centre to the insert's bottom, likewise."""
+
+MOST_TURNED = np.radians(40.0)
+"""rad, of the insert's axes from the tibia's: slope, torsion and varus of a deformed leg."""
+
+ASIDE = 0.5
+"""Of that distance: how far the other end may lie beside the link's y axis, which is upwards."""
+
+
+def load_urdf(patient: Patient, with_patella: bool) -> str:
+    """Return the URDF text of a right knee (a left one mirrored), complete and checked.
+
+    Args:
+        patient: who it is.
+        with_patella: whether the patella and its joints are needed.
+
+    Raises:
+        InputError: missing file, link or joint, wrong axis, singular inertia.
+    """
+    path = patient.urdf
+    robot = _parse(path)
+    check_elements(robot, path)
+    check_links(robot, path, with_patella)
+    check_tree(robot, path)
+    if patient.side == "left":
+        _mirror(robot)
+    check_chain(robot, path, patient.side, with_patella)
+    _check_places(robot, path)
+    _complete_inertias(robot, patient, with_patella)
+    for link in robot.findall("link"):
+        check_inertia(link, path, link.get("name") in {"tibia", "femur", "patella"})
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
+def _parse(path: Path) -> ElementTree.Element:
+    robot = read_xml(path, what="URDF")
+    if robot.tag != "robot":
+        raise InputError(f"is not a URDF: its root is <{robot.tag}>, not <robot>", path)
+    return robot
+
+
+def _origin(element: ElementTree.Element) -> Array:
+    """Return the 4x4 pose of the <origin> of a joint or inertial."""
+    origin = element.find("origin")
+    rotation = Rotation.from_euler("xyz", numbers_of(origin, "rpy")).as_matrix()
+    return pose(rotation, numbers_of(origin, "xyz"))
+
+
+def _set_origin(element: ElementTree.Element, value: Array) -> None:
+    origin = element.find("origin")
+    if origin is None:
+        origin = ElementTree.SubElement(element, "origin")
+    origin.set("xyz", _text(value[:3, 3]))
+    origin.set("rpy", _text(Rotation.from_matrix(value[:3, :3]).as_euler("xyz")))
+
+
+def _text(values: Array) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _mirror(robot: ElementTree.Element) -> None:
+    """Reflect the chain in the sagittal plane (z to -z): a left knee becomes a right one.
+
+    Prismatic axes stay: along z the coordinate changes sign instead, at the motion's input.
+    """
+    for joint in robot.findall("joint"):
+        _set_origin(joint, mirrored_pose(_origin(joint)))
+        axis = joint.find("axis")
+        if axis is not None and joint.get("type") != "prismatic":
+            axis.set("xyz", _text(-MIRROR @ numbers_of(axis, "xyz")))
+    for inertial in robot.iterfind("link/inertial"):
+        _set_origin(inertial, mirrored_pose(_origin(inertial)))
+        tensor = inertial.find("inertia")
+        for key in ("ixz", "iyz"):
+            if tensor is not None:
+                tensor.set(key, _text(-numbers_of(tensor, key, "0")))
+
+
+def _check_places(robot: ElementTree.Element, path: Path) -> None:
+    """Raise unless hip and insert lie where a leg has them, above femur and ankle."""
+    joints = {joint.get("name"): joint for joint in robot.findall("joint")}
+    found = (
+        ("the hip", "femur", _fixed_pose(robot, "hip", "femur", path)[:3, 3], THIGH),
+        ("the origin of knee_ap", "tibia", _origin(joints["knee_ap"])[:3, 3], SHANK),
+    )
+    for name, link, place, (low, high) in found:
+        away = float(np.linalg.norm(place))
+        if not low <= away <= high or place[1] < 0 or np.hypot(*place[[0, 2]]) > ASIDE * away:
+            shown = ", ".join(f"{value:.4g}" for value in place)
+            raise InputError(
+                f"{name} is at ({shown}) m in '{link}', {away:.4g} m from its origin",
+                path,
+                f"it must lie {low:g} to {high:g} m above it, along y: is it in metres?",
+            )
+    turn = _origin(joints["knee_ap"])[:3, :3]
+    if min(turn[0, 0], turn[1, 1]) < np.cos(MOST_TURNED):
+        tilts = ", ".join(f"{np.degrees(np.arccos(turn[i, i])):.0f}" for i in range(3))
+        raise InputError(
+            f"the origin of knee_ap turns the insert's axes by {tilts} deg from the tibia's",
+            path,
+            "is its rpy in radians, and are the axes anterior, superior and right?",
+        )
+
+
+def _complete_inertias(robot: ElementTree.Element, patient: Patient, with_patella: bool) -> None:
+    links = {link.get("name"): link for link in robot.findall("link")}
+    missing = [n for n in ("tibia", "femur") if links[n].find("inertial") is None]
+    if missing and patient.sex is None:
+        raise InputError(
+            f"link '{missing[0]}' has no <inertial>",
+            patient.urdf,
+            "add one, or give [patient] sex for the de Leva table",
+        )
+    for name in missing:
+        assert patient.sex is not None
+        _write_inertia(links[name], _segment(robot, name, patient.sex, patient))
+    if with_patella and links["patella"].find("inertial") is None:
+        tensor = PATELLA_MASS * PATELLA_RADIUS_OF_GYRATION**2 * np.eye(3)
+        _write_inertia(links["patella"], RigidInertia(PATELLA_MASS, np.zeros(3), tensor))
+
+
+def _segment(robot: ElementTree.Element, name: str, sex: Sex, patient: Patient) -> RigidInertia:
+    joints = {joint.get("name"): joint for joint in robot.findall("joint")}
+    if name == "femur":
+        hip = _fixed_pose(robot, "hip", "femur", patient.urdf)[:3, 3]
+        return segment_inertia("thigh", sex, patient.mass, hip, np.zeros(3))
+    ankle = np.zeros(3)
+    knee = _origin(joints["knee_ap"])[:3, 3]
+    shank = segment_inertia("shank", sex, patient.mass, knee, ankle)
+    foot = segment_inertia("foot", sex, patient.mass, ankle, ankle + np.array([0, -1.0, 0]))
+    return combined(shank, foot)
+
+
+def _fixed_pose(robot: ElementTree.Element, link: str, base: str, path: Path) -> Array:
+    """Return the pose of `link` in `base`, which must be joined to it by fixed joints."""
+    parents = {joint.find("child").get("link"): joint for joint in robot.findall("joint")}  # type: ignore[union-attr]
+    result, place = np.eye(4), link
+    while place != base:
+        joint = parents.get(place)
+        if joint is None or joint.get("type") != "fixed":
+            raise InputError(f"link '{link}' is not fixed to '{base}'", path, "use fixed joints")
+        result = _origin(joint) @ result
+        place = joint.find("parent").get("link")  # type: ignore[union-attr,assignment]
+    return result
+
+
+def _write_inertia(link: ElementTree.Element, inertia: RigidInertia) -> None:
+    inertial = ElementTree.SubElement(link, "inertial")
+    _set_origin(inertial, pose(np.eye(3), inertia.centre))
+    ElementTree.SubElement(inertial, "mass", value=repr(float(inertia.mass)))
+    rows = {
+        "ixx": (0, 0),
+        "iyy": (1, 1),
+        "izz": (2, 2),
+        "ixy": (0, 1),
+        "ixz": (0, 2),
+        "iyz": (1, 2),
+    }
+    values = {key: repr(float(inertia.tensor[index])) for key, index in rows.items()}
+    ElementTree.SubElement(inertial, "inertia", values)

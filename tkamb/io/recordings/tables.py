@@ -1,0 +1,419 @@
+"""Read recorded tables: `.csv`, OpenSim `.sto` and `.mot`, and markers of `.trc` and `.c3d`."""
+
+import contextlib
+import math
+import re
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.errors import InputError, names_near
+from tkamb.files import TABLE_LIMIT, read_text
+from tkamb.geometry.frames import Array
+from tkamb.io.recordings.unit_words import GivenUnits, metres
+from tkamb.units import LENGTH
+
+TRC_ROUNDING_S = 1e-3
+"""Cameras write `.trc` times rounded to the millisecond; the header's rate is exact."""
+
+_NOT_A_NUMBER = re.compile(r"[+-]?(nan(\(\w*\))?|1\.#(ind|qnan)0*)")
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
+"""Plain decimal: Python alone also reads 1_000 and the digits of other scripts."""
+_OF_NUMBERS = "0123456789+-.eE "
+"""What plain decimals are written with."""
+_INFINITE = re.compile(r"[+-]?inf(inity)?")
+_LARGEST = 1e12
+"""Beyond any measurement and any clock: the square of a larger number may overflow."""
+_COMMA_NUMBER = re.compile(r"[+-]?[0-9]+,[0-9]+")
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Named columns of equal length, in the units of the file.
+
+    Args:
+        path: the file.
+        columns: name -> (n,) values. A marker M of `.trc` or `.c3d` has columns M_x, M_y, M_z.
+        length_unit: the unit that the file itself states (`.trc`, `.c3d`), else None.
+        in_degrees: what the file itself states about angles (`.sto`, `.mot`), else None.
+        equal: names that stand for several columns; none of these is in `columns`.
+        notices: remarks on what was read otherwise than stated, or not at all.
+        unit_word: the file's own word for its unit of length, understood or not.
+        unit_given: whether the unit of length is the user's word, for want of the file's.
+    """
+
+    path: Path
+    columns: dict[str, Array]
+    length_unit: str | None = None
+    in_degrees: bool | None = None
+    equal: tuple[str, ...] = ()
+    notices: tuple[str, ...] = ()
+    unit_given: bool = False
+    unit_word: str = ""
+
+    @property
+    def rows(self) -> int:
+        """Number of data rows."""
+        return len(next(iter(self.columns.values())))
+
+    def column(self, name: str) -> Array:
+        """Return one column.
+
+        Raises:
+            InputError: no such column, or several of that name; the message lists the nearest.
+        """
+        if name in self.equal:
+            raise InputError(f"has two columns named '{name}'", self.path, "rename one")
+        if name not in self.columns:
+            mend = names_near(name, self.columns, "its header")
+            raise InputError(f"has no column '{name}'", self.path, mend)
+        return self.columns[name]
+
+    def complete_column(self, name: str) -> Array:
+        """Return one column that has no gap.
+
+        Raises:
+            InputError: no such column, or a value that is missing or not finite.
+        """
+        values = self.column(name)
+        gaps = np.flatnonzero(~np.isfinite(values))
+        if len(gaps):
+            raise InputError(
+                f"column '{name}' has {len(gaps)} missing or non-finite value(s), "
+                f"the first in data row {gaps[0] + 1}",
+                self.path,
+                "fill or cut the gap",
+            )
+        return values
+
+    def time(self, name: str = "time") -> Array:
+        """Return the time column, which must rise strictly.
+
+        Raises:
+            InputError: no such column, a gap, or a time that does not rise.
+        """
+        values = self.complete_column(name)
+        falls = np.flatnonzero(np.diff(values) <= 0)
+        if len(falls):
+            row = int(falls[0])
+            raise InputError(
+                f"column '{name}' does not rise from data row {row + 1} ({values[row]:g}) "
+                f"to {row + 2} ({values[row + 1]:g})",
+                self.path,
+                "sort the rows by time and drop duplicates",
+            )
+        return values
+
+    def unit_scale(self, length_unit: str | None, key: str) -> float:
+        """Return metres per unit of length of this file.
+
+        Args:
+            length_unit: the scene's word, or None to trust the file's own header.
+            key: the scene's key, for the message.
+
+        Raises:
+            InputError: neither states a unit, or they contradict each other.
+        """
+        unit = length_unit or self.length_unit
+        if unit not in LENGTH:
+            word = f"the unit '{self.unit_word}'" if self.unit_word else "no unit of length"
+            mend = f"give '{key}' in the scene, or --length-unit to an import: m, cm or mm"
+            raise InputError(f"states {word}", self.path, mend)
+        if length_unit and self.length_unit and length_unit != self.length_unit:
+            raise InputError(
+                f"is in {self.length_unit} by its own header, but the scene says {length_unit}",
+                self.path,
+                f"correct '{key}'",
+            )
+        return LENGTH[unit]
+
+
+def read_table(path: Path, format: str | None = None) -> Table:
+    """Read a table.
+
+    Args:
+        path: the file.
+        format: a name of `READERS`; by default the suffix.
+
+    Raises:
+        InputError: missing or unreadable file, unknown format, a malformed header or row, an
+            infinite number.
+    """
+    path = Path(path)
+    kind = format or path.suffix.lower().lstrip(".")
+    if kind not in READERS:
+        raise InputError(f"unknown table format '{kind}'", path, f"use {', '.join(READERS)}")
+    return READERS[kind](path)
+
+
+def with_unit(table: Table, length_unit: str | None) -> Table:
+    """Return a table with a unit of length that it may lack.
+
+    Raises:
+        InputError: the file states another one.
+    """
+    if length_unit is None:
+        return table
+    if table.path.suffix.lower() == ".c3d" and table.length_unit is not None:
+        from tkamb.io.recordings.c3d import read_c3d
+
+        read_c3d(table.path, GivenUnits(length_unit))
+        return table  # in m already
+    table.unit_scale(length_unit, "--length-unit")
+    return replace(table, length_unit=length_unit, unit_given=True)
+
+
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text file that is no larger than a table may be."""
+    return read_text(path, TABLE_LIMIT, "utf-8-sig").splitlines()
+
+
+def read_csv(path: Path) -> Table:
+    """Comma-separated: one header row; empty lines and lines that begin with # are skipped.
+
+    Empty cells behind the last name are left out: some programs end every line with a comma.
+    """
+    lines = read_lines(path)
+    rows = [
+        (number, line.split(","))
+        for number, line in enumerate(lines, 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not rows:
+        raise InputError("is empty", path)
+    names = [name.strip().strip('"') for name in rows[0][1]]
+    for sign, word in ((";", "semicolons"), ("\t", "tabs")):
+        if len(names) == 1 and sign in names[0]:
+            mend = "save it with commas between the cells and points in the numbers"
+            raise InputError(f"has {word} between its cells, not commas", path, mend)
+    body = [
+        (number, cells if any(map(str.strip, cells[len(names) :])) else cells[: len(names)])
+        for number, cells in rows[1:]
+    ]
+    columns, equal = _columns(path, names, body)
+    return Table(path, columns, equal=equal, notices=_of_equal(equal))
+
+
+def read_storage(path: Path) -> Table:
+    """OpenSim storage: `key=value` lines to `endheader`, column names, rows."""
+    lines = read_lines(path)
+    ends = [k for k, line in enumerate(lines) if line.strip().lower() == "endheader"]
+    if not ends:
+        raise InputError("has no 'endheader' line", path, "is it an OpenSim storage file?")
+    header = {}
+    for line in lines[: ends[0]]:
+        key, _, value = line.partition("=")
+        header[key.strip().lower()] = value.strip().lower()
+    rows = [
+        (number, line.split())
+        for number, line in enumerate(lines[ends[0] + 1 :], ends[0] + 2)
+        if line.strip()
+    ]
+    if not rows:
+        raise InputError("has no columns after 'endheader'", path)
+    degrees = {"yes": True, "no": False}.get(header.get("indegrees", ""))
+    columns, equal = _columns(path, rows[0][1], rows[1:])
+    return Table(path, columns, in_degrees=degrees, equal=equal, notices=_of_equal(equal))
+
+
+def read_trc(path: Path) -> Table:
+    """Markers. A marker at exactly (0, 0, 0), an empty cell and NaN are gaps.
+
+    Cells end at tabs, or at blanks where a line has no tabs. Columns without a label are
+    `marker 7`.
+    """
+    lines = read_lines(path)
+    if len(lines) < 6 or not lines[0].startswith("PathFileType"):
+        raise InputError("is not a .trc file: too short or no 'PathFileType' line", path)
+    header = dict(zip(lines[1].split(), lines[2].split(), strict=False))
+    body = [(number, _trc_cells(line)) for number, line in enumerate(lines[5:], 6) if line.strip()]
+    usual = int(np.median([_filled(cells) for _, cells in body])) if body else 2
+    markers = _trc_labels(lines[3], lines[4], usual, path)
+    labels = [name or f"marker {k}" for k, name in enumerate(markers, 1)]
+    columns = ["frame", "time", *(f"{m}_{axis}" for m in labels for axis in "xyz")]
+    rows = []
+    for number, cells in body:
+        padded = cells[: len(columns)] + [""] * (len(columns) - len(cells))
+        rows.append((number, padded if _filled(cells) <= len(columns) else cells))
+    table, equal = _columns(path, columns, rows)
+    known = [m for m in labels if f"{m}_x" in table]
+    for marker in known:
+        absent = np.all([table[f"{marker}_{axis}"] == 0.0 for axis in "xyz"], axis=0)
+        for axis in "xyz":
+            table[f"{marker}_{axis}"][absent] = np.nan
+    frame = table.pop("frame")
+    table["time"] = _exact_time(table["time"], frame, header.get("DataRate", ""))
+    twice = sorted({name[:-2] for name in equal})
+    notices = [f"has two markers '{name}'; neither is used" for name in twice]
+    if unlabelled := markers.count(""):
+        notices.append(f"has {unlabelled} marker(s) without a label; they are not used")
+    return Table(
+        path,
+        table,
+        _trc_unit(header, path),
+        equal=equal,
+        notices=tuple(notices),
+        unit_word=header.get("Units", ""),
+    )
+
+
+def _trc_cells(line: str) -> list[str]:
+    """Return the cells of a line: between tabs, where an empty one is a gap, or blanks."""
+    if "\t" not in line.strip():
+        return line.split()
+    cells = [cell.strip() for cell in line.split("\t")]
+    if any(len(cell.split()) > 1 for cell in cells):
+        return [part for cell in cells for part in cell.split() or [""]]
+    return cells
+
+
+def _filled(cells: list[str]) -> int:
+    """Return the number of cells up to the last that is not empty."""
+    return max((k for k, cell in enumerate(cells, 1) if cell), default=0)
+
+
+def _trc_labels(names: str, axes: str, usual: int, path: Path) -> list[str]:
+    """Return a label per marker, empty where the header has none.
+
+    The line of labels has one every three cells. Some programs write blanks for tabs; then the
+    labels in turn are the markers', if there are as many as markers. `usual` is how many cells
+    a row has.
+    """
+    count = max(len(axes.split()) // 3, math.ceil((usual - 2) / 3))
+    cells = [cell.strip() for cell in names.split("\t")][2:]
+    places = [k for k, cell in enumerate(cells) if cell]
+    if places and all(k % 3 == 0 for k in places):
+        spread = [cells[3 * k] if 3 * k < len(cells) else "" for k in range(count)]
+        if len(places) == sum(bool(name) for name in spread):
+            return spread
+    readings = [[cell for cell in cells if cell]]
+    readings.append([part for part in re.split(r"\t|\s{2,}", names.strip()) if part][2:])
+    readings.append(names.split()[2:])
+    for labels in readings:
+        if len(labels) == count:
+            return labels
+    raise InputError(
+        f"names {len(readings[0] or readings[-1])} markers in line 4, but has columns for {count}",
+        path,
+        "write one label every three columns, with tabs between the cells",
+    )
+
+
+def _trc_unit(header: dict[str, str], path: Path) -> str | None:
+    """Return the length unit that a .trc states, as m, cm or mm; None for none of these."""
+    scale = metres(header.get("Units", ""))
+    return next((name for name, value in LENGTH.items() if value == scale), None)
+
+
+def read_c3d_markers(path: Path) -> Table:
+    """Markers of a C3D file on the recording's own clock, m.
+
+    In the file's own numbers, without a unit, where its word for the unit is not understood.
+    """
+    from tkamb.io.recordings.c3d import read_c3d
+
+    recording = read_c3d(path)
+    recording.check_markers()
+    equal = {name for name, count in Counter(recording.labels).items() if count > 1}
+    columns = {
+        f"{label}_{axis}": recording.points[:, k, i]
+        for k, label in enumerate(recording.labels)
+        for i, axis in enumerate("xyz")
+        if label not in equal
+    }
+    return Table(
+        path,
+        {"time": recording.time, **columns},
+        length_unit=recording.length_unit,
+        equal=tuple(f"{label}_{axis}" for label in sorted(equal) for axis in "xyz"),
+        notices=recording.all_notices,
+        unit_word=recording.length_word,
+    )
+
+
+def _exact_time(time: Array, frame: Array, rate: str) -> Array:
+    """Return the camera's even time if the column is that, rounded; else the column.
+
+    The even time is the one that fits the rounded column best.
+    """
+    try:
+        period = 1.0 / float(rate)
+    except (ValueError, ZeroDivisionError):
+        return time
+    even = (frame - frame[0]) * period
+    even = even + (time - even).mean()
+    return even if np.abs(even - time).max() <= TRC_ROUNDING_S else time
+
+
+def _columns(
+    path: Path, names: list[str], rows: list[tuple[int, list[str]]]
+) -> tuple[dict[str, Array], tuple[str, ...]]:
+    """Return name -> values (n,), and the names that stand for several columns."""
+    if not rows:
+        raise InputError("has no data rows", path)
+    counts = Counter(names)
+    values = np.empty((len(rows), len(names)))
+    for k, (number, cells) in enumerate(rows):
+        if len(cells) != len(names):
+            wrong = f"line {number} has {len(cells)} cells, the header {len(names)}"
+            raise InputError(wrong, path, _why_uneven(cells, names))
+        values[k] = _row(cells, path, number)
+    found = {name: values[:, k].copy() for k, name in enumerate(names) if counts[name] == 1}
+    return found, tuple(sorted(name for name, count in counts.items() if count > 1))
+
+
+def _of_equal(names: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(f"has two columns named '{name}'; neither is used" for name in names)
+
+
+def _row(cells: list[str], path: Path, line: int) -> list[float]:
+    if not "".join(cells).strip(_OF_NUMBERS):
+        # The whole row at once is quicker; what is no number after all gets its message below.
+        with contextlib.suppress(ValueError):
+            numbers = [float(cell) for cell in cells]
+            if max(numbers) <= _LARGEST and min(numbers) >= -_LARGEST:
+                return numbers
+    return [_number(cell, path, line) for cell in cells]
+
+
+def _number(cell: str, path: Path, line: int) -> float:
+    text = cell.strip()
+    if not text or _NOT_A_NUMBER.fullmatch(text.lower()):
+        return math.nan
+    if not (_NUMBER.fullmatch(text) or _INFINITE.fullmatch(text.lower())):
+        comma = "is the comma a decimal point? write a point" if _COMMA_NUMBER.match(text) else None
+        plain = comma or "write plain decimal numbers like -12.5"
+        raise InputError(f"line {line} holds '{text}', which is no number", path, plain)
+    number = float(text)
+    if math.isinf(number):
+        mend = "leave the cell empty where nothing was measured"
+        raise InputError(f"line {line} holds '{text}', which is not finite", path, mend)
+    if abs(number) > _LARGEST:
+        raise InputError(
+            f"line {line} holds '{text}', which nothing measures", path, "is it a typing mistake?"
+        )
+    return number
+
+
+def _why_uneven(cells: list[str], names: list[str]) -> str:
+    """Return what may make a row longer or shorter than the header."""
+    if len(cells) < len(names):
+        return "is a cell missing, or a comma?"
+    # a decimal comma cuts every number in two: whole parts alone, and rows about twice as long
+    whole = all(re.fullmatch(r"[+-]?[0-9]*", cell.strip()) for cell in cells)
+    if whole and 4 * len(cells) > 5 * len(names):
+        return "are there decimal commas? write points"
+    return "has the header a name for every column?"
+
+
+READERS: dict[str, Callable[[Path], Table]] = {
+    "csv": read_csv,
+    "sto": read_storage,
+    "mot": read_storage,
+    "trc": read_trc,
+    "c3d": read_c3d_markers,
+}
+"""Suffix, which is the format's name in a scene -> its reader. A new format is a row here."""

@@ -1,0 +1,170 @@
+"""How the shank stands in the laboratory: a sagittal lean, poses, or shank markers.
+
+The laboratory is x forward, y up, z to the subject's right. The tibia link's origin is the
+ankle centre. A left shank is mirrored here, so that the mechanics see a right one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, pose, transform
+from tkamb.io.recordings.filtering import Cutoff, differentiate_coordinates, differentiate_poses
+from tkamb.io.recordings.laboratory import (
+    angle_scale,
+    check_roles,
+    laboratory_rotation,
+    poses_of_columns,
+)
+from tkamb.io.recordings.markers import check_fit, complete_run, fit_rigid, shank_points
+from tkamb.io.recordings.recordings import ShankRecording, Side
+from tkamb.io.recordings.samples import (
+    OddSample,
+    check_range,
+    check_spacing,
+    check_steps,
+    odd_samples,
+)
+from tkamb.io.recordings.tables import Table, read_table
+from tkamb.units import DEGREE, MILLIMETRE
+
+MOST_LEAN_DEG = 150.0
+"""Of a shank from the vertical, either way; a sprinter's swings back by 110."""
+FARTHEST = 100.0
+"""m from the laboratory's origin: what no camera covers."""
+FASTEST_TURN, FASTEST_MOVE = 100.0, 30.0
+"""rad/s and m/s: twice the fastest sprinter's and kicker's shank."""
+ODD_TURN, ODD_MOVE = 0.5 * DEGREE, 3.0 * MILLIMETRE
+"""As near to its neighbours' curve as skin markers are, no sample is odd."""
+SHANK_LENGTH = 0.4
+"""m: where the far end of the shank is looked at."""
+WINDOW = 0.5
+"""s: samples farther from the frames than this do not reach them through the filter."""
+
+
+@dataclass(frozen=True, eq=False)
+class BodyMotion:
+    """The motion of a body in the laboratory, SI.
+
+    Args:
+        time: (f,) s.
+        pose: (f, 4, 4) pose_tibia_in_laboratory, m.
+        velocity: (f, 6) spatial velocity in the body's axes at its origin, linear (m/s)
+            then angular (rad/s): Pinocchio's free flyer.
+        acceleration: (f, 6) its rate, component by component.
+        residual: (f,) m, root mean square distance of the marker fit before filtering; None
+            if the pose was not fitted.
+        odd: samples around the frames that lie off their neighbours' curve.
+    """
+
+    time: Array
+    pose: Array
+    velocity: Array
+    acceleration: Array
+    residual: Array | None = None
+    odd: tuple[OddSample, ...] = ()
+
+
+def load_tibia(source: ShankRecording, time: Array, side: Side, cutoff_Hz: Cutoff) -> BodyMotion:
+    """Return the tibia's motion at the frames of the knee's motion.
+
+    The whole record is filtered and then evaluated, so that a record longer than the
+    interval has no end effect in it.
+
+    Args:
+        source: what to read, and how.
+        time: (f,) s of the frames, on the file's clock.
+        side: of the knee.
+        cutoff_Hz: the motion's cut-off, which holds unless the source has its own.
+
+    Raises:
+        InputError: file, columns or markers cannot be used, or do not cover `time`.
+    """
+    cutoff: Cutoff = cutoff_Hz if source.cutoff is None else source.cutoff
+    recorded = read_table(source.file)
+    if source.kind == "sagittal":
+        return _sagittal(source, recorded, time, side, cutoff)
+    stamps = recorded.time(source.columns.get("time", "time"))
+    rotation = pose(laboratory_rotation(source.laboratory_axes, recorded.path), np.zeros(3))
+    residual = None
+    if source.kind == "markers":
+        stamps, poses, residual = _fit_markers(source, recorded, stamps, time)
+    else:
+        poses = _read_poses(source, recorded)
+    poses = rotation @ poses
+    if side == "left":
+        poses = mirrored_pose(poses)
+    name = str(recorded.path)
+    check_spacing(recorded.path, stamps)
+    odd = _odd_poses(recorded, stamps, poses, time)
+    filtered, velocity, acceleration = differentiate_poses(stamps, poses, cutoff, time, name)
+    at_frames = None if residual is None else np.interp(time, stamps, residual)
+    return BodyMotion(time, filtered, velocity, acceleration, at_frames, odd)
+
+
+def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tuple[OddSample, ...]:
+    """Return the odd samples of the shank's two ends, none of which is or moves impossibly."""
+    near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
+    ends = {"ankle": np.zeros(3), "knee's end of the shank": np.array([0.0, SHANK_LENGTH, 0.0])}
+    odd: list[OddSample] = []
+    for end, point in ends.items():
+        places = transform(poses[near], point)
+        for axis, values in zip("xyz", places.T, strict=True):
+            what = f"{axis} of the {end}"
+            limits, question = (-FARTHEST, FARTHEST), "check [tibia] columns and length_unit"
+            check_range(recorded.path, f"shank: {what}", values, limits, "m", question)
+            one = (recorded.path, what, stamps[near], values)
+            check_steps(*one, FASTEST_MOVE, MILLIMETRE, "mm")
+            odd += odd_samples(*one, ODD_MOVE, MILLIMETRE, "mm")
+    return tuple(odd)
+
+
+def _sagittal(
+    source: ShankRecording, recorded: Table, time: Array, side: str, cutoff: Cutoff
+) -> BodyMotion:
+    """Return the lean about the laboratory's z over a fixed ankle."""
+    check_roles(source.columns, ("time", "angle"), recorded.path, "tibia")
+    stamps = recorded.time(source.columns.get("time", "time"))
+    lean = recorded.complete_column(source.columns.get("angle", "angle"))
+    lean = lean * angle_scale(recorded, source.angle_unit)
+    limits = (-MOST_LEAN_DEG, MOST_LEAN_DEG)
+    question = "check [tibia] columns and angle_unit: it is the lean from the vertical"
+    check_range(recorded.path, "shank: angle", lean / DEGREE, limits, "deg", question)
+    check_spacing(recorded.path, stamps)
+    one = (recorded.path, "the shank's lean", stamps, lean)
+    check_steps(*one, FASTEST_TURN, DEGREE, "deg")
+    odd = odd_samples(*one, ODD_TURN, DEGREE, "deg")
+    angle, rate, rate_of_rate = differentiate_coordinates(
+        stamps, -lean, cutoff, time, name=str(recorded.path)
+    )
+    ankle = source.ankle
+    if side == "left":
+        ankle = MIRROR @ ankle
+    velocity, acceleration = np.zeros((len(time), 6)), np.zeros((len(time), 6))
+    velocity[:, 5], acceleration[:, 5] = rate, rate_of_rate
+    rotation = Rotation.from_euler("z", angle[:, None]).as_matrix()
+    return BodyMotion(time, pose(rotation, ankle), velocity, acceleration, odd=odd)
+
+
+def _read_poses(source: ShankRecording, recorded: Table) -> Array:
+    assert source.sequence is not None
+    kinds = ("rotation", "translation")
+    roles = tuple(f"{kind}_{k}" for kind in kinds for k in (1, 2, 3))
+    check_roles(source.columns, ("time", *roles), recorded.path, "tibia")
+    return poses_of_columns(
+        recorded, source.columns, source.sequence, source.angle_unit, source.length_unit
+    )
+
+
+def _fit_markers(
+    source: ShankRecording, recorded: Table, stamps: Array, time: Array
+) -> tuple[Array, Array, Array]:
+    """Return times, poses and residuals of the marker fit, around the frames."""
+    check_roles(source.columns, ("time",), recorded.path, "tibia")
+    points, reference = shank_points(source, recorded)
+    names = [*source.markers, *(joint.name for joint in source.joint_centre)]
+    run = complete_run(points, names, stamps, time[0], time[-1], recorded)
+    poses, residual = fit_rigid(points[run], reference)
+    check_fit(residual, "shank markers", recorded)
+    return stamps[run], poses, residual

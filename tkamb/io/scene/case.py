@@ -1,0 +1,362 @@
+"""A case: the scene with its files read, in SI, as a right knee. Only what the scene asks for."""
+
+import logging
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, pose
+from tkamb.io.recordings.filtering import check_frames, differentiate_coordinates
+from tkamb.io.recordings.motion import KneeMotion, load_motion
+from tkamb.io.recordings.patient import load_urdf
+from tkamb.io.scene.scene import Scene
+from tkamb.io.scene.si import in_si
+from tkamb.io.scene.tables import FemoralImplantTable, PatellarImplantTable
+from tkamb.knee.chain import Chain
+from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.geometry.surface import Surface
+    from tkamb.io.recordings.emg import Envelopes
+    from tkamb.io.recordings.ground_reaction import GroundReaction
+    from tkamb.io.recordings.measured_force import MeasuredForce
+    from tkamb.io.recordings.recordings import MotionRecording
+    from tkamb.io.recordings.tibia import BodyMotion
+    from tkamb.knee.ligaments import Ligament
+    from tkamb.knee.muscles import Muscle, PatellarLigament
+
+logger = logging.getLogger("tkamb")
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What a run works on. Absent in the scene: None.
+
+    Args:
+        scene: the scene, as its file has it.
+        chain: the patient in Pinocchio.
+        motion: knee (and recorded patella) coordinates per frame.
+        tibia: the shank in the laboratory; None: upright and at rest.
+        ground: ground reaction in the laboratory.
+        femoral: femoral component in the femur link's frame.
+        insert: insert in the insert frame; without its post where that has a contact of its own.
+        patella: patellar button in the patella link's frame.
+        ligaments: the bundles, generic ones among them; slack lengths where the scene has them.
+        muscles: the muscles.
+        patellar_ligament: the patellar ligament.
+        measured: what an instrumented implant measured.
+        emg: envelopes of the muscles' surface EMG.
+        post: the insert's post, insert frame, where the scene asks for its contact.
+        insert_placement: (4, 4) of the insert's mesh, in anatomical axes about its own origin and
+            not mirrored, in the insert frame; None where nothing needs it.
+    """
+
+    scene: Scene
+    chain: Chain
+    motion: KneeMotion
+    tibia: "BodyMotion | None"
+    ground: "GroundReaction | None"
+    femoral: "Surface | None"
+    insert: "Surface | None"
+    patella: "Surface | None"
+    ligaments: "tuple[Ligament, ...]" = ()
+    muscles: "tuple[Muscle, ...]" = ()
+    patellar_ligament: "PatellarLigament | None" = None
+    measured: "MeasuredForce | None" = None
+    emg: "Envelopes | None" = None
+    post: "Surface | None" = None
+    insert_placement: Array | None = None
+
+    @cached_property
+    def split(self) -> float | None:
+        """z (m, femoral frame) between the condyles; None if there is only one."""
+        from tkamb.geometry.condyles import condyle_split
+
+        return condyle_split(self.femoral) if self.femoral else None
+
+    def rates(self, time: Array, places: Array) -> tuple[Array, Array, Array]:
+        """Return places of the patella (n, 3) filtered as the recording is, and derivatives."""
+        cutoff = self.scene.motion.cutoff_Hz
+        check_frames(self.motion.time, cutoff, self.scene.motion.frames)
+        return differentiate_coordinates(time, places, cutoff, name="places of the patella")
+
+    @property
+    def bone(self) -> "Surface | None":
+        """The bone that a muscle wraps, femur link; None without one."""
+        return next((m.wrap.bone for m in self.muscles if m.wrap and m.wrap.bone), None)
+
+    @property
+    def body_mass(self) -> float:
+        """kg, of the patient at the scene's scale."""
+        return self.scene.patient.mass_kg * self.scene.patient.scale**3
+
+    @property
+    def height_mm(self) -> float | None:
+        """Body height at the scene's scale, if the scene has one."""
+        patient = self.scene.patient
+        return None if patient.height_mm is None else patient.height_mm * patient.scale
+
+    @property
+    def body_weight(self) -> float:
+        """N."""
+        return self.body_mass * -float(self.chain.model.gravity.linear[1])
+
+
+def _recordings(
+    scene: Scene, source: "MotionRecording", chain: Chain, parts: "_Parts | None"
+) -> "tuple[KneeMotion, BodyMotion | None, GroundReaction | None]":
+    """Return knee, shank and ground reaction at the frames of the motion."""
+    released = scene.contact.released if scene.contact else ()
+    motion = load_motion(
+        source,
+        scene.patient.side,
+        parts.insert_mesh_in_insert if parts else np.eye(4),
+        parts.femoral_mesh_in_femur if parts else np.eye(4),
+        (*released, "si") if released else (),
+        chain.insert_in_tibia,
+    )
+    tibia = ground = None
+    if scene.tibia:
+        from tkamb.io.recordings.tibia import load_tibia
+
+        tibia = load_tibia(
+            in_si(scene.tibia), motion.time, scene.patient.side, scene.motion.cutoff_Hz
+        )
+    elif motion.markers:
+        cutoff = scene.motion.cutoff_Hz
+        tibia = motion.markers.shank_motion(cutoff, motion.time, str(scene.motion.file))
+    if scene.ground_reaction:
+        from tkamb.io.recordings.ground_reaction import check_under_foot, load_ground_reaction
+
+        ground = load_ground_reaction(in_si(scene.ground_reaction), motion.time, scene.patient.side)
+        for notice in ground.notices:
+            logger.warning("%s: %s", scene.ground_reaction.file, notice)
+        if tibia and scene.ground_reaction.applied == "cop":
+            check_under_foot(ground, tibia.pose[:, :3, 3], scene.ground_reaction.file)
+    return motion, tibia, ground
+
+
+def _common_part(scene: Scene) -> "MotionRecording | None":
+    """Return the motion on the part that the ground reaction covers; None if that is no remedy.
+
+    A scene that states no interval means all that was recorded, and clocks of two files begin
+    and end a little apart.
+    """
+    if scene.ground_reaction is None or scene.motion.interval_s or scene.motion.cycle_s:
+        return None
+    from tkamb.io.recordings.ground_reaction import recorded_span
+    from tkamb.io.recordings.tables import read_table
+
+    source: MotionRecording = in_si(scene.motion)
+    recorded = read_table(source.file, source.format)
+    time = recorded.time(source.columns.get("time", "time"))
+    start, end = recorded_span(in_si(scene.ground_reaction))
+    inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
+    if len(inside) < 2 or len(inside) == len(time):
+        return None
+    common = (float(inside[0]), float(inside[-1]))
+    logger.warning(
+        "%s: recorded from %.4f to %.4f s, the motion from %.4f to %.4f s: %.4f to %.4f s are used",
+        scene.ground_reaction.file,
+        *(start, end, time[0], time[-1], *common),
+    )
+    return replace(source, interval=common)
+
+
+def load_case(scene: Scene) -> Case:
+    """Read the files that the scene names, and no other.
+
+    Raises:
+        InputError: whatever is wrong with them, in one line.
+    """
+    with_patella = scene.patella is not None
+    chain = Chain(load_urdf(in_si(scene.patient), with_patella), with_patella)
+    # tables before meshes, which take longer: a mistake in them is told at once
+    parts = _Parts(scene) if scene.motion.interpretation == "pose" else None
+    try:
+        motion, tibia, ground = _recordings(scene, in_si(scene.motion), chain, parts)
+    except InputError:
+        source = _common_part(scene)
+        if source is None:
+            raise
+        motion, tibia, ground = _recordings(scene, source, chain, parts)
+    parts = parts or _Parts(scene)
+    motion = _derived(scene, motion, parts)
+    muscles: tuple[Muscle, ...] = ()
+    patellar_ligament = None
+    if scene.patella:
+        from tkamb.io.scene import lines
+
+        muscles, patellar_ligament = lines.muscles(scene, chain), lines.patellar_ligament(scene)
+    case = Case(
+        scene,
+        chain,
+        motion,
+        tibia,
+        ground,
+        parts.femoral,
+        parts.insert,
+        parts.patella,
+        _ligaments(scene, parts, chain),
+        muscles,
+        patellar_ligament,
+        _measured(scene, motion),
+        _emg(scene, motion),
+        parts.post,
+        parts.insert_placement,
+    )
+    if scene.patient.scale == 1.0:
+        return case
+    from tkamb.io.scene.scaling import scaled_case
+
+    return scaled_case(case)
+
+
+def _derived(scene: Scene, motion: KneeMotion, parts: "_Parts") -> KneeMotion:
+    """Return the motion with what follows from the surfaces: a seat, a roll with slip."""
+    table = scene.motion
+    if motion.unrecorded or table.motion == "roll-slip":
+        check_frames(motion.time, table.cutoff_Hz, table.frames)
+    if motion.unrecorded:
+        from tkamb.io.scene.derived_motion import seated_motion
+
+        assert parts.femoral is not None and parts.insert is not None
+        motion = seated_motion(motion, parts.femoral, parts.insert, table.cutoff_Hz)
+    if table.motion == "roll-slip":
+        from tkamb.io.scene.derived_motion import rolling_motion
+
+        assert parts.femoral is not None and parts.insert is not None
+        motion = rolling_motion(
+            motion, parts.femoral, parts.insert, table.slip_share, table.cutoff_Hz
+        )
+    return motion
+
+
+def _measured(scene: Scene, motion: KneeMotion) -> "MeasuredForce | None":
+    if scene.measured is None:
+        return None
+    from tkamb.io.recordings.measured_force import load_measured_force
+
+    return load_measured_force(in_si(scene.measured), motion.time)
+
+
+def _emg(scene: Scene, motion: KneeMotion) -> "Envelopes | None":
+    if scene.muscles is None or scene.muscles.emg is None:
+        return None
+    from tkamb.io.recordings.emg import load_envelopes
+
+    return load_envelopes(in_si(scene.muscles.emg), motion.time)
+
+
+def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, ...]":
+    """Return the scene's bundles and the generic ones that it asks for."""
+    bundles: tuple[Ligament, ...] = ()
+    if scene.ligament:
+        from tkamb.io.scene import lines
+        from tkamb.knee.ligament_sides import check_collateral_sides
+
+        bundles = lines.ligaments(scene)
+        check_collateral_sides(bundles, chain, scene.patient.side)
+    if scene.generic_ligaments:
+        from tkamb.knee.generic_ligaments import generic_ligaments
+
+        assert parts.femoral is not None and parts.insert is not None
+        wanted = scene.generic_ligaments.ligaments
+        bundles += generic_ligaments(parts.femoral, parts.insert, chain.insert_in_tibia, wanted)
+    return bundles
+
+
+class _Parts:
+    """The implant's surfaces in their own frames, and where their meshes' axes lie."""
+
+    def __init__(self, scene: Scene) -> None:
+        implant, self._left = scene.implant, scene.patient.side == "left"
+        wants_insert = (
+            scene.contact is not None
+            or scene.generic_ligaments is not None
+            or scene.motion.interpretation == "pose"
+            or scene.motion.motion == "roll-slip"
+        )
+        wants_femoral = wants_insert or scene.patella is not None
+        self.femoral: Surface | None = None
+        self.insert: Surface | None = None
+        self.patella: Surface | None = None
+        self.post: Surface | None = None
+        self.insert_mesh_in_insert = self.femoral_mesh_in_femur = np.eye(4)
+        self.insert_placement: Array | None = None
+        if wants_insert:
+            if not implant.insert:
+                raise InputError(
+                    "interpretation = 'pose' is in the insert mesh's axes",
+                    "[motion]",
+                    "give [implant.insert] and [implant.femoral]",
+                )
+            self.insert = self._place_insert(scene)
+            if scene.contact is not None and scene.contact.post:
+                from tkamb.geometry.post import divide_insert
+
+                self.insert, self.post = divide_insert(self.insert)
+        elif implant.insert and scene.muscles is not None:  # where the model's insert lies
+            self._place_insert(scene)
+        if wants_femoral:
+            if not implant.femoral:
+                raise InputError("is missing", "[implant.femoral]", "the patella rides on it")
+            self.femoral, self.femoral_mesh_in_femur = self._place(
+                "femoral component", implant.femoral
+            )
+        if scene.patella is not None:
+            if not implant.patella:
+                raise InputError("is missing", "[implant.patella]", "[patella] needs its mesh")
+            self.patella, _ = self._place("patellar button", implant.patella)
+
+    def _place_insert(self, scene: Scene) -> "Surface":
+        """Read the insert, keep where its mesh lies in its frame, and return it there."""
+        from tkamb.geometry.flat_bottom import insert_placement
+        from tkamb.io.recordings.meshes import axes_rotation, load_surface
+
+        table = scene.implant.insert
+        assert table is not None
+        surface = load_surface(table.mesh, table.unit, table.axes, name="insert", closed=True)
+        try:
+            placement = insert_placement(surface, axes_rotation(table.axes))
+        except InputError as error:
+            if scene.implant.femoral and self._could_be_insert(scene.implant.femoral):
+                question = "are the meshes of [implant.femoral] and [implant.insert] exchanged?"
+                raise InputError(error.what, error.where, question) from None
+            raise
+        self.insert_mesh_in_insert = placement @ pose(axes_rotation(table.axes), np.zeros(3))
+        self.insert_placement = placement
+        return self._right(surface.moved(placement))
+
+    def _could_be_insert(self, table: FemoralImplantTable) -> bool:
+        """Say whether the mesh that the scene calls femoral has an insert's flat bottom."""
+        from tkamb.geometry.flat_bottom import insert_placement
+        from tkamb.io.recordings.meshes import axes_rotation, load_surface
+
+        try:
+            surface = load_surface(table.mesh, table.unit, table.axes, name="femoral component")
+            insert_placement(surface, axes_rotation(table.axes))
+        except InputError:
+            return False
+        return True
+
+    def _place(
+        self, name: str, table: FemoralImplantTable | PatellarImplantTable
+    ) -> "tuple[Surface, Array]":
+        from scipy.spatial.transform import Rotation
+
+        from tkamb.io.recordings.meshes import axes_rotation, load_surface
+
+        surface = load_surface(table.mesh, table.unit, table.axes, name=name)
+        turn = Rotation.from_euler("XYZ", table.rotation_deg, degrees=True).as_matrix()
+        placement = pose(turn, np.array(table.position_mm) * MILLIMETRE)
+        mesh_in_link = placement @ pose(axes_rotation(table.axes), np.zeros(3))
+        return self._right(surface.moved(placement)), mesh_in_link
+
+    def _right(self, surface: "Surface") -> "Surface":
+        from tkamb.io.recordings.meshes import mirrored
+
+        return mirrored(surface) if self._left else surface

@@ -1,0 +1,107 @@
+"""Motions that nobody recorded as they are computed: seated on the insert, or rolled over it."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.condyles import LowestPoints, condyle_split
+from tkamb.geometry.first_touch import FirstTouch
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
+from tkamb.geometry.surface import Surface
+from tkamb.io.recordings.filtering import Cutoff, differentiate_coordinates
+from tkamb.io.recordings.motion import KneeMotion
+from tkamb.knee.slip import condyle_slip, roll_slip_motion
+
+
+def seated_motion(
+    motion: KneeMotion, femoral: Surface, insert: Surface, cutoff: Cutoff
+) -> KneeMotion:
+    """Return the motion with a first guess for the coordinates that were not recorded.
+
+    Rotations stay at zero. AP and ML bring the mean of the condyles' lowest points over the
+    insert's origin, SI brings the femur down to first touch, all at the other coordinates.
+    They are where the search for the released coordinates begins in each frame; their rates,
+    which enter inertia and the direction of sliding, are those of this guess.
+
+    Args:
+        motion: as recorded; `motion.unrecorded` names what is missing.
+        femoral: femoral component, femoral frame.
+        insert: insert, insert frame.
+        cutoff: Hz, low-pass of the differentiation.
+
+    Raises:
+        InputError: the femur does not come to lie over the insert.
+    """
+    places = motion.coordinates.copy()
+    lowest = LowestPoints(femoral, condyle_split(femoral))
+    touch = FirstTouch(femoral, insert)
+    over = [(i, KNEE_COORDINATES.index(name), name) for i, name in ((0, "ap"), (2, "ml"))]
+    for place in places:
+        points = [point for point in lowest.at(knee_pose(place)) if point is not None]
+        for axis, index, name in over:
+            if name in motion.unrecorded:
+                place[index] -= np.mean(points, axis=0)[axis]
+        if "si" in motion.unrecorded:
+            place[KNEE_COORDINATES.index("si")] -= touch.travel(knee_pose(place))
+    lost = _first_lost(places, motion.time)
+    if lost is not None:
+        raise InputError(
+            f"the femur does not lie over the insert at {lost:.3g} s",
+            "[motion]",
+            "record ap and ml, or check the meshes' units, axes and origins",
+        )
+    found = [KNEE_COORDINATES.index(name) for name in motion.unrecorded]
+    return _with_coordinates(motion, places, found, cutoff)
+
+
+def rolling_motion(
+    motion: KneeMotion, femoral: Surface, insert: Surface, slip_share: float, cutoff: Cutoff
+) -> KneeMotion:
+    """Return the motion with its AP and SI coordinates replaced by those of roll and slip.
+
+    SI brings the femur down to first touch, of one condyle; rotations and ML stay. The two
+    new coordinates are differentiated like recorded ones; they are no closed cycle even
+    where the recorded ones are.
+
+    Args:
+        motion: as recorded and filtered.
+        femoral: femoral component, femoral frame.
+        insert: insert, insert frame.
+        slip_share: 1: the mean slip of the condyles that the recorded motion has;
+            0: pure rolling.
+        cutoff: Hz, low-pass of the differentiation.
+
+    Raises:
+        InputError: the femur rolls off the insert.
+    """
+    split = condyle_split(femoral)
+    recorded = condyle_slip(femoral, insert, split, motion.coordinates)
+    slip = np.mean([side.slip for side in recorded if side is not None], axis=0)
+    rolled = roll_slip_motion(femoral, insert, split, motion.coordinates, slip_share * slip)
+    lost = _first_lost(rolled, motion.time)
+    if lost is not None:
+        raise InputError(
+            f"the femur rolls off the insert at {lost:.3g} s",
+            "[motion] motion = 'roll-slip'",
+            "give it more of the recorded slip (slip_share) or take motion = 'recorded'",
+        )
+    return _with_coordinates(motion, rolled, [0, 1], cutoff)
+
+
+def _first_lost(places: Array, time: Array) -> float | None:
+    """Return the first time (s) at which coordinates (f, 6) are not known."""
+    lost = np.flatnonzero(~np.isfinite(places).all(axis=1))
+    return float(time[lost[0]]) if len(lost) else None
+
+
+def _with_coordinates(
+    motion: KneeMotion, places: Array, columns: list[int], cutoff: Cutoff
+) -> KneeMotion:
+    """Return the motion with some columns of other coordinates (f, 6), differentiated."""
+    values = (motion.coordinates.copy(), motion.velocity.copy(), motion.acceleration.copy())
+    found = differentiate_coordinates(motion.time, places[:, columns], cutoff)
+    for value, new in zip(values, found, strict=True):
+        value[:, columns] = new
+    coordinates, velocity, acceleration = values
+    return replace(motion, coordinates=coordinates, velocity=velocity, acceleration=acceleration)

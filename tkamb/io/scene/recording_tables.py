@@ -1,0 +1,305 @@
+"""The tables of what was recorded: the knee's motion, the shank and the ground reaction."""
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from tkamb.io.scene.table import (
+    FORMAT,
+    AngleUnit,
+    Axes,
+    Count,
+    LengthUnit,
+    Number,
+    Point,
+    SceneTable,
+    TableFormat,
+    Vector,
+    within,
+)
+
+
+class MarkerSegmentTable(SceneTable):
+    """A segment with skin markers: the shank, the thigh, or what hangs on one of them."""
+
+    name: str = Field(description="'shank' and 'thigh' are the knee's; others are neighbours")
+    markers_mm: dict[str, Vector] = Field(
+        min_length=1,
+        description="marker -> position in the tibia link (shank), the femur link (thigh) or the "
+        "neighbour's own frame",
+    )
+    weights: dict[str, float] = Field(
+        default_factory=dict, description="of the squared distances, where not 1"
+    )
+    joined_to: Literal["shank", "thigh"] | None = Field(
+        None, description="a neighbour's: the segment that it hangs on by a ball joint"
+    )
+    joint_mm: Vector | None = Field(None, description="the ball joint in that segment's link")
+    centre_mm: Vector | None = Field(None, description="the same in the neighbour's own frame")
+
+    @model_validator(mode="after")
+    def _hangs_somewhere(self) -> Self:
+        knee = self.name in ("shank", "thigh")
+        given = [v is not None for v in (self.joined_to, self.joint_mm, self.centre_mm)]
+        if any(given) if knee else not all(given):
+            raise ValueError(
+                "'joined_to', 'joint_mm' and 'centre_mm' go together, on every segment but "
+                "shank and thigh"
+            )
+        for name, weight in self.weights.items():
+            if name not in self.markers_mm:
+                raise ValueError(f"a weight for '{name}', which is no marker of '{self.name}'")
+            if not weight >= 0:
+                raise ValueError(f"the weight of '{name}' is negative")
+        return self
+
+
+class MarkersTable(SceneTable):
+    """The knee's motion and the shank in the laboratory, from skin markers."""
+
+    method: Literal["segments", "chain"] = Field(
+        description="'segments': rigid fits of shank and thigh, each by itself; 'chain': all "
+        "segments at once, held together by their joints. Both are computed and compared"
+    )
+    knee: Literal["hinge", "free"] = Field(
+        "hinge", description="the chain's knee: flexion alone, or six freedoms"
+    )
+    coordinates: tuple[Literal["flexion", "adduction", "axial_rotation", "ap", "si", "ml"], ...] = (
+        Field(
+            ("flexion",),
+            min_length=1,
+            description="knee coordinates that are taken from the markers; [contact] releases "
+            "the others",
+        )
+    )
+    neutral_mm: Vector = Field(
+        description="ap, si, ml of the femur link in the insert frame, where a hinge keeps it"
+    )
+    neutral_deg: tuple[float, float] = Field(
+        (0.0, 0.0), description="axial rotation and adduction that a hinge keeps"
+    )
+    laboratory_axes: Axes = Field(
+        "+x,+y,+z", description="axes of the file that point forward, up and right"
+    )
+    segment: tuple[MarkerSegmentTable, ...] = Field(description="shank, thigh and neighbours")
+
+    @model_validator(mode="after")
+    def _shank_and_thigh(self) -> Self:
+        names = [segment.name for segment in self.segment]
+        if len(names) != len(set(names)):
+            raise ValueError("two segments have the same name")
+        if missing := {"shank", "thigh"} - set(names):
+            raise ValueError(f"segment '{min(missing)}' is missing")
+        if "flexion" not in self.coordinates:
+            raise ValueError("'coordinates' lacks flexion, which nothing else gives")
+        return self
+
+
+class MotionTable(SceneTable):
+    """The knee's recorded motion.
+
+    `interpretation = "coordinates"`: columns are the six knee coordinates (Grood-Suntay) of
+    the femoral component in the insert frame. `"pose"`: columns are a rotation sequence and
+    a translation that place the femoral mesh in the insert mesh's own axes. `"markers"`: skin
+    markers of shank and thigh, see [motion.markers]; they place the shank too.
+    """
+
+    file: Path
+    motion: Literal["recorded", "roll-slip"] = Field(
+        "recorded",
+        description=(
+            "'roll-slip' (Sharma 2008): rotations and ML as recorded, AP from rolling plus slip, "
+            "SI from first touch; needs the implant"
+        ),
+    )
+    slip_share: Number = Field(
+        1.0, ge=0, le=10, description="roll-slip: share of the recorded slip; 0 is pure rolling"
+    )
+    format: TableFormat | None = Field(None, description=FORMAT)
+    interpretation: Literal["coordinates", "pose", "markers"] = "coordinates"
+    markers: MarkersTable | None = Field(None, description="with interpretation = 'markers'")
+    sequence: str | None = Field(
+        None,
+        pattern="^([xyz]{3}|[XYZ]{3})$",
+        description="pose only: upper case = intrinsic, as in scipy ('XYZ' is Rx Ry Rz)",
+    )
+    columns: dict[str, str] = Field(
+        default_factory=dict,
+        description=(
+            "role -> column name, where it differs from the role. Roles: time (s), flexion, "
+            "adduction, axial_rotation, ap, si, ml (coordinates); time, rotation_1..3, "
+            "translation_1..3 (pose); patella_ap, patella_si, patella_rotation. Coordinates that "
+            "[contact] releases need no column"
+        ),
+    )
+    signs_turned: tuple[str, ...] = Field(
+        (),
+        description=(
+            "roles whose columns are read with the other sign: states another reading of a file "
+            "whose signs are in doubt"
+        ),
+    )
+    angle_unit: AngleUnit | None = Field(None, description="of the file; markers need none")
+    length_unit: LengthUnit | None = Field(
+        None, description="of the file; .trc and .c3d state their own"
+    )
+    cutoff_Hz: Number | Literal["none"] = Field(
+        description="low-pass cut-off of the differentiation; 'none' trusts the samples"
+    )
+    interval_s: tuple[Number, Number] | None = Field(
+        None, description="the part of the recording that is computed; default: all of it"
+    )
+    cycle_s: tuple[Number, Number] | None = Field(
+        None,
+        description="the motion's time column is per cent of a cycle, which lies on this interval",
+    )
+    cycle_offset_percent: Number = Field(
+        0.0, ge=-100, le=100, description="per cent of the cycle at cycle_s[0]"
+    )
+    frames: Count | None = Field(
+        None,
+        ge=2,
+        description="resample to so many frames; default: as recorded. The recording is filtered "
+        "at its own samples first; what is found at the frames (a solved patella, roll-slip, "
+        "the first guess of coordinates that nobody recorded) is filtered there, so that these "
+        "must be more than twice cutoff_Hz a second",
+    )
+
+    @model_validator(mode="after")
+    def _keys_go_together(self) -> Self:
+        if (self.interpretation == "pose") != (self.sequence is not None):
+            raise ValueError("'sequence' belongs to interpretation = 'pose', and is needed there")
+        if self.motion == "recorded" and "slip_share" in self.model_fields_set:
+            raise ValueError("'slip_share' belongs to motion = 'roll-slip'")
+        if (self.interpretation == "markers") != (self.markers is not None):
+            raise ValueError("[motion.markers] belongs to interpretation = 'markers'")
+        if self.markers is None and not (self.angle_unit and self.length_unit):
+            missing = "length_unit" if self.angle_unit else "angle_unit"
+            raise ValueError(f"missing key '{missing}'")
+        if self.interval_s and (self.cycle_s or self.interval_s[0] >= self.interval_s[1]):
+            raise ValueError("'interval_s' must rise, and excludes cycle_s")
+        return self
+
+
+class JointCentreTable(SceneTable):
+    """A joint centre known from the neighbouring segment's markers: one more shank marker.
+
+    For shanks with fewer than three markers: the ankle centre is carried by the markers of
+    the foot, the knee centre by those of the thigh.
+    """
+
+    name: str
+    markers_mm: dict[str, Point] = Field(
+        min_length=1,
+        description="the neighbour's markers: name -> position in the neighbour's own frame",
+    )
+    centre_mm: Point = Field(description="the joint centre in the neighbour's own frame")
+    tibia_mm: Point = Field(description="the joint centre in the tibia link")
+
+
+class TibiaTable(SceneTable):
+    """How the shank stands in the laboratory (x forward, y up, z right).
+
+    One of: `sagittal` (a forward lean about z over a fixed ankle), `pose` (columns of a
+    file that place the tibia link), `markers` (rigid fit of shank markers).
+    """
+
+    kind: Literal["sagittal", "pose", "markers"]
+    file: Path
+    columns: dict[str, str] = Field(
+        default_factory=dict,
+        description=(
+            "role -> column: time (s), angle (sagittal; forward lean is positive) | "
+            "time, rotation_1..3, translation_1..3 (pose)"
+        ),
+    )
+    sequence: str | None = Field(
+        None,
+        pattern="^([xyz]{3}|[XYZ]{3})$",
+        description="pose only: upper case = intrinsic, as in scipy",
+    )
+    angle_unit: AngleUnit = "deg"
+    length_unit: LengthUnit | None = Field(
+        None, description="of the file; needed for pose, and for markers unless the file says"
+    )
+    cutoff_Hz: Number | Literal["none"] | None = Field(
+        None, description="low-pass cut-off; default: the motion's"
+    )
+    ankle_mm: Annotated[Vector, within(-20000, 20000, "is it in millimetres?")] = Field(
+        (0.0, 0.0, 0.0), description="sagittal: the fixed ankle in the lab"
+    )
+    markers_mm: dict[str, Point] = Field(
+        default_factory=dict, description="markers: name -> position in the tibia link"
+    )
+    joint_centre: tuple[JointCentreTable, ...] = Field(
+        (), description="markers: joint centres that neighbouring segments carry"
+    )
+    laboratory_axes: Axes = Field(
+        "+x,+y,+z", description="axes of the file that point forward, up and right"
+    )
+
+    @model_validator(mode="after")
+    def _kind_is_complete(self) -> Self:
+        if (self.kind == "pose") != (self.sequence is not None):
+            raise ValueError("'sequence' belongs to kind = 'pose', and is needed there")
+        if self.kind == "pose" and self.length_unit is None:
+            raise ValueError("kind = 'pose' needs 'length_unit'")
+        if (self.kind == "markers") != bool(self.markers_mm or self.joint_centre):
+            raise ValueError("'markers_mm' belongs to kind = 'markers', and is needed there")
+        return self
+
+
+class GroundReactionTable(SceneTable):
+    """The force that the ground exerts on the foot: one level plate, or plates of a `.c3d`."""
+
+    file: Path
+    format: TableFormat | None = Field(None, description=FORMAT)
+    plates: tuple[int, ...] = Field(
+        (),
+        description="of a .c3d: the plates that the foot stood on, in turn or at once, from 1; "
+        "their wrenches are summed",
+    )
+    columns: dict[str, str] = Field(
+        default_factory=dict,
+        description=(
+            "role -> column: time (s), force_1..3 (N, along the file's x, y, z), "
+            "point_1..3 (centre of pressure; the one along the vertical may be missing: the "
+            "plate then is at the laboratory's height 0), moment_1..3 (N·m, free moment at that "
+            "point; those not named and not in the file are zero)"
+        ),
+    )
+    length_unit: LengthUnit | None = Field(
+        None, description="of the file; a .c3d mostly states its own"
+    )
+    force_unit: str | None = Field(
+        None,
+        description="of a .c3d: what its force channels are in (N, kN), where they state no unit "
+        "or one that is not understood",
+    )
+    moment_unit: str | None = Field(
+        None, description="of a .c3d: what its moment channels are in (Nm, Nmm, Ncm), likewise"
+    )
+    laboratory_axes: Axes = Field(
+        "+x,+y,+z", description="axes of the file that point forward, up and right"
+    )
+    force: Literal["on the foot", "on the plate"] = Field(
+        "on the foot",
+        description="what the file's force acts on: 'on the plate' turns the signs of force and "
+        "free moment (Newton's third law), which no choice of axes does; the centre of pressure "
+        "stays",
+    )
+    applied: Literal["cop", "ankle"] = Field(
+        "cop", description="'ankle' applies the force alone at the ankle centre (Sharma 2008)"
+    )
+    cutoff_Hz: Number | Literal["none"]
+    unloaded_N: Number = Field(
+        20.0, gt=0, le=200, description="below this vertical force the centre of pressure is held"
+    )
+    surface_mm: Number = Field(
+        0.0,
+        ge=0,
+        le=3000,
+        description="of a .c3d: height above the plates of what the foot stands on, a step say; "
+        "the wrench stays as measured, the centre of pressure is given on that level",
+    )

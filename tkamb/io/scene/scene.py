@@ -1,0 +1,355 @@
+"""The scene: what exists and what is to be modelled. An absent table is not modelled.
+
+A scene is a TOML file. Units are in the key names, paths are relative to the file, an
+unknown key is an error. `load_scene` reads and validates it; nothing else is opened.
+"""
+
+import json
+import os
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self, get_args
+
+from pydantic import BaseModel, Field, PrivateAttr, ValidationError, model_validator
+from pydantic_core import ErrorDetails
+
+from tkamb.errors import InputError, names_near
+from tkamb.files import read_text
+from tkamb.io.scene.measured import MeasuredTable
+from tkamb.io.scene.recording_tables import GroundReactionTable, MotionTable, TibiaTable
+from tkamb.io.scene.table import SceneTable
+from tkamb.io.scene.tables import (
+    ContactTable,
+    GenericLigamentsTable,
+    ImplantTable,
+    LigamentTable,
+    MaterialTable,
+    MusclesTable,
+    MuscleTable,
+    OutputTable,
+    PatellarLigamentTable,
+    PatellaTable,
+    PatientTable,
+    QuadricepsTable,
+    WearTable,
+)
+from tkamb.io.scene.uncertainty import UncertaintyTable
+
+if TYPE_CHECKING:
+    from tkamb.io.presets.preset import AppliedPreset
+
+
+class Scene(SceneTable):
+    """Everything a run needs to know; see the tables."""
+
+    base: str | None = Field(
+        None,
+        description=(
+            "name of another scene file in the same folder: its keys hold where this file does "
+            "not give them, table by table; lists are replaced whole"
+        ),
+    )
+    patient: PatientTable
+    motion: MotionTable
+    tibia: TibiaTable | None = None
+    ground_reaction: GroundReactionTable | None = None
+    implant: ImplantTable = ImplantTable()
+    ligament: tuple[LigamentTable, ...] = ()
+    generic_ligaments: GenericLigamentsTable | None = None
+    muscle: tuple[MuscleTable, ...] = ()
+    quadriceps: QuadricepsTable | None = None
+    muscles: MusclesTable | None = None
+    patellar_ligament: PatellarLigamentTable | None = None
+    patella: PatellaTable | None = None
+    contact: ContactTable | None = None
+    material: MaterialTable | None = None
+    measured: MeasuredTable | None = None
+    wear: WearTable | None = None
+    output: OutputTable = OutputTable()
+    uncertainty: UncertaintyTable | None = None
+    _overrides: dict[str, Any] = PrivateAttr(default_factory=dict)
+    _preset: "AppliedPreset | None" = PrivateAttr(default=None)
+
+    @property
+    def overrides(self) -> dict[str, Any]:
+        """Return dotted key -> value that `load_scene` put in the place of the file's."""
+        return dict(self._overrides)
+
+    @property
+    def identity_json(self) -> str:
+        """All that a run depends on, as JSON: what only `tkamb wear` reads is left out."""
+        unused = {"wear"} if self.material else {"wear", "material"}
+        return self.model_dump_json(exclude=unused)
+
+    @property
+    def insert_material(self) -> dict[str, Any]:
+        """What the insert is made of, as `tkamb.contact.given_material` takes it."""
+        if self.material is not None:
+            return self.material.model_dump()
+        return {} if self.contact is None else {"base": self.contact.material}
+
+    @property
+    def yield_stress_MPa(self) -> float:
+        """Yield stress of the insert: [material]'s, else [output]'s."""
+        own = self.material.yield_stress_MPa if self.material else None
+        return self.output.yield_stress_MPa if own is None else own
+
+    @property
+    def preset(self) -> "AppliedPreset | None":
+        """Return the preset that was laid over the scene, if any."""
+        return self._preset
+
+    def __repr__(self) -> str:
+        """Return in a line whose knee it is, what moves and what presses."""
+        contact = self.contact
+        parts = [
+            f"{self.patient.side} knee",
+            f"{self.patient.mass_kg:g} kg",
+            f"motion of {self.motion.file.name}",
+            f"{contact.model} at {contact.resolution_mm:g} mm" if contact else "no contact",
+        ]
+        return f"<tkamb.Scene: {', '.join(parts)}>"
+
+    @model_validator(mode="after")
+    def _belongs_together(self) -> Self:
+        names = [ligament.name for ligament in self.ligament]
+        if len(names) != len(set(names)):
+            raise ValueError("two [[ligament]] tables have the same name")
+        generic = self.generic_ligaments.ligaments if self.generic_ligaments else ()
+        for name in names:
+            if name.removeprefix("generic_").startswith(generic):
+                raise ValueError(f"'{name}' is in [generic_ligaments] and in [[ligament]]")
+        muscles = [muscle.name for muscle in self.muscle] + ["quadriceps"] * bool(self.quadriceps)
+        if len(muscles) != len(set(muscles)):
+            raise ValueError("two muscles have the same name; [quadriceps] is one of that name")
+        parts = (muscles, self.patellar_ligament, self.patella)
+        if any(parts) and not all(parts):
+            raise ValueError(
+                "[quadriceps] (or [[muscle]]), [patellar_ligament] and [patella] go together: "
+                "give all or none"
+            )
+        if self.muscles and not self.patella:
+            raise ValueError("[muscles] needs [quadriceps], [patellar_ligament] and [patella]")
+        ligament = self.patellar_ligament
+        solved = self.patella is not None and self.patella.motion == "solved"
+        if solved and (ligament is None or ligament.length_mm is None):
+            raise ValueError("[patella] motion = 'solved' needs [patellar_ligament] length_mm")
+        needs_implant = {
+            "[contact]": self.contact is not None,
+            "[generic_ligaments]": bool(generic),
+            "[motion] motion = 'roll-slip'": self.motion.motion == "roll-slip",
+        }
+        for name, asked in needs_implant.items():
+            if asked and not (self.implant.femoral and self.implant.insert):
+                raise ValueError(f"{name} needs [implant.femoral] and [implant.insert]")
+        contact = self.contact
+        if self.material and contact and "material" in contact.model_fields_set:
+            raise ValueError("[material] and [contact] material name two materials: give one")
+        own_yield = self.material is not None and self.material.yield_stress_MPa is not None
+        if own_yield and "yield_stress_MPa" in self.output.model_fields_set:
+            raise ValueError("[material] and [output] both give yield_stress_MPa: give one")
+        if self.material and not contact:
+            raise ValueError("[material] needs [contact]: nothing else is pressed")
+        if self.tibia and self.motion.markers:
+            raise ValueError("[motion.markers] places the shank too: drop [tibia]")
+        if self.ground_reaction and not (self.tibia or self.motion.markers):
+            raise ValueError("[ground_reaction] needs [tibia]: how the shank stands in the lab")
+        return self
+
+
+def load_scene(
+    path: str | Path, overrides: dict[str, Any] | None = None, preset: str | None = None
+) -> Scene:
+    """Read and validate a scene file.
+
+    Args:
+        path: a TOML file; paths inside it are relative to its folder.
+        overrides: dotted key ("contact.model") -> value, applied before validation.
+        preset: name of a preset (`tkamb.io.presets.registry`), applied before the overrides.
+
+    Raises:
+        InputError: unreadable file, unknown key, missing unit, value out of range, no such
+            preset, or a scene that lacks what the preset needs.
+    """
+    path = Path(path)
+    content = _content(path)
+    applied = None if preset is None else _apply_preset(content, preset, overrides or {}, path)
+    for key, value in (overrides or {}).items():
+        _override(content, key, value)
+    try:
+        scene = Scene.model_validate(content)
+    except ValidationError as error:
+        raise _complaint(error, path, overrides or {}) from None
+    resolved: Scene = _resolve_paths(scene, path.parent)
+    resolved._overrides = dict(overrides or {})
+    resolved._preset = applied
+    return resolved
+
+
+def with_preset(scene: Scene, preset: str, overrides: dict[str, Any] | None = None) -> Scene:
+    """Return a scene with a preset laid over it; what its own overrides set stays.
+
+    Args:
+        scene: as read.
+        preset: name of a preset (`tkamb.io.presets.registry`).
+        overrides: dotted key -> value that is laid over the preset.
+
+    Raises:
+        InputError: no such preset, or the scene lacks what it needs.
+    """
+    content = scene.model_dump(exclude_unset=True)
+    more = scene.overrides | (overrides or {})
+    applied = _apply_preset(content, preset, more, "scene")
+    for key, value in more.items():
+        _override(content, key, value)
+    try:
+        found = Scene.model_validate(content)
+    except ValidationError as error:
+        raise _complaint(error, Path("scene"), more) from None
+    found._overrides, found._preset = more, applied
+    return found
+
+
+def _apply_preset(
+    content: dict[str, Any], name: str, overrides: dict[str, Any], where: object
+) -> "AppliedPreset":
+    from tkamb.io.presets.registry import find_preset
+
+    return find_preset(name).apply(content, overrides, where)
+
+
+def scene_files(path: Path) -> list[Path]:
+    """Return a scene file that could be read and, if it stands on one, its base."""
+    base = _parse(path).get("base")
+    return [path] if base is None else [path, path.parent / base]
+
+
+def _content(path: Path) -> dict[str, Any]:
+    """Return what a scene file says, on top of what its base says."""
+    content = _parse(path)
+    if "base" not in content:
+        return content
+    name = content["base"]
+    if not isinstance(name, str) or name != Path(name).name:
+        raise InputError("'base' is no file name", path, "name a scene file in the same folder")
+    base = _parse(path.parent / name)
+    if "base" in base:
+        raise InputError(f"its base {name} has a base itself", path, "name that one")
+    return _merge(base, content)
+
+
+def _merge(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Return the base's keys with one's own in their place; tables are merged."""
+    merged = base | own
+    for key, value in own.items():
+        if isinstance(value, dict) and isinstance(base.get(key), dict):
+            merged[key] = _merge(base[key], value)
+    return merged
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(read_text(path, what="scene file"))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"is not TOML ({error})", path) from None
+
+
+def scene_schema() -> dict[str, Any]:
+    """Return the JSON schema of the scene file."""
+    return Scene.model_json_schema()
+
+
+def _override(content: dict[str, Any], dotted: str, value: Any) -> None:
+    *tables, key = dotted.split(".")
+    for name in tables:
+        content = content.setdefault(name, {})
+        if not isinstance(content, dict):
+            raise InputError(f"'{dotted}' does not lead through tables", "--set")
+    content[key] = value
+
+
+def _complaint(error: ValidationError, path: Path, overrides: dict[str, Any]) -> InputError:
+    """Return what to mend first: an unknown key may be the missing one, misspelt."""
+    found = error.errors()
+    rank = {"extra_forbidden": 0, "missing": 2}
+    first = min(found, key=lambda one: rank.get(one["type"], 1))
+    key = ".".join(str(part) for part in first["loc"])
+    option = next((o for o in overrides if f"{o}.".startswith(f"{key}.") or o == key), None)
+    where = path if option is None else f"--set {option}"
+    more = f" ({len(found) - 1} more after this one)" if len(found) > 1 else ""
+    if first["type"] == "extra_forbidden":
+        known = list(_keys_of(first["loc"][:-1]))
+        advice = names_near(str(first["loc"][-1]), known)
+        return InputError(f"unknown key '{key}'", where, f"{advice}{_tables_with(first)}{more}")
+    advice = f"`tkamb scene --schema` lists every key{more}"
+    if first["type"] == "missing":
+        return InputError(f"missing key '{key}'", where, advice)
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] in ("float_type", "int_type", "bool_type"):
+        message += f", {_shown(first['input'])} is none"
+    if first["type"] in ("tuple_type", "list_type"):
+        message = _as_list(key, first["input"], option == key)
+    return InputError(f"'{key}': {message}" if key else message, where, advice)
+
+
+def _as_list(key: str, value: Any, from_command_line: bool) -> str:
+    """Return how to write a list where a single value was given."""
+    if isinstance(value, dict):
+        return f"is one table; write [[{key}]], with two brackets, above each"
+    shown = json.dumps(value, default=str)
+    written = (
+        f"--set '{key}=[{shown}]'" if from_command_line else f"{key.split('.')[-1]} = [{shown}]"
+    )
+    return f"{shown} is no list; in brackets it is one: {written}"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}" in quotes' if isinstance(value, str) else str(value)
+
+
+def _keys_of(place: tuple[int | str, ...]) -> tuple[str, ...]:
+    """Return the keys of the table at a place of the scene."""
+    model = _model_at(place)
+    return () if model is None else tuple(model.model_fields)
+
+
+def _model_at(place: tuple[int | str, ...]) -> type[BaseModel] | None:
+    model: type[BaseModel] | None = Scene
+    for part in place:
+        if isinstance(part, int):
+            continue
+        field = None if model is None else model.model_fields.get(part)
+        model = None if field is None else _table_in(field.annotation)
+    return model
+
+
+def _table_in(annotation: Any) -> type[BaseModel] | None:
+    """Return the table's class in an annotation: itself, optional, or in a tuple."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((t for a in get_args(annotation) if (t := _table_in(a)) is not None), None)
+
+
+def _tables_with(complaint: ErrorDetails) -> str:
+    """Return in which other tables the key would be known."""
+    key = complaint["loc"][-1]
+    own = _model_at(complaint["loc"][:-1])
+    tables = {name: _model_at((name,)) for name in Scene.model_fields}
+    named = [f"[{n}]" for n, m in tables.items() if m and m is not own and key in m.model_fields]
+    return f"; '{key}' is a key of {', '.join(named)}" if named else ""
+
+
+def _resolve_paths(model: Any, folder: Path) -> Any:
+    """Return the model with its paths made absolute against the scene's folder."""
+    changed: dict[str, Any] = {}
+    for name in type(model).model_fields:
+        value = getattr(model, name)
+        if isinstance(value, Path):
+            changed[name] = Path(os.path.abspath(folder / value))
+        elif isinstance(value, SceneTable):
+            changed[name] = _resolve_paths(value, folder)
+        elif isinstance(value, tuple) and value and isinstance(value[0], SceneTable):
+            changed[name] = tuple(_resolve_paths(one, folder) for one in value)
+    return model.model_copy(update=changed) if changed else model

@@ -1,0 +1,81 @@
+"""What the tables of the scene file are made of: their base, units, numbers and limits."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Strict
+
+LengthUnit = Literal["m", "cm", "mm", "inch"]
+AngleUnit = Literal["rad", "deg"]
+Number = Annotated[float, Strict()]
+"""Neither `true` nor a number in quotes is one."""
+Count = Annotated[int, Strict()]
+Switch = Annotated[bool, Strict()]
+Vector = tuple[Number, Number, Number]
+KneeFreedom = Literal["ap", "si", "ml", "axial_rotation", "adduction"]
+Closing = Literal["interpolate", "there-and-back", "as recorded"]
+"""How recorded frames become a cycle of wear, see `tkamb.studies.wear.motion`."""
+DEFAULT_CLOSING: Closing = "interpolate"
+
+
+def _axes(text: str) -> str:
+    names = [part.strip() for part in text.split(",")]
+    if len(names) != 3 or sorted(n.lstrip("+-") for n in names) != ["x", "y", "z"]:
+        raise ValueError(
+            "must name three different axes for anterior, superior and right, e.g. '-x,+y,-z'"
+        )
+    return ",".join(n if n[0] in "+-" else f"+{n}" for n in names)
+
+
+Axes = Annotated[str, AfterValidator(_axes)]
+
+
+def within(low: float, high: float, question: str) -> Any:
+    """Return the annotation of a number, or of each of a vector's, that must lie in a range."""
+
+    def checked(value: Any) -> Any:
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and not low <= number <= high:
+                raise ValueError(f"{number:g} is not within {low:g} to {high:g}; {question}")
+        return value
+
+    return AfterValidator(checked)
+
+
+def zero_or_within(low: float, high: float, question: str) -> Any:
+    """Return the annotation of a number that is zero or must lie in a range."""
+
+    def checked(value: float) -> float:
+        if value != 0 and not low <= value <= high:
+            raise ValueError(f"{value:g} is neither 0 nor within {low:g} to {high:g}; {question}")
+        return value
+
+    return AfterValidator(checked)
+
+
+HalfThickness = Annotated[Number, zero_or_within(0.2, 20, "is it in millimetres?")]
+"""Of a tendon, off the outline that it wraps; zero is a string."""
+Band = Annotated[Number, zero_or_within(0.1, 50, "is it in millimetres?")]
+"""Of the sections that a tendon wraps; zero is its own sagittal plane."""
+Point = Annotated[Vector, within(-1000, 1000, "is it in millimetres?")]
+"""A bone's length (0.6 m at most) and a frame's origin beside it are less than a metre."""
+Offset = Annotated[Vector, within(-600, 600, "is it in millimetres?")]
+"""From a mesh's origin, at worst at the bone's other end, to the link's."""
+Turn = Annotated[Vector, within(-360, 360, "is it in degrees?")]
+
+
+def _known_format(name: str) -> str:
+    from tkamb.io.recordings.tables import READERS
+
+    if name not in READERS:
+        raise ValueError(f"unknown table format '{name}', use {', '.join(READERS)}")
+    return name
+
+
+TableFormat = Annotated[str, AfterValidator(_known_format)]
+FORMAT = "csv, sto, mot, trc or c3d; default: the suffix"
+
+
+class SceneTable(BaseModel):
+    """A table of the scene file: frozen, and unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

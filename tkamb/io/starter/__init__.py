@@ -1,0 +1,85 @@
+"""`tkamb new`: a folder with a commented scene and its files, which runs as it is."""
+
+import argparse
+import shutil
+import tempfile
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tkamb.errors import InputError
+
+if TYPE_CHECKING:
+    from tkamb.io.starter.person import Person
+
+
+def lay_out(directory: Path, person: "Person | None" = None) -> Path:
+    """Write the starter scene with its files into a new or empty folder; return the scene.
+
+    The folder appears whole or not at all.
+
+    Args:
+        directory: the folder.
+        person: whose leg the files shall be; None: a man of 75 kg and 1.75 m, right knee.
+
+    Raises:
+        InputError: the folder holds something, or cannot be written.
+    """
+    directory = Path(directory)
+    try:
+        if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+            hint = "give a new folder: nothing of yours is overwritten"
+            raise InputError("is there already and not empty", directory, hint)
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        with (
+            as_file(files("tkamb.io.starter") / "files") as source,
+            tempfile.TemporaryDirectory(dir=directory.parent, prefix=".tkamb-new-") as beside,
+        ):
+            whole = Path(beside) / directory.name
+            shutil.copytree(source, whole)
+            if person is not None:
+                from tkamb.io.starter.person import write_person
+
+                write_person(whole, person)
+            whole.replace(directory)  # an empty folder of that name is replaced too
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", directory) from None
+    return directory / "scene.toml"
+
+
+def add_new(commands: Any) -> None:
+    """Add the command `new` to the parser's commands."""
+    new = commands.add_parser(
+        "new",
+        help="a commented scene with its files, to start from; a patient from mass and height",
+    )
+    new.add_argument("folder", type=Path, metavar="FOLDER", help="new or empty")
+    new.add_argument("--side", choices=("left", "right"), help="of the knee; default right")
+    new.add_argument("--mass-kg", type=float, metavar="KG", help="of the body; default 75")
+    new.add_argument("--height-mm", type=float, metavar="MM", help="of the body; default 1750")
+    new.add_argument(
+        "--sex", choices=("female", "male"), help="which table of de Leva (1996); default male"
+    )
+    new.set_defaults(command=_new)
+
+
+def _new(options: argparse.Namespace) -> int:
+    scene = lay_out(options.folder, _person(options))
+    print(f"written: {scene}\nnext: tkamb check {scene}")
+    return 0
+
+
+def _person(options: argparse.Namespace) -> "Person | None":
+    """Return whose leg is asked for; None: the usual one."""
+    given = {
+        "side": options.side,
+        "mass": options.mass_kg,
+        "height": None if options.height_mm is None else options.height_mm * 1e-3,
+        "sex": options.sex,
+    }
+    given = {key: value for key, value in given.items() if value is not None}
+    if not given:
+        return None
+    from tkamb.io.starter.person import Person
+
+    return Person(**given)

@@ -1,0 +1,79 @@
+"""What the femoral adjustment does to the forces: the same equations at the recorded pose.
+
+The adjustment is meant to mend the split of the load and to leave the total alone (Sharma 2008,
+5.2.2: less than 0.001 BW). Where it does not, the frame's forces hang on a rotation and a
+translation that are smaller than fluoroscopy's error, and a reader has to know.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from tkamb.knee.contact_points import CondylePoint
+from tkamb.knee.equations import KneeLoads
+from tkamb.units import MILLIMETRE
+
+FAR = 5.0 * MILLIMETRE
+"""A contact point that moves farther has jumped: onto eminence or lip, or off it."""
+
+
+@dataclass(frozen=True)
+class AdjustmentEffect:
+    """The adjusted frame against the recorded one.
+
+    Args:
+        force: N, change of the total contact force; NaN where either is not solved.
+        share: change of medial / (medial + lateral) by coronal equilibrium.
+        cause: plain words, what in the contact changed most.
+    """
+
+    force: float
+    share: float
+    cause: str
+
+
+def adjustment_effect(
+    adjusted: KneeLoads,
+    recorded: KneeLoads,
+    points_adjusted: Mapping[str, CondylePoint],
+    points_recorded: Mapping[str, CondylePoint],
+) -> AdjustmentEffect:
+    """Return what changes from the recorded to the adjusted contact points.
+
+    Args:
+        adjusted: loads with the contact points of the adjusted pose.
+        recorded: loads with those of the recorded pose; all else is the same.
+        points_adjusted: side -> contact point.
+        points_recorded: side -> contact point.
+    """
+    total, before = (float(np.linalg.norm(one.contact_force)) for one in (adjusted, recorded))
+    share = _share(adjusted, points_adjusted) - _share(recorded, points_recorded)
+    carry, carried = (
+        _name_carriers(loads, points)
+        for loads, points in ((adjusted, points_adjusted), (recorded, points_recorded))
+    )
+    if carry != carried:
+        cause = f"with it {carry}, without it {carried}"
+    else:
+        cause = _largest_move(points_adjusted, points_recorded)
+    return AdjustmentEffect(total - before, share, cause)
+
+
+def _share(loads: KneeLoads, points: Mapping[str, CondylePoint]) -> float:
+    normal = {side: loads.values.get(f"{side}_normal", 0.0) for side in points}
+    total = sum(normal.values())
+    return normal["medial"] / total if total > 0 else float("nan")
+
+
+def _name_carriers(loads: KneeLoads, points: Mapping[str, CondylePoint]) -> str:
+    sides = [side for side in points if side not in loads.lifted]
+    return "both condyles carry" if len(sides) > 1 else f"the {sides[0]} condyle alone carries"
+
+
+def _largest_move(now: Mapping[str, CondylePoint], before: Mapping[str, CondylePoint]) -> str:
+    """Return which contact point moved most."""
+    moved = {side: float(np.linalg.norm(now[side].point - before[side].point)) for side in now}
+    side = max(moved, key=lambda name: moved[name])
+    word = "jumps" if moved[side] > FAR else "moves"
+    return f"the {side} contact point {word} by {moved[side] / MILLIMETRE:.1f} mm"

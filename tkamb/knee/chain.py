@@ -1,0 +1,265 @@
+"""The rigid-body chain in Pinocchio: motion in, inertial forces and load columns out.
+
+The root is always free (a free-flyer), so that the measured ground reaction enters as a
+load; an ankle joint in the URDF is locked, its motion is the root's.
+"""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from tkamb.errors import InputError, names_near
+from tkamb.geometry.frames import (
+    KNEE_JOINT_NAMES,
+    PATELLA_JOINT_NAMES,
+    Array,
+    inverse,
+    rotate,
+    transform,
+)
+from tkamb.knee.load import PointForces, wrenches
+from tkamb.units import STANDARD_GRAVITY
+
+
+@dataclass(frozen=True, eq=False)
+class ChainMotion:
+    """Where the chain is at one instant, SI.
+
+    Args:
+        tibia: (4, 4) pose_tibia_in_laboratory (x forward, y up, z right).
+        tibia_velocity: (6,) spatial velocity (linear, angular) in the tibia's own frame.
+        tibia_acceleration: (6,) spatial acceleration, same frame.
+        joints: (3, 6) or (3, 9): knee (and patella) coordinates, rates, accelerations.
+    """
+
+    tibia: Array
+    tibia_velocity: Array
+    tibia_acceleration: Array
+    joints: Array
+
+
+class Chain:
+    """The patient as a Pinocchio model with a free root.
+
+    Args:
+        urdf: text of a checked URDF (`tkamb.io.recordings.patient.load_urdf`).
+        with_patella: whether the patella moves, or rides on the femur at its neutral pose.
+        gravity: m/s², downwards in the laboratory.
+    """
+
+    def __init__(self, urdf: str, with_patella: bool, gravity: float = STANDARD_GRAVITY) -> None:
+        try:
+            full = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
+        except (ValueError, RuntimeError) as error:
+            raise InputError(f"Pinocchio cannot build the chain ({error})", "URDF") from None
+        self.joints = KNEE_JOINT_NAMES + (PATELLA_JOINT_NAMES if with_patella else ())
+        keep = {"universe", "root_joint", *self.joints}
+        lock = [full.getJointId(name) for name in full.names if name not in keep]
+        model = pin.buildReducedModel(full, lock, pin.neutral(full)) if lock else full
+        model.gravity = pin.Motion(np.array([0.0, -gravity, 0.0]), np.zeros(3))
+        self._columns = [model.joints[model.getJointId(name)].idx_v for name in self.joints]
+        self._take(model)
+
+    def changed(
+        self, mass_factor: float, insert_shift: Array, insert_turn: Array | None = None
+    ) -> "Chain":
+        """Return the chain with other masses, and the insert elsewhere on the tibia.
+
+        Args:
+            mass_factor: of every segment's mass; its inertia changes alike.
+            insert_shift: (3,) m, in the insert's axes; the femur goes with the insert.
+            insert_turn: (3, 3) rotation about the insert's origin, in its axes; None: none.
+        """
+        other, model = copy.copy(self), pin.Model(self.model)
+        for joint in range(1, model.njoints):
+            inertia = model.inertias[joint]
+            model.inertias[joint] = pin.Inertia(
+                mass_factor * inertia.mass, inertia.lever, mass_factor * inertia.inertia
+            )
+        base = model.getJointId(KNEE_JOINT_NAMES[0])
+        placement = model.jointPlacements[base]
+        turn = np.eye(3) if insert_turn is None else insert_turn
+        model.jointPlacements[base] = placement * pin.SE3(turn, insert_shift)
+        other._take(model)
+        return other
+
+    def scaled(self, length: float) -> "Chain":
+        """Return the chain of a body of the same shape and density, `length` times as large."""
+        other, model = copy.copy(self), pin.Model(self.model)
+        for joint in range(1, model.njoints):
+            inertia, placement = model.inertias[joint], model.jointPlacements[joint]
+            model.inertias[joint] = pin.Inertia(
+                length**3 * inertia.mass, length * inertia.lever, length**5 * inertia.inertia
+            )
+            model.jointPlacements[joint] = pin.SE3(
+                placement.rotation, length * placement.translation
+            )
+        for frame in model.frames:
+            frame.placement = pin.SE3(
+                frame.placement.rotation, length * frame.placement.translation
+            )
+        other._take(model)
+        return other
+
+    def _take(self, model: pin.Model) -> None:
+        """Make another model this chain's, and remember where the insert and the tibia are."""
+        self.model = model
+        frames = enumerate(model.frames)
+        self._frames = {frame.name: k for k, frame in frames if frame.type == pin.FrameType.BODY}
+        base = model.getJointId(KNEE_JOINT_NAMES[0])
+        self._insert_in_root = model.jointPlacements[base].homogeneous
+        self._tibia_in_root = model.frames[self.frame_id("tibia")].placement.homogeneous
+
+    def frame_id(self, link: str) -> int:
+        """Return Pinocchio's id of a link's frame, or raise InputError naming the links."""
+        if link not in self._frames:
+            names = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
+            raise InputError(f"no link '{link}' in the URDF", None, names_near(link, names))
+        return self._frames[link]
+
+    @property
+    def insert_in_tibia(self) -> Array:
+        """pose_insert_in_tibia (4, 4)."""
+        return inverse(self._tibia_in_root) @ self._insert_in_root
+
+    @property
+    def patella_joint_in_femur(self) -> Array:
+        """pose_joint_in_femur (4, 4): where the patella's sagittal plane lies on the femur."""
+        return self.model.jointPlacements[self.model.getJointId(PATELLA_JOINT_NAMES[0])].homogeneous
+
+    def link_in(self, link: str, base: str) -> Array:
+        """Return pose_link_in_base (4, 4) of two links that are fixed to each other."""
+        frames = [self.model.frames[self.frame_id(name)] for name in (link, base)]
+        if frames[0].parentJoint != frames[1].parentJoint:
+            raise InputError(f"link '{link}' is not fixed to '{base}'", "URDF")
+        return inverse(frames[1].placement.homogeneous) @ frames[0].placement.homogeneous
+
+    def carrier(self, link: str) -> str:
+        """Return which of tibia, femur and patella a link is fixed to."""
+        own = self.model.frames[self.frame_id(link)].parentJoint
+        for base in ("tibia", "femur", "patella"):
+            if self.model.frames[self.frame_id(base)].parentJoint == own:
+                return base
+        raise InputError(f"link '{link}' is fixed to neither tibia, femur nor patella", "URDF")
+
+    def segment(self, link: str) -> tuple[float, Array, Array]:
+        """Return the inertia of a link, and of all that is fixed to it, in the link's frame.
+
+        Mass (kg), centre (3,) m, and tensor (3, 3) kg·m² about the centre.
+        """
+        frame = self.model.frames[self.frame_id(link)]
+        whole = self.model.inertias[frame.parentJoint].se3Action(frame.placement.inverse())
+        return float(whole.mass), np.array(whole.lever), np.array(whole.inertia)
+
+    def on_shank(self, link: str) -> bool:
+        """Return whether a link is fixed to the tibia, and not on the femur's side."""
+        ends = [self.model.frames[self.frame_id(name)].parentJoint for name in (link, "tibia")]
+        return bool(ends[0] == ends[1])
+
+    def knee_columns(self) -> list[int]:
+        """Rows of the generalised force that belong to the six knee coordinates."""
+        return self._columns[:6]
+
+    def patella_columns(self) -> list[int]:
+        """Those that belong to the three coordinates of the patella, none where it rides along."""
+        return self._columns[6:]
+
+    def at(self, motion: ChainMotion) -> "ChainState":
+        """Return the chain at one instant, with its inertial forces."""
+        return ChainState(self, *self.configuration(motion))
+
+    def configuration(self, motion: ChainMotion) -> tuple[Array, Array, Array]:
+        """Return q (nq,), v (nv,) and a (nv,) of the model at one instant."""
+        model = self.model
+        root_in_tibia = pin.SE3(inverse(self._tibia_in_root))
+        q, v, a = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
+        q[:7] = pin.SE3ToXYZQUAT(pin.SE3(motion.tibia) * root_in_tibia)
+        v[:6] = root_in_tibia.actInv(pin.Motion(motion.tibia_velocity)).vector
+        a[:6] = root_in_tibia.actInv(pin.Motion(motion.tibia_acceleration)).vector
+        for name, column, (x, rate, acceleration) in zip(
+            self.joints, self._columns, motion.joints.T, strict=True
+        ):
+            q[model.joints[model.getJointId(name)].idx_q] = x
+            v[column], a[column] = rate, acceleration
+        return q, v, a
+
+
+class ChainState:
+    """The chain at one instant. Poses and loads are in the insert frame.
+
+    Attributes:
+        inertial: (nv,) RNEA(q, v, a): what gravity and inertia ask of all loads together.
+    """
+
+    def __init__(self, chain: Chain, q: Array, v: Array, a: Array) -> None:
+        self.chain, self.q, self.v, self.a = chain, q, v, a
+        self.data = chain.model.createData()
+        self.inertial: Array = pin.rnea(chain.model, self.data, q, v, a).copy()
+        pin.computeJointJacobians(chain.model, self.data, q)
+        pin.updateFramePlacements(chain.model, self.data)
+        root = self.data.oMi[chain.model.getJointId("root_joint")].homogeneous
+        self.insert_in_laboratory: Array = root @ chain._insert_in_root
+        self._jacobians: dict[int, Array] = {}
+
+    @cached_property
+    def laboratory_in_insert(self) -> Array:
+        """pose_laboratory_in_insert (4, 4)."""
+        return inverse(self.insert_in_laboratory)
+
+    def pose(self, link: str) -> Array:
+        """Return pose_link_in_insert (4, 4)."""
+        placement = self.data.oMf[self.chain.frame_id(link)].homogeneous
+        return self.laboratory_in_insert @ placement
+
+    def point(self, link: str, point: Array) -> Array:
+        """Return a point (3,) of a link in the insert frame."""
+        return transform(self.pose(link), point)
+
+    def generalised(self, groups: Sequence[Sequence[PointForces]]) -> Array:
+        """Return the generalised forces (nv, k) of k groups of loads: columns sum J^T w."""
+        loads = [load for group in groups for load in group]
+        column = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+        total = np.zeros((self.chain.model.nv, len(groups)))
+        if not loads:
+            return total
+        acting = wrenches(loads)
+        links = [load.link for load in loads]
+        for link in sorted(set(links)):
+            own = [n for n, name in enumerate(links) if name == link]
+            on_link = np.zeros((len(groups), 6))
+            np.add.at(on_link, column[own], acting[own])
+            total += self._jacobian(link).T @ on_link.T
+        return total
+
+    def add_need(self, link: str, wrench: Array) -> None:
+        """Add a wrench (6,) that all loads together must also exert on a link.
+
+        Args:
+            link: its name.
+            wrench: force (N) and moment about the insert's origin (N·m), insert frame.
+        """
+        self.inertial = self.inertial + self._jacobian(link).T @ wrench
+
+    def ground_reaction(self, force: Array, point: Array, moment: Array) -> PointForces:
+        """Return a laboratory force (3,), its point (3,) and moment (3,) as load on the tibia."""
+        here = self.laboratory_in_insert
+        return PointForces(
+            "tibia",
+            transform(here, point)[None],
+            rotate(here, force)[None],
+            rotate(here, moment),
+        )
+
+    def _jacobian(self, link: str) -> Array:
+        """Return a link's Jacobian (6, nv) at the insert's origin, in the insert's axes."""
+        joint = self.chain.model.frames[self.chain.frame_id(link)].parentJoint
+        if joint not in self._jacobians:
+            model, data = self.chain.model, self.data
+            local = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL)
+            joint_in_insert = pin.SE3(self.laboratory_in_insert) * data.oMi[joint]
+            self._jacobians[joint] = joint_in_insert.toActionMatrix() @ local
+        return self._jacobians[joint]

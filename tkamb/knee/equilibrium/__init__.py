@@ -1,0 +1,1 @@
+"""Released knee coordinates: the pose at which contact, ligaments and muscles balance."""

@@ -1,0 +1,71 @@
+"""The contact side of one frame, as the run records it."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.contact.area import area_above
+from tkamb.contact.result import ContactResult
+from tkamb.geometry.adjustment import Adjustment
+
+if TYPE_CHECKING:
+    from tkamb.contact.cam_post import PostContact
+    from tkamb.knee.equilibrium.released import KneeEquilibrium
+
+NAN = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameContact:
+    """The contact side of one frame.
+
+    Args:
+        result: the contact, None where it could not be computed.
+        medial: (n,) which map points lie under the medial condyle.
+        adjustment: the femoral adjustment, checked and perhaps restored; None if not asked for.
+        seconds: computing time.
+        problem: why there is no result, or empty.
+        flags: plain words that a reader must know.
+        iterations: of body and contact, until they agreed; 0 if not coupled.
+        load_change: N, by the last of them.
+        point_change: m, likewise, of the centres of pressure.
+        equilibrium: the search for the released coordinates, if there are any.
+        sensitivity: N/rad, of the medial force to adduction (`split_sensitivity`); NaN where
+            adduction is released, or there is one condyle.
+        turned: the contact with a little more adduction from which that was found, if one was.
+        triangles: (k, 3) of the map.
+        post: cam and post, where the scene asks for their contact.
+    """
+
+    result: ContactResult | None
+    medial: NDArray[np.bool_]
+    adjustment: Adjustment | None
+    seconds: float
+    problem: str
+    flags: tuple[str, ...]
+    iterations: int = 0
+    load_change: float = NAN
+    point_change: float = NAN
+    equilibrium: "KneeEquilibrium | None" = None
+    sensitivity: float = NAN
+    turned: ContactResult | None = None
+    triangles: NDArray[np.int64] | None = None
+    post: "PostContact | None" = None
+
+    def area_above(self, side: str, pressure: float) -> float:
+        """Return the share of a condyle's contact area above a pressure (Pa), 1 at most.
+
+        The pressure is taken as linear between the map's points, see
+        `tkamb.contact.area.area_above`.
+        """
+        if self.result is None or self.triangles is None:
+            return NAN
+        condyle = self.result.medial if side == "medial" else self.result.lateral
+        if condyle is None:
+            return NAN
+        own = self.medial if side == "medial" else ~self.medial
+        carried = np.where(own, self.result.pressure, 0.0)
+        above = area_above(self.result.points, self.triangles, carried, pressure)
+        return min(above / condyle.area, 1.0)

@@ -1,0 +1,101 @@
+"""Muscle forces that a search for equilibrium holds for a while: between the last and the new.
+
+The sharing answers to where the knee rests, and the knee to the sharing. Where a light load
+leaves the knee soft, either overshoots the other, and taken in turn they would go round in a
+circle. So the forces go only a part omega of the way from those held, f, to those asked for, f',
+
+    f <- f + omega (f' - f),   omega <- -omega d . (d' - d) / |d' - d|²,
+
+d and d' the last two f' - f: Aitken's secant for a vector. At the end f' itself is held.
+
+How the knee yields to the muscles decides their arms, and hangs itself on where the knee rests. It
+is taken as found in the first passes; then it goes only half of the way to what is found, and a
+quarter, so that it comes to rest where the contact's stiffness changes fast with the pose. Where
+even that goes on and on (a condyle about to lift, whose pose jumps), it is kept at last. `doubt`
+says what of it is left open.
+
+References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.1620010306;
+Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
+"""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.geometry.frames import Array
+from tkamb.knee.equilibrium.released_forces import LEVER
+
+if TYPE_CHECKING:
+    from tkamb.knee.crossing import MuscleShare
+
+AGREED = 1.0
+"""N: no muscle's force asked for differs by more from the one held where both agree."""
+LEAST, MOST = 0.05, 1.0
+"""The limits of omega."""
+
+
+STEPS = ((4, 1.0), (8, 0.5), (16, 0.25))
+"""Until so many passes are made, how the knee yields goes that part of the way to what is found."""
+TURNS = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
+"""Makes answers to forces and to moments comparable."""
+
+
+class Relaxation:
+    """The muscles' forces over the passes of one search.
+
+    Attributes:
+        settled: what was asked for last agrees with what was held, and is held now.
+        doubt: share by which the knee yields otherwise, as last found, than it is taken to; 0:
+            it is as found.
+    """
+
+    def __init__(self) -> None:
+        self._held: MuscleShare | None = None
+        self._last: Array | None = None
+        self._part, self.settled = MOST, True
+        self._yields: Array | None = None
+        self._passes, self.doubt = 0, 0.0
+
+    def yielding(self, found: Array | None) -> Array | None:
+        """Return how the knee is taken to yield.
+
+        Args:
+            found: how it does where it rests, see `ReleasedForces.tension_per_wrench`.
+        """
+        self._passes, self.doubt = self._passes + 1, 0.0
+        last, self._yields = self._yields, found
+        step = next((part for until, part in STEPS if self._passes <= until), 0.0)
+        if last is None or found is None or step == 1.0:
+            return found
+        taken = last + step * (found - last)
+        away, size = (float(np.linalg.norm(part * TURNS)) for part in (found - taken, taken))
+        if away > 0.0:
+            self.doubt = away / size if size > 0.0 else np.inf
+        self._yields = taken
+        return taken
+
+    def mixed(self, asked: "MuscleShare") -> "MuscleShare":
+        """Return the forces to hold next.
+
+        Args:
+            asked: the sharing where the knee rested under those held before.
+        """
+        held, self._held, self.settled = self._held, asked, False
+        if held is None:
+            return asked
+        away = asked.force - held.force
+        if self._last is not None:
+            change = away - self._last
+            part = -self._part * float(self._last @ change) / max(float(change @ change), 1e-12)
+            self._part = float(np.clip(part, LEAST, MOST))
+        self._last = away
+        self.settled = bool(np.abs(away).max() < AGREED)
+        if not self.settled:
+            self._held = replace(
+                asked,
+                activation=held.activation + self._part * (asked.activation - held.activation),
+                force=held.force + self._part * away,
+                reserve=held.reserve + self._part * (asked.reserve - held.reserve),
+            )
+        return self._held

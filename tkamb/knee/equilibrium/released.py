@@ -1,0 +1,378 @@
+"""Released knee coordinates: where contact, ligaments and muscle line leave them at rest.
+
+Flexion is as recorded. The superior-inferior position always follows from the contact;
+adduction, axial rotation, anterior-posterior and medial-lateral position do so if the scene
+releases them, else they are kept as recorded, and what keeps them is a residual of the
+equations of motion.
+
+Within one search the patella rides on the femur, and its ligament turns with it, while the other
+muscles' forces stay; patella and lines are then found anew at the solved pose, and the load shared
+anew among the muscles with the contact found there, until that moves the knee no more. At rest
+the sharing's tension of the extensor group is therefore that of the knee's equations. Inertia and
+sliding speed are those of the recorded rates: for the released coordinates all is
+quasi-static. Friction is Coulomb's, mu times each condyle's resultant against the recorded
+sliding, on the line of action of the resultant; without it nothing but follower loads keeps
+the forces from having a potential.
+
+The contact comes as a probe; this file does not know the models.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_axes, knee_pose
+from tkamb.knee.equations import KneeGeometry
+from tkamb.knee.equilibrium.balance import Balance, BalanceStatus
+from tkamb.knee.equilibrium.relaxation import Relaxation
+from tkamb.knee.equilibrium.released_forces import SCALE, ReleasedForces
+from tkamb.knee.joint_equilibrium import JointEquilibrium, external_wrench, joint_equilibrium
+
+if TYPE_CHECKING:
+    from tkamb.contact.probe import CondyleWrench, Probe, ProbedContact
+    from tkamb.knee.contact_points import CondylePoint
+    from tkamb.knee.crossing import MuscleShare
+    from tkamb.knee.ligaments import Ligament
+    from tkamb.knee.load import PointForces
+    from tkamb.knee.patella import PatellaState
+    from tkamb.run.muscles.shared_muscles import SharedMuscles
+
+KNEE_CHANGE = 2e-6
+"""m: the knee moves less than this when the patella is found anew."""
+FORCE_CHANGE = 0.1
+"""N: neither does the contact force,"""
+FORCE_SHARE = 2e-4
+"""of it: or this part of it, by which the patella's jumps from facet to facet change it."""
+MOST_PASSES = 24
+"""Passes by which knee and patella settle; each halves what is left where the knee is soft."""
+LEFT = 0.1
+"""Share of its way that a pass may leave to the next, where muscles make it a few passes anyway."""
+REACH = 3e-3
+"""m: and so far it may go from a contact like the last frame's, from which the muscles' forces are
+known: they hold near by only."""
+ABOUT, MOST_HEIGHTS = 0.5, 4
+"""Where a search begins the load is to differ by less than this share from the last frame's, at one
+of so many heights."""
+SUPERIOR = KNEE_COORDINATES.index("si")
+SLACK = 1e-3
+"""N: an extensor group of muscles that pulls with less is slack."""
+
+
+@dataclass(frozen=True, eq=False)
+class KneeEquilibrium:
+    """One frame with its released coordinates at rest.
+
+    Args:
+        coordinates: (6,) m and rad.
+        geometry: the leg there, without its contact.
+        patella: where it is; None if not modelled.
+        contact: the contact there.
+        balance: the last search.
+        passes: how often patella and lines were found anew.
+        trials: how often the contact was computed.
+        change: N, what the last pass changed in the contact force.
+        problem: why this is no result, or empty.
+        doubt: see `Relaxation`.
+    """
+
+    coordinates: Array
+    geometry: KneeGeometry
+    patella: "PatellaState | None"
+    contact: "ProbedContact"
+    balance: Balance
+    passes: int
+    trials: int
+    change: float
+    problem: str
+    doubt: float = 0.0
+
+
+def released_indices(names: Sequence[str]) -> tuple[int, ...]:
+    """Return the indices of the released coordinates, the superior-inferior one among them."""
+    return tuple(i for i, name in enumerate(KNEE_COORDINATES) if name == "si" or name in names)
+
+
+class Body(Protocol):
+    """What the search asks of a body, frame by frame: of a whole motion, or of one instant."""
+
+    friction: float
+    ligaments: "Sequence[Ligament]"
+    extensor: Any
+    muscles: "SharedMuscles | None"
+
+    @property
+    def sides(self) -> set[str]:
+        """Names of the condyles that may carry load."""
+
+    def geometry(
+        self, k: int, coordinates: Array | None = None, patella: "PatellaState | None" = None
+    ) -> KneeGeometry:
+        """Return frame k without its contact, perhaps at other coordinates (6,)."""
+
+    def sliding(self, k: int, coordinates: Array, point: Array) -> Array:
+        """Return the velocity (3,) m/s of the femur's point relative to the insert's."""
+
+    def resultants(
+        self, k: int, coordinates: Array, condyles: "Mapping[str, CondyleWrench]"
+    ) -> "dict[str, CondylePoint]":
+        """Return the resultants of a contact as the contact points of the equations."""
+
+    def post_loads(
+        self, k: int, coordinates: Array, post: "CondyleWrench | None"
+    ) -> "tuple[PointForces, ...]":
+        """Return what a cam on the post does to tibia and femur."""
+
+
+class ReleasedKnee:
+    """Finds the released coordinates of a body, frame by frame.
+
+    Args:
+        mechanics: the body side.
+        probe: of the contact model.
+        names: the released coordinates, "si" understood.
+
+    Attributes:
+        released: their indices.
+        muscles: the load is shared among muscles.
+    """
+
+    def __init__(self, mechanics: Body, probe: "Probe", names: Sequence[str]) -> None:
+        self._mechanics, self._probe = mechanics, probe
+        self.muscles = mechanics.muscles is not None
+        self.released = released_indices(names)
+        self._external: tuple[int, Array] | None = None
+        """Of the last frame, and which it was."""
+
+    def find(
+        self,
+        k: int,
+        start: Array,
+        points: dict[str, Array] | None = None,
+        before: KneeEquilibrium | None = None,
+    ) -> KneeEquilibrium:
+        """Return frame k at rest.
+
+        Args:
+            k: frame.
+            start: (6,) coordinates; the released ones are where the search begins.
+            points: side -> (3,) m, where a condyle that carries nothing is nearest to the
+                insert: residual forces act in the middle of both condyles' points.
+            before: the frame before, whose patella and stiffness are guesses.
+
+        Raises:
+            ComputationError: no muscle forces carry the frame.
+        """
+        place, middle, force = np.array(start, float), np.array(start[:3]), np.full(3, np.nan)
+        knee, slack, trials, passes = before, False, 0, 0
+        touch, mixing, ways = None, Relaxation(), [np.inf, np.inf]
+        if self._mechanics.muscles and before:
+            place, touch = self._carrying(place, before.contact)
+        reach = REACH if touch else np.inf
+        while passes < MOST_PASSES:
+            knee, pushes = self._pass(k, place, middle, slack, knee, touch, mixing, reach)
+            touch = knee.contact
+            passes, trials = passes + 1, trials + knee.balance.trials
+            change = float(np.linalg.norm(knee.contact.wrench[:3] - force))
+            knee = replace(knee, passes=passes, trials=trials, change=change)
+            moved = np.abs((knee.coordinates - place) * SCALE).max()
+            place, force, last = knee.coordinates, knee.contact.wrench[:3], middle
+            middle = _middle(knee.contact, points, place)
+            ways.append(max(moved, np.abs(middle - last).max() if self._keeps else 0.0))
+            if pushes:
+                # a line that pushes drives the knee away: slack, it begins where this began
+                slack, knee, touch = True, before, None
+                place, middle, force = np.array(start, float), np.array(start[:3]), force * np.nan
+                ways = [np.inf, np.inf]
+            elif knee.problem or (
+                mixing.settled
+                and knee.balance.at_rest
+                and ahead(ways[-3:]) * ways[-1] < KNEE_CHANGE
+                and ahead(ways[-3:]) * change
+                < max(FORCE_CHANGE, FORCE_SHARE * float(np.linalg.norm(force)))
+            ):
+                return replace(knee, doubt=mixing.doubt)
+        assert knee is not None
+        return replace(knee, problem="knee and patella do not settle together")
+
+    def _carrying(
+        self, place: Array, like: "ProbedContact"
+    ) -> "tuple[Array, ProbedContact | None]":
+        """Return the place, raised or lowered until it carries about what another contact does.
+
+        Returns:
+            Coordinates (6,) and the contact there; None if the same condyles do not carry, or the
+            model does not know its tangent.
+        """
+        load = float(like.wrench[1])
+        for _ in range(MOST_HEIGHTS):
+            here = self._probe.at(knee_pose(place))
+            if not here.tangent or not here.condyles or set(here.condyles) != set(like.condyles):
+                break
+            more = float(here.wrench[1]) - load
+            if abs(more) < ABOUT * abs(load):
+                return place, here
+            twist = knee_axes(place)[SUPERIOR]
+            slope = sum(
+                float(c.stiffness[1] @ twist) for c in here.loads if c.stiffness is not None
+            )
+            if not slope > 0.0:
+                break
+            place = place.copy()
+            place[SUPERIOR] -= more / slope
+        return place, None
+
+    def _pass(
+        self,
+        k: int,
+        place: Array,
+        middle: Array,
+        slack: bool,
+        before: KneeEquilibrium | None,
+        touch: "ProbedContact | None",
+        mixing: Relaxation,
+        reach: float,
+    ) -> tuple[KneeEquilibrium, bool]:
+        """Return the knee at rest with the patella as at `place`, and whether it would push."""
+        patella = self._patella(k, place, before.patella if before else None)
+        geometry = self._mechanics.geometry(k, place, patella)
+        joint = self._joint(k, geometry, middle, slack)
+        muscles = self._mechanics.muscles
+        if muscles is not None and not geometry.problems:
+            held = None if touch is None or before is None else before.geometry.share
+            held = None if held is None else muscles.at(k, held)
+            share = mixing.mixed(self._share(k, geometry, joint, touch, held, mixing))
+            geometry, joint = replace(geometry, share=share), replace(joint, share=share)
+            if slack := muscles.tension(share) < SLACK:
+                joint = self._joint(k, geometry, middle, slack)
+        forces = self._forces(k, joint, place, touch)
+        stiffness = before.balance.stiffness if before else None
+        balance = forces.balance(stiffness, *((LEFT, reach) if muscles else ()))
+        contact, problem = forces.contact(balance), "; ".join(geometry.problems)
+        if balance.status is not BalanceStatus.OK:
+            problem = problem or f"released: {balance.status.value}" + (
+                " (quadriceps slack, flexors not modelled)" if slack and not muscles else ""
+            )
+        knee = KneeEquilibrium(
+            forces.at(balance),
+            geometry,
+            patella,
+            contact,
+            balance,
+            1,
+            balance.trials,
+            np.nan,
+            problem,
+        )
+        # with other muscles their sharing says whether the quadriceps is slack
+        ended = balance.at_rest or balance.status is not BalanceStatus.OK
+        return knee, ended and not muscles and contact.known and forces.pushes(balance)
+
+    def _share(
+        self,
+        k: int,
+        geometry: KneeGeometry,
+        joint: JointEquilibrium,
+        touch: "ProbedContact | None",
+        held: "MuscleShare | None",
+        mixing: Relaxation,
+    ) -> "MuscleShare":
+        """Return what each muscle carries, the released coordinates yielding to it.
+
+        Where no contact is known yet, or the contact model has no tangent, contact points stay;
+        where these make the first equations singular the knee's forces pass through the femoral
+        origin.
+
+        Args:
+            k: frame.
+            geometry: the frame without its contact.
+            joint: its equations, the extensor mechanism taut.
+            touch: the contact there; None where the search begins without one like the last
+                frame's.
+            held: what was held last, in this frame or the one before.
+            mixing: keeps how the knee yields.
+
+        Raises:
+            ComputationError: no muscle forces carry the frame.
+        """
+        mechanics, place = self._mechanics, geometry.coordinates
+        muscles, friction = mechanics.muscles, mechanics.friction
+        assert muscles is not None
+        here = self._probe.at(knee_pose(place)) if touch is None else touch
+        gain = None
+        if held is not None:
+            forces = self._forces(k, replace(joint, share=held), place)
+            smooth = self._probe.smoothed(knee_pose(place), here)
+            gain = mixing.yielding(forces.tension_per_wrench(smooth))
+        if held is not None and gain is not None:
+            pull = held.wrench(geometry.state.pose("tibia"), geometry.state.pose("femur"))
+            base = forces.tension_at_rest(here, gain) - float(gain @ pull)
+            share = muscles.share_of_yielding_knee(k, geometry, base, gain)
+        else:
+            points = mechanics.resultants(k, place, here.condyles)
+            geometry = replace(geometry, post=mechanics.post_loads(k, place, here.post))
+            off = frozenset(mechanics.sides - set(points)) if points else frozenset[str]()
+            share = muscles.share(k, replace(geometry, condyles=points), friction, off)
+            if touch is None and share.status != "ok":
+                share = muscles.share(k, geometry, friction, frozenset())
+        if share.status != "ok":
+            raise ComputationError(f"muscles: {share.status.removeprefix('failed: ')}")
+        return share
+
+    @property
+    def _keeps(self) -> bool:
+        """Whether residual forces act: a translation or rotation is kept as recorded."""
+        return len(self.released) < 5
+
+    def _patella(self, k: int, place: Array, guess: "PatellaState | None") -> "PatellaState | None":
+        extensor = self._mechanics.extensor
+        if extensor is None:
+            return None
+        return extensor.patella(k, knee_pose(place), guess)
+
+    def _joint(
+        self, k: int, geometry: KneeGeometry, middle: Array, slack: bool
+    ) -> JointEquilibrium:
+        ligaments, place = self._mechanics.ligaments, geometry.coordinates
+        if self._external is None or self._external[0] != k:
+            self._external = k, external_wrench(geometry, place)
+        external = self._external[1]
+        if not np.isfinite(external).all():  # of a patella that was lost: the next may not be
+            self._external = None
+        return joint_equilibrium(geometry, ligaments, place, self.released, middle, slack, external)
+
+    def _forces(
+        self,
+        k: int,
+        joint: JointEquilibrium,
+        place: Array,
+        touch: "ProbedContact | None" = None,
+    ) -> "ReleasedForces":
+        sliding = partial(self._mechanics.sliding, k)
+        friction = self._mechanics.friction
+        return ReleasedForces(joint, self._probe, place, friction, sliding, touch)
+
+
+def ahead(ways: Sequence[float]) -> float:
+    """Return how far a search of ever shorter passes still goes, per way of its last pass.
+
+    With q the greater of the last two ratios of successive passes, the geometric series of what
+    would follow is q / (1 - q). Where a pass did not at least halve the way of the one before,
+    or there were less than three: 1, so that the last pass itself has to be short.
+
+    Args:
+        ways: m, by which the last three passes moved; inf where there was none.
+    """
+    first, second, last = ways
+    if not 0.0 < second <= 0.5 * first < np.inf or last > 0.5 * second:
+        return 1.0
+    ratio = max(last / second, second / first)
+    return ratio / (1.0 - ratio)
+
+
+def _middle(contact: "ProbedContact", points: dict[str, Array] | None, place: Array) -> Array:
+    known = (points or {}) | {side: c.point for side, c in contact.condyles.items()}
+    return np.asarray(np.mean(list(known.values()), axis=0)) if known else place[:3]

@@ -1,0 +1,191 @@
+"""What drives free knee coordinates at trial places, in a leg or in a machine."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+
+import numpy as np
+
+from tkamb.geometry.frames import Array, knee_axes, knee_pose
+from tkamb.knee.contact_points import CondylePoint
+from tkamb.knee.equilibrium.balance import Balance, Trial, find_balance
+from tkamb.knee.joint_equilibrium import JointEquilibrium
+from tkamb.knee.load import wrench_of
+
+if TYPE_CHECKING:
+    from tkamb.contact.probe import Probe, ProbedContact
+
+LEVER = 0.025
+"""m: half the usual distance of the condyles; makes rotations comparable to translations."""
+SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
+TINY = 1e-7
+"""m: step of the finite differences of axes and ligaments."""
+
+Sliding = Callable[[Array, Array], Array]
+
+
+def _no_sliding(place: Array, point: Array) -> Array:
+    return np.zeros(3)
+
+
+class Joint(Protocol):
+    """What pushes the free coordinates beside the contact: of a leg, or of a simulator."""
+
+    @property
+    def released(self) -> tuple[int, ...]:
+        """Indices of the n free coordinates."""
+
+    def imbalance(self, coordinates: Array, contact: Array) -> Array:
+        """Return the generalised forces (..., n) at coordinates (..., 6) and a contact (6,)."""
+
+    def contact_gain(self, coordinates: Array) -> Array:
+        """Return how they follow the contact's wrench on the insert, (n, 6)."""
+
+
+J = TypeVar("J", bound=Joint)
+
+
+class FreeForces(Generic[J]):
+    """What drives the free coordinates of a joint at trial places.
+
+    Args:
+        joint: what acts beside the contact.
+        probe: of the contact model.
+        place: (6,) knee coordinates; those not free stay.
+        friction: Coulomb coefficient.
+        sliding: from coordinates (6,) and point (3,) to the femur's velocity there (3,), m/s.
+        touch: the contact at that place, where it is known already.
+
+    Attributes:
+        seen: scaled coordinates as bytes -> contact there.
+    """
+
+    def __init__(
+        self,
+        joint: J,
+        probe: "Probe",
+        place: Array,
+        friction: float = 0.0,
+        sliding: Sliding = _no_sliding,
+        touch: "ProbedContact | None" = None,
+    ) -> None:
+        self._joint, self._probe, self._place = joint, probe, np.array(place, float)
+        self._friction, self._sliding = friction, sliding
+        self._rows = list(joint.released)
+        self._scale = SCALE[self._rows]
+        self._start = self._place[self._rows] * self._scale
+        self.seen: dict[bytes, ProbedContact] = {}
+        if touch is not None:
+            self.seen[self._start.tobytes()] = touch
+
+    def balance(
+        self, stiffness: Array | None = None, left: float = 0.0, reach: float = np.inf
+    ) -> Balance:
+        """Return where the free coordinates come to rest, from the given place.
+
+        Args:
+            stiffness: (n, n) N/m of a search near by.
+            left: share of the way that may be left, see `find_balance`.
+            reach: m, likewise, how far it may go.
+        """
+        return find_balance(self.trial, self._start, stiffness, left, reach)
+
+    def contact(self, balance: Balance) -> "ProbedContact":
+        """Return the contact of a balance."""
+        return self.seen[balance.coordinates.tobytes()]
+
+    def trial(self, x: Array) -> Trial:
+        """Return scaled forces and stiffness at scaled coordinates (n,), m."""
+        place, key = self._with(x), x.tobytes()
+        contact = self.seen.get(key)
+        if contact is None:
+            contact = self.seen[key] = self._probe.at(knee_pose(place))
+        if not contact.known:
+            return Trial(np.full(len(x), np.nan))
+        wrench, stiffness = self._with_friction(place, contact)
+        known_to = contact.accuracy * float(np.linalg.norm(wrench[:3]))
+        if stiffness is None:
+            force = self._joint.imbalance(place, wrench) / self._scale
+            return Trial(force, known_to=known_to)
+        steps = np.zeros((len(x) + 1, 6))
+        steps[np.arange(len(x)), self._rows] = TINY / self._scale
+        forces = self._joint.imbalance(place + steps, wrench) / self._scale
+        change = (forces[:-1] - forces[-1]).T / TINY
+        twists = knee_axes(place)[self._rows] / self._scale[:, None]
+        gain = self._joint.contact_gain(place) / self._scale[:, None]
+        tangent = -(change + gain @ stiffness @ twists.T)
+        return Trial(forces[-1], tangent, contact.exact, known_to)
+
+    def at(self, balance: Balance) -> Array:
+        """Return the knee coordinates (6,) of a balance."""
+        return self._with(balance.coordinates)
+
+    def _with(self, x: Array) -> Array:
+        place = self._place.copy()
+        place[self._rows] = x / self._scale
+        return place
+
+    def _with_friction(self, place: Array, contact: "ProbedContact") -> tuple[Array, Array | None]:
+        """Return wrench (6,) on the insert with friction, and its stiffness (6, 6) if known."""
+        wrench, stiffness = np.zeros(6), np.zeros((6, 6))
+        for condyle in contact.loads:
+            sliding = self._sliding(place, condyle.point)
+            touch = CondylePoint(condyle.point, condyle.normal, sliding, 0.0)
+            drag = touch.normal - touch.direction(self._friction)
+            rubbing = wrench_of(touch.point, drag)
+            wrench += condyle.wrench + condyle.force * rubbing
+            if condyle.stiffness is not None:
+                pressed = -touch.normal @ condyle.stiffness[:3]
+                stiffness += condyle.stiffness + np.outer(rubbing, pressed)
+        return wrench, stiffness if contact.tangent else None
+
+
+class ReleasedForces(FreeForces[JointEquilibrium]):
+    """What drives the released coordinates of a leg, the patella held on the femur."""
+
+    def tension_per_wrench(self, contact: "ProbedContact") -> Array | None:
+        """Return v (6,): a further wrench dw on the insert adds v . dw to the ligament's tension.
+
+        The released coordinates yield to it by dq and stay at rest: with K = -df/dq of the
+        generalised forces f = -J w of contact, ligaments and muscles,
+
+            -J dw - K dq - J B dy = 0
+
+        for dq and what keeps the other coordinates dy, the tension of the patellar ligament
+        among it. None where the contact model does not know its tangent.
+
+        Args:
+            contact: at the place where the search begins, the knee at rest.
+        """
+        place = self._place
+        wrench, stiffness = self._with_friction(place, contact)
+        if stiffness is None:
+            return None
+        steps = np.zeros((len(self._rows) + 1, 6))
+        steps[np.arange(len(self._rows)), self._rows] = TINY / self._scale
+        forces = self._joint.whole(place + steps, wrench)
+        axes = knee_axes(place)
+        twists = axes[self._rows] / self._scale[:, None]
+        change = (forces[:-1] - forces[-1]).T / TINY - axes @ stiffness @ twists.T
+        matrix = np.hstack([-change, axes @ self._joint.columns(place)])
+        return np.asarray(-np.linalg.solve(matrix, axes)[-1])
+
+    def tension_at_rest(self, contact: "ProbedContact", per_wrench: Array) -> float:
+        """Return the tension (N) by which the patellar ligament balances flexion near by, at rest.
+
+        A wrench that the place leaves unbalanced counts as one more that the knee yields to.
+
+        Args:
+            contact: at the place where the search begins.
+            per_wrench: (6,), see `tension_per_wrench`.
+        """
+        wrench, _ = self._with_friction(self._place, contact)
+        kept, left = self._joint.kept_and_left(self._place, wrench)
+        return float(kept[-1] + per_wrench @ left)
+
+    def pushes(self, balance: Balance) -> bool:
+        """Return whether the patellar ligament, where it is taut, would have to push."""
+        if self._joint.line is None:
+            return False
+        place = self.at(balance)
+        wrench, _ = self._with_friction(place, self.contact(balance))
+        return bool(self._joint.kept(place, wrench)[-1] < 0)

@@ -1,0 +1,116 @@
+"""Where a search for released coordinates begins, and what it finds from there."""
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.contact.pair import ContactPair
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
+from tkamb.knee.equilibrium.balance import BalanceStatus
+from tkamb.knee.equilibrium.released import KneeEquilibrium, ReleasedKnee
+from tkamb.knee.equilibrium.released_forces import SCALE
+
+if TYPE_CHECKING:
+    from tkamb.contact.cam_post import CamPost
+
+ASTRAY = (
+    BalanceStatus.OUT_OF_RANGE,
+    BalanceStatus.NOT_CONVERGED,
+    BalanceStatus.RUNS_AWAY,  # as far from a bad start as from a good one
+)
+"""Ends of a search that another start may mend."""
+FARTHEST_AHEAD = 2e-3
+"""m: a search begins at most so far ahead of the last frame."""
+FIRST_DEPTH = 5e-5
+"""m: how deep the search for released coordinates begins."""
+AP = KNEE_COORDINATES.index("ap")
+
+
+class Starts:
+    """The starts of the frames of a motion, from the likeliest on.
+
+    Args:
+        recorded: (f, 6) knee coordinates of the motion, m and rad.
+        knee: searches from a start.
+        pair: femoral component and insert.
+        post: cam and post, if they are modelled.
+    """
+
+    def __init__(
+        self, recorded: Array, knee: ReleasedKnee, pair: ContactPair, post: "CamPost | None"
+    ) -> None:
+        self._recorded, self._knee, self._pair, self._post = recorded, knee, pair, post
+
+    def rest(
+        self, k: int, found: Sequence[KneeEquilibrium], points: dict[str, Array]
+    ) -> KneeEquilibrium:
+        """Return the knee at rest, from the first start that leads there.
+
+        Args:
+            k: frame.
+            found: the last three frames that were found.
+            points: side -> where a condyle that carries nothing is nearest to the insert.
+
+        Raises:
+            ComputationError: no start lies over the insert, or no muscle forces carry the frame.
+        """
+        knee, failure = None, "the femoral component does not lie over the insert"
+        for place in self._starts(k, [knee.coordinates for knee in found]):
+            if not np.isfinite(place).all():
+                continue
+            try:
+                knee = self._knee.find(k, place, points, found[-1] if found else None)
+            except ComputationError as error:
+                failure = error.what
+                continue
+            if knee.balance.status not in ASTRAY and not (knee.problem and self._knee.muscles):
+                break
+        if knee is None:
+            raise ComputationError(failure)
+        return knee
+
+    def _starts(self, k: int, found: list[Array]) -> Iterator[Array]:
+        """Yield where a search may begin: as the last frames went on, as the last, as recorded.
+
+        The first keeps its height, the others just touch.
+        """
+        recorded, rows = self._recorded[k], list(self._knee.released)
+        for number, place in enumerate([carried_on(found), found[-1]] if found else []):
+            start = recorded.copy()
+            start[rows] = place[rows]
+            yield start if number == 0 else self.on_the_insert(start)
+        yield self.on_the_insert(recorded)
+
+    def on_the_insert(self, place: Array) -> Array:
+        """Return coordinates (6,) whose superior-inferior one makes the condyles just touch.
+
+        Where AP is released and a cam overlaps the post, AP makes them just touch, too.
+        """
+        touching = self._on_the_dishes(place)
+        if self._post is None or AP not in self._knee.released:
+            return touching
+        gap = self._post.clearance(knee_pose(touching))
+        if not gap < 0:
+            return touching
+        return self._on_the_dishes(np.array([place[0] + gap + FIRST_DEPTH, *place[1:]]))
+
+    def _on_the_dishes(self, place: Array) -> Array:
+        height = self._pair.first_touch_height(knee_pose(place))
+        return np.array([place[0], height - FIRST_DEPTH, *place[2:]])
+
+
+def carried_on(found: list[Array]) -> Array:
+    """Return the coordinates (6,) after those of up to three frames.
+
+    The last step is made again, or that part of it by which the step before foretold it, and no
+    farther than `FARTHEST_AHEAD`: a lightly loaded knee wanders to and fro.
+    """
+    if len(found) < 3:
+        return found[-1]
+    before, step = ((b - a) * SCALE for a, b in pairwise(found))
+    part = float(before @ step) / max(float(before @ before), 1e-18)
+    longest = FARTHEST_AHEAD / max(float(np.linalg.norm(step)), 1e-9)
+    return found[-1] + min(max(part, 0.0), 1.0, longest) * (found[-1] - found[-2])

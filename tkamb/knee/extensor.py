@@ -1,0 +1,399 @@
+"""The extensor mechanism over all frames: where the patella is, and its lines of action."""
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Protocol, overload
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_coordinates, transform
+from tkamb.geometry.sections import sagittal_outline
+from tkamb.geometry.surface import Surface
+from tkamb.knee.chain import Chain, ChainState
+from tkamb.knee.equations import Extensor
+from tkamb.knee.load import PointForces
+from tkamb.knee.muscles import Line, Muscle, PatellarLigament, Wrap, muscle_line, off_femur
+from tkamb.knee.patella import ExtensorMechanism, PatellaState, patella_at
+from tkamb.knee.patella_search import solve_patella
+from tkamb.knee.patellofemoral import PatellarContact, PatellofemoralContact
+from tkamb.knee.unknowns import Unknown, muscle_load
+from tkamb.knee.wrapping import TautPath, is_inside
+from tkamb.units import DEGREE
+
+Rates = Callable[[Array, Array], tuple[Array, Array, Array]]
+
+
+@dataclass(frozen=True, eq=False)
+class ExtensorParts:
+    """What the extensor mechanism of a knee is made of.
+
+    Args:
+        muscle: the one that pulls the patella.
+        ligament: the patellar ligament.
+        chain: the patient.
+        femoral: femoral component, femur link.
+        button: patellar button, patella link.
+        insert: insert, insert frame; None: the ligament wraps nothing.
+    """
+
+    muscle: Muscle
+    ligament: PatellarLigament
+    chain: Chain
+    femoral: Surface
+    button: Surface
+    insert: Surface | None
+
+
+class Posed(Protocol):
+    """The knee at one instant, as far as lines run over it."""
+
+    def pose(self, link: str) -> Array:
+        """Return pose_link_in_insert (4, 4)."""
+
+
+class ExtensorLines:
+    """Muscle, patella and patellar ligament of a knee, at any pose of the femur.
+
+    Args:
+        parts: the mechanism.
+
+    Attributes:
+        muscle: its line of action.
+        ligament: the patellar ligament's.
+
+    Raises:
+        InputError: a line starts inside what it wraps.
+    """
+
+    def __init__(self, parts: ExtensorParts) -> None:
+        self._take(parts)
+
+    def _take(self, parts: ExtensorParts) -> PatellofemoralContact:
+        """Build the lines and the mechanism of parts; return its contact as it was prepared."""
+        self._parts, self._chain = parts, parts.chain
+        self.muscle = muscle_line(parts.muscle, parts.chain, parts.femoral)
+        self.ligament = self._ligament_line()
+        self._check_fixed_ends()
+        self._mechanism, prepared = self._build_mechanism()
+        return prepared
+
+    def given(self, pose: Array, coordinates: Array) -> PatellaState:
+        """Return the patella at given coordinates (3,), the femur at a pose (4, 4)."""
+        contact = self._mechanism.contact.at(coordinates)
+        return patella_at(self._mechanism, pose, coordinates, contact)
+
+    def solved(
+        self, pose: Array, guess: PatellaState | None = None, near: Array | None = None
+    ) -> PatellaState:
+        """Return the patella where its moments balance, the femur at a pose (4, 4).
+
+        Args:
+            pose: pose_femur_in_insert.
+            guess: the patella at a pose near by.
+            near: (3,) coordinates near by, without it; None searches all rotations.
+        """
+        if guess is None or not guess.status.found:
+            return solve_patella(self._mechanism, pose, near)
+        return solve_patella(self._mechanism, pose, guess.coordinates, guess.slopes)
+
+    def loads(
+        self, flexion: float, state: Posed, patella: PatellaState
+    ) -> tuple[Extensor, Unknown]:
+        """Return the mechanism and its muscle, both per unit tension.
+
+        Args:
+            flexion: rad, for messages.
+            state: the chain there.
+            patella: where it is.
+
+        Raises:
+            ComputationError: no patella at this frame, or a line's end inside what it wraps.
+        """
+        if not patella.status.found:
+            raise ComputationError(
+                f"patella lost at {flexion / DEGREE:.1f} deg of flexion: {patella.status.value}"
+            )
+        muscle, ligament = self.paths(state)
+        extensor = Extensor(
+            tuple(_on_tibia(load) for load in self.ligament.loads(ligament)),
+            patella.contact_point,
+            patella.contact_normal,
+            (self.muscle.name,),
+            muscle.wrap_angle,
+        )
+        return extensor, Unknown(muscle_load(self.muscle.name), self.muscle.loads(muscle))
+
+    def paths(self, state: Posed) -> tuple[TautPath, TautPath]:
+        """Return muscle and patellar ligament as they run, in the insert frame.
+
+        Raises:
+            ComputationError: a line's end inside what it wraps.
+        """
+        links = {point.link for line in (self.muscle, self.ligament) for point in line.points}
+        poses = {link: state.pose(link) for link in links | {"femur"}} | {"insert": np.eye(4)}
+        return self.muscle.path(poses), self.ligament.path(poses)
+
+    def _ligament_line(self) -> Line:
+        parts, wrap = self._parts, None
+        ligament = parts.ligament
+        if ligament.wrap is not None and parts.insert is not None:
+            tuberosity = transform(self._tibia_in_insert(), ligament.distal.position)
+            outline = ligament.wrap.outline(parts.insert, float(tuberosity[2]))
+            wrap = Wrap("insert", outline)
+        return Line("patellar_ligament", (ligament.proximal, ligament.distal), wrap)
+
+    def _tibia_in_insert(self) -> Array:
+        """Return the pose in the insert frame of the link that holds the ligament's end."""
+        on_tibia = self._chain.link_in(self._parts.ligament.distal.link, "tibia")
+        return inverse(self._chain.insert_in_tibia) @ on_tibia
+
+    def _check_fixed_ends(self) -> None:
+        """Raise if the end that does not move against an outline lies within it."""
+        ends, name = [], self.muscle.name
+        if self.muscle.wrap is not None:
+            last = self.muscle.points[self.muscle.wrap.stretch]
+            place = transform(self._chain.link_in(last.link, "femur"), last.position)
+            low, high = self._parts.femoral.bounds[:, 2]
+            whole = sagittal_outline([self._parts.femoral], 0.95 * np.linspace(low, high, 15))
+            ends.append((f"the origin of {name}", place, whole, "femur"))
+        if self.ligament.wrap is not None:
+            tuberosity = transform(self._tibia_in_insert(), self.ligament.points[1].position)
+            outline = self.ligament.wrap.outline
+            ends.append(("[patellar_ligament] distal", tuberosity, outline, "insert"))
+        for where, point, outline, bone in ends:
+            if is_inside(point, outline):
+                raise InputError(
+                    f"lies inside the outline of the {bone} that the line wraps",
+                    where,
+                    "move the point, or set wrap = false",
+                )
+
+    def _build_mechanism(self) -> tuple[ExtensorMechanism, PatellofemoralContact]:
+        """Return the mechanism, and its contact as it was prepared."""
+        parts, chain = self._parts, self._chain
+        stretch = off_femur(self.muscle.points, chain)
+        origin, insertion = self.muscle.points[stretch : stretch + 2]
+        joint, (proximal, distal) = chain.patella_joint_in_femur, self.ligament.points
+        prepared = _patellar_contact(parts.femoral, parts.button, joint.tobytes())
+        mechanism = ExtensorMechanism(
+            prepared.unused(),
+            joint,
+            transform(chain.link_in(origin.link, "femur"), origin.position),
+            transform(chain.link_in(insertion.link, "patella"), insertion.position),
+            transform(chain.link_in(proximal.link, "patella"), proximal.position),
+            transform(self._tibia_in_insert(), distal.position),
+            parts.ligament.length,
+            None if self.muscle.wrap is None else self.muscle.wrap.outline,
+            None if self.ligament.wrap is None else self.ligament.wrap.outline,
+        )
+        return mechanism, prepared
+
+
+class ExtensorFrames(ExtensorLines):
+    """Muscle, patella and patellar ligament over the frames of a motion.
+
+    Args:
+        parts: the mechanism.
+        time: (f,) s.
+        poses: (f, 4, 4) pose_femur_in_insert.
+        recorded: (f, 3, 3) patella coordinates, rates and accelerations; None: to be found.
+        rates: from time (n,) and coordinates (n, 3) to them filtered, and their derivatives.
+
+    Attributes:
+        muscle: its line of action.
+        ligament: the patellar ligament's.
+        states: the patella at each frame; a recorded one is looked at when it is asked for.
+
+    Raises:
+        InputError: a line starts inside what it wraps, or the patella is found nowhere.
+    """
+
+    def __init__(
+        self, parts: ExtensorParts, time: Array, poses: Array, recorded: Array | None, rates: Rates
+    ) -> None:
+        prepared = self._take(parts)
+        self._contacts: _RecordedContacts | None = None
+        self.states: Sequence[PatellaState]
+        if recorded is not None:
+            self._joints = recorded
+            self._contacts = _recorded_contacts(prepared, recorded[:, 0].tobytes())
+            self.states = _RecordedStates(self._mechanism, poses, self._contacts)
+        else:
+            self.states = _solve_all(self._mechanism, poses)
+            self._joints = self._differentiate(time, poses, rates)
+
+    def moved(self, parts: ExtensorParts, poses: Array, frames: Sequence[int]) -> "ExtensorFrames":
+        """Return the mechanism of a solved patella with its parts or the femur a little elsewhere.
+
+        In the frames asked for the patella is found anew, from where it is here; its joint moves
+        by as much. Rates, and the patella in the other frames, stay.
+
+        Args:
+            parts: the mechanism.
+            poses: (f, 4, 4) pose_femur_in_insert.
+            frames: in which the patella is found anew.
+
+        Raises:
+            InputError: a line starts inside what it wraps.
+        """
+        other = copy.copy(self)
+        other._take(parts)
+        states, other._joints = list(self.states), self._joints.copy()
+        for k in frames:
+            near = self.states[k]
+            found = solve_patella(other._mechanism, poses[k], near.coordinates, near.slopes)
+            states[k] = found
+            other._joints[k, 0] += found.coordinates - near.coordinates
+        other.states = states
+        return other
+
+    def joints(self, k: int) -> Array:
+        """Return patella coordinates, rates and accelerations (3, 3) of frame k; NaN if lost."""
+        return np.asarray(self._joints[k])
+
+    def patella(self, k: int, pose: Array, guess: PatellaState | None = None) -> PatellaState:
+        """Return the patella of frame k with the femur at another pose (4, 4).
+
+        Recorded coordinates are kept; a solved patella is found anew, from `guess` or from
+        where it was at the recorded pose.
+        """
+        if self._contacts is not None:
+            recorded = self._contacts.places[k]
+            return patella_at(self._mechanism, pose, recorded, self._contacts[k])
+        own = self.states[k]
+        if guess is not None and own.status.found:
+            # a guess from a frame far before may lead nowhere, where its own leads to the place
+            near = guess.coordinates
+            found = solve_patella(self._mechanism, pose, near, guess.slopes, anywhere=False)
+            if found.status.found:
+                return found
+            guess = None
+        last = own if guess is None else guess
+        return solve_patella(self._mechanism, pose, last.coordinates, last.slopes)
+
+    def at(
+        self, k: int, flexion: float, state: ChainState, patella: PatellaState | None = None
+    ) -> tuple[Extensor, Unknown]:
+        """Return the mechanism and its muscle, both per unit tension.
+
+        Args:
+            k: frame.
+            flexion: rad, for messages.
+            state: the chain there.
+            patella: where it is, if not as at the recorded pose.
+
+        Raises:
+            ComputationError: no patella at this frame, or a line's end inside what it wraps.
+        """
+        return self.loads(flexion, state, self.states[k] if patella is None else patella)
+
+    def _differentiate(self, time: Array, poses: Array, rates: Rates) -> Array:
+        """Return the solved coordinates with their rates (f, 3, 3); NaN where it is lost.
+
+        Lost frames between found ones are bridged for the rates of their neighbours (shape-
+        preserving cubic): a patella of 0.1 kg turns an acceleration that is wrong by 1 m/s²
+        into 0.1 N.
+        """
+        places = np.array([state.coordinates for state in self.states])
+        found = np.flatnonzero(np.isfinite(places).all(axis=1))
+        if len(found) < 2:
+            flexion = knee_coordinates(poses)[:, KNEE_COORDINATES.index("flexion")] / DEGREE
+            raise InputError(
+                f"no place of the patella is found in {len(places) - len(found)} of "
+                f"{len(places)} frames; first: {self.states[0].status.value}",
+                "[patella]",
+                "check its mesh, the lines' points, length_mm, and the motion's angle_unit: "
+                f"flexion is read as {flexion.min():.3g} to {flexion.max():.3g} deg",
+            )
+        part = slice(found[0], found[-1] + 1)
+        bridged = PchipInterpolator(time[found], places[found])(time[part])
+        result = np.full((len(places), 3, 3), np.nan)
+        result[part] = np.stack(rates(time[part], bridged), axis=1)
+        result[np.isnan(places).any(axis=1)] = np.nan
+        return result
+
+
+@lru_cache(maxsize=1)
+def _patellar_contact(femoral: Surface, button: Surface, joint: bytes) -> PatellofemoralContact:
+    """Return the contact of two surfaces, prepared once for the many samples of a scene.
+
+    Args:
+        femoral: femoral component, femur link's frame; told from others by its identity.
+        button: patellar button, likewise.
+        joint: (4, 4) pose_joint_in_femur, its bytes.
+    """
+    joint_in_femur = np.frombuffer(joint).reshape(4, 4)
+    return PatellofemoralContact(femoral.moved(inverse(joint_in_femur)), button)
+
+
+class _RecordedContacts:
+    """The contact at each recorded place, found once it is asked for.
+
+    Args:
+        contact: of the two surfaces, unused.
+        places: (f, 3) m and rad, recorded coordinates of the patella.
+    """
+
+    def __init__(self, contact: PatellofemoralContact, places: Array) -> None:
+        self.places, self._contact = places, contact
+        self._found: dict[int, PatellarContact] = {}
+
+    def __getitem__(self, k: int) -> PatellarContact:
+        if k not in self._found:
+            self._found[k] = self._contact.at(self.places[k])
+        return self._found[k]
+
+
+@lru_cache(maxsize=1)
+def _recorded_contacts(prepared: PatellofemoralContact, coordinates: bytes) -> _RecordedContacts:
+    """Return the contacts at recorded places: where the knee is does not change them.
+
+    Args:
+        prepared: the contact; told from others by its identity.
+        coordinates: (f, 3) m and rad, their bytes.
+    """
+    return _RecordedContacts(prepared.unused(), np.frombuffer(coordinates).reshape(-1, 3))
+
+
+class _RecordedStates(Sequence[PatellaState]):
+    """The patella where it was recorded, at the recorded poses of the femur (f, 4, 4)."""
+
+    def __init__(
+        self, mechanism: ExtensorMechanism, poses: Array, contacts: _RecordedContacts
+    ) -> None:
+        self._mechanism, self._poses, self._contacts = mechanism, poses, contacts
+        self._found: dict[int, PatellaState] = {}
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    @overload
+    def __getitem__(self, k: int) -> PatellaState: ...
+    @overload
+    def __getitem__(self, k: slice) -> list[PatellaState]: ...
+    def __getitem__(self, k: int | slice) -> PatellaState | list[PatellaState]:
+        if isinstance(k, slice):
+            return [self[one] for one in range(len(self))[k]]
+        k = range(len(self))[k]
+        if k not in self._found:
+            place, contact = self._contacts.places[k], self._contacts[k]
+            self._found[k] = patella_at(self._mechanism, self._poses[k], place, contact)
+        return self._found[k]
+
+
+def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]:
+    """Solve frame after frame, each from the one before."""
+    states: list[PatellaState] = []
+    for pose in poses:
+        near = (states[-1].coordinates, states[-1].slopes) if states else ()
+        states.append(solve_patella(mechanism, pose, *near))
+    return states
+
+
+def _on_tibia(load: PointForces) -> PointForces:
+    """Return the load with the insert, which the tibia carries, named as the tibia."""
+    return replace(load, link="tibia") if load.link == "insert" else load

@@ -1,0 +1,59 @@
+"""A collateral ligament's side: the MCL is medial, the LCL lateral, whatever the knee's side."""
+
+import re
+from collections.abc import Iterable
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import inverse, transform
+from tkamb.knee.chain import Chain
+from tkamb.knee.ligaments import Ligament
+from tkamb.knee.load import LinkPoint
+from tkamb.units import MILLIMETRE
+
+WRONG_SIDE = 8.0 * MILLIMETRE
+"""Beyond the middle, on the other side: collateral ligaments end 20 to 45 mm off it, and no frame
+is off the knee's middle by as much as this."""
+
+_MEDIAL = re.compile(r"mcl|(medial|tibial)[ _-]*collateral", re.IGNORECASE)
+_LATERAL = re.compile(r"(?<![a-z])l[ _-]?cl|fcl|(lateral|fibular)[ _-]*collateral", re.IGNORECASE)
+
+
+def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: str) -> None:
+    """Raise where a collateral ligament's name and its place are of different sides.
+
+    Args:
+        ligaments: the bundles, of a right knee or mirrored to one: z points laterally.
+        chain: of the links that carry them.
+        side: of the patient, for the message.
+
+    Raises:
+        InputError: names the bundle and its end.
+    """
+    for bundle in ligaments:
+        sign = _lateral_sign(bundle.name)
+        for name, end in (("proximal", bundle.proximal), ("distal", bundle.distal)):
+            lateral = _lateral_place(end, chain)
+            if sign * lateral < -WRONG_SIDE:
+                there, own = ("lateral", "medial") if sign < 0 else ("medial", "lateral")
+                raise InputError(
+                    f"its {name} end lies {abs(lateral) / MILLIMETRE:.0f} mm on the {there} side "
+                    f"of this {side} knee, a ligament of the {own} side by its name",
+                    f"[[ligament]] {bundle.name}",
+                    "turn the sign of z in point_mm (z points to the right on either side), or "
+                    "mend [patient] side or the name",
+                )
+
+
+def _lateral_sign(name: str) -> int:
+    """Return -1 for a medial collateral ligament, 1 for a lateral one, else 0."""
+    medial, lateral = bool(_MEDIAL.search(name)), bool(_LATERAL.search(name))
+    return int(lateral) - int(medial)
+
+
+def _lateral_place(end: LinkPoint, chain: Chain) -> float:
+    """Return how far (m) an end lies laterally in the femur link or the insert frame."""
+    carrier = chain.carrier(end.link)
+    place = transform(chain.link_in(end.link, carrier), end.position)
+    if carrier == "tibia":
+        place = transform(inverse(chain.insert_in_tibia), place)
+    return float(place[2])

@@ -1,0 +1,267 @@
+"""Ligament bundles: straight lines between two links that pull and never push.
+
+With slack length L0 and strain eps = (L - L0)/L0, eps1 = 0.03:
+
+    two-line (k in N/m)                         quadratic toe (k_eps in N per unit strain)
+    F = 0                      eps <= 0         F = 0                        eps <= 0
+    F = (k/2) (L - L0)         eps <= 2 eps1    F = k_eps eps²/(4 eps1)      eps <= 2 eps1
+    F = k (L - (1 + eps1) L0)  otherwise        F = k_eps (eps - eps1)       otherwise
+
+Both are continuous; the first has a kink at 2 eps1, the second has none.
+
+References: Abdel-Rahman & Hefzy, Med Eng Phys 20:276 (1998); Blankevoort & Huiskes,
+J Biomech Eng 113:263 (1991), doi:10.1115/1.2894883.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tkamb.errors import InputError, names_near
+from tkamb.geometry.frames import Array, transform
+from tkamb.knee.load import LinkPoint, PointForces, wrench_of
+from tkamb.units import DEGREE
+
+TOE_STRAIN = 0.03
+"""eps1: the toe region ends at twice this strain, the same for every ligament."""
+
+FARTHEST_REFERENCE = 15.0 * DEGREE
+"""rad: a recorded frame farther than this from the reference flexion is no reference pose."""
+
+Law = Literal["two-line", "quadratic-toe"]
+
+
+def two_line_force(length: ArrayLike, slack_length: ArrayLike, stiffness: ArrayLike) -> Array:
+    """Return the tension (N) of the two-line law; `stiffness` in N/m, lengths in m."""
+    length, slack = np.asarray(length, float), np.asarray(slack_length, float)
+    toe = 0.5 * np.asarray(stiffness) * (length - slack)
+    line = np.asarray(stiffness) * (length - (1.0 + TOE_STRAIN) * slack)
+    strain = (length - slack) / slack
+    return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * TOE_STRAIN, toe, line))
+
+
+def quadratic_toe_force(length: ArrayLike, slack_length: ArrayLike, stiffness: ArrayLike) -> Array:
+    """Return the tension (N) of the quadratic-toe law; `stiffness` in N per unit strain."""
+    length, slack = np.asarray(length, float), np.asarray(slack_length, float)
+    strain = (length - slack) / slack
+    toe = np.asarray(stiffness) * strain**2 / (4.0 * TOE_STRAIN)
+    line = np.asarray(stiffness) * (strain - TOE_STRAIN)
+    return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * TOE_STRAIN, toe, line))
+
+
+@dataclass(frozen=True, eq=False)
+class Ligament:
+    """One bundle on a straight line between a point of one link and a point of another.
+
+    Args:
+        name: as in the scene.
+        proximal: its proximal end.
+        distal: its distal end.
+        law: which of the two laws.
+        stiffness: N/m for "two-line", N per unit strain for "quadratic-toe".
+        slack_length: m; NaN where a reference strain is given instead.
+        reference_strain: strain at the reference pose.
+        reference_flexion: rad, of the reference pose.
+    """
+
+    name: str
+    proximal: LinkPoint
+    distal: LinkPoint
+    law: Law
+    stiffness: float
+    slack_length: float = float("nan")
+    reference_strain: float = float("nan")
+    reference_flexion: float = 0.0
+
+    def ends(self, poses: Mapping[str, Array]) -> tuple[Array, Array]:
+        """Return proximal and distal end (..., 3) in the insert frame.
+
+        Args:
+            poses: link -> pose_link_in_insert, (4, 4) or (f, 4, 4).
+        """
+        proximal = transform(poses[self.proximal.link], self.proximal.position)
+        return proximal, transform(poses[self.distal.link], self.distal.position)
+
+    def length(self, poses: Mapping[str, Array]) -> Array:
+        """Return the distance (...,) between the ends, m."""
+        proximal, distal = self.ends(poses)
+        return np.asarray(np.linalg.norm(distal - proximal, axis=-1))
+
+    def strain(self, length: ArrayLike) -> Array:
+        """Return (L - L0)/L0."""
+        return np.asarray(length, float) / self.slack_length - 1.0
+
+    def force(self, length: ArrayLike) -> Array:
+        """Return the tension (N), never negative, at a length (m)."""
+        law = two_line_force if self.law == "two-line" else quadratic_toe_force
+        return law(length, self.slack_length, self.stiffness)
+
+
+@dataclass(frozen=True, eq=False)
+class BundleArrays:
+    """Several bundles at once, their ends in two frames of one's choice.
+
+    Args:
+        proximal: (m, 3) m, one end of each.
+        distal: (m, 3) m, the other end.
+        two_line: (m,) which law.
+        stiffness: (m,) N/m or N per unit strain, as the law takes it.
+        slack_length: (m,) m.
+    """
+
+    proximal: Array
+    distal: Array
+    two_line: NDArray[np.bool_]
+    stiffness: Array
+    slack_length: Array
+
+    @classmethod
+    def of(cls, bundles: Sequence[Ligament], proximal: Array, distal: Array) -> "BundleArrays":
+        """Return bundles with their ends (m, 3)."""
+        return cls(
+            proximal.reshape(-1, 3),
+            distal.reshape(-1, 3),
+            np.array([bundle.law == "two-line" for bundle in bundles], bool),
+            np.array([bundle.stiffness for bundle in bundles], float),
+            np.array([bundle.slack_length for bundle in bundles], float),
+        )
+
+    def pulls(self, proximal: Array, distal: Array) -> tuple[Array, Array]:
+        """Return tensions (..., m) N and the pulls (..., m, 3) N on the distal ends.
+
+        Args:
+            proximal: (..., m, 3) m, and
+            distal: (..., m, 3) m, the ends in one frame.
+        """
+        along = proximal - distal
+        length = np.linalg.norm(along, axis=-1)
+        law = (length, self.slack_length, self.stiffness)
+        tension = np.where(self.two_line, two_line_force(*law), quadratic_toe_force(*law))
+        return tension, (tension / length)[..., None] * along
+
+    def wrench(self, poses: Array) -> Array:
+        """Return the wrench (..., 6) about the origin of the distal ends' frame, on its body.
+
+        Args:
+            poses: (..., 4, 4) of the proximal ends' frame in the distal ends'.
+        """
+        proximal = np.einsum("...ij,mj->...mi", poses[..., :3, :3], self.proximal)
+        proximal = proximal + poses[..., None, :3, 3]
+        _, pull = self.pulls(proximal, self.distal)
+        return wrench_of(self.distal, pull).sum(axis=-2)
+
+
+def ligament_loads(
+    ligaments: Sequence[Ligament], poses: Mapping[str, Array]
+) -> tuple[Array, tuple[PointForces, ...]]:
+    """Return all tensions (n,) N and what they do to the links, at one frame.
+
+    The forces on a bundle's ends are equal and opposite, and lie on the line through both;
+    they are gathered into one load per link.
+
+    Args:
+        ligaments: the bundles.
+        poses: link -> pose_link_in_insert (4, 4).
+    """
+    points = [*(bundle.proximal for bundle in ligaments), *(bundle.distal for bundle in ligaments)]
+    links = np.array([point.link for point in points]).reshape(2, -1)
+    here = np.array([poses[point.link] for point in points], float)
+    places = np.array([point.position for point in points], float)
+    ends = np.einsum("nij,nj->ni", here[:, :3, :3], places) + here[:, :3, 3]
+    ends = ends.reshape(2, -1, 3)
+    tension, pull = BundleArrays.of(ligaments, *ends).pulls(*ends)
+    loads = []
+    for link in dict.fromkeys(links.ravel().tolist()):
+        own = links == link
+        forces = np.concatenate([-pull[own[0]], pull[own[1]]])
+        loads.append(PointForces(link, ends[own], forces))
+    return tension, tuple(loads)
+
+
+def build_ligaments(
+    ligaments: Sequence[Ligament], poses: Mapping[str, Array], flexion: Array
+) -> tuple[Ligament, ...]:
+    """Return bundles whose slack lengths are found where a reference strain is given.
+
+    A reference strain eps_r holds at the frame nearest to the reference flexion, where the
+    bundle has length L_r: L0 = L_r/(1 + eps_r).
+
+    Args:
+        ligaments: the bundles.
+        poses: link -> pose_link_in_insert (f, 4, 4).
+        flexion: (f,) rad, of the same frames.
+
+    Raises:
+        InputError: unknown link, an end that lies on the other one, or no recorded frame near
+            the reference flexion.
+    """
+    flexion = np.asarray(flexion, float)
+    return tuple(_with_slack_length(bundle, poses, flexion) for bundle in ligaments)
+
+
+def _with_slack_length(bundle: Ligament, poses: Mapping[str, Array], flexion: Array) -> Ligament:
+    where = f"ligament {bundle.name}"
+    for end in (bundle.proximal, bundle.distal):
+        if end.link not in poses:
+            raise InputError(f"no link '{end.link}'", where, names_near(end.link, poses))
+    reference = nearest_frame(flexion, bundle.reference_flexion)
+    length = float(bundle.length(_frame(poses, reference)))
+    if length == 0.0:
+        raise InputError("both ends are the same point", where)
+    if not np.isnan(bundle.slack_length):
+        return bundle
+    if abs(flexion[reference] - bundle.reference_flexion) > FARTHEST_REFERENCE:
+        raise InputError(
+            f"its reference pose is at {bundle.reference_flexion / DEGREE:g} deg of flexion, but "
+            f"the nearest recorded frame is at {flexion[reference] / DEGREE:.0f} deg",
+            where,
+            "give slack_length_mm, or a reference strain at a flexion that was recorded; check the "
+            f"motion's angle_unit: flexion is read as {np.nanmin(flexion) / DEGREE:.3g} to "
+            f"{np.nanmax(flexion) / DEGREE:.3g} deg",
+        )
+    return replace(bundle, slack_length=length / (1.0 + bundle.reference_strain))
+
+
+def nearest_frame(flexion: Array, wanted: float) -> int:
+    """Return the index of the frame whose flexion (f,) is nearest to the wanted one, rad."""
+    return int(np.nanargmin(np.abs(flexion - wanted)))
+
+
+def strain_table(
+    ligaments: Sequence[Ligament],
+    poses: Mapping[str, Array],
+    flexion: Array,
+    at_deg: Sequence[float] = (0.0, 60.0, 90.0),
+    within_deg: float = 10.0,
+) -> dict[str, tuple[float, ...]]:
+    """Return strain per bundle at given flexions, so that a wrong insertion is seen.
+
+    Args:
+        ligaments: the bundles.
+        poses: link -> pose_link_in_insert (f, 4, 4).
+        flexion: (f,) rad, of the same frames.
+        at_deg: flexions to look at; the nearest recorded frame is taken.
+        within_deg: NaN where no recorded frame is nearer than this.
+
+    Returns:
+        name -> strain at each flexion.
+    """
+    frames = [nearest_frame(flexion, angle * DEGREE) for angle in at_deg]
+    reached = [
+        abs(flexion[k] - angle * DEGREE) <= within_deg * DEGREE
+        for k, angle in zip(frames, at_deg, strict=True)
+    ]
+    table = {}
+    for bundle in ligaments:
+        strain = [float(bundle.strain(bundle.length(_frame(poses, k)))) for k in frames]
+        table[bundle.name] = tuple(s if r else np.nan for s, r in zip(strain, reached, strict=True))
+    return table
+
+
+def _frame(poses: Mapping[str, Array], k: int) -> dict[str, Array]:
+    return {
+        link: np.asarray(p)[k] if np.ndim(p) == 3 else np.asarray(p) for link, p in poses.items()
+    }

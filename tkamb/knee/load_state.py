@@ -1,0 +1,113 @@
+"""Which loads of the knee act at one frame: a condyle may be lifted, the extensor muscle slack.
+
+Lines pull and contacts push: N_medial, N_lateral, the muscle's tension, PL and PF along its normal
+are >= 0. A load that is left out is replaced by a residual moment, and only where it is asked for
+what it cannot do: a condyle that would have to pull, were it there; a muscle that would have to
+push. Otherwise a frame would be balanced without a load that it needs. So there are at most six
+sets: no condyle, the medial or the lateral one lifted, the extensor mechanism taut or slack, less
+those that the recorded gap excludes.
+"""
+
+from collections.abc import Iterable, Mapping
+from itertools import product
+from typing import NamedTuple
+
+from tkamb.knee.unknowns import MUSCLE, Solution
+
+ROUNDING = 1e-6
+"""N: a sign that is wrong by less is rounding."""
+
+PATELLA_MOMENT = 0.25
+"""N·m: the patella's own weight and inertia (up to 5 N on an arm of 45 mm), which stand between
+an extensor that pulls and one that is slack."""
+
+PATELLAR_LOADS = ("patellar_ligament", "patellofemoral")
+
+
+class LoadState(NamedTuple):
+    """What carries nothing.
+
+    Args:
+        lifted: sides of the condyles that carry nothing.
+        slack: muscles of the extensor mechanism, where it carries nothing; else empty.
+    """
+
+    lifted: frozenset[str]
+    slack: frozenset[str]
+
+    @property
+    def label(self) -> str:
+        """What is left out, in words."""
+        left_out = [f"{side} lifted" for side in sorted(self.lifted)]
+        left_out += [f"{muscle} slack" for muscle in sorted(self.slack)]
+        return " and ".join(left_out) or "all loaded"
+
+
+def load_states(
+    sides: Iterable[str], off: frozenset[str], extensors: Iterable[str]
+) -> list[LoadState]:
+    """Return the sets to try, fewest left out first, a slack muscle before a lifted condyle.
+
+    The order is the preference where several hold: contact is seen in the recorded gap, the
+    muscle's activity is not.
+
+    Args:
+        sides: of the condyles that are modelled.
+        off: sides that the recorded gap keeps off the insert.
+        extensors: names of the extensor muscles; none: the mechanism is not modelled.
+    """
+    near = [side for side in sides if side not in off]
+    lifted = [off, *(off | {side} for side in near if len(near) == 2)]
+    slack = dict.fromkeys([frozenset[str](), frozenset(extensors)])
+    states = [LoadState(*state) for state in product(lifted, slack)]
+    return sorted(
+        states, key=lambda state: (len(state.lifted) + bool(state.slack), len(state.lifted))
+    )
+
+
+def _muscles(values: Mapping[str, float]) -> list[str]:
+    return [name for name in values if name.startswith(MUSCLE)]
+
+
+def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
+    """Return what contradicts a set's own assumptions, with its size; empty where they hold."""
+    if not solution.regular:
+        return ["singular equations"]
+    values = solution.values
+    one_sided = ("medial_normal", "lateral_normal", *_muscles(values), *PATELLAR_LOADS)
+    wrong = [
+        f"{name.removeprefix(MUSCLE).replace('_', ' ')} {values[name]:.3g} N"
+        for name in one_sided
+        if values.get(name, 0.0) < -ROUNDING
+    ]
+    if state.slack:
+        # on the tibia, about insert z; without contact it is given on the femur
+        extension = values.get("residual_flexion", 0.0) - values.get("knee_moment_flexion", 0.0)
+        if extension > PATELLA_MOMENT:
+            wrong.append(f"extension moment {extension:.3g} N·m needed")
+    return wrong
+
+
+def contradictions(
+    state: LoadState, solutions: Mapping[LoadState, Solution], off: frozenset[str]
+) -> list[str]:
+    """Return what is wrong with one of the sets: its signs, or a load left out that would act.
+
+    Args:
+        state: the set.
+        solutions: of all sets.
+        off: sides that the recorded gap keeps off the insert.
+    """
+    wrong = wrong_signs(state, solutions[state])
+    if state.slack:
+        taut = solutions[LoadState(state.lifted, frozenset())].values
+        pulls = {name: taut[name] for name in (*_muscles(taut), "patellar_ligament")}
+        if not min(pulls.values()) < -ROUNDING:
+            name, pull = next(iter(pulls.items()))
+            wrong.append(f"{name.removeprefix(MUSCLE)} would pull with {pull:.3g} N")
+    for side in sorted(state.lifted - off):
+        there = solutions[LoadState(state.lifted - {side}, state.slack)]
+        force = there.values[f"{side}_normal"]
+        if not force < 0.0:
+            wrong.append(f"{side} condyle would push with {force:.3g} N")
+    return wrong

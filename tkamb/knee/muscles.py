@@ -1,0 +1,233 @@
+"""Muscles, tendons and the paths they take, as data: points on links, what they wrap, strength.
+
+A line of action is a massless string through points of the links, perhaps around the outline
+of one of them. A unit tension on it, with the reactions of what it passes, is one column of the
+equations of motion; its moment arm about any coordinate q of the chain is then -dL/dq.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.frames import Array, transform
+from tkamb.geometry.sections import sagittal_outline
+from tkamb.knee.load import LinkPoint, PointForces
+from tkamb.knee.wrapping import TautPath, path_in_link
+
+if TYPE_CHECKING:
+    from tkamb.geometry.surface import Surface
+    from tkamb.knee.chain import Chain
+
+SECTIONS = 7
+"""Sagittal planes across the band whose sections are wrapped."""
+
+
+@dataclass(frozen=True, eq=False)
+class SagittalWrap:
+    """How a line wraps an implant part: in front of its sagittal outline.
+
+    Args:
+        band: m, half the width of the sections, about the line's own sagittal plane.
+        half_thickness: m, of the tendon, off the outline.
+        bone: wrapped beside the part, in the frame of the link that carries it.
+    """
+
+    band: float
+    half_thickness: float
+    bone: "Surface | None" = None
+
+    def outline(self, part: "Surface", middle: float, below: float = np.inf) -> Array:
+        """Return the convex outline (n, 2) m of the part and the bone, grown by the tendon.
+
+        Args:
+            part: in the frame whose x-y plane holds the outline.
+            middle: m, z of the line's own sagittal plane there.
+            below: m, what lies above this y is left out.
+        """
+        surfaces = [part] if self.bone is None else [part, self.bone]
+        planes = middle + np.linspace(-self.band, self.band, SECTIONS)
+        return sagittal_outline(surfaces, planes, self.half_thickness, below=below)
+
+
+@dataclass(frozen=True, eq=False)
+class Muscle:
+    """A muscle as the scene gives it.
+
+    Args:
+        name: of the muscle.
+        points: its path from origin to insertion, at least two.
+        wrap: how its stretch off the femur wraps the femoral component; None: straight.
+        strength: N, maximal isometric force; NaN where none is given.
+        group: of muscles that are shown together; empty: its own.
+    """
+
+    name: str
+    points: tuple[LinkPoint, ...]
+    wrap: SagittalWrap | None = None
+    strength: float = float("nan")
+    group: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class PatellarLigament:
+    """The patellar ligament: one line from the patella to the tibial tuberosity.
+
+    Args:
+        proximal: on the patella.
+        distal: on the tibia.
+        wrap: how it wraps the insert's front lip; None: straight.
+        length: m, where the patella's motion is to be found; else NaN.
+    """
+
+    proximal: LinkPoint
+    distal: LinkPoint
+    wrap: SagittalWrap | None = None
+    length: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class Wrap:
+    """An outline that one stretch of a line passes in front of.
+
+    Args:
+        link: to which the outline is fixed; it takes the reaction.
+        outline: (n, 2) m, convex, in the link's x-y plane.
+        stretch: which: 0 is that from the first point to the second.
+    """
+
+    link: str
+    outline: Array
+    stretch: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A line of action: a string through points of the links.
+
+    Args:
+        name: of the muscle or ligament, for messages.
+        points: from the proximal end to the distal one, at least two.
+        wrap: what it wraps; None: straight from point to point.
+    """
+
+    name: str
+    points: tuple[LinkPoint, ...]
+    wrap: Wrap | None = None
+
+    def path(self, poses: Mapping[str, Array]) -> TautPath:
+        """Return the taut path in the insert frame, at one frame of the motion.
+
+        Args:
+            poses: link -> pose_link_in_insert (4, 4).
+
+        Raises:
+            ComputationError: an end of the wrapped stretch lies inside the outline.
+        """
+        places = [transform(poses[point.link], point.position) for point in self.points]
+        stretches = []
+        for i, (start, end) in enumerate(pairwise(places)):
+            wrapped = self.wrap if self.wrap and self.wrap.stretch == i else None
+            outline, link = (wrapped.outline, wrapped.link) if wrapped else (None, None)
+            pose = np.eye(4) if link is None else np.asarray(poses[link], float)
+            try:
+                stretches.append(path_in_link(start, end, outline, pose))
+            except ComputationError as error:
+                raise ComputationError(error.what, self.name) from None
+        if len(stretches) == 1:
+            return stretches[0]
+        points = [stretches[0].points, *(stretch.points[1:] for stretch in stretches[1:])]
+        return TautPath(
+            np.concatenate(points),
+            sum(stretch.length for stretch in stretches),
+            sum(stretch.wrap_angle for stretch in stretches),
+        )
+
+    def loads(self, path: TautPath) -> tuple[PointForces, ...]:
+        """Return the forces of a unit tension on the links: zero force and moment in sum.
+
+        Both ends are pulled along the path; every point between, and every corner of the
+        outline, is pressed by the change of direction there. The ends come first.
+        """
+        links = [point.link for point in self.points]
+        if self.wrap:
+            at = self.wrap.stretch + 1
+            links[at:at] = [self.wrap.link] * (len(path.points) - len(links))
+        along = path.directions
+        forces = np.concatenate([along[:1], np.diff(along, axis=0), -along[-1:]])
+        inner = np.array(links[1:-1])
+        return (
+            PointForces(links[0], path.points[:1], forces[:1]),
+            PointForces(links[-1], path.points[-1:], forces[-1:]),
+            *(
+                PointForces(link, path.points[1:-1][inner == link], forces[1:-1][inner == link])
+                for link in dict.fromkeys(links[1:-1])
+            ),
+        )
+
+
+def off_femur(points: Sequence[LinkPoint], chain: "Chain") -> int:
+    """Return the index of the stretch that leaves the femur.
+
+    Raises:
+        InputError: none does.
+    """
+    carriers = [chain.carrier(point.link) for point in points]
+    for i, (one, other) in enumerate(pairwise(carriers)):
+        if one == "femur" != other:
+            return i
+    raise InputError("no stretch of the path leaves the femur", None, "check its points' links")
+
+
+def muscle_line(muscle: Muscle, chain: "Chain", femoral: "Surface") -> Line:
+    """Return a muscle's line of action; it wraps the femoral component in the patella's plane.
+
+    Args:
+        muscle: the muscle.
+        chain: the patient.
+        femoral: femoral component in the femur link's frame.
+    """
+    if muscle.wrap is None:
+        return Line(muscle.name, muscle.points)
+    stretch = off_femur(muscle.points, chain)
+    last = muscle.points[stretch]
+    outline = muscle.wrap.outline(
+        femoral,
+        float(chain.patella_joint_in_femur[2, 3]),
+        below=float(transform(chain.link_in(last.link, "femur"), last.position)[1]),
+    )
+    return Line(muscle.name, muscle.points, Wrap("femur", outline, stretch))
+
+
+def check_muscles(muscles: Sequence[Muscle], chain: "Chain") -> None:
+    """Raise unless one muscle alone crosses the knee, from the femur to the patella.
+
+    Then the equations of a frame are square. More of them share the joint moments in a way
+    that equilibrium does not determine.
+
+    Raises:
+        InputError: several muscles, one that crosses no joint, or one that inserts elsewhere.
+    """
+    for muscle in muscles:
+        if len({chain.carrier(point.link) for point in muscle.points}) == 1:
+            where = f"[[muscle]] {muscle.name}"
+            raise InputError("crosses no joint of the model", where, "check its points' links")
+    if len(muscles) > 1:
+        raise InputError(
+            f"{len(muscles)} muscles cross the knee ({', '.join(m.name for m in muscles)}): "
+            "static optimisation, which shares the load among them, does not reach scenes yet",
+            "[[muscle]]",
+            "keep the one that inserts on the patella",
+        )
+    for muscle in muscles:
+        ends = [chain.carrier(muscle.points[i].link) for i in (0, -1)]
+        if ends != ["femur", "patella"]:
+            raise InputError(
+                f"runs from {ends[0]} to {ends[1]}: static optimisation, which such a muscle "
+                "needs, does not reach scenes yet",
+                f"[[muscle]] {muscle.name}",
+                "the only muscle must run from the femur to the patella",
+            )

@@ -1,0 +1,214 @@
+"""The patella's forces at a place in the femur's sagittal plane, massless and without friction.
+
+A place is the three joint coordinates patella_ap, patella_si and patella_rotation. Muscle,
+patellar ligament and contact force balance at each; the moment that is left over vanishes where
+the patella rests (see `patella_search`).
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Array, inverse, rotate, transform
+from tkamb.knee.patellofemoral import PatellarContact, PatellofemoralContact
+from tkamb.knee.wrapping import TautPath, path_in_link
+
+FLATTEST = 1e-6
+"""Determinant of the contact normal and the ligament's direction: less is one line."""
+
+
+class PatellaStatus(Enum):
+    """How the search ended: found, or which condition of the place was not met."""
+
+    OK = "ok"
+    SEVERAL = "several_solutions"
+    EDGE = "contact_on_edge_of_femoral_mesh"
+    NO_CONTACT = "no contact: the button meets the femoral component at no rotation"
+    LINE = "a line's end lies inside what it wraps, or runs along the contact normal"
+    GAP = "the gap to the femoral component does not close"
+    LIGAMENT = "the patellar ligament's length is not met"
+    MOMENT = "moments balance at no rotation that was tried"
+    PULL = "the contact would have to pull, or the patellar ligament to push"
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a place; else the value says which condition failed."""
+        return self in (PatellaStatus.OK, PatellaStatus.SEVERAL, PatellaStatus.EDGE)
+
+
+@dataclass(frozen=True, eq=False)
+class PatellaState:
+    """The patella at one frame.
+
+    Args:
+        coordinates: (3,) patella_ap, patella_si (m), patella_rotation (rad); NaN if not found.
+        contact_point: (3,) m, on the line of action, insert frame.
+        contact_normal: (3,) unit, out of the femur into the patella, in the femur's sagittal
+            plane, insert frame.
+        contact_on_patella: (3,) m, the same point in the patella's frame.
+        gap: m, positive when apart.
+        ligament_ratio: patellar ligament tension per tension of the muscle, massless patella.
+        patellofemoral_ratio: patellofemoral force per tension of the muscle, massless patella.
+        shift: m along z, the mediolateral shift that is left out of the motion; first order.
+        tilt: rad about y, likewise.
+        status: how the search ended.
+        slopes: (3, 3) of gap, ligament length and moment (m, per unit tension) by the coordinates,
+            about, which shortens a search near by; None if not known.
+    """
+
+    coordinates: Array
+    contact_point: Array
+    contact_normal: Array
+    contact_on_patella: Array
+    gap: float
+    ligament_ratio: float
+    patellofemoral_ratio: float
+    shift: float
+    tilt: float
+    status: PatellaStatus
+    slopes: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ExtensorMechanism:
+    """What stays the same over all frames.
+
+    Args:
+        contact: button against femoral component, in the patellar joint's frame.
+        pose_joint_in_femur: (4, 4), the patellar joint's frame on the femur link.
+        muscle_origin: (3,) m, femur link; of the stretch that leaves the femur.
+        muscle_insertion: (3,) m, patella link.
+        ligament_proximal: (3,) m, patella link.
+        ligament_distal: (3,) m, insert frame.
+        ligament_length: m.
+        femoral_outline: (n, 2) m, in the femur link's x-y plane; None: no wrapping.
+        insert_outline: (n, 2) m, in the insert's x-y plane; None: no wrapping.
+    """
+
+    contact: PatellofemoralContact
+    pose_joint_in_femur: Array
+    muscle_origin: Array
+    muscle_insertion: Array
+    ligament_proximal: Array
+    ligament_distal: Array
+    ligament_length: float
+    femoral_outline: Array | None = None
+    insert_outline: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PatellaBalance:
+    """Forces on the patella per unit tension of the muscle, in the joint's frame."""
+
+    coordinates: Array
+    contact: PatellarContact
+    muscle: TautPath
+    ligament: TautPath
+    ligament_force: float
+    normal_force: float
+    moment: float
+    slopes: Array | None = None
+
+
+def patella_at(
+    mechanism: ExtensorMechanism,
+    pose_femur_in_insert: Array,
+    coordinates: Array,
+    contact: PatellarContact,
+) -> PatellaState:
+    """Return the state of a patella whose place was recorded; its gap is as recorded.
+
+    Args:
+        mechanism: the extensor mechanism.
+        pose_femur_in_insert: (4, 4).
+        coordinates: (3,) of the patella, m and rad.
+        contact: of the button there.
+    """
+    frame = PatellaFrame(mechanism, pose_femur_in_insert)
+    balance = frame.balance_at(np.asarray(coordinates, float), contact)
+    edge = balance.contact.on_edge > 0.5
+    return frame.state(balance, PatellaStatus.EDGE if edge else PatellaStatus.OK)
+
+
+def touching_patella(coordinates: Array, point: Array, normal: Array) -> PatellaState:
+    """Return the state of a patella of which place and contact are known, and nothing else.
+
+    Args:
+        coordinates: (3,) of the patella, m and rad.
+        point: (3,) m, contact point, insert frame.
+        normal: (3,) unit, into the patella, insert frame.
+    """
+    nan = float("nan")
+    on_patella = np.full(3, nan)
+    known = (coordinates, point, normal, on_patella)
+    return PatellaState(*known, nan, nan, nan, nan, nan, PatellaStatus.OK)
+
+
+class PatellaFrame:
+    """The mechanism at one frame, in the patellar joint's frame."""
+
+    def __init__(self, mechanism: ExtensorMechanism, pose_femur_in_insert: Array) -> None:
+        self.mechanism = mechanism
+        self.in_insert = np.asarray(pose_femur_in_insert, float) @ mechanism.pose_joint_in_femur
+        self.insert = inverse(self.in_insert)
+        self.femur = inverse(mechanism.pose_joint_in_femur)
+        self.origin = transform(self.femur, mechanism.muscle_origin)
+        self.tuberosity = transform(self.insert, mechanism.ligament_distal)
+
+    def balance(self, coordinates: Array) -> PatellaBalance:
+        """Return the forces with the force balance met and the moment left over (m)."""
+        return self.balance_at(coordinates, self.mechanism.contact.at(coordinates))
+
+    def balance_at(self, coordinates: Array, contact: PatellarContact) -> PatellaBalance:
+        """Return what `balance` does, with the contact there known already."""
+        m = self.mechanism
+        here = m.contact.pose(coordinates)
+        muscle = path_in_link(
+            self.origin, transform(here, m.muscle_insertion), m.femoral_outline, self.femur
+        )
+        ligament = path_in_link(
+            transform(here, m.ligament_proximal), self.tuberosity, m.insert_outline, self.insert
+        )
+        pull, hold = -muscle.end_direction[:2], ligament.start_direction[:2]
+        sides = np.column_stack([hold, contact.normal[:2]])
+        if abs(np.linalg.det(sides)) < FLATTEST:
+            raise ComputationError("the patellar ligament runs along the contact normal")
+        ligament_force, normal_force = np.linalg.solve(sides, -pull)
+        moment = (
+            _cross(muscle.points[-1], pull)
+            + ligament_force * _cross(ligament.points[0], hold)
+            + normal_force * _cross(contact.point, contact.normal)
+        )
+        return PatellaBalance(
+            coordinates,
+            contact,
+            muscle,
+            ligament,
+            float(ligament_force),
+            float(normal_force),
+            float(moment),
+        )
+
+    def state(self, balance: PatellaBalance, status: PatellaStatus) -> PatellaState:
+        """Return the result in the insert frame."""
+        contact = balance.contact
+        in_patella = inverse(self.mechanism.contact.pose(balance.coordinates))
+        return PatellaState(
+            balance.coordinates,
+            transform(self.in_insert, contact.point),
+            rotate(self.in_insert, contact.normal),
+            transform(in_patella, contact.point),
+            contact.gap,
+            balance.ligament_force,
+            balance.normal_force,
+            contact.shift,
+            contact.tilt,
+            status,
+            balance.slopes,
+        )
+
+
+def _cross(a: Array, b: Array) -> float:
+    return float(a[0] * b[1] - a[1] * b[0])

@@ -1,0 +1,348 @@
+"""Where the patella rests when its motion was not recorded.
+
+Three unknowns per frame, the joint coordinates patella_ap, patella_si and patella_rotation,
+and three equations of a massless patella without friction:
+
+    gap to the femoral component = 0
+    length of the patellar ligament = its given length
+    muscle, ligament and contact force meet in one point (moment balance in the plane)
+
+By virtual work the third says that the muscle's length is stationary among all places
+that satisfy the first two; a stable patella sits at a minimum of it. Near a known place Newton's
+steps with learnt slopes close all three at once. Else the search turns the patella in the
+direction of the unbalanced moment until that changes sign.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.optimize import brentq
+
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Array, transform
+from tkamb.knee.patella import (
+    FLATTEST,
+    ExtensorMechanism,
+    PatellaBalance,
+    PatellaFrame,
+    PatellaState,
+    PatellaStatus,
+)
+
+TOLERANCE = 1e-8
+"""m, of gap and ligament length."""
+
+TURN_TOLERANCE = 1e-7
+"""rad, of the rotation at which the moment vanishes."""
+
+FARTHEST_AHEAD = 8.0
+"""Lengths of a chord that a search looks ahead along it."""
+
+MOST_LOOKS = 14
+"""Of one approach to a place near by."""
+
+LONGEST_STEP = np.array([5e-3, 5e-3, np.deg2rad(4.0)])
+"""m, m and rad, of the coordinates in one step."""
+
+LEVER = 0.02
+"""m: a radian counts as much when slopes are learnt from a step."""
+
+FIRST_STEP = np.deg2rad(0.5)
+NEAR_TURN = np.deg2rad(12.0)
+WIDEST_TURN = np.deg2rad(40.0)
+"""rad: first step, reach of a quick look, and end of the search about the guess."""
+
+NEAR = 5e-3
+"""m: a place found farther from where the button first touched lies behind the femur."""
+
+
+class _Lost(ComputationError):
+    """A search that ended without a place: which condition was not met."""
+
+    def __init__(self, status: PatellaStatus) -> None:
+        super().__init__(status.value)
+        self.status = status
+
+
+def solve_patella(
+    mechanism: ExtensorMechanism,
+    pose_femur_in_insert: Array,
+    guess: Array | None = None,
+    slopes: Array | None = None,
+    anywhere: bool = True,
+) -> PatellaState:
+    """Return the patella's place at one frame.
+
+    Args:
+        mechanism: points, lengths, outlines and surfaces.
+        pose_femur_in_insert: (4, 4) of the femur link.
+        guess: (3,) coordinates of the previous frame; None searches all rotations.
+        slopes: its `slopes`, if it has them.
+        anywhere: search all rotations where the guess leads nowhere.
+
+    Returns:
+        The state; coordinates and forces are NaN unless status is OK, SEVERAL or EDGE.
+    """
+    search = _Search(mechanism, pose_femur_in_insert)
+    found, several = None, False
+    if guess is not None and np.isfinite(guess).all():
+        try:
+            found = search.follow(guess, slopes)
+        except ComputationError:
+            found = None  # a guess that leads nowhere says nothing: all rotations are searched
+    if found is None:
+        if not anywhere:
+            return _nothing(PatellaStatus.MOMENT)
+        try:
+            found, several = search.scan()
+        except _Lost as lost:
+            return _nothing(lost.status)
+    if found.normal_force <= 0.0 or found.ligament_force <= 0.0:
+        return _nothing(PatellaStatus.PULL)
+    status = PatellaStatus.SEVERAL if several else PatellaStatus.OK
+    if found.contact.on_edge > 0.5:
+        status = PatellaStatus.EDGE
+    return search.state(found, status)
+
+
+class _Closing:
+    """Newton's steps that close gap and ligament length in the plane, with Broyden's slopes.
+
+    The contact's unit normal and the ligament's direction are the slopes to begin with. The
+    groove's flanks make the gap's up to a fifth less steep, which Broyden's updates learn.
+    """
+
+    def __init__(self, ligament_length: float) -> None:
+        self._length = ligament_length
+        self._slopes: Array = np.eye(2)
+        self._step: Array = np.zeros(2)
+        self.errors: Array = np.full(2, np.inf)
+
+    @property
+    def closed(self) -> bool:
+        return bool(np.abs(self.errors).max() < TOLERANCE)
+
+    def step(self, balance: PatellaBalance) -> Array:
+        """Return the step (2,) in ap and si from a balance, 5 mm at most."""
+        before, stretch = self.errors, balance.ligament.length - self._length
+        self.errors = np.array([balance.contact.gap, stretch])
+        largest, last = float(np.abs(self.errors).max()), float(np.abs(before).max())
+        learns = largest < 0.5 * last < np.inf
+        if learns:
+            missed = self.errors - before - self._slopes @ self._step
+            self._slopes += np.outer(missed, self._step) / (self._step @ self._step)
+        if not learns or abs(np.linalg.det(self._slopes)) < FLATTEST:
+            self._slopes = _slopes_in_plane(balance)
+        step = np.linalg.solve(self._slopes, -self.errors)
+        self._step = np.asarray(
+            step * min(1.0, LONGEST_STEP[0] / max(float(np.linalg.norm(step)), 1e-12))
+        )
+        return self._step
+
+
+class _Search(PatellaFrame):
+    """The search at one frame."""
+
+    def at_rotation(self, start: Array, rotation: float) -> PatellaBalance:
+        """Return the balance where gap and ligament length hold at a rotation (Newton, Broyden).
+
+        Raises:
+            ComputationError: they do not, or a line cannot run there.
+        """
+        closing = _Closing(self.mechanism.ligament_length)
+        coordinates = np.array([start[0], start[1], rotation])
+        for _ in range(40):
+            balance = self.balance(coordinates)
+            step = closing.step(balance)
+            if closing.closed:
+                return balance
+            coordinates = coordinates + np.append(step, 0.0)
+        worst = np.argmax(np.abs(closing.errors))
+        raise _Lost((PatellaStatus.GAP, PatellaStatus.LIGAMENT)[worst])
+
+    def follow(self, guess: Array, slopes: Array | None = None) -> PatellaBalance:
+        """Return the stable balance next to a guess: turn with the moment to its zero.
+
+        Args:
+            guess: (3,) coordinates.
+            slopes: of a place near by; with them the zero is looked for at once.
+
+        Raises:
+            ComputationError: there is none within `WIDEST_TURN`.
+        """
+        if slopes is not None:
+            found = self._closed_in(guess, slopes, (-NEAR_TURN, NEAR_TURN))
+            if found is not None:
+                return found
+        here = self.at_rotation(guess, float(guess[2]))
+        step = FIRST_STEP
+        while abs(here.coordinates[2] - guess[2]) < WIDEST_TURN:
+            turn = here.coordinates[2] + np.sign(here.moment) * step
+            there = self.at_rotation(here.coordinates, float(turn))
+            if there.moment * here.moment <= 0.0:
+                return self.between(here, there)
+            ahead = self._chord(here, there, FARTHEST_AHEAD)
+            if ahead is not None:
+                return ahead
+            here, step = there, 1.6 * step
+        raise _Lost(PatellaStatus.MOMENT)
+
+    def between(self, here: PatellaBalance, there: PatellaBalance) -> PatellaBalance:
+        """Return the balance at the zero of the moment between two rotations."""
+        found = self._chord(here, there)
+        if found is not None:
+            return found
+        last = here
+
+        def moment(rotation: float) -> float:
+            nonlocal last
+            last = self.at_rotation(last.coordinates, rotation)
+            return last.moment
+
+        ends = (here.coordinates[2], there.coordinates[2])
+        try:
+            brentq(moment, *ends, xtol=TURN_TOLERANCE, rtol=1e-12)
+        except ValueError:
+            # the patella that is followed from one end lies elsewhere at the other, so that the
+            # moment there has another sign than the one that was found before
+            raise _Lost(PatellaStatus.MOMENT) from None
+        return last
+
+    def _chord(
+        self, here: PatellaBalance, there: PatellaBalance, reach: float = 1.0
+    ) -> PatellaBalance | None:
+        """Return the stable balance on the chord of two, at most `reach` times its length away."""
+        turn = float(there.coordinates[2] - here.coordinates[2])
+        way = (there.coordinates - here.coordinates)[:2] / turn
+        slope = (there.moment - here.moment) / turn
+        if slope >= 0.0:
+            return None
+        slopes = np.zeros((3, 3))
+        slopes[:2, :2] = _slopes_in_plane(here)
+        slopes[:2, 2], slopes[2, 2] = -slopes[:2, :2] @ way, slope
+        start = here.coordinates + np.append(way, 1.0) * -here.moment / slope
+        span = np.array([min(0.0, reach * turn), max(0.0, reach * turn)])
+        return self._closed_in(start, slopes, span + here.coordinates[2] - start[2])
+
+    def _closed_in(
+        self, start: Array, slopes: Array, span: Sequence[float]
+    ) -> PatellaBalance | None:
+        """Return the stable balance near a place: Newton's steps in all three, Broyden's slopes.
+
+        None where that leads out of a span, to an unstable place, or does not end.
+
+        Args:
+            start: (3,) coordinates.
+            slopes: (3, 3) of gap, ligament length and moment, about.
+            span: rad, least and greatest rotation from the start.
+        """
+        scale = np.array([1.0, 1.0, LEVER])
+        coordinates, step, before = start, None, np.zeros(3)
+        for _ in range(MOST_LOOKS):
+            if not span[0] <= coordinates[2] - start[2] <= span[1]:
+                return None
+            balance = self.balance(coordinates)
+            stretch = balance.ligament.length - self.mechanism.ligament_length
+            errors = np.array([balance.contact.gap, stretch, balance.moment])
+            if step is not None:
+                missed, scaled = errors - before - slopes @ step, step * scale
+                slopes = slopes + np.outer(missed, scaled * scale) / (scaled @ scaled)
+            if not _stable(slopes):
+                return None
+            step, before = -np.linalg.solve(slopes, errors), errors
+            if np.abs(errors[:2]).max() < TOLERANCE and abs(step[2]) < TURN_TOLERANCE:
+                return replace(balance, slopes=slopes)
+            step = step / max(1.0, float(np.abs(step / LONGEST_STEP).max()))
+            coordinates = coordinates + step
+        return None
+
+    def scan(self) -> tuple[PatellaBalance, bool]:
+        """Return the stable balance with the shortest muscle, and whether there are more.
+
+        Raises:
+            _Lost: there is none; with the condition that the nearest miss did not meet.
+        """
+        flexion = np.arctan2(self.in_insert[1, 0], self.in_insert[0, 0])
+        rotations = -0.65 * flexion + np.deg2rad(np.arange(-50.0, 50.1, 10.0))
+        places: list[PatellaBalance | None] = []
+        misses = []
+        for rotation in rotations:
+            try:
+                places.append(self.first_touch(float(rotation)))
+            except ComputationError as error:
+                places.append(None)
+                misses.append(_condition(error))
+        found = []
+        for here, there in pairwise(places):
+            if here and there and here.moment > 0.0 >= there.moment:
+                try:
+                    found.append(self.between(here, there))
+                except ComputationError as error:
+                    misses.append(_condition(error))
+        if not found:
+            misses += [PatellaStatus.MOMENT] * any(places)
+            raise _Lost(max(misses, key=_CONDITIONS.index))
+        return min(found, key=lambda b: b.muscle.length), len(found) > 1
+
+    def first_touch(self, rotation: float) -> PatellaBalance:
+        """Return the balance at a rotation, the patella swung in on its ligament from in front.
+
+        Raises:
+            ComputationError: it touches nothing, or gap or length do not hold where it does.
+        """
+        m = self.mechanism
+        turned = m.contact.pose(np.array([0.0, 0.0, rotation]))
+        proximal = transform(turned, m.ligament_proximal)
+        radius = np.sqrt(max(m.ligament_length**2 - (proximal[2] - self.tuberosity[2]) ** 2, 1e-8))
+
+        def place(lean: float) -> Array:
+            swing = self.insert[:2, :2] @ (radius * np.array([np.sin(lean), np.cos(lean)]))
+            return np.append(self.tuberosity[:2] + swing - proximal[:2], rotation)
+
+        leans = np.deg2rad(np.arange(75.0, -75.1, -5.0))
+        touching = next((k for k, lean in enumerate(leans) if m.contact.touches(place(lean))), 0)
+        if touching == 0:  # never, or from the start
+            raise _Lost(PatellaStatus.NO_CONTACT)
+        free, deep = leans[touching - 1], leans[touching]
+        for _ in range(6):
+            middle = 0.5 * (free + deep)
+            free, deep = (free, middle) if m.contact.touches(place(middle)) else (middle, deep)
+        found = self.at_rotation(place(free), rotation)
+        if np.linalg.norm((found.coordinates - place(free))[:2]) > NEAR:
+            raise _Lost(PatellaStatus.GAP)
+        return found
+
+
+_CONDITIONS = (
+    PatellaStatus.NO_CONTACT,
+    PatellaStatus.LINE,
+    PatellaStatus.LIGAMENT,
+    PatellaStatus.GAP,
+    PatellaStatus.MOMENT,
+)
+"""In the order in which a search meets them: the last that any rotation missed is named."""
+
+
+def _condition(error: ComputationError) -> PatellaStatus:
+    """Return the condition that a search missed; errors of the lines have no status."""
+    return error.status if isinstance(error, _Lost) else PatellaStatus.LINE
+
+
+def _slopes_in_plane(balance: PatellaBalance) -> Array:
+    """Return the slopes (2, 2) of gap and ligament length by ap and si at a balance."""
+    return np.stack([balance.contact.normal[:2], -balance.ligament.start_direction[:2]])
+
+
+def _stable(slopes: Array) -> bool:
+    """Say whether a turn with gap and ligament kept is turned back by the moment."""
+    plane = slopes[:2, :2]
+    if abs(np.linalg.det(plane)) < FLATTEST:
+        return False
+    return bool(slopes[2, 2] < slopes[2, :2] @ np.linalg.solve(plane, slopes[:2, 2]))
+
+
+def _nothing(status: PatellaStatus) -> PatellaState:
+    nan, none = float("nan"), np.full(3, np.nan)
+    return PatellaState(none, none, none, none, nan, nan, nan, nan, nan, status)

@@ -1,0 +1,369 @@
+"""Where the patella touches the femoral component, and along which line it is pressed.
+
+Everything is in the patellar joint's frame: the femur's, x anterior, y superior, z right;
+the patella moves in it in the sagittal plane only (x, y, rotation about z).
+
+The joint side of the button is sampled. Sample i has the signed distance d_i from the
+femoral component, there the nearest point p_i and its normal n_i. The single closest point
+of two faceted, nearly conforming surfaces jumps by centimetres from frame to frame; so the
+contact is the mean over a thin patch, with weights w_i ~ exp(-d_i/tau), for the samples on
+either side of the patella's middle:
+
+    g = sum w_i d_i - tau,    p = sum w_i p_i,    n = sum w_i n_i
+
+For a paraboloid of any curvature g is the distance of the closest points, exactly. A patella
+in its groove touches on its left and on its right. How the force is shared, lambda on the
+left and 1 - lambda on the right, follows from soft tissue that lets the patella shift by c
+times the lateral force and tilt by d times the tilting moment, per unit contact force:
+
+    gap = min over 0 <= lambda <= 1 of
+          lambda g_l + (1 - lambda) g_r + (c/2) n_z² + (d/2) a²
+    n_z = lambda n_lz + (1 - lambda) n_rz      a = lambda z_l + (1 - lambda) z_r
+
+z measured from the patella's middle. The sagittal part of lambda n_l + (1 - lambda) n_r is
+the direction of the patellofemoral force. Shift and tilt are estimated to first order and
+reported, not carried out.
+"""
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.compiled import compiled_as_written
+from tkamb.geometry.frames import Array, Index, pose, transform
+from tkamb.geometry.normals import sharp_edges
+from tkamb.geometry.surface import Surface
+
+PATCH_DEPTH = 5e-5
+"""m: tau above; a contact of relative radius R is averaged over about sqrt(R tau)."""
+
+SAMPLE_SPACING = 1e-3
+"""m: spacing of the samples of the button, in the patella's coronal plane."""
+
+REACH = 14.0 * PATCH_DEPTH
+"""m: samples farther than this behind the nearest one weigh nothing (exp(-14) = 8e-7, by which the
+gap of a patch of twenty samples jumps by 3e-11 m)."""
+
+COARSE = 60
+"""Samples that a quick look takes."""
+
+LATERAL_YIELD = 0.01
+"""m: c above, the shift if the contact force were purely lateral."""
+
+TILT_YIELD = 10.0
+"""rad/m: d above, the tilt (5.7 deg) if the whole force acted 10 mm beside the middle."""
+
+SIDEWAYS = 1e-9
+"""Sagittal part of a unit normal below which there is none."""
+
+STRAIGHT = 1e-12
+"""m: where the share changes the gap by less through what yields, all goes to the nearer side."""
+
+FIELDS = 11
+"""Numbers that say where and how the patella is pressed."""
+
+EDGE_MARGIN = 0.02
+"""Barycentric distance from a sharp edge within which a point lies on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class PatellarContact:
+    """The contact at one position of the patella, in the patellar joint's frame.
+
+    Args:
+        gap: m, positive when apart.
+        point: (3,) m, on the line of action, at the height of the facets' contact points.
+        normal: (3,) unit, in the sagittal plane, out of the femur into the patella.
+        share_left: lambda, the share of the facet on the -z side.
+        shift: m along z, by which soft tissue would let the patella yield; first order.
+        tilt: rad about y, likewise.
+        on_edge: share of the force on sharp or open edges of the femoral mesh.
+    """
+
+    gap: float
+    point: Array
+    normal: Array
+    share_left: float
+    shift: float
+    tilt: float
+    on_edge: float
+
+
+class PatellofemoralContact:
+    """Contact between button and femoral component, prepared for many positions.
+
+    Distances of samples that cannot matter are carried over from the position before, with
+    what the samples have moved since as a bound: this saves time and changes nothing, since
+    samples beyond `REACH` have no weight.
+
+    Args:
+        femoral: femoral component in the patellar joint's frame; triangles share vertices.
+        patellar: button in the patella's frame, x anterior: its joint side faces -x.
+        ml: m, z of the patella's frame in the joint's frame.
+        lateral_yield: m, c in the module's equation.
+        tilt_yield: rad/m, d in the module's equation.
+
+    Raises:
+        InputError: the button has no surface that faces the femur on both sides.
+    """
+
+    def __init__(
+        self,
+        femoral: Surface,
+        patellar: Surface,
+        ml: float = 0.0,
+        lateral_yield: float = LATERAL_YIELD,
+        tilt_yield: float = TILT_YIELD,
+    ) -> None:
+        self.ml, self._yield = ml, np.array([lateral_yield, tilt_yield])
+        self._nearest = femoral.nearest
+        normals = femoral.corner_normals, self._nearest.corner_normals
+        self._facets = femoral.triangles, *normals, sharp_edges(femoral)
+        self._samples = _joint_side(patellar)
+        self._left: NDArray[np.bool_] = np.asarray(self._samples[:, 2] < 0.0)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Have no distance carried over."""
+        count = len(self._samples)
+        never, nothing = np.full((count, 3), np.inf), np.zeros(count)
+        places = np.zeros((count, 3)), np.zeros((count, 3))
+        # where each was seen, its distance, nearest point, normal there, and whether on an edge
+        self._seen = never, nothing, *places, np.zeros(count)
+
+    def unused(self) -> "PatellofemoralContact":
+        """Return the same contact as it was before any position was looked at."""
+        other = copy.copy(self)
+        other._forget()
+        return other
+
+    def pose(self, coordinates: Array) -> Array:
+        """Return pose_patella_in_joint (4, 4) at (ap, si, rotation), m and rad."""
+        ap, si, rotation = coordinates
+        c, s = np.cos(rotation), np.sin(rotation)
+        return pose([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], [ap, si, self.ml])
+
+    def at(self, coordinates: Array) -> PatellarContact:
+        """Return the contact at (ap, si, rotation), m and rad.
+
+        Raises:
+            ComputationError: it pushes straight sideways, which no line in the plane can balance.
+        """
+        found = np.empty(FIELDS)
+        length = _shared(self._sides_at(coordinates), self.ml, self._yield, found)
+        if length < SIDEWAYS:
+            raise ComputationError("the femur pushes the patella straight sideways")
+        gap, left, shift, tilt, on_edge = found[:5].tolist()
+        return PatellarContact(gap, found[5:8], found[8:], left, shift, tilt, on_edge)
+
+    def touches(self, coordinates: Array) -> bool:
+        """Return whether a few of the samples lie in the femur: a quick look for searches."""
+        few = self._samples[:: max(1, len(self._samples) // COARSE)]
+        here = transform(self.pose(np.asarray(coordinates, float)), few)
+        low, high = self._nearest.surface.bounds
+        here = here[((here >= low) & (here <= high)).all(axis=1)]  # beside its box none is in it
+        near = self._nearest.at(here)
+        apart = np.einsum("ij,ij->i", here - near.points, near.normals)
+        return bool((apart < 0.0).any())
+
+    def _sides_at(self, coordinates: Array) -> Array:
+        """Return gap, point, normal and share on edges (2, 8) of both sides, distances renewed."""
+        here = transform(self.pose(np.asarray(coordinates, float)), self._samples)
+        seen_at, distance = self._seen[:2]
+        which = _which_matter(here, self._left, REACH, seen_at, distance)
+        if len(which):
+            found = self._nearest.at(here[which])
+            _take(
+                which, here, found.distance, found.faces, found.weights, *self._facets, *self._seen
+            )
+        sides = np.empty((2, 8))
+        _mean_over_sides(self._left, PATCH_DEPTH, REACH, *self._seen[1:], sides)
+        return sides
+
+
+@compiled_as_written
+def _which_matter(
+    here: Array, left: NDArray[np.bool_], reach: float, seen_at: Array, distance: Array
+) -> Index:
+    """Return the samples whose distances are out of date and could matter.
+
+    A sample that has moved by m since it was seen at distance d lies between d - m and d + m:
+    what cannot come within reach of its side's nearest keeps what was seen.
+
+    Args:
+        here: (n, 3) m, samples at their place.
+        left: (n,) whether they are on the -z side.
+        reach: m, behind the nearest one, beyond which a sample does not matter.
+        seen_at: (n, 3) m, where each was when it was looked at; inf: never.
+        distance: (n,) m, signed, there.
+    """
+    count, nearest = len(here), np.full(2, np.inf)
+    moved, which, number = np.full(count, np.inf), np.empty(count, np.int64), 0
+    for n in range(count):
+        if seen_at[n, 0] < np.inf:
+            moved[n] = np.sqrt(np.sum((here[n] - seen_at[n]) ** 2))
+            side = 0 if left[n] else 1
+            nearest[side] = min(nearest[side], distance[n] + moved[n])
+    for n in range(count):
+        beyond = distance[n] - moved[n] >= nearest[0 if left[n] else 1] + reach
+        if moved[n] != 0.0 and not beyond:  # nor where it is NaN
+            which[number] = n
+            number += 1
+    return which[:number]
+
+
+@compiled_as_written
+def _take(
+    which: Index,
+    here: Array,
+    apart: Array,
+    faces: Index,
+    weights: Array,
+    triangles: Array,
+    smooth_normals: Array,
+    vertex_normals: Array,
+    sharp: NDArray[np.bool_],
+    seen_at: Array,
+    distance: Array,
+    foot: Array,
+    normal: Array,
+    on_edge: Array,
+) -> None:
+    """Write what the nearest points of samples say.
+
+    Args:
+        which: (m,) samples.
+        here: (n, 3) m, where all of them are.
+        apart: (m,) m, their distances.
+        faces: (m,) triangles of their nearest points.
+        weights: (m, 3) barycentrics there.
+        triangles: (k, 3, 3) m, of the femoral component.
+        smooth_normals: (k, 3, 3) at the corners, sharp edges kept.
+        vertex_normals: (k, 3, 3) likewise, means over each vertex.
+        sharp: (k, 3) whether the edge opposite each corner is sharp or open.
+        seen_at: (n, 3) m, to be written, as what follows.
+        distance: (n,) m, signed.
+        foot: (n, 3) m, nearest point.
+        normal: (n, 3) unit, there.
+        on_edge: (n,) 1 where that is on a sharp or open edge.
+    """
+    outward = np.empty(3)
+    for m in range(len(which)):
+        n, face, edge = which[m], faces[m], False
+        for corner in range(3):
+            edge |= sharp[face, corner] and weights[m, corner] < EDGE_MARGIN
+        normals = vertex_normals[face] if edge else smooth_normals[face]
+        along, length = 0.0, 0.0
+        for k in range(3):
+            foot[n, k], outward[k], seen_at[n, k] = 0.0, 0.0, here[n, k]
+            for corner in range(3):
+                foot[n, k] += weights[m, corner] * triangles[face, corner, k]
+                outward[k] += weights[m, corner] * normals[corner, k]
+            along += (here[n, k] - foot[n, k]) * outward[k]
+            length += outward[k] ** 2
+        for k in range(3):
+            normal[n, k] = outward[k] / np.sqrt(length)
+        distance[n] = -apart[m] if along < 0.0 else apart[m]
+        on_edge[n] = 1.0 if edge else 0.0
+
+
+@compiled_as_written
+def _mean_over_sides(
+    left: NDArray[np.bool_],
+    depth: float,
+    reach: float,
+    distance: Array,
+    foot: Array,
+    normal: Array,
+    on_edge: Array,
+    found: Array,
+) -> None:
+    """Write g, p, n and the share on edges (2, 8), left and right.
+
+    Args:
+        left: (n,) see `_which_matter`.
+        depth: m, tau of the module's equation.
+        reach: m.
+        distance: (n,) m.
+        foot: (n, 3) m.
+        normal: (n, 3).
+        on_edge: (n,).
+        found: (2, 8) to be written.
+    """
+    for side in range(2):
+        nearest, total = np.inf, 0.0
+        for n in range(len(left)):
+            if left[n] == (side == 0):
+                nearest = min(nearest, distance[n])
+        found[side] = 0.0
+        for n in range(len(left)):
+            behind = distance[n] - nearest
+            if left[n] != (side == 0) or behind >= reach:
+                continue
+            weight = np.exp(-behind / depth)
+            total += weight
+            found[side, 0] += weight * distance[n]
+            found[side, 7] += weight * on_edge[n]
+            for k in range(3):
+                found[side, 1 + k] += weight * foot[n, k]
+                found[side, 4 + k] += weight * normal[n, k]
+        found[side] /= total
+        found[side, 0] -= depth
+
+
+@compiled_as_written
+def _shared(sides: Array, middle: float, yields: Array, found: Array) -> float:
+    """Share the force by the module's equation, and return the sagittal part of its direction.
+
+    Args:
+        sides: (2, 8) gap, point, normal and share on edges, left and right.
+        middle: m, z of the patella's.
+        yields: (2,) c and d.
+        found: (`FIELDS`,) to be written: gap, share of the left, shift, tilt, share on edges,
+            point (3,) and normal (3,) of the line of action in the sagittal plane.
+    """
+    curvature, slope = 0.0, sides[0, 0] - sides[1, 0]
+    for k in range(2):
+        at, offset = (6, 0.0) if k == 0 else (3, middle)
+        change = sides[0, at] - sides[1, at]
+        curvature += yields[k] * change * change
+        slope += yields[k] * change * (sides[1, at] - offset)
+    if curvature < STRAIGHT:
+        left = 1.0 if sides[0, 0] < sides[1, 0] else 0.0
+    else:
+        left = min(max(-slope / curvature, 0.0), 1.0)
+    mean = left * sides[0] + (1.0 - left) * sides[1]
+    moment, length = 0.0, np.sqrt(mean[4] ** 2 + mean[5] ** 2)
+    for side in range(2):
+        part = left if side == 0 else 1.0 - left
+        moment += (sides[side, 1] - mean[1]) * part * sides[side, 5]
+        moment -= (sides[side, 2] - mean[2]) * part * sides[side, 4]
+    aside, lever = mean[6], mean[3] - middle
+    found[0] = mean[0] + 0.5 * (yields[0] * aside**2 + yields[1] * lever**2)
+    found[1], found[2], found[3], found[4] = left, yields[0] * aside, yields[1] * lever, mean[7]
+    # the mean point, moved in the sagittal plane onto the resultant's line
+    found[5] = mean[1] + moment / length**2 * mean[5]
+    found[6], found[7] = mean[2] - moment / length**2 * mean[4], mean[3]
+    found[8], found[9], found[10] = mean[4] / length, mean[5] / length, 0.0
+    return length
+
+
+def _joint_side(patellar: Surface) -> Array:
+    """Return samples (n, 3) of the surface that a view along the patella's +x shows."""
+    low, high = patellar.bounds
+    axes = [np.arange(low[k] + 0.5 * SAMPLE_SPACING, high[k], SAMPLE_SPACING) for k in (1, 2)]
+    y, z = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
+    start = np.column_stack([np.full(len(y), low[0] - SAMPLE_SPACING), y, z])
+    distance, _ = patellar.rays.first(start, np.array([1.0, 0.0, 0.0]))
+    hit = np.isfinite(distance)
+    samples = start[hit] + distance[hit, None] * np.array([1.0, 0.0, 0.0])
+    if not ((samples[:, 2] < 0.0).any() and (samples[:, 2] >= 0.0).any()):
+        raise InputError(
+            "does not lie on both sides of the patella's sagittal plane",
+            patellar.name,
+            "check the mesh's unit, axes and position on the patella",
+        )
+    return samples

@@ -1,0 +1,199 @@
+"""The taut path of a massless string around a bone's convex sagittal outline.
+
+The bone is a general cylinder: a convex polygon in its own x-y plane, extruded along z. The
+string starts at one point, keeps the bone on its right-hand side (seen with x to the right
+and y up: it passes in front of the bone on its way down) and ends at another point. Its
+shortest length is found by unrolling: with S the length of the taut path in the x-y plane,
+
+    L = sqrt(S² + dz²),   z linear in S.
+
+Around a polygon dL is exact and continuous: at a change of the tangent corner, and where
+wrapping begins, both candidate paths coincide, so the moment arm has no jump.
+
+Frictionless: the tension is the same all along, and the bone is pressed at the corners by
+the change of the string's direction, which has no z component.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tkamb.errors import ComputationError
+from tkamb.geometry.compiled import compiled_as_written
+from tkamb.geometry.frames import Array, transform
+
+NEITHER, START, END = 0, 1, 2
+"""Which end of a line lies inside the outline."""
+
+
+@dataclass(frozen=True, eq=False)
+class TautPath:
+    """A taut path at one instant.
+
+    Args:
+        points: (m, 3) m, from start to end, with the corners it touches between.
+        length: m.
+        wrap_angle: rad, by which the bone turns the string in its sagittal plane; 0 if straight.
+    """
+
+    points: Array
+    length: float
+    wrap_angle: float
+
+    @property
+    def wrapped(self) -> bool:
+        """Whether the path touches the bone."""
+        return len(self.points) > 2
+
+    @property
+    def directions(self) -> Array:
+        """Unit vectors (m-1, 3) along the segments, from start to end."""
+        steps = np.diff(self.points, axis=0)
+        return np.asarray(steps / np.linalg.norm(steps, axis=1, keepdims=True))
+
+    @property
+    def start_direction(self) -> Array:
+        """Unit vector (3,) that leaves the start: the way a tension pulls the start."""
+        return np.asarray(self.directions[0])
+
+    @property
+    def end_direction(self) -> Array:
+        """Unit vector (3,) that arrives at the end: a tension pulls the end the other way."""
+        return np.asarray(self.directions[-1])
+
+    def moved(self, pose_here_in_there: Array) -> "TautPath":
+        """Return the path in another frame."""
+        return TautPath(transform(pose_here_in_there, self.points), self.length, self.wrap_angle)
+
+
+def straight_path(start: Array, end: Array) -> TautPath:
+    """Return the straight path between two points (3,)."""
+    return TautPath(np.stack([start, end]), float(np.linalg.norm(end - start)), 0.0)
+
+
+def taut_path(start: Array, end: Array, outline: Array) -> TautPath:
+    """Return the taut path around an outline, all in the bone's frame.
+
+    Which way round: the angle swept about the outline's centre from start to end, clockwise
+    (x to the right, y up), is taken between -90 and 270 deg.
+
+    Args:
+        start: (3,) m.
+        end: (3,) m.
+        outline: (n, 2) m, strictly convex polygon in x-y, counter-clockwise.
+
+    Raises:
+        ComputationError: start or end lies inside the outline.
+    """
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    points, length, turn, inside = _taut(start, end, outline)
+    if inside:
+        name = "start" if inside == START else "end"
+        raise ComputationError(f"the {name} of a wrapping line lies inside the bone's outline")
+    return TautPath(points, length, turn)
+
+
+def is_inside(point: Array, outline: Array) -> bool:
+    """Say whether a point (3,) lies within an outline (n, 2) of its own frame."""
+    return bool(_is_inside(np.asarray(point, float), outline))
+
+
+def path_in_link(
+    start: Array, end: Array, outline: Array | None, pose_link_in_here: Array
+) -> TautPath:
+    """Return the taut path between points given here around an outline fixed to a link.
+
+    Args:
+        start: (3,) m, in the frame "here".
+        end: (3,) m, in the frame "here".
+        outline: (n, 2) m in the link's sagittal plane; None for a straight line.
+        pose_link_in_here: (4, 4).
+    """
+    if outline is None:
+        return straight_path(np.asarray(start, float), np.asarray(end, float))
+    origin = pose_link_in_here[:3, 3]
+    back = pose_link_in_here[:3, :3].T
+    path = taut_path(back @ (start - origin), back @ (end - origin), outline)
+    return path.moved(pose_link_in_here)
+
+
+@compiled_as_written
+def _height(point: Array, outline: Array, edge: int) -> float:
+    """Return twice the area that an edge spans with a point: negative if it is seen from there."""
+    there = (edge + 1) % len(outline)
+    x, y = point[0] - outline[edge, 0], point[1] - outline[edge, 1]
+    return float(x * (point[1] - outline[there, 1]) - y * (point[0] - outline[there, 0]))
+
+
+@compiled_as_written
+def _is_inside(point: Array, outline: Array) -> bool:
+    outside = False
+    for edge in range(len(outline)):
+        outside |= not _height(point, outline, edge) >= 0.0  # NaN is not inside
+    return not outside
+
+
+@compiled_as_written
+def _sweep(start: Array, end: Array, outline: Array) -> float:
+    """Return the clockwise angle (rad) from start to end about the outline's centre."""
+    x, y = np.mean(outline[:, 0]), np.mean(outline[:, 1])
+    ax, ay, bx, by = start[0] - x, start[1] - y, end[0] - x, end[1] - y
+    return float(-np.arctan2(ax * by - ay * bx, ax * bx + ay * by))
+
+
+@compiled_as_written
+def _crosses(start: Array, end: Array, outline: Array) -> bool:
+    """Clip the straight segment by the outline's half planes (Cyrus-Beck)."""
+    entered, left = 0.0, 1.0
+    for edge in range(len(outline)):
+        above, below = _height(start, outline, edge), _height(end, outline, edge)
+        if above <= 0.0 and below <= 0.0:
+            return False
+        if above < 0.0 and below > 0.0:
+            entered = max(entered, above / (above - below))
+        elif above > 0.0 and below < 0.0:
+            left = min(left, above / (above - below))
+    return entered < left
+
+
+@compiled_as_written
+def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float, int]:
+    """Return the taut path's points (m, 3), length and turn, and which end is inside.
+
+    It is straight where the segment leaves the outline on its right, or never comes to it. Else
+    the edges seen from the start begin (counter-clockwise) at the corner whose tangent has the
+    outline on its right; those seen from the end stop at the corner of the other tangent.
+
+    Args:
+        start: (3,) m.
+        end: (3,) m.
+        outline: (n, 2) m.
+    """
+    ends, straight = np.stack((start, end)), np.sqrt(np.sum((end - start) ** 2))
+    if _is_inside(start, outline):
+        return ends, straight, 0.0, START
+    if _is_inside(end, outline):
+        return ends, straight, 0.0, END
+    if _sweep(start, end, outline) >= -0.5 * np.pi and not _crosses(start, end, outline):
+        return ends, straight, 0.0, NEITHER
+    count, first, last = len(outline), -1, -1
+    for edge in range(count):
+        before, after = (edge - 1) % count, (edge + 1) % count
+        if first < 0 and _height(start, outline, edge) < 0.0 <= _height(start, outline, before):
+            first = edge
+        if last < 0 and _height(end, outline, edge) < 0.0 <= _height(end, outline, after):
+            last = edge + 1
+    corners = (first - last) % count + 1
+    points, turn, along = np.empty((corners + 2, 3)), 0.0, np.zeros(corners + 2)
+    points[0], points[-1] = start, end
+    for corner in range(corners):
+        points[corner + 1, :2] = outline[(first - corner) % count]
+    for k in range(1, corners + 2):
+        x, y = points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1]
+        along[k] = along[k - 1] + np.hypot(x, y)
+        if k <= corners:
+            ahead = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
+            turn -= np.arctan2(x * ahead[1] - y * ahead[0], x * ahead[0] + y * ahead[1])
+    for k in range(1, corners + 1):
+        points[k, 2] = start[2] + (end[2] - start[2]) * along[k] / along[-1]
+    return points, np.hypot(along[-1], end[2] - start[2]), turn, NEITHER

@@ -1,9 +1,0 @@
-"""OpenSim models without OpenSim: read, posed, their muscles' paths measured.
-
-- `tkamb.opensim.read`: `read_osim(path)` returns an `OpenSimModel`.
-- `tkamb.opensim.model`: what that holds.
-- `tkamb.opensim.kinematics`: `frame_poses(model, q)`; `Kinematics(model)` for many poses at
-  once, `.motion(q).points(bodies, locations)` for points with their Jacobians.
-- `tkamb.opensim.paths`: `LineSet(kinematics).at(q)` for lengths and moment arms.
-- `tkamb.opensim.inverse_dynamics`: the generalised forces of a motion.
-"""

@@ -1,1 +1,0 @@
-"""What a reader gets: tables, maps, plots, report and viewer."""

@@ -1,0 +1,144 @@
+"""The deck of one frame of a run, with what the run found for comparison."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from tkamb.contact.given_material import given_material
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.registry import contact_class
+from tkamb.errors import InputError
+from tkamb.run.decks.calculix import Deck
+from tkamb.run.decks.febio import febio_text
+from tkamb.run.decks.problem import PressProblem, press_problem
+from tkamb.run.metrics import lateral_axis_name, map_rows
+from tkamb.run.rerun import case_of_results
+from tkamb.run.results import Results
+from tkamb.run.results_folder import read_results
+from tkamb.units import MEGAPASCAL, MILLIMETRE
+
+SUFFIX = {"ccx": ".inp", "feb": ".feb"}
+
+
+@dataclass(frozen=True, eq=False)
+class FramePress:
+    """The contact of one frame as a finite-element problem, and what the run found there.
+
+    Args:
+        problem: the pose is the one at which the frame's map holds, the load the vertical sum
+            of its nodal forces.
+        approach: m, of that pose.
+        peak_pressure: Pa, of the map.
+        origin: which frame of what, by which contact model.
+        lateral: what insert z points to, "lateral" or "medial".
+        notes: what else of the run whoever compares must know.
+    """
+
+    problem: PressProblem
+    approach: float
+    peak_pressure: float
+    origin: str
+    lateral: str = "lateral"
+    notes: tuple[str, ...] = ()
+
+    def comments(self) -> tuple[str, ...]:
+        """Return what whoever opens the deck must know."""
+        problem, millimetres = self.problem, self.approach / MILLIMETRE
+        return (
+            f"{self.origin}; written by tkamb; mm, N, MPa.",
+            f"Insert frame: x anterior, y superior, z {self.lateral}; no friction; the bottom is "
+            "held.",
+            f"{len(problem.lattice.cells)} hexahedra; load {problem.load:.6g} N along -y.",
+            f"The run found: approach since first touch {millimetres:.6g} mm, peak pressure "
+            f"{self.peak_pressure / MEGAPASCAL:.6g} MPa.",
+            *self.notes,
+        )
+
+    def deck(self, kind: str) -> str:
+        """Return the input of CalculiX ("ccx") or FEBio ("feb").
+
+        Raises:
+            InputError: a material or bearing that the program's deck does not hold.
+        """
+        problem, said = self.problem, self.comments()
+        if kind == "feb":
+            return febio_text(
+                problem,
+                self.approach,
+                (*said, "Compare the size of Fy of femur.csv with the load."),
+            )
+        start = problem.depth / MILLIMETRE
+        more = (
+            f"The femoral patch begins {start:.6g} mm below first touch and is let go: its",
+            "approach is that less the U2 of the set NREF; pressures stand in the .dat file, too.",
+        )
+        pair = problem.pair
+        deck = Deck(
+            problem.lattice, problem.patch, pair.material, pair.bearing, problem.load,
+            comments=(*said, *more),
+        )  # fmt: skip
+        return deck.text
+
+
+def frame_press(folder: Path, frame: int, resolution_mm: float | None = None) -> FramePress:
+    """Return the contact of one frame of a folder of results.
+
+    Args:
+        folder: that `tkamb run` wrote.
+        frame: row of results.csv; negative ones count from the end.
+        resolution_mm: edge of the hexahedra; None: the run's spacing.
+
+    Raises:
+        InputError: no results, no such frame, one without a map or without load, or a scene
+            that is no longer what was run.
+        ComputationError: the load presses nothing together.
+    """
+    results = read_results(folder)
+    count = len(results)
+    if not -count <= frame < count:
+        raise InputError(f"there is no frame {frame}", "--frame", f"0 to {count - 1}")
+    frame %= count
+    row, maps = map_rows(results).get(frame), results.maps
+    if maps is None or row is None:
+        raise InputError(f"frame {frame} has no pressure map", folder, "choose another --frame")
+    load = -float(maps.nodal_force_N[row, :, 1].sum())
+    if not load > 0:
+        raise InputError(f"frame {frame} carries no load", folder, "choose another --frame")
+    pair, spacing = _pair(results)
+    pose = maps.femoral_pose[row]
+    problem = press_problem(pair, load, pose, resolution_mm or spacing)
+    model = (results.summary.get("contact") or {}).get("model")
+    origin = f"Frame {frame} of {folder} by {model} at {spacing:g} mm"
+    peak = float(maps.pressure_Pa[row].max())
+    lateral, notes = lateral_axis_name(results), tuple(_notes(results, frame, pair))
+    return FramePress(problem, pair.approach(pose), peak, origin, lateral, notes)
+
+
+def _notes(results: Results, frame: int, pair: ContactPair) -> Iterator[str]:
+    """Yield what a deck's answer differs from the run's by, beside the discretisation."""
+    law, contact = pair.material, results.summary.get("contact") or {}
+    yield (
+        f"Material '{law.name}', {'linear' if law.is_linear else 'nonlinear'}: "
+        f"E {law.young_modulus / MEGAPASCAL:.6g} MPa, nu {law.poisson_ratio:g}; the run's model "
+        f"assumes {contact_class(contact['model']).assumes}."
+    )
+    if results.summary.get("side") == "left":
+        yield "A left knee's mirror image, a right one, as the run's files are."
+    if "post_force_N" in results.columns:
+        force, peak = (results[name][frame] for name in ("post_force_N", "post_peak_pressure_MPa"))
+        yield (
+            f"Without the cam's contact with the post, which is in neither load nor peak: "
+            f"{force:.6g} N, peak {peak:.6g} MPa in the run."
+        )
+
+
+def _pair(results: Results) -> tuple[ContactPair, float]:
+    """Return the two bodies of a run and the spacing of its map points, mm."""
+    case = case_of_results(results)
+    table, insert = case.scene.contact, case.scene.implant.insert
+    assert table is not None and insert is not None
+    assert case.femoral is not None and case.insert is not None
+    pair = ContactPair(
+        case.femoral, case.insert, given_material(case.scene.insert_material), insert.bearing
+    )
+    return pair, table.resolution_mm

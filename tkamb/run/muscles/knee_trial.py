@@ -1,0 +1,180 @@
+"""A trial whose knee is somebody else's: the muscles' sharing but for its flexion row.
+
+The leg's other rows (hip, ankle, subtalar) are those of the OpenSim model. The knee's comes from
+the equations of the knee itself, frame by frame: the moment, the arm of the extensor group and
+the arms of the muscles that cross the knee (`tkamb.knee.extensor_response`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, inverse, transform
+from tkamb.io.importing.links import Links
+from tkamb.io.opensim.motion import CoordinateMotion
+from tkamb.run.muscles.bones import Bones
+from tkamb.run.muscles.leg import muscle_groups
+from tkamb.run.muscles.sharing import FrameProblems, Sharing
+from tkamb.run.muscles.trial import trial_problems
+
+
+@dataclass(frozen=True, eq=False)
+class KneeTrial:
+    """The frames' problems, and the lines across the knee.
+
+    Args:
+        problems: of all frames; their row of the knee's flexion is not looked at.
+        flexion: place of that row among the coordinates.
+        extensor: (m,) bool, muscles of the extensor group.
+        crossing: (c,) places of the other muscles that cross the knee.
+        shank: (f, c, 3) m, where these leave shank or foot, tibia link.
+        thigh: (f, c, 3) m, where they reach thigh or pelvis, femur link.
+        groups: name of a group -> its muscles, see `muscle_groups`.
+        knee: (f, 4, 4) pose of the femur link in the tibia link at which the ends were found;
+            None: not known.
+    """
+
+    problems: FrameProblems
+    flexion: int
+    extensor: np.ndarray
+    crossing: np.ndarray
+    shank: Array
+    thigh: Array
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    knee: Array | None = None
+
+    @property
+    def muscles(self) -> tuple[str, ...]:
+        """Their names."""
+        return tuple(muscle.name for muscle in self.problems.muscles)
+
+    def changed(self, strength: Array, shank: Array, thigh: Array) -> "KneeTrial":
+        """Return the trial with other strengths, and the lines across the knee elsewhere.
+
+        Args:
+            strength: (m,) factors of each muscle's strength, active and passive.
+            shank: (m, 3) m, shifts of where its line leaves the shank.
+            thigh: (m, 3) m, of where it reaches the thigh.
+        """
+        muscles = [
+            replace(muscle, max_isometric_force_N=float(factor) * muscle.max_isometric_force_N)
+            for muscle, factor in zip(self.problems.muscles, strength, strict=True)
+        ]
+        problems = replace(
+            self.problems,
+            muscles=muscles,
+            active=self.problems.active * strength,
+            passive=self.problems.passive * strength,
+        )
+        return replace(
+            self,
+            problems=problems,
+            shank=self.shank + shank[self.crossing],
+            thigh=self.thigh + thigh[self.crossing],
+        )
+
+    def solved(
+        self, k: int, moment: float, extensor_arm: float, arms: Array
+    ) -> tuple[FrameProblems, tuple[Array, Array, float, str]]:
+        """Return the problem of frame k with the knee's row, and `FrameProblems.solved` of it.
+
+        Args:
+            k: frame.
+            moment: N·m, what muscles and reserve carry at the knee.
+            extensor_arm: m, of the extensor group.
+            arms: (c,) m, of the crossing muscles.
+        """
+        whole, own = self.problems, slice(k, k + 1)
+        moments, table = whole.moment[own].copy(), whole.arms[own].copy()
+        moments[0, self.flexion] = moment
+        row = np.where(self.extensor, extensor_arm, 0.0)
+        row[self.crossing] = arms
+        # a muscle without a taut path keeps its NaN, so that the frame fails by its name
+        lost = np.isnan(table[0]).any(axis=1)
+        table[0, :, self.flexion] = np.where(lost, np.nan, row)
+        guide = None if whole.guide is None else whole.guide.only(k)
+        frame = replace(
+            whole,
+            moment=moments,
+            arms=table,
+            active=whole.active[own],
+            passive=whole.passive[own],
+            guide=guide,
+        )
+        return frame, frame.solved(0)
+
+    def force(self, k: int, activation: Array) -> Array:
+        """Return the muscles' forces (m,) N."""
+        return np.asarray(activation * self.problems.active[k] + self.problems.passive[k])
+
+
+def knee_trial(
+    links: Links, motion: CoordinateMotion, loads: Mapping[str, Array], sharing: Sharing
+) -> KneeTrial:
+    """Return the muscles of a leg over a motion, for a knee with a patella of its own.
+
+    Args:
+        links: of the leg.
+        motion: the model's coordinates over time.
+        loads: body -> (f, 6), as in `solve_trial`.
+        sharing: options.
+
+    Raises:
+        InputError: no muscle ends on or passes the patella, or see `solve_trial`.
+    """
+    leg = links.leg
+    problems, bones = trial_problems(leg, motion, loads, sharing)
+    if leg.flexion not in problems.coordinates:
+        raise InputError("the knee's flexion is not balanced", leg.model.name)
+    extensor = np.array(
+        [leg.patella in [p.body for p in muscle.path.points] for muscle in problems.muscles]
+    )
+    if leg.patella is None or not extensor.any():
+        raise InputError("no muscle leads to or past a patella", leg.model.name)
+    crossing, shank, thigh = _crossing_lines(links, bones, extensor)
+    flexion = problems.coordinates.index(leg.flexion)
+    groups = muscle_groups(leg, problems.muscles)
+    tibia, femur = (
+        bones.poses[:, bones.index(bone)] @ own
+        for bone, own in (("tibia", links.tibia), ("femur", links.femur))
+    )
+    knee = inverse(tibia) @ femur
+    return KneeTrial(problems, flexion, extensor, crossing, shank, thigh, groups, knee)
+
+
+def _crossing_lines(
+    links: Links, bones: Bones, extensor: np.ndarray
+) -> tuple[np.ndarray, Array, Array]:
+    """Return which muscles cross the knee, and their ends on either side of it.
+
+    Raises:
+        InputError: one crosses it more than once.
+    """
+    parts = bones.crossings
+    below = np.isin(parts.bodies, [bones.index("tibia"), bones.index("foot")])
+    above = np.isin(parts.bodies, [bones.index("femur"), -1])
+    across = (below[:, 0] & above[:, 1]) | (above[:, 0] & below[:, 1])
+    chosen = np.flatnonzero(across & ~extensor[parts.line])
+    part = parts.chosen(chosen)
+    crossing = np.unique(part.line)
+    frames = len(bones.poses)
+    counts = np.zeros((frames, len(bones.muscles)), int)
+    np.add.at(counts, (part.frame, part.line), 1)
+    if (counts > 1).any():
+        name = bones.muscles[int(np.argmax(counts.max(axis=0)))]
+        raise InputError(f"'{name}' crosses the knee more than once", links.leg.model.name)
+    ends = np.full((2, frames, len(crossing), 3), np.nan)
+    column = np.searchsorted(crossing, part.line)
+    rows = np.arange(len(chosen))
+    first = np.where(below[chosen, 0], 0, 1)  # which end lies below the knee
+    for side, end, bone, own in (
+        (0, first, "tibia", links.tibia),
+        (1, 1 - first, "femur", links.femur),
+    ):
+        here = bones.poses[part.frame, bones.index(bone)] @ own
+        ends[side, part.frame, column] = transform(inverse(here), part.ends[rows, end][:, None])[
+            :, 0
+        ]
+    return crossing, ends[0], ends[1]

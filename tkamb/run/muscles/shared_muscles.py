@@ -1,0 +1,273 @@
+"""The muscles of a scene with [muscles]: shared frame by frame, in agreement with the knee.
+
+Hip, ankle and subtalar rows of the static optimisation are the OpenSim model's, made once for all
+frames. The flexion row is the knee's own (`tkamb.knee.extensor_response`), so that the tension of
+the extensor group which the optimisation finds is the one that the knee's equations give back.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from tkamb.errors import ComputationError, InputError, names_near
+from tkamb.geometry.frames import MIRROR, Array, mirrored_pose
+from tkamb.io.scene.case import Case
+from tkamb.io.scene.si import in_si
+from tkamb.io.scene.tables import MusclesTable
+from tkamb.knee.crossing import CrossingLines, MuscleShare
+from tkamb.knee.equations import KneeGeometry, KneeLoads, solve_knee, unsolved
+from tkamb.knee.extensor_response import FlexionRow, flexion_row, yielding_flexion_row
+from tkamb.run.muscles.emg import EmgGuide
+from tkamb.run.muscles.knee_trial import KneeTrial
+from tkamb.run.muscles.recording import LegRecording, group_names, load_knee_trial
+from tkamb.run.muscles.sharing import Sharing
+from tkamb.units import MILLIMETRE
+
+SAME_PLACE = 0.5 * MILLIMETRE
+"""How far the URDF's insert and hip may lie from the model's."""
+MOST_SHARINGS = 8
+
+
+class SharedMuscles:
+    """Shares the load of frames among the muscles of a leg.
+
+    Args:
+        trial: the muscles over the frames.
+        left: a left leg's, whose knee is computed as its mirror image.
+
+    Attributes:
+        trial: as given.
+    """
+
+    def __init__(self, trial: KneeTrial, left: bool = False) -> None:
+        flip = MIRROR if left else np.eye(3)
+        self.trial, self._left, self._names = trial, left, trial.muscles
+        self._shank, self._thigh = trial.shank @ flip, trial.thigh @ flip
+        self._knee = trial.knee
+        if left and trial.knee is not None:
+            self._knee = mirrored_pose(trial.knee)
+
+    @property
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """Group of muscles -> their names (`tkamb.run.muscles.leg.muscle_groups`)."""
+        return dict(self.trial.groups)
+
+    def changed(self, strength: Array, shank: Array, thigh: Array) -> "SharedMuscles":
+        """Return the muscles with other strengths, and their lines across the knee elsewhere.
+
+        Args:
+            strength: (m,) factors of each muscle's strength.
+            shank: (m, 3) m, shifts of where its line leaves the shank, a right leg's tibia link.
+            thigh: (m, 3) m, of where it reaches the thigh, femur link.
+        """
+        flip = MIRROR if self._left else np.eye(3)
+        trial = self.trial.changed(strength, shank @ flip, thigh @ flip)
+        return SharedMuscles(trial, self._left)
+
+    def share(
+        self, k: int, geometry: KneeGeometry, friction: float, lifted: frozenset[str]
+    ) -> MuscleShare:
+        """Return what each muscle carries in frame k with the knee as it stands.
+
+        Args:
+            k: frame.
+            geometry: the knee, with contact points where contact is modelled.
+            friction: Coulomb coefficient.
+            lifted: sides that carry nothing.
+        """
+        lines = self._lines(k)
+        try:
+            return self._shared(k, lines, flexion_row(geometry, lines, friction, lifted))
+        except ComputationError as error:
+            return self._failed(lines, f"failed: {error.what}")
+
+    def share_of_yielding_knee(
+        self, k: int, geometry: KneeGeometry, base: float, per_wrench: Array
+    ) -> MuscleShare:
+        """Return what each muscle carries in frame k while released coordinates yield to it.
+
+        Args:
+            k: frame.
+            geometry: the knee; its contact is not looked at.
+            base: N, see `yielding_flexion_row`.
+            per_wrench: (6,), likewise.
+        """
+        lines = self._lines(k)
+        try:
+            row = yielding_flexion_row(geometry, lines, base, per_wrench)
+        except ComputationError as error:
+            return self._failed(lines, f"failed: {error.what}")
+        return self._shared(k, lines, row)
+
+    def at(self, k: int, share: MuscleShare) -> MuscleShare:
+        """Return the forces of a share along the lines of frame k."""
+        return replace(share, lines=self._lines(k))
+
+    def _lines(self, k: int) -> CrossingLines:
+        knee = None if self._knee is None else self._knee[k]
+        return CrossingLines(self._shank[k], self._thigh[k], knee)
+
+    def _shared(self, k: int, lines: CrossingLines, row: FlexionRow) -> MuscleShare:
+        trial = self.trial
+        problem, (activation, reserve, _, status) = trial.solved(
+            k, row.moment, row.extensor_arm, row.arms
+        )
+        if status != "ok":
+            return self._failed(lines, status)
+        return MuscleShare(
+            self._names,
+            activation,
+            trial.force(k, activation),
+            trial.problems.coordinates,
+            problem.moment[0],
+            reserve,
+            trial.flexion,
+            trial.crossing,
+            lines,
+        )
+
+    def tension(self, share: MuscleShare) -> float:
+        """Return what the extensor group pulls with, N."""
+        return float(share.force[self.trial.extensor].sum())
+
+    def solve(
+        self, k: int, geometry: KneeGeometry, friction: float
+    ) -> tuple[KneeGeometry, KneeLoads]:
+        """Return frame k with the muscles' forces, and all loads.
+
+        Contact points and lines stay, so the sharing is exact at once; again where a condyle
+        turns out to carry nothing.
+        """
+        lifted = geometry.lifted
+        for _ in range(MOST_SHARINGS):
+            share = self.share(k, geometry, friction, lifted)
+            geometry = replace(geometry, share=share)
+            if share.status != "ok":
+                return geometry, unsolved([f"muscles: {share.status.removeprefix('failed: ')}"])
+            loads = solve_knee(geometry, friction)
+            if loads.problems or loads.lifted == lifted:
+                return geometry, loads
+            lifted = loads.lifted
+        return geometry, unsolved(["muscles and load state do not come to agree"])
+
+    def _failed(self, lines: CrossingLines, status: str) -> MuscleShare:
+        nothing = np.full(len(self._names), np.nan)
+        names = self.trial.problems.coordinates
+        rest = np.full(len(names), np.nan)
+        return MuscleShare(
+            self._names,
+            nothing,
+            nothing,
+            names,
+            rest,
+            rest,
+            self.trial.flexion,
+            self.trial.crossing,
+            lines,
+            status,
+        )
+
+
+def sharing_of(table: MusclesTable) -> Sharing:
+    """Return the options of a scene's [muscles]."""
+    return Sharing(
+        reserve=table.reserve_Nm,
+        exponent=table.exponent,
+        weights=table.weights,
+        lowest=table.least_activation,
+        law=table.law,
+    )
+
+
+def load_muscles(case: Case) -> SharedMuscles:
+    """Return the muscles of a case with [muscles], checked against its URDF.
+
+    Raises:
+        InputError: files that cannot be used, or a model that is not the URDF's.
+    """
+    scene, table = case.scene, case.scene.muscles
+    assert table is not None
+    ground, markers, insert = scene.ground_reaction, scene.motion.markers, scene.implant.insert
+    if ground is not None and ground.applied == "ankle":
+        raise InputError(
+            "applied = 'ankle' leaves the ankle without its moment",
+            "[ground_reaction] with [muscles]",
+            "apply the force at the centre of pressure",
+        )
+    source = LegRecording(
+        model=table.model,
+        side=scene.patient.side,
+        coordinates=table.coordinates,
+        markers=scene.motion.file if markers else None,
+        laboratory_axes=markers.laboratory_axes if markers else "+x,+y,+z",
+        cutoff=scene.motion.cutoff_Hz,
+        ground=None if ground is None else in_si(ground),
+        insert_placement=case.insert_placement,
+        mesh_axes="+x,+y,+z" if insert is None else insert.axes,
+        sharing=sharing_of(table),
+    )
+    links, trial = load_knee_trial(source, case.motion.time)
+    _check_links(case, links.insert_in_tibia, links.hip)
+    if table.emg is not None:
+        trial = _guided(case, trial)
+    return SharedMuscles(trial, scene.patient.side == "left")
+
+
+def groups_of(case: Case) -> tuple[str, ...]:
+    """Return the names of the groups of the muscles of a case with [muscles].
+
+    Raises:
+        InputError: a model that cannot be used.
+    """
+    table = case.scene.muscles
+    assert table is not None
+    return group_names(table.model, case.scene.patient.side)
+
+
+def _guided(case: Case, trial: KneeTrial) -> KneeTrial:
+    """Return the trial with the scene's EMG in it, where it is more than reported.
+
+    Raises:
+        InputError: a muscle that the model does not have, or frames without EMG.
+    """
+    table, envelopes, time = case.scene.muscles, case.emg, case.motion.time
+    assert table is not None and table.emg is not None and envelopes is not None
+    for name in envelopes.channel_of:
+        if name not in trial.muscles:
+            mend = names_near(name, trial.muscles, "the leg's muscles")
+            raise InputError(f"no muscle '{name}'", "[muscles.emg] channels", mend)
+    if table.emg.use == "report":
+        return trial
+    values = np.full((len(time), len(trial.muscles)), np.nan)
+    for name in envelopes.channel_of:
+        values[:, trial.muscles.index(name)] = envelopes.at(name, time)
+        if np.isnan(values[:, trial.muscles.index(name)]).any():
+            raise InputError(
+                f"covers {envelopes.time[0]:g} to {envelopes.time[-1]:g} s, the frames "
+                f"{time[0]:g} to {time[-1]:g} s",
+                envelopes.path,
+                "EMG that guides the muscles is needed in every frame",
+            )
+    size = table.emg.weight if table.emg.use == "target" else table.emg.width
+    assert size is not None
+    guide = EmgGuide(values, table.emg.use, size)
+    return replace(trial, problems=replace(trial.problems, guide=guide))
+
+
+def _check_links(case: Case, insert_in_tibia: Array, hip: Array) -> None:
+    """Raise unless the model's insert and hip lie where the URDF has them."""
+    left, table = case.scene.patient.side == "left", case.scene.muscles
+    assert table is not None
+    insert = mirrored_pose(insert_in_tibia) if left else insert_in_tibia
+    centre = MIRROR @ hip if left else hip
+    for name, here, there in (
+        ("insert", insert[:3, 3], case.chain.insert_in_tibia[:3, 3]),
+        ("hip", centre, case.chain.link_in("hip", "femur")[:3, 3]),
+    ):
+        apart = float(np.linalg.norm(here - there))
+        if apart > SAME_PLACE:
+            raise InputError(
+                f"has its {name} {apart / MILLIMETRE:.1f} mm from where the URDF has it",
+                table.model,
+                "make the URDF from this model with `tkamb import`",
+            )

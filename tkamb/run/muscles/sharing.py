@@ -1,0 +1,138 @@
+"""How muscles share the load: the options, and each frame's problem made of them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.frames import Array
+from tkamb.io.opensim.lines import Muscle
+from tkamb.run.muscles.emg import EmgGuide
+from tkamb.run.muscles.hill import HILL
+from tkamb.run.muscles.static_optimisation import LoadSharing, share_load
+
+KKT_LIMIT = 1e-8
+"""Largest violation of the optimality conditions (relative) with which a frame is kept."""
+
+
+@dataclass(frozen=True)
+class Sharing:
+    """How muscles share the load.
+
+    Args:
+        muscles: names; None: those of the leg, see `leg_muscles`.
+        coordinates: those that are balanced; None: hip, knee flexion, ankle, subtalar.
+        reserve: ρ, N·m (N for a translation): the reserve that costs as much as one fully active
+            muscle of weight 1, for all coordinates or by name; inf: free of cost, 0: none.
+        exponent: p, at least 2.
+        weights: "volume" (optimal fibre length times strength, over the mean), or "equal".
+        lowest: least activation.
+        highest: largest activation.
+        law: "isometric" (F_i the maximal isometric force, nothing passive) or "hill", see
+            `rigid_tendon_strength`.
+    """
+
+    muscles: tuple[str, ...] | None = None
+    coordinates: tuple[str, ...] | None = None
+    reserve: float | Mapping[str, float] = 10.0
+    exponent: float = 2.0
+    weights: Literal["volume", "equal"] = "volume"
+    lowest: float = 0.0
+    highest: float = 1.0
+    law: Literal["isometric", "hill"] = "isometric"
+
+    def reserves(self, coordinates: Sequence[str]) -> Array:
+        """Return ρ (c,) of some coordinates."""
+        if isinstance(self.reserve, Mapping):
+            return np.array([float(self.reserve[name]) for name in coordinates])
+        return np.full(len(coordinates), float(self.reserve))
+
+    def check(self, coordinates: Sequence[str]) -> None:
+        """Raise an InputError for what is out of range."""
+        if isinstance(self.reserve, Mapping) and set(self.reserve) != set(coordinates):
+            odd = sorted(set(self.reserve) ^ set(coordinates))
+            raise InputError(f"reserve and coordinates differ in {', '.join(odd)}", "muscles")
+        if not (self.reserves(coordinates) >= 0.0).all():
+            raise InputError("a reserve is negative or no number", "muscles")
+        if not (0.0 <= self.lowest < self.highest < np.inf and 2.0 <= self.exponent < np.inf):
+            raise InputError(
+                f"lowest {self.lowest:g}, highest {self.highest:g}, exponent {self.exponent:g}",
+                "muscles",
+                "0 <= lowest < highest and exponent >= 2",
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class FrameProblems:
+    """All frames' problems; arrays as in `MuscleTrial`, forces as in `rigid_tendon_strength`.
+
+    `guide`: what EMG asks of the activations, if anything.
+    """
+
+    muscles: list[Muscle]
+    coordinates: tuple[str, ...]
+    sharing: Sharing
+    moment: Array
+    arms: Array
+    active: Array
+    passive: Array
+    guide: EmgGuide | None = None
+
+    def solved(self, k: int) -> tuple[Array, Array, float, str]:
+        """Return activations (m,), reserves (c,), KKT residual and status of frame k."""
+        reason = self._unknown(k)
+        if reason is None:
+            try:
+                shared = share_load(self.frame(k))
+            except ComputationError as error:
+                reason = error.what
+            else:
+                if shared.kkt_residual < KKT_LIMIT:
+                    return shared.activation, shared.others, shared.kkt_residual, "ok"
+                reason = f"the optimum is met to {shared.kkt_residual:.1g} only"
+        nothing = np.full(len(self.muscles), np.nan), np.full(len(self.coordinates), np.nan)
+        return *nothing, np.nan, f"failed: {reason}"
+
+    def _unknown(self, k: int) -> str | None:
+        """Return why frame k cannot be asked for, None if it can."""
+        if not np.isfinite(self.moment[k]).all():
+            return "an external load is not known"
+        for lost, why in (
+            (~np.isfinite(self.arms[k]).all(axis=1), "no taut path of"),
+            (
+                ~np.isfinite(self.active[k]),
+                f"fibres beyond {HILL.longest_fibre_ratio:g} optimal lengths in",
+            ),
+        ):
+            if lost.any():
+                names = [self.muscles[i].name for i in np.flatnonzero(lost)]
+                return f"{why} {', '.join(names)}"
+        return None
+
+    def frame(self, k: int) -> LoadSharing:
+        """Return the problem of frame k."""
+        count, reserve = len(self.muscles), self.sharing.reserves(self.coordinates)
+        none = reserve == 0.0
+        turned = self.arms[k].T
+        problem = LoadSharing(
+            weight=_weights(self.muscles, self.sharing),
+            lowest=np.full(count, self.sharing.lowest),
+            highest=np.full(count, self.sharing.highest),
+            offset=self.moment[k] - turned @ self.passive[k],
+            gain=-turned * self.active[k],
+            lower=np.where(none, 0.0, -np.inf),
+            upper=np.where(none, 0.0, np.inf),
+            reserve=np.where(none, np.inf, reserve),
+            exponent=self.sharing.exponent,
+        )
+        return problem if self.guide is None else self.guide.applied(problem, k)
+
+
+def _weights(muscles: Sequence[Muscle], sharing: Sharing) -> Array:
+    """Return w (m,), 1 on average."""
+    if sharing.weights == "equal":
+        return np.ones(len(muscles))
+    volume = np.array([m.optimal_fibre_length_m * m.max_isometric_force_N for m in muscles])
+    return volume / volume.mean()

@@ -1,0 +1,239 @@
+"""Muscle forces of a whole recording by inverse dynamics and static optimisation.
+
+Per frame, with the generalised forces τ of the motion (inertia, gravity, external loads) and the
+moment arms R = -dL/dq of the muscles' lines about the coordinates that are balanced,
+
+    τ_c = Σ_i R_ci (a_i F_i + P_i) + r_c,
+
+F_i a muscle's force at full activation, P_i its passive force, r_c the reserve: what the muscles
+leave to a motor in the joint. Activations and reserves are those of least cost
+
+    Σ_i w_i a_i^p + Σ_c (r_c / ρ_c)²,   lowest <= a_i <= highest.
+
+A coordinate that follows another by a coupler adds to τ and R of that one by the chain rule.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tkamb.errors import InputError, names_near
+from tkamb.geometry.frames import Array
+from tkamb.io.importing.anatomy import Leg, find_leg
+from tkamb.io.opensim.inverse_dynamics import required_wrenches
+from tkamb.io.opensim.kinematics import Kinematics, Motion
+from tkamb.io.opensim.model import OpenSimModel
+from tkamb.io.opensim.motion import CoordinateMotion
+from tkamb.io.opensim.paths import LineSet, Pulls
+from tkamb.run.muscles.bones import Bones
+from tkamb.run.muscles.hill import rigid_tendon_strength
+from tkamb.run.muscles.leg import (
+    check_extensors,
+    leg_bones,
+    leg_coordinates,
+    leg_muscles,
+    length_twins,
+)
+from tkamb.run.muscles.sharing import FrameProblems, Sharing
+
+
+@dataclass(frozen=True, eq=False)
+class MuscleTrial:
+    """Muscles over a recording; frames that failed hold NaN.
+
+    Args:
+        time: (f,) s.
+        muscles: m names.
+        coordinates: c names of those that are balanced.
+        activation: (f, m).
+        force_N: (f, m).
+        moment_arm_m: (f, m, c) -dL/dq, m per rad.
+        moment: (f, c) τ, N·m, what muscles and reserves carry together.
+        reserve: (f, c) r, N·m.
+        kkt_residual: (f,) largest violation of the optimality conditions, relative.
+        status: (f,) "ok" or "failed: …".
+        bones: what acts on the bones.
+    """
+
+    time: Array
+    muscles: tuple[str, ...]
+    coordinates: tuple[str, ...]
+    activation: Array
+    force_N: Array
+    moment_arm_m: Array
+    moment: Array
+    reserve: Array
+    kkt_residual: Array
+    status: tuple[str, ...]
+    bones: Bones
+
+    def muscle_wrench(self, bones: tuple[str, ...], seen_from: str) -> Array:
+        """Return what all muscles exert on some bones taken together (f, 6).
+
+        Moment (N·m) above force (N), in the frame of bone `seen_from` about its origin. On tibia
+        and foot together that is the muscles which cross the knee: the others pull both ends.
+        """
+        pull = self.bones.pull_on(bones, seen_from)
+        return np.einsum("fm,fmi->fi", self.force_N, pull)
+
+    def knee_reaction(self) -> Array:
+        """Return what the femur exerts on the tibia beside the muscles (f, 6), contact above all.
+
+        Moment (N·m) above force (N), in the tibia's frame about its origin: what the motion of
+        tibia and foot takes, less gravity, external loads and muscles.
+
+        Raises:
+            InputError: muscles that reach the tibia through a patellar ligament, which is none.
+        """
+        own = ("tibia", "foot")
+        if "patella" in self.bones.names:
+            patella = self.bones.attachments("patella", "tibia").points
+            other = [None, "femur"]
+            held = [self.bones.attachments("patella", bone).points for bone in other]
+            ends = np.isfinite(held).any(axis=(0, 1, 3)) & ~np.isfinite(patella).any(axis=(0, 2))
+            if ends.any():
+                names = [self.muscles[k] for k in np.flatnonzero(ends)]
+                raise InputError(
+                    f"{', '.join(names)} end on the patella; the patellar ligament's force on the "
+                    "tibia is not known here",
+                    "muscles",
+                    "use a model whose quadriceps lines lead past the patella to the tibia",
+                )
+        return self.bones.demand_of(own, "tibia") - self.muscle_wrench(own, "tibia")
+
+
+def solve_trial(
+    model: OpenSimModel,
+    motion: CoordinateMotion,
+    loads: Mapping[str, Array],
+    side: str = "right",
+    sharing: Sharing | None = None,
+) -> MuscleTrial:
+    """Return the muscle forces of a leg in every frame of a motion.
+
+    Args:
+        model: the model; its locked coordinates stay as the motion has them.
+        motion: its coordinates over time.
+        loads: body -> (f, 6) moment (N·m) above force (N) on it, in ground at ground's origin,
+            such as the ground reaction on either foot. NaN: not known, so that frames fail.
+        side: "right" or "left".
+        sharing: options.
+
+    Raises:
+        InputError: no such side, muscle, coordinate or body, or options out of range.
+    """
+    sharing = Sharing() if sharing is None else sharing
+    leg = find_leg(model, side)
+    balanced = leg_coordinates(leg) if sharing.coordinates is None else sharing.coordinates
+    if leg.flexion in balanced:
+        check_extensors(leg, leg_muscles(leg) if sharing.muscles is None else sharing.muscles)
+    problem, bones = trial_problems(leg, motion, loads, sharing)
+    frames = [problem.solved(k) for k in range(len(motion.q))]
+    activation, reserve, residual = (
+        np.array([frame[part] for frame in frames]) for part in range(3)
+    )
+    return MuscleTrial(
+        motion.time,
+        bones.muscles,
+        balanced,
+        activation,
+        activation * problem.active + problem.passive,
+        problem.arms,
+        problem.moment,
+        reserve,
+        residual,
+        tuple(frame[3] for frame in frames),
+        bones,
+    )
+
+
+def trial_problems(
+    leg: Leg, motion: CoordinateMotion, loads: Mapping[str, Array], sharing: Sharing
+) -> tuple[FrameProblems, Bones]:
+    """Return what every frame asks of a leg's muscles, and what acts on the bones.
+
+    Args:
+        leg: the leg.
+        motion: as in `solve_trial`, as the others.
+        loads: likewise.
+        sharing: likewise.
+
+    Raises:
+        InputError: no such muscle, coordinate or body, or options out of range.
+    """
+    model, kinematics = leg.model, Kinematics(leg.model)
+    names = leg_muscles(leg) if sharing.muscles is None else sharing.muscles
+    balanced = leg_coordinates(leg) if sharing.coordinates is None else sharing.coordinates
+    _check(kinematics, motion, loads, names, balanced, sharing)
+    q, groups = motion.q, leg_bones(leg)
+    placed = kinematics.motion(q)
+    needed = required_wrenches(kinematics, placed, q, motion.rates, motion.accelerations, loads)
+    own = kinematics.coupling(q)[:, :, [kinematics.coordinates[name] for name in balanced]]
+    moment = np.einsum("fbin,fbi,fnc->fc", placed.twists, needed, own, optimize=True)
+    pulls = LineSet(kinematics, names).pulls(q, list(groups.values()))
+    arms = pulls.moment_arms @ own
+    active, passive = _strength(kinematics, motion, sharing, pulls)
+    muscles = [model.muscles[name] for name in names]
+    problem = FrameProblems(muscles, balanced, sharing, moment, arms, active, passive)
+    return problem, _bones(groups, placed, needed, pulls)
+
+
+def _bones(
+    groups: Mapping[str, Sequence[str]], placed: Motion, needed: Array, pulls: Pulls
+) -> Bones:
+    """Return the bones, of what each body needs (f, bodies, 6) and the muscles' pulls on groups."""
+    places = [[placed.bodies[name] for name in bodies] for bodies in groups.values()]
+    demand = np.stack([needed[:, place].sum(axis=1) for place in places], axis=1)
+    poses = placed.poses[:, [place[0] for place in places]]
+    return Bones(tuple(groups), pulls.names, poses, pulls.wrenches, demand, pulls.crossings)
+
+
+def _strength(
+    kinematics: Kinematics, motion: CoordinateMotion, sharing: Sharing, pulls: Pulls
+) -> tuple[Array, Array]:
+    """Return force at full activation and passive force (f, m), N."""
+    model = kinematics.model
+    muscles = [model.muscles[name] for name in pulls.names]
+    if sharing.law == "isometric":
+        strength = np.array([muscle.max_isometric_force_N for muscle in muscles])
+        shape = pulls.lengths_m.shape
+        return np.broadcast_to(strength, shape), np.zeros(shape)
+    lengths, arms = pulls.lengths_m.copy(), pulls.moment_arms.copy()
+    twins = length_twins(model)
+    measured = [k for k, name in enumerate(pulls.names) if name in twins]
+    if measured:
+        lines = LineSet(kinematics, [twins[pulls.names[k]] for k in measured]).at(motion.q)
+        lengths[:, measured], arms[:, measured] = lines.lengths_m, lines.moment_arms
+    return rigid_tendon_strength(muscles, lengths, -np.einsum("fmn,fn->fm", arms, motion.rates))
+
+
+def _check(
+    kinematics: Kinematics,
+    motion: CoordinateMotion,
+    loads: Mapping[str, Array],
+    muscles: Sequence[str],
+    coordinates: Sequence[str],
+    sharing: Sharing,
+) -> None:
+    """Raise an InputError for what is not there or out of range."""
+    where, model = kinematics.model.name, kinematics.model
+    for what, asked, known in (
+        ("body", loads, model.bodies),
+        ("muscle", muscles, model.muscles),
+        ("coordinate", coordinates, model.coordinates),
+    ):
+        for name in asked:
+            if name not in known:
+                raise InputError(f"has no {what} '{name}'", where, names_near(name, known))
+    if not muscles or not coordinates or len(set(coordinates)) < len(coordinates):
+        raise InputError("needs muscles and coordinates, each once", where)
+    for name in coordinates:
+        if model.coordinates[name].locked or name in {c.dependent for c in model.couplers}:
+            raise InputError(f"coordinate '{name}' is locked or follows another", where)
+    sharing.check(coordinates)
+    for values in (motion.q, motion.rates, motion.accelerations, *loads.values()):
+        if len(values) != len(motion.time):
+            raise InputError(f"{len(values)} rows for {len(motion.time)} times", "muscles")
+    if not np.isfinite([motion.q, motion.rates, motion.accelerations]).all():
+        raise InputError("a coordinate or its derivative is not finite", "muscles")

@@ -1,0 +1,213 @@
+"""Questions about lines of action: where they end, how stiff and how far stretched they are."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.geometry.frames import Array, inverse, transform
+from tkamb.io.scene.case import Case
+from tkamb.run.plausibility.question import Question, some
+from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.knee.ligaments import Ligament
+    from tkamb.knee.load import LinkPoint
+
+STRAIN = 0.15
+"""Ligaments of the knee tear at 12 to 20 % (Kennedy et al. 1976, Butler et al. 1986)."""
+SLACK = -0.4
+"""A bundle that is never nearer to being taut has no task in this movement."""
+STIFFNESS_PER_MM, STIFFNESS_PER_STRAIN = (2.0, 500.0), (20.0, 30000.0)
+"""N/mm and N: from a tenth of a capsule's bundle to more than a whole cruciate ligament
+(347 N/mm: Race & Amis 1994; 18 kN for both PCL bundles: Blankevoort & Huiskes 1996)."""
+FARTHEST_ATTACHMENT = 0.16
+"""m from the insert's centre: the superficial MCL, the farthest, ends 0.06 to 0.12 below it."""
+BEYOND = 0.03
+"""m, of a tibial end above the insert's bottom, or of a femoral one below the flexion axis."""
+TENDON = (0.025, 0.085)
+"""m, of the patellar ligament's length."""
+ORIGIN = (0.08, 0.55)
+"""m, of an extensor's origin above the flexion axis: within the thigh."""
+AHEAD = 0.01
+"""m, of that origin from the line from hip to knee at least: 0.029 to 0.044 in three models. Vasti
+begin on the front of a shaft that is bowed forward, the rectus femoris ahead of the hip."""
+TUBEROSITY = (0.01, 0.11)
+"""m, of the patellar ligament's distal end from the insert's centre; it lies below and ahead."""
+ON_PATELLA = 0.06
+"""m, of both lines' ends from the patella's origin: the patella is 0.045 long."""
+PATELLA_HEIGHT, PATELLA_ASIDE = 0.025, 0.025
+"""m: the lines end at least so far apart along it (0.039 to 0.045 in three models), and within
+half its breadth."""
+TENDON_CHANGE = 0.15
+"""Of its mean, the change of the patellar ligament's length between recorded ends: it strains by
+a few per cent."""
+
+
+def attachment_questions(case: Case) -> Iterator[Question]:
+    """Points in metres called millimetres, and bundles that end far from the knee."""
+    ends = [
+        (f"{bundle.name} {side}", getattr(bundle, side))
+        for bundle in case.ligaments
+        for side in ("proximal", "distal")
+    ]
+    far = [name for name, end in ends if not _belongs(*_on_carrier(case, end))]
+    if far:
+        yield Question(
+            f"{some(far)} ends more than {FARTHEST_ATTACHMENT / MILLIMETRE:.0f} mm from the knee, "
+            "or beyond the joint: is its point_mm, sign or link another one?",
+            "attachment far from its place",
+        )
+    for muscle in case.muscles:
+        ends += [(f"[{muscle.name}] origin", muscle.points[0])]
+        ends += [(f"[{muscle.name}] via point", point) for point in muscle.points[1:-1]]
+        ends += [(f"[{muscle.name}] insertion", muscle.points[-1])]
+    if case.patellar_ligament:
+        ends += [
+            ("[patellar_ligament] proximal", case.patellar_ligament.proximal),
+            ("[patellar_ligament] distal", case.patellar_ligament.distal),
+        ]
+    tiny = [name for name, end in ends if 0.0 < np.abs(end.position).max() < MILLIMETRE]
+    if tiny:
+        yield Question(
+            f"{some(tiny)} lies within 1 mm of its link's origin: is point_mm in metres?",
+            "attachment within 1 mm of its link's origin",
+        )
+
+
+def _on_carrier(case: Case, end: "LinkPoint") -> tuple[str, Array]:
+    """Return the link that carries an attachment, and where on it that is (3,) m.
+
+    On the tibia in the insert frame, on femur or patella in that link's own.
+    """
+    chain = case.chain
+    carrier = chain.carrier(end.link)
+    place = transform(chain.link_in(end.link, carrier), end.position)
+    if carrier == "tibia":
+        place = transform(inverse(chain.insert_in_tibia), place)
+    return carrier, place
+
+
+def _belongs(carrier: str, place: Array) -> bool:
+    """Say whether a ligament may end at a place (3,) m, as `_on_carrier` gives it."""
+    beyond = {"tibia": place[1], "femur": -place[1]}.get(carrier, 0.0)
+    return float(np.linalg.norm(place)) <= FARTHEST_ATTACHMENT and beyond <= BEYOND
+
+
+def stiffness_questions(case: Case) -> Iterator[Question]:
+    """Bundles stiffer or softer than any ligament."""
+    for law, (low, high), scale, unit in (
+        ("two-line", STIFFNESS_PER_MM, MILLIMETRE, "N/mm"),
+        ("quadratic-toe", STIFFNESS_PER_STRAIN, 1.0, "N per unit strain"),
+    ):
+        values = {b.name: b.stiffness * scale for b in case.ligaments if b.law == law}
+        if odd := [name for name, k in values.items() if not low <= k <= high]:
+            yield Question(
+                f"{some(odd)}: {values[odd[0]]:g} {unit} is no ligament's stiffness ({low:g} to "
+                f"{high:g}): is it in another unit?",
+                "stiffness of no ligament",
+            )
+
+
+def torn_bundles(ligaments: "Sequence[Ligament]", tensions: Mapping[str, float]) -> list[str]:
+    """Return the bundles whose tension (N) is above that of the strain they bear."""
+    return [
+        bundle.name
+        for bundle in ligaments
+        if tensions.get(bundle.name, 0.0)
+        > float(bundle.force((1.0 + STRAIN) * bundle.slack_length))
+    ]
+
+
+def strain_questions(
+    ligaments: "Sequence[Ligament]", strains: Mapping[str, Array], time: Array
+) -> Iterator[Question]:
+    """Bundles that would tear, and bundles that never come near to being taut.
+
+    Args:
+        ligaments: the bundles.
+        strains: name -> strain (f,) of the recorded poses.
+        time: (f,) s.
+    """
+    if not ligaments:
+        return
+    table = np.array([strains[bundle.name] for bundle in ligaments])
+    most = table.max(axis=1)
+    torn = [bundle.name for bundle, strain in zip(ligaments, most, strict=True) if strain > STRAIN]
+    if torn:
+        i, k = divmod(int(np.argmax(table)), table.shape[1])
+        yield Question(
+            f"{some(torn)} would strain beyond {100 * STRAIN:.0f} %, {ligaments[i].name} by "
+            f"{100 * table[i, k]:.0f} % at {time[k]:.4g} s: is an attachment, a slack length or "
+            "the recorded pose wrong?",
+            "",
+        )
+    loose = [bundle.name for bundle, strain in zip(ligaments, most, strict=True) if strain < SLACK]
+    if loose:
+        yield Question(
+            f"{some(loose)} is never within {-100 * SLACK:.0f} % of being taut: is an attachment "
+            "or slack_length_mm in another unit?",
+            "ligament far from taut throughout",
+        )
+
+
+def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Question]:
+    """Ends of the muscles on the patella and its ligament, and the length between recorded ends.
+
+    Args:
+        case: the case.
+        poses: link -> pose_link_in_insert (f, 4, 4).
+    """
+    ligament = case.patellar_ligament
+    if ligament is None:
+        return
+    _, tip = _on_carrier(case, ligament.proximal)
+    hip = case.chain.link_in("hip", "femur")[:3, 3]
+    off, on_patella = [], [("[patellar_ligament] proximal", tip, -1.0)]
+    for muscle in case.muscles:
+        _, origin = _on_carrier(case, muscle.points[0])
+        ahead = origin[0] - hip[0] * origin[1] / hip[1]
+        aside = np.hypot(origin[0], origin[2]) > 0.12
+        if not ORIGIN[0] <= origin[1] <= ORIGIN[1] or ahead < AHEAD or aside:
+            off.append(f"[{muscle.name}] origin")
+        _, base = _on_carrier(case, muscle.points[-1])
+        on_patella.insert(-1, (f"[{muscle.name}] insertion", base, 1.0))
+        if 0.0 <= base[1] < tip[1] + PATELLA_HEIGHT and tip[1] < 0.0:
+            above = (base - tip)[1] / MILLIMETRE
+            off.append(f"[{muscle.name}] insertion, {above:.0f} mm above the patellar ligament's,")
+    _, distal = _on_carrier(case, ligament.distal)
+    away = float(np.linalg.norm(distal))
+    if not TUBEROSITY[0] <= away <= TUBEROSITY[1] or distal[0] < 0 or distal[1] > 0.01:
+        off.append("[patellar_ligament] distal")
+    for name, place, sign in on_patella:
+        beyond = np.linalg.norm(place) > ON_PATELLA or abs(place[2]) > PATELLA_ASIDE
+        if beyond or sign * place[1] < 0.0:
+            off.append(name)
+    if off:
+        yield Question(
+            f"{some(off)} lies where no such line ends: is its point_mm, sign or link another one?",
+            "extensor line ends off its bone",
+        )
+    ends = [transform(poses[e.link], e.position) for e in (ligament.proximal, ligament.distal)]
+    lengths = np.linalg.norm(ends[0] - ends[1], axis=1)
+    yield from _tendon(lengths[np.isfinite(lengths)], ligament.length)
+
+
+def _tendon(lengths: Array, declared: float) -> Iterator[Question]:
+    """The patellar ligament's lengths (f,) m between its ends, and the declared one."""
+    if not len(lengths):
+        return
+    low, high = float(lengths.min()), float(lengths.max())
+    mean = float(lengths.mean())
+    if not TENDON[0] <= mean <= TENDON[1] or high - low > TENDON_CHANGE * mean:
+        yield Question(
+            f"the patellar ligament is {low / MILLIMETRE:.0f} to {high / MILLIMETRE:.0f} mm long: "
+            "is one of its ends, or the patella's motion, wrong in sign or unit?",
+            "patellar ligament of odd length",
+        )
+    elif abs(declared / mean - 1) > TENDON_CHANGE:  # not where none is declared: NaN
+        yield Question(
+            f"the patellar ligament is {mean / MILLIMETRE:.0f} mm between its ends, but length_mm "
+            f"is {declared / MILLIMETRE:g}: which is right?",
+            "patellar ligament of odd length",
+        )

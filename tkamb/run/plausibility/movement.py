@@ -1,0 +1,148 @@
+"""Questions about the recorded movement: ranges, rates, samples off their neighbours' curve."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from tkamb.geometry.frames import KNEE_COORDINATES
+from tkamb.io.recordings.samples import OddSample
+from tkamb.io.scene.case import Case
+from tkamb.io.scene.recording_tables import GroundReactionTable
+from tkamb.run.plausibility.question import Question
+from tkamb.units import DEGREE, MILLIMETRE
+
+FLEXION_RADIANS = 3.3
+"""deg: a bend of more than 10 deg, in radians and called degrees, stays below this."""
+LEAN_RADIANS, DEEP = 2.6, 60.0
+"""deg: a shank that leans by up to 150 deg, in radians and called degrees, stays below the first;
+whoever bends the knee by the second leans by ten times as much."""
+USUAL_DEG = {"flexion": (-15, 160), "adduction": (-12, 12), "axial_rotation": (-40, 40)}
+"""A kneeling, a dislocated and a rotating-platform knee reach these."""
+USUAL_RATE = {"flexion": 20.0, "adduction": 6.0, "axial_rotation": 10.0}
+"""rad/s: a kick's flexion; the others in a pivoting jump."""
+PATELLA_AWAY = (15.0 * MILLIMETRE, 80.0 * MILLIMETRE)
+"""Of a recorded patella's origin from the flexion axis: 26 to 57 mm in eight designs' bends."""
+MARKERS_OFF = 12.0 * MILLIMETRE
+"""rms, in the median frame: skin moves by up to 10 mm in a cluster, 5 mm on subject JW's stairs."""
+BRIEFEST = 0.15
+"""s: no movement of a leg is over sooner."""
+
+
+def motion_questions(case: Case) -> Iterator[Question]:
+    """Ranges and rates of the recorded angles, and how long the motion lasts."""
+    motion = case.motion
+    angles = dict(zip(KNEE_COORDINATES, motion.coordinates.T, strict=True))
+    rates = dict(zip(KNEE_COORDINATES, motion.velocity.T, strict=True))
+    flexion = angles["flexion"] / DEGREE
+    if np.ptp(flexion) > 0.2 and np.abs(flexion).max() < FLEXION_RADIANS:
+        yield Question(
+            f"flexion runs from {flexion.min():.2g} to {flexion.max():.2g} deg: is it in radians?",
+            "flexion hardly changes",
+        )
+    table = case.scene.tibia
+    if case.tibia is not None and table is not None and table.kind != "markers":
+        forward, up = case.tibia.pose[:, 0, 1], case.tibia.pose[:, 1, 1]
+        lean = np.arctan2(forward, up) / DEGREE
+        moves = np.ptp(lean) > 0.1 and np.ptp(flexion) > DEEP
+        if moves and np.abs(lean).max() < LEAN_RADIANS:
+            yield Question(
+                f"the shank leans from {lean.min():.2g} to {lean.max():.2g} deg in a bend of "
+                f"{np.ptp(flexion):.0f} deg: is [tibia]'s angle in radians?",
+                "shank hardly leans",
+            )
+    for name, (low, high) in USUAL_DEG.items():
+        angle = angles[name] / DEGREE
+        far = (angle < low) | (angle > high)
+        if far.any():
+            worst = angle[int(np.argmax(np.maximum(low - angle, angle - high)))]
+            yield Question(
+                f"{name} reaches {worst:.0f} deg, where few knees go ({low} to {high}): is its "
+                "column, sign ([motion] signs_turned) or axis another one?",
+                f"{name} of {worst:.0f} deg",
+                far,
+            )
+        fast = np.abs(rates[name]) > USUAL_RATE[name]
+        if fast.any():
+            k = int(np.argmax(np.abs(rates[name])))
+            yield Question(
+                f"{name} changes by {abs(rates[name][k]) / DEGREE:.0f} deg/s at "
+                f"{motion.time[k]:.4g} s: is the time in seconds, or is it noise?",
+                f"{name} changes too fast",
+                fast,
+            )
+    if motion.patella is not None:
+        away = np.hypot(motion.patella[:, 0], motion.patella[:, 1])
+        far = (away < PATELLA_AWAY[0]) | (away > PATELLA_AWAY[1])
+        if far.any():
+            nearest, farthest = away.min() / MILLIMETRE, away.max() / MILLIMETRE
+            yield Question(
+                f"the patella lies {nearest:.3g} to {farthest:.3g} mm from the flexion axis: are "
+                "its ap and si in millimetres, of the femoral component's origin, of their sign?",
+                "patella where none is",
+                far,
+            )
+    lasting = float(motion.time[-1] - motion.time[0])
+    if lasting < BRIEFEST:
+        yield Question(
+            f"the motion lasts {lasting:.3g} s: is its time in seconds?", "motion too brief"
+        )
+
+
+def marker_questions(case: Case) -> Iterator[Question]:
+    """How far markers lie from their places on the segments that a rigid fit of them gives."""
+    if case.motion.markers is not None:
+        whose, rms = "shank's and thigh's markers", case.motion.markers.rms["segments"]
+    elif case.tibia is not None and case.tibia.residual is not None:
+        whose, rms = "the shank's markers", case.tibia.residual
+    else:
+        return
+    known = rms[np.isfinite(rms)]
+    if len(known) and (middle := float(np.median(known))) > MARKERS_OFF:
+        yield Question(
+            f"{whose} lie {middle / MILLIMETRE:.0f} mm (rms) from their places: is markers_mm "
+            "another subject's or trial's, or are two of them exchanged?",
+            "markers do not fit their segments",
+        )
+
+
+def drift_questions(case: Case) -> Iterator[Question]:
+    """Force plates that read a force while nobody stands on them."""
+    if case.ground is None:
+        return
+    drift = [f"plate {number} {level:.1f} N" for number, level in case.ground.drift.items()]
+    if drift:
+        yield Question(
+            f"force plates drift: while nobody stands on it, {', '.join(drift)}, and as much too "
+            "much under the foot: were they not set to zero before the trial?",
+            "force plate drifts",
+        )
+
+
+def sample_questions(case: Case) -> Iterator[Question]:
+    """Recorded samples that lie off their neighbours' curve, one question a file."""
+    parts = (case.motion, case.tibia, case.ground)
+    time = case.motion.time
+    reach = float(np.ptp(time)) / max(len(time) - 1, 1)
+    for samples in (part.odd for part in parts if part is not None and part.odd):
+        worst = max(samples, key=lambda sample: sample.away)
+        near = np.zeros(len(time), bool)
+        for sample in samples:
+            near |= np.abs(time - sample.time) <= 3.0 * reach
+        text = _odd_text(samples, worst, case.scene.ground_reaction)
+        yield Question(text, "recorded sample off its neighbours' curve", near)
+
+
+def _odd_text(
+    samples: Sequence[OddSample], worst: OddSample, ground: GroundReactionTable | None
+) -> str:
+    """Return the question about a file's odd samples; a C3D file has no cells, but plates."""
+    more = f" and {len(samples) - 1} more" if len(samples) > 1 else ""
+    of_plates = ground is not None and worst.path == ground.file and bool(ground.plates)
+    numbers = ", ".join(map(str, ground.plates)) if ground and of_plates else ""
+    what = f"{worst.what} of plates {numbers}" if of_plates else worst.what
+    mistake = "is it a spike" if of_plates else "is a cell mistyped"
+    return (
+        f"{worst.path.name}: {what} at {worst.time:.4g} s{more} lies {worst.away:.3g} "
+        f"{worst.unit} off its neighbours' curve: {mistake}, or is it noise? cutoff_Hz filters "
+        "noise; anything else is to be mended in the file"
+    )

@@ -1,0 +1,121 @@
+"""All questions of a case, and what they say about a frame."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.run.plausibility.ground import (
+    direction_questions,
+    foot_questions,
+    load_questions,
+    posture_questions,
+    step_questions,
+)
+from tkamb.run.plausibility.implant import implant_questions
+from tkamb.run.plausibility.movement import (
+    drift_questions,
+    marker_questions,
+    motion_questions,
+    sample_questions,
+)
+from tkamb.run.plausibility.question import Question, some
+from tkamb.run.plausibility.segments import segment_questions
+from tkamb.run.plausibility.signs import sign_questions
+
+if TYPE_CHECKING:
+    from tkamb.run.mechanics import FrameLoads, Mechanics
+
+ANSWERS = "[output] answers"
+FORCE_BW = 8.0
+"""BW: instrumented knees measured 5 to 6 at most, in stumbling (Bergmann et al. 2014)."""
+
+
+class Plausibility:
+    """The questions of a case.
+
+    Args:
+        mechanics: its body side, prepared.
+
+    Attributes:
+        questions: those that the scene does not answer.
+        answered: question and answer, each in words.
+
+    Raises:
+        InputError: an answer is empty, or to a question that nobody asks.
+    """
+
+    def __init__(self, mechanics: "Mechanics") -> None:
+        self._mechanics = mechanics
+        case = mechanics.case
+        found = [
+            *segment_questions(case),
+            *motion_questions(case),
+            *marker_questions(case),
+            *sample_questions(case),
+            *drift_questions(case),
+            *load_questions(case),
+            *foot_questions(case),
+            *direction_questions(case),
+            *posture_questions(case),
+            *step_questions(case),
+            *implant_questions(case),
+            *sign_questions(case),
+        ]
+        if case.ligaments or case.muscles:
+            found += _line_questions(mechanics)
+        self.questions, self.answered = _answered(found, case.scene.output.answers)
+
+    def flags(self, k: int, body: "FrameLoads") -> list[str]:
+        """Return the words for the status of frame k."""
+        words = [
+            question.flag for question in self.questions if question.flag and question.concerns(k)
+        ]
+        if self._mechanics.ligaments:
+            from tkamb.run.plausibility.lines import STRAIN, torn_bundles
+
+            if torn := torn_bundles(self._mechanics.ligaments, body.geometry.tensions):
+                words.append(f"ligament strain above {100 * STRAIN:.0f} %: {some(torn)}")
+        force = float(np.linalg.norm(body.loads.contact_force)) / self._mechanics.case.body_weight
+        if force > FORCE_BW:
+            words.append(
+                f"contact force of {force:.1f} BW, more than any knee was measured to bear"
+            )
+        return words
+
+
+def _answered(
+    asked: Sequence[Question], answers: Mapping[str, str]
+) -> tuple[tuple[Question, ...], tuple[str, ...]]:
+    """Return the questions without an answer, and those with one in words.
+
+    Args:
+        asked: all of them.
+        answers: words of a question's text -> its answer.
+    """
+    left, told = list(asked), []
+    for words, answer in answers.items():
+        own = [question for question in left if words and words.lower() in question.text.lower()]
+        if not own:
+            texts = "; ".join(question.text for question in left) or "there is none"
+            mend = f"leave it out, or take words of one that is asked: {texts}"
+            raise InputError(f"no question holds '{words}'", ANSWERS, mend)
+        if not answer.strip():
+            raise InputError(f"'{words}' has no answer", ANSWERS, "say why the input is right")
+        told += [f"Answered: {question.text} {answer}" for question in own]
+        left = [question for question in left if question not in own]
+    return tuple(left), tuple(told)
+
+
+def _line_questions(mechanics: "Mechanics") -> list[Question]:
+    from tkamb.run.plausibility import lines
+
+    case = mechanics.case
+    found = [*lines.attachment_questions(case), *lines.stiffness_questions(case)]
+    poses = mechanics.recorded_poses
+    found += lines.extensor_questions(case, poses)
+    if not (case.scene.contact and case.scene.contact.released):
+        strains = {b.name: b.strain(b.length(poses)) for b in mechanics.ligaments}
+        found += lines.strain_questions(mechanics.ligaments, strains, case.motion.time)
+    return found

@@ -1,0 +1,388 @@
+"""Contact alone: two meshes, a pose, a load; what `tkamb press` does and what it found."""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tkamb.contact.given_material import (
+    material_as_json,
+    material_in_words,
+    named_material,
+)
+from tkamb.contact.materials import Material
+from tkamb.contact.model import ContactModel
+from tkamb.contact.pair import Bearing, ContactPair
+from tkamb.contact.pressing import check_load
+from tkamb.contact.registry import contact_model
+from tkamb.contact.result import CondyleContact, ContactResult, ContactStatus
+from tkamb.errors import InputError
+from tkamb.files import read_text
+from tkamb.geometry.adjustment import Adjustment, AdjustmentSettings, RestoreRule
+from tkamb.geometry.adjustment import adjust as adjusted
+from tkamb.geometry.closest import ClosestPointQuery
+from tkamb.geometry.condyles import condyle_split
+from tkamb.geometry.flat_bottom import insert_placement
+from tkamb.geometry.frames import MIRROR, Array, Index, mirrored_pose
+from tkamb.geometry.frames import pose as pose_matrix
+from tkamb.io.defaults import CONTACT_MODEL
+from tkamb.io.recordings.meshes import axes_rotation, load_surface, mirrored
+from tkamb.knee.equilibrium.adjusted_press import press_adjusted
+from tkamb.memory import peak_rss
+from tkamb.run.known_errors import KnownError, as_json, known_error, known_error_words, left_out
+from tkamb.units import DEGREE, LENGTH, MEGAPASCAL, MILLIMETRE
+
+LARGEST_LOAD = 1e5
+"""N, over a hundred body weights."""
+Side = Literal["right", "left"]
+
+_CONDYLE = (
+    "{force_N:8.1f} N {area_mm2:7.1f} mm2  mean {mean_pressure_MPa:5.2f}  "
+    "peak {peak_pressure_MPa:5.2f} MPa  centre ({:.1f}, {:.1f}, {:.1f}) mm"
+)
+_ERRORS_TOLD = ("peak_pressure", "mean_pressure", "area", "approach")
+
+
+@dataclass(frozen=True, eq=False)
+class PressReport:
+    """What a press found, and what it took.
+
+    Args:
+        contact: name of the contact model.
+        resolution_mm: spacing of its map points.
+        nodes: of the model (lattice, mesh), or map points where it has none.
+        load: N.
+        result: the contact, in the insert frame (mirrored for a left knee).
+        adjustment: what was done to the pose before contact, if anything.
+        triangles: (k, 3) of neighbouring map points.
+        pair: the two bodies.
+        side: of the knee.
+        prepare_seconds: for the geometry.
+        solve_seconds: for the press.
+        peak_rss_MB: largest resident memory of the process so far.
+        known_error: of the contact model at this resolution; None if it was not measured.
+    """
+
+    contact: str
+    resolution_mm: float
+    nodes: int
+    load: float
+    result: ContactResult
+    adjustment: Adjustment | None
+    triangles: Index
+    pair: ContactPair
+    side: Side
+    prepare_seconds: float
+    solve_seconds: float
+    peak_rss_MB: float
+    known_error: KnownError | None = None
+
+    def __repr__(self) -> str:
+        """Return in a line what was pressed and what was found."""
+        return (
+            f"<tkamb.PressReport: {self.contact} at {self.resolution_mm:g} mm, "
+            f"{self.load:g} N; {self.result!r}>"
+        )
+
+    @property
+    def carried(self) -> bool:
+        """Whether the load was reached."""
+        return self.result.status is ContactStatus.OK
+
+    def write_map(self, path: Path) -> None:
+        """Write the pressure map as .vtp: metres, insert frame, z to the subject's right.
+
+        A left knee's is mirrored back: it lies on the insert that was given, as the centres of
+        pressure do.
+
+        Raises:
+            InputError: another format, or a place that cannot be written.
+        """
+        from tkamb.io.vtk import write_triangles
+
+        result, triangles = self.result, self.triangles
+        points, force = result.points, result.nodal_force
+        if self.side == "left":
+            points, force, triangles = points @ MIRROR, force @ MIRROR, triangles[:, ::-1]
+        data = {"pressure_Pa": result.pressure, "gap_m": result.gap, "nodal_force_N": force}
+        write_triangles(path, points, triangles, data)
+
+    def lines(self) -> list[str]:
+        """Return the report as lines of text."""
+        found = self.as_dict()
+        lines = [
+            f"{self.contact} at {self.resolution_mm:g} mm, {self.nodes} nodes: {found['status']}",
+            f"load {self.load:g} N, reaction {_text(found['reaction_N'])} N, "
+            f"approach {_text(found['approach_mm'])} mm",
+            f"material {material_in_words(found['material'])}",
+        ]
+        for name in ("medial", "lateral"):
+            if found[name] is not None:
+                lines.append(
+                    f"{name:8s}" + _CONDYLE.format(*found[name].pop("cop_mm"), **found[name])
+                )
+        if self.adjustment is not None:
+            done = self.adjustment
+            restored = ", recorded rotation restored" if done.restored else ""
+            lines.append(
+                f"adjusted {done.translation / MILLIMETRE:.3f} mm along y, "
+                f"{done.coronal_angle / DEGREE:.3f} deg coronal{restored}"
+            )
+        lines.append(known_error_words(found["known_error"], _ERRORS_TOLD))
+        lines += [f"note: {flag}" for flag in found["flags"]]
+        took = f"prepared in {self.prepare_seconds:.3g} s, solved in {self.solve_seconds:.3g} s"
+        return [*lines, f"{took}, {self.result.iterations} iterations"]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `tkamb press --json` prints; None stands for what is unknown.
+
+        Vectors are in the insert frame, z to the subject's right on either side. "adjustment" is
+        there where the femur was adjusted.
+        """
+        result = self.result
+        return {
+            "contact": self.contact,
+            "resolution_mm": self.resolution_mm,
+            "nodes": self.nodes,
+            "load_N": self.load,
+            "reaction_N": _known(-result.wrench_on_insert[1]),
+            "approach_mm": _known(result.approach / MILLIMETRE),
+            "medial": _condyle(result.medial, self.side),
+            "lateral": _condyle(result.lateral, self.side),
+            "prepare_seconds": self.prepare_seconds,
+            "solve_seconds": self.solve_seconds,
+            "peak_rss_MB": self.peak_rss_MB,
+            "iterations": result.iterations,
+            "residual": _known(result.residual),
+            "status": result.status.value,
+            "flags": [*left_out(self.contact, self.pair.bearing), *result.flags],
+            "known_error": as_json(self.known_error),
+            "material": material_as_json(self.pair.material),
+        } | ({} if self.adjustment is None else {"adjustment": _adjustment(self.adjustment)})
+
+
+def _adjustment(done: Adjustment) -> dict[str, Any]:
+    return {
+        "translation_mm": done.translation / MILLIMETRE,
+        "coronal_deg": done.coronal_angle / DEGREE,
+        "penetration_mm": _known(done.penetration / MILLIMETRE),
+        "final_angle_deg": _known(done.final_angle / DEGREE),
+        "restore_when": done.settings.restore_when,
+        "restored": done.restored,
+    }
+
+
+def _condyle(carried: CondyleContact | None, side: Side) -> dict[str, Any] | None:
+    if carried is None:
+        return None
+    to_right = np.array([1.0, 1.0, -1.0 if side == "left" else 1.0])
+    return {
+        "force_N": carried.force,
+        "area_mm2": carried.area / MILLIMETRE**2,
+        "mean_pressure_MPa": carried.mean_pressure / MEGAPASCAL,
+        "peak_pressure_MPa": carried.peak_pressure / MEGAPASCAL,
+        "cop_mm": (carried.centre_of_pressure * to_right / MILLIMETRE).tolist(),
+    }
+
+
+def _text(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.6g}"
+
+
+def _known(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def press_meshes(
+    femoral: str | Path,
+    insert: str | Path,
+    load: float,
+    *,
+    units: str = "mm",
+    pose: Sequence[float] | None = None,
+    contact: str = CONTACT_MODEL,
+    resolution_mm: float = 1.0,
+    bearing: Bearing = "fixed",
+    material: str | Path | Material = "polyethylene",
+    axes: str = "+x,+y,+z",
+    side: Side = "right",
+    adjust: bool = False,
+    restore_when: RestoreRule | None = None,
+    options: dict[str, Any] | None = None,
+) -> PressReport:
+    """Press a femoral component into an insert until it carries the load.
+
+    Args:
+        femoral: mesh file of the femoral component.
+        insert: mesh file of the insert, closed.
+        load: N, along the insert's bottom normal.
+        units: unit of length of both files and of the pose, "mm", "cm", "m" or "inch".
+        pose: x, y, z (units), rx, ry, rz (deg, intrinsic x-y-z): places the femoral mesh in
+            the insert mesh's own axes. None: as the files have them, both about one origin.
+            Height above the insert does not matter: the press moves along the load.
+        contact: a name of `tkamb contact list`.
+        resolution_mm: spacing of the model's map points.
+        bearing: "fixed" or "mobile".
+        material: a name of `tkamb.contact.materials`, a file (.toml) of the keys of a scene's
+            [material], or a `Material`.
+        axes: mesh axes that point anterior, superior and right.
+        side: of the knee; a left one is mirrored.
+        adjust: femoral adjustment before contact (`tkamb.geometry.adjustment`); the pose must then
+            be a recorded one, with a condyle within 3 mm of the insert.
+        restore_when: with `adjust`: the recorded rotation is restored if penetration and coronal
+            angle after the press exceed the adjustment ("both", Sharma 2008, the default), or
+            if "either" does.
+        options: the model's own options.
+
+    Raises:
+        InputError: bad file, unit, axes, name or load, or a femoral component that does not
+            lie over the insert, or not near it where it is to be adjusted; or `restore_when`
+            without `adjust`.
+    """
+    _check_load(load)
+    settings = _adjustment_settings(adjust, restore_when)
+    model = contact_model(contact, resolution_mm, **(options or {}))
+    pair, femoral_pose = load_pair(femoral, insert, units, pose, bearing, material, axes, side)
+    if not math.isfinite(pair.first_touch_height(femoral_pose)):
+        raise InputError(
+            "neither condyle lies over the insert",
+            femoral,
+            "check the pose, the axes and the unit",
+        )
+    started = time.perf_counter()
+    state = model.prepare(pair)
+    prepared = time.perf_counter()
+    result, adjustment = _press(model, state, load, femoral_pose, settings)
+    solved = time.perf_counter()
+    return PressReport(
+        contact=contact,
+        resolution_mm=resolution_mm,
+        nodes=state.node_count,
+        load=load,
+        result=result,
+        adjustment=adjustment,
+        triangles=state.triangles,
+        pair=pair,
+        side=side,
+        prepare_seconds=prepared - started,
+        solve_seconds=solved - prepared,
+        peak_rss_MB=peak_rss(),
+        known_error=known_error(contact, resolution_mm, pair.material.name, options),
+    )
+
+
+def _check_load(load: float) -> None:
+    check_load(load)
+    if load > LARGEST_LOAD:
+        limit = f"no knee carries more than {LARGEST_LOAD:g} N"
+        raise InputError(f"impossible load {load:g} N", mend=f"{limit}; is it in N?")
+
+
+def _adjustment_settings(
+    adjust: bool, restore_when: RestoreRule | None
+) -> AdjustmentSettings | None:
+    """Return how to adjust; None: not at all."""
+    if restore_when not in (None, *get_args(RestoreRule)):
+        raise InputError(
+            f"'{restore_when}' is no rule",
+            "restore_when",
+            f"one of {', '.join(get_args(RestoreRule))}",
+        )
+    if not adjust:
+        if restore_when is not None:
+            raise InputError("needs the femoral adjustment", "restore_when", "give --adjust too")
+        return None
+    return (
+        AdjustmentSettings()
+        if restore_when is None
+        else AdjustmentSettings(restore_when=restore_when)
+    )
+
+
+def _press(
+    model: ContactModel,
+    state: Any,
+    load: float,
+    femoral_pose: Array,
+    settings: AdjustmentSettings | None,
+) -> tuple[ContactResult, Adjustment | None]:
+    if settings is None:
+        return model.press(state, load, femoral_pose), None
+    pair: ContactPair = state.pair
+    query = ClosestPointQuery(pair.femoral, pair.insert, condyle_split(pair.femoral))
+    return press_adjusted(model, state, load, adjusted(query, femoral_pose, settings), query)
+
+
+def load_pair(
+    femoral: str | Path,
+    insert: str | Path,
+    units: str,
+    pose: Sequence[float] | None,
+    bearing: Bearing,
+    material: str | Path | Material,
+    axes: str,
+    side: Side,
+) -> tuple[ContactPair, Array]:
+    """Return the bodies and pose_femoral_in_insert (4, 4); see `press_meshes`."""
+    rotation = axes_rotation(axes)
+    femoral_pose = mesh_pose(pose, units, rotation)
+    femoral_surface = load_surface(femoral, units, axes, name="femoral")
+    insert_surface = load_surface(insert, units, axes, name="insert", closed=True)
+    if side == "left":
+        femoral_surface, insert_surface = mirrored(femoral_surface), mirrored(insert_surface)
+        femoral_pose = mirrored_pose(femoral_pose)
+    elif side != "right":
+        raise InputError(f"'{side}' is no side", "side", "give right or left")
+    if bearing not in ("fixed", "mobile"):
+        raise InputError(f"'{bearing}' is no bearing", "bearing", "give fixed or mobile")
+    in_frame = insert_placement(insert_surface, rotation)
+    pair = ContactPair(
+        femoral_surface, insert_surface.moved(in_frame), named_material(material), bearing
+    )
+    return pair, in_frame @ femoral_pose
+
+
+def mesh_pose(pose: Sequence[float] | None, units: str, rotation: Array) -> Array:
+    """Return the pose (4, 4) between the meshes, turned from mesh to anatomical axes.
+
+    Args:
+        pose: x, y, z (units), rx, ry, rz (deg, intrinsic x-y-z) in mesh axes, or None.
+        units: unit of length.
+        rotation: (3, 3) from mesh to anatomical axes.
+
+    Raises:
+        InputError: not six finite numbers.
+    """
+    if pose is None:
+        return np.eye(4)
+    values = np.asarray(pose, float)
+    if values.shape != (6,) or not np.isfinite(values).all():
+        raise InputError("is not six finite numbers", "pose", "give x y z rx ry rz")
+    if units not in LENGTH:
+        raise InputError(f"unknown unit '{units}'", "units", f"one of {', '.join(LENGTH)}")
+    turn = Rotation.from_euler("XYZ", values[3:] * DEGREE).as_matrix()
+    return pose_matrix(rotation @ turn @ rotation.T, rotation @ values[:3] * LENGTH[units])
+
+
+def read_pose(path: str | Path) -> tuple[float, ...]:
+    """Read x y z rx ry rz from a text file: six numbers parted by blanks, commas or lines.
+
+    Raises:
+        InputError: no such file, or not six numbers.
+    """
+    try:
+        words = read_text(path, what="pose file").replace(",", " ").split()
+        values = tuple(float(word) for word in words)
+    except ValueError as error:
+        raise InputError(f"cannot be read ({error})", path, _SIX) from None
+    if len(values) != 6:
+        raise InputError(f"holds {len(values)} numbers", path, _SIX)
+    return values
+
+
+_SIX = "give a text file of six numbers: x y z (mesh units) rx ry rz (deg)"

@@ -1,0 +1,239 @@
+"""What a run found: one row per frame, the contact maps, and where it all came from."""
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tkamb.errors import InputError, names_near, not_installed
+from tkamb.files import TABLE_LIMIT, read_text
+from tkamb.geometry.frames import Array
+from tkamb.run.columns import KINDS, RENAMED, in_a_family, ordered_names
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+    from tkamb.run.maps import ContactMaps
+
+PERCENTILES = {"p05": 5.0, "p50": 50.0, "p95": 95.0}
+"""Ending of a column of bands.csv -> per cent of the samples below it."""
+FEWEST = 20
+"""Numbers below which a 5th percentile is not even between the two smallest of them."""
+MOST_FAILED = 0.5
+"""Share of samples: where more fail, the rest says too little."""
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """The time series, maps and provenance of a run.
+
+    Args:
+        columns: column name -> one entry per frame: float arrays, and `status` as a list of
+            texts. Columns of the table `COLUMNS` that are not given are not modelled and
+            hold NaN; the order becomes the table's.
+        summary: provenance and notes, JSON-able; the keys that the report reads are listed
+            in docs/results.md.
+        maps: pressure maps per frame; None without contact.
+        directory: where it was written to or read from.
+        bands: columns of bands.csv, where inputs were varied; else empty.
+
+    Raises:
+        InputError: an unknown column, columns of different lengths, or no time or status.
+    """
+
+    columns: dict[str, Any]
+    summary: dict[str, Any] = field(default_factory=dict)
+    maps: "ContactMaps | None" = None
+    directory: Path | None = None
+    bands: dict[str, Array] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "columns", _complete_columns(self.columns))
+
+    def __len__(self) -> int:
+        return len(self.columns["status"])
+
+    def __repr__(self) -> str:
+        """Return in a line how much there is, of what."""
+        lost = sum(status.startswith("failed") for status in self.status)
+        contact = self.summary.get("contact") or {}
+        parts = [
+            f"{len(self)} frames" + (f" ({lost} failed)" if lost else ""),
+            contact.get("model", "no contact"),
+            f"{len(self.columns)} columns, {len(self.not_modelled)} of them not modelled",
+            "no maps" if self.maps is None else f"maps of {len(self.maps.points_m)} points",
+        ]
+        return f"<tkamb.Results: {', '.join(parts)}>"
+
+    def __getitem__(self, name: str) -> Array:
+        """Return a numeric column (f,).
+
+        Raises:
+            InputError: no such column; the message lists the nearest names.
+        """
+        if name not in self.columns:
+            raise InputError(f"no column '{name}'", "results", names_near(name, self.columns))
+        return self.columns[name]
+
+    @property
+    def status(self) -> list[str]:
+        """Return the status of each frame: "ok" or reason words joined by ;."""
+        return self.columns["status"]
+
+    @property
+    def not_modelled(self) -> tuple[str, ...]:
+        """Return the columns that hold no number in any frame."""
+        return tuple(
+            name
+            for name, values in self.columns.items()
+            if KINDS.get(name) != "text" and bool(np.isnan(values).all())
+        )
+
+    def band(self, name: str) -> Array | None:
+        """Return p05, p50 and p95 (3, f) of a column; None where it has no band."""
+        ends = [self.bands.get(f"{name}_{end}") for end in PERCENTILES]
+        found = [end for end in ends if end is not None]
+        return np.array(found) if len(found) == len(ends) else None
+
+    def why_no_band(self, frame: int) -> str:
+        """Return why a frame's results have no band, in words."""
+        if self.bands["failed_share"][frame] > MOST_FAILED:
+            return "more than half of the samples failed"
+        return f"fewer than {FEWEST} samples have it, take more"
+
+    def to_dataframe(self) -> "DataFrame":
+        """Return the columns as a pandas DataFrame, frames as rows; NaN where there is no number.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        try:
+            from pandas import DataFrame
+        except ImportError:
+            raise not_installed("pandas", "to_dataframe", "notebook") from None
+        return DataFrame(self.columns)
+
+    def plot(self, *names: str, axis: str | None = None) -> "Figure":
+        """Return plots of the run in one matplotlib figure, which notebooks show.
+
+        Args:
+            names: ids of the report's plots ("forces", "condyles", "pressures", ...);
+                default: forces, condyles, ratios and pressures.
+            axis: "flexion", "cycle" or "time"; default: as the scene asks.
+
+        Raises:
+            InputError: a plot or an axis that does not exist.
+        """
+        from tkamb.run.pages import page
+
+        figure: Figure = page("plots")(self, names, axis)
+        return figure
+
+    def _repr_html_(self) -> str:
+        """Return the report's headline numbers, for notebooks."""
+        from tkamb.run.pages import page
+
+        return str(page("headline")(self))
+
+
+def _complete_columns(given: Mapping[str, Any]) -> dict[str, Any]:
+    names = ordered_names(given)
+    unknown = sorted(set(given) - set(names))
+    if unknown:
+        raise InputError(f"unknown column '{unknown[0]}'", "results", names_near(unknown[0], KINDS))
+    for needed in ("time_s", "status"):
+        if needed not in given:
+            raise InputError(f"column '{needed}' is missing", "results")
+    frames = len(given["status"])
+    columns: dict[str, Any] = {}
+    for name in names:
+        if KINDS.get(name) == "text":
+            columns[name] = [str(value) for value in given[name]]
+        else:
+            columns[name] = np.array(given.get(name, np.full(frames, np.nan)), float)
+        if np.shape(columns[name]) != (frames,):
+            shape = np.shape(columns[name])
+            raise InputError(f"column '{name}' is {shape}, not one of {frames} frames", "results")
+    return columns
+
+
+def read_csv(path: str | Path) -> dict[str, Any]:
+    """Read the columns of a results.csv, of this release or an earlier one.
+
+    Raises:
+        InputError: no such file, an unknown column, a row of another length, not a number.
+    """
+    path = Path(path)
+    cells = _cells_of(path)
+    return {name: _parse(name, values, path) for name, values in cells.items()}
+
+
+def read_bands(path: str | Path) -> dict[str, Array]:
+    """Read the columns of a bands.csv.
+
+    Raises:
+        InputError: no such file, a row of another length, not a number.
+    """
+    path = Path(path)
+    return {name: _numbers(name, cells, path) for name, cells in _cells_of(path).items()}
+
+
+def _cells_of(path: Path) -> dict[str, tuple[str, ...]]:
+    """Return the cells of a table, column by column, with names of earlier releases made ours."""
+    try:
+        rows = list(csv.reader(io.StringIO(read_text(path, TABLE_LIMIT))))
+    except csv.Error as error:
+        raise InputError(f"cannot be read as CSV ({error})", path) from None
+    if not rows:
+        raise InputError("is empty", path)
+    header, body = [RENAMED.get(name, name) for name in rows[0]], rows[1:]
+    for number, row in enumerate(body, start=2):
+        if len(row) != len(header):
+            raise InputError(f"line {number} has {len(row)} cells, not {len(header)}", path)
+    cells = list(zip(*body, strict=True)) or [() for _ in header]
+    return dict(zip(header, cells, strict=True))
+
+
+def csv_text(columns: Mapping[str, Any]) -> str:
+    """Return the text of a results.csv: numbers bit for bit, NaN as an empty cell."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(columns)
+    cells = [_cells(KINDS.get(name, "number"), values) for name, values in columns.items()]
+    writer.writerows(zip(*cells, strict=True))
+    return buffer.getvalue()
+
+
+def _cells(kind: str, values: Iterable[Any]) -> list[str]:
+    """Return the cells of a column."""
+    if kind == "text":
+        return [str(value) for value in values]
+    numbers = [float(value) for value in values]
+    if kind == "integer":
+        return ["" if math.isnan(number) else _integer(number) for number in numbers]
+    return ["" if math.isnan(number) else repr(number) for number in numbers]
+
+
+def _integer(number: float) -> str:
+    return str(int(number)) if number.is_integer() else repr(number)
+
+
+def _parse(name: str, cells: tuple[str, ...], path: Path) -> Any:
+    if KINDS.get(name) == "text":
+        return list(cells)
+    if name not in KINDS and not in_a_family(name):
+        raise InputError(f"unknown column '{name}'", path, names_near(name, KINDS))
+    return _numbers(name, cells, path)
+
+
+def _numbers(name: str, cells: tuple[str, ...], path: Path) -> Array:
+    try:
+        return np.array([float(cell) if cell else math.nan for cell in cells])
+    except ValueError as error:
+        raise InputError(f"column '{name}': {error}", path) from None

@@ -1,0 +1,272 @@
+"""A folder of results: written as one, read back bit for bit, and held against its hashes."""
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tkamb import __version__
+from tkamb.atomic import Replacement, replaced_together, write_synced
+from tkamb.code_identity import code_identity
+from tkamb.errors import InputError
+from tkamb.files import MEGABYTE, read_json, sha256_of
+from tkamb.io.claim import claimed_directory, settle
+from tkamb.run.plug_ins import CONTACT_CODE, contact_code
+from tkamb.run.results import Results, csv_text, read_bands, read_csv
+
+if TYPE_CHECKING:
+    from tkamb.run.maps import ContactMaps
+    from tkamb.show.panels import Panel
+
+CSV_NAME, SUMMARY_NAME, REPORT_NAME = "results.csv", "summary.json", "report.html"
+MAPS_NAME = "contact.h5"
+BANDS_NAME, TORNADO_NAME, SAMPLES_NAME = "bands.csv", "tornado.csv", "samples.h5"
+INDICES_NAME = "indices.csv"
+UNCERTAINTY_NAMES = (BANDS_NAME, TORNADO_NAME, SAMPLES_NAME, INDICES_NAME)
+"""Stand beside the results that they belong to, and go with them."""
+SUMMARY_LIMIT = 256 * MEGABYTE
+"""Bytes of a summary: a line for every failed frame."""
+
+
+def read_results(directory: str | Path, *, check: bool = True) -> Results:
+    """Read what `write_results` wrote; numbers come back bit for bit.
+
+    What a kill left to be put in place is put there first.
+
+    Args:
+        directory: the folder.
+        check: hold the files against the SHA-256 in summary.json.
+
+    Raises:
+        InputError: a file is missing, is not what it should be, or not what was written.
+    """
+    directory = Path(directory)
+    settle(directory)
+    columns = read_csv(directory / CSV_NAME)
+    summary = read_summary(directory)
+    maps = None
+    if (directory / MAPS_NAME).exists():
+        from tkamb.run.maps import read_maps
+
+        maps = read_maps(directory / MAPS_NAME)
+    if check and (found := differences(directory, summary)):
+        raise InputError(found[0], directory, "`tkamb verify` tells all; run it again")
+    there = (directory / BANDS_NAME).exists()
+    bands = read_bands(directory / BANDS_NAME) if there else {}
+    return Results(columns, summary, maps, directory, bands)
+
+
+def read_summary(directory: Path) -> dict[str, Any]:
+    """Return a folder's summary.json.
+
+    Raises:
+        InputError: no such file, or not a JSON object.
+    """
+    path = directory / SUMMARY_NAME
+    found = read_json(path, SUMMARY_LIMIT, what="summary of a run")
+    if not isinstance(found, dict):
+        raise InputError("is no JSON object", path, "is it a folder that `tkamb run` wrote?")
+    return found
+
+
+def differences(directory: Path, summary: Mapping[str, Any]) -> list[str]:
+    """Return in words what of a folder's files is not what was written with the summary.
+
+    Results of a release that kept no SHA-256 differ in nothing that could be known.
+    """
+    messages, recorded = [], summary.get("files")
+    if not isinstance(recorded, Mapping):
+        return []
+    if summary.get("summary_sha256") != _summary_hash(summary):
+        messages.append(f"{SUMMARY_NAME} has changed since it was written")
+    for name in (CSV_NAME, MAPS_NAME, *UNCERTAINTY_NAMES):
+        there = (directory / name).exists()
+        if there and name not in recorded:
+            messages.append(f"{name} does not belong to these results")
+        elif not there and name in recorded:
+            messages.append(f"{name} is missing")
+        elif there and sha256_of(directory / name) != recorded[name]:
+            messages.append(f"{name} has changed since it was written")
+    return messages
+
+
+def write_results(
+    results: Results,
+    directory: str | Path,
+    *,
+    force: bool = False,
+    more: Mapping[str, Callable[[Path], object]] | None = None,
+    progress: Callable[[Sequence["Panel"]], Iterable["Panel"]] = lambda drawn: drawn,
+) -> None:
+    """Write results.csv, summary.json, contact.h5 and report.html: all of them or none.
+
+    Without maps, a contact.h5 of an earlier run in that folder is removed, since it would pass
+    for this run's. The shards of a run under way (`tkamb.run.shards`) have served and go.
+
+    Args:
+        results: what to write.
+        directory: the folder; made if it is not there.
+        force: write even into a folder that holds things that are not tkamb's.
+        more: of `UNCERTAINTY_NAMES`, what writes the file at a path; those left out are removed.
+        progress: wraps the plots of the report, a progress bar for example.
+
+    Raises:
+        InputError: the folder cannot be claimed (`tkamb.io.claim`) or written.
+    """
+    from tkamb.run.pages import page
+    from tkamb.run.shards import remove_shards
+
+    if BANDS_NAME not in (more or {}):
+        results = replace(results, bands={})  # the page shows none that stand beside it nowhere
+    with claimed_directory(directory, force, "run") as folder:
+        with replaced_together(folder) as files:
+            _put_maps(results.maps, files)
+            for name, write in (more or {}).items():
+                write(files.path(name))
+            put_numbers(results, files)
+            write_synced(files.path(REPORT_NAME), page("report")(results, progress))
+        remove_shards(folder)
+
+
+def put_numbers(results: Results, files: Replacement) -> None:
+    """Write results.csv and summary.json with the SHA-256 of the files that stand beside it.
+
+    Args:
+        results: what to write.
+        files: among which a new contact.h5 is already, else the one in place is kept; so are
+            the bands of these results, else those in place are removed.
+    """
+    write_synced(files.path(CSV_NAME), csv_text(results.columns))
+    recorded = {CSV_NAME: sha256_of(files.path(CSV_NAME))}
+    if results.maps is None:
+        files.remove(MAPS_NAME)
+    else:
+        recorded[MAPS_NAME] = sha256_of(files.current(MAPS_NAME))
+    for name in UNCERTAINTY_NAMES:
+        if files.current(name) == files.folder / name:  # of an earlier run
+            files.remove(name)
+        else:
+            recorded[name] = sha256_of(files.current(name))
+    summary = _plain(results.summary) | {"files": recorded}
+    summary["summary_sha256"] = _summary_hash(summary)
+    text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
+    write_synced(files.path(SUMMARY_NAME), text + "\n")
+
+
+def _summary_hash(summary: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of all of a summary but this."""
+    content = {key: value for key, value in summary.items() if key != "summary_sha256"}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    """Return the value with numpy, paths and NaN turned into what JSON has."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+def _put_maps(maps: "ContactMaps | None", files: Replacement) -> None:
+    """Write maps that are not in their place already."""
+    if maps is None:
+        return
+    if (
+        isinstance(maps.source, Path)
+        and maps.source.absolute() == files.current(MAPS_NAME).absolute()
+    ):
+        return
+    from tkamb.run.maps import write_maps
+
+    write_maps(maps, files.path(MAPS_NAME))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was found of a folder of results.
+
+    Args:
+        differs: what is not as it was written, a line each.
+        notes: what a reader should know though the results are whole.
+        inputs: how many input files were looked at.
+    """
+
+    differs: tuple[str, ...]
+    notes: tuple[str, ...]
+    inputs: int
+
+    def lines(self) -> list[str]:
+        """Return the verdict as lines of text."""
+        end = f"results and {self.inputs} input file(s) are as they were when it was written"
+        return [*self.differs, *self.notes, *([] if self.differs else [end])]
+
+
+def verify_results(directory: str | Path) -> Verdict:
+    """Hold a folder against the SHA-256 that its summary.json records.
+
+    What a kill left to be put in place is put there first.
+
+    Raises:
+        InputError: it is not a folder of results.
+    """
+    directory = Path(directory)
+    settle(directory)
+    summary = read_summary(directory)
+    if not isinstance(summary.get("versions"), Mapping):
+        raise InputError("was not written by tkamb run", directory / SUMMARY_NAME)
+    found = differences(directory, summary)
+    if not isinstance(summary.get("files"), Mapping):
+        found.append("carries no SHA-256: written by an earlier tkamb, nothing can be checked")
+    try:
+        read_results(directory, check=False)
+    except InputError as error:
+        found.append(str(error))
+    inputs = summary.get("inputs")
+    inputs = inputs if isinstance(inputs, Mapping) else {}
+    found += [line for path, recorded in inputs.items() if (line := _input(path, recorded))]
+    return Verdict(tuple(found), tuple(_notes(summary)), len(inputs))
+
+
+def _input(path: str, recorded: str) -> str | None:
+    """Return in words what is wrong with an input file; None if it is the one that was read."""
+    try:
+        same = sha256_of(path) == recorded
+    except InputError as error:
+        return f"input {error}"
+    return None if same else f"input {path} has changed since it was read"
+
+
+def _notes(summary: Mapping[str, Any]) -> list[str]:
+    identity = summary.get("identity")
+    identity = identity if isinstance(identity, Mapping) else {}
+    notes, made_by = [], identity.get("version of tkamb")
+    code, this = str(identity.get("code of tkamb")), code_identity()
+    if made_by != __version__ or code != this:
+        notes.append(
+            f"computed by other code (tkamb {made_by}, {code[:12]}; "
+            f"this is {__version__}, {this[:12]})"
+        )
+    contact = summary.get("contact")
+    if CONTACT_CODE in identity and isinstance(contact, Mapping):
+        notes += _plug_in_note(str(contact.get("model")), identity[CONTACT_CODE])
+    if summary.get("unfinished_frames"):
+        notes.append(f"unfinished: {summary['unfinished_frames']} frames are still to be computed")
+    return notes
+
+
+def _plug_in_note(model: str, code: str) -> list[str]:
+    try:
+        same = contact_code(model) == code
+    except InputError as error:
+        return [f"its code cannot be compared: {error}"]
+    return [] if same else [f"computed by another code of the contact model '{model}'"]

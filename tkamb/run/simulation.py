@@ -1,0 +1,233 @@
+"""The whole pipeline on one page: scene, body, contact, results."""
+
+import math
+import time as clock
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tkamb.errors import InputError
+from tkamb.io.claim import claimed_directory
+from tkamb.io.scene import Scene, load_scene, with_preset
+from tkamb.io.scene.case import Case, load_case
+from tkamb.run.frames import FRAME_LOOP, ChunkSolver, Finished, FrameSolver, finished_in_order
+from tkamb.run.guard import interrupt_as_such
+from tkamb.run.recorder import FolderRecorder, Recorder, finished_results
+from tkamb.run.results import Results
+from tkamb.run.summary import input_hashes, run_identity, scene_hash, summary_of
+from tkamb.run.tabulate import join_rows
+from tkamb.run.workers import Crew, Task, Team
+
+if TYPE_CHECKING:
+    from tkamb.run.contact_side import ContactSide
+
+Progress = Callable[[Sequence[int]], Iterable[int]]
+
+
+def simulate(
+    scene: Scene | Case | str | Path,
+    *,
+    contact: str | None = None,
+    resolution_mm: float | None = None,
+    preset: str | None = None,
+    frames: slice | None = None,
+    directory: str | Path | None = None,
+    scene_path: str | Path | None = None,
+    progress: Progress = lambda frames: frames,
+    stage: Callable[[str], None] = lambda name: None,
+    resume: bool = False,
+    force: bool = False,
+    workers: int = 1,
+) -> Results:
+    """Run a scene and return its results.
+
+    Args:
+        scene: a scene, the path of its file, or its case, read already.
+        contact: contact model, instead of the scene's.
+        resolution_mm: spacing of the map points, instead of the scene's.
+        preset: name of a study whose choices are laid over the scene, as by `tkamb run --as`
+            (`tkamb.io.presets.registry`); contact and resolution_mm still hold.
+        frames: which frames; default all.
+        directory: folder where the finished frames are kept, see `tkamb.run.recorder`; None
+            keeps them in memory.
+        scene_path: where the scene came from, for the summary.
+        progress: wraps the frame indices, a progress bar for example.
+        stage: is told what begins before the frames, by name.
+        resume: go on with what an earlier, interrupted run of the same scene and frames left
+            in the folder; needs one.
+        force: write into the folder even if it holds things that are not tkamb's.
+        workers: processes that share the frames; more than one start every tenth frame without
+            a guess from the one before, which moves answers within the solver's tolerance.
+
+    Raises:
+        InputError: the scene or a file that it names cannot be used, a case is given another
+            contact model, resolution or preset, the run to resume is another one, the folder
+            cannot be claimed (`tkamb.io.claim`), or no such number of workers.
+        ComputationError: a worker was killed.
+        KeyboardInterrupt: with a folder, what was finished is written there first.
+    """
+    crew = Crew(workers)
+    if isinstance(scene, str | Path):
+        scene_path, scene = scene, load_scene(scene)
+    start = clock.perf_counter()
+    stage("reading scene and recordings")
+    if preset is not None:
+        scene = _scene_as(scene, preset, contact, resolution_mm)
+    case = _case_with_contact(scene, contact, resolution_mm)
+    indices = chosen_frames(frames, len(case.motion.time))
+    identity = run_identity(case, indices)
+    if directory is None and resume:
+        raise InputError("there is no folder to go on in", "resume", "give a directory")
+    if directory is not None and resume:
+        done = finished_results(Path(directory), identity)
+        if done is not None:
+            return done
+    path = None if scene_path is None else Path(scene_path)
+    run = _Run(case, indices, identity, input_hashes(case, path), path, start)
+    with ExitStack() as stack:
+        team, chunks = None, math.ceil(len(indices) / FRAME_LOOP.frames_per_chunk)
+        if min(workers, chunks) > 1:
+            task = Task(ChunkSolver, (case.scene,))
+            team = stack.enter_context(crew.team(task, chunks))  # prepares meanwhile
+        stage("preparing body and contact")
+        run.prepare()  # before the folder is touched: bad input leaves it as it was
+        recorder = Recorder()
+        if directory is not None:
+            folder = stack.enter_context(claimed_directory(directory, force, "run"))
+            recorder = FolderRecorder(folder, identity, resume)
+        stack.callback(recorder.close)
+        return run.compute(recorder, progress, team)
+
+
+@dataclass(eq=False)
+class _Run:
+    """One run: computes its frames, hands them to the recorder, and makes the results."""
+
+    case: Case
+    indices: range
+    identity: dict[str, Any]
+    inputs: dict[str, str]
+    path: Path | None
+    start: float
+
+    def prepare(self) -> None:
+        """Build both sides of the equilibrium; whatever is wrong with the input shows here."""
+        self.solver = FrameSolver(self.case, self.indices)
+        side = self.solver.side
+        self.seconds = {"read": clock.perf_counter() - self.start}
+        if side is not None:
+            self.seconds["prepare contact"] = side.prepare_seconds
+            self.seconds["read"] -= side.prepare_seconds
+
+    def compute(self, recorder: Recorder, progress: Progress, team: Team | None) -> Results:
+        """Compute every frame that is not there yet and return the results."""
+        self.recorder = recorder
+        if self.solver.side is not None:
+            self._begin_maps(self.solver.side)
+        self._take_earlier()
+        self.resumed = len(self.recorder.rows)
+        left = [k for k in self.indices if k not in self.recorder.rows]
+        try:
+            with interrupt_as_such():
+                for frame in self._finished(left, progress, team):
+                    self.recorder.record(*frame)
+                    if self.recorder.due() and len(self.recorder.rows) < len(self.indices):
+                        self.recorder.publish(self.results)
+        except KeyboardInterrupt:
+            if not self.recorder.keeps_files or not self.recorder.rows:
+                raise
+            self.recorder.publish(self.results)
+            done = f"{len(self.recorder.rows)} of {len(self.indices)} frames"
+            raise KeyboardInterrupt(f"{done} are kept; go on with --resume") from None
+        self.recorder.finish()
+        return self.recorder.publish(self.results)
+
+    def results(self) -> Results:
+        """Return the results so far; frames that are still to do are failed ones."""
+        columns = join_rows(self.case, self.indices, self.recorder.rows)
+        self.seconds["all"] = clock.perf_counter() - self.start
+        strains = self.solver.mechanics.strains
+        summary = summary_of(self.case, columns, self.seconds, self.path, strains)
+        muscles = self.solver.mechanics.muscles
+        if muscles is not None:
+            summary["muscle_groups"] = muscles.groups
+        plausibility = self.solver.plausibility
+        summary["questions"] = [question.text for question in plausibility.questions]
+        summary["notes"] += plausibility.answered
+        summary["identity"] = self.identity
+        summary["inputs"] = self.inputs
+        summary["resumed_frames"] = self.resumed
+        summary["unfinished_frames"] = len(self.indices) - len(self.recorder.rows)
+        return Results(columns, summary, self.recorder.maps)
+
+    def _finished(
+        self, left: Sequence[int], progress: Progress, team: Team | None
+    ) -> Iterator[Finished]:
+        """Yield the frames that are left, in order, as they are finished."""
+        if team is None:
+            yield from (self.solver.solve(k) for k in progress(left))
+            return
+        frames = finished_in_order(team, self.solver.slips, self.indices, left)
+        yield from (frame for _, frame in zip(progress(left), frames, strict=True))
+
+    def _begin_maps(self, side: "ContactSide") -> None:
+        labels = {
+            "frame": "insert: x anterior, y superior, z lateral",
+            "model": side.table.model,
+            "version": str(self.identity["version of tkamb"]),
+            "scene_sha256": scene_hash(self.case),
+        }
+        self.recorder.begin_maps(side.state.points, side.state.triangles, labels)
+
+    def _take_earlier(self) -> None:
+        """Take over the frames of the run that is resumed, the last contacts as guesses."""
+        earlier, side = self.recorder.take_earlier(self.indices), self.solver.side
+        if side is None or not earlier:
+            return
+        from tkamb.run.recall import recalled
+
+        mechanics, last = self.solver.mechanics, list(earlier.items())[-FRAME_LOOP.kept_contacts :]
+        self.solver.before = [recalled(side, mechanics, k, arrays) for k, arrays in last]
+
+
+def _scene_as(
+    scene: Scene | Case, preset: str, model: str | None, resolution_mm: float | None
+) -> Scene:
+    """Return the scene with a preset laid over it, and over that what else was asked for."""
+    if isinstance(scene, Case):
+        raise InputError("a case has been read already", "preset", "give its scene instead")
+    asked = {"contact.model": model, "contact.resolution_mm": resolution_mm}
+    return with_preset(scene, preset, {key: v for key, v in asked.items() if v is not None})
+
+
+def _case_with_contact(scene: Scene | Case, model: str | None, resolution_mm: float | None) -> Case:
+    """Return the case of a scene with another contact model or resolution, where one is given."""
+    changes = {"model": model, "resolution_mm": resolution_mm}
+    changes = {key: value for key, value in changes.items() if value is not None}
+    if isinstance(scene, Case):
+        if changes:
+            raise InputError("a case has been read already", "contact", "give its scene instead")
+        return scene
+    if not changes:
+        return load_case(scene)
+    if scene.contact is None:
+        raise InputError("the scene has no [contact]", "contact", "add the table to the scene")
+    table = scene.contact.model_copy(update=changes)
+    return load_case(scene.model_copy(update={"contact": table}))
+
+
+def chosen_frames(frames: slice | None, count: int) -> range:
+    """Return the frames of a slice; its ends must lie inside the motion."""
+    if frames is None:
+        return range(count)
+    ends = [end for end in (frames.start, frames.stop) if end is not None]
+    chosen = range(count)[frames] if frames.step != 0 else range(0)
+    if any(not -count <= end <= count for end in ends) or len(chosen) == 0:
+        raise InputError(
+            f"frames {frames.start}:{frames.stop}:{frames.step} are not in the motion",
+            "--frames",
+            f"it has frames 0 to {count - 1}",
+        )
+    return chosen

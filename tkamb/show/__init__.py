@@ -1,0 +1,1 @@
+"""What a reader gets: report, comparison, check of a scene, viewer."""

@@ -1,0 +1,103 @@
+"""The report's horizontal axis, and which frames stand for the whole motion."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+LABELS = {"flexion": "flexion (deg)", "cycle": "cycle (%)", "time": "time (s)"}
+UNITS = {"flexion": "°", "cycle": " %", "time": " s"}
+
+
+@dataclass(frozen=True, eq=False)
+class HorizontalAxis:
+    """What the results are drawn against, in time order; it need not be monotonic.
+
+    Args:
+        kind: "flexion", "cycle" or "time".
+        values: (f,) deg, per cent or s.
+    """
+
+    kind: str
+    values: Array
+
+    @property
+    def label(self) -> str:
+        """Return the axis label with its unit."""
+        return LABELS[self.kind]
+
+    def at(self, frame: int) -> str:
+        """Return where a frame lies, with its unit."""
+        digits = 2 if self.kind == "time" else 0
+        return f"{self.values[frame]:.{digits}f}{UNITS[self.kind]}"
+
+    def broken(self, values: Array) -> tuple[Array, Array]:
+        """Return x and y for drawing, interrupted where a cycle starts anew."""
+        x = self.values
+        if self.kind != "cycle":
+            return x, values
+        cuts = np.flatnonzero(np.diff(x) < -50) + 1
+        return np.insert(x, cuts, np.nan), np.insert(values, cuts, np.nan)
+
+    def stops(self, count: int) -> NDArray[np.int64]:
+        """Return about `count` frames spread evenly over the motion, in its order.
+
+        On a flexion axis that rises or falls throughout they lie at round angles, otherwise
+        at even times.
+        """
+        x = self.values
+        steps = np.diff(x)
+        if self.kind == "flexion" and not (np.all(steps > 0) or np.all(steps < 0)):
+            return np.unique(np.linspace(0, len(x) - 1, count).round().astype(np.int64))
+        low, high = float(np.min(x)), float(np.max(x))
+        step = round_step((high - low) / max(count - 1, 1))
+        wanted = np.arange(np.ceil(low / step - 0.3), np.floor(high / step + 0.3) + 1) * step
+        return self.nearest(wanted)
+
+    def nearest(self, wanted: Iterable[float]) -> NDArray[np.int64]:
+        """Return the frames nearest to these places, without repeats, in time order."""
+        return np.unique([int(np.argmin(np.abs(self.values - place))) for place in wanted])
+
+
+def round_step(step: float) -> float:
+    """Return the smallest 1, 1.5, 2, 3 or 5 x 10^k that is not below a step."""
+    if not step > 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(step))
+    choices = np.array([1.0, 1.5, 2.0, 3.0, 5.0, 10.0]) * power
+    return float(choices[choices >= step * (1 - 1e-9)][0])
+
+
+def horizontal_axis(results: "Results", kind: str | None = None) -> HorizontalAxis:
+    """Return the axis that the summary's `axis` (or `kind`) asks for.
+
+    Per cent of the cycle are the column of that name; without it they are counted from the
+    summary's `cycle_percent_s` = (time of 0 %, time of 100 %), or over the whole motion.
+
+    Raises:
+        InputError: an axis that does not exist.
+    """
+    kind = kind or results.summary.get("axis") or "flexion"
+    if kind == "flexion":
+        return HorizontalAxis(kind, results["flexion_deg"])
+    time = results["time_s"]
+    if kind == "time":
+        return HorizontalAxis(kind, time)
+    if kind != "cycle":
+        raise InputError(f"there is no axis '{kind}'", "axis", f"one of {', '.join(LABELS)}")
+    percent = results["cycle_percent"]
+    if np.isfinite(percent).all():
+        return HorizontalAxis(kind, percent)
+    start, end = results.summary.get("cycle_percent_s") or (time[0], time[-1])
+    percent = 100 * (time - start) / (end - start)
+    if percent.max() > 100 + 1e-6 or percent.min() < -1e-6:
+        percent = percent % 100
+    return HorizontalAxis(kind, percent)

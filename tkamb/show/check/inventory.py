@@ -1,0 +1,210 @@
+"""What each file of a scene gave, in a line: frames, durations, ranges, sizes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.contact.given_material import (
+    given_material,
+    material_as_json,
+    material_in_words,
+)
+from tkamb.geometry.frames import KNEE_COORDINATES, Array
+from tkamb.geometry.surface import Surface
+from tkamb.io.scene.case import Case
+from tkamb.run.mechanics import STRAIN_FLEXIONS, Mechanics
+from tkamb.units import DEGREE, MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.io.recordings.measured_force import MeasuredForce
+
+ANGLES = ("flexion", "adduction", "axial_rotation")
+TORN = 0.1
+"""Strain at which a bundle is named: docs/results.md."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One part of the scene.
+
+    Args:
+        part: what it is, as its table is called.
+        file: where it was read from; None: the scene itself.
+        found: what it gave.
+    """
+
+    part: str
+    file: Path | None
+    found: str
+
+    def line(self) -> str:
+        """Return the entry as one line of text."""
+        where = "" if self.file is None else f" ({self.file.name})"
+        return f"{self.part}{where}: {self.found}"
+
+
+def inventory(mechanics: Mechanics) -> tuple[Entry, ...]:
+    """Return what every file and table of a case gave."""
+    case = mechanics.case
+    found = [_patient(case), _motion(case)]
+    if case.scene.tibia or case.motion.markers:
+        found.append(_shank(case))
+    if case.ground is not None:
+        found.append(_ground(case))
+    found += _surfaces(case)
+    if mechanics.ligaments:
+        found.append(_ligaments(mechanics))
+    if case.muscles:
+        found.append(_extensor(case))
+    if case.scene.muscles:
+        file = case.scene.muscles.model
+        found.append(Entry("muscles", file, "all of the leg, by static optimisation"))
+    if case.emg is not None:
+        text = f"channels {', '.join(case.emg.values)}, {_span(case.emg.time)}"
+        found.append(Entry("EMG", case.emg.path, text))
+    if case.scene.contact:
+        found.append(_contact(case))
+    if case.measured is not None:
+        found.append(_measured(case.measured, case.body_weight))
+    return tuple(found)
+
+
+def _patient(case: Case) -> Entry:
+    patient, chain = case.scene.patient, case.chain
+    masses = ", ".join(f"{link} {chain.segment(link)[0]:.2f} kg" for link in ("tibia", "femur"))
+    text = (
+        f"{patient.side} knee, {patient.mass_kg:g} kg (1 BW is {case.body_weight:.0f} N); "
+        f"with all that is fixed to them: {masses}"
+    )
+    return Entry("patient", patient.urdf, text)
+
+
+def _motion(case: Case) -> Entry:
+    motion, table = case.motion, case.scene.motion
+    duration = motion.time[-1] - motion.time[0]
+    rate = (len(motion.time) - 1) / duration
+    ranges = []
+    for name, values in zip(KNEE_COORDINATES, motion.coordinates.T, strict=True):
+        if name in motion.unrecorded:
+            ranges.append(f"{name} not recorded")
+        elif name in ANGLES:
+            ranges.append(_range(name, values / DEGREE, "deg", 1))
+        else:
+            ranges.append(_range(name, values / MILLIMETRE, "mm", 1))
+    text = (
+        f"{len(motion.time)} frames, {motion.time[0]:.3g} to {motion.time[-1]:.3g} s, "
+        f"{rate:.0f} a second; {', '.join(reversed(ranges))}"
+    )
+    return Entry("motion", table.file, text)
+
+
+def _shank(case: Case) -> Entry:
+    """Return how the shank stands: its lean is that of the tibia's long axis."""
+    if case.tibia is None:
+        raise ValueError("a shank that was read has a motion")
+    up = case.tibia.pose[:, :3, 1]
+    lean = np.arctan2(up[:, 0], up[:, 1]) / DEGREE
+    height = case.tibia.pose[:, 1, 3] / MILLIMETRE
+    text = f"{_range('forward lean', lean, 'deg', 0)}, {_range('ankle height', height, 'mm', 0)}"
+    file = case.scene.tibia.file if case.scene.tibia else case.scene.motion.file
+    return Entry("tibia", file, text)
+
+
+def _ground(case: Case) -> Entry:
+    ground, table = case.ground, case.scene.ground_reaction
+    assert ground is not None and table is not None
+    vertical = ground.force[:, 1] / case.body_weight
+    loaded = f"foot loaded in {int(np.sum(ground.loaded))} of {len(vertical)} frames"
+    place = "at the ankle" if table.applied == "ankle" else "at the centre of pressure"
+    turned = ", signs turned: force on the plate" if table.force == "on the plate" else ""
+    text = f"{_range('vertical', vertical, 'BW', 2)}, {loaded}; applied {place}{turned}"
+    return Entry("ground reaction", table.file, text)
+
+
+def _surfaces(case: Case) -> list[Entry]:
+    implant = case.scene.implant
+    parts = (
+        ("femoral component", implant.femoral, case.femoral),
+        ("insert", implant.insert, case.insert),
+        ("patellar button", implant.patella, case.patella),
+    )
+    return [
+        Entry(name, table.mesh, _surface(surface))
+        for name, table, surface in parts
+        if table is not None and surface is not None
+    ]
+
+
+def _surface(surface: Surface) -> str:
+    size = np.ptp(surface.bounds, axis=0) / MILLIMETRE
+    return (
+        f"{len(surface.faces)} triangles, {size[0]:.1f} mm anterior–posterior, "
+        f"{size[1]:.1f} high, {size[2]:.1f} wide"
+    )
+
+
+def _ligaments(mechanics: Mechanics) -> Entry:
+    """Return the bundles, and which are torn where: the strains that the report prints."""
+    strains = mechanics.strains
+    torn = [
+        f"{name} {100 * value:.0f} % at {flexion:.0f} deg"
+        for name, values in strains.items()
+        for flexion, value in zip(STRAIN_FLEXIONS, values, strict=True)
+        if value > TORN
+    ]
+    text = f"{len(mechanics.ligaments)} bundles: {_listed([b.name for b in mechanics.ligaments])}"
+    known = np.array([v for values in strains.values() for v in values if np.isfinite(v)])
+    if len(known):
+        text += f"; {_range('strain', 100 * known, '%', 1)} at the recorded pose"
+    return Entry("ligaments", None, text + (f"; over 10 %: {', '.join(torn)}" if torn else ""))
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return names by commas; three or more that count up one by one as first–last."""
+    said: list[str] = []
+    for stem, group in groupby(names, lambda name: name.rstrip("0123456789")):
+        own = list(group)
+        first, last = own[0][len(stem) :], own[-1][len(stem) :]
+        counted = [f"{stem}{k}" for k in range(int(first), int(last) + 1)] if first and last else []
+        said += [f"{own[0]}–{last}"] if len(own) > 2 and own == counted else own
+    return ", ".join(said)
+
+
+def _extensor(case: Case) -> Entry:
+    assert case.scene.patella is not None
+    names = ", ".join(muscle.name for muscle in case.muscles)
+    return Entry("muscle line", None, f"{names}; patella's motion {case.scene.patella.motion}")
+
+
+def _contact(case: Case) -> Entry:
+    table = case.scene.contact
+    assert table is not None
+    made_of = material_in_words(material_as_json(given_material(case.scene.insert_material)))
+    text = f"{table.model} at {table.resolution_mm:g} mm, {made_of}"
+    if table.released:
+        text += f"; solved for: {', '.join(sorted({*table.released, 'si'}))}"
+    return Entry("contact", None, text)
+
+
+def _measured(measured: "MeasuredForce", weight: float) -> Entry:
+    """Return what an instrumented implant measured: held against a run, never used in it."""
+    forces = [
+        _range(name, values[np.isfinite(values)] / weight, "BW", 2)
+        for name, values in measured.force.items()
+        if np.isfinite(values).any()
+    ]
+    text = f"{', '.join(forces)}, {_span(measured.time)}; only compared, never used"
+    return Entry("measured force", measured.path, text)
+
+
+def _span(time: Array) -> str:
+    return f"{len(time)} samples, {time[0]:.3g} to {time[-1]:.3g} s"
+
+
+def _range(name: str, values: Array, unit: str, digits: int) -> str:
+    low, high = float(np.min(values)), float(np.max(values))
+    return f"{name} {low:.{digits}f} to {high:.{digits}f} {unit}"

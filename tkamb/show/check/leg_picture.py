@@ -1,0 +1,265 @@
+"""A picture of the leg at three frames, in the laboratory, with the plate's force.
+
+Rows: the whole leg from its lateral side and from the front, and the knee from its lateral side.
+The laboratory's y is up; ahead is where the insert's x points, on the mean over the three frames.
+A left knee is mirrored at input and drawn mirrored back.
+"""
+
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
+
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Array, transform
+from tkamb.geometry.surface import Surface
+from tkamb.knee.chain import ChainState
+from tkamb.run.mechanics import Mechanics
+from tkamb.show.style import (
+    BLACK,
+    FORCE_COLOURS,
+    GREY,
+    LIGAMENT,
+    PATELLAR_LIGAMENT,
+    QUADRICEPS,
+    SKY,
+    new_figure,
+    settings,
+)  # fmt: skip
+from tkamb.units import DEGREE, MILLIMETRE
+
+
+@dataclass(frozen=True)
+class LegPictureSettings:
+    """Sizes in the picture of a leg."""
+
+    arrow_metres_per_BW: float = 0.35
+    """Length of the force's arrow."""
+    knee_half_width: float = 0.085
+    """m, that the picture of the knee shows around its middle."""
+    margin: float = 0.08
+    """m, around what is shown."""
+
+
+LEG_PICTURE = LegPictureSettings()
+
+LEGEND = (
+    f"In the laboratory, y up, grid 0.1 m. Green arrow: force of the plate on the foot, 1 BW = "
+    f"{LEG_PICTURE.arrow_metres_per_BW:g} m.\nGrey: femoral component, light blue: insert and button; "  # noqa: E501
+    "dark red: quadriceps, pink: patellar ligament, purple: ligaments."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class LegFrame:
+    """The leg at one frame in the laboratory, m.
+
+    Args:
+        frame: of the motion.
+        joints: (3, 3) hip, knee, ankle; the knee is the insert frame's origin.
+        bodies: the implant's surfaces with their colours.
+        lines: name -> (n, 3) ligaments and tendons, with their colours.
+        force: (3,) N on the foot; None without a plate.
+        point: (3,) where it acts.
+        loaded: whether the foot stands on the plate; else no arrow is drawn.
+    """
+
+    frame: int
+    joints: Array
+    bodies: tuple[tuple[Surface, str], ...]
+    lines: tuple[tuple[Array, str], ...]
+    force: Array | None
+    point: Array
+    loaded: bool
+
+
+def shown_frames(mechanics: Mechanics) -> list[int]:
+    """Return three frames (fewer of a short motion), apart from each other, in time order.
+
+    They are the first, the one of the largest ground reaction and the one of the most flexion;
+    where one lies near another, the last or the middle one instead.
+    """
+    case = mechanics.case
+    count = len(case.motion.time)
+    wanted = [0, int(np.argmax(case.motion.coordinates[:, 5])), count - 1, count // 2]
+    if case.ground is not None:
+        wanted.insert(1, int(np.argmax(np.linalg.norm(case.ground.force, axis=1))))
+    found: list[int] = []
+    for k in wanted:
+        if len(found) < 3 and all(abs(k - other) >= max(count // 5, 1) for other in found):
+            found.append(k)
+    return sorted(found)
+
+
+def leg_frame(mechanics: Mechanics, k: int) -> LegFrame:
+    """Return the leg at frame k."""
+    case, geometry = mechanics.case, mechanics.geometry(k)
+    state = geometry.state
+    to_laboratory = state.insert_in_laboratory
+    in_insert = [state.point("hip", np.zeros(3)), np.zeros(3), state.point("tibia", np.zeros(3))]
+    parts = (
+        (case.insert, np.eye(4), SKY),
+        (case.femoral, state.pose("femur"), GREY),
+        (case.patella, state.pose("patella") if case.patella else np.eye(4), SKY),
+    )
+    bodies = tuple(
+        (surface.moved(to_laboratory @ pose), colour)
+        for surface, pose, colour in parts
+        if surface is not None
+    )
+    lines = [(transform(to_laboratory, points), c) for points, c in _lines(mechanics, state)]
+    force, point = None, transform(to_laboratory, in_insert[2])
+    if case.ground is not None:
+        force = case.ground.force[k]
+        if case.scene.ground_reaction and case.scene.ground_reaction.applied == "cop":
+            point = case.ground.point[k]
+    joints = transform(to_laboratory, np.array(in_insert))
+    loaded = case.ground is not None and bool(case.ground.loaded[k])
+    return LegFrame(k, joints, bodies, tuple(lines), force, point, loaded)
+
+
+def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str]]:
+    """Return ligaments, muscle line and patellar ligament with their colours, insert frame."""
+    found = []
+    for bundle in mechanics.ligaments:
+        poses = {link: state.pose(link) for link in (bundle.proximal.link, bundle.distal.link)}
+        found.append((np.stack(bundle.ends(poses)), LIGAMENT))
+    if mechanics.extensor is not None:
+        with suppress(ComputationError):  # a patella that is lost there: the run says so
+            quadriceps, ligament = mechanics.extensor.paths(state)
+            found += [(quadriceps.points, QUADRICEPS), (ligament.points, PATELLAR_LIGAMENT)]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What is to the right of the page and what comes out of it; the laboratory's y is up.
+
+    Args:
+        across: (3,) horizontal, to the right of the page; turned over for a left knee, which
+            is computed as a right one and so drawn as it is.
+        towards: (3,) horizontal, towards the reader.
+    """
+
+    across: Array
+    towards: Array
+
+    def page(self, points: Array) -> Array:
+        """Return points (..., 3) m on the page (..., 2), m."""
+        return np.stack([points @ self.across, points[..., 1]], axis=-1)
+
+
+def draw_leg(mechanics: Mechanics) -> Figure:
+    """Return the picture of a case: three frames across; leg from two sides, and the knee."""
+    frames = [leg_frame(mechanics, k) for k in shown_frames(mechanics)]
+    ahead = np.mean([_ahead(mechanics, one.frame) for one in frames], axis=0)
+    ahead /= np.linalg.norm(ahead)
+    lateral = np.cross(ahead, [0.0, 1.0, 0.0])
+    mirror = -1.0 if mechanics.case.scene.patient.side == "left" else 1.0
+    from_side, from_front = View(mirror * ahead, lateral), View(-mirror * lateral, ahead)
+    weight = mechanics.case.body_weight
+    with settings():
+        figure = new_figure(3.2 * len(frames), 11.5)
+        grid = figure.subplots(3, len(frames), squeeze=False, height_ratios=(1.3, 1.3, 1.0))
+        for column, one in zip(grid.T, frames, strict=True):
+            for axes, view in zip(column, (from_side, from_front, from_side), strict=True):
+                _draw(axes, one, view, weight)
+            _close_up(column[2], one, from_side)
+            column[0].set_title(_caption(mechanics, one), fontsize=9)
+        _same_limits(grid[0])
+        _same_limits(grid[1])
+        words = ("leg, from its lateral side", "leg, from the front", "knee, from its lateral side")
+        for row, label in zip(grid, words, strict=True):
+            row[0].set_ylabel(label)
+        figure.supxlabel(LEGEND, fontsize=8)
+    return figure
+
+
+def _ahead(mechanics: Mechanics, k: int) -> Array:
+    """Return the horizontal part (3,) of where the insert's x points in the laboratory."""
+    state = mechanics.geometry(k).state
+    return state.insert_in_laboratory[:3, 0] * np.array([1.0, 0.0, 1.0])
+
+
+def _caption(mechanics: Mechanics, one: LegFrame) -> str:
+    motion = mechanics.case.motion
+    flexion = motion.coordinates[one.frame, 5] / DEGREE
+    words = f"frame {one.frame}, {motion.time[one.frame]:.2f} s\nflexion {flexion:.0f} deg"
+    if one.force is None:
+        return f"{words}, no force plate"
+    if not one.loaded:
+        return f"{words}, plate not loaded"
+    return f"{words}, plate {np.linalg.norm(one.force) / mechanics.case.body_weight:.2f} BW"
+
+
+def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
+    """Draw one frame: the implant, the joint centres, lines of action and the plate's force."""
+    joints = view.page(one.joints)
+    axes.plot(*joints.T, color=BLACK, linewidth=3, alpha=0.35, solid_capstyle="round")
+    axes.plot(*joints.T, "o", color=BLACK, markersize=4)
+    shown = [one.joints]
+    for surface, colour in one.bodies:
+        _draw_surface(axes, surface, view, colour)
+    for points, colour in one.lines:
+        axes.plot(*view.page(points).T, color=colour, linewidth=1.3)
+    if one.force is not None and one.loaded:
+        tip = one.point + one.force / weight * LEG_PICTURE.arrow_metres_per_BW
+        arrow = {
+            "arrowstyle": "-|>",
+            "color": FORCE_COLOURS["ground reaction"],
+            "linewidth": 1.8,
+            "shrinkA": 0,
+            "shrinkB": 0,
+        }
+        head, tail = (tuple(view.page(end).tolist()) for end in (tip, one.point))
+        axes.annotate("", head, tail, arrowprops=arrow)
+        shown += [tip[None], one.point[None]]
+    if one.force is not None:
+        axes.axhline(one.point[1], color=GREY, linewidth=1)
+    extent = view.page(np.concatenate(shown))
+    low, high = extent.min(axis=0) - LEG_PICTURE.margin, extent.max(axis=0) + LEG_PICTURE.margin
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal", adjustable="box")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MultipleLocator(0.1))
+    axes.tick_params(labelbottom=False, labelleft=False, length=0)
+
+
+def _draw_surface(axes: Axes, surface: Surface, view: View, colour: str) -> None:
+    """Draw a surface's triangles, the farthest first, those that face the reader the lightest."""
+    lean = surface.face_normals @ view.towards
+    facing = np.flatnonzero(lean > 0)
+    corners = surface.triangles[facing]
+    order = np.argsort(corners.mean(axis=1) @ view.towards)
+    faces = (0.45 + 0.55 * lean[facing[order]])[:, None] * np.array(to_rgb(colour))
+    axes.add_collection(
+        PolyCollection(
+            list(view.page(corners[order])), facecolors=faces, linewidths=0, antialiaseds=False,
+            rasterized=True,
+        ),
+        autolim=False,
+    )  # fmt: skip
+
+
+def _close_up(axes: Axes, one: LegFrame, view: View) -> None:
+    """Show the knee alone."""
+    centre = view.page(one.joints[1]) + np.array([0.0, 15 * MILLIMETRE])
+    axes.set_xlim(centre[0] - LEG_PICTURE.knee_half_width, centre[0] + LEG_PICTURE.knee_half_width)
+    axes.set_ylim(centre[1] - LEG_PICTURE.knee_half_width, centre[1] + LEG_PICTURE.knee_half_width)
+
+
+def _same_limits(row: Array) -> None:
+    """Give pictures of a row one scale: the widest and the tallest of them."""
+    width = max(np.ptp(axes.get_xlim()) for axes in row)
+    low = min(axes.get_ylim()[0] for axes in row)
+    high = max(axes.get_ylim()[1] for axes in row)
+    for axes in row:
+        middle = np.mean(axes.get_xlim())
+        axes.set_xlim(middle - width / 2, middle + width / 2)
+        axes.set_ylim(low, high)

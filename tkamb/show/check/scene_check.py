@@ -1,0 +1,113 @@
+"""A scene read whole and looked at, before anything is run."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tkamb.contact.given_material import given_material
+from tkamb.contact.registry import contact_model
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import Case, load_case
+from tkamb.run.mechanics import Mechanics
+from tkamb.run.plausibility.plausibility import Plausibility
+from tkamb.run.summary import assumptions, not_modelled
+from tkamb.show.check.inventory import Entry, inventory
+
+
+@dataclass(frozen=True, eq=False)
+class SceneCheck:
+    """What a scene gives, leaves out and makes one ask.
+
+    Args:
+        scene: its file.
+        mechanics: the case, prepared.
+        entries: what each file and table gave.
+        not_modelled: what the scene leaves out.
+        assumptions: what the numbers would rest on.
+        questions: what is unlikely about it, with the likely mistake.
+        answered: of these, what the scene answers.
+    """
+
+    scene: Path
+    mechanics: Mechanics
+    entries: tuple[Entry, ...]
+    not_modelled: tuple[str, ...]
+    assumptions: tuple[str, ...]
+    questions: tuple[str, ...]
+    answered: tuple[str, ...] = ()
+
+    def lines(self) -> list[str]:
+        """Return the check as lines of text."""
+        nothing = ["none: nothing unlikely was found; that is no proof"]
+        return [
+            f"{self.scene}: can be run",
+            *(entry.line() for entry in self.entries),
+            f"not modelled: {', '.join(self.not_modelled)}",
+            *(f"assumed: {sentence}" for sentence in self.assumptions),
+            *(f"question: {question}" for question in self.questions or nothing),
+            *self.answered,
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `tkamb check --json` prints."""
+        motion = self.mechanics.case.motion
+        return {
+            "scene": str(self.scene),
+            "frames": len(motion.time),
+            "duration_s": float(motion.time[-1] - motion.time[0]),
+            "inputs": [
+                {"part": e.part, "file": e.file and str(e.file), "found": e.found}
+                for e in self.entries
+            ],
+            "not_modelled": list(self.not_modelled),
+            "assumptions": list(self.assumptions),
+            "questions": list(self.questions),
+            "answered": list(self.answered),
+        }
+
+
+def check_scene(
+    path: str | Path,
+    overrides: dict[str, Any] | None = None,
+    begin: Callable[[str], None] = lambda stage: None,
+) -> SceneCheck:
+    """Read every file of a scene and ask what is unlikely about it; nothing is run.
+
+    The contact model is made, but not prepared: a mesh that it cannot use is found by a run.
+
+    Args:
+        path: of the scene.
+        overrides: dotted key -> value, as `tkamb.load_scene` takes them.
+        begin: is told each stage as it begins.
+
+    Raises:
+        InputError: what `tkamb run` would refuse of the scene and its files.
+    """
+    begin("reading the scene and its files")
+    scene = load_scene(path, overrides)
+    if scene.contact:
+        contact_model(scene.contact.model, scene.contact.resolution_mm, **scene.contact.options)
+        given_material(scene.insert_material)
+    case = load_case(scene)
+    begin("placing leg, patella and muscles")
+    mechanics = Mechanics(case)
+    begin("looking for what is unlikely")
+    plausibility = Plausibility(mechanics)
+    return SceneCheck(
+        Path(path),
+        mechanics,
+        inventory(mechanics),
+        (*not_modelled(case), *_beyond(case)),
+        tuple(assumptions(case)),
+        tuple(question.text for question in plausibility.questions),
+        plausibility.answered,
+    )
+
+
+def _beyond(case: Case) -> list[str]:
+    """Return what tkamb has no table for, as far as it matters to this scene."""
+    others = [] if case.scene.muscles else ["muscles other than the quadriceps"]
+    patella = ["out-of-plane motion of the patella"] if case.scene.patella else []
+    post = [] if case.post is not None else ["cam–post contact"]
+    return [*others, *patella, *post, "wear and creep (`tkamb wear`)"]

@@ -1,0 +1,304 @@
+"""The cohort's report: one page that stands by itself, groups side by side."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from tkamb.geometry.frames import Array
+from tkamb.run.maps import ContactMaps
+from tkamb.show.headline import Card
+from tkamb.show.pages import asset, policy_sources, render
+from tkamb.show.pressure_maps import TopView, draw_pressure
+from tkamb.show.style import CYCLE as COLOURS
+from tkamb.show.style import PRESSURE_MAP, legend_above, new_figure, settings, svg_text
+from tkamb.studies.cohort.outcome import Outcome
+from tkamb.studies.cohort.plan import Cohort
+from tkamb.studies.cohort.statistics import CYCLE, Group, spread
+from tkamb.units import MEGAPASCAL
+
+PACKAGE = "tkamb.studies.cohort"
+POLICY = (
+    "default-src 'none'; style-src-elem {style}; style-src-attr 'unsafe-inline'; img-src data:; "
+    "base-uri 'none'; form-action 'none'"
+)
+SHOWN = {
+    "force_total_BW": ("Tibiofemoral contact force", "BW", 2),
+    "medial_peak_pressure_MPa": ("Peak pressure, medial", "MPa", 1),
+    "lateral_peak_pressure_MPa": ("Peak pressure, lateral", "MPa", 1),
+    "medial_area_mm2": ("Contact area, medial", "mm²", 0),
+    "lateral_area_mm2": ("Contact area, lateral", "mm²", 0),
+    "quadriceps_N": ("Quadriceps tension", "N", 0),
+}
+"""Column -> title, unit and digits."""
+AT_ONCE = len(COLOURS)
+"""Groups in one plot."""
+
+
+@dataclass(frozen=True)
+class CohortReportSettings:
+    """How much a cohort's page shows."""
+
+    most_maps: int = 24
+    """Pressure maps on the page; more make it slow to open."""
+    most_failed: int = 100
+    """Failed runs that the page lists."""
+
+
+COHORT_REPORT = CohortReportSettings()
+
+
+def cohort_html(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> str:
+    """Return the report as HTML."""
+    style = asset("tkamb.show", "report.css")
+    return render(
+        PACKAGE,
+        "cohort.html",
+        policy=POLICY.format(style=policy_sources(style)),
+        style=style,
+        title=cohort.table.title,
+        subtitle=_subtitle(cohort, outcomes),
+        cards=_cards(cohort, outcomes, groups),
+        headings=[SHOWN[name][:2] for name in _there(groups)],
+        rows=[_row(group, _there(groups)) for group in groups],
+        plots=list(_plots(groups)),
+        maps=_maps(cohort, outcomes, groups),
+        failed=_failed(cohort, outcomes)[: COHORT_REPORT.most_failed],
+        failed_count=sum(bool(one.reason) for one in outcomes.values()),
+    )
+
+
+def _there(groups: Sequence[Group]) -> list[str]:
+    return [name for name in SHOWN if any(name in group.peaks for group in groups)]
+
+
+def _subtitle(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> str:
+    parts = []
+    for axis in ("subject", "trial", "design", "contact"):
+        count = len({cohort.runs[n].labels[axis] for n in outcomes} - {""})
+        if count:
+            parts.append(f"{count} {axis}{'s' if count > 1 else ''}")
+    groups = ", ".join(cohort.group_by) or "nothing: one group"
+    return f"{' × '.join(parts)}; grouped by {groups}"
+
+
+def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> list[Card]:
+    failed = sum(bool(one.reason) for one in outcomes.values())
+    frames = sum(len(one.status) for one in outcomes.values())
+    lost = sum(one.failed_frames for one in outcomes.values())
+    detail = f"{failed} failed: listed at the end" if failed else "none failed"
+    found = [
+        Card("Runs computed", f"{len(outcomes) - failed} of {len(outcomes)}", detail, failed > 0)
+    ]
+    words = "no numbers in those that failed" if lost else "none failed"
+    if flagged := sum(one.flagged_frames for one in outcomes.values()):
+        words += f"; {flagged} to be read with care, see their status in cohort.parquet"
+    found.append(Card("Frames computed", f"{frames - lost} of {frames}", words, lost > 0))
+    name = "force_total_BW"
+    means = {
+        group.name: float(np.nanmean(group.peaks[name])) for group in groups if name in group.peaks
+    }
+    if not means:
+        return found
+    low, high = (f(means, key=lambda group: means[group]) for f in (min, max))
+    value, detail = f"{means[low]:.2f}–{means[high]:.2f} BW", f"least {low}, most {high}"
+    if f"{means[low]:.2f}" == f"{means[high]:.2f}":
+        value, detail = f"{means[low]:.2f} BW", "alike in all groups"
+    found.append(Card("Peak contact force", value, f"mean of the runs' peaks: {detail}"))
+    if cohort.table.wear is not None:
+        found.append(_wear_card(outcomes, groups))
+    return found
+
+
+def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card:
+    """Return each group's worn volume, its range by the wear factor, and what other laws say."""
+    lost = sum(bool(one.wear_problem) for one in outcomes.values())
+    parts = []
+    for group in groups:
+        if "volume_mm3_per_Mc" not in group.wear:
+            continue
+        ends = ("volume_mm3_per_Mc", "volume_mm3_per_Mc_low", "volume_mm3_per_Mc_high")
+        mean, low, high = (float(np.nanmean(group.wear[name])) for name in ends)
+        laws = ", ".join(
+            f"{name.removeprefix('first_').removesuffix('_mm3_per_Mc')} {np.nanmean(values):.3g}"
+            for name, values in group.wear.items()
+            if name.startswith("first_")
+        )
+        parts.append(
+            f"{group.name} {mean:.3g} ({low:.3g} to {high:.3g} by the wear factor; {laws})"
+        )
+    told = "mean of the runs, mm³ per million cycles: " + "; ".join(parts or ["none"])
+    told += (
+        ". By archard and cross-shear the contact area cancels: the volume hardly follows the "
+        "design's conformity. A difference that only one law shows is that law's"
+    )
+    if lost:
+        told += f". {lost} runs have none, see wear_failed in runs.csv"
+    return Card("Worn volume", f"{len(outcomes) - lost} of {len(outcomes)} runs", told, lost > 0)
+
+
+def _row(group: Group, names: Sequence[str]) -> list[str]:
+    """Return a group's line of the table: how many runs, and the peaks."""
+    cells = [group.name, str(len(group.numbers)), str(group.failed or "")]
+    for name in names:
+        over = spread(group.peaks.get(name, np.array([np.nan]))[:, None])
+        digits = SHOWN[name][2]
+        if not over.runs.sum():
+            cells.append("–")
+            continue
+        text = f"{over.mean[0]:.{digits}f}"
+        if over.runs[0] > 1:
+            text += (
+                f" ± {over.sd[0]:.{digits}f} ({over.low[0]:.{digits}f}–{over.high[0]:.{digits}f})"
+            )
+        cells.append(text)
+    return cells
+
+
+def _plots(groups: Sequence[Group]) -> Any:
+    """Yield plots per quantity and axis, each of so many groups as one can tell apart."""
+    for name in _there(groups):
+        for axis in dict.fromkeys(group.axis for group in groups):
+            own = [group for group in groups if group.axis == axis and name in group.bins]
+            highest = max(_highest(group, name) for group in own) if own else 0.0
+            for place, (words, part) in enumerate(_told_apart(own)):
+                title = ", ".join(filter(None, (SHOWN[name][0], words)))
+                svg = svg_text(draw_groups(part, name, highest), f"{name}-{axis}-{place}")
+                yield {"title": title, "unit": SHOWN[name][1], "svg": svg}
+
+
+def _told_apart(groups: Sequence[Group]) -> list[tuple[str, dict[str, Group]]]:
+    """Return plots: what all groups of one have in common, and name -> group.
+
+    Too many for one plot are divided by the label with the fewest values that makes them few
+    enough, so that what differs in all else stands in one plot; else in their order.
+    """
+    if len(groups) > AT_ONCE:
+        values = {
+            axis: list(dict.fromkeys(group.labels[axis] for group in groups))
+            for axis in groups[0].labels
+        }
+        for axis in sorted(values, key=lambda axis: len(values[axis])):
+            parts = [[g for g in groups if g.labels[axis] == value] for value in values[axis]]
+            if 1 < max(map(len, parts)) <= AT_ONCE:
+                named = [{group.name_without(axis): group for group in part} for part in parts]
+                return list(zip(values[axis], named, strict=True))
+    starts = range(0, len(groups), AT_ONCE)
+    return [("", {group.name: group for group in groups[k : k + AT_ONCE]}) for k in starts]
+
+
+def _highest(group: Group, name: str) -> float:
+    """Return the top of a group's line and shade."""
+    over = spread(group.bins[name])
+    return float(np.nanmax(over.mean + np.nan_to_num(over.sd), initial=0.0))
+
+
+def draw_groups(groups: Mapping[str, Group], name: str, highest: float) -> Figure:
+    """Return the groups' means of a column over the motion, with one standard deviation.
+
+    Args:
+        groups: the legend's name -> group.
+        name: of the column.
+        highest: of all plots beside each other, so that they have one scale.
+    """
+    with settings():
+        figure = new_figure(5.4, 3.1)
+        axes = figure.add_subplot()
+        for (label, group), colour in zip(groups.items(), COLOURS, strict=False):
+            _draw_group(axes, group, label, name, colour)
+        cycle = next(iter(groups.values())).axis == CYCLE
+        axes.set_xlabel("cycle (%)" if cycle else "flexion (deg)")
+        axes.set_ylabel(SHOWN[name][1])
+        axes.set_ylim(0.0, 1.05 * highest or None)
+        legend_above(axes, 2 if sum(len(label) + 6 for label in groups) > 72 else 4)
+    return figure
+
+
+def _draw_group(axes: Axes, group: Group, label: str, name: str, colour: str) -> None:
+    over, middle = spread(group.bins[name]), 0.5 * (group.edges[:-1] + group.edges[1:])
+    there = over.runs > 0  # lines run on over bins that no frame falls into
+    middle, mean, sd = middle[there], over.mean[there], over.sd[there]
+    axes.plot(middle, mean, "o-", color=colour, markersize=3, label=label)
+    axes.fill_between(middle, mean - sd, mean + sd, color=colour, alpha=0.13, linewidth=0)
+
+
+def _maps(
+    cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]
+) -> dict[str, Any] | None:
+    """Return one map of each group side by side on one scale; None without contact."""
+    shown = [(group, _typical(group, outcomes)) for group in groups]
+    with_map = [(group, n) for group, n in shown if n is not None][: COHORT_REPORT.most_maps]
+    if not with_map:
+        return None
+    flexion = cohort.table.map_flexion_deg
+    frame = "The largest force" if flexion is None else f"The frame nearest to {flexion:g}°"
+    return {
+        "svg": svg_text(draw_group_maps(cohort, outcomes, with_map), "maps"),
+        "frame": frame,
+        "more": len(groups) - len(with_map),
+    }
+
+
+def _typical(group: Group, outcomes: Mapping[int, Outcome]) -> int | None:
+    """Return the run whose peak force is the group's median, of those with a map."""
+    peaks = {
+        n: float(np.nanmax(outcomes[n].columns["force_total_BW"]))
+        for n in group.numbers
+        if outcomes[n].chosen is not None
+    }
+    ordered = sorted(peaks, key=lambda n: peaks[n])
+    return ordered[(len(ordered) - 1) // 2] if ordered else None
+
+
+def draw_group_maps(
+    cohort: Cohort, outcomes: Mapping[int, Outcome], shown: Sequence[tuple[Group, int]]
+) -> Figure:
+    """Return the chosen pressure maps on one colour scale."""
+    largest = max(_pressure(outcomes[n]).max() for _, n in shown)
+    scale = Normalize(0.0, float(largest) or 1.0)
+    across = min(4, len(shown))
+    down = -(-len(shown) // across)
+    with settings():
+        figure = new_figure(11.0, down * 2.6)
+        grid = figure.subplots(down, across, squeeze=False).ravel()
+        for axes in grid:
+            axes.set_axis_off()
+        for axes, (group, n) in zip(grid, shown, strict=False):
+            chosen = outcomes[n].chosen
+            assert chosen is not None
+            maps = ContactMaps({"points_m": chosen.points, "triangles": chosen.triangles})
+            view = TopView(maps, chosen.side, chosen.lateral)
+            view.draw_insert(axes)
+            draw_pressure(axes, view, _pressure(outcomes[n]), scale)
+            view.draw_labels(axes)
+            axes.set_title(_caption(cohort, outcomes[n], group, n), fontsize=8.5)
+        bar = figure.colorbar(
+            ScalarMappable(scale, PRESSURE_MAP), ax=list(grid), fraction=0.02, pad=0.01, aspect=30
+        )
+        bar.set_label("contact pressure (MPa)")
+    return figure
+
+
+def _pressure(outcome: Outcome) -> Array:
+    assert outcome.chosen is not None
+    return outcome.chosen.pressure / MEGAPASCAL
+
+
+def _caption(cohort: Cohort, outcome: Outcome, group: Group, number: int) -> str:
+    assert outcome.chosen is not None
+    k = outcome.chosen.frame
+    flexion, force = outcome.columns["flexion_deg"][k], outcome.columns["force_total_BW"][k]
+    who = cohort.runs[number].labels["subject"]
+    return f"{group.name}\n{who + ', ' if who else ''}{flexion:.0f}°, {force:.2f} BW"
+
+
+def _failed(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> list[tuple[str, str, str]]:
+    """Return number, labels and reason of the runs that failed."""
+    return [
+        (str(n), cohort.runs[n].words(), one.reason) for n, one in outcomes.items() if one.reason
+    ]

@@ -1,0 +1,271 @@
+"""Folders of results read, held against each other, and what about them is not the same."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.run.columns import KINDS
+from tkamb.run.metrics import failed
+from tkamb.run.plug_ins import CONTACT_CODE
+from tkamb.run.results import Results
+from tkamb.run.results_folder import read_results
+from tkamb.show.axis import HorizontalAxis, horizontal_axis
+from tkamb.show.compare.pairing import Pairing, pair_frames
+
+NOT_COMPARED = ("time_s", "body_seconds", "query_seconds", "contact_seconds")
+SETTINGS = {
+    "scene": "scene file",
+    "scene_sha256": "scene (SHA-256 of all its keys)",
+    "side": "side",
+    "lateral_axis": "direction of insert z",
+    "body_mass_kg": "body mass, kg (1 BW differs)",
+    "height_mm": "body height, mm",
+    "yield_stress_MPa": "yield stress, MPa (areas above yield)",
+    "not_modelled": "not modelled",
+    "assumptions": "assumptions",
+}
+"""Keys of summary.json that are said where they differ."""
+VERSIONS = "identity"
+LARGEST_COUNT = 8
+"""Runs that one picture can hold apart by colour."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One folder of results.
+
+    Args:
+        label: short and unlike the others'.
+        folder: where it was read from.
+        results: what it holds.
+        axis: on which it is drawn.
+        pairing: where the first run's frames lie in it; None: nowhere without two answers.
+    """
+
+    label: str
+    folder: Path
+    results: Results
+    axis: HorizontalAxis
+    pairing: Pairing | None
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How one column of a run differs from the first run's: the run less the first.
+
+    Args:
+        run: label of the run.
+        column: name, with its unit.
+        max_abs: largest absolute difference.
+        percent: that, of the first run's largest absolute value; NaN where it is zero.
+        at_frame: of the first run, where it is.
+        at: the place of that frame, deg, per cent or s.
+        rms: root mean square of the differences.
+        mean: of the differences, signed.
+        frames: how many were compared.
+    """
+
+    run: str
+    column: str
+    max_abs: float
+    percent: float
+    at_frame: int
+    at: float
+    rms: float
+    mean: float
+    frames: int
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Runs beside each other; the first is what the others are held against.
+
+    Args:
+        runs: at least two.
+        kind: of the axis: "flexion", "cycle" or "time".
+        notes: what is not the same, or could not be compared, a sentence each.
+        differences: of every run but the first, column by column.
+    """
+
+    runs: tuple[Run, ...]
+    kind: str
+    notes: tuple[str, ...]
+    differences: tuple[Difference, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `tkamb compare --json` prints."""
+        return {
+            "axis": self.kind,
+            "runs": [
+                {
+                    "label": run.label,
+                    "folder": str(run.folder),
+                    "scene": run.results.summary.get("scene"),
+                    "scene_sha256": run.results.summary.get("scene_sha256"),
+                    "contact": run.results.summary.get("contact"),
+                    "frames": len(run.results),
+                    "failed_frames": int(failed(run.results).sum()),
+                    "paired": _pairing_word(run.pairing),
+                }
+                for run in self.runs
+            ],
+            "notes": list(self.notes),
+            "differences": [
+                asdict(one) | {"percent": one.percent if np.isfinite(one.percent) else None}
+                for one in self.differences
+            ],
+        }
+
+
+def compare_folders(folders: Sequence[str | Path], axis: str | None = None) -> Comparison:
+    """Read folders of results and hold the others against the first.
+
+    Args:
+        folders: two to eight that `tkamb run` wrote.
+        axis: "flexion", "cycle" or "time"; default: the one that all of them ask for.
+
+    Raises:
+        InputError: fewer than two or too many folders, one that holds no results, or runs that
+            ask for different axes.
+    """
+    if not 2 <= len(folders) <= LARGEST_COUNT:
+        what = f"{len(folders)} folders of results"
+        raise InputError(what, "compare", f"give two to {LARGEST_COUNT}")
+    paths = [Path(folder) for folder in folders]
+    read = [read_results(path) for path in paths]
+    for path, results in zip(paths, read, strict=True):
+        if not len(results):
+            raise InputError("holds no frame", path, "run it again: tkamb run")
+    kind = axis or _common_axis(paths, read)
+    axes = [horizontal_axis(results, kind) for results in read]
+    runs = tuple(
+        Run(label, path, results, own, pair_frames(read[0], axes[0], results, own))
+        for label, path, results, own in zip(_labels(paths), paths, read, axes, strict=True)
+    )
+    found = [one for run in runs[1:] for one in differences(runs[0], run)]
+    return Comparison(runs, kind, tuple(_notes(runs)), tuple(found))
+
+
+def _common_axis(paths: Sequence[Path], read: Sequence[Results]) -> str:
+    kinds = [str(results.summary.get("axis") or "flexion") for results in read]
+    for path, kind in zip(paths, kinds, strict=True):
+        if kind != kinds[0]:
+            what = f"is drawn over {kind}, {paths[0]} over {kinds[0]}"
+            raise InputError(what, path, "choose one with --axis flexion, cycle or time")
+    return kinds[0]
+
+
+def _labels(paths: Sequence[Path]) -> list[str]:
+    """Return the folders' names, with as many of their parents as tell them apart."""
+    parts = [path.resolve().parts for path in paths]
+    for count in range(1, max(map(len, parts)) + 1):
+        labels = ["/".join(part[-count:]) for part in parts]
+        if len(set(labels)) == len(labels):
+            return labels
+    return [f"{path} ({k})" for k, path in enumerate(paths, 1)]  # one folder, given twice
+
+
+def differences(first: Run, run: Run) -> list[Difference]:
+    """Return how the columns that both runs model differ; none where frames do not pair.
+
+    A frame that failed in one of them holds NaN there and is not compared.
+    """
+    if run.pairing is None:
+        return []
+    found = []
+    for column, values in first.results.columns.items():
+        if KINDS.get(column, "number") != "number" or column in NOT_COMPARED:
+            continue
+        if column not in run.results.columns:
+            continue
+        off = run.pairing.values(run.results[column]) - values
+        if not np.isfinite(off).any():
+            continue
+        worst = int(np.nanargmax(np.abs(off)))
+        largest = float(np.nanmax(np.abs(values)))
+        found.append(
+            Difference(
+                run.label,
+                column,
+                float(abs(off[worst])),
+                100.0 * float(abs(off[worst])) / largest if largest > 0 else float("nan"),
+                worst,
+                float(first.axis.values[worst]),
+                float(np.sqrt(np.nanmean(off**2))),
+                float(np.nanmean(off)),
+                int(np.isfinite(off).sum()),
+            )
+        )
+    return found
+
+
+def _notes(runs: Sequence[Run]) -> list[str]:
+    """Return what a reader must know before comparing, a sentence each."""
+    notes = []
+    for key, words in SETTINGS.items():
+        notes += _unlike(runs, words, [run.results.summary.get(key) for run in runs])
+    tables = [run.results.summary.get("contact") or {} for run in runs]
+    for key in sorted({key for table in tables for key in table}):
+        notes += _unlike(runs, f"contact, {key}", [_whole(table.get(key)) for table in tables])
+    for code in ("code of tkamb", CONTACT_CODE):
+        codes = [(run.results.summary.get(VERSIONS) or {}).get(code) for run in runs]
+        notes += _unlike(runs, code, codes)
+    for run in runs:
+        notes += _frames_note(runs[0], run)
+    return notes
+
+
+def _unlike(runs: Sequence[Run], words: str, values: Sequence[Any]) -> list[str]:
+    """Return one sentence if the values are not all the same."""
+    if all(value == values[0] for value in values):
+        return []
+    if all(isinstance(value, list) for value in values):
+        shared = set(values[0]).intersection(*values)
+        values = [[item for item in value if item not in shared] for value in values]
+    listed = "; ".join(f"{run.label}: {_shown(v)}" for run, v in zip(runs, values, strict=True))
+    return [f"Not the same {words}. {listed}."]
+
+
+def _whole(value: Any) -> Any:
+    """Return a list of names as one text, in an order of its own: all of it is said."""
+    return (", ".join(sorted(value)) or "nothing") if isinstance(value, list) else value
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, value)) or "nothing"
+    text = (
+        "not given" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+    )
+    return text[:12] + "…" if len(text) == 64 else text
+
+
+def _frames_note(first: Run, run: Run) -> list[str]:
+    lost, count = int(failed(run.results).sum()), len(run.results)
+    notes = [f"{run.label}: {lost} of {count} frames failed and are not compared."] if lost else []
+    if run is first:
+        return notes
+    if run.pairing is None:
+        return [
+            *notes,
+            f"{run.label}: no differences from {first.label}: other frames, and the "
+            f"{run.axis.kind} does not rise or fall throughout, so that a place has two answers; "
+            "try --axis time or cycle.",
+        ]
+    without = int((run.pairing.lower < 0).sum())
+    if without:
+        notes.append(f"{run.label}: {without} frames of {first.label} have no partner in it.")
+    if not run.pairing.exact:
+        notes.append(
+            f"{run.label}: other frames than {first.label}'s; it is interpolated linearly between "
+            "neighbouring frames."
+        )
+    return notes
+
+
+def _pairing_word(pairing: Pairing | None) -> str:
+    return "not" if pairing is None else "frame by frame" if pairing.exact else "interpolated"

@@ -1,0 +1,134 @@
+"""The map that follows the report's slider: every frame's pressure as bytes of one grey picture.
+
+A byte is `FRAME_MAP.rim_byte` where the contact ends, above it in contact (the run's largest
+pressure is
+255) and below it apart; the page draws between the bytes linearly and colours what lies above.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import Normalize, to_hex
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from tkamb.geometry.frames import SIDES, Array
+from tkamb.run.metrics import map_rows
+from tkamb.show.levels import pressure_levels, touched_part
+from tkamb.show.pressure_maps import TopView, place_maps, pressure_bar
+from tkamb.show.style import PRESSURE_MAP, new_figure, settings
+from tkamb.show.svg import png_address
+from tkamb.units import MEGAPASCAL
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+
+@dataclass(frozen=True)
+class FrameMapSettings:
+    """The pressure maps behind the report's frame slider."""
+
+    rim_byte: int = 64
+    """Byte of the page's picture where the contact ends; above it there is pressure."""
+    most_frames: int = 250
+    """A longer run shows, at each place of the slider, the nearest of so many maps."""
+    coarsening: int = 2
+    """The page's grid has every so-manieth point of the picture's."""
+
+
+FRAME_MAP = FrameMapSettings()
+
+
+def draw_insert(view: TopView, largest: float) -> Figure:
+    """Return the bare insert, over which the page draws, and the colours up to `largest`, MPa."""
+    with settings():
+        figure = new_figure(5.4, 3.7)
+        (axes,), beside = place_maps(figure, 1, 1, 4.0)
+        view.draw_insert(axes)
+        view.draw_labels(axes)
+        pressure_bar(figure, Normalize(0.0, largest), cax=beside)
+    return figure
+
+
+def largest_pressure(results: "Results") -> float:
+    """Return the top of the colour scale, MPa: the largest pressure, 1 where there is none."""
+    assert results.maps is not None
+    return float(np.nanmax(results.maps.pressure_Pa)) / MEGAPASCAL or 1.0
+
+
+def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
+    """Return what the page needs to draw any frame's pressure, JSON-able.
+
+    `picture` is the PNG with the frames' tiles as a data address, `across` tiles side by side,
+    each `columns` by `rows` bytes; `tile` names each frame's tile and `shown` the frame whose map
+    it is; `edges` are the left, right, bottom and top of a tile in mm on the page and `span`
+    those of the drawn insert; `centres` are the centres of pressure there, per side.
+    """
+    assert results.maps is not None
+    rows = map_rows(results)
+    frames = np.array(sorted(rows))
+    kept = frames[
+        np.unique(np.linspace(0, len(frames) - 1, FRAME_MAP.most_frames).round().astype(int))
+    ]
+    largest = largest_pressure(results) * MEGAPASCAL
+    tiles, edges = _tiles(results, view, [rows[k] for k in kept], largest)
+    across = int(np.ceil(np.sqrt(len(kept))))
+    nearest = [int(np.argmin(np.abs(kept - k))) for k in range(len(results))]
+    bottom, top = view.up_limits
+    left, right = view.across_limits
+    return {
+        "picture": _png(tiles, across),
+        "across": across,
+        "rows": tiles.shape[1],
+        "columns": tiles.shape[2],
+        "tile": nearest,
+        "shown": [int(kept[n]) for n in nearest],
+        "edges": edges,
+        "span": [left, right, bottom, top],
+        "rim": FRAME_MAP.rim_byte,
+        "largest": largest / MEGAPASCAL,
+        "colours": "".join(to_hex(one)[1:] for one in colormaps[PRESSURE_MAP](np.arange(256))),
+        "centres": {side: _centres(results, view, side) for side in SIDES},
+    }
+
+
+def _tiles(
+    results: "Results", view: TopView, rows: list[int], largest: float
+) -> tuple[NDArray[np.uint8], list[float]]:
+    """Return the bytes (frames, rows, columns), cut to all contacts, and the edges, mm."""
+    maps = results.maps
+    assert maps is not None
+    levels = pressure_levels(maps.pressure_Pa[rows], maps.gap_m[rows], view.triangles, largest)
+    found = view.grid.sample(levels, FRAME_MAP.coarsening)
+    down, over = touched_part(found.max(axis=0) > 0)
+    steps = np.clip(
+        np.round(FRAME_MAP.rim_byte + (255 - FRAME_MAP.rim_byte) * found[:, down, over]), 0, 255
+    )
+    up, across = (
+        view.grid.up[:: FRAME_MAP.coarsening][down],
+        view.grid.across[:: FRAME_MAP.coarsening][over],
+    )
+    edges = [round(float(edge), 3) for edge in (across[0], across[-1], up[-1], up[0])]
+    return steps.astype(np.uint8), edges
+
+
+def _png(tiles: NDArray[np.uint8], across: int) -> str:
+    """Return tiles, row by row, as a grey PNG in a data address."""
+    count, rows, columns = tiles.shape
+    down = -(-count // across)
+    whole = np.zeros((down * across, rows, columns), np.uint8)
+    whole[:count] = tiles
+    sheet = whole.reshape(down, across, rows, columns).swapaxes(1, 2)
+    return png_address(sheet.reshape(down * rows, across * columns))
+
+
+def _centres(results: "Results", view: TopView, side: str) -> list[list[float] | None]:
+    places: tuple[Array, Array] = view.page_coordinates(
+        results[f"{side}_cop_ap_mm"], results[f"{side}_cop_ml_mm"]
+    )
+    return [
+        [round(float(x), 2), round(float(y), 2)] if np.isfinite(x + y) else None
+        for x, y in zip(*places, strict=True)
+    ]

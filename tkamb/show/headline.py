@@ -1,0 +1,357 @@
+"""What a reader learns in the first half minute: a few cards and sentences, in plain words."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tkamb.contact.articular_edge import AT_EDGE
+from tkamb.contact.narrow import TOO_NARROW
+from tkamb.geometry.frames import Array
+from tkamb.run import metrics
+from tkamb.run.agreement import AGREEMENT
+from tkamb.run.known_errors import is_large, known_error_words
+from tkamb.show.axis import HorizontalAxis
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+BANDED = {"force_total_N": "the total", "medial_force_N": "the medial force"}
+AXIS_NAMES = {"ap": "AP", "si": "SI", "ml": "ML"}
+
+
+@dataclass(frozen=True)
+class HeadlineSettings:
+    """What the report's first lines name."""
+
+    most_inputs: int = 2
+    """How many inputs a sentence names."""
+    notable_failed_share: float = 0.05
+    """Share of samples: where more fail, the bands leave out a whole tail."""
+    residual_percent: float = 0.05
+    """%, of the SI contact force: what a search for equilibrium may leave of residuals."""
+    distant_frames_deg: float = 5.0
+    """deg: what begins between frames farther apart is said with both."""
+
+
+HEADLINE = HeadlineSettings()
+
+PRESSURE_AND_AREA = ("peak_pressure", "mean_pressure", "area")
+
+
+@dataclass(frozen=True)
+class Card:
+    """One headline number.
+
+    Args:
+        title: what it is.
+        value: the number with its unit.
+        detail: where it occurs and what it means.
+        warning: shown as something to look at.
+    """
+
+    title: str
+    value: str
+    detail: str
+    warning: bool = False
+
+    def line(self) -> str:
+        """Return the card as one line of text."""
+        return f"{self.title}: {self.value} ({self.detail})"
+
+
+def run_title(summary: Mapping[str, Any]) -> str:
+    """Return the title that a run's summary gives, or else the name of its scene."""
+    if summary.get("title"):
+        return str(summary["title"])
+    scene = Path(str(summary.get("scene") or "tkamb run"))
+    name = scene.parent.name if scene.stem == "scene" and scene.parent.name else scene.stem
+    return name.upper() if len(name) <= 3 else name.replace("_", " ").capitalize()
+
+
+PEAK_DOUBTS = {
+    AT_EDGE: "that contact reaches the edge of the insert's articular surface",
+    TOO_NARROW: "that contact is too narrow for the map, so that the peak is not resolved",
+}
+"""Flag of a frame, after "the <side> ", -> words beside the peak pressure."""
+
+
+def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
+    """Return the headline numbers that the run has."""
+    found = (
+        _questions(results),
+        _peak_force(results, axis),
+        _band(results, axis),
+        _measured(results),
+        _shares(results),
+        _peak_pressure(results, axis),
+        _post(results, axis),
+        _extensor(results, axis),
+        _residuals(results),
+        _frames(results),
+    )
+    return [card for card in found if card is not None]
+
+
+def _where(results: "Results", axis: HorizontalAxis, frame: int) -> str:
+    flexion = f"{round(results['flexion_deg'][frame]) + 0}° of flexion"
+    if axis.kind == "flexion":
+        return f"at {flexion}"
+    name = f"{axis.at(frame)} of the cycle" if axis.kind == "cycle" else axis.at(frame)
+    return f"at {name} ({flexion})"
+
+
+def _questions(results: "Results") -> Card | None:
+    questions = results.summary.get("questions") or []
+    if not questions:
+        return None
+    many = len(questions) > 1
+    detail = " ".join(f"({k}) {q}" if many else str(q) for k, q in enumerate(questions, 1))
+    return Card("Questions to answer", str(len(questions)), detail, True)
+
+
+def _peak_force(results: "Results", axis: HorizontalAxis) -> Card | None:
+    found = metrics.peak(results, "force_total_BW")
+    if found is None:
+        return None
+    share = results["force_si_N"][found.frame] / results["force_total_N"][found.frame]
+    table, band = results.summary.get("uncertainty"), results.band("force_total_BW")
+    if table and band is not None and np.isfinite(band[0, found.frame]):
+        low, middle, high = band[:, found.frame]
+        sampled = table.get("peak_force_total_BW") or {}
+        words = sampled.get("words", f"{found.value:.2f} BW as the inputs stand")
+        detail = (
+            f"median of {table['samples']} samples and 5 to 95 % of them, "
+            f"{_where(results, axis, found.frame)}; {words}"
+        )
+        return Card("Peak contact force", f"{middle:.2f} BW ({low:.2f}–{high:.2f})", detail)
+    detail = (
+        f"{results['force_total_N'][found.frame]:.0f} N {_where(results, axis, found.frame)}; "
+        f"{100 * share:.1f} % of it superior–inferior"
+    )
+    return Card("Peak contact force", f"{found.value:.2f} BW", detail)
+
+
+def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
+    """Return how sure the peak force is, what moves it, and what the band leaves out."""
+    table, peak = results.summary.get("uncertainty"), metrics.peak(results, "force_total_BW")
+    band = results.band("force_total_BW")
+    if not table or peak is None or band is None:
+        return None
+    low, middle, high = band[:, peak.frame]
+    parts = [f"5 to 95 % of {table['samples']} samples, median {middle:.2f} BW"]
+    if not np.isfinite(low):
+        why = results.why_no_band(peak.frame)
+        parts = [f"no band {_where(results, axis, peak.frame)}: {why}"]
+    parts += [
+        f"{words} varies most with {_largest(table, name)}"
+        for name, words in BANDED.items()
+        if _largest(table, name)
+    ]
+    for name, inside in table.get("measured_inside", {}).items():
+        if inside["frames"]:
+            parts.append(
+                f"the measured {name} force lies within its band in {inside['share']:.0%} of "
+                f"{inside['frames']} frames"
+            )
+    sampled = table.get("peak_force_total_BW")
+    if sampled and sampled["median"] is None:
+        parts.append(sampled["words"])
+    worst, held = table["largest_failed_share"], table["not_varied"]
+    if worst > HEADLINE.notable_failed_share:
+        why = "".join(f", most often: {text}" for text in [*table.get("causes_of_failure", ())][:1])
+        parts.append(f"in up to {worst:.0%} of the samples a frame failed{why}")
+    if held:
+        names = ", ".join(name.replace("_", " ") for name in held)
+        parts.append(f"not varied, and so not in the band: {names}")
+    value = f"{low:.2f}–{high:.2f} BW" if np.isfinite(low) else "–"
+    return Card("How sure the peak is", value, "; ".join(parts), bool(held))
+
+
+def _largest(table: Mapping[str, Any], result: str) -> str:
+    """Return the inputs with the largest shares in a result's variance, in words."""
+    shares = (table.get("shares_of_variance") or {}).get(result) or {}
+    first = [(name, share) for name, share in shares.items() if name != "rest"][
+        : HEADLINE.most_inputs
+    ]
+    return ", ".join(f"{_plain(name)} ({share:.0%})" for name, share in first if share >= 0.01)
+
+
+def _plain(name: str) -> str:
+    return AXIS_NAMES.get(name, name.replace("_", " ").replace(".", " "))
+
+
+def _measured(results: "Results") -> Card | None:
+    """Return how far the run is from what an instrumented implant measured, with [measured]."""
+    if not results.summary.get("measured"):
+        return None
+    from tkamb.show.comparison import comparison_words
+
+    value, detail, incomplete = comparison_words(results.summary["measured"])
+    return Card("Against what was measured", value, detail, incomplete)
+
+
+def _shares(results: "Results") -> Card | None:
+    texts = {}
+    for estimate in ("deformation", "equilibrium"):
+        share = 100 * metrics.medial_share(results, estimate)
+        if np.isfinite(share).any():
+            texts[estimate] = _range(share, " %")
+    if not texts:
+        return None
+    unknown = int(metrics.split_undetermined(results).sum())
+    first = "equilibrium" if unknown and "equilibrium" in texts else next(iter(texts))
+    rest = [f"by {name} {text}" for name, text in texts.items() if name != first]
+    share = metrics.medial_share(results, "deformation" if "deformation" in texts else first)
+    alone = int(((share <= 0) | (share >= 1)).sum())
+    rest += [f"one condyle carries nothing in {alone} frame{'s' * (alone > 1)}"] if alone else []
+    apart = int((metrics.shares_apart(results) > AGREEMENT.share_difference).sum())
+    rest += [f"the two contradict each other in {apart} frame{'s' * (apart > 1)}"] if apart else []
+    rest += _adduction(results, unknown)
+    detail = "; ".join([f"by {first}, the rest lateral", *rest])
+    return Card("Medial share of the load", texts[first], detail, bool(alone or apart or unknown))
+
+
+def _adduction(results: "Results", unknown: int) -> list[str]:
+    """Return what an error of the adduction does to the split by deformation, in words."""
+    moved = metrics.moved_per_half_degree(results)
+    words = []
+    if unknown:
+        where = "in every frame" if unknown == len(results) else f"in {unknown} frames"
+        words.append(f"the split by deformation is not determined {where}")
+    if np.isfinite(moved).any():
+        text = _range(moved, " N")
+        words.append(f"± 0.5 deg of adduction moves {text} between condyles that both carry")
+    return [": ".join(words)] if words else []
+
+
+def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
+    found = metrics.peak(results, "<side>_peak_pressure_MPa")
+    if found is None:
+        return None
+    detail = f"{found.side}, {_where(results, axis, found.frame)}"
+    stress = results.summary.get("yield_stress_MPa")
+    above = metrics.peak(results, "<side>_area_above_yield")
+    if stress is not None and above is not None:
+        if above.value > 0:
+            detail += (
+                f"; up to {100 * above.value:.0f} % of the {above.side} area "
+                f"is above yield ({stress:g}\u00a0MPa)"
+            )
+        else:
+            detail += f"; never above yield ({stress:g}\u00a0MPa)"
+    error = results.summary.get("known_error")
+    if error is not None:
+        detail += f"; {_model(results)} {known_error_words(error, PRESSURE_AND_AREA)}"
+    doubt = _doubt_of_peak(results, found.side, found.frame)
+    if doubt:
+        detail += f"; {doubt}"
+    large = bool(doubt) or (error is not None and is_large(error, PRESSURE_AND_AREA))
+    return Card("Peak contact pressure", f"{found.value:.1f} MPa", detail, large)
+
+
+def _doubt_of_peak(results: "Results", side: str | None, frame: int) -> str:
+    """Return in words why the peak pressure of a condyle at a frame is in doubt; "" if it is not.
+
+    A run's status tells the flags of each frame.
+    """
+    status = str(results.status[frame])
+    words = [word for flag, word in PEAK_DOUBTS.items() if f"the {side} {flag}" in status]
+    return ", and ".join(words)
+
+
+def _post(results: "Results", axis: HorizontalAxis) -> Card | None:
+    """Return the cam's largest force on the post and the pressure there, with [contact] post."""
+    found = metrics.peak(results, "post_force_N") if "post_force_N" in results.columns else None
+    if found is None:
+        return None
+    if found.value <= 0:
+        return Card("Peak force on the post", "none", "cam and post stay apart")
+    pressure = metrics.peak(results, "post_peak_pressure_MPa")
+    detail = f"{found.value:.0f} N {_where(results, axis, found.frame)}"
+    if pressure is not None:
+        detail += f"; up to {pressure.value:.1f}\u00a0MPa there, error not measured"
+    value = f"{found.value / metrics.body_weight(results):.2f} BW"
+    return Card("Peak force on the post", value, detail)
+
+
+def _model(results: "Results") -> str:
+    table = results.summary.get("contact") or {}
+    return f"{table.get('model', 'the contact model')} at {table.get('resolution_mm', 0.0):g} mm:"
+
+
+def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:
+    found = metrics.peak(results, "quadriceps_N")
+    if found is None:
+        return None
+    value = found.value / metrics.body_weight(results)
+    ligament = _range(metrics.tension_ratio(results, "patellar_ligament_N"), "", 2)
+    patella = _range(metrics.tension_ratio(results, "patellofemoral_N"), "", 2)
+    detail = f"{_where(results, axis, found.frame)}; over the quadriceps: patellar ligament (PL/Q) "
+    detail += f"{ligament}, patellofemoral force (PF/Q) {patella}"
+    if "first_wrapping_flexion_deg" in results.summary:
+        first = results.summary["first_wrapping_flexion_deg"]
+        detail += "; wraps nowhere" if first is None else f"; {_wraps_from(results, first)}"
+    slope = results.columns.get("quadriceps_per_dome_mm_N")
+    if slope is not None and np.isfinite(slope[found.frame]) and found.value > 0:
+        percent = 100 * abs(slope[found.frame]) / found.value
+        detail += f"; ± {percent:.1f} % per mm of the button's height on the patella"
+    return Card("Peak quadriceps tension", f"{value:.2f} BW", detail)
+
+
+def _wraps_from(results: "Results", first: float) -> str:
+    """Return where the quadriceps begins to wrap, as well as the frames tell it."""
+    flexion, wrap = results["flexion_deg"], results["quadriceps_wrap_deg"]
+    last = max(flexion[(wrap == 0.0) & (flexion < first)], default=first)
+    if first - last > HEADLINE.distant_frames_deg:
+        return f"begins to wrap the femur between {last:.0f}° and {first:.0f}°"
+    return f"wraps the femur from {first:.0f}°"
+
+
+def _residuals(results: "Results") -> Card | None:
+    share = 100 * metrics.residual_share(results)
+    if not np.isfinite(share).any():
+        return None
+    released = (results.summary.get("contact") or {}).get("released") or ()
+    if {"ap", "ml", "axial_rotation"} <= set(released) and np.nanmax(
+        share
+    ) < HEADLINE.residual_percent:
+        at_rest = "AP, ML and axial rotation are released: what they need is part of the solution"
+        return Card("Residual force", "none", at_rest)
+    middle = f"{np.nanmedian(share):.1f} %"
+    detail = f"median over the frames, at most {np.nanmax(share):.1f} %, of the SI contact force"
+    change = 100 * metrics.residual_effect(results)
+    if np.isfinite(change).any():
+        largest = np.nanmax(change)
+        detail += f"; acting 10 mm higher or lower changes the total by ≤ {largest:.1f} % of it"
+    axial = np.abs(results["residual_axial_Nm"])
+    if np.isfinite(axial).any():
+        detail += f"; and a residual axial moment of up to {np.nanmax(axial):.1f}\u00a0N·m"
+    return Card(
+        "Residual force",
+        middle,
+        detail,
+        bool(np.nanmax(share) > 100 * AGREEMENT.large_residual_share),
+    )
+
+
+def _frames(results: "Results") -> Card:
+    failed = int(metrics.failed(results).sum())
+    flagged = int(metrics.flagged(results).sum())
+    value = f"{len(results) - failed} of {len(results)}"
+    if failed or flagged:
+        words = [f"{failed} failed (no numbers)"] if failed else []
+        words += [f"{flagged} to be read with care"] if flagged else []
+        detail = "; ".join(words) + ": why is in the report's table and in column status"
+    else:
+        detail = "none failed, none flagged"
+    return Card("Frames computed", value, detail, bool(failed or flagged))
+
+
+def _range(values: Array, unit: str, digits: int = 0) -> str:
+    if not np.isfinite(values).any():
+        return "–"
+    low, high = f"{np.nanmin(values):.{digits}f}", f"{np.nanmax(values):.{digits}f}"
+    return f"{low}{unit}" if low == high else f"{low}–{high}{unit}"

@@ -1,0 +1,241 @@
+"""The report's section on muscles: activations beside EMG, forces, and what they do to the knee."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from tkamb.geometry.frames import Array
+from tkamb.run.columns import (
+    ACTIVATION,
+    CONTRIBUTIONS,
+    ENVELOPE,
+    MUSCLE_FORCE,
+    family_column,
+)
+from tkamb.run.metrics import body_weight
+from tkamb.show.axis import HorizontalAxis
+from tkamb.show.panels import Line, Panel
+from tkamb.show.places import LABEL_PLACE, label_width, leave_unmeasured, overhang, set_place
+from tkamb.show.style import (
+    BLACK,
+    GREY,
+    LIGAMENT,
+    LIST,
+    QUADRICEPS,
+    new_figure,
+    settings,
+)
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+GROUP_COLOURS = (QUADRICEPS, *LIST, GREY, GREY)
+EXTERNAL, LIGAMENTS, POST, EXTENSORS = "external", "ligaments", "post", "quadriceps"
+"""Contributions beside those of single muscles."""
+HELD = (
+    "What makes a force: each load alone in the frame's equations, with pose, contact points and "
+    "normals, friction's direction and all lines of action held; they sum up to the force by "
+    "equilibrium. What a muscle alone leaves unbalanced in flexion is carried by a moment. "
+    "External loads: weight, inertia and ground. Muscles are grouped by the bones that they end on."
+)
+HIGHEST = 1.02
+"""Of the activations' axis."""
+CELL, CELLS_ACROSS, MARGIN = (2.16, 1.12), 5, 0.3
+"""Inches: width and height of a small plot; how many stand beside each other; for the labels."""
+BETWEEN, LABELS = (11.5, 20.0), 10.0
+"""Points between two small plots, beside each other at least and below each other; for the
+horizontal axis' labels over an empty place."""
+FOOT, TITLE = 33.5, 11.5
+"""Points under all small plots, and over them."""
+SHADE = "#c4c4c4"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One small plot of activations.
+
+    Args:
+        title: the muscle, or the channel of several and how many they are.
+        muscles: whose activations are drawn.
+        envelope: the muscle whose EMG stands behind; None: there is none.
+    """
+
+    title: str
+    muscles: tuple[str, ...]
+    envelope: str | None
+
+
+def muscle_panels(results: "Results") -> tuple[Panel, ...]:
+    """Return the plots of what makes either condyle's force, and of the forces by group."""
+    made = (
+        *(_contributions(results, side) for side in CONTRIBUTIONS),
+        _forces(results),
+    )
+    return tuple(panel for panel in made if panel.lines)
+
+
+def _groups(results: "Results") -> dict[str, tuple[str, ...]]:
+    found: Mapping[str, Any] = results.summary.get("muscle_groups") or {}
+    return {group: tuple(names) for group, names in found.items()}
+
+
+def _colours(results: "Results") -> dict[str, str]:
+    return dict(zip(_groups(results), GROUP_COLOURS, strict=False))
+
+
+def _forces(results: "Results") -> Panel:
+    scale, colours = 1 / body_weight(results), _colours(results)
+    lines = tuple(
+        Line(f"group-{k}", group, scale * total, colours[group])
+        for k, (group, names) in enumerate(_groups(results).items())
+        if np.isfinite(total := _sum(results, MUSCLE_FORCE, names)).any()
+    )
+    return Panel("muscle_forces", "Muscle forces by group", "BW", lines)
+
+
+def _contributions(results: "Results", side: str) -> Panel:
+    family, scale, colours = CONTRIBUTIONS[side], 1 / body_weight(results), _colours(results)
+    total = results[f"{side}_force_equilibrium_N"]
+    parts = {name: (name,) for name in (EXTERNAL, LIGAMENTS, POST)} | _groups(results)
+    labels = {EXTERNAL: "external loads"}
+    shades = {EXTERNAL: GREY, LIGAMENTS: LIGAMENT, POST: BLACK} | colours
+    lines = [Line("all", "all", scale * total, BLACK)]
+    for k, (part, names) in enumerate(parts.items()):
+        own = (EXTENSORS,) if part == "knee extensors" else names
+        values = _sum(results, family, own)
+        if np.isfinite(values).any():
+            dashed = part in (EXTERNAL, LIGAMENTS, POST)
+            label = labels.get(part, part)
+            lines.append(Line(f"part-{k}", label, scale * values, shades[part], dashed))
+    panel = Panel(f"from_{side}", f"What makes the {side} force", "BW", tuple(lines))
+    return panel if len(lines) > 1 else Panel(panel.name, panel.title, "BW", ())
+
+
+def _sum(results: "Results", family: str, names: tuple[str, ...]) -> Array:
+    """Return the sum (f,) of a family's columns, of those that are there; NaN without any."""
+    columns = [family_column(family, name) for name in names]
+    there = [results[name] for name in columns if name in results.columns]
+    return np.sum(there, axis=0) if there else np.full(len(results), np.nan)
+
+
+def activation_cells(results: "Results") -> list[Cell]:
+    """Return the small plots: each muscle across the knee, and the others by EMG channel."""
+    emg: Mapping[str, Any] = (results.summary.get("emg") or {}).get("muscles", {})
+    cells: list[Cell] = []
+    for group, names in _groups(results).items():
+        across = group == "knee extensors" or any(
+            family_column(CONTRIBUTIONS["medial"], name) in results.columns for name in names
+        )
+        if across:
+            cells += [Cell(name, (name,), name if name in emg else None) for name in names]
+            continue
+        channels: dict[str, tuple[str, ...]] = {}
+        for name in names:
+            if name in emg:
+                channel = emg[name]["channel"]
+                channels[channel] = (*channels.get(channel, ()), name)
+        cells += [
+            Cell(own[0] if len(own) == 1 else f"{channel} ({len(own)})", own, own[0])
+            for channel, own in channels.items()
+        ]
+    return cells
+
+
+def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
+    """Return small plots of the activations, EMG shaded behind them; None without any."""
+    cells = activation_cells(results)
+    if not cells:
+        return None
+    rows = -(-len(cells) // CELLS_ACROSS)
+    with settings():
+        figure = new_figure(CELLS_ACROSS * CELL[0], rows * CELL[1] + MARGIN)
+        first = figure.add_axes((0, 0, 1, 1))
+        others = [figure.add_axes((0, 0, 1, 1), sharex=first, sharey=first) for _ in cells[1:]]
+        for k, (cell, axes) in enumerate(zip(cells, (first, *others), strict=True)):
+            _draw_cell(axes, cell, results, axis)
+            below = k + CELLS_ACROSS >= len(cells)
+            axes.tick_params(labelbottom=below, labelleft=k % CELLS_ACROSS == 0)
+        first.set_ylim(0, HIGHEST)
+        first.set_yticks([0, 0.5, 1])
+        low = LABEL_PLACE.edge_points / 72 / figure.get_figheight()
+        figure.supxlabel(axis.label, fontsize=LABEL_PLACE.tick_label_points, y=low, va="bottom")
+        _place_cells((first, *others), rows)
+    return figure
+
+
+def _place_cells(cells: Sequence[Axes], rows: int) -> None:
+    """Put small plots beside and below each other, with room for what stands around them."""
+    width, height = 72 * CELLS_ACROSS * CELL[0], 72 * (rows * CELL[1] + MARGIN)
+    left = LABEL_PLACE.edge_points + LABEL_PLACE.tick_points + label_width(cells[0].yaxis)
+    beyond = overhang(cells[0].xaxis, width / CELLS_ACROSS - left)
+    left, right = (
+        max(left, LABEL_PLACE.edge_points + beyond[0]),
+        LABEL_PLACE.edge_points + beyond[1],
+    )
+    gap = max(BETWEEN[0], sum(beyond) + 2 * LABEL_PLACE.edge_points)
+    labels_within = LABELS if len(cells) % CELLS_ACROSS and rows > 1 else 0.0
+    wide = (width - left - right + gap) / CELLS_ACROSS - gap
+    tall = (height - FOOT - TITLE - labels_within + BETWEEN[1]) / rows - BETWEEN[1]
+    for k, axes in enumerate(cells):
+        row, column = divmod(k, CELLS_ACROSS)
+        raised = labels_within if row < rows - 1 else 0.0
+        bottom = FOOT + (rows - 1 - row) * (tall + BETWEEN[1]) + raised
+        set_place(axes, left + column * (wide + gap), bottom, wide, tall)
+    for axes in cells:
+        leave_unmeasured(axes.xaxis)
+        leave_unmeasured(axes.yaxis)
+
+
+def _draw_cell(axes: Axes, cell: Cell, results: "Results", axis: HorizontalAxis) -> None:
+    if cell.envelope is not None:
+        x, envelope = axis.broken(results[family_column(ENVELOPE, cell.envelope)])
+        axes.fill_between(x, envelope, color=SHADE, linewidth=0)
+    for name in cell.muscles:
+        x, activation = axis.broken(results[family_column(ACTIVATION, name)])
+        axes.plot(x, activation, color=BLACK, linewidth=1.3)
+    axes.set_title(cell.title, loc="left", fontsize=8.5, pad=2)
+    said = ", ".join(filter(None, (_agreement(results, cell), _beyond(results, cell))))
+    if said:
+        axes.set_title(said, loc="right", fontsize=7.5, color=GREY, pad=2)
+
+
+def _beyond(results: "Results", cell: Cell) -> str:
+    """Return in words how far an envelope goes beyond the plot: above its normalising value."""
+    if cell.envelope is None:
+        return ""
+    envelope = results[family_column(ENVELOPE, cell.envelope)]
+    largest = float(np.nan_to_num(envelope).max(initial=0.0))
+    return f"EMG to {largest:.2g}" if largest > HIGHEST else ""
+
+
+def _agreement(results: "Results", cell: Cell) -> str:
+    """Return Pearson's r of activation and envelope in words, the range over several muscles."""
+    emg: Mapping[str, Any] = (results.summary.get("emg") or {}).get("muscles", {})
+    known = [emg[name]["pearson_r"] for name in cell.muscles if name in emg]
+    known = [r for r in known if r is not None and np.isfinite(r)]
+    if not known:
+        return ""
+    low, high = f"{min(known):.2f}", f"{max(known):.2f}"
+    return (f"r {low}" if low == high else f"r {low} to {high}").replace("-", "−")
+
+
+def reserve_words(summary: Mapping[str, Any]) -> str:
+    """Return in a sentence what no muscle carries; empty without reserves."""
+    found: Mapping[str, Any] = summary.get("reserves") or {}
+    if not found:
+        return ""
+    parts = [
+        f"{name.replace('_', ' ')} {one['largest_Nm']:.1f} N·m "
+        f"({one['percent_of_largest_moment']:.0f} %"
+        + (f", above 5 % in {n} frames)" if (n := one["frames_above_5_percent"]) else ")")
+        for name, one in found.items()
+    ]
+    return (
+        "Reserves, which no muscle carries, at most (share of the coordinate's largest moment): "
+        + "; ".join(parts)
+        + "."
+    )

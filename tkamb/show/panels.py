@@ -1,0 +1,410 @@
+"""What the report draws: the plots of a run, their lines and what they mean."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.geometry.frames import Array
+from tkamb.io.activities import PEAKS_BW, peaks_words
+from tkamb.run.columns import is_ligament, ligament_of
+from tkamb.run.known_errors import is_large, known_error_words
+from tkamb.run.metrics import (
+    body_weight,
+    lateral_axis_name,
+    medial_share,
+    residual_effect,
+    residual_share,
+    split_undetermined,
+    tension_ratio,
+)
+from tkamb.show.style import (
+    ANTERIOR,
+    BLACK,
+    GREY,
+    LIST,
+    PATELLAR_LIGAMENT,
+    PATELLOFEMORAL,
+    QUADRICEPS,
+    RIGHT,
+    SIDE_COLOURS,
+    SUPERIOR,
+)
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """One curve.
+
+    Args:
+        name: unique in its panel; a column's name, or what was made from columns.
+        label: as the legend shows it.
+        values: (f,) in the panel's unit.
+        colour: of the line.
+        dashed: drawn dashed.
+        band: (3, f) p05, p50 and p95 over samples with varied inputs, in the panel's unit; None:
+            there are none.
+        behind: drawn broad and pale behind the others: what they are held against.
+    """
+
+    name: str
+    label: str
+    values: Array
+    colour: str
+    dashed: bool = False
+    band: Array | None = None
+    behind: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One plot.
+
+    Args:
+        name: id of the plot in the page.
+        title: what it shows.
+        unit: of the vertical axis.
+        lines: its curves.
+        note: a sentence under the plot.
+        level: (value, label) of a horizontal reference line.
+        span: (low, high, label) of a shaded range behind the curves.
+        second: (factor, unit) of a second vertical axis on the right.
+        logarithmic: vertical axis.
+        from_zero: the vertical axis holds zero.
+        limits: of the vertical axis, where they are known beforehand.
+        warning: the note is something to look at.
+    """
+
+    name: str
+    title: str
+    unit: str
+    lines: tuple[Line, ...]
+    note: str = ""
+    level: tuple[float, str] | None = None
+    span: tuple[float, float, str] | None = None
+    second: tuple[float, str] | None = None
+    logarithmic: bool = False
+    from_zero: bool = True
+    limits: tuple[float, float] | None = None
+    warning: bool = False
+
+
+def panels(results: "Results") -> tuple[Panel, ...]:
+    """Return the plots whose numbers the run has, in the report's order."""
+    makers: tuple[Callable[[Results], Panel], ...] = (
+        _total, _condyles, _share, _sensitivity, _extensor, _ratios, _areas, _pressures, _yield,
+        _post, _external, _ground, _ligaments, _residuals, _residual_moment, _hip_force,
+        _hip_moment, _motion, _slip, _adjustment, _adjustment_effect, _condition,
+    )  # fmt: skip
+    made = (_without_empty_lines(make(results)) for make in makers)
+    return tuple(panel for panel in made if panel.lines)
+
+
+def _without_empty_lines(panel: Panel) -> Panel:
+    """Return the panel with only the lines that hold a number."""
+    lines = tuple(line for line in panel.lines if np.isfinite(line.values).any())
+    return replace(panel, lines=lines)
+
+
+def _line(
+    results: "Results",
+    column: str,
+    label: str,
+    colour: str,
+    dashed: bool = False,
+    scale: float = 1.0,
+) -> Line:
+    values = results.columns.get(column, np.full(len(results), np.nan))
+    band = results.band(column)
+    return Line(
+        column, label, values * scale, colour, dashed, None if band is None else band * scale
+    )
+
+
+def _components(results: "Results", stem: str, unit: str, scale: float = 1.0) -> tuple[Line, ...]:
+    right = lateral_axis_name(results)
+    return (
+        _line(results, f"{stem}_si_{unit}", "superior", SUPERIOR, scale=scale),
+        _line(results, f"{stem}_ap_{unit}", "anterior", ANTERIOR, scale=scale),
+        _line(results, f"{stem}_ml_{unit}", right, RIGHT, scale=scale),
+    )
+
+
+def _both_sides(
+    results: "Results", column: str, label: str = "", dashed: bool = False, scale: float = 1.0
+) -> tuple[Line, ...]:
+    return tuple(
+        _line(results, f"{side}_{column}", f"{side}{label}", colour, dashed, scale)
+        for side, colour in SIDE_COLOURS.items()
+    )
+
+
+def _total(results: "Results") -> Panel:
+    scale = 1 / body_weight(results)
+    total = _line(results, "force_total_BW", "total", BLACK)
+    parts = _components(results, "force", "N", scale)
+    lines = (total, replace(parts[0], label="superior–inferior", dashed=True), *parts[1:])
+    lines += (_measured(results, "total", "measured, axial", BLACK),)
+    note = "On the insert; SI positive in compression. Residuals are not included."
+    activity, span = results.summary.get("activity"), None
+    if activity in PEAKS_BW:
+        found = PEAKS_BW[activity].values()
+        span = (min(found), max(found), "in vivo")
+        note += " " + peaks_words(activity)
+    return Panel("forces", "Tibiofemoral contact force", "BW", lines, note, span=span)
+
+
+def _condyles(results: "Results") -> Panel:
+    scale = 1 / body_weight(results)
+    lines = (
+        *_both_sides(results, "force_N", ", deformation", scale=scale),
+        *_both_sides(results, "force_equilibrium_N", ", equilibrium", dashed=True, scale=scale),
+        *(_measured(results, s, f"{s}, measured", colour) for s, colour in SIDE_COLOURS.items()),
+    )
+    note = (
+        "Deformation: the total load is pressed in at the measured rotation. "
+        "Equilibrium: balance of coronal moments."
+    )
+    return Panel("condyles", "Medial and lateral force, two estimates", "BW", lines, note)
+
+
+def _measured(results: "Results", name: str, label: str, colour: str) -> Line:
+    line = _line(results, f"measured_{name}_N", label, colour, scale=1 / body_weight(results))
+    return replace(line, behind=True)
+
+
+def _share(results: "Results") -> Panel:
+    lines = (
+        Line("deformation", "by deformation", medial_share(results, "deformation"), BLACK),
+        Line("equilibrium", "by equilibrium", medial_share(results, "equilibrium"), GREY, True),
+    )
+    title, unit = "Medial share of the load", "medial / (medial + lateral)"
+    panel = Panel("share", title, unit, lines, level=(0.5, "even"), limits=(0.0, 1.0))
+    unknown = int(split_undetermined(results).sum())
+    if not unknown:
+        return panel
+    note = (
+        f"By deformation not determined in {unknown} of {len(results)} frames: 0.5 deg of "
+        "adduction moves more than a quarter of the load, or one condyle alone carries it."
+    )
+    return replace(panel, note=note, warning=True)
+
+
+def _sensitivity(results: "Results") -> Panel:
+    name = "medial_force_per_adduction_N_per_deg"
+    lines = (_line(results, name, "medial force", BLACK),)
+    note = (
+        "Change of the medial force by deformation with the adduction, at constant load. "
+        "Fluoroscopy knows the adduction to about 0.5 deg."
+    )
+    return Panel("sensitivity", "Sensitivity of the split to adduction", "N/deg", lines, note)
+
+
+def _extensor(results: "Results") -> Panel:
+    scale = 1 / body_weight(results)
+    tangential = ("patellofemoral_tangential_N", "patellofemoral, tangential", PATELLOFEMORAL, True)
+    lines = (
+        _line(results, "quadriceps_N", "quadriceps", QUADRICEPS, scale=scale),
+        _line(results, "patellar_ligament_N", "patellar ligament", PATELLAR_LIGAMENT, scale=scale),
+        _line(results, "patellofemoral_N", "patellofemoral", PATELLOFEMORAL, scale=scale),
+        _line(results, *tangential, scale=scale),
+    )
+    return Panel("extensor", "Extensor mechanism", "BW", lines)
+
+
+def _ratios(results: "Results") -> Panel:
+    ligament = tension_ratio(results, "patellar_ligament_N")
+    patella = tension_ratio(results, "patellofemoral_N")
+    lines = (
+        Line("PL/Q", "patellar ligament, PL/Q", ligament, PATELLAR_LIGAMENT),
+        Line("PF/Q", "patellofemoral, PF/Q", patella, PATELLOFEMORAL),
+    )
+    note = (
+        "PL/Q: tension of the patellar ligament over that of the quadriceps; PF/Q: patellofemoral."
+    )
+    return Panel("ratios", "Ratios to the quadriceps tension", "force / quadriceps", lines, note)
+
+
+def _areas(results: "Results") -> Panel:
+    lines = _both_sides(results, "area_mm2")
+    return _with_known_error(results, Panel("areas", "Contact area", "mm²", lines), ("area",))
+
+
+def _with_known_error(results: "Results", panel: Panel, names: tuple[str, ...]) -> Panel:
+    """Return the panel with what its contact model is known to be off by."""
+    error = results.summary.get("known_error")
+    if error is None:
+        return panel
+    words = known_error_words(error, names)
+    note = f"{words[0].upper()}{words[1:]}."
+    return replace(panel, note=note, warning=is_large(error, names))
+
+
+def centre_panel(results: "Results") -> Panel:
+    """Return the anterior positions of the centres of pressure over the motion."""
+    lines = _both_sides(results, "cop_ap_mm")
+    title = "Anterior position of the centres of pressure"
+    note = "Insert x; zero is the middle of its bottom."
+    return _without_empty_lines(Panel("centres", title, "mm", lines, note))
+
+
+def _pressures(results: "Results") -> Panel:
+    lines = (
+        *_both_sides(results, "peak_pressure_MPa", ", peak"),
+        *_both_sides(results, "mean_pressure_MPa", ", mean", dashed=True),
+    )
+    stress = results.summary.get("yield_stress_MPa")
+    level = None if stress is None else (float(stress), f"yield {stress:g} MPa")
+    panel = Panel("pressures", "Contact pressure", "MPa", lines, level=level)
+    return _with_known_error(results, panel, ("peak_pressure", "mean_pressure"))
+
+
+def _yield(results: "Results") -> Panel:
+    lines = _both_sides(results, "area_above_yield", scale=100)
+    if not any(np.nanmax(line.values, initial=0) > 0 for line in lines):
+        lines = ()
+    return Panel("above_yield", "Contact area above yield", "% of the condyle's area", lines)
+
+
+def _post(results: "Results") -> Panel:
+    scale, right = 1 / body_weight(results), lateral_axis_name(results)
+    lines = (
+        _line(results, "post_force_N", "total", BLACK, scale=scale),
+        _line(results, "post_force_ap_N", "anterior", ANTERIOR, scale=scale),
+        _line(results, "post_force_si_N", "inferior", SUPERIOR, scale=scale),
+        _line(results, "post_force_ml_N", right, RIGHT, scale=scale),
+    )
+    note = "On the insert, without friction; the contact force holds it."
+    return Panel("post", "Force of the cam on the post", "BW", lines, note)
+
+
+def _external(results: "Results") -> Panel:
+    lines = (
+        _line(results, "external_flexion_moment_Nm", "flexing", RIGHT),
+        _line(results, "external_adduction_moment_Nm", "adducting", ANTERIOR),
+    )
+    height = results.summary.get("height_mm")
+    second = None
+    if height:
+        second = (100 / (body_weight(results) * float(height) * 1e-3), "% BW·height")
+    return Panel("external", "External knee moments", "N·m", lines, second=second)
+
+
+def _ground(results: "Results") -> Panel:
+    lines = _components(results, "ground_reaction", "N", 1 / body_weight(results))
+    return Panel("ground", "Ground reaction along the insert axes", "BW", lines)
+
+
+def _ligaments(results: "Results") -> Panel:
+    names = [name for name in results.columns if is_ligament(name)]
+    bundles: dict[str, list[str]] = {}
+    for name in names:
+        own = ligament_of(name)
+        bundle = own.rstrip("0123456789").rstrip("_") if len(names) > len(LIST) else own
+        bundles.setdefault(bundle or own, []).append(name)
+    lines = tuple(
+        _bundle(results, bundle, strands, k) for k, (bundle, strands) in enumerate(bundles.items())
+    )
+    summed = len(bundles) < len(names)
+    note = f"{len(names)} strands; those that differ in a number only are summed." if summed else ""
+    return Panel("ligaments", "Ligament tension", "N", lines, note)
+
+
+def _bundle(results: "Results", bundle: str, strands: Sequence[str], position: int) -> Line:
+    """Return the summed tension of strands; NaN only where all of them are."""
+    tension = np.array([results[name] for name in strands])
+    missing = np.isnan(tension).all(axis=0)
+    values = np.where(missing, np.nan, np.nansum(tension, axis=0))
+    colour = LIST[position % len(LIST)]
+    label = bundle.replace("_", " ") + (f" ({len(strands)})" if len(strands) > 1 else "")
+    name = strands[0] if len(strands) == 1 else bundle
+    return Line(name, label, values, colour, position >= len(LIST))
+
+
+def _residuals(results: "Results") -> Panel:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        percent = 100 / np.abs(results["force_si_N"])
+        lines = (
+            Line("size", "magnitude", 100 * residual_share(results), BLACK),
+            Line("ap", "anterior", results["residual_ap_N"] * percent, ANTERIOR),
+            Line("ml", lateral_axis_name(results), results["residual_ml_N"] * percent, RIGHT),
+            Line(
+                "effect",
+                "effect of ±10 mm on the total",
+                100 * residual_effect(results),
+                GREY,
+                True,
+            ),
+        )
+    note = (
+        "Forces that balance needs beyond the modelled loads; an exact model has none. "
+        "Dashed: change of the total contact force when they act 10 mm higher or lower."
+    )
+    return Panel("residuals", "Residual forces", "% of the SI contact force", lines, note)
+
+
+def _residual_moment(results: "Results") -> Panel:
+    lines = (
+        _line(results, "residual_axial_Nm", "axial", SUPERIOR),
+        _line(results, "residual_coronal_Nm", "coronal, one condyle off", ANTERIOR),
+        _line(results, "residual_flexion_Nm", "flexion, no quadriceps", RIGHT),
+    )
+    return Panel("residual_moment", "Residual moments", "N·m", lines)
+
+
+def _hip_force(results: "Results") -> Panel:
+    lines = _components(results, "hip_force", "N", 1 / body_weight(results))
+    return Panel("hip_force", "Intersegmental force on the femur at the hip", "BW", lines)
+
+
+def _hip_moment(results: "Results") -> Panel:
+    lines = _components(results, "hip_moment", "Nm")
+    note = "About the axes named; what muscles across the hip do is in it."
+    return Panel("hip_moment", "Intersegmental moment on the femur at the hip", "N·m", lines, note)
+
+
+def _motion(results: "Results") -> Panel:
+    lines = [
+        _line(results, "adduction_deg", "adduction", ANTERIOR),
+        _line(results, "axial_rotation_deg", "axial rotation", SUPERIOR),
+    ]
+    if results.summary.get("axis", "flexion") != "flexion":
+        lines.insert(0, _line(results, "flexion_deg", "flexion", RIGHT))
+    note = "Grood–Suntay; adduction positive in varus, axial rotation when the femur turns out."
+    return Panel("motion", "Knee rotations", "deg", tuple(lines), note)
+
+
+def _slip(results: "Results") -> Panel:
+    note = (
+        "By arcs, without the part that axial rotation alone would do: condyles of one radius "
+        "slip alike."
+    )
+    return Panel("slip", "Slip since the first frame", "mm", _both_sides(results, "slip_mm"), note)
+
+
+def _adjustment(results: "Results") -> Panel:
+    lines = (
+        _line(results, "adjust_translation_mm", "translation, mm", BLACK),
+        _line(results, "adjust_coronal_deg", "coronal angle, deg", ANTERIOR),
+    )
+    return Panel("adjustment", "Femoral adjustment before contact", "mm or deg", lines)
+
+
+def _adjustment_effect(results: "Results") -> Panel:
+    lines = (
+        _line(results, "adjust_force_change_BW", "total force, BW", BLACK),
+        _line(results, "adjust_share_change", "medial share (by equilibrium)", GREY, True),
+    )
+    note = "Adjusted less recorded pose. Frames whose total changes by over 0.01 BW are flagged."
+    return Panel("adjustment_effect", "What the adjustment changes", "BW or share", lines, note)
+
+
+def _condition(results: "Results") -> Panel:
+    lines = (_line(results, "condition_number", "condition number", BLACK),)
+    note = "How much an input error may grow in the solution (scaled columns)."
+    title = "Condition number of the equilibrium"
+    return Panel("condition", title, "–", lines, note, logarithmic=True, from_zero=False)

@@ -1,0 +1,315 @@
+"""Line plots of a run, drawn in time order against flexion, cycle or time."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import (
+    LogLocator,
+    MaxNLocator,
+    MultipleLocator,
+    NullFormatter,
+    StrMethodFormatter,
+)
+
+from tkamb.errors import InputError
+from tkamb.run.metrics import failed, flagged
+from tkamb.show.axis import HorizontalAxis, horizontal_axis
+from tkamb.show.panels import Line, Panel, centre_panel, panels
+from tkamb.show.places import LABEL_PLACE, label_width, leave_unmeasured, set_place
+from tkamb.show.style import (
+    BLACK,
+    GREY,
+    ORANGE,
+    legend_above,
+    new_figure,
+    settings,
+)
+from tkamb.show.svg import text_width
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+WIDTH, HEIGHT = 5.4, 3.1
+DEFAULT = ("forces", "condyles", "ratios", "pressures")
+TITLE_PAD, LEGEND_ROW = 8.0, 14.0
+"""Points between a plot and its title, for each row of the legend between them."""
+FOOT, OVERHANG, AXIS_LABEL = 31.5, 13.0, 13.0
+"""Points around a plot: for the labels of the horizontal axis; for half of its last label; for the
+vertical axis' label."""
+SIDE_LABEL, LEGEND = 8.0, 8.5
+"""Points, sizes of letters."""
+
+
+@dataclass(frozen=True)
+class PlotSettings:
+    """Looks of the report's plots."""
+
+    label_offset_points: float = 12.0
+    """Points from a plot's edge to the near side of an axis' label."""
+    side_gap: float = 0.01
+    """Of the width, between the axes and what is written beside them."""
+    band_opacity: float = 0.16
+    """Opacity of the band around a line, 0 to 1."""
+
+
+PLOT = PlotSettings()
+
+HANDLE, COLUMN_GAP = 2.7, 1.4
+"""Of a legend's letters: a handle with its gap, and the gap between columns."""
+DASHES = (0, (4, 2))
+SPAN = "#e2e2e2"
+
+
+class Sheet:
+    """A figure on which the plots of a run are drawn one after the other.
+
+    Axes and ticks are most of what a plot takes to make: they stay, all that is drawn goes. A plot
+    that `_place_alone` has no place for has a figure of its own.
+
+    Args:
+        results: of the run.
+        axis: horizontal, of every plot.
+        width: inches.
+    """
+
+    def __init__(self, results: "Results", axis: HorizontalAxis, width: float = WIDTH) -> None:
+        self._results, self._axis, self._width = results, axis, width
+        self._axes = self._new_axes()
+
+    def draw(self, panel: Panel) -> Figure:
+        """Return one plot with its flagged and failed frames marked along the bottom.
+
+        Each curve's id in the picture is its line's name. It stands until the next is drawn.
+        """
+        with settings():
+            self._clear()
+            self._draw_on(self._axes, panel)
+            axes = self._axes
+            if not _place_alone(axes, panel):
+                axes = self._new_axes()
+                self._draw_on(axes, panel)
+        figure = axes.get_figure(root=True)
+        assert figure is not None
+        return figure
+
+    def _new_axes(self) -> Axes:
+        with settings():
+            return new_figure(self._width, HEIGHT).add_subplot()
+
+    def _draw_on(self, axes: Axes, panel: Panel) -> None:
+        _draw_lines(axes, panel, self._axis)
+        _label_axes(axes, panel, self._axis)
+        mark_frames(axes, self._results, self._axis)
+        legend_above(axes, _legend_columns(panel))
+
+    def _clear(self) -> None:
+        axes = self._axes
+        for drawn in (*axes.lines, *axes.patches, *axes.collections, *axes.texts, *axes.child_axes):
+            drawn.remove()
+        axes.set_yscale("linear")
+        axes.relim()
+        axes.autoscale()
+
+
+def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = None) -> Figure:
+    """Return the plots of a run in one figure, for notebooks.
+
+    Args:
+        results: the run.
+        names: panels by their ids in the report ("forces", "condyles", "pressures", ...);
+            default: forces, condyles, ratios and pressures, as far as the run has them.
+        axis: "flexion", "cycle" or "time"; default: as the scene asks.
+
+    Raises:
+        InputError: a plot or an axis that does not exist.
+    """
+    known = {panel.name: panel for panel in (*panels(results), centre_panel(results))}
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise InputError(
+            f"the run has no plot '{unknown[0]}'", "plot", f"it has {', '.join(known)}"
+        )
+    chosen = [known[name] for name in names or DEFAULT if name in known]
+    horizontal = horizontal_axis(results, axis)
+    with settings():
+        rows = max(1, -(-len(chosen) // 2))
+        figure = new_figure(2 * WIDTH, rows * HEIGHT)
+        for k, panel in enumerate(chosen):
+            axes = figure.add_subplot(rows, min(2, len(chosen)), k + 1)
+            _draw_lines(axes, panel, horizontal)
+            _label_axes(axes, panel, horizontal)
+            mark_frames(axes, results, horizontal)
+            columns = _legend_columns(panel)
+            above = TITLE_PAD + LEGEND_ROW * -(-len(panel.lines) // columns)
+            axes.set_title(panel.title, loc="left", pad=above, fontweight="bold")
+            legend_above(axes, columns)
+    return figure
+
+
+def _place_alone(axes: Axes, panel: Panel) -> bool:
+    """Give a plot that stands alone the room that its labels need; say whether that was possible.
+
+    The places are those that matplotlib's constrained layout finds, which looks at everything
+    four times; it still has to place what is not simple: a factor over a vertical axis, a legend
+    that is too wide.
+    """
+    for second in axes.child_axes:
+        second.apply_aspect()  # takes its range from the first
+    sides = [one.yaxis for one in (axes, *axes.child_axes)]
+    widths = [label_width(side) for side in sides]
+    if any(side.get_major_formatter().get_offset() for side in sides):
+        return False
+    left, *others = (
+        LABEL_PLACE.edge_points
+        + LABEL_PLACE.tick_points
+        + width
+        + (AXIS_LABEL if side.get_label_text() else 0.0)
+        for side, width in zip(sides, widths, strict=True)
+    )
+    words = [one[-1] for one in (panel.level, panel.span) if one]
+    lines = [line for one in words for line in one.split(" ", 1)]
+    outside = max((text_width(line, SIDE_LABEL) for line in lines), default=0.0)
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    width, height = 72 * figure.get_size_inches()
+    right = max(LABEL_PLACE.edge_points + outside + PLOT.side_gap * width, OVERHANG, *others)
+    columns = _legend_columns(panel)
+    if _legend_width(panel, columns) > width - left - LABEL_PLACE.edge_points:
+        return False
+    rows = -(-len(panel.lines) // columns)
+    top = LABEL_PLACE.edge_points + LEGEND * (1.0 + rows + 0.5 * (rows - 1))
+    wide, tall = width - left - right, height - FOOT - top
+    set_place(axes, left, FOOT, wide, tall)
+    axes.xaxis.set_label_coords(0.5, (PLOT.label_offset_points - FOOT) / tall)
+    for side, place in zip(
+        sides, (PLOT.label_offset_points, width - PLOT.label_offset_points), strict=False
+    ):
+        side.set_label_coords((place - left) / wide, 0.5, axes.transAxes)
+    for axis in (axes.xaxis, *sides):
+        leave_unmeasured(axis)
+    return True
+
+
+def _legend_width(panel: Panel, columns: int) -> float:
+    """Return the width (points) of the legend of `legend_above`."""
+    texts = [text_width(line.label, LEGEND) for line in panel.lines]
+    rows = -(-len(texts) // columns)
+    wide = [max(texts[k : k + rows]) for k in range(0, len(texts), rows)]
+    return sum(wide) + LEGEND * (HANDLE * len(wide) + COLUMN_GAP * (len(wide) - 1) + 1.0)
+
+
+def mark_frames(axes: Axes, results: "Results", axis: HorizontalAxis) -> None:
+    """Mark flagged frames with ticks and failed ones with crosses along the bottom."""
+    transform = axes.get_xaxis_transform()
+    for mask, marker, colour, name in (
+        (flagged(results), "|", ORANGE, "flagged"),
+        (failed(results), "x", BLACK, "failed"),
+    ):
+        if mask.any():
+            x = axis.values[mask]
+            axes.plot(
+                x,
+                np.full(len(x), 0.025),
+                linestyle="none",
+                marker=marker,
+                color=colour,
+                markersize=7 if marker == "|" else 5,
+                markeredgewidth=1.6,
+                transform=transform,
+                gid=f"frames-{name}",
+            )
+
+
+def _draw_lines(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:
+    for line in panel.lines:
+        x, y = axis.broken(line.values)
+        dashes = DASHES if line.dashed else "-"
+        gid = f"line-{line.name}"
+        broad: Any = {"linewidth": 5.0, "alpha": 0.28, "zorder": 1.5} if line.behind else {}
+        axes.plot(x, y, color=line.colour, linestyle=dashes, label=line.label, gid=gid, **broad)
+        if line.band is not None and not line.dashed:
+            _draw_band(axes, line, axis)
+
+
+def _draw_band(axes: Axes, line: Line, axis: HorizontalAxis) -> None:
+    """Shade a line's 5 to 95 % and dot its median."""
+    assert line.band is not None
+    (x, low), (_, middle), (_, high) = (axis.broken(one) for one in line.band)
+    opacity, name = PLOT.band_opacity, f"band-{line.name}"
+    axes.fill_between(x, low, high, color=line.colour, alpha=opacity, linewidth=0, gid=name)
+    axes.plot(x, middle, color=line.colour, linestyle=":", linewidth=1, gid=f"median-{line.name}")
+
+
+def _legend_columns(panel: Panel) -> int:
+    """Return how many legend entries stand beside each other."""
+    return 2 if sum(len(line.label) + 6 for line in panel.lines) > 72 else 4
+
+
+def _label_axes(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:
+    axes.set_xlabel(axis.label)
+    axes.set_ylabel(panel.unit if panel.unit != "–" else "")
+    low, high = float(np.min(axis.values)), float(np.max(axis.values))
+    margin = 0.01 * (high - low) or 0.5
+    axes.set_xlim(low - margin, high + margin)
+    if axis.kind != "time" and high - low > 40:
+        axes.xaxis.set_major_locator(MultipleLocator(20 if high - low > 70 else 10))
+    _scale_vertically(axes, panel)
+    if panel.level:
+        _draw_level(axes, *panel.level)
+    if panel.span:
+        _draw_span(axes, *panel.span)
+    if panel.second:
+        _draw_second(axes, *panel.second)
+
+
+def _scale_vertically(axes: Axes, panel: Panel) -> None:
+    if panel.logarithmic:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        return
+    axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
+    drawn = [line.values for line in panel.lines]
+    drawn += [one.band.ravel() for one in panel.lines if one.band is not None and not one.dashed]
+    values = [one[np.isfinite(one)] for one in drawn]
+    values.append(np.zeros(int(panel.from_zero)))
+    values.append(np.array(panel.level[:1] if panel.level else ()))
+    values.append(np.array(panel.span[:2] if panel.span else ()))
+    low, high = (float(f(np.concatenate(values))) for f in (np.min, np.max))
+    if panel.limits:
+        low, high = panel.limits
+    span = high - low if high > low else 1.0
+    axes.set_ylim(low - 0.06 * span, high + 0.04 * span)
+    if low < 0 < high or panel.from_zero:
+        axes.axhline(0, color=GREY, linewidth=0.8, zorder=1)
+
+
+def _draw_level(axes: Axes, value: float, label: str) -> None:
+    axes.axhline(value, color=GREY, linewidth=1, linestyle=":", zorder=1, gid="level")
+    transform = axes.get_yaxis_transform()
+    words = label.replace(" ", "\n", 1)
+    axes.text(1.01, value, words, transform=transform, va="center", fontsize=8, color=GREY)
+
+
+def _draw_span(axes: Axes, low: float, high: float, label: str) -> None:
+    """Shade a range, as a line where it is one value."""
+    axes.axhspan(low, high, facecolor=SPAN, edgecolor=SPAN, linewidth=2, zorder=0.5, gid="span")
+    middle, transform = 0.5 * (low + high), axes.get_yaxis_transform()
+    words = label.replace(" ", "\n", 1)
+    axes.text(1.01, middle, words, transform=transform, va="center", fontsize=8, color=GREY)
+
+
+def _draw_second(axes: Axes, factor: float, unit: str) -> None:
+    def there(value: Any) -> Any:
+        return np.asarray(value, float) * factor
+
+    def back(value: Any) -> Any:
+        return np.asarray(value, float) / factor
+
+    right = axes.secondary_yaxis("right", functions=(there, back))
+    right.set_ylabel(unit)
+    right.spines["right"].set_visible(True)

@@ -1,0 +1,330 @@
+"""Pressure on the insert seen from above, and the paths of the centres of pressure.
+
+Anterior is up and the subject's right is on the right of the page, as one looks down on the
+insert; for a left knee, which is mirrored at input, the picture is mirrored back.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
+
+from tkamb.geometry.frames import Array
+from tkamb.run.maps import ContactMaps
+from tkamb.run.metrics import lateral_axis_name, map_rows, stretches
+from tkamb.show.axis import HorizontalAxis
+from tkamb.show.levels import PageGrid, pressure_levels, touched_part
+from tkamb.show.style import BLACK, GREY, PRESSURE_MAP, SIDE_COLOURS, new_figure, settings
+from tkamb.units import MEGAPASCAL, MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+
+@dataclass(frozen=True)
+class PressurePictureSettings:
+    """Looks of the pressure maps."""
+
+    margin_mm: float = 2.0
+    """Around the insert in a picture."""
+    step_mm: float = 0.3
+    """Between the points of the grid that pressures are drawn on."""
+    rim_share: float = 0.03
+    """Share of the scale over which a flat map fades at its rim; elsewhere it fades from
+one point of the grid to the next, so that no steps are seen there."""
+
+
+PRESSURE_PICTURE = PressurePictureSettings()
+
+LABEL_GAP_MM, LABEL_STEP_MM = 4.0, 2.6
+"""From a path to its labels, and between two of them."""
+EDGE, ABOVE, BELOW, BETWEEN = 3.0, 17.0, 18.0, 6.0
+"""Points: left of maps, over each for its title, under each for its scale, between two beside each
+other."""
+BAR_LABELS, BAR_RATIO = 41.0, 30.0
+"""Points right of a colour bar for its labels; its height over its width."""
+
+
+class TopView:
+    """The insert as one looks down on it, in page coordinates (mm, right and up).
+
+    Args:
+        maps: points and triangles.
+        side: "right" or "left": the subject's knee.
+        lateral: what insert z points to, "lateral" or "medial".
+    """
+
+    def __init__(self, maps: ContactMaps, side: str, lateral: str) -> None:
+        self.side = side
+        self.sign = -1.0 if side == "left" and lateral == "lateral" else 1.0
+        points = maps.points_m
+        self.across = self.sign * points[:, 2] / MILLIMETRE
+        self.up = points[:, 0] / MILLIMETRE
+        self.triangles = maps.triangles
+        self.grid = PageGrid(points, self.triangles, self.sign, PRESSURE_PICTURE.step_mm)
+        self.grey = self.grid.sample(_shade(points, self.triangles))
+
+    def page_coordinates(self, ap: Array, ml: Array) -> tuple[Array, Array]:
+        """Return page coordinates (mm) of insert x and z (mm)."""
+        return self.sign * ml, ap
+
+    @property
+    def across_limits(self) -> tuple[float, float]:
+        """Left and right end of the picture, mm."""
+        return float(self.across.min() - PRESSURE_PICTURE.margin_mm), float(
+            self.across.max() + PRESSURE_PICTURE.margin_mm
+        )
+
+    @property
+    def up_limits(self) -> tuple[float, float]:
+        """Lower and upper end of the picture, mm."""
+        return float(self.up.min() - PRESSURE_PICTURE.margin_mm), float(
+            self.up.max() + PRESSURE_PICTURE.margin_mm
+        )
+
+    def draw_insert(self, axes: Axes) -> None:
+        """Draw the insert in greys that show its dishes, and dress the axes."""
+        over = self.grey >= 0
+        picture = colormaps["gray"](np.where(over, self.grey, self.grey.max()), bytes=True)
+        picture[..., 3] = 255 * over
+        _show(axes, picture, self.grid.extent(), 1.0)
+        axes.set_xlim(self.across_limits)
+        axes.set_ylim(self.up_limits)
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+
+    def draw_labels(self, axes: Axes) -> None:
+        """Write where anterior, medial and lateral are, and a 10 mm scale."""
+        left, right = ("medial", "lateral") if self.side == "right" else ("lateral", "medial")
+        style: Any = {"fontsize": 7.5, "color": GREY, "transform": axes.transAxes}
+        axes.text(0.0, -0.01, left, ha="left", va="top", **style)
+        axes.text(1.0, -0.01, right, ha="right", va="top", **style)
+        axes.text(0.0, 1.0, "anterior ↑", ha="left", va="top", **style)
+        axes.text(1.0, 1.0, self.side[0].upper(), ha="right", va="top", **style)
+        low = self.up.min() - 3.0
+        axes.plot([-5, 5], [low, low], color=GREY, linewidth=2, clip_on=False)
+        axes.text(0, low - 0.8, "10 mm", ha="center", va="top", fontsize=7, color=GREY)
+
+
+def top_view(results: "Results") -> TopView | None:
+    """Return the view of the run's insert; None without maps."""
+    if results.maps is None or len(results.maps.triangles) == 0:
+        return None
+    side = str(results.summary.get("side", "right"))
+    return TopView(results.maps, side, lateral_axis_name(results))
+
+
+def mapped_frames(results: "Results", axis: HorizontalAxis, count: int = 8) -> list[int]:
+    """Return at most `count` frames with a pressure map, spread over the motion."""
+    frames = np.array(sorted(map_rows(results)), int)
+    if not len(frames):
+        return []
+    return sorted({int(frames[np.argmin(np.abs(frames - stop))]) for stop in axis.stops(count)})
+
+
+def draw_maps(
+    results: "Results", view: TopView, axis: HorizontalAxis, frames: Sequence[int]
+) -> Figure:
+    """Return pressure maps of these frames on one colour scale, 0 to the run's largest."""
+    largest = float(np.nanmax(_pressure(results)))
+    scale = Normalize(0.0, largest if largest > 0 else 1.0)
+    across = min(4, len(frames))
+    down = -(-len(frames) // across)
+    ratio = np.ptp(view.up) / np.ptp(view.across)
+    with settings():
+        figure = new_figure(11.0, down * (10.0 / 4 * ratio + 0.75))
+        grid, beside = place_maps(figure, down, across, 26.0)
+        for axes, frame in zip(grid, frames, strict=False):
+            draw_map(axes, view, results, frame, scale)
+            axes.set_title(_caption(results, axis, frame), fontsize=8.5)
+        for axes in grid[len(frames) :]:
+            axes.set_axis_off()
+        bar = pressure_bar(figure, scale, cax=beside)
+        stress = results.summary.get("yield_stress_MPa")
+        if stress is not None and stress < float(scale.vmax or 1.0):
+            bar.ax.axhline(stress, color="white", linewidth=1.5)
+            bar.ax.text(-0.25, stress, "yield", ha="right", va="center", fontsize=7.5)
+    return figure
+
+
+def draw_map(
+    axes: Axes,
+    view: TopView,
+    results: "Results",
+    frame: int,
+    scale: Normalize,
+) -> None:
+    """Draw the pressure of a frame that has a map on the insert, with its centres."""
+    assert results.maps is not None
+    row = map_rows(results)[frame]
+    view.draw_insert(axes)
+    draw_pressure(axes, view, _pressure(results)[row], scale, results.maps.gap_m[row])
+    _draw_centres(axes, view, results, frame)
+    view.draw_labels(axes)
+
+
+def place_maps(figure: Figure, down: int, across: int, gap: float) -> tuple[list[Axes], Axes]:
+    """Return axes for maps, row by row, and for their colour bar, `gap` points beside them.
+
+    What stands around maps is known, so that no layout need look for it.
+    """
+    figure.set_layout_engine("none")
+    width, height = 72 * figure.get_size_inches()
+    tall = height / down - ABOVE - BELOW
+    long = height - ABOVE - BELOW
+    thick = long / BAR_RATIO
+    right = gap + thick + BAR_LABELS
+    wide = (width - EDGE - right + BETWEEN) / across - BETWEEN
+
+    def place(x: float, y: float, across: float, up: float) -> Axes:
+        return figure.add_axes((x / width, y / height, across / width, up / height))
+
+    maps = [
+        place(EDGE + k * (wide + BETWEEN), (down - 1 - row) * height / down + BELOW, wide, tall)
+        for row in range(down)
+        for k in range(across)
+    ]
+    return maps, place(width - BAR_LABELS - thick, BELOW, thick, long)
+
+
+def pressure_bar(figure: Figure, scale: Normalize, **place: Any) -> Colorbar:
+    """Return the colour bar of pressure maps on one scale (MPa), in a place of `colorbar`."""
+    bar = figure.colorbar(ScalarMappable(scale, PRESSURE_MAP), **place)
+    bar.set_label("contact pressure (MPa)")
+    return bar
+
+
+def draw_paths(
+    results: "Results", view: TopView, axis: HorizontalAxis, frames: Sequence[int]
+) -> Figure:
+    """Return the paths of both centres of pressure over the insert, in time order."""
+    with settings():
+        figure = new_figure(5.4, 3.7)
+        axes = figure.add_subplot()
+        view.draw_insert(axes)
+        for side, colour in SIDE_COLOURS.items():
+            x, y = view.page_coordinates(results[f"{side}_cop_ap_mm"], results[f"{side}_cop_ml_mm"])
+            parts = stretches(np.column_stack([x, y]) * MILLIMETRE)
+            apart = np.full(len(x), np.nan)
+            for number, part in enumerate(parts):
+                line = apart.copy()
+                line[part] = x[part]
+                name = f"path-{side}" + (f"-{number}" if number else "")
+                axes.plot(line, y, color=colour, linewidth=1.6, gid=name)
+            _label_stops(axes, x, y, axis, frames, colour)
+        view.draw_labels(axes)
+    return figure
+
+
+def _pressure(results: "Results") -> Array:
+    if results.maps is None:
+        raise ValueError("the run has no pressure maps")
+    return results.maps.pressure_Pa / MEGAPASCAL
+
+
+def _shade(points: Array, triangles: NDArray[np.int64]) -> Array:
+    """Return a grey level (n,) per point, lit obliquely from above."""
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    normal *= np.where(normal[:, 1:2] < 0, -1.0, 1.0)
+    summed = np.zeros_like(points)
+    for k in range(3):
+        np.add.at(summed, triangles[:, k], normal)
+    length = np.linalg.norm(summed, axis=1)
+    summed /= np.where(length > 0, length, 1.0)[:, None]
+    light = np.array([0.5, 0.8, -0.33])
+    return 0.55 + 0.4 * np.clip(summed @ (light / np.linalg.norm(light)), 0.0, 1.0)
+
+
+def draw_pressure(
+    axes: Axes, view: TopView, pressure: Array, scale: Normalize, gap: Array | None = None
+) -> None:
+    """Colour the insert with a pressure (n,), in the scale's unit.
+
+    Args:
+        axes: with the insert.
+        view: of the insert.
+        pressure: (n,).
+        scale: from 0.
+        gap: (n,) m; says where between the points the contact ends.
+    """
+    peak = float(scale.vmax or 1.0)
+    apart = None if gap is None else gap[None]
+    level = view.grid.sample(pressure_levels(pressure[None], apart, view.triangles, peak)[0])
+    if (level > 0).any():
+        part = touched_part(level > 0)
+        level = level[part]
+        picture = colormaps[PRESSURE_MAP](np.maximum(level, 0.0), bytes=True)
+        change = np.hypot(*np.gradient(level))  # from point to point of the grid
+        picture[..., 3] = 255 * np.clip(
+            0.5 + level / np.maximum(change, PRESSURE_PICTURE.rim_share), 0.0, 1.0
+        )
+        _show(axes, picture, view.grid.extent(*part), 1.5)
+
+
+def _show(
+    axes: Axes,
+    picture: NDArray[np.uint8],
+    extent: tuple[float, float, float, float],
+    height: float,
+) -> None:
+    """Draw a picture (rows, columns, 4) of a grid's points as it is; the page smooths it."""
+    axes.imshow(picture, extent=extent, interpolation="none", zorder=height, clip_on=False)
+
+
+def _draw_centres(axes: Axes, view: TopView, results: "Results", frame: int) -> None:
+    for side in SIDE_COLOURS:
+        x, y = view.page_coordinates(
+            results[f"{side}_cop_ap_mm"][frame], results[f"{side}_cop_ml_mm"][frame]
+        )
+        axes.plot(x, y, "+", color="white", markersize=7, markeredgewidth=2.4)
+        axes.plot(x, y, "+", color=BLACK, markersize=6, markeredgewidth=1.1)
+
+
+def _caption(results: "Results", axis: HorizontalAxis, frame: int) -> str:
+    force = results["force_total_BW"][frame]
+    return f"{axis.label.split(' (')[0]} {axis.at(frame)}, {force:.2f} BW"
+
+
+def _label_stops(
+    axes: Axes, x: Array, y: Array, axis: HorizontalAxis, frames: Sequence[int], colour: str
+) -> None:
+    """Write beside a path where the motion is at its dots, its first and its last place."""
+    known = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    if not len(known):
+        return
+    first, last = int(known[0]), int(known[-1])
+    chosen = sorted({first, last, *(k for k in frames if np.isfinite(x[k] + y[k]))})
+    outward = 1.0 if np.nanmean(x) > 0 else -1.0
+    column = outward * (np.nanmax(outward * x) + LABEL_GAP_MM)
+    words = {first: "start ", last: "end "} if last > first else {}
+    order = sorted(chosen, key=lambda k: y[k])
+    for frame, height in zip(order, _spread(y[order], LABEL_STEP_MM), strict=True):
+        axes.plot([x[frame], column], [y[frame], height], color=GREY, linewidth=0.5, zorder=2.5)
+        axes.plot(x[frame], y[frame], "o", color=colour, ms=4, mec="white", zorder=3)
+        axes.text(
+            column + 0.5 * outward,
+            height,
+            words.get(frame, "") + axis.at(frame),
+            ha="left" if outward > 0 else "right",
+            va="center",
+            fontsize=8,
+            color=BLACK,
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
+        )
+
+
+def _spread(heights: Array, step: float) -> Array:
+    """Return rising heights moved apart to at least a step, about where they were."""
+    count = np.arange(len(heights))
+    pressed = np.maximum.accumulate(heights - step * count) + step * count
+    return pressed - 0.5 * float(np.mean(pressed - heights))

@@ -1,0 +1,265 @@
+"""The report: one page that stands by itself, for a biomechanist to read in a minute.
+
+Its frame slider moves one cursor in every plot; the numbers of the frames stand in the page as
+JSON, rounded to five digits. Without scripts, and on paper, the page reads as before.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tkamb.atomic import write_text
+from tkamb.geometry.frames import Array
+from tkamb.run.metrics import body_weight, failed, flagged
+from tkamb.show.axis import LABELS, HorizontalAxis, horizontal_axis
+from tkamb.show.frame_maps import draw_insert, frame_maps, largest_pressure
+from tkamb.show.headline import cards, run_title
+from tkamb.show.methods import methods
+from tkamb.show.pages import asset, policy_sources, render
+from tkamb.show.panels import Panel, centre_panel, panels
+from tkamb.show.plots import WIDTH, Sheet
+from tkamb.show.pressure_maps import draw_maps, draw_paths, mapped_frames, top_view
+from tkamb.show.reading import conclusions
+from tkamb.show.style import svg_text
+from tkamb.show.tables import flag_rows, motion_table, strain_table
+from tkamb.show.wear import wear_section
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+Progress = Callable[[Sequence[Panel]], Iterable[Panel]]
+
+PACKAGE = "tkamb.show"
+POLICY = (
+    "default-src 'none'; script-src {script}; style-src-elem {style}; "
+    "style-src-attr 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
+)
+"""The page runs its own script and loads nothing; the plots set their colours in attributes."""
+THIRD = 2 / 3 * WIDTH
+"""Inches: width of a plot of which three stand beside each other, at the same size of letters."""
+SCRIPTS = ("cursor.js", "units.js", "insert.js", "downloads.js", "start.js")
+"""In the order in which they stand in the page."""
+COLOURS = (
+    "Lines run in time order. In every plot blue is medial, red lateral, black the total; violet "
+    "is superior–inferior, teal anterior–posterior, olive medial–lateral, and moments and "
+    "rotations have the colour of the axis they turn about. Ligaments and muscles are told apart "
+    "within one plot."
+)
+PROVENANCE = (
+    "scene", "scene_sha256", "started", "command", "versions", "seconds", "contact", "frame",
+)  # fmt: skip
+"""Keys of the summary that are shown as they are."""
+
+
+def write_report(results: "Results", path: str | Path) -> None:
+    """Write the report of a run as one self-contained HTML page, whole or not at all.
+
+    Raises:
+        InputError: the folder cannot be written, or the summary lacks the body mass.
+    """
+    write_text(Path(path), report_html(results))
+
+
+def report_html(results: "Results", progress: Progress = lambda drawn: drawn) -> str:
+    """Return the report as HTML: vector plots, pictures and style are inside the page.
+
+    Args:
+        results: of a run.
+        progress: wraps the plots, a progress bar for example.
+    """
+    axis = horizontal_axis(results)
+    style = asset(PACKAGE, "report.css")
+    script = "\n".join(asset(PACKAGE, name) for name in SCRIPTS)
+    sheet = Sheet(results, axis)
+    maps, force = _maps(results, axis, sheet), results["force_total_N"]
+    return render(
+        PACKAGE,
+        "report.html",
+        policy=POLICY.format(script=policy_sources(script), style=policy_sources(style)),
+        style=style,
+        script=script,
+        title=run_title(results.summary),
+        subtitle=_subtitle(results),
+        cards=cards(results, axis),
+        conclusions=conclusions(results),
+        sentences=_sentences(results.summary),
+        maps=maps,
+        legend=_legend(results),
+        plots=[_plot(panel, sheet) for panel in progress(panels(results))],
+        muscles=_muscles(results, axis),
+        wear=wear_section(results),
+        motion=motion_table(results, axis),
+        strain=strain_table(results.summary),
+        flags=flag_rows(results, axis),
+        axis_name=LABELS[axis.kind].split(" (")[0],
+        methods=methods(results.summary) if "scene_tables" in results.summary else None,
+        provenance=_provenance(results.summary),
+        last_frame=len(results) - 1,
+        first_frame=int(np.nanargmax(force)) if np.isfinite(force).any() else 0,
+        cursor=_cursor_data(results, axis) | {"maps": maps and maps["frames"]},
+    )
+
+
+def headline_html(results: "Results") -> str:
+    """Return the headline numbers alone, with their style, for notebooks."""
+    return render(
+        PACKAGE,
+        "notebook.html",
+        style=asset(PACKAGE, "notebook.css"),
+        title=run_title(results.summary),
+        subtitle=_subtitle(results),
+        cards=cards(results, horizontal_axis(results)),
+    )
+
+
+def _subtitle(results: "Results") -> str:
+    summary = results.summary
+    contact = summary.get("contact") or {}
+    weight = body_weight(results)
+    parts = [
+        f"{summary['side']} knee" if summary.get("side") else "",
+        f"{summary['body_mass_kg']:g} kg; one body weight (BW) is {weight:.0f} N",
+        _contact_words(contact, summary.get("material") or {}),
+    ]
+    return " · ".join(part for part in parts if part)
+
+
+def _contact_words(contact: dict[str, Any], material: dict[str, Any]) -> str:
+    if not contact:
+        return "contact not modelled"
+    words = f"contact: {contact.get('model', 'unnamed')}"
+    if contact.get("resolution_mm"):
+        words += f" at {contact['resolution_mm']:g} mm"
+    name = material.get("name") or contact.get("material")
+    if name:
+        words += f", {name}"
+    if material:
+        modulus, ratio = material["young_modulus_MPa"], material["poisson_ratio"]
+        words += f" (E {modulus:.4g} MPa, ν {ratio:.3g}, {material['law']})"
+    return words
+
+
+def _maps(results: "Results", axis: HorizontalAxis, sheet: Sheet) -> dict[str, Any] | None:
+    """Return the pictures of pressure on the insert; None without maps."""
+    view, frames = top_view(results), mapped_frames(results, axis)
+    if view is None or not frames:
+        return None
+    return {
+        "insert": svg_text(draw_insert(view, largest_pressure(results)), "map"),
+        "frames": frame_maps(results, view),
+        "pictures": svg_text(draw_maps(results, view, axis, frames), "maps"),
+        "paths": svg_text(draw_paths(results, view, axis, frames), "paths"),
+        "centres": _plot(centre_panel(results), sheet),
+        "side": view.side,
+    }
+
+
+def _muscles(results: "Results", axis: HorizontalAxis) -> dict[str, Any] | None:
+    """Return the section on muscles; None without [muscles]."""
+    if not results.summary.get("muscle_groups"):
+        return None
+    from tkamb.show.muscles import HELD, draw_activations, muscle_panels, reserve_words
+
+    figure, sheet = draw_activations(results, axis), Sheet(results, axis, THIRD)
+    return {
+        "activations": None if figure is None else svg_text(figure, "activations"),
+        "emg": bool(results.summary.get("emg")),
+        "plots": [_plot(panel, sheet) for panel in muscle_panels(results)],
+        "held": HELD,
+        "reserves": reserve_words(results.summary),
+    }
+
+
+def _plot(panel: Panel, sheet: Sheet) -> dict[str, Any]:
+    return {"panel": panel, "svg": svg_text(sheet.draw(panel), panel.name)}
+
+
+def _legend(results: "Results") -> list[str]:
+    """Return what the marks in the plots mean."""
+    sentences = [COLOURS]
+    if results.bands:
+        sentences.append(
+            "Shaded: 5 to 95 % of the samples with varied inputs, dotted: their median; "
+            "full lines: the scene as it stands."
+        )
+    if flagged(results).any():
+        sentences.append("Orange ticks at the bottom: frames to be read with care.")
+    if failed(results).any():
+        sentences.append("Crosses at the bottom: frames that failed; the lines are broken there.")
+    return sentences
+
+
+def _sentences(summary: dict[str, Any]) -> list[str]:
+    """Return what a reader must know, one sentence each, without repeats."""
+    found: list[str] = []
+    for key in ("residuals", "notes", "assumptions"):
+        value = summary.get(key) or []
+        found.extend([value] if isinstance(value, str) else [str(item) for item in value])
+    missing = summary.get("not_modelled")
+    if missing:
+        found.append("Not modelled: " + ", ".join(map(str, missing)) + ".")
+    return list(dict.fromkeys(found))
+
+
+def _provenance(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return where the run came from: name and text."""
+    return [
+        (key.replace("_", " ").replace("sha256", "SHA-256"), _text(summary[key]))
+        for key in PROVENANCE
+        if summary.get(key) not in (None, "", {}, [])
+    ]
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, dict):
+        filled = {str(k).replace("_", " "): v for k, v in value.items() if v not in (None, {}, [])}
+        return ", ".join(f"{name} {_text(item)}" for name, item in filled.items())
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return ", ".join(_text(item) for item in value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _cursor_data(results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
+    """Return what the slider shows of each frame: position, status, the lines of every plot."""
+    drawn = (*panels(results), centre_panel(results))
+    if results.summary.get("muscle_groups"):
+        from tkamb.show.muscles import muscle_panels
+
+        drawn += muscle_panels(results)
+    name = axis.label.split(" (")[0]
+    return {
+        "name": run_title(results.summary),
+        "axis": axis.label,
+        "bodyWeight": body_weight(results),
+        "x": _round(axis.values),
+        "place": [f"{name} {axis.at(k)}" for k in range(len(results))],
+        "status": results.status,
+        "panels": {
+            panel.name: {"unit": panel.unit, "lines": _cursor_lines(panel)}
+            for panel in drawn
+            if panel.lines
+        },
+    }
+
+
+def _cursor_lines(panel: Panel) -> list[dict[str, Any]]:
+    """Return a panel's lines with as many decimals as show a thousandth of its largest value."""
+    largest = max(float(np.nanmax(np.abs(line.values))) for line in panel.lines)
+    digits = int(np.clip(2 - np.floor(np.log10(largest)), 0, 4)) if largest > 0 else 0
+    return [
+        {
+            "label": line.label,
+            "colour": line.colour,
+            "digits": digits,
+            "values": _round(line.values),
+        }
+        for line in panel.lines
+    ]
+
+
+def _round(values: Array) -> list[float | None]:
+    return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values]

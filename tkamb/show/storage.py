@@ -1,0 +1,117 @@
+"""OpenSim's files, written: `.sto` and `.mot` tables, `.trc` markers."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.atomic import write_text
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.run.columns import KINDS
+from tkamb.run.metrics import failed, flagged
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+STORAGE = (".sto", ".mot")
+
+
+def write_storage(path: Path, columns: Mapping[str, Array], in_degrees: bool) -> None:
+    """Write a `.sto` or `.mot` table.
+
+    Args:
+        path: the file.
+        columns: name -> (n,) values, "time" (s) first.
+        in_degrees: what the header says of the angles.
+
+    Raises:
+        InputError: no time, unequal lengths, a blank in a name, or no place to write.
+    """
+    names = list(columns)
+    lengths = {len(values) for values in columns.values()}
+    if not names or names[0] != "time" or len(lengths) != 1:
+        raise InputError("a storage file needs 'time' first and columns of one length", path)
+    if blank := [name for name in names if not name or any(c.isspace() for c in name)]:
+        raise InputError(f"column '{blank[0]}' has a blank in its name", path, "rename it")
+    rows = np.stack([np.asarray(values, float) for values in columns.values()], axis=1)
+    lines = [
+        path.stem,
+        "version=1",
+        f"nRows={len(rows)}",
+        f"nColumns={len(names)}",
+        f"inDegrees={'yes' if in_degrees else 'no'}",
+        "endheader",
+        "\t".join(names),
+        *("\t".join(f"{value:.10g}" for value in row) for row in rows),
+    ]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def write_results_storage(results: "Results", path: Path) -> str:
+    """Write the numbers of a run as a storage file.
+
+    Columns keep their names, units (`_N`, `_mm`, `_deg`) and order; `time_s` is called `time`.
+    What has no number is `nan`. Instead of the status' words there is `status`: 0 "ok", 1 to be
+    read with care, 2 failed.
+
+    Args:
+        results: of a run.
+        path: a new file, .sto or .mot.
+
+    Returns:
+        What was written, in a line.
+
+    Raises:
+        InputError: another format, a file that is there already, times that do not rise, or no
+            place to write.
+    """
+    if path.suffix.lower() not in STORAGE:
+        raise InputError(f"is none of {', '.join(STORAGE)}", path, "name a file that ends so")
+    if path.exists():
+        raise InputError("is there already", path, "give a new file: nothing of yours is replaced")
+    numbers = {name: v for name, v in results.columns.items() if KINDS.get(name) != "text"}
+    time = numbers.pop("time_s")
+    if not (np.diff(time) > 0).all():
+        raise InputError("holds times that do not rise, as OpenSim wants them", results.directory)
+    lost, doubtful = failed(results), flagged(results)
+    status = np.where(lost, 2.0, np.where(doubtful, 1.0, 0.0))
+    write_storage(path, {"time": time, **numbers, "status": status}, in_degrees=True)
+    return (
+        f"{len(status)} frames ({doubtful.sum()} to be read with care, {lost.sum()} failed: nan), "
+        f"{len(numbers) + 2} columns"
+    )
+
+
+def write_trc(path: Path, time: Array, markers: Mapping[str, Array], rate_Hz: float) -> None:
+    """Write markers in millimetres; a gap is left empty.
+
+    Args:
+        path: the file.
+        time: (n,) s.
+        markers: label -> (n, 3) m, gaps NaN.
+        rate_Hz: of the recording.
+
+    Raises:
+        InputError: no place to write.
+    """
+    count, names = len(time), list(markers)
+    header = ["DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units"]
+    header += ["OrigDataRate", "OrigDataStartFrame", "OrigNumFrames"]
+    values = [f"{rate_Hz:g}", f"{rate_Hz:g}", f"{count}", f"{len(names)}", "mm"]
+    values += [f"{rate_Hz:g}", "1", f"{count}"]
+    axes = [f"{axis}{k}" for k in range(1, len(names) + 1) for axis in "XYZ"]
+    lines = [
+        f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
+        "\t".join(header),
+        "\t".join(values),
+        "\t".join(["Frame#", "Time", *(f"{name}\t\t" for name in names)]),
+        "\t".join(["", "", *axes]),
+        "",
+    ]
+    positions = np.concatenate(list(markers.values()), axis=1) * 1e3
+    for k, row in enumerate(positions):
+        cells = ["" if np.isnan(value) else f"{value:.5f}" for value in row]
+        lines.append("\t".join([str(k + 1), f"{time[k]:.6f}", *cells]))
+    write_text(path, "\n".join(lines) + "\n")

@@ -1,0 +1,195 @@
+"""A run into a drawing: geometry of the scene, forces and numbers of results.csv, the maps."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.geometry.frames import SIDES, Array
+from tkamb.io.scene.case import Case
+from tkamb.run.metrics import body_weight, map_rows, medial_share
+from tkamb.show.axis import HorizontalAxis, horizontal_axis
+from tkamb.show.headline import run_title
+from tkamb.show.view.arrows import contact_markers, force_arrows
+from tkamb.show.view.drawing import Drawing, PressureMap, Reading
+from tkamb.show.view.run import CaseResults, Progress
+from tkamb.show.view.solids import floor_and_foot, solids, worn_insert
+from tkamb.show.view.strands import (
+    centre_markers,
+    centres_of_pressure,
+    extensor_strands,
+    ligament_strands,
+    muscle_strands,
+    path_strands,
+)
+from tkamb.units import MEGAPASCAL, MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+STAND_INS = "{} plain stand-ins between the joint centres; they carry no load."
+FOOT = "The foot is a stand-in too, drawn level with the floor whatever it did."
+
+
+def draw(
+    run: CaseResults, progress: Progress = lambda frames: frames, lattice: bool = False
+) -> Drawing:
+    """Return what is drawn of a run.
+
+    Args:
+        run: case, mechanics and results that belong together.
+        progress: wraps the frame indices, a progress bar for example.
+        lattice: whether the contact model's grid is drawn too.
+    """
+    case, mechanics, results = run.case, run.mechanics, run.results
+    geometries = run.geometries(progress)
+    states = [one.state for one in geometries]
+    maps, found = results.maps, map_rows(results)
+    rows = [found.get(k, -1) for k in range(len(results))]
+    contact = case.scene.contact
+    floor, centre = floor_and_foot(case, geometries, run.frames)
+    others = floor + worn_insert(results, case.scene.patient.side)
+    bundles, limit = ligament_strands(mechanics, states, results)
+    muscles, most_active = muscle_strands(geometries)
+    strands = [*bundles, *extensor_strands(mechanics, states, results), *muscles]
+    markers = [*contact_markers(geometries), *centre]
+    if maps is not None and found:
+        assert case.insert is not None
+        centres = centres_of_pressure(results, case.insert)
+        strands += path_strands(centres)
+        markers += centre_markers(centres)
+    axis = horizontal_axis(results)
+    return Drawing(
+        title=_title(run),
+        side=case.scene.patient.side,
+        body_weight=case.body_weight,
+        contact=contact.model if contact else "",
+        labels=frame_labels(axis),
+        times=results["time_s"],
+        statuses=tuple(results.status),
+        readings=readings(results, axis),
+        solids=solids(case, mechanics.poses[list(run.frames)], states, maps, rows) + others,
+        strands=tuple(strands),
+        arrows=force_arrows(results, geometries, contact.friction if contact else 0.0),
+        markers=tuple(markers),
+        map=_pressure_map(results, rows),
+        strain_limit=limit,
+        activation_limit=most_active,
+        lattice=lattice_lines(case) if lattice else np.empty((0, 2, 3)),
+        notes=(*_stand_ins(case, bool(floor)), *case.scene.output.notes),
+    )
+
+
+def _stand_ins(case: Case, foot: bool) -> tuple[str, ...]:
+    words = STAND_INS.format("Tibia and patella are" if case.bone else "Bones are")
+    return (words, FOOT) if foot else (words,)
+
+
+def _title(run: CaseResults) -> str:
+    name, contact = run_title(run.results.summary), run.case.scene.contact
+    if contact is None:
+        return f"{name} (contact not modelled)"
+    return f"{name}, contact: {contact.model} at {contact.resolution_mm:g} mm"
+
+
+def _pressure_map(results: "Results", rows: list[int]) -> PressureMap | None:
+    maps = results.maps
+    if maps is None or all(row < 0 for row in rows):
+        return None
+    nothing = np.full(len(maps.points_m), np.nan)
+    pressure, gap = (
+        np.stack([stored[row] if row >= 0 else nothing for row in rows])
+        for stored in (maps.pressure_Pa / MEGAPASCAL, maps.gap_m)
+    )
+    return PressureMap(maps.points_m, maps.triangles, pressure, gap)
+
+
+def lattice_lines(case: Case) -> Array:
+    """Return the edges (s, 2, 3) m of the lattice's outer cell faces, insert frame.
+
+    The grid is the lattice models' at the scene's resolution, whichever model was run; without
+    [contact] there is none.
+
+    Raises:
+        InputError: the insert cannot be meshed.
+    """
+    if case.scene.contact is None or case.insert is None:
+        return np.empty((0, 2, 3))
+    from tkamb.contact.lattice.meshing.cells import FACES
+    from tkamb.contact.lattice.meshing.whole import whole_lattice
+
+    lattice = whole_lattice(case.insert, case.scene.contact.resolution_mm * MILLIMETRE)
+    faces = lattice.cells[:, FACES].reshape(-1, 4)
+    _, first, count = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    outer = faces[first[count == 1]]
+    edges = np.stack([outer, np.roll(outer, -1, axis=1)], axis=2).reshape(-1, 2)
+    return np.asarray(lattice.nodes[np.unique(np.sort(edges, axis=1), axis=0)])
+
+
+def readings(results: "Results", axis: HorizontalAxis) -> tuple[Reading, ...]:
+    """Return the lines of numbers; what no frame has is left out."""
+    weight = body_weight(results)
+
+    def number(name: str, values: Array, unit: str, digits: int = 0) -> Reading:
+        return _reading(name, lambda value: _text(value, digits) + unit, values)
+
+    def force(name: str, values: Array) -> Reading:
+        return _reading(name, lambda value: f"{value / weight:.2f} BW ({value:.0f} N)", values)
+
+    def both(name: str, column: str, unit: str, digits: int = 0, scale: float = 1.0) -> Reading:
+        def write(medial: float, lateral: float) -> str:
+            return f"M {_text(medial, digits)} · L {_text(lateral, digits)}{unit}"
+
+        return _reading(name, write, *(scale * results[f"{side}_{column}"] for side in SIDES))
+
+    rows = [
+        _reading("time", lambda value: f"{value:.2f} s", results["time_s"]),
+        number("flexion", results["flexion_deg"], "°", 1),
+        _reading("adduction", _direction("varus", "valgus"), results["adduction_deg"]),
+        _reading("axial rotation", _direction("ext.", "int."), results["axial_rotation_deg"]),
+        force("contact force", results["force_total_N"]),
+        both("· by deformation", "force_N", " BW", 2, 1.0 / weight),
+        both("· by equilibrium", "force_equilibrium_N", " BW", 2, 1.0 / weight),
+        number("· medial share, deform.", 100 * medial_share(results, "deformation"), " %"),
+        number("· medial share, equil.", 100 * medial_share(results, "equilibrium"), " %"),
+        both("peak pressure", "peak_pressure_MPa", " MPa", 1),
+        both("contact area", "area_mm2", " mm²"),
+        force("quadriceps", results["quadriceps_N"]),
+        force("patellar ligament", results["patellar_ligament_N"]),
+        force("patellofemoral", results["patellofemoral_N"]),
+        force("hip", _magnitude(results, "hip_force")),
+        force("ground reaction", _magnitude(results, "ground_reaction")),
+    ]
+    return tuple(row for row in rows if any(value != "–" for value in row.values))
+
+
+def frame_labels(axis: HorizontalAxis) -> tuple[str, ...]:
+    """Return where in the motion each frame is, in words."""
+    words = {"flexion": "{} of flexion", "cycle": "{} of the cycle", "time": "{}"}[axis.kind]
+    return tuple(words.format(axis.at(k)) for k in range(len(axis.values)))
+
+
+def _reading(name: str, write: Callable[..., str], *columns: Array) -> Reading:
+    """Return one text per frame, "–" where no column has a number."""
+    return Reading(
+        name,
+        tuple(
+            write(*values) if np.isfinite(values).any() else "–"
+            for values in zip(*columns, strict=True)
+        ),
+    )
+
+
+def _magnitude(results: "Results", stem: str) -> Array:
+    return np.sqrt(sum(results[f"{stem}_{axis}_N"] ** 2 for axis in ("ap", "si", "ml")))
+
+
+def _direction(positive: str, negative: str) -> Callable[[float], str]:
+    """Return what writes an angle (deg) without a sign, with the word for its direction."""
+    return lambda angle: f"{abs(angle):.1f}° {positive if round(angle, 1) >= 0 else negative}"
+
+
+def _text(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}".replace("-", "−") if np.isfinite(value) else "–"

@@ -1,0 +1,289 @@
+"""The knee live: what `tkamb live` computes and answers, apart from its page."""
+
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Any
+
+import numpy as np
+
+from tkamb.contact.registry import contact_names
+from tkamb.errors import InputError, TkambError
+from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, knee_pose
+from tkamb.io.recordings.patient import load_urdf
+from tkamb.io.scene.case import Case
+from tkamb.io.scene.si import in_si
+from tkamb.knee.chain import Chain
+from tkamb.knee.equilibrium.frame_contact import FrameContact
+from tkamb.run.contact_side import ContactSide
+from tkamb.run.known import Known
+from tkamb.run.known_errors import as_json, known_error
+from tkamb.run.mechanics import FrameLoads, Mechanics
+from tkamb.show.view.bench import ROWS, Bench, BenchRequest, write_bench
+from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
+
+
+@dataclass(frozen=True, eq=False)
+class LiveAnswer:
+    """What the bench shows of one request.
+
+    Args:
+        request: what was computed.
+        numbers: name -> value, units in the names; NaN where there is none.
+        status: "ok", flags in plain words, or why there are no numbers ("failed: ...").
+        pose: (4, 4) pose_femoral_in_insert; NaN where it failed.
+        points: (n, 3) m of the map; triangles (k, 3).
+        pressure: (n,) Pa.
+        gap: (n,) m.
+        ligaments: name -> both ends (2, 3) m in the insert frame.
+        centres: side -> (3,) m, centre of pressure.
+    """
+
+    request: BenchRequest
+    numbers: dict[str, float]
+    status: str
+    pose: Array
+    points: Array
+    triangles: Array
+    pressure: Array
+    gap: Array
+    ligaments: dict[str, Array]
+    centres: dict[str, Array]
+
+    @property
+    def failed(self) -> bool:
+        """Whether there are no numbers."""
+        return self.status.startswith("failed: ")
+
+
+class LiveKnee:
+    """A knee on the bench; each contact model is prepared once.
+
+    Only the latest request matters: `answer` raises for one that a newer has overtaken.
+
+    Args:
+        case: a scene with [contact], its files read.
+    """
+
+    def __init__(self, case: Case) -> None:
+        if case.scene.contact is None:
+            raise InputError("has no [contact]", "scene", "tkamb live shows contact: add the table")
+        if case.scene.patient.scale != 1.0:
+            raise InputError("is scaled", "[patient] scale", "tkamb live needs scale = 1")
+        self.case = _without_muscles(case)
+        self.bench = Bench(self.case, Mechanics(self.case, near=True).ligaments)
+        self._sides: dict[tuple[str, float], ContactSide] = {}
+        self._known: Known | None = None
+        self._threads: dict[tuple[str, float], Thread] = {}
+        self._refused: dict[tuple[str, float], TkambError] = {}
+        self._before: dict[tuple[str, float], FrameContact] = {}
+        self._computing, self._counting, self._latest = Lock(), Lock(), 0
+
+    def models(self) -> tuple[str, ...]:
+        """Return the names of the contact models."""
+        return contact_names()
+
+    def recorded(self, frame: int) -> BenchRequest:
+        """Return the bench at a recorded frame, under one body weight.
+
+        Raises:
+            InputError: no such frame.
+        """
+        motion, table = self.case.motion, self.case.scene.contact
+        if not 0 <= frame < len(motion.time):
+            raise InputError(
+                f"there is no frame {frame}", "--frame", f"0 to {len(motion.time) - 1}"
+            )
+        assert table is not None
+        values = dict(zip(KNEE_COORDINATES, motion.coordinates[frame].tolist(), strict=True))
+        return BenchRequest(
+            flexion_deg=values["flexion"] / DEGREE,
+            adduction_deg=values["adduction"] / DEGREE,
+            axial_rotation_deg=values["axial_rotation"] / DEGREE,
+            ap_mm=values["ap"] / MILLIMETRE,
+            ml_mm=values["ml"] / MILLIMETRE,
+            load_N=self.case.body_weight,
+            contact=table.model,
+            resolution_mm=table.resolution_mm,
+        )
+
+    def overtake(self) -> int:
+        """Make requests before this moment stale; return the number of the next one."""
+        with self._counting:
+            self._latest += 1
+            return self._latest
+
+    def preparing(self, request: BenchRequest) -> str:
+        """Return what a request has to wait for, in words; empty where it can be answered.
+
+        What is not prepared yet is prepared in a thread of its own: a lattice takes seconds, in
+        which other models go on answering.
+
+        Raises:
+            InputError: the model cannot be prepared.
+        """
+        key = (request.contact, request.resolution_mm)
+        if key in self._sides:
+            return ""
+        with self._counting:
+            if key in self._refused:
+                raise self._refused.pop(key)
+            if key not in self._threads:
+                thread = Thread(target=self._prepare, args=(request, key), daemon=True)
+                self._threads[key] = thread
+                thread.start()
+        return f"preparing {request.contact} at {request.resolution_mm:g} mm"
+
+    def _prepare(self, request: BenchRequest, key: tuple[str, float]) -> None:
+        try:
+            self._side(request)
+        except TkambError as error:
+            self._refused[key] = error
+        finally:
+            del self._threads[key]
+
+    def answer(self, request: BenchRequest, number: int | None = None) -> LiveAnswer:
+        """Return what the bench shows.
+
+        Args:
+            request: the state of the bench.
+            number: from `overtake`; None: whatever comes after, this is wanted.
+
+        Raises:
+            TkambError: a newer request came.
+            InputError: no such contact model or spacing.
+        """
+        with self._computing:
+            if number is not None and number != self._latest:
+                raise TkambError("overtaken")
+            return self._compute(request)
+
+    def save(self, request: BenchRequest, folder: Path) -> Path:
+        """Write a scene that gives the same numbers by `tkamb run`; return its file.
+
+        Args:
+            request: what is shown.
+            folder: new or empty.
+
+        Raises:
+            InputError: the folder holds something, or cannot be written.
+        """
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise InputError("is there already and not empty", folder, "give a new folder")
+        try:
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".tkamb-live-") as beside:
+                whole = Path(beside) / folder.name
+                whole.mkdir()
+                write_bench(self._still_case(request), whole)
+                whole.replace(folder)
+        except OSError as error:
+            raise InputError(f"cannot be written ({error.strerror})", folder) from None
+        return folder / "scene.toml"
+
+    def _still_case(self, request: BenchRequest) -> Case:
+        return self.bench.case_of(request, self._side(request).state.pair.first_touch_height)
+
+    def _side(self, request: BenchRequest) -> ContactSide:
+        """Return a contact side whose model and prepared state every request shares."""
+        key = (request.contact, request.resolution_mm)
+        if key not in self._sides:
+            case = self.bench.case_of(request)
+            mechanics = Mechanics(case, self._known, near=True)
+            self._sides[key] = ContactSide(case, mechanics)
+            self._known = Known(mechanics.query, None, None, range(ROWS))
+        return self._sides[key]
+
+    def _compute(self, request: BenchRequest) -> LiveAnswer:
+        prepared = self._side(request)
+        state = prepared.state
+        nothing = np.zeros(len(state.points))
+        empty = LiveAnswer(
+            request, {}, "", np.full((4, 4), np.nan), state.points, state.triangles, nothing,
+            np.full(len(nothing), np.inf), {}, {},
+        )  # fmt: skip
+        case = self._still_case(request)
+        if not np.isfinite(case.motion.coordinates).all():
+            words = "failed: the femoral component does not lie over the insert"
+            return replace(empty, status=words)
+        key = (request.contact, request.resolution_mm)
+        try:
+            mechanics = Mechanics(case, self._known, near=True)
+            side = ContactSide(case, mechanics, state, sensitivity=False, model=prepared.model)
+            before = [self._before[key]] if key in self._before and not request.released else []
+            body, contact = side.frame(0, before)
+        except TkambError as error:
+            return replace(empty, status=f"failed: {error.what}")
+        if contact.result is None:
+            return replace(empty, status=f"failed: {contact.problem}")
+        if not request.released:
+            self._before[key] = contact
+        result = contact.result
+        poses = {link: body.geometry.state.pose(link) for link in ("femur", "tibia")}
+        if contact.equilibrium is None:
+            lifted = result.pose @ np.linalg.inv(knee_pose(case.motion.coordinates[0]))
+            poses["femur"] = lifted @ poses["femur"]
+        ends = {one.name: np.stack(one.ends(poses)) for one in mechanics.ligaments}
+        flags = [*contact.flags]
+        return LiveAnswer(
+            request,
+            _numbers(body, contact, mechanics),
+            "; ".join(flags) or "ok",
+            result.pose,
+            state.points,
+            state.triangles,
+            result.pressure,
+            result.gap,
+            ends,
+            {
+                side: getattr(result, side).centre_of_pressure
+                for side in SIDES
+                if getattr(result, side) is not None
+            },
+        )
+
+    def known_error(self, request: BenchRequest) -> Any:
+        """Return how far the chosen contact model is known to be off, or "not measured"."""
+        assert self.case.scene.contact is not None
+        material = self.case.scene.contact.material
+        return as_json(known_error(request.contact, request.resolution_mm, material))
+
+
+def _numbers(body: FrameLoads, contact: FrameContact, mechanics: Mechanics) -> dict[str, float]:
+    """Return the numbers of results.csv that the bench shows, under the same names."""
+    result = contact.result
+    assert result is not None
+    numbers = {
+        "force_si_N": float(body.loads.contact_force[1]),
+        "approach_mm": result.approach / MILLIMETRE,
+    }
+    for side in SIDES:
+        condyle = getattr(result, side)
+        if condyle is None:
+            continue
+        numbers |= {
+            f"{side}_force_N": condyle.force,
+            f"{side}_area_mm2": condyle.area / MILLIMETRE**2,
+            f"{side}_mean_pressure_MPa": condyle.mean_pressure / MEGAPASCAL,
+            f"{side}_peak_pressure_MPa": condyle.peak_pressure / MEGAPASCAL,
+            f"{side}_cop_ap_mm": float(condyle.centre_of_pressure[0]) / MILLIMETRE,
+            f"{side}_cop_ml_mm": float(condyle.centre_of_pressure[2]) / MILLIMETRE,
+        }
+    for name, tension in body.geometry.tensions.items():
+        numbers[f"ligament_{name}_N"] = tension
+    if contact.equilibrium is not None:
+        places = contact.equilibrium.coordinates
+        for name, value in zip(KNEE_COORDINATES, places, strict=True):
+            length = name in KNEE_COORDINATES[:3]
+            unit = "mm" if length else "deg"
+            numbers[f"{name}_{unit}"] = float(value) / (MILLIMETRE if length else DEGREE)
+    return {name: float(value) for name, value in numbers.items()}
+
+
+def _without_muscles(case: Case) -> Case:
+    """Return a case of bones, ligaments and contact alone: nothing else is on the bench."""
+    chain = Chain(load_urdf(in_si(case.scene.patient), False), False)
+    update = {"patella": None, "muscles": None, "quadriceps": None, "muscle": ()}
+    scene = case.scene.model_copy(update=update)
+    return replace(case, scene=scene, chain=chain, muscles=(), patellar_ligament=None, patella=None)

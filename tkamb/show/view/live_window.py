@@ -1,0 +1,251 @@
+"""The window of `tkamb live`: its page, its server and what they say to each other."""
+
+import json
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tkamb.errors import TkambError
+from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, knee_pose
+from tkamb.io.scene.case import Case
+from tkamb.show.pages import asset, policy_sources, render
+from tkamb.show.style import SIDE_COLOURS
+from tkamb.show.view.bench import BenchRequest
+from tkamb.show.view.colours import INSERT, METAL, RECORDED, SLACK, rgb
+from tkamb.show.view.drawing import Drawing, Marker, PressureMap, Solid, Strand
+from tkamb.show.view.live import LiveAnswer, LiveKnee
+from tkamb.show.view.page import PACKAGE, POLICY, meshcat_script
+from tkamb.show.view.payload import pack, packed_map
+from tkamb.show.view.server import NotYet, ViewServer
+from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
+
+SCRIPTS = ("scene.js", "moving.js", "controls.js", "live.js")
+COARSE = ("foundation", 2.0)
+"""Contact model and spacing (mm) while a slider moves."""
+SCALES_MPA = (5.0, 10.0, 20.0, 30.0, 50.0, 80.0, 120.0, 200.0, 500.0, 1000.0)
+"""Tops of the colour scale: the least that holds the peak is taken."""
+
+
+class LiveWindow:
+    """A knee on the bench, its page and the folder for what is kept.
+
+    Args:
+        knee: what computes.
+        folder: in which scenes are saved, kept-1, kept-2 and so on.
+        frame: of the recorded motion, shown first.
+
+    Raises:
+        InputError: no such frame.
+    """
+
+    def __init__(self, knee: LiveKnee, folder: Path, frame: int = 0) -> None:
+        self.knee, self.folder, self.frame = knee, folder, frame
+        self.start = knee.recorded(frame)
+        self.title = f"{knee.case.scene.patient.side.capitalize()} knee, live"
+
+    def set_resolution(self, resolution_mm: float) -> None:
+        """Begin with another spacing of the map than the scene's."""
+        self.start = replace(self.start, resolution_mm=resolution_mm)
+
+    def server(self, port: int = 0) -> ViewServer:
+        """Return the server of the window, not yet started.
+
+        Raises:
+            InputError: the port is taken.
+        """
+        return ViewServer(self.page(), pack([self._drawing()]), None, port, self.question)
+
+    def question(self, name: str, content: dict[str, Any]) -> bytes:
+        """Answer one question of the page.
+
+        Args:
+            name: "live" computes a state, "save" writes it as a scene.
+            content: a `BenchRequest` as JSON object.
+
+        Raises:
+            TkambError: no such question, a state that cannot be, or a newer one came.
+        """
+        if name == "live":
+            request, number = BenchRequest.read(content), self.knee.overtake()
+            if words := self.knee.preparing(request):
+                raise NotYet(words)
+            return self._packed(self.knee.answer(request, number))
+        if name == "save":
+            return str(self.knee.save(BenchRequest.read(content), self._next_folder())).encode()
+        raise TkambError("no such question")
+
+    def page(self) -> str:
+        """Return the page; it needs the server."""
+        scripts = [
+            "\n" + text.replace("</script", "<\\/script")
+            for text in (meshcat_script(), *(asset(PACKAGE, name) for name in SCRIPTS))
+        ]
+        return render(
+            PACKAGE,
+            "live.html",
+            title=self.title,
+            policy=POLICY.format(scripts=policy_sources(*scripts), connect="'self'"),
+            style=asset(PACKAGE, "style.css") + asset(PACKAGE, "live.css"),
+            request=self._request(),
+            scripts=scripts,
+        )
+
+    def _request(self) -> dict[str, Any]:
+        motion = self.knee.case.motion
+        columns = {
+            "flexion_deg": ("flexion", DEGREE),
+            "adduction_deg": ("adduction", DEGREE),
+            "axial_rotation_deg": ("axial_rotation", DEGREE),
+            "ap_mm": ("ap", MILLIMETRE),
+            "ml_mm": ("ml", MILLIMETRE),
+        }
+        places = {
+            key: motion.coordinates[:, KNEE_COORDINATES.index(name)] / unit
+            for key, (name, unit) in columns.items()
+        }
+        frames = range(len(motion.time))
+        poses = knee_pose(motion.coordinates)
+        return {
+            "frame": self.frame,
+            "frames": len(frames),
+            "start": asdict(self.start),
+            "models": list(self.knee.models()),
+            "coarse": list(COARSE),
+            "recorded": [{key: float(places[key][k]) for key in places} for k in frames],
+            "ghosts": [poses[k].T.ravel().tolist() for k in frames],
+        }
+
+    def _packed(self, answer: LiveAnswer) -> bytes:
+        peak = float(answer.pressure.max(initial=0.0)) / MEGAPASCAL
+        scale = next((top for top in SCALES_MPA if peak <= top), SCALES_MPA[-1])
+        shown = PressureMap(
+            answer.points,
+            answer.triangles,
+            answer.pressure[None] / MEGAPASCAL,
+            answer.gap[None],
+        )
+        return packed_map(shown, scale, json.dumps(self._words(answer, scale), allow_nan=False))
+
+    def _words(self, answer: LiveAnswer, scale: float) -> dict[str, Any]:
+        numbers = {name: x for name, x in answer.numbers.items() if math.isfinite(x)}
+        forces = [numbers.get(f"{side}_force_N", 0.0) for side in SIDES]
+        if sum(forces) > 0:
+            numbers["medial_share"] = 100.0 * forces[0] / sum(forces)
+        finite = bool(np.isfinite(answer.pose).all())
+        return {
+            "status": answer.status,
+            "request": asdict(answer.request),
+            "label": f"{answer.request.contact} at {answer.request.resolution_mm:g} mm",
+            "error": self._error_words(answer.request),
+            "scale_MPa": scale,
+            "numbers": numbers,
+            "pose": answer.pose.T.ravel().tolist() if finite else None,
+            "ligaments": {
+                name.replace("/", "-"): ends.tolist() for name, ends in answer.ligaments.items()
+            },
+            "centres": {
+                f"{side} centre": centre.tolist() for side, centre in answer.centres.items()
+            },
+        }
+
+    def _error_words(self, request: BenchRequest) -> str:
+        error = self.knee.known_error(request)
+        if isinstance(error, str):
+            return f"how far it is off was {error} at this spacing"
+        return (
+            f"on the studied cases off by at most {100 * error['peak_pressure']:.2g} % in peak "
+            f"pressure, {100 * error['area']:.2g} % in area"
+        )
+
+    def _next_folder(self) -> Path:
+        """Return a folder that is not there yet."""
+        number = 1
+        while (self.folder / f"kept-{number}").exists():
+            number += 1
+        return self.folder / f"kept-{number}"
+
+    def _drawing(self) -> Drawing:
+        case: Case = self.knee.case
+        assert case.femoral is not None and case.insert is not None
+        recorded = knee_pose(case.motion.coordinates[self.frame])[None]
+        still = np.eye(4)[None]
+        metal = ("femoral component", "femoral component", case.femoral, METAL, 0.5)
+        ghost = ("recorded femoral component", "recorded pose", case.femoral, RECORDED, 0.25)
+        coarse = replace(self.start, contact=COARSE[0], resolution_mm=COARSE[1])
+        answer = self.knee.answer(coarse)
+        nothing = np.zeros((1, len(answer.points)))
+        nowhere = np.full((1, 3), np.nan)
+        colour = np.tile(rgb(SLACK), (1, 2, 1))
+        return Drawing(
+            title="on the bench",
+            side=case.scene.patient.side,
+            body_weight=case.body_weight,
+            contact=coarse.contact,
+            labels=("",),
+            times=np.zeros(1),
+            statuses=("ok",),
+            readings=(),
+            solids=(
+                Solid("insert", "insert", case.insert, INSERT, 1.0, still),
+                Solid(*metal, recorded),
+                Solid(*ghost, recorded),
+            ),
+            strands=tuple(
+                Strand(one.name, "ligaments", np.full((1, 2, 3), np.nan), colour, 1e-3)
+                for one in self.knee.bench.bundles
+            ),
+            arrows=(),
+            markers=tuple(
+                Marker(f"{side} centre", "contact points", SIDE_COLOURS[side], nowhere, 8e-4)
+                for side in SIDES
+            ),
+            map=PressureMap(answer.points, answer.triangles, nothing, nothing + 1.0),
+            strain_limit=0.0,
+        )
+
+
+def open_live(
+    path: Path, *, frame: int = 0, contact: str | None = None, folder: Path | None = None
+) -> LiveWindow:
+    """Return the window of a scene or of a folder of results.
+
+    Args:
+        path: a scene file, or a folder that `tkamb run` wrote.
+        frame: of the recorded motion, shown first.
+        contact: contact model, instead of the scene's.
+        folder: for what is kept; None: out/live.
+
+    Raises:
+        InputError: nothing to see there, or the scene has no [contact].
+    """
+    from tkamb.show.view.run import read_source
+
+    case = read_source(path, contact).case
+    return LiveWindow(LiveKnee(case), folder or Path("out") / "live", frame)
+
+
+def live(
+    path: str | Path, *, frame: int = 0, contact: str | None = None, folder: Path | None = None
+) -> ViewServer:
+    """Serve the live window beside the caller, for notebooks; its address is `url`.
+
+    Args:
+        path: a scene file, or a folder that `tkamb run` wrote.
+        frame: of the recorded motion, shown first.
+        contact: contact model, instead of the scene's.
+        folder: for what is kept; None: out/live.
+
+    Returns:
+        The server, which answers until `close()`.
+
+    Raises:
+        InputError: nothing to see there, or the scene has no [contact].
+    """
+    from tkamb.show.view.show import serve_in_background
+
+    server = open_live(Path(path), frame=frame, contact=contact, folder=folder).server()
+    serve_in_background(server)
+    return server

@@ -1,0 +1,286 @@
+"""Drawings as one compressed block of bytes, the same for the live window and for a file.
+
+Layout, before compression by gzip: the length of the header (uint32, little-endian), the
+header (JSON, padded to 4 bytes), the arrays one after another. In the header an array is
+{"at": byte, "of": element type, "n": elements}. What stands still is a list of meshcat
+commands, msgpack as meshcat's own viewer takes them; what moves are arrays per frame.
+"""
+
+import gzip
+import json
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import umsgpack  # type: ignore[import-untyped]
+from meshcat.commands import SetObject, SetTransform
+from meshcat.geometry import MeshLambertMaterial, TriangularMeshGeometry, pack_numpy_array
+from meshcat.path import Path as NodePath
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from tkamb.geometry.frames import Array
+from tkamb.show.levels import pressure_levels
+from tkamb.show.view.colours import (
+    Colours,
+    activation_scale,
+    pressure_scale,
+    strain_scale,
+    wear_colours,
+    wear_scale,
+)
+from tkamb.show.view.drawing import (
+    HIDDEN_AT_FIRST,
+    LAYERS,
+    Arrow,
+    Drawing,
+    Marker,
+    PressureMap,
+    Solid,
+    Strand,
+)
+from tkamb.show.view.shading import MOST_TRIANGLES, Shaded, shade
+from tkamb.units import MILLIMETRE
+
+
+@dataclass(frozen=True)
+class ViewPayloadSettings:
+    """What the viewer's page is given."""
+
+    arrow_metres_per_body_weight: float = 0.03
+    """Length of an arrow of one body weight."""
+    pressure_levels: int = 32767
+    """Steps from no pressure to the largest."""
+    most_coloured_triangles: int = 100_000
+    """Triangles of a surface that its colours divide: merged ones would blur them."""
+
+
+VIEW_PAYLOAD = ViewPayloadSettings()
+
+
+WHITE = "#ffffff"
+"""Of a material whose vertices have colours of their own."""
+
+FRONT = 0
+"""three.js: triangles are seen from outside only, which spares half of them."""
+
+TYPES = {"float32": np.float32, "uint8": np.uint8, "int16": np.int16, "uint32": np.uint32}
+
+
+class Block:
+    """Collects arrays; see the module's layout."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._size = 0
+
+    def put(self, values: Any, kind: str) -> dict[str, Any]:
+        """Add an array and return where it is."""
+        array = np.ascontiguousarray(values, TYPES[kind])
+        return self._add(array.tobytes(), kind, array.size)
+
+    def put_bytes(self, text: bytes) -> dict[str, Any]:
+        """Add bytes and return where they are."""
+        return self._add(text, "uint8", len(text))
+
+    def _add(self, part: bytes, kind: str, count: int) -> dict[str, Any]:
+        span = {"at": self._size, "of": kind, "n": count}
+        padded = part + bytes(-len(part) % 4)
+        self._parts.append(padded)
+        self._size += len(padded)
+        return span
+
+    def compress(self, header: dict[str, Any]) -> bytes:
+        """Return header and arrays, compressed."""
+        text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
+        text += b" " * (-len(text) % 4)
+        return gzip.compress(
+            struct.pack("<I", len(text)) + text + b"".join(self._parts), 6, mtime=0
+        )
+
+
+def pack(drawings: Sequence[Drawing]) -> bytes:
+    """Return the drawings, shown side by side, on common colour scales."""
+    block = Block()
+    peak = peak_pressure(drawings)
+    limit = max(one.strain_limit for one in drawings)
+    deepest = max(one.deepest_wear for one in drawings)
+    return block.compress(
+        {
+            "layers": list(LAYERS),
+            "hidden": list(HIDDEN_AT_FIRST),
+            "metres_per_body_weight": VIEW_PAYLOAD.arrow_metres_per_body_weight,
+            "peak_MPa": peak,
+            "strain_limit": limit,
+            "activation_limit": max(one.activation_limit for one in drawings),
+            "wear_limit_mm": deepest,
+            "wear_scale": block.put(wear_scale(), "uint8"),
+            "pressure_scale": block.put(pressure_scale(), "uint8"),
+            "strain_scale": block.put(strain_scale(), "uint8"),
+            "activation_scale": block.put(activation_scale(), "uint8"),
+            "views": [_view(block, k, one, peak, deepest) for k, one in enumerate(drawings)],
+        }
+    )
+
+
+def peak_pressure(drawings: Sequence[Drawing]) -> float:
+    """Return the largest pressure (MPa) of all frames: the top of the common scale."""
+    return max((one.map.peak for one in drawings if one.map), default=0.0)
+
+
+def packed_map(found: PressureMap, peak: float, words: str) -> bytes:
+    """Return one map alone, on the scale of a page that is open, with words about it."""
+    block = Block()
+    return block.compress({"map": _map(block, found, peak), "words": words})
+
+
+def packed_lattice(lines: Array) -> bytes:
+    """Return the lines (s, 2, 3) m of a lattice alone."""
+    block = Block()
+    return block.compress({"lattice": block.put(lines, "float32")})
+
+
+def _view(
+    block: Block, number: int, drawing: Drawing, peak: float, deepest: float
+) -> dict[str, Any]:
+    root = f"/tkamb/{number}"
+    commands, moving, notes = [_insert_transform(root, drawing.side)], [], list(drawing.notes)
+    for solid in drawing.solids:
+        shape = shade(
+            solid.surface,
+            MOST_TRIANGLES if solid.wear is None else VIEW_PAYLOAD.most_coloured_triangles,
+        )
+        if shape.error:
+            notes.append(
+                f"{solid.name.capitalize()}: drawn with {len(shape.faces)} of "
+                f"{len(solid.surface.faces)} triangles, at most {shape.error / MILLIMETRE:.2f} mm "
+                "from the true surface."
+            )
+        path = _node_name(root, solid.layer, solid.name)
+        commands += _commands(path, solid, shape, deepest)
+        if len(solid.poses) > 1:
+            poses = block.put(np.swapaxes(solid.poses, 1, 2), "float32")
+            moving.append({"path": path, "poses": poses})
+    return {
+        "title": drawing.title,
+        "side": drawing.side,
+        "body_weight": drawing.body_weight,
+        "contact": drawing.contact,
+        "labels": drawing.labels,
+        "statuses": drawing.statuses,
+        "readings": [{"name": row.name, "values": row.values} for row in drawing.readings],
+        "notes": notes,
+        "times": [float(time) for time in drawing.times],
+        "commands": [block.put_bytes(umsgpack.packb(one.lower())) for one in commands],
+        "moving": moving,
+        "strands": [_strand(block, root, one) for one in drawing.strands],
+        "arrows": [_arrow(block, root, one) for one in drawing.arrows],
+        "markers": [_marker(block, root, one) for one in drawing.markers],
+        "map": _map(block, drawing.map, peak) if drawing.map else None,
+        "lattice": block.put(drawing.lattice, "float32") if len(drawing.lattice) else None,
+    }
+
+
+def _strand(block: Block, root: str, strand: Strand) -> dict[str, Any]:
+    return {
+        "path": _node_name(root, strand.layer, strand.name),
+        "frames": len(strand.points),
+        "count": strand.points.shape[1],
+        "points": block.put(strand.points, "float32"),
+        "colours": block.put(strand.colours, "uint8"),
+        "radius": strand.radius,
+    }
+
+
+def _arrow(block: Block, root: str, arrow: Arrow) -> dict[str, Any]:
+    return {
+        "path": _node_name(root, "forces", arrow.name),
+        "name": arrow.name,
+        "meaning": arrow.meaning,
+        "colour": arrow.colour,
+        "ends_there": arrow.ends_there,
+        "points": block.put(arrow.points, "float32"),
+        "forces": block.put(arrow.forces, "float32"),
+    }
+
+
+def _marker(block: Block, root: str, marker: Marker) -> dict[str, Any]:
+    return {
+        "path": _node_name(root, marker.layer, marker.name),
+        "colour": marker.colour,
+        "radius": marker.radius,
+        "points": block.put(marker.points, "float32"),
+    }
+
+
+def _map(block: Block, found: PressureMap, peak: float) -> dict[str, Any]:
+    return {
+        "count": len(found.points),
+        "points": block.put(found.points, "float32"),
+        "triangles": block.put(found.triangles, "uint32"),
+        "levels": block.put(map_levels(found, peak), "int16"),
+    }
+
+
+def map_levels(found: PressureMap, peak: float) -> NDArray[np.int16]:
+    """Return `pressure_levels` (f, n) of the map as integers: a loaded point's is at least 1.
+
+    Args:
+        found: the map.
+        peak: MPa, top of the scale; a higher pressure has the top level.
+    """
+    level = pressure_levels(found.pressure, found.gap, found.triangles, peak)
+    whole = np.maximum(np.round(np.abs(level) * VIEW_PAYLOAD.pressure_levels), 1.0)
+    return np.where(level > 0, whole, -whole).astype(np.int16)
+
+
+def _insert_transform(root: str, side: str) -> SetTransform:
+    """Return the insert frame (y up) in meshcat's (z up), a left knee mirrored back."""
+    turn = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+    if side == "left":
+        turn = turn @ np.diag([1.0, 1.0, -1.0, 1.0])
+    return SetTransform(turn, _node(root))
+
+
+def _commands(path: str, solid: Solid, shape: Shaded, deepest: float) -> list[Any]:
+    """Return what hangs a solid into the scene; wear colours it on a scale up to `deepest` mm."""
+    colours, colour = None, solid.colour
+    if solid.wear is not None:
+        nearest = cKDTree(solid.surface.vertices).query(shape.vertices)[1]
+        colours, colour = wear_colours(solid.wear[nearest], deepest), WHITE
+    material = MeshLambertMaterial(
+        color=int(colour.removeprefix("#"), 16),
+        opacity=solid.opacity,
+        side=FRONT,
+        vertexColors=colours is not None,
+    )
+    made = [SetObject(_Mesh(shape, colours), material, _node(path))]
+    if len(solid.poses) == 1:
+        made.append(SetTransform(solid.poses[0], _node(path)))
+    return made
+
+
+def _node_name(root: str, layer: str, name: str) -> str:
+    """Return a path in the scene tree; a name's own slash would divide it."""
+    return f"{root}/{layer}/{name.replace('/', '-')}"
+
+
+def _node(path: str) -> NodePath:
+    return NodePath(tuple(part for part in path.split("/") if part))
+
+
+class _Mesh(TriangularMeshGeometry):
+    """meshcat's mesh with our normals, and a colour per vertex where there are any."""
+
+    def __init__(self, shape: Shaded, colours: Colours | None) -> None:
+        share = None if colours is None else colours / np.float32(255.0)
+        super().__init__(shape.vertices, shape.faces, share)
+        self._normals = shape.normals
+
+    def lower(self, object_data: Any) -> Any:
+        """Return what three.js loads."""
+        lowered = super().lower(object_data)
+        lowered["data"]["attributes"]["normal"] = pack_numpy_array(self._normals.T)
+        return lowered

@@ -1,0 +1,222 @@
+"""What there is to see: a results folder and its scene, or a scene that is run first."""
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import SIDES
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import Case, load_case
+from tkamb.knee.contact_points import CondylePoint
+from tkamb.knee.equations import KneeGeometry
+from tkamb.knee.patella import touching_patella
+from tkamb.run.mechanics import Mechanics
+from tkamb.run.metrics import map_rows
+from tkamb.run.rerun import RUN_AGAIN, case_of_results, same_files
+from tkamb.run.results import Results
+from tkamb.run.results_folder import SUMMARY_NAME, read_results
+from tkamb.run.simulation import simulate
+from tkamb.run.summary import scene_hash
+
+Progress = Callable[[Iterable[int]], Iterable[int]]
+
+
+@dataclass(frozen=True, eq=False)
+class CaseResults:
+    """A case and the results that belong to it.
+
+    Args:
+        case: the scene with its files read.
+        mechanics: the rigid-body side, whose geometry is drawn.
+        results: the numbers.
+        frames: the motion's frame of each row of the results.
+    """
+
+    case: Case
+    mechanics: Mechanics
+    results: Results
+    frames: tuple[int, ...]
+
+    def geometries(self, progress: Progress = lambda frames: frames) -> list[KneeGeometry]:
+        """Return what the equations of every frame worked on.
+
+        Where condyles and patella touch stands in the maps of the run, or is looked for again.
+        Where body and contact were made to agree, both are solved again: the places where forces
+        act come from the contact.
+        """
+        contact = self.case.scene.contact
+        if contact is None or (contact.coupling == "none" and not contact.released):
+            rows = map_rows(self.results)
+            return [self._geometry(k, rows.get(row)) for row, k in enumerate(progress(self.frames))]
+        from tkamb.knee.equilibrium.frame_contact import FrameContact
+        from tkamb.run.contact_side import ContactSide
+
+        side, found = ContactSide(self.case, self.mechanics), list[KneeGeometry]()
+        touched: list[FrameContact] = []
+        for k in progress(self.frames):
+            body, contact_of_frame = side.frame(k, touched)
+            found.append(body.geometry)
+            touched.append(contact_of_frame)
+        return found
+
+    def _geometry(self, k: int, row: int | None) -> KneeGeometry:
+        """Return what the equations of a frame of the motion worked on.
+
+        Args:
+            k: frame.
+            row: of its map; None without one.
+        """
+        maps, mechanics = self.results.maps, self.mechanics
+        if maps is None or row is None or mechanics.muscles is not None:
+            return mechanics.frame(k).geometry
+        place = self.case.motion.coordinates[k]
+        points, normals = maps.contact_points_m[row], maps.contact_normals[row]
+        condyles = {
+            side: CondylePoint(point, normal, mechanics.sliding(k, place, point), np.nan)
+            for side, point, normal in zip(SIDES, points[:2], normals[:2], strict=True)
+            if np.isfinite(point).all()
+        }
+        if not condyles:
+            return mechanics.frame(k).geometry
+        patella = None
+        if mechanics.extensor is not None and np.isfinite(points[2]).all():
+            patella = touching_patella(mechanics.extensor.joints(k)[0], points[2], normals[2])
+        return replace(mechanics.geometry(k, patella=patella), condyles=condyles)
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """What a path names, its files read once: results and their case, or a case to be run.
+
+    Args:
+        path: a folder that `tkamb run` wrote, or a scene file.
+        case: the scene with its files read.
+        results: of the case; None where it has not been run.
+        kept: the folder in which a scene's own results were found.
+    """
+
+    path: Path
+    case: Case
+    results: Results | None
+    kept: Path | None = None
+
+    def __len__(self) -> int:
+        """Return the number of frames that there are to see."""
+        return len(self.case.motion.time if self.results is None else self.results)
+
+    def open(
+        self,
+        progress: Progress = lambda frames: frames,
+        announce: Callable[[str], None] = lambda line: None,
+    ) -> CaseResults:
+        """Return the run, computed first where there are no results.
+
+        Args:
+            progress: wraps the frame indices of a run.
+            announce: takes a line for the user.
+
+        Raises:
+            InputError: the scene cannot be run, or is no longer what was run.
+        """
+        if self.kept is not None:
+            announce(f"results of this scene found in {self.kept}")
+        results = self.results
+        if results is None:
+            announce("running the scene (keep its results with `tkamb run`)")
+            results = simulate(self.case, scene_path=self.path, progress=progress)
+        return match_frames(self.case, results)
+
+
+def read_source(path: str | Path, contact: str | None = None) -> Source:
+    """Return what stands behind a results folder or a scene file; nothing is run.
+
+    A scene whose results stand in its output folder need not be run again.
+
+    Args:
+        path: a folder that `tkamb run` wrote, or a scene file.
+        contact: contact model, instead of the scene's; a scene only.
+
+    Raises:
+        InputError: nothing to see there, or the scene is no longer what was run.
+    """
+    path = Path(path)
+    if os.path.isdir(path):
+        if contact:
+            raise InputError("has its own contact model", path, "give the scene to choose another")
+        results = read_results(path)
+        if not len(results):
+            raise InputError("holds no frame", path, RUN_AGAIN)
+        return Source(path, case_of_results(results), results)
+    scene = load_scene(path, {"contact.model": contact} if contact else {})
+    case = load_case(scene)
+    folder = scene.output.directory or Path("out") / path.resolve().parent.name
+    if (folder / SUMMARY_NAME).exists():
+        results = read_results(folder)
+        same = results.summary.get("scene_sha256") == scene_hash(case)
+        same = same and same_files(case, results.summary)
+        if same and len(results) and not results.summary.get("unfinished_frames"):
+            return Source(path, case, results, folder)
+    return Source(path, case, None)
+
+
+def open_run(
+    path: str | Path,
+    *,
+    contact: str | None = None,
+    announce: Callable[[str], None] = lambda line: None,
+) -> CaseResults:
+    """Return the run behind a results folder or a scene file; see `read_source` and `Source`.
+
+    Raises:
+        InputError: nothing to see there, or the scene is no longer what was run.
+    """
+    return read_source(path, contact).open(announce=announce)
+
+
+def check_frame(sources: Sequence[Source], frame: int) -> None:
+    """Refuse a frame that none of the runs has, before any is run or drawn.
+
+    Args:
+        sources: of the runs.
+        frame: row of the results; negative ones count from the end.
+
+    Raises:
+        InputError: no run has it.
+    """
+    most = max(map(len, sources))
+    if not -most <= frame < most:
+        raise no_frame(frame, most)
+
+
+def no_frame(frame: int, most: int) -> InputError:
+    """Return the refusal of a frame where the longest run has `most`."""
+    return InputError(f"there is no frame {frame}", "--frame", f"0 to {most - 1}")
+
+
+def match_frames(case: Case, results: Results) -> CaseResults:
+    """Return the run of a case and its results.
+
+    Raises:
+        InputError: results at times that the motion does not have.
+    """
+    frame_at = {float(time): k for k, time in enumerate(case.motion.time)}
+    try:
+        frames = tuple(frame_at[float(time)] for time in results["time_s"])
+    except KeyError as error:
+        raise InputError(
+            f"no frame at {error.args[0]} s in the scene's motion", "results", RUN_AGAIN
+        ) from None
+    return CaseResults(case, Mechanics(case, near=True), results, frames)
+
+
+def run_of_results(results: Results) -> CaseResults:
+    """Return the run of results, whose summary names the scene.
+
+    Raises:
+        InputError: the scene is not there, or no longer what was run.
+    """
+    return match_frames(case_of_results(results), results)

@@ -1,0 +1,316 @@
+"""The live window: its server, and another contact model on one frame while one looks at it.
+
+The server is for this machine only, and gives nothing but the page and its data. Other
+users of the machine reach the port too: every address starts with a random token, which only the
+user's terminal shows.
+"""
+
+import json
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+from tkamb.contact.registry import contact_names
+from tkamb.errors import InputError, TkambError
+from tkamb.run.contact_side import ContactSide
+from tkamb.show.style import SIDE_COLOURS
+from tkamb.show.view.draw import lattice_lines
+from tkamb.show.view.drawing import PressureMap
+from tkamb.show.view.payload import packed_lattice, packed_map
+from tkamb.show.view.run import CaseResults
+from tkamb.units import MEGAPASCAL, MILLIMETRE
+
+HOST = "127.0.0.1"
+
+
+@dataclass(frozen=True)
+class ViewServerSettings:
+    """Limits of the viewer's local server."""
+
+    most_request_bytes: int = 10_000
+    """Bytes of a request; a longer one is refused."""
+    idle_seconds: float = 15.0
+    """s: without a byte from a client that is connected, before it is cut off."""
+    token_bytes: int = 18
+    """Random bytes of the token in the address."""
+
+
+VIEW_SERVER = ViewServerSettings()
+
+HEADERS = {
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Referrer-Policy": "no-referrer",
+    "Connection": "close",
+}
+"""Of every answer. The page's own policy says what it may load (`tkamb.show.view.page.POLICY`);
+who may frame it can only be said here."""
+
+
+class ContactSwitch:
+    """Computes a frame of a run with any contact model; each model is prepared once.
+
+    Only the latest question is answered: a newer one, or `cancel`, ends those before it as soon as
+    the step that they are at is done.
+
+    Args:
+        run: with [contact].
+        peak: MPa, top of the colour scale of the page.
+
+    Attributes:
+        stage: what is being done, in words; empty when nothing is.
+    """
+
+    def __init__(self, run: CaseResults, peak: float) -> None:
+        self.run, self.peak = run, peak
+        self.stage = ""
+        self._sides: dict[str, ContactSide] = {}
+        self._lock, self._counting, self._latest = Lock(), Lock(), 0
+
+    def models(self) -> tuple[str, ...]:
+        """Return the names that can be asked for; none without [contact]."""
+        return contact_names() if self.run.case.scene.contact else ()
+
+    def answer(self, row: int, model: str) -> bytes:
+        """Return map and plain words of one frame, packed.
+
+        Args:
+            row: row of the results.
+            model: name of the contact model.
+
+        Raises:
+            TkambError: no such model or frame, or the model cannot be prepared, or another
+                question came.
+        """
+        if not 0 <= row < len(self.run.frames):
+            raise TkambError(f"there is no frame {row}")
+        number = self.cancel()
+        with self._lock:
+            try:
+                self._go_on(number, f"preparing {model}")
+                side = self._side(model)
+                self._go_on(number, f"computing frame {row} with {model}")
+                return self._compute(side, row, model)
+            finally:
+                self.stage = ""
+
+    def cancel(self) -> int:
+        """End what was asked before; return the number of the next question."""
+        with self._counting:
+            self._latest += 1
+            return self._latest
+
+    def _go_on(self, number: int, stage: str) -> None:
+        if number != self._latest:
+            raise TkambError("cancelled")
+        self.stage = stage
+
+    def lattice(self) -> bytes:
+        """Return the lines of the run's lattice, packed.
+
+        Raises:
+            TkambError: the insert cannot be meshed.
+        """
+        with self._lock:
+            return packed_lattice(lattice_lines(self.run.case))
+
+    def _compute(self, side: ContactSide, row: int, model: str) -> bytes:
+        _, contact = side.frame(self.run.frames[row])
+        points, triangles = side.state.points, side.state.triangles
+        result = contact.result
+        if result is None:
+            nothing = PressureMap(points, triangles, *np.zeros((2, 1, len(points))))
+            return packed_map(nothing, self.peak, f"{model}: {contact.problem}")
+        found = PressureMap(points, triangles, result.pressure[None] / MEGAPASCAL, result.gap[None])
+        parts = []
+        for name in SIDE_COLOURS:
+            condyle = getattr(result, name)
+            if condyle is not None:
+                parts.append(
+                    f"{name} {condyle.force:.0f} N on {condyle.area / MILLIMETRE**2:.0f} mm², "
+                    f"peak {condyle.peak_pressure / MEGAPASCAL:.1f} MPa"
+                )
+        words = [f"{model}: {'; '.join(parts)}", f"{contact.seconds:.2f} s", *contact.flags]
+        if found.peak > self.peak:
+            words.append(f"the map exceeds the colour scale ({self.peak:.1f} MPa)")
+        return packed_map(found, self.peak, "; ".join(words))
+
+    def _side(self, model: str) -> ContactSide:
+        if model not in self._sides:
+            case = self.run.case
+            assert case.scene.contact is not None
+            own = model == case.scene.contact.model
+            changes = {"model": model} if own else {"model": model, "options": {}}
+            contact = case.scene.contact.model_copy(update=changes)
+            scene = case.scene.model_copy(update={"contact": contact})
+            self._sides[model] = ContactSide(replace(case, scene=scene), self.run.mechanics)
+        return self._sides[model]
+
+
+class NotYet(TkambError):
+    """What is asked for is being prepared; ask again."""
+
+
+class ViewServer:
+    """Serves one page on the loopback address.
+
+    Requests under another host name (DNS rebinding), from another site, or without the token in
+    their address are refused.
+
+    Args:
+        html: the page.
+        packed: the drawings.
+        switch: computes other contact models; None without.
+        port: 0 for any free one.
+        bench: answers a question of `tkamb live`, by its name and content; None without.
+
+    Raises:
+        InputError: the port is taken.
+    """
+
+    def __init__(
+        self,
+        html: str,
+        packed: bytes,
+        switch: ContactSwitch | None,
+        port: int = 0,
+        bench: "Callable[[str, dict[str, Any]], bytes] | None" = None,
+    ) -> None:
+        self.switch = switch
+        self._token = secrets.token_urlsafe(VIEW_SERVER.token_bytes)
+        content = {
+            "": ("text/html; charset=utf-8", html.encode()),
+            "scene.bin": ("application/octet-stream", packed),
+        }
+
+        class Handler(_Handler):
+            pass
+
+        Handler.content, Handler.switch, Handler.root = content, switch, f"/{self._token}/"
+        Handler.bench = None if bench is None else staticmethod(bench)
+        try:
+            self._server = ThreadingHTTPServer((HOST, port), Handler)
+        except (OSError, OverflowError) as error:
+            raise InputError(f"cannot listen ({error})", f"{HOST}:{port}", "--port 0") from None
+        self._server.daemon_threads = True
+        own = self._server.server_address[1]
+        Handler.names = {f"{name}:{own}" for name in (HOST, "localhost")}
+
+    @property
+    def url(self) -> str:
+        """Address of the page, token included."""
+        return f"http://{HOST}:{self._server.server_address[1]}/{self._token}/"
+
+    def serve(self) -> None:
+        """Answer until `close`, or until the user interrupts."""
+        self._server.serve_forever(poll_interval=0.2)
+
+    def close(self) -> None:
+        """Stop."""
+        self._server.shutdown()
+        self._server.server_close()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    content: dict[str, tuple[str, bytes]]
+    switch: ContactSwitch | None
+    bench: "Callable[[str, dict[str, Any]], bytes] | None"
+    names: set[str]
+    root: str
+
+    timeout = VIEW_SERVER.idle_seconds
+
+    def do_GET(self) -> None:
+        if not self._is_allowed():
+            self._refuse()
+        elif self._path_below_token in self.content:
+            self._send(HTTPStatus.OK, *self.content[self._path_below_token])
+        else:
+            self._send_line(HTTPStatus.NOT_FOUND, "no such page")
+
+    def do_POST(self) -> None:
+        if not self._is_allowed():
+            self._refuse()
+            return
+        try:
+            answer = self._answer(self._question())
+        except NotYet as error:
+            self._send_line(HTTPStatus.ACCEPTED, error.what)
+        except TimeoutError:
+            self._send_line(HTTPStatus.REQUEST_TIMEOUT, "the question did not arrive")
+        except (TkambError, ValueError, KeyError, RecursionError) as error:
+            self._send_line(HTTPStatus.BAD_REQUEST, str(error) or type(error).__name__)
+        except Exception as error:  # the last handler: the window says it, the server goes on
+            words = f"{type(error).__name__}: {error}"
+            self._send_line(HTTPStatus.INTERNAL_SERVER_ERROR, words)
+        else:
+            self._send(HTTPStatus.OK, "application/octet-stream", answer)
+
+    def _answer(self, question: dict[str, Any]) -> bytes:
+        if self.bench is not None:
+            return self.bench(self._path_below_token, question)
+        if self.switch is not None and self._path_below_token == "contact":
+            frame, model = question["frame"], question["model"]
+            if type(frame) is not int or not isinstance(model, str):
+                raise TkambError("frame is an integer, model a name")
+            return self.switch.answer(frame, model)
+        if self.switch is not None and self._path_below_token == "lattice":
+            return self.switch.lattice()
+        if self.switch is not None and self._path_below_token == "stage":
+            return self.switch.stage.encode()
+        if self.switch is not None and self._path_below_token == "cancel":
+            self.switch.cancel()
+            return b""
+        raise TkambError("no such question")
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Stay quiet."""
+
+    @property
+    def _path_below_token(self) -> str:
+        """The path below the token."""
+        return self.path.removeprefix(self.root)
+
+    def _question(self) -> dict[str, Any]:
+        length = int(self.headers.get("Content-Length") or 0)
+        if not 0 < length <= VIEW_SERVER.most_request_bytes:
+            raise TkambError("a question of no or too many bytes")
+        question = json.loads(self.rfile.read(length))
+        if not isinstance(question, dict):
+            raise TkambError("a question is an object")
+        return question
+
+    def _is_allowed(self) -> bool:
+        origin = self.headers.get("Origin")
+        given = self.path[: len(self.root)].encode(errors="replace")
+        return (
+            self.headers.get("Host") in self.names
+            and (origin is None or origin.removeprefix("http://") in self.names)
+            and secrets.compare_digest(given, self.root.encode())
+        )
+
+    def _refuse(self) -> None:
+        self._send_line(
+            HTTPStatus.FORBIDDEN, "another host or site, or not the address tkamb printed"
+        )
+
+    def _send_line(self, status: HTTPStatus, words: str) -> None:
+        """Send one line of text."""
+        self._send(status, "text/plain; charset=utf-8", " ".join(words.split()).encode())
+
+    def _send(self, status: HTTPStatus, kind: str, body: bytes) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        for name, value in HEADERS.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)

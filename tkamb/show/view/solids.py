@@ -1,0 +1,310 @@
+"""The rigid parts of a drawing: implant, patella, bones as plain solids, floor and foot.
+
+A scene holds no bone meshes but one that a muscle may wrap, which is drawn; the other
+bones are stand-ins of about the right size between the joint centres: they orient the eye and
+carry no load. Nobody measured the foot: it hangs at the ankle, level with the floor and pointing
+where the shank does, so that the arrow of the ground reaction does not hang in the air.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from tkamb.geometry.frames import MIRROR, Array, inverse, pose, transform
+from tkamb.geometry.surface import Surface
+from tkamb.io.recordings.vtp import read_vtp, read_vtp_values
+from tkamb.io.scene.case import Case
+from tkamb.knee.chain import ChainState
+from tkamb.knee.equations import KneeGeometry
+from tkamb.run.maps import ContactMaps
+from tkamb.show.style import BLACK
+from tkamb.show.view.arrows import centre_of_pressure
+from tkamb.show.view.colours import BONE, BUTTON, FLOOR, INSERT, METAL, RECORDED
+from tkamb.show.view.drawing import Marker, Solid
+from tkamb.show.wear import WORN_NAME, wear_of_run
+from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+FEMUR_PROFILE = (
+    (0.015, 19.0),
+    (0.045, 21.0),
+    (0.10, 15.0),
+    (0.25, 12.5),
+    (0.80, 13.0),
+    (0.93, 17.0),
+    (1.0, 20.0),
+)
+TIBIA_PROFILE = ((0.0, 26.0), (0.05, 24.0), (0.16, 15.0), (0.50, 11.0), (0.85, 11.0), (1.0, 18.0))
+"""Share of the length from the knee, and radius in mm."""
+
+PATELLA_DEPTH, PATELLA_WIDTH = 8.0 * MILLIMETRE, 21.0 * MILLIMETRE
+
+INSTEP = (15.0, 42.0, 0.0, 22.0)
+SOLE = (
+    (-48.0, 26.0, 0.0, 26.0),
+    (75.0, 26.0, 0.0, 22.0),
+    (125.0, 18.0, -24.0, 18.0),
+    (115.0, 16.0, 26.0, 16.0),
+    (172.0, 11.0, -20.0, 11.0),
+    (160.0, 10.0, 22.0, 10.0),
+)
+"""Balls in whose hull the foot lies: anterior of the ankle, above the sole, right; radius; mm."""
+
+
+@dataclass(frozen=True)
+class ViewSolidSettings:
+    """Sizes of what the viewer draws beside the implant."""
+
+    ankle_radius_mm: float = 20.0
+    """mm."""
+    plate_centre: float = 60.0 * MILLIMETRE
+    """m, anterior of the ankle."""
+
+
+VIEW_SOLID = ViewSolidSettings()
+
+PLATE = np.array([340.0, 5.0, 200.0]) * MILLIMETRE
+GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
+"""rad: successive points of a spiral turned by it cover a sphere evenly."""
+
+
+def solids(
+    case: Case,
+    recorded: Array,
+    states: Sequence[ChainState],
+    maps: ContactMaps | None,
+    rows: Sequence[int],
+) -> tuple[Solid, ...]:
+    """Return the solids of a case.
+
+    The femoral component stands where the contact model pressed it, else where it was
+    recorded.
+
+    Args:
+        case: the case.
+        recorded: (f, 4, 4) pose_femur_in_insert as measured.
+        states: chain at each frame.
+        maps: the run's maps, whose poses are used.
+        rows: row of the maps of each frame, -1 where there is none.
+    """
+    solved = np.stack([state.pose("femur") for state in states])
+    still = np.eye(4)[None]
+    found = []
+    if case.insert is not None:
+        found.append(Solid("insert", "insert", case.insert, INSERT, 1.0, still))
+    if case.post is not None:
+        found.append(Solid("post", "insert", case.post, INSERT, 1.0, still))
+    if case.femoral is not None:
+        poses = _contact_poses(solved, maps, rows)
+        found.append(
+            Solid("femoral component", "femoral component", case.femoral, METAL, 0.5, poses)
+        )
+        found.append(
+            Solid(
+                "recorded femoral component",
+                "recorded pose",
+                case.femoral,
+                RECORDED,
+                0.35,
+                recorded,
+            )
+        )
+    found += [_femur(case, states, solved), _tibia(states)]
+    if case.scene.patella is not None and case.patella is not None:
+        poses = np.stack([state.pose("patella") for state in states])
+        found.append(Solid("patellar button", "patella", case.patella, BUTTON, 1.0, poses))
+        bone = _patella(case)
+        found.append(Solid("patella", "patella", bone, BONE, 0.55, poses))
+    return tuple(found)
+
+
+def worn_insert(results: "Results", side: str) -> tuple[Solid, ...]:
+    """Return the insert as `tkamb wear` left it, coloured by depth; nothing without one.
+
+    Args:
+        results: of a run, whose folder may hold wear.vtp of the same scene.
+        side: of the knee; the file of a left one is not mirrored, the drawing is.
+
+    Raises:
+        InputError: wear.json or wear.vtp cannot be read.
+    """
+    if not wear_of_run(results):
+        return ()
+    assert results.directory is not None
+    path = results.directory / WORN_NAME
+    points, faces = read_vtp(path)
+    depth = read_vtp_values(path, "wear_depth_mm")
+    if side == "left":
+        points, faces = points @ MIRROR, faces[:, ::-1]
+    worn = Surface(points, faces, "worn insert")
+    return (Solid(worn.name, "worn insert", worn, INSERT, 1.0, np.eye(4)[None], depth),)
+
+
+def _contact_poses(recorded: Array, maps: ContactMaps | None, rows: Sequence[int]) -> Array:
+    poses = recorded.copy()
+    if maps is not None:
+        stored = maps.femoral_pose
+        for frame, row in enumerate(rows):
+            if row >= 0 and np.isfinite(stored[row]).all():
+                poses[frame] = stored[row]
+    return poses
+
+
+def _femur(case: Case, states: Sequence[ChainState], poses: Array) -> Solid:
+    """Return the bone that a muscle wraps, else a stand-in up to the hip."""
+    bone = case.bone
+    if bone is not None:
+        return Solid("femur", "bones", bone, BONE, 1.0, poses)
+    hip = (inverse(poses[0]) @ np.append(states[0].point("hip", np.zeros(3)), 1.0))[:3]
+    return Solid("femur", "bones", _shaft(hip, FEMUR_PROFILE, "femur"), BONE, 1.0, poses)
+
+
+def _tibia(states: Sequence[ChainState]) -> Solid:
+    """Return the tibia below the insert's bottom, down to the ankle."""
+    ankle = states[0].point("tibia", np.zeros(3))
+    surface = _shaft(ankle, TIBIA_PROFILE, "tibia")
+    return Solid("tibia", "bones", surface, BONE, 1.0, np.eye(4)[None])
+
+
+def _shaft(end: Array, profile: tuple[tuple[float, float], ...], name: str) -> Surface:
+    """Return a body of revolution from the origin towards `end` (3,)."""
+    length = float(np.linalg.norm(end))
+    share, radius = np.array(profile).T
+    at = np.linspace(share[0], share[-1], 24)
+    radii = np.interp(at, share, radius * MILLIMETRE)
+    return revolved(radii, length * at, name).moved(_turned([0.0, 0.0, 1.0], end))
+
+
+def _patella(case: Case) -> Surface:
+    """Return an ellipsoid from the tendon's insertion to the ligament's origin."""
+    assert case.patellar_ligament is not None
+    ends = (case.muscles[0].points[-1], case.patellar_ligament.proximal)
+    top, bottom = (transform(case.chain.link_in(end.link, "patella"), end.position) for end in ends)
+    radii = np.array([PATELLA_DEPTH, 0.5 * float(np.linalg.norm(top - bottom)), PATELLA_WIDTH])
+    placed = _turned([0.0, 1.0, 0.0], top - bottom)
+    placed[:3, 3] = 0.5 * (top + bottom)
+    return hull(sphere_points() * radii, "patella").moved(placed)
+
+
+def _turned(axis: ArrayLike, towards: Array) -> Array:
+    """Return the smallest turn (4, 4) of an axis (3,) towards a direction (3,)."""
+    rotation, _ = Rotation.align_vectors(np.atleast_2d(towards), np.atleast_2d(axis))
+    return pose(rotation.as_matrix(), np.zeros(3))
+
+
+def floor_and_foot(
+    case: Case, geometries: Sequence[KneeGeometry], frames: Sequence[int]
+) -> tuple[tuple[Solid, ...], tuple[Marker, ...]]:
+    """Return floor and foot, and the centre of pressure; nothing without a force plate.
+
+    Args:
+        case: the case.
+        geometries: of the frames.
+        frames: of the motion.
+    """
+    table = case.scene.ground_reaction
+    if case.ground is None or case.tibia is None or table is None or table.applied == "ankle":
+        return (), ()
+    floor = float(np.median(case.ground.point[:, 1]))
+    tibias = case.tibia.pose[list(frames)]
+    grounds = np.stack(
+        [_floor_pose(one, tibia, floor) for one, tibia in zip(geometries, tibias, strict=True)]
+    )
+    lowest = float((tibias[:, 1, 3] - floor).min())
+    feet = grounds.copy()
+    feet[:, :3, 3] += (tibias[:, 1, 3] - floor - lowest)[:, None] * grounds[:, :3, 1]
+    plate = Solid("floor", "floor", _floor_surface(), FLOOR, 0.6, grounds)
+    foot = Solid("foot", "bones", _foot_surface(lowest), BONE, 1.0, feet)
+    points = np.stack([centre_of_pressure(one) for one in geometries])
+    marker = Marker("centre of pressure", "floor", BLACK, points, 5.0 * MILLIMETRE)
+    return (plate, foot), (marker,)
+
+
+def _floor_pose(geometry: KneeGeometry, tibia_in_laboratory: Array, floor: float) -> Array:
+    """Return the pose (4, 4) in the insert frame of the floor under the ankle, y up."""
+    laboratory = geometry.state.pose("tibia") @ inverse(tibia_in_laboratory)
+    up = laboratory[:3, 1]
+    ahead = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    ahead /= np.linalg.norm(ahead)
+    below = tibia_in_laboratory[:3, 3].copy()
+    below[1] = floor
+    axes = np.column_stack([ahead, up, np.cross(ahead, up)])
+    return pose(axes, transform(laboratory, below))
+
+
+def _floor_surface() -> Surface:
+    return box(PLATE, "floor").moved(
+        pose(np.eye(3), [VIEW_SOLID.plate_centre, -0.5 * PLATE[1], 0.0])
+    )
+
+
+def _foot_surface(height: float) -> Surface:
+    """Return a foot whose ankle is `height` (m) above the sole."""
+    ankle = (0.0, height / MILLIMETRE, 0.0, VIEW_SOLID.ankle_radius_mm)
+    sole, leg = _hull((*SOLE, INSTEP)), _hull((INSTEP, ankle))
+    faces = np.concatenate([sole.faces, leg.faces + len(sole.vertices)])
+    return Surface(np.concatenate([sole.vertices, leg.vertices]), faces, "foot")
+
+
+def _hull(balls: Sequence[tuple[float, ...]]) -> Surface:
+    """Return the hull of balls: centre and radius in mm."""
+    points = [sphere_points() * radius + centre for *centre, radius in balls]
+    return hull(np.concatenate(points) * MILLIMETRE, "balls")
+
+
+def hull(points: Array, name: str) -> Surface:
+    """Return the convex hull of points (n, 3), m, its triangles wound outwards."""
+    found = ConvexHull(points)
+    faces = found.simplices
+    a, b, c = np.moveaxis(points[faces], 1, 0)
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), found.equations[:, :3]) < 0
+    faces = np.where(inward[:, None], faces[:, ::-1], faces)
+    place = np.full(len(points), -1)
+    place[found.vertices] = np.arange(len(found.vertices))
+    return Surface(points[found.vertices], place[faces], name)
+
+
+def sphere_points(count: int = 640) -> Array:
+    """Return points (n, 3) spread evenly over the unit sphere: a spiral of golden angles."""
+    k = np.arange(count) + 0.5
+    up = 1.0 - 2.0 * k / count
+    across = np.sqrt(1.0 - up**2)
+    return np.column_stack([across * np.cos(GOLDEN * k), up, across * np.sin(GOLDEN * k)])
+
+
+def box(size: Array, name: str) -> Surface:
+    """Return a box about the origin; size (3,) m."""
+    corners = np.array(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5])).reshape(3, 8).T
+    return hull(corners * size, name)
+
+
+def revolved(radius: Array, height: Array, name: str, sections: int = 28) -> Surface:
+    """Return a body of revolution about z with flat ends: radius (n,) at rising height (n,), m."""
+    count, angle = len(radius), 2.0 * np.pi * np.arange(sections) / sections
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    around = np.concatenate(
+        [radius[:, None, None] * ring, np.tile(height[:, None, None], (1, sections, 1))], axis=2
+    )
+    poles = [[0.0, 0.0, height[0]], [0.0, 0.0, height[-1]]]
+    here = np.arange(sections)
+    ahead = (here + 1) % sections
+    low = (sections * np.arange(count - 1))[:, None]
+    a, b, c, d = low + here, low + ahead, low + ahead + sections, low + here + sections
+    bottom, top = count * sections, count * sections + 1
+    last = (count - 1) * sections
+    faces = np.concatenate(
+        [
+            np.stack([a, b, c], axis=2).reshape(-1, 3),
+            np.stack([a, c, d], axis=2).reshape(-1, 3),
+            np.column_stack([np.full(sections, bottom), ahead, here]),
+            np.column_stack([np.full(sections, top), last + here, last + ahead]),
+        ]
+    )
+    return Surface(np.concatenate([around.reshape(-1, 3), poles]), faces, name)

@@ -1,0 +1,203 @@
+"""The lines of a drawing: ligaments, tendons, muscles, and paths of the centres of pressure."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Array, Mask, transform
+from tkamb.geometry.surface import Surface
+from tkamb.knee.chain import ChainState
+from tkamb.knee.equations import KneeGeometry
+from tkamb.knee.wrapping import TautPath
+from tkamb.run.mechanics import Mechanics
+from tkamb.run.metrics import failed, stretches
+from tkamb.show.style import SIDE_COLOURS
+from tkamb.show.view.colours import (
+    SLACK,
+    TENDON,
+    WRAPPED,
+    Colours,
+    activation_colours,
+    rgb,
+    strain_colours,
+)
+from tkamb.show.view.drawing import Marker, Strand
+from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+BUNDLE, TENDON_RADIUS, PATH = 1.0 * MILLIMETRE, 1.5 * MILLIMETRE, 0.35 * MILLIMETRE
+"""m, radii; bundles are thinner where a ligament has many."""
+
+
+@dataclass(frozen=True)
+class ViewStrandSettings:
+    """How muscles and ligaments are drawn."""
+
+    muscle_radius: float = 2.0 * MILLIMETRE
+    """m; radius of a muscle's tube."""
+    slack_force: float = 1.0
+    """N."""
+    least_activation: float = 0.1
+    """Upper end of the colour scale, where no muscle is more active."""
+    many_bundles: int = 20
+    """Ligament bundles from which on they are drawn thinner."""
+
+
+VIEW_STRAND = ViewStrandSettings()
+
+
+def ligament_strands(
+    mechanics: Mechanics, states: Sequence[ChainState], results: "Results"
+) -> tuple[tuple[Strand, ...], float]:
+    """Return the bundles coloured by strain, and the upper limit of the colour scale.
+
+    A frame that failed has no numbers: its bundles are grey, and no scale ends at them.
+    """
+    bundles = mechanics.ligaments
+    if not bundles:
+        return (), 0.0
+    links = {link for one in bundles for link in (one.proximal.link, one.distal.link)}
+    poses = {link: np.stack([state.pose(link) for state in states]) for link in links}
+    lost = failed(results)
+    strains = [np.where(lost, np.nan, one.strain(one.length(poses))) for one in bundles]
+    limit = float(np.nanmax(strains, initial=0.01))
+    radius = BUNDLE * (0.5 if len(bundles) > VIEW_STRAND.many_bundles else 1.0)
+    strands = []
+    for bundle, strain in zip(bundles, strains, strict=True):
+        points = np.stack(bundle.ends(poses), axis=1)
+        colours = np.repeat(strain_colours(strain, limit)[:, None], 2, axis=1)
+        strands.append(Strand(bundle.name, "ligaments", points, colours, radius))
+    return tuple(strands), limit
+
+
+def extensor_strands(
+    mechanics: Mechanics, states: Sequence[ChainState], results: "Results"
+) -> tuple[Strand, ...]:
+    """Return muscle and patellar ligament, the part that lies on the bone in another colour.
+
+    In frames where one carries less than a newton it is grey.
+    """
+    extensor = mechanics.extensor
+    if extensor is None:
+        return ()
+    paths: list[tuple[TautPath | None, ...]] = []
+    for state in states:
+        try:
+            paths.append(extensor.paths(state))
+        except ComputationError:
+            paths.append((None, None))
+    muscle, ligament = (list(found) for found in zip(*paths, strict=True))
+    name = extensor.muscle.name.replace("_", " ")
+    slack = [
+        results[f"{one}_N"] < VIEW_STRAND.slack_force for one in ("quadriceps", "patellar_ligament")
+    ]
+    return (
+        _tendon(name, muscle, slack[0]),
+        _tendon("patellar ligament", ligament, slack[1]),
+    )
+
+
+def muscle_strands(geometries: Sequence[KneeGeometry]) -> tuple[tuple[Strand, ...], float]:
+    """Return the muscles across the knee coloured by activation, and the scale's upper limit.
+
+    From where a line leaves the shank or foot to where it reaches thigh or pelvis; those that
+    carry less than a newton are grey, and frames without a solution have none.
+    """
+    shares = [one.share if one.share and one.share.status == "ok" else None for one in geometries]
+    first = next((share for share in shares if share), None)
+    if first is None:
+        return (), 0.0
+    count = len(first.crossing)
+    ends = np.full((len(shares), count, 2, 3), np.nan)
+    activation, force = np.zeros((2, len(shares), count))
+    for k, (one, share) in enumerate(zip(geometries, shares, strict=True)):
+        if share is not None:
+            ends[k, :, 0] = transform(one.state.pose("tibia"), share.lines.shank)
+            ends[k, :, 1] = transform(one.state.pose("femur"), share.lines.thigh)
+            activation[k], force[k] = share.activation[share.crossing], share.force[share.crossing]
+    limit = max(float(activation.max()), VIEW_STRAND.least_activation)
+    colours = activation_colours(np.where(force < VIEW_STRAND.slack_force, 0.0, activation), limit)
+    strands = tuple(
+        Strand(
+            first.muscles[muscle],
+            "muscles",
+            ends[:, i],
+            np.repeat(colours[:, i, None], 2, axis=1),
+            VIEW_STRAND.muscle_radius,
+        )
+        for i, muscle in enumerate(first.crossing)
+    )
+    return strands, limit
+
+
+def _tendon(name: str, paths: list[TautPath | None], slack: Mask) -> Strand:
+    """Return the strand of a taut path (f), grey where it is slack (f,).
+
+    Its corners are doubled where the colour changes.
+    """
+    lines = [_colour_path(path) for path in paths]
+    most = max(len(points) for points, _ in lines)
+    points = np.stack([np.pad(p, ((0, most - len(p)), (0, 0)), mode="edge") for p, _ in lines])
+    colours = np.stack([np.pad(c, ((0, most - len(c)), (0, 0)), mode="edge") for _, c in lines])
+    colours[slack] = rgb(SLACK)
+    return Strand(name, "extensor lines", points, colours, TENDON_RADIUS)
+
+
+def _colour_path(path: TautPath | None) -> tuple[Array, Colours]:
+    """Return points and colours: free, on the bone, free."""
+    free, wrapped = rgb(TENDON), rgb(WRAPPED)
+    if path is None or not np.isfinite(path.points).all():
+        return np.full((2, 3), np.nan), np.stack([free, free])
+    corners = path.points[1:-1]
+    if len(corners) < 2:
+        return path.points, np.repeat(free[None], len(path.points), axis=0)
+    points = np.concatenate([path.points[:2], corners, path.points[-2:]])
+    colours = np.repeat(wrapped[None], len(points), axis=0)
+    colours[[0, 1, -2, -1]] = free
+    return points, colours
+
+
+def centres_of_pressure(results: "Results", insert: Surface) -> dict[str, Array]:
+    """Return side -> (f, 3) m, on the undeformed insert; NaN beside it."""
+    rays, top = insert.rays, float(insert.bounds[1, 1]) + MILLIMETRE
+    found = {}
+    for side in SIDE_COLOURS:
+        x, z = (results[f"{side}_cop_{axis}_mm"] * MILLIMETRE for axis in ("ap", "ml"))
+        points = np.column_stack([x, np.full(len(x), top), z])
+        known = np.isfinite(points).all(axis=1)
+        points[~known] = np.nan
+        down, _ = rays.first(points[known], np.array([0.0, -1.0, 0.0]))
+        points[known, 1] -= np.where(np.isfinite(down), down, np.nan)
+        found[side] = points
+    return found
+
+
+def path_strands(centres: dict[str, Array]) -> tuple[Strand, ...]:
+    """Return the path of each centre of pressure, broken where it is missing or jumps."""
+    strands = []
+    for side, points in centres.items():
+        for number, stretch in enumerate(stretches(points)):
+            part = points[stretch] + np.array([0.0, 2.0 * PATH, 0.0])
+            colours = np.repeat(rgb(SIDE_COLOURS[side])[None], len(part), axis=0)
+            name = f"{side} path {number}"
+            strands.append(Strand(name, "load paths", part[None], colours[None], PATH))
+    return tuple(strands)
+
+
+def centre_markers(centres: dict[str, Array]) -> tuple[Marker, ...]:
+    """Return a ball at each centre of pressure."""
+    return tuple(
+        Marker(
+            f"{side} centre of pressure",
+            "load paths",
+            SIDE_COLOURS[side],
+            points,
+            0.9 * MILLIMETRE,
+        )
+        for side, points in centres.items()
+    )

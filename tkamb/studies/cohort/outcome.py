@@ -1,0 +1,203 @@
+"""One run of a cohort: through the whole pipeline, and what of it is kept."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.errors import TkambError
+from tkamb.geometry.frames import Array
+from tkamb.memory import give_back
+from tkamb.run.columns import KINDS
+from tkamb.run.metrics import lateral_axis_name, map_rows
+from tkamb.run.results import Results
+from tkamb.run.shards import Shard
+from tkamb.run.simulation import simulate
+from tkamb.run.status import FAILED
+from tkamb.studies.cohort.plan import CohortRun, CohortWearTable
+
+TIMES = "_seconds"
+"""Ending of computing times: the only columns that another computer finds otherwise."""
+
+
+@dataclass(frozen=True, eq=False)
+class PressureMap:
+    """The pressure on the insert at one frame.
+
+    Args:
+        frame: of the run's rows.
+        points: (n, 3) m.
+        triangles: (k, 3).
+        pressure: (n,) Pa.
+        side: "right" or "left".
+        lateral: what insert z points to, "lateral" or "medial".
+    """
+
+    frame: int
+    points: Array
+    triangles: NDArray[np.int64]
+    pressure: Array
+    side: str
+    lateral: str
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What one run gave.
+
+    Args:
+        reason: why the run failed as a whole; "" if it did not.
+        columns: name -> (f,) numbers of results.csv that the run has, without computing times.
+        status: of each frame.
+        chosen: its pressure map; None without contact.
+        wear: name -> number, "volume_mm3_per_Mc" and others; empty: not asked for, or not found.
+        wear_problem: why there is no wear; empty otherwise.
+    """
+
+    reason: str
+    columns: dict[str, Array]
+    status: list[str]
+    chosen: PressureMap | None = None
+    wear: Mapping[str, float] = field(default_factory=dict)
+    wear_problem: str = ""
+
+    @property
+    def failed_frames(self) -> int:
+        """Return how many frames failed."""
+        return sum(status.startswith(FAILED) for status in self.status)
+
+    @property
+    def flagged_frames(self) -> int:
+        """Return how many have numbers, and a status that says more than "ok"."""
+        return sum(status != "ok" for status in self.status) - self.failed_frames
+
+    def shard(self) -> Shard:
+        """Return it as what is kept in a folder."""
+        row: dict[str, Any] = {"reason": self.reason, "status": self.status}
+        row |= {"wear": dict(self.wear), "wear_problem": self.wear_problem}
+        arrays: dict[str, Any] = {f"column {name}": values for name, values in self.columns.items()}
+        if self.chosen is not None:
+            one = self.chosen
+            row |= {"frame": one.frame, "side": one.side, "lateral": one.lateral}
+            arrays |= {"points": one.points, "triangles": one.triangles, "pressure": one.pressure}
+        return Shard(row, arrays or None)
+
+    @classmethod
+    def of(cls, shard: Shard) -> "Outcome":
+        """Return what a shard holds."""
+        row, arrays = shard.row, shard.contact or {}
+        columns = {
+            name.removeprefix("column "): values
+            for name, values in arrays.items()
+            if name.startswith("column ")
+        }
+        chosen = None
+        if "points" in arrays:
+            triangles = np.asarray(arrays["triangles"], np.int64)
+            chosen = PressureMap(
+                row["frame"],
+                arrays["points"],
+                triangles,
+                arrays["pressure"],
+                row["side"],
+                row["lateral"],
+            )
+        wear, problem = row.get("wear", {}), row.get("wear_problem", "")
+        return cls(row["reason"], columns, row["status"], chosen, wear, problem)
+
+
+class CohortWorker:
+    """Computes runs of a cohort.
+
+    Args:
+        frames: of every trial.
+        map_flexion: deg, which frame's map is kept; None: that of the largest force.
+        wear: of every run's insert; None: none.
+    """
+
+    def __init__(
+        self, frames: slice, map_flexion: float | None, wear: CohortWearTable | None = None
+    ) -> None:
+        self._frames, self._map_flexion, self._wear = frames, map_flexion, wear
+
+    def __call__(self, number: int, run: CohortRun) -> Outcome:
+        """Return what a run gives: what `tkamb run` would, or why it cannot."""
+        try:
+            return self._outcome(run)
+        finally:
+            give_back()
+
+    def _outcome(self, run: CohortRun) -> Outcome:
+        try:
+            results = simulate(run.scene, frames=self._frames, scene_path=run.scene_path)
+        except TkambError as error:
+            return Outcome(str(error), {}, [])
+        if all(status.startswith(FAILED) for status in results.status):
+            return Outcome(f"every frame failed, the first: {results.status[0]}", {}, [])
+        columns = {
+            name: values
+            for name, values in results.columns.items()
+            if KINDS.get(name) != "text"
+            and not name.endswith(TIMES)
+            and name not in results.not_modelled
+        }
+        found = Outcome("", columns, results.status, chosen_map(results, self._map_flexion))
+        return found if self._wear is None else self._worn(run, results, found, self._wear)
+
+    def _worn(
+        self, run: CohortRun, results: Results, found: Outcome, wear: CohortWearTable
+    ) -> Outcome:
+        """Return an outcome with the wear of its insert, or why there is none."""
+        from tkamb.studies.wear.run import wear_of_results
+
+        try:
+            report = wear_of_results(
+                run.scene,
+                run.scene_path,
+                results,
+                cycles=wear.cycles,
+                updates=wear.updates,
+                frames=wear.frames_per_cycle,
+            ).as_dict()
+        except TkambError as error:
+            return replace(found, wear_problem=str(error))
+        low, high = report["volume_mm3_per_Mc_range"]
+        values = {
+            "volume_mm3_per_Mc": report["volume_mm3_per_Mc"],
+            "volume_mm3_per_Mc_low": low,
+            "volume_mm3_per_Mc_high": high,
+            "max_depth_mm": report["max_depth_mm"],
+            "frames_change": report["frames_change"],
+        }
+        for one in report["laws_side_by_side"]:
+            values[f"first_{one['law']}_mm3_per_Mc"] = one["first_volume_mm3_per_Mc"]
+        return replace(found, wear={k: v for k, v in values.items() if v is not None})
+
+
+def chosen_map(results: Results, flexion: float | None) -> PressureMap | None:
+    """Return the map of the frame nearest to a flexion (deg), or of the largest force."""
+    if results.maps is None:
+        return None
+    rows = {k: row for k, row in map_rows(results).items() if not _failed(results, k)}
+    if not rows:
+        return None
+    frames = np.array(sorted(rows))
+    if flexion is None:
+        best = int(np.nanargmax(results["force_total_BW"][frames]))
+    else:
+        best = int(np.argmin(np.abs(results["flexion_deg"][frames] - flexion)))
+    frame = int(frames[best])
+    return PressureMap(
+        frame,
+        results.maps.points_m,
+        results.maps.triangles,
+        results.maps.pressure_Pa[rows[frame]],
+        str(results.summary.get("side", "right")),
+        lateral_axis_name(results),
+    )
+
+
+def _failed(results: Results, frame: int) -> bool:
+    return results.status[frame].startswith(FAILED)

@@ -1,0 +1,312 @@
+"""The cohort file: which subjects, trials, designs and contact models, and the runs they make.
+
+A TOML file. Paths in it are relative to it, an unknown key is an error. Every run is one of the
+trials' scenes with overrides, as `tkamb run --set` gives them.
+"""
+
+import hashlib
+import itertools
+import json
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from tkamb.errors import InputError, names_near
+from tkamb.files import read_text, sha256_of
+from tkamb.io.scene import Scene, load_scene
+from tkamb.io.scene.table import Count, Number, SceneTable
+from tkamb.run.frame_choice import frames_slice
+from tkamb.run.summary import files_in
+
+AXES = ("subject", "trial", "design", "contact")
+GROUP_AXES = ("activity", *AXES[1:])
+MOST_RUNS = 100_000
+Name = Annotated[str, Field(pattern=r"^[\w .+-]{1,60}$")]
+Overrides = Annotated[
+    dict[str, Any],
+    Field(default_factory=dict, description="dotted key of the scene -> value, as --set gives it"),
+]
+
+
+class SubjectTable(SceneTable):
+    """One person: what of the trials' scenes is another for them."""
+
+    name: Name
+    scale: Annotated[Number, Field(ge=0.7, le=1.4)] = Field(
+        1.0, description="[patient] scale: a synthetic subject of the same shape and another size"
+    )
+    set: Overrides
+
+
+class TrialTable(SceneTable):
+    """One recording: a scene."""
+
+    name: Name
+    scene: Path
+    activity: Name | None = Field(None, description="for groups; default: the trial's name")
+    subjects: tuple[Name, ...] = Field((), description="who did it; none named: everybody")
+    set: Overrides
+
+
+class DesignTable(SceneTable):
+    """One implant: its meshes, or any other overrides."""
+
+    name: Name
+    femoral: Path | None = Field(None, description="mesh of the femoral component")
+    insert: Path | None = Field(None, description="mesh of the insert")
+    bearing: Literal["fixed", "mobile"] | None = None
+    scenes: dict[Name, Path] = Field(
+        default_factory=dict,
+        description="trial -> its scene with this implant, where that is a scene of its own",
+    )
+    set: Overrides
+
+
+class ContactModelTable(SceneTable):
+    """One contact model."""
+
+    name: Name
+    model: str | None = Field(None, description="of `tkamb contact list`; default: the name")
+    resolution_mm: Annotated[Number, Field(gt=0)] | None = None
+    set: Overrides
+
+
+class CohortWearTable(SceneTable):
+    """Wear of every run's insert by its own motion; closing, material and law by its [wear]."""
+
+    cycles: Annotated[Count, Field(ge=1, le=10**9)] = 1_000_000
+    updates: Annotated[Count, Field(ge=1, le=1000)] = Field(2, description="of the geometry")
+    frames_per_cycle: Annotated[Count, Field(ge=2, le=1000)] = 40
+
+
+class CohortTable(SceneTable):
+    """The cohort file. An axis that is not given has one entry that changes nothing."""
+
+    title: str = "Cohort"
+    frames: str = Field(":", description="A:B:STEP of every trial's frames, as in Python")
+    group_by: tuple[Literal["activity", "trial", "design", "contact"], ...] = Field(
+        (), description="default: the axes with more than one entry, subjects left out"
+    )
+    bin_deg: Annotated[Number, Field(ge=1, le=180)] = Field(10.0, description="width of a bin")
+    map_flexion_deg: Annotated[Number, Field(ge=-30, le=170)] | None = Field(
+        None, description="the frame nearest to it is shown; default: each run's peak force"
+    )
+    wear: CohortWearTable | None = Field(
+        None, description="volumes in runs.csv and groups.csv; not computed without this table"
+    )
+    set: Overrides
+    subject: tuple[SubjectTable, ...] = ()
+    trial: Annotated[tuple[TrialTable, ...], Field(min_length=1)]
+    design: tuple[DesignTable, ...] = ()
+    contact: tuple[ContactModelTable, ...] = ()
+
+    @model_validator(mode="after")
+    def _names(self) -> Self:
+        for axis in AXES:
+            names = [one.name for one in getattr(self, axis)]
+            twice = sorted({name for name in names if names.count(name) > 1})
+            if twice:
+                raise ValueError(f"[[{axis}]] has two entries called '{twice[0]}'")
+        known = [one.name for one in self.subject]
+        for trial in self.trial:
+            for name in trial.subjects:
+                if name not in known:
+                    raise ValueError(
+                        f"no subject '{name}' for trial '{trial.name}'; {names_near(name, known)}"
+                    )
+        trials = [one.name for one in self.trial]
+        for design in self.design:
+            for name in design.scenes:
+                if name not in trials:
+                    near = names_near(name, trials)
+                    raise ValueError(f"no trial '{name}' for design '{design.name}'; {near}")
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class CohortRun:
+    """One run of a cohort.
+
+    Args:
+        number: its place in the table of runs.
+        labels: subject, trial, activity, design and contact -> name; "" where the cohort has none.
+        scene_path: the trial's scene file.
+        overrides: dotted key -> value.
+        scene: with the overrides applied.
+    """
+
+    number: int
+    labels: dict[str, str]
+    scene_path: Path
+    overrides: dict[str, Any]
+    scene: Scene
+
+    @cached_property
+    def scene_hash(self) -> str:
+        """Return the SHA-256 of the validated scene."""
+        return hashlib.sha256(self.scene.identity_json.encode()).hexdigest()
+
+    def words(self) -> str:
+        """Return the labels in one line."""
+        return ", ".join(self.labels[axis] for axis in AXES if self.labels[axis])
+
+
+@dataclass(frozen=True, eq=False)
+class Cohort:
+    """A cohort file and the runs that it makes.
+
+    Args:
+        path: of the file.
+        table: what it says.
+        runs: all of them, in the order subject, trial, design, contact.
+    """
+
+    path: Path
+    table: CohortTable
+    runs: tuple[CohortRun, ...]
+
+    @property
+    def group_by(self) -> tuple[str, ...]:
+        """Return the labels that make the groups."""
+        if self.table.group_by:
+            return self.table.group_by
+        many = [a for a in GROUP_AXES if len({run.labels[a] for run in self.runs}) > 1]
+        if "activity" in many and "trial" in many:  # trials of one activity are one group
+            many.remove("trial")
+        return tuple(many)
+
+    @property
+    def frames(self) -> slice:
+        """Return the frames of every trial."""
+        return _slice(self.table.frames, self.path)
+
+    def identity(self) -> dict[str, Any]:
+        """Return what makes two cohorts the same but for the code: runs, files, frames."""
+        runs = [[run.labels, run.scene_hash] for run in self.runs]
+        files = sorted({path for run in self.runs for path in files_in(run.scene.model_dump())})
+        return {
+            "table of runs": hashlib.sha256(json.dumps(runs).encode()).hexdigest(),
+            "content of a file": {str(path): sha256_of(path) for path in files},
+            "choice of frames": self.table.frames,
+            "choice of maps": self.table.map_flexion_deg,
+            **self._wear_identity(),
+        }
+
+    def _wear_identity(self) -> dict[str, Any]:
+        wear = self.table.wear
+        if wear is None:
+            return {}
+        tables = [run.scene.wear and run.scene.wear.model_dump(mode="json") for run in self.runs]
+        return {"wear": [wear.model_dump(mode="json"), tables]}
+
+
+def load_cohort(path: str | Path, frames: str | None = None) -> Cohort:
+    """Read a cohort file and the scene of every run; no other file is opened.
+
+    Args:
+        path: of the cohort file.
+        frames: A:B:STEP instead of the file's.
+
+    Raises:
+        InputError: the file or a scene cannot be used.
+    """
+    path = Path(path)
+    try:
+        content = tomllib.loads(read_text(path, what="cohort file"))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"is not TOML ({error})", path) from None
+    if frames is not None:
+        content["frames"] = frames
+    try:
+        table = CohortTable.model_validate(content)
+    except ValidationError as error:
+        raise _complaint(error, path) from None
+    _slice(table.frames, path)
+    return Cohort(path, table, tuple(_runs(table, path)))
+
+
+def _runs(table: CohortTable, path: Path) -> list[CohortRun]:
+    axes: list[Sequence[Any]] = [getattr(table, axis) or (None,) for axis in AXES]
+    count = 1
+    for axis in axes:
+        count *= len(axis)
+    if count > MOST_RUNS:
+        raise InputError(f"makes {count} runs, more than {MOST_RUNS}", path, "split it")
+    found: list[CohortRun] = []
+    for subject, trial, design, contact in itertools.product(*axes):
+        if trial.subjects and (subject is None or subject.name not in trial.subjects):
+            continue
+        labels = {
+            "subject": subject.name if subject else "",
+            "trial": trial.name,
+            "activity": trial.activity or trial.name,
+            "design": design.name if design else "",
+            "contact": contact.name if contact else "",
+        }
+        overrides = dict(table.set)
+        for one in (trial, subject, design, contact):
+            overrides |= _overrides(one, path.parent)
+        own = design.scenes.get(trial.name) if design else None
+        scene_path = path.parent / (own or trial.scene)
+        scene = _scene(scene_path, overrides, labels, path)
+        found.append(CohortRun(len(found), labels, scene_path, overrides, scene))
+    if not found:
+        raise InputError("makes no run", path, "does any subject do any trial?")
+    return found
+
+
+def _scene(
+    scene_path: Path, overrides: dict[str, Any], labels: dict[str, str], path: Path
+) -> Scene:
+    try:
+        return load_scene(scene_path, overrides)
+    except InputError as error:
+        what = f"{' × '.join(filter(None, labels.values()))}: {error}"
+        raise InputError(what, path) from None
+
+
+def _overrides(entry: Any, folder: Path) -> dict[str, Any]:
+    """Return what an entry of an axis changes, paths made absolute."""
+    if entry is None:
+        return {}
+    found: dict[str, Any] = {}
+    if isinstance(entry, SubjectTable) and entry.scale != 1.0:
+        found["patient.scale"] = entry.scale
+    if isinstance(entry, DesignTable):
+        meshes = {"femoral": entry.femoral, "insert": entry.insert}
+        found |= {
+            f"implant.{part}.mesh": str((folder / mesh).absolute())
+            for part, mesh in meshes.items()
+            if mesh is not None
+        }
+        found |= {} if entry.bearing is None else {"implant.insert.bearing": entry.bearing}
+    if isinstance(entry, ContactModelTable):
+        found["contact.model"] = entry.model or entry.name
+        if entry.resolution_mm is not None:
+            found["contact.resolution_mm"] = entry.resolution_mm
+    return found | entry.set
+
+
+def _slice(text: str, path: Path) -> slice:
+    try:
+        return frames_slice(text)
+    except ValueError as error:
+        raise InputError(f"'frames': {error}", path) from None
+
+
+def _complaint(error: ValidationError, path: Path) -> InputError:
+    """Return the first complaint in one line, unknown keys before missing ones."""
+    rank = {"extra_forbidden": 0, "missing": 2}
+    first = min(error.errors(), key=lambda one: rank.get(one["type"], 1))
+    key = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return InputError(f"unknown key '{key}'", path, "docs/cohort.md lists the keys")
+    if first["type"] == "missing":
+        return InputError(f"missing key '{key}'", path, "docs/cohort.md lists the keys")
+    message = first["msg"].removeprefix("Value error, ")
+    return InputError(f"'{key}': {message}" if key else message, path)

@@ -1,0 +1,128 @@
+"""A design file: the documented dimensions of one implant, and its meshes.
+
+Keys are the fields of `FemoralComponent`, `Cam`, `Insert` and `Post` with their unit behind them.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from tkamb.contact.pair import Bearing
+from tkamb.errors import InputError
+from tkamb.files import read_text
+from tkamb.studies.designs import solids
+from tkamb.studies.designs.femoral import Cam, FemoralComponent
+from tkamb.studies.designs.insert import Insert, Post
+from tkamb.studies.designs.touch import Articulation
+
+DESIGN_FILE = "design.toml"
+FEMORAL_MESH, INSERT_MESH, TRAY_MESH = "femoral_component.stl", "insert.stl", "tray.stl"
+CAM_MESH = "femoral_component_with_cam.stl"
+_Part = TypeVar("_Part", FemoralComponent, Cam, Insert, Post)
+
+
+@dataclass(frozen=True)
+class Design:
+    """One implant.
+
+    Args:
+        name: of the folder.
+        title: of the implant that it stands for.
+        bearing: "fixed" or "mobile".
+        symmetric: whether both condyles have one J-curve.
+        articulation: femoral component and insert, mm.
+        sources: where each group of numbers comes from.
+    """
+
+    name: str
+    title: str
+    bearing: Bearing
+    symmetric: bool
+    articulation: Articulation
+    sources: Mapping[str, str]
+
+    @property
+    def femoral(self) -> FemoralComponent:
+        """The femoral component."""
+        return self.articulation.femoral
+
+    @property
+    def insert(self) -> Insert:
+        """The insert."""
+        return self.articulation.insert
+
+    def write_meshes(self, folder: Path) -> tuple[Path, ...]:
+        """Write the parts as binary STL in mm, a component with a cam with and without it."""
+        folder.mkdir(parents=True, exist_ok=True)
+        meshes = {
+            FEMORAL_MESH: self.femoral.mesh(),
+            INSERT_MESH: self.insert.mesh(),
+            TRAY_MESH: self.insert.tray(),
+        }
+        if self.femoral.cam is not None:
+            meshes[CAM_MESH] = self.femoral.mesh_with_cam()
+        for name, (vertices, faces) in meshes.items():
+            solids.write_stl(folder / name, vertices, faces)
+        return tuple(folder / name for name in meshes)
+
+
+def load_design(folder: str | Path) -> Design:
+    """Read design.toml of a folder.
+
+    Raises:
+        InputError: no such file, an unknown key, one without its unit, or an impossible value.
+    """
+    file = Path(folder) / DESIGN_FILE
+    try:
+        rows = tomllib.loads(read_text(file, what="design file"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"is no TOML ({error})", file, "mend the line it names") from None
+    unknown = set(rows) - {"title", "bearing", "femoral", "cam", "insert", "post", "sources"}
+    if unknown:
+        raise InputError(f"unknown key '{min(unknown)}'", file, "see models/designs/README.md")
+    bearing = rows.get("bearing", "fixed")
+    if bearing not in ("fixed", "mobile"):
+        raise InputError(f"'{bearing}' is no bearing", file, "give fixed or mobile")
+    post = _part(Post, rows["post"], file) if "post" in rows else None
+    cam = _part(Cam, rows["cam"], file) if "cam" in rows else None
+    femoral = _part(FemoralComponent, {**rows.get("femoral", {}), "cam": cam}, file)
+    insert = _part(Insert, {**rows.get("insert", {}), "post": post}, file)
+    return Design(
+        name=Path(folder).resolve().name,
+        title=str(rows.get("title", Path(folder).name)),
+        bearing=bearing,
+        symmetric=femoral.medial_arcs == femoral.lateral_arcs,
+        articulation=Articulation(femoral, insert),
+        sources=rows.get("sources", {}),
+    )
+
+
+UNITS = ("_deg_mm", "_deg", "_mm")
+
+
+def _part(kind: type[_Part], given: Mapping[str, Any], file: Path) -> _Part:
+    """Build a part from its table: the unit is cut off each key."""
+    known = {field.name for field in fields(kind)}
+    values = {}
+    for key, value in given.items():
+        unit = next((u for u in UNITS if key.endswith(u)), "")
+        name = key.removesuffix(unit)
+        if name not in known or (not unit and name not in ("cam", "post")):
+            raise InputError(
+                f"unknown key '{key}'", file, f"known, with _mm or _deg: {', '.join(sorted(known))}"
+            )
+        values[name] = _tuples(value)
+    if "medial_arcs" in values:
+        values.setdefault("lateral_arcs", values["medial_arcs"])
+    if "medial_dish_radii" in values:
+        values.setdefault("lateral_dish_radii", values["medial_dish_radii"])
+    try:
+        return kind(**values)
+    except TypeError as error:
+        raise InputError(f"{kind.__name__}: {error}", file, "give the missing keys") from None
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(x) for x in value) if isinstance(value, list) else value

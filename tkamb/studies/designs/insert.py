@@ -1,0 +1,163 @@
+"""An insert: a dished height field over a kidney-shaped outline, flat below, with or without post.
+
+Each dish is a coronal arc moved along a sagittal arc, so the two curvatures are exact at its low
+line; the eminence between the dishes is an arc tangent to both.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tkamb.geometry.frames import Array
+from tkamb.studies.designs import solids
+from tkamb.studies.designs.femoral import rounded_edge
+
+BLEND_HALF = 8.0
+"""mm; unequal dishes blend within this distance of the middle."""
+
+
+@dataclass(frozen=True)
+class Post:
+    """A posterior-stabilising post; mm, insert frame.
+
+    Args:
+        posterior: AP position of its posterior face at the foot.
+        anterior: of its anterior face.
+        half_width: ML.
+        height: above the dishes' low point.
+        corner_radius: of its outline.
+        draft: the faces lean inwards by this much over the height.
+    """
+
+    posterior: float
+    anterior: float
+    half_width: float
+    height: float
+    corner_radius: float = 2.0
+    draft: float = 2.0
+
+    def rise(self, x: ArrayLike, z: ArrayLike) -> Array:
+        """Return the height (...) of the post's surface above the dishes' low point; 0 outside.
+
+        The outline is a rectangle with rounded corners; d is the distance inside it.
+        """
+        half = np.array([(self.anterior - self.posterior) / 2.0, self.half_width])
+        middle = (self.anterior + self.posterior) / 2.0
+        reach = np.abs(np.stack(np.broadcast_arrays(np.asarray(x) - middle, z), axis=-1))
+        corner = reach - (half - self.corner_radius)
+        outside = np.linalg.norm(np.maximum(corner, 0.0), axis=-1)
+        inside = np.minimum(corner.max(axis=-1), 0.0)
+        distance = self.corner_radius - outside - inside
+        return np.asarray(self.height * np.clip(distance / self.draft, 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class Insert:
+    """A right insert; lengths mm, insert frame (x anterior, y superior, z lateral).
+
+    Args:
+        medial_dish_radii: sagittal radius in front of and behind the low point.
+        lateral_dish_radii: of the lateral dish.
+        coronal_radius: of both dishes.
+        thickness: at the thinnest.
+        low_point_ap: of both dishes.
+        dish_half: ML distance of the dishes' low lines from the middle.
+        eminence_height: above the dishes.
+        depth_half: half the AP depth.
+        width_half: half the ML width.
+        notch_depth: of the posterior notch.
+        notch_width: its width.
+        edge_fillet: radius of the rounded edge.
+        post: None for a design without.
+    """
+
+    medial_dish_radii: tuple[float, float]
+    lateral_dish_radii: tuple[float, float]
+    coronal_radius: float = 25.0
+    thickness: float = 9.5
+    low_point_ap: float = -2.0
+    dish_half: float = 23.0
+    eminence_height: float = 4.0
+    depth_half: float = 24.0
+    width_half: float = 37.0
+    notch_depth: float = 7.0
+    notch_width: float = 9.0
+    edge_fillet: float = 2.0
+    post: Post | None = None
+
+    def eminence_radius(self) -> float:
+        """Return the radius of the arc of eminence height that is tangent to both dishes."""
+        r, h, w = self.coronal_radius, self.eminence_height, self.dish_half
+        return (w**2 + (r - h) ** 2 - r**2) / (2.0 * h)
+
+    def height(self, x: ArrayLike, z: ArrayLike) -> Array:
+        """Return the height (mm) of the articular surface above the flat bottom."""
+        x, z = np.broadcast_arrays(x, z)
+        dishes = self._sagittal(x, z) + self._coronal(z)
+        if self.post is not None:
+            dishes = np.maximum(dishes, self.post.rise(x, z))
+        return np.asarray(self.thickness + dishes)
+
+    def mesh(self) -> tuple[Array, NDArray[np.int64]]:
+        """Return a closed triangulation (vertices mm, faces) in the insert frame."""
+        z, back, front = self._outline()
+        fillet = np.minimum(self.edge_fillet, (front - back) / 4.0)
+        turn = (1.0 - np.cos(np.radians(np.linspace(0.0, 90.0, 5)[:-1])))[:, None]
+        inside = np.linspace(0.0, 1.0, 71)[:, None]
+        x = np.concatenate(
+            [
+                back + fillet * turn,
+                back + fillet + (front - back - 2.0 * fillet) * inside,
+                front - fillet * turn[::-1],
+            ]
+        )
+        z = np.broadcast_to(z, x.shape)
+        drop = rounded_edge(np.minimum(x - back, front - x), fillet)
+        drop = drop + rounded_edge(self.width_half - np.abs(z), self.edge_fillet)
+        top = np.stack([x, self.height(x, z) - drop, z], axis=-1)
+        bottom = top * np.array([1.0, 0.0, 1.0])
+        return solids.close_sheets(top, bottom, [0, len(x) - 1], list(range(z.shape[1])))
+
+    def tray(self, thickness: float = 4.0) -> tuple[Array, NDArray[np.int64]]:
+        """Return the flat plate below the insert, same outline, as a closed triangulation."""
+        z, back, front = self._outline()
+        x = back + (front - back) * np.linspace(0.0, 1.0, 5)[:, None]
+        top = np.stack([x, np.zeros_like(x), np.broadcast_to(z, x.shape)], axis=-1)
+        bottom = top - np.array([0.0, thickness, 0.0])
+        return solids.close_sheets(top, bottom, list(range(5)), list(range(len(z))))
+
+    def _sagittal(self, x: Array, z: Array) -> Array:
+        medial = self._arc(x, self.medial_dish_radii)
+        if self.medial_dish_radii == self.lateral_dish_radii:
+            return medial
+        s = np.clip(0.5 + 0.5 * z / BLEND_HALF, 0.0, 1.0)
+        lateral = s * s * (3.0 - 2.0 * s)
+        return (1.0 - lateral) * medial + lateral * self._arc(x, self.lateral_dish_radii)
+
+    def _arc(self, x: Array, radii: tuple[float, float]) -> Array:
+        s = x - self.low_point_ap
+        radius = np.where(s > 0, *radii)
+        s = np.clip(s, -radius, radius)
+        return np.asarray(radius - np.sqrt(radius**2 - s**2))
+
+    def _coronal(self, z: Array) -> Array:
+        u, arc, bump = np.abs(z), self.coronal_radius, self.eminence_radius()
+        tangent = self.dish_half * bump / (bump + arc)
+        across = np.clip(u - self.dish_half, -arc, arc)
+        dish = arc - np.sqrt(arc**2 - across**2)
+        hill = self.eminence_height - bump + np.sqrt(bump**2 - np.minimum(u, bump) ** 2)
+        return np.asarray(np.where(u < tangent, hill, dish))
+
+    def _outline(self) -> tuple[Array, Array, Array]:
+        """ML stations (n,), closer at the rounded ends, and both edges (n,) there, centred."""
+        inner = np.linspace(0.0, self.width_half - 4.0, 49)
+        turn = np.sin(np.radians(np.linspace(0.0, 90.0, 13)))[1:]
+        half = np.concatenate([inner, self.width_half - 4.0 + 4.0 * turn])
+        z = np.concatenate([-half[:0:-1], half])
+        u = np.abs(z) / (self.width_half * 1.004)
+        front = self.depth_half * (1.0 - u**3.0) ** (1.0 / 2.2)
+        back = -self.depth_half * (1.0 - u**6.0) ** (1.0 / 2.2)
+        back = back + self.notch_depth * np.exp(-((z / self.notch_width) ** 2))
+        middle = (back.min() + front.max()) / 2.0
+        return z, back - middle, front - middle

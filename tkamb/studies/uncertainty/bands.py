@@ -1,0 +1,226 @@
+"""From samples to bands and to which input moves what."""
+
+import re
+import warnings
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tkamb.geometry.frames import SIDES, Array
+from tkamb.run.results import FEWEST, MOST_FAILED, PERCENTILES
+
+ENDS = ("p05", "p95")
+ROUND_OFF = 1e-9
+"""Standard deviation over magnitude: a result that varies less does not vary."""
+SAMPLES_PER_INPUT = 6
+"""Fewer per input leave a regression undetermined: its shares would be those of chance."""
+NUMBER = re.compile(r"[-−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+MOST_CAUSES = 3
+
+
+def varies(variance: float, square: float) -> bool:
+    """Say whether a variance is more than round-off of values of this mean square."""
+    return variance > ROUND_OFF**2 * square
+
+
+def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Array]:
+    """Return p05, p50 and p95 over samples, each of the shape of one sample.
+
+    Of the samples that have a number (linear between order statistics); NaN where fewer than
+    `FEWEST` have one, or where more than `MOST_FAILED` of all failed.
+
+    Args:
+        values: (n, ...) NaN where a sample has no number.
+        failed: (n, ...) of the last axes of `values`, which samples failed; None: none.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # nothing but NaN, hidden below
+        found = np.nanpercentile(values, list(PERCENTILES.values()), axis=0)
+    hidden = np.isfinite(values).sum(axis=0) < FEWEST
+    if failed is not None:
+        hidden = hidden | (failed.mean(axis=0) > MOST_FAILED)
+    found[:, hidden] = np.nan
+    return dict(zip(PERCENTILES, found, strict=True))
+
+
+def peak_band(nominal: Array, values: Array, failed: np.ndarray) -> dict[str, Any] | None:
+    """Return how the nominal peak lies among its samples; None: no frame has a number.
+
+    Args:
+        nominal: (f,) of the run as its inputs stand; its largest value's frame is looked at.
+        values: (n, f) of the samples, NaN where one has none.
+        failed: (n, f) which frames of which samples failed.
+
+    Returns:
+        frame, nominal, samples, failed_samples (of them, there), median, p05, p95 (None: no
+        band), nominal_percentile: per cent of the samples below the nominal value, those equal to
+        it by half; and all that in words.
+    """
+    if not np.isfinite(nominal).any():
+        return None
+    frame = int(np.nanargmax(nominal))
+    there, level = values[:, frame], float(nominal[frame])
+    known = there[np.isfinite(there)]
+    bands = percentiles(values[:, frame : frame + 1], failed[:, frame : frame + 1])
+    low, middle, high = (float(bands[name][0]) for name in ("p05", "p50", "p95"))
+    below = (known < level).sum() + 0.5 * (known == level).sum()
+    found = {
+        "frame": frame,
+        "nominal": level,
+        "samples": len(there),
+        "failed_samples": int(failed[:, frame].sum()),
+        "median": middle if np.isfinite(middle) else None,
+        "p05": low if np.isfinite(low) else None,
+        "p95": high if np.isfinite(high) else None,
+        "nominal_percentile": 100.0 * float(below) / len(known) if len(known) else None,
+    }
+    return found | {"words": _peak_words(found)}
+
+
+def _peak_words(peak: Mapping[str, Any]) -> str:
+    """Return where the nominal peak lies among its samples, and how many failed, in words."""
+    share = peak["failed_samples"] / peak["samples"]
+    failed = f"{peak['failed_samples']} of {peak['samples']} samples failed there ({share:.0%})"
+    if peak["median"] is None:
+        return failed
+    outside = not peak["p05"] <= peak["nominal"] <= peak["p95"]
+    return (
+        f"{peak['nominal']:.2f} BW as the inputs stand, at the {peak['nominal_percentile']:.0f}th "
+        f"percentile of the samples{', outside the band' if outside else ''}; {failed}"
+    )
+
+
+def band_columns(
+    time: Array, names: Sequence[str], values: Array, failed: np.ndarray
+) -> dict[str, Array]:
+    """Return the columns of bands.csv, one entry per frame.
+
+    Args:
+        time: (f,) s.
+        names: (m,) columns of results.csv.
+        values: (n, m, f) of each sample.
+        failed: (n, f) which frames of which samples failed.
+    """
+    columns = {"time_s": time, "failed_share": failed.mean(axis=0)}
+    solved = np.maximum((~failed).sum(axis=0), 1)
+    for side in SIDES:
+        if f"{side}_force_N" in names:
+            force = values[:, list(names).index(f"{side}_force_N")]
+            columns[f"{side}_unloaded_share"] = (force == 0.0).sum(axis=0) / solved
+    for index, name in enumerate(names):
+        for ending, found in percentiles(values[:, index], failed).items():
+            columns[f"{name}_{ending}"] = found
+    return columns
+
+
+def causes(problems: np.ndarray) -> dict[str, float]:
+    """Return why frames failed: cause -> its share of those that did, the most frequent first.
+
+    Args:
+        problems: text, why a frame failed; empty where it did not. The last of its clauses says
+            most; numbers in it differ from frame to frame and are left out.
+    """
+    last = [text.rsplit("; ", 1)[-1] for text in problems.ravel() if text]
+    count = Counter(NUMBER.sub("…", text) for text in last)
+    return {text: times / len(last) for text, times in count.most_common(MOST_CAUSES)}
+
+
+def measured_inside(
+    columns: Mapping[str, Any], bands: Mapping[str, Array], compared: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """Return of each force that was measured in how many frames it lies from p05 to p95.
+
+    Args:
+        columns: of results.csv, `measured_<name>_N` among them.
+        bands: of bands.csv.
+        compared: force -> what it is held against, as in the summary's `measured`.
+
+    Returns:
+        Force -> frames that have both, and the share of them inside; NaN of none.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for name, one in compared.items():
+        measured, column = columns[f"measured_{name}_N"], one["predicted"]
+        low, high = (bands.get(f"{column}_{end}", np.full(len(measured), np.nan)) for end in ENDS)
+        both = np.isfinite(measured) & np.isfinite(low)
+        inside = (low <= measured) & (measured <= high)
+        share = float(inside[both].mean()) if both.any() else float("nan")
+        found[name] = {"frames": int(both.sum()), "share": share}
+    return found
+
+
+@dataclass(frozen=True)
+class Influence:
+    """What one input does to one result.
+
+    Args:
+        result: column of results.csv.
+        name: of the input; "rest" for what no function of one input explains.
+        share: of the result's variance over samples, all frames together.
+        change: of the result per standard deviation of the input, its linear part, where the
+            result's median is largest; NaN for the rest.
+    """
+
+    result: str
+    name: str
+    share: float
+    change: float
+
+
+def influences(
+    results: Sequence[str], inputs: Sequence[str], values: Array, errors: Array
+) -> list[Influence]:
+    """Return the tornado table: each input's share in each result's variance, largest first.
+
+    Regression: at each frame y = a + sum_i (b_i x_i + c_i x_i²) + e by least squares, x_i the
+    errors in standard deviations; the square is for what rises either way, as a force does up
+    either flank. An input's part of var(y) is cov(b_i x_i + c_i x_i², y), for independent inputs
+    b_i² var(x_i) + c_i² var(x_i²); that of an input which errs with others has what it does with
+    them in it, and may be negative (Li et al. 2010). Parts and variances are summed
+    over the frames. What is left is the rest: kinks, interactions and chance. A result that does
+    not vary beyond round-off has no rows. Empty with fewer than `SAMPLES_PER_INPUT` samples per
+    input.
+
+    Args:
+        results: (m,) names.
+        inputs: (d,) names.
+        values: (n, m, f) NaN where a sample has no number.
+        errors: (n, f, d) in standard deviations.
+
+    Reference: Li et al., J Phys Chem A 114:6022 (2010), doi:10.1021/jp9096919.
+    """
+    found: list[Influence] = []
+    for index, result in enumerate(results):
+        of_frames = [_regression(values[:, index, k], errors[:, k]) for k in range(errors.shape[1])]
+        frames = [(k, *one) for k, one in enumerate(of_frames) if one is not None]
+        total = sum(variance for _, _, _, variance in frames)
+        square = sum(float(np.nanmean(values[:, index, k] ** 2)) for k, *_ in frames)
+        if not varies(total, square):
+            continue
+        explained = np.sum([parts for _, _, parts, _ in frames], axis=0) / total
+        medians = [np.nanmedian(values[:, index, k]) for k, *_ in frames]
+        slopes = frames[int(np.argmax(medians))][1]
+        rows = [
+            Influence(result, name, float(share), float(slope))
+            for name, share, slope in zip(inputs, explained, slopes, strict=True)
+        ]
+        rows.sort(key=lambda one: -one.share)
+        found += [*rows, Influence(result, "rest", float(1.0 - explained.sum()), float("nan"))]
+    return found
+
+
+def _regression(y: Array, errors: Array) -> tuple[Array, Array, float] | None:
+    """Return slopes (d,), the variance that each explains (d,), and y's; None: too few."""
+    there, count = np.isfinite(y), errors.shape[1]
+    if there.sum() < max(FEWEST, SAMPLES_PER_INPUT * count):
+        return None
+    y, x = y[there], errors[there]
+    variance = float(y.var())
+    terms: Any = np.hstack([x, x**2])
+    terms = terms - terms.mean(axis=0)
+    slopes, *_ = np.linalg.lstsq(terms, y - y.mean(), rcond=None)
+    parts = slopes * (terms.T @ (y - y.mean())) / len(y)
+    return slopes[:count], parts[:count] + parts[count:], variance

@@ -1,0 +1,280 @@
+"""All samples of a scene: over worker processes, kept as they are finished, then made bands."""
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.io.claim import claimed_directory
+from tkamb.io.scene import Scene, load_scene
+from tkamb.io.scene.case import Case, load_case
+from tkamb.run.columns import KINDS
+from tkamb.run.guard import interrupt_as_such
+from tkamb.run.results import FEWEST, Results
+from tkamb.run.shards import Shard, Shards
+from tkamb.run.simulation import chosen_frames, simulate
+from tkamb.run.workers import Crew, Progress, Task, Team
+from tkamb.studies.uncertainty.bands import (
+    Influence,
+    band_columns,
+    causes,
+    influences,
+    measured_inside,
+    peak_band,
+)
+from tkamb.studies.uncertainty.correlation import correlation_root
+from tkamb.studies.uncertainty.folder import write_uncertainty
+from tkamb.studies.uncertainty.indices import SobolIndex, sobol_indices
+from tkamb.studies.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
+from tkamb.studies.uncertainty.sample import BandWorker, Sample
+from tkamb.studies.uncertainty.sampling import Point, crossed_points, normal_samples
+
+SAMPLES = 256
+MOST_SAMPLES = 100_000
+TORNADO_RESULTS = (
+    *("force_total_N", "medial_force_N", "lateral_force_N", "medial_share_equilibrium"),
+    *("medial_peak_pressure_MPa", "lateral_peak_pressure_MPa", "quadriceps_N"),
+)
+PEAK = "force_total_BW"
+"""Whose peak is the headline."""
+NO_BAND = (
+    *("time_s", "cycle_percent", "iterations", "coupling_iterations", "coupling_change_N"),
+    *("coupling_change_mm", "contact_trials", "split_determined", "condition_number"),
+    *("medial_force_per_adduction_N_per_deg", "adjust_restored"),
+)
+"""What is no result of the knee, or is not computed for a sample."""
+NOT_SAMPLED = ("_seconds", "_slip_mm", "_velocity_mm_per_s")
+"""Endings: computing time, and what adds up over frames that a sample does not compute."""
+RECORDED = ("measured_", "envelope_")
+"""Beginnings: what was recorded beside the run."""
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """What `estimate_uncertainty` found.
+
+    Args:
+        results: of the scene as it stands; its summary says what varied.
+        bands: columns of bands.csv.
+        tornado: which input moves what.
+        names: columns of results.csv that have a band.
+        inputs: those that varied.
+        samples: in the order of their numbers; those of Saltelli's design after the others.
+        indices: Sobol' indices, where they were asked for.
+    """
+
+    results: Results
+    bands: dict[str, Array]
+    tornado: list[Influence]
+    names: list[str]
+    inputs: tuple[VariedInput, ...]
+    samples: list[Sample]
+    indices: list[SobolIndex] = field(default_factory=list)
+
+
+def estimate_uncertainty(
+    scene: Scene | str | Path,
+    *,
+    samples: int = SAMPLES,
+    workers: int = 1,
+    dask: str | None = None,
+    method: str = "lhs",
+    indices: bool = False,
+    frames: slice | None = None,
+    directory: str | Path | None = None,
+    scene_path: str | Path | None = None,
+    resume: bool = False,
+    force: bool = False,
+    progress: Progress = lambda samples, count: samples,
+) -> Uncertainty:
+    """Vary the inputs of a scene as its table [uncertainty] says and return bands.
+
+    The same numbers whatever the number of workers; more samples keep the earlier ones.
+
+    Args:
+        scene: a scene, or the path of its file.
+        samples: how many, at least 20.
+        workers: processes; 1 computes in this one.
+        dask: address of a Dask scheduler that has the samples computed, or "local" for one with
+            so many workers.
+        method: "lhs" or "sobol", see `tkamb.studies.uncertainty.sampling`.
+        indices: find Sobol' indices too, by Saltelli's design: `samples` (d + 2) are computed
+            with d inputs, and the bands are those of twice `samples`.
+        frames: which frames; default all.
+        directory: folder for all results; None keeps them in memory.
+        scene_path: where the scene came from, for the summary.
+        resume: go on with the samples that an interrupted run left in the folder.
+        force: write into the folder even if it holds things that are not tkamb's.
+        progress: wraps the samples as they come.
+
+    Raises:
+        InputError: bad input, another run to resume, or a folder that cannot be claimed.
+        ComputationError: a worker ended before its sample.
+        KeyboardInterrupt: what is finished is kept in the folder.
+    """
+    if isinstance(scene, str | Path):
+        scene_path, scene = scene, load_scene(scene)
+    crew = Crew(workers, dask)
+    if not FEWEST <= samples <= MOST_SAMPLES:
+        raise InputError(f"{samples} is not within {FEWEST} to {MOST_SAMPLES}", "--samples")
+    if directory is None and resume:
+        raise InputError("there is no folder to go on in", "resume", "give a directory")
+    crew.check()
+    case = load_case(scene)
+    chosen = chosen_frames(frames, len(case.motion.time))
+    inputs = varied_inputs(case)
+    _check_correlation(case, inputs, indices)
+    points = _points(method, samples, len(inputs), uncertainty_of(case).seed, indices)
+    crossed = samples if indices else 0
+    with ExitStack() as stack:
+        folder = None
+        if directory is not None:
+            claim = claimed_directory(directory, force, "uncertainty")
+            folder = stack.enter_context(claim)
+        task = Task(BandWorker, (case.scene, chosen))
+        team = stack.enter_context(crew.team(task, len(points)))  # prepares meanwhile
+        nominal = simulate(scene, frames=frames, scene_path=scene_path)
+        job = _Job(case, nominal, inputs, points, crossed, method, team, progress)
+        if folder is None:
+            return job.run(None)
+        identity = nominal.summary["identity"] | {"method of sampling": job.design}
+        found = job.run(Shards(folder, identity, resume))
+        write_uncertainty(found, folder)
+    return found
+
+
+def _check_correlation(case: Case, inputs: Sequence[VariedInput], indices: bool) -> None:
+    """Raise where inputs cannot err together so, or indices are asked of such inputs."""
+    tables = uncertainty_of(case).correlation
+    correlation_root(tables, [one.name for one in inputs])
+    if tables and indices:
+        raise InputError(
+            "Sobol' indices are those of independent inputs",
+            "--indices with [[uncertainty.correlation]]",
+            "leave out one of them; tornado.csv has shares of correlated inputs",
+        )
+
+
+def _points(method: str, samples: int, dimensions: int, seed: int, crossed: bool) -> list[Point]:
+    if not crossed:
+        normal = normal_samples(method, samples, dimensions, seed)
+        return [Point.of(number, one) for number, one in enumerate(normal)]
+    both = normal_samples(method, samples, 2 * dimensions, seed)
+    return crossed_points(both[:, :dimensions], both[:, dimensions:])
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """The samples of one scene; with `crossed` rows of Saltelli's design, if that is not 0."""
+
+    case: Case
+    nominal: Results
+    inputs: tuple[VariedInput, ...]
+    points: list[Point]
+    crossed: int
+    method: str
+    team: Team
+    progress: Progress
+
+    @property
+    def design(self) -> str:
+        """Return what makes sample n the same: not how many there are, but for a design."""
+        return (
+            f"{self.method}, Saltelli's design of {self.crossed}" if self.crossed else self.method
+        )
+
+    def run(self, shards: Shards | None) -> Uncertainty:
+        """Compute the samples that are not there yet and return all with their bands."""
+        names = banded_names(self.nominal)
+        count = len(self.points)
+        done = _kept(shards, count)
+        left = [n for n in range(count) if n not in done]
+        new = self.team.answers([(n, (self.points[n], names)) for n in left])
+        try:
+            with interrupt_as_such():
+                for number, sample in self.progress(new, len(left)):
+                    done[number] = sample
+                    if shards is not None:
+                        shards.put(number, Shard({}, dict(vars(sample))))
+        except KeyboardInterrupt:
+            if shards is None or not done:
+                raise
+            kept = f"{len(done)} of {count} samples are kept; go on with --resume"
+            raise KeyboardInterrupt(kept) from None
+        return self._found(names, [done[n] for n in range(count)])
+
+    def _found(self, names: list[str], samples: list[Sample]) -> Uncertainty:
+        wanted = [name for name in TORNADO_RESULTS if name in names]
+        rows = [names.index(name) for name in wanted]
+        input_names = [one.name for one in self.inputs]
+        found: list[SobolIndex] = []
+        if self.crossed:
+            every = np.array([one.values[rows] for one in samples])
+            seed = uncertainty_of(self.case).seed
+            found = sobol_indices(wanted, input_names, every, self.crossed, seed)
+        plain = samples[: 2 * self.crossed or len(samples)]  # those that are independent
+        values = np.array([one.values for one in plain])
+        problems = np.array([one.problems for one in plain])
+        failed = problems != ""
+        errors = np.array([one.errors for one in plain])
+        bands = band_columns(self.nominal["time_s"], names, values, failed)
+        tornado = influences(wanted, input_names, values[:, rows], errors)
+        summary = self.nominal.summary
+        summary["uncertainty"] = self._summary(problems, tornado)
+        if PEAK in names:
+            peak = peak_band(self.nominal[PEAK], values[:, names.index(PEAK)], failed)
+            summary["uncertainty"]["peak_force_total_BW"] = peak
+        if summary.get("measured"):
+            inside = measured_inside(self.nominal.columns, bands, summary["measured"])
+            summary["uncertainty"]["measured_inside"] = inside
+        results = replace(self.nominal, bands=bands)
+        return Uncertainty(results, bands, tornado, names, self.inputs, samples, found)
+
+    def _summary(self, problems: np.ndarray, tornado: list[Influence]) -> dict[str, Any]:
+        failed = problems != ""
+        return {
+            "samples": len(failed),
+            "method": self.method,
+            "table": uncertainty_of(self.case).model_dump(mode="json"),
+            "varied": [one.name for one in self.inputs],
+            "not_varied": held_inputs(self.case),
+            "failed_share": float(failed.mean()),
+            "largest_failed_share": float(failed.mean(axis=0).max()),
+            "causes_of_failure": causes(problems),
+            "shares_of_variance": shares_of_variance(tornado),
+        }
+
+
+def shares_of_variance(tornado: Sequence[Influence]) -> dict[str, dict[str, float]]:
+    """Return result -> input -> its share of the result's variance, largest first."""
+    found: dict[str, dict[str, float]] = {}
+    for one in tornado:
+        found.setdefault(one.result, {})[one.name] = one.share
+    return found
+
+
+def banded_names(results: Results) -> list[str]:
+    """Return the columns that get a band: numbers that the scene models and a sample computes."""
+    return [
+        name
+        for name in results.columns
+        if KINDS.get(name) != "text"
+        and name not in (*NO_BAND, *results.not_modelled)
+        and not name.endswith(NOT_SAMPLED)
+        and not name.startswith(RECORDED)
+    ]
+
+
+def _kept(shards: Shards | None, count: int) -> dict[int, Sample]:
+    """Return the samples that an earlier run left."""
+    found: dict[int, Sample] = {}
+    for number in range(count) if shards is not None and shards.resumed else ():
+        shard = shards.get(number) if shards is not None else None
+        if shard is not None and shard.contact is not None:
+            found[number] = Sample(**shard.contact)
+    return found

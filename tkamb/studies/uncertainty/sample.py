@@ -1,0 +1,188 @@
+"""One sample of a scene: the varied case through body and contact, its results as one array.
+
+Meshes, their search trees and the prepared contact are those of the scene as it stands: no
+input that varies changes them, but the insert's modulus, for which the contact is prepared anew.
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from tkamb.errors import TkambError
+from tkamb.geometry.frames import Array
+from tkamb.io.scene import Scene
+from tkamb.io.scene.case import Case, load_case
+from tkamb.knee.equilibrium.frame_contact import FrameContact
+from tkamb.run.contact_side import ContactSide
+from tkamb.run.known import Known
+from tkamb.run.mechanics import Mechanics
+from tkamb.run.status import failures_of, frame_status
+from tkamb.run.tabulate import frame_row
+from tkamb.studies.uncertainty.correlation import correlation_root
+from tkamb.studies.uncertainty.inputs import (
+    Draw,
+    VariedInput,
+    pose_names,
+    uncertainty_of,
+    varied_inputs,
+)
+from tkamb.studies.uncertainty.sampling import Point, noise_of_point
+from tkamb.studies.uncertainty.varied_case import thinnable, thinned, varied_case, varied_muscles
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """What one sample gives.
+
+    Args:
+        values: (names, frames) in the order asked for; NaN where a frame failed or has no number.
+        problems: (frames,) text, why the frame failed; empty where it did not.
+        errors: (frames, d) the inputs' errors in their standard deviations.
+    """
+
+    values: Array
+    problems: np.ndarray
+    errors: Array
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Whether each frame failed (frames,)."""
+        return self.problems != ""
+
+
+class Sampler:
+    """Computes samples of one scene.
+
+    Args:
+        scene: the scene.
+        frames: of the motion.
+        names: columns of results.csv that are wanted.
+
+    Attributes:
+        names: as given.
+        case: as it stands.
+        inputs: that vary.
+
+    Raises:
+        TkambError: whatever is wrong with the scene.
+    """
+
+    def __init__(self, scene: Scene, frames: range, names: Sequence[str]) -> None:
+        whole = load_case(scene)
+        self._time = whole.motion.time
+        self._chosen, self.names = frames, list(names)
+        self.case, self._frames = (
+            (thinned(whole, frames), range(len(frames))) if thinnable(whole) else (whole, frames)
+        )
+        self.inputs: tuple[VariedInput, ...] = varied_inputs(self.case)
+        self._root = correlation_root(
+            uncertainty_of(self.case).correlation, [one.name for one in self.inputs]
+        )
+        self._split = self.case.split
+        self._mechanics = Mechanics(self.case)
+        contact = self.case.scene.contact
+        self._side = ContactSide(self.case, self._mechanics) if contact else None
+
+    def draw(self, point: Point) -> Draw:
+        """Return what the sample at a point makes of the inputs."""
+        table = uncertainty_of(self.case)
+        count = len(pose_names(self.inputs))  # they come first
+        # on the whole recording's clock: the same whichever frames are asked for
+        per_frame = noise_of_point(point, range(count), self._time, table.correlation_s, table.seed)
+        if len(self.case.motion.time) < len(self._time):
+            per_frame = per_frame[list(self._chosen)]
+        if point.noise_of is None:  # one input at a time: whatever errs with it stays
+            return Draw(self.inputs, point.normal, per_frame, 1.0)
+        noise = per_frame @ self._root[:count, :count].T
+        return Draw(self.inputs, self._root @ point.normal, noise, table.constant_share)
+
+    def __call__(self, number: int, point: Point) -> Sample:
+        """Return the sample at a point; a frame begins its search at the one before.
+
+        Args:
+            number: of the sample; what workers tell samples by, it changes nothing.
+            point: where it lies.
+        """
+        draw = self.draw(point)
+        errors = draw.standardised()[list(self._frames)]
+        values = np.full((len(self.names), len(self._frames)), np.nan)
+        try:
+            case = self._varied(draw)
+            mechanics = Mechanics(case, self._known(draw))
+            side = self._contact(case, mechanics, draw)
+        except TkambError as error:  # the moved inputs cannot be used: no frame has a number
+            return Sample(values, np.full(len(self._frames), str(error)), errors)
+        problems: list[str] = []
+        before: list[FrameContact] = []
+        for column, k in enumerate(self._frames):
+            row, problem = _frame(case, mechanics, side, k, before)
+            problems.append(problem)
+            if not problem:
+                values[:, column] = [row.get(name, np.nan) for name in self.names]
+        return Sample(values, np.array(problems), errors)
+
+    def _known(self, draw: Draw) -> Known:
+        nominal = self._mechanics
+        muscles = varied_muscles(nominal.muscles, draw)
+        return Known(nominal.query, muscles, nominal.extensor, self._frames)
+
+    def _varied(self, draw: Draw) -> Case:
+        case = varied_case(self.case, draw)
+        case.__dict__["split"] = self._split  # of the same femoral component: found once
+        return case
+
+    def _contact(self, case: Case, mechanics: Mechanics, draw: Draw) -> ContactSide | None:
+        """Return the contact side, with the contact that is prepared already where it serves."""
+        if self._side is None:
+            return None
+        factor = draw.factor("young_modulus")
+        state = self._side.state
+        if factor != 1.0:
+            material = state.pair.material
+            stiffer = replace(material, young_modulus=material.young_modulus * factor)
+            state = self._side.model.prepare(replace(state.pair, material=stiffer))
+        return ContactSide(case, mechanics, state, sensitivity=False, post=self._side.post)
+
+
+class BandWorker:
+    """Computes samples; prepared before it is known which columns have a band.
+
+    Args:
+        scene: the scene.
+        frames: of the motion.
+    """
+
+    def __init__(self, scene: Scene, frames: range) -> None:
+        self._scene, self._frames = scene, frames
+        self._sampler: Sampler | None = None
+        with suppress(TkambError):  # the run of the scene as it stands says what is wrong
+            self._sampler = Sampler(scene, frames, ())
+
+    def __call__(self, number: int, job: tuple[Point, list[str]]) -> Sample:
+        """Return the sample at a point, with the columns of these names."""
+        point, names = job
+        sampler = self._sampler or Sampler(self._scene, self._frames, names)
+        sampler.names = names
+        return sampler(number, point)
+
+
+def _frame(
+    case: Case,
+    mechanics: Mechanics,
+    side: ContactSide | None,
+    k: int,
+    before: list[FrameContact],
+) -> tuple[dict[str, Any], str]:
+    """Return frame k's row of results.csv and why it failed; its contact joins those before it."""
+    contact = None
+    if side is None:
+        body = mechanics.frame(k)
+    else:
+        body, contact = side.frame(k, before)
+        before.append(contact)
+        del before[:-2]
+    row = frame_row(case, k, body, contact, {}, frame_status(case, k, body, contact))
+    return row, "; ".join(failures_of(body, contact))

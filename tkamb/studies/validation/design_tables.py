@@ -1,0 +1,131 @@
+"""Tables D-3 to D-6 beside parametric designs that are pressed at the tables' own forces."""
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tkamb.geometry.frames import Array
+from tkamb.studies.designs.design import load_design
+from tkamb.studies.validation import dissertation
+from tkamb.studies.validation.design_cells import (
+    Condyle,
+    PressedDesign,
+    assumptions,
+    in_public_units,
+    table_cell,
+    table_force,
+)
+
+FOLDERS = {
+    "Sigma FB": "sigma_fb",
+    "Sigma MB": "sigma_mb",
+    "CR-Flex": "cr_flex",
+    "LPS-Flex": "lps_flex",
+    "NKII UCP": "nkii_ucp",
+    "NKII CP": "nkii_cp",
+}
+"""Of models/designs, by the tables' names."""
+CONDYLES: tuple[Condyle, Condyle] = ("medial", "lateral")
+QUANTITIES = ("area_mm2", "overlap_mm2", "mean_pressure_MPa", "overlap_pressure_MPa")
+"""Contact area, the source's area, and force over each."""
+SAMPLES = 6
+"""Besides the nominal case."""
+
+
+def pressed_row(
+    pressed: PressedDesign, name: str, condyle: Condyle, row: int, samples: int = SAMPLES
+) -> dict[str, Any]:
+    """Press one condyle at one percentage of the bend over all assumptions.
+
+    Returns:
+        design, condyle, percent, force_N, carried (of how many), and per quantity
+        [nominal, least, median, largest].
+    """
+    force = table_force(name, condyle, row)
+    percent = float(dissertation.table(1).percent[row])
+    cases = assumptions(samples, pressed.design.bearing == "mobile")
+    cells = [pressed.cell(condyle, percent, force, case) for case in cases]
+    found = in_public_units(cell for cell in cells if cell is not None)
+    spread = np.stack(
+        [found[0], found.min(axis=0), np.median(found, axis=0), found.max(axis=0)], axis=1
+    )
+    values = {q: np.round(spread[i], 3).tolist() for i, q in enumerate(QUANTITIES)}
+    return {
+        "design": name,
+        "condyle": condyle,
+        "percent": percent,
+        "force_N": round(force, 1),
+        "carried": [len(found), len(cases)],
+        **values,
+    }
+
+
+def press_tables(
+    folder: Path,
+    rows: Iterable[int] = range(11),
+    resolution_mm: float = 2.0,
+    said: Callable[[str], None] = lambda words: None,
+) -> list[dict[str, Any]]:
+    """Press every design, condyle and percentage; see `pressed_row`.
+
+    Args:
+        folder: models/designs.
+        rows: of the tables, 0 for the start of the bend.
+        resolution_mm: of the lattice.
+        said: is told each design when it is done.
+    """
+    found = []
+    for name in dissertation.designs():
+        pressed = PressedDesign(load_design(folder / FOLDERS[name]), resolution_mm)
+        found += [pressed_row(pressed, name, c, row) for c in CONDYLES for row in rows]
+        said(name)
+    return found
+
+
+def compared(row: dict[str, Any]) -> dict[str, bool]:
+    """Return per quantity whether the table's mean lies within the range over the assumptions."""
+    index = int(np.flatnonzero(dissertation.table(1).percent == row["percent"])[0])
+    area, pressure = table_cell(row["design"], row["condyle"], index)
+    told = dict(zip(QUANTITIES, (area, area, pressure, pressure), strict=True))
+    return {q: row[q][1] <= value <= row[q][3] for q, value in told.items()}
+
+
+def overlapping(row: dict[str, Any]) -> dict[str, bool]:
+    """Return per quantity whether our range and the table's mean ± one deviation overlap."""
+    index = int(np.flatnonzero(dissertation.table(1).percent == row["percent"])[0])
+    column = dissertation.designs().index(row["design"])
+    shift = 0 if row["condyle"] == "medial" else 1
+    told = {}
+    for quantity in QUANTITIES:
+        base = dissertation.MEDIAL_PRESSURE if "pressure" in quantity else dissertation.MEDIAL_AREA
+        table = dissertation.table(base + shift)
+        mean, deviation = table.mean[index, column], table.deviation[index, column]
+        _, low, _, high = row[quantity]
+        told[quantity] = bool(low <= mean + deviation and high >= mean - deviation)
+    return told
+
+
+def by_design(rows: Sequence[dict[str, Any]], quantity: str, condyle: Condyle) -> Array:
+    """Return nominal values (11, 6) of a quantity, columns as in the tables."""
+    percent = dissertation.table(1).percent.tolist()
+    values = np.full((11, 6), np.nan)
+    for row in rows:
+        if row["condyle"] == condyle:
+            at = percent.index(row["percent"]), dissertation.designs().index(row["design"])
+            values[at] = row[quantity][0]
+    return values
+
+
+def pairs_in_order(ours: Array, table: Array) -> tuple[int, int]:
+    """Return how many pairs of designs are in the table's order, and how many pairs there are.
+
+    Args:
+        ours: (6,) one number per design.
+        table: (6,) the table's.
+    """
+    pairs = list(combinations(range(len(table)), 2))
+    right = sum((ours[i] - ours[j]) * (table[i] - table[j]) > 0 for i, j in pairs)
+    return int(right), len(pairs)

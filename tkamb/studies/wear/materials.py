@@ -1,0 +1,186 @@
+"""What the insert is made of as far as wear goes: laws with parameters, density, creep."""
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from tkamb.errors import InputError, names_near
+from tkamb.files import read_text
+from tkamb.studies.wear.creep import LogarithmicCreep
+from tkamb.studies.wear.laws import WearLaw, law_class, wear_law
+
+DEFAULT_MATERIAL = "conventional"
+DENSITY_RANGE = (500.0, 3000.0)
+"""kg/m³ that a bearing polymer may have."""
+TWO_EITHER_WAY = (0.5, 2.0)
+ASSUMED_RANGE = "a factor of two either way: by that much and more laboratories differ (assumption)"
+
+
+@dataclass(frozen=True)
+class WearMaterial:
+    """A wear material with where its numbers come from.
+
+    Args:
+        name: what to call it.
+        text: in words.
+        density_kg_per_m3: turns volume into mass.
+        law: the law that is taken unless another is asked for.
+        laws: law -> its parameters.
+        sources: one line per number.
+        caution: what a reader must know before using the numbers; may be empty.
+        creep: parameters of `LogarithmicCreep`; None: creep is not modelled.
+        factor_range: lowest and highest factor on every law's depth that its sources allow.
+        range_source: where that range comes from.
+    """
+
+    name: str
+    text: str
+    density_kg_per_m3: float
+    law: str
+    laws: Mapping[str, Mapping[str, Any]]
+    sources: tuple[str, ...]
+    caution: str = ""
+    creep: LogarithmicCreep | None = None
+    factor_range: tuple[float, float] = TWO_EITHER_WAY
+    range_source: str = ASSUMED_RANGE
+
+    def with_own_factor(self) -> "WearMaterial":
+        """Return the material with the range of a wear factor that the user gives."""
+        return replace(self, factor_range=TWO_EITHER_WAY, range_source=ASSUMED_RANGE, caution="")
+
+    def all_laws(self) -> dict[str, WearLaw]:
+        """Return every law that the material has parameters for."""
+        return {name: wear_law(name, table, self.name) for name, table in self.laws.items()}
+
+    def wear_law(self, name: str | None = None, wear_factor: float | None = None) -> WearLaw:
+        """Return one of its laws.
+
+        Args:
+            name: of the law; None: the material's own choice.
+            wear_factor: mm³/(N m), in place of the material's `wear_factor_mm3_per_Nm`.
+
+        Raises:
+            InputError: no such law, the material has no parameters for it, or the law has no
+                single wear factor.
+        """
+        name = name or self.law
+        parameters = dict(self.laws.get(name, {}))
+        if wear_factor is not None:
+            key = "wear_factor_mm3_per_Nm"
+            if name != "archard" and not isinstance(parameters.get(key), float):
+                raise InputError(
+                    f"law '{name}' of material '{self.name}' has no single wear factor",
+                    "--wear-factor",
+                    "give a material file",
+                )
+            parameters[key] = wear_factor
+        elif name not in self.laws:
+            law_class(name)  # a name that there is not is another mistake
+            raise InputError(
+                f"material '{self.name}' has no parameters for the law '{name}'",
+                mend=f"it has: {', '.join(self.laws)}; others in a material file (docs/wear.md)",
+            )
+        return wear_law(name, parameters, self.name)
+
+
+def material_names() -> tuple[str, ...]:
+    """Return the names of the built-in wear materials."""
+    return tuple(_built_in())
+
+
+def wear_material(name: str | Path) -> WearMaterial:
+    """Return a built-in wear material, or what a TOML file says.
+
+    Raises:
+        InputError: no such name or file, an unknown key, or a bad value.
+    """
+    known = _built_in()
+    if str(name) in known:
+        return _material(str(name), known[str(name)], f"wear material '{name}'")
+    if Path(name).suffix != ".toml":
+        mend = f"{names_near(str(name), known)}; or give a material file (.toml)"
+        raise InputError(f"no wear material '{name}'", mend=mend)
+    try:
+        content = tomllib.loads(read_text(name, what="wear material"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"is not TOML ({error})", name) from None
+    return _material(str(content.pop("name", Path(name).stem)), content, name)
+
+
+def _built_in() -> dict[str, Any]:
+    text = files("tkamb.studies.wear").joinpath("materials.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)
+
+
+def _material(name: str, content: dict[str, Any], where: object) -> WearMaterial:
+    own = [field.name for field in fields(WearMaterial) if field.name != "name"]
+    for key in content:
+        if key not in own:
+            raise InputError(f"unknown key '{key}'", where, names_near(key, own))
+    for key in ("density_kg_per_m3", "law", "laws", "sources"):
+        if key not in content:
+            raise InputError(f"'{key}' is missing", where, "see docs/wear.md")
+    density, laws = content["density_kg_per_m3"], content["laws"]
+    low, high = DENSITY_RANGE
+    if not (isinstance(density, int | float) and low <= density <= high):
+        raise InputError(
+            f"density_kg_per_m3 cannot be {density}", where, f"give {low:g} to {high:g}"
+        )
+    if not (isinstance(laws, dict) and all(isinstance(table, dict) for table in laws.values())):
+        raise InputError("laws are no tables", where, "write [laws.archard] and its parameters")
+    for law, parameters in laws.items():
+        wear_law(law, parameters, where)
+    if content["law"] not in laws:
+        raise InputError(f"law '{content['law']}' has no parameters", where, names_near("", laws))
+    return WearMaterial(
+        name=name,
+        text=str(content.get("text", name)),
+        density_kg_per_m3=float(density),
+        law=str(content["law"]),
+        laws=laws,
+        sources=_sources(content["sources"], where),
+        caution=str(content.get("caution", "")),
+        creep=_creep(content.get("creep"), where),
+        factor_range=_factor_range(content, where),
+        range_source=str(content.get("range_source", ASSUMED_RANGE)),
+    )
+
+
+def _factor_range(content: dict[str, Any], where: object) -> tuple[float, float]:
+    given = content.get("factor_range")
+    if given is None:
+        return TWO_EITHER_WAY
+    sound = (
+        isinstance(given, list)
+        and len(given) == 2
+        and all(isinstance(one, int | float) and math.isfinite(one) for one in given)
+        and 0 < given[0] <= 1 <= given[1]
+    )
+    if not sound:
+        mend = "give two factors, at most 1 and at least 1, e.g. [0.5, 2.0]"
+        raise InputError(f"cannot be {given}", f"{where}: factor_range", mend)
+    if "range_source" not in content:
+        raise InputError("'range_source' is missing", where, "say where the range comes from")
+    return float(given[0]), float(given[1])
+
+
+def _sources(given: Any, where: object) -> tuple[str, ...]:
+    if not (isinstance(given, list) and given and all(isinstance(line, str) for line in given)):
+        raise InputError("sources is no list of texts", where, "say where each number comes from")
+    return tuple(given)
+
+
+def _creep(table: Any, where: object) -> LogarithmicCreep | None:
+    if table is None:
+        return None
+    own = [field.name for field in fields(LogarithmicCreep)]
+    if not isinstance(table, dict) or sorted(table) != sorted(own):
+        raise InputError("[creep] is not complete", where, f"it needs: {', '.join(own)}")
+    for key, value in table.items():
+        if not isinstance(value, int | float) or not math.isfinite(value):
+            raise InputError(f"cannot be {value}", f"{where}: [creep] {key}", "give a number")
+    return LogarithmicCreep(**{key: float(value) for key, value in table.items()})

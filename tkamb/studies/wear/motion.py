@@ -1,0 +1,271 @@
+"""The motion that one cycle consists of: poses of the femoral component, and the load at each."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple, get_args
+
+import numpy as np
+import pinocchio
+from scipy.spatial.transform import Rotation
+
+from tkamb.errors import InputError, names_near
+from tkamb.geometry.frames import Array, inverse, knee_coordinates, knee_pose
+from tkamb.io.scene.table import DEFAULT_CLOSING, Closing
+from tkamb.studies.wear.force_control import ForceDrive
+from tkamb.units import MILLIMETRE
+
+CLOSINGS: tuple[Closing, ...] = get_args(Closing)
+LEVER = 0.025
+"""m; what a turn moves at a condyle, to compare turns with translations."""
+WIDE_GAP = 0.1
+"""Share of the motion's extent. Ends further apart are asked about; the cycle stays the same."""
+
+
+class Path(NamedTuple):
+    """The way of the femoral component in more poses than there are frames.
+
+    Args:
+        poses: (g, 4, 4) pose_femoral_in_insert; y is not used, the load finds it.
+        place: (g,) of each pose among the frames: 2.5 is midway between frames 2 and 3.
+    """
+
+    poses: Array
+    place: Array
+
+    def weights(self, rows: Sequence[int]) -> Array:
+        """Return (g, n) that interpolate values at n of the frames to the poses of the path."""
+        place = np.interp(self.place, rows, np.arange(len(rows)))
+        return np.array(
+            [np.interp(place, np.arange(len(rows)), one) for one in np.eye(len(rows))]
+        ).T
+
+
+@dataclass(frozen=True, eq=False)
+class CycleMotion:
+    """One cycle.
+
+    Args:
+        poses: (f, 4, 4) pose_femoral_in_insert; the press keeps rotation, x and z.
+        load: (f,) N along -y.
+        duration: s of a cycle.
+        passes: how often the frames are gone through in a cycle: 1 for a closed cycle, 2 where
+            the way back is the way out.
+        notes: what a reader must know about it.
+        drive: finds the poses anew on every insert, from forces; None: they are prescribed. Those
+            of a driven motion are where its first search begins.
+        seconds: (f - 1,) duration of each step in one pass; None: all steps are equally long.
+        path: poses at the frames and between them, where more of the motion is known than its
+            frames; None: it is a screw motion from frame to frame.
+        closing: how the recorded frames became a cycle; empty: it is a simulator's profile.
+        questions: what a reader must decide before using the numbers.
+    """
+
+    poses: Array
+    load: Array
+    duration: float
+    passes: int = 1
+    notes: tuple[str, ...] = ()
+    drive: ForceDrive | None = None
+    seconds: Array | None = None
+    path: "Path | None" = None
+    closing: str = ""
+    questions: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.load)
+
+    @classmethod
+    def of_frames(
+        cls,
+        time: Array,
+        poses: Array,
+        load: Array,
+        closing: Closing = DEFAULT_CLOSING,
+        interval: float | None = None,
+        track: tuple[Array, Array] | None = None,
+    ) -> "CycleMotion":
+        """Return the cycle that recorded frames stand for.
+
+        The cycle depends on `closing` alone, never on the frames' number or on how far apart
+        their ends are:
+
+        - "interpolate": the femoral component goes from the last frame to the first by one
+          screw motion, the load linearly. That way is divided into steps no longer than the
+          longest step between frames.
+        - "there-and-back": the frames are gone through forwards, then backwards.
+        - "as recorded": the frames alone. Nothing leads from the last to the first.
+
+        Args:
+            time: (f,) s.
+            poses: (f, 4, 4); NaN where a frame failed.
+            load: (f,) N; NaN where a frame failed.
+            closing: see above.
+            interval: s that the way from the last frame to the first takes; None: the mean
+                interval between the frames.
+            track: times (g,) s and poses (g, 4, 4) of the whole recording, of which the frames
+                are a part; None: no more is known than the frames.
+
+        Raises:
+            InputError: fewer than two frames are left, or there is no such closing.
+        """
+        check_closing(closing)
+        known = np.isfinite(load) & np.isfinite(poses).all(axis=(1, 2))
+        notes, questions = [], []
+        if lost := int((~known).sum()):
+            notes.append(f"{lost} of {len(known)} frames failed and are left out of the cycle")
+        time, poses, load = time[known], poses[known], load[known]
+        if len(time) < 2:
+            raise InputError("fewer than two frames have a contact", "wear", "see the run's status")
+        steps, span = np.diff(time), float(time[-1] - time[0])
+        path = None if track is None else _path(time, track)
+        if closing == "there-and-back":
+            notes.append("a cycle is the motion there and back")
+            return cls(
+                poses,
+                load,
+                2.0 * span,
+                2,
+                tuple(notes),
+                seconds=steps,
+                path=path,
+                closing=closing,
+            )
+        gap = distance(poses[-1], poses[0])
+        extent = max(distance(poses[0], pose) for pose in poses)
+        apart = f"the motion's ends are {gap / MILLIMETRE:.3g} mm apart"
+        if closing == "as recorded":
+            notes.append(f"a cycle is the frames as recorded; {apart}, and nothing leads across")
+            return cls(
+                poses, load, span, 1, tuple(notes), seconds=steps, path=path, closing=closing
+            )
+        if gap > WIDE_GAP * extent:
+            questions.append(
+                f"{apart}, {gap / extent:.0%} of its extent; the cycle closes by one screw motion "
+                "from the last frame to the first: is that meant? (--close there-and-back, or "
+                "'as recorded')"
+            )
+        longest = max(distance(a, b) for a, b in pairwise(poses))
+        pieces = 1 if longest == 0 else max(1, int(np.ceil(gap / longest - 1e-9)))
+        way = _way(poses[-1], poses[0], pieces)
+        carried = np.linspace(load[-1], load[0], pieces + 1)
+        interval = span / (len(time) - 1) if interval is None else interval
+        if path is not None:
+            places = len(time) - 1 + np.arange(1, pieces + 1)
+            path = Path(np.concatenate([path.poses, way[1:]]), np.append(path.place, places))
+        notes.append(
+            f"a closed cycle: {apart}, closed by a screw motion"
+            + (f" in {pieces} steps" if pieces > 1 else "")
+        )
+        return cls(
+            np.concatenate([poses, way[1:]]),
+            np.concatenate([load, carried[1:]]),
+            span + interval,
+            1,
+            tuple(notes),
+            seconds=np.append(steps, np.full(pieces, interval / pieces)),
+            path=path,
+            closing=closing,
+            questions=tuple(questions),
+        )
+
+    def refined(self) -> "CycleMotion":
+        """Return the motion with a frame in the middle of each step, linear in between.
+
+        Knee coordinates, load and applied forces are linear, as a simulator's profile is.
+        """
+        poses = knee_pose(_with_middles(knee_coordinates(self.poses)))
+        drive = self.drive
+        if drive is not None:
+            drive = replace(
+                drive,
+                coordinates=_with_middles(drive.coordinates),
+                applied=_with_middles(drive.applied),
+                percent=None
+                if drive.percent is None
+                else _with_middles(drive.percent[:, None])[:, 0],
+            )
+        seconds = np.repeat(0.5 * self.step_seconds, 2)
+        load = _with_middles(self.load[:, None])[:, 0]
+        return replace(self, poses=poses, load=load, drive=drive, seconds=seconds)
+
+    @property
+    def every_second(self) -> list[int]:
+        """Indices of every second frame, and of the last."""
+        chosen = list(range(0, len(self), 2))
+        return chosen if chosen[-1] == len(self) - 1 else [*chosen, len(self) - 1]
+
+    @property
+    def step_seconds(self) -> Array:
+        """Duration of each step in one pass, (f - 1,) s."""
+        if self.seconds is not None:
+            return self.seconds
+        steps = len(self) - 1
+        return np.full(steps, self.duration / self.passes / steps)
+
+    def seconds_between(self, rows: list[int]) -> Array:
+        """Return the durations (n - 1,) s from each of n frames to the next one chosen.
+
+        A frame that lies before its predecessor is reached in the next cycle.
+        """
+        times = np.concatenate([[0.0], np.cumsum(self.step_seconds)])
+        between = np.diff(times[rows])
+        return np.where(between < 0, between + times[-1], between)
+
+
+def check_closing(closing: str) -> None:
+    """Raise an InputError where there is no such way to close a cycle."""
+    if closing not in CLOSINGS:
+        raise InputError(
+            f"no way '{closing}' to close a cycle", "--close", names_near(closing, CLOSINGS)
+        )
+
+
+def chosen_frames(count: int, most: int) -> list[range]:
+    """Return at most `most` of `count` frames, the first and the last among them.
+
+    Two ranges one after the other, whose steps differ by one: as even as whole frames allow.
+    """
+    if count <= most:
+        return [range(count)]
+    steps = most - 1
+    short, longer = divmod(count - 1, steps)
+    turn = (steps - longer) * short
+    return (
+        [range(0, turn, short), range(turn, count, short + 1)]
+        if longer
+        else [range(0, count, short)]
+    )
+
+
+def _path(time: Array, track: tuple[Array, Array]) -> Path | None:
+    """Return the recorded poses from the first frame to the last; None: one of them is unknown."""
+    moments, poses = track
+    inside = (moments >= time[0]) & (moments <= time[-1])
+    if not np.isfinite(poses[inside]).all():
+        return None
+    return Path(poses[inside], np.interp(moments[inside], time, np.arange(len(time))))
+
+
+def _way(begin: Array, end: Array, pieces: int) -> Array:
+    """Return the poses (pieces + 1, 4, 4) of the screw motion from one pose to another."""
+    twist = pinocchio.log6(pinocchio.SE3(end @ inverse(begin)))
+    shares = np.linspace(0.0, 1.0, pieces + 1)
+    way = np.array([pinocchio.exp6(pinocchio.Motion(s * twist.vector)).homogeneous for s in shares])
+    way = way @ begin
+    way[0], way[-1] = begin, end
+    return way
+
+
+def _with_middles(values: Array) -> Array:
+    """Return rows (f, n) with the mean of each two neighbours between them, (2 f - 1, n)."""
+    dense = np.empty((2 * len(values) - 1, values.shape[1]))
+    dense[::2], dense[1::2] = values, 0.5 * (values[:-1] + values[1:])
+    return dense
+
+
+def distance(one: Array, other: Array) -> float:
+    """Return how far apart two poses (4, 4) are, m, a turn counted at `LEVER`."""
+    move = inverse(one) @ other
+    turn = np.linalg.norm(Rotation.from_matrix(move[:3, :3]).as_rotvec())
+    return float(np.linalg.norm(move[:3, 3]) + LEVER * turn)

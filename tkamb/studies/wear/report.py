@@ -1,0 +1,316 @@
+"""What a wear simulation writes: table, summary, maps, the worn insert, a picture."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from tkamb.atomic import replaced_together, write_rows, write_synced
+from tkamb.code_identity import code_identity
+from tkamb.geometry.frames import MIRROR, Array
+from tkamb.geometry.surface import Surface
+from tkamb.io.vtk import write_triangles
+from tkamb.run.shards import remove_shards
+from tkamb.studies.wear.bands import WearBands
+from tkamb.studies.wear.force_control import UNITS
+from tkamb.studies.wear.kept import STATE_NAME
+from tkamb.studies.wear.materials import WearMaterial
+from tkamb.studies.wear.setup import WearSetup
+from tkamb.studies.wear.simulation import CycleWear, FirstCycle, WearCase, WearState
+from tkamb.units import MEGAPASCAL, MILLIMETRE
+
+MILLION = 1e6
+SAMPLES_NAME = ".wear_samples"
+"""Folder of the finished samples while a simulation is under way."""
+FIRST = (
+    "Worn volume, mass and depth follow the wear factor, which differs by a factor of two and more "
+    "between laboratories."
+)
+"""What is said before any number."""
+PROPORTIONAL = ("volume_mm3", "mass_mg", "max_depth_mm")
+"""Columns that follow the wear factor in proportion, but for what the worn shape changes."""
+LARGEST_FRAMES_CHANGE = 0.02
+"""Of a cycle's volume by half as many frames, beyond which they are too few."""
+DEAREST_CORRECTION = 0.05
+"""Correction of a map's force beyond which the map is too coarse."""
+PUBLISHED_RATES = (1.6, 4.4)
+"""mm³ per million cycles of one whole knee in two tests: Dreyer et al. (2023),
+doi:10.1101/2023.05.09.23289712."""
+FAR_FROM_PUBLISHED = 3.0
+"""Times the published rates beyond which a rate is asked about."""
+
+
+@dataclass(frozen=True, eq=False)
+class WearReport:
+    """A finished wear simulation.
+
+    Args:
+        setup: bodies, motion, contact.
+        case: what was worn, by what law.
+        material: with sources.
+        state: at the end.
+        last: what the next cycle would do.
+        cycles: asked for.
+        updates: asked for.
+        first: what is known of the first cycle.
+        bands: beside the rows; None: not asked for.
+    """
+
+    setup: WearSetup
+    case: WearCase
+    material: WearMaterial
+    state: WearState
+    last: CycleWear
+    cycles: int
+    updates: int
+    first: FirstCycle
+    bands: WearBands | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `tkamb wear --json` prints; None stands for what is not modelled."""
+        last = {key: _known(value) for key, value in self.state.rows[-1].items()}
+        law = self.case.law
+        return {
+            "first": FIRST,
+            **last,
+            "status": self.state.end or "ok",
+            "cycles_asked": self.cycles,
+            "updates": self.updates,
+            "blocks": len(self.state.rows) - 1,
+            "volume_mm3_per_Mc": self.rate,
+            "mass_mg_per_Mc": self.rate * self.case.density * 1e-3,
+            **self.ranges(),
+            "range_factors": list(self.material.factor_range),
+            "range_source": self.material.range_source,
+            "law": law.name,
+            "law_parameters": vars(law),
+            "geometry": law.geometry,
+            "laws_side_by_side": self.side_by_side(),
+            "frames_change": _known(self.first.frames_change),
+            "close": self.case.motion.closing or None,
+            "material": self.material.name,
+            "sources": list(self.material.sources),
+            "creep": None if self.case.creep is None else vars(self.case.creep),
+            "contact": self.setup.contact,
+            "resolution_mm": self.setup.resolution_mm,
+            "source": self.setup.source,
+            "scene_sha256": self.setup.scene_sha256,
+            "files_sha256": self.setup.files_sha256,
+            "run_frames": self.setup.run_frames,
+            "side": self.setup.side,
+            "frames": len(self.case.motion),
+            "passes_per_cycle": self.case.motion.passes,
+            "seconds_per_cycle": self.case.motion.duration,
+            "largest_force_correction": self.state.map_error,
+            "mean_cross_shear": _known(self._mean_cross_shear()),
+            **self._control(),
+            "bands": None if self.bands is None else self.bands.as_dict(),
+            "notes": list(self.case.motion.notes),
+            "questions": self.questions(),
+            "rows": [{k: _known(v) for k, v in row.items()} for row in self._rows()],
+            "code": code_identity(),
+        }
+
+    def _rows(self) -> list[dict[str, float]]:
+        """Return the table, with its bands where there are any."""
+        rows = self.state.rows
+        beside = [{}] * len(rows) if self.bands is None else self.bands.rows
+        return [row | band for row, band in zip(rows, beside, strict=True)]
+
+    def _control(self) -> dict[str, Any]:
+        """Return what was prescribed, what was found in equilibrium, and where."""
+        drive = self.case.motion.drive
+        if drive is None:
+            return {"control": "displacement", "found_in_equilibrium": []}
+        springs = drive.springs
+        return {
+            "control": "force",
+            "found_in_equilibrium": drive.names,
+            "springs": None if springs is None else dict(springs.table),
+            "springs_sources": [] if springs is None else list(springs.sources),
+            "dwell_mm": [float(drive.zero[i] / MILLIMETRE) for i in (0, 2)],
+            "last_cycle": drive.rows(self.last.poses, self.last.failed),
+        }
+
+    @property
+    def rate(self) -> float:
+        """Volume per cycle, mm³ per million cycles."""
+        last = self.state.rows[-1]
+        return last["volume_mm3"] * MILLION / last["cycles"] if last["cycles"] else 0.0
+
+    def ranges(self) -> dict[str, list[float]]:
+        """Return the range of each number that is proportional to the wear factor."""
+        last = self.state.rows[-1]
+        values = {key: last[key] for key in PROPORTIONAL}
+        values["volume_mm3_per_Mc"] = self.rate
+        return {
+            f"{key}_range": [factor * value for factor in self.material.factor_range]
+            for key, value in values.items()
+        }
+
+    def side_by_side(self) -> list[dict[str, Any]]:
+        """Return what each law of the material takes off the unworn insert, with its range."""
+        found = []
+        for name, law in self.material.all_laws().items():
+            if name not in self.first.volumes:
+                continue
+            rate = self.first.volumes[name] * MILLION / MILLIMETRE**3
+            found.append(
+                {
+                    "law": name,
+                    "first_volume_mm3_per_Mc": rate,
+                    "first_volume_mm3_per_Mc_range": [f * rate for f in self.material.factor_range],
+                    "law_parameters": vars(law),
+                    "geometry": law.geometry,
+                }
+            )
+        return found
+
+    def questions(self) -> list[str]:
+        """Return what a reader must know before using the numbers."""
+        asked = [] if not self.material.caution else [self.material.caution]
+        asked += self.case.motion.questions
+        if self.first.frames_change > LARGEST_FRAMES_CHANGE:
+            asked.append(
+                f"half as many frames per cycle move its volume by {self.first.frames_change:.1%}: "
+                "take more with --frames-per-cycle"
+            )
+        if self.state.map_error > DEAREST_CORRECTION:
+            asked.append(
+                f"maps had to be scaled by up to {self.state.map_error:.0%} to carry their load: "
+                "take a finer resolution"
+            )
+        if self.state.unsettled:
+            asked.append(
+                f"in {self.state.unsettled} blocks the pressure moved away from what it wore, "
+                "however short they were: take more --updates"
+            )
+        low, high = PUBLISHED_RATES
+        if not low / FAR_FROM_PUBLISHED <= self.rate <= high * FAR_FROM_PUBLISHED:
+            asked.append(
+                f"{self.rate:.3g} mm3 a million cycles is far from a whole knee's {low:g} (ISO) to "
+                f"{high:g} (in-vivo loads) mm3 (Dreyer 2023): does the wear factor suit it?"
+            )
+        most = max(row.get("failed_rows", 0.0) for row in self.state.rows)
+        if most:
+            why = next(iter(self.last.failed.values()), "in blocks before the last")
+            asked.append(
+                f"up to {most:.0f} of {len(self.case.motion)} rows of the profile failed and are "
+                f"left out of the cycle: {why}"
+            )
+        if self.setup.engine.bearing == "mobile":
+            asked.append("the backside of a mobile bearing wears too and is not modelled")
+        if self.bands is not None:
+            asked += self.bands.questions()
+        if self.case.creep is None:
+            asked.append("creep is not modelled: the material gives no [creep]")
+        return asked
+
+    def lines(self) -> list[str]:
+        """Return the report as lines of text."""
+        found = self.as_dict()
+        creep = found["creep_depth_mm"]
+        said = "not modelled" if creep is None else f"{creep:.4g} mm deep"
+        low, high = found["volume_mm3_range"]
+        slow, fast = found["volume_mm3_per_Mc_range"]
+        others = [
+            f"{one['law']} {one['first_volume_mm3_per_Mc']:.3g} "
+            f"({one['first_volume_mm3_per_Mc_range'][0]:.3g} to "
+            f"{one['first_volume_mm3_per_Mc_range'][1]:.3g})"
+            for one in found["laws_side_by_side"]
+        ]
+        return [
+            FIRST,
+            f"{found['cycles']:.6g} cycles in {found['blocks']} blocks, {found['law']}, "
+            f"{found['material']}: {found['status']}",
+            f"worn off {found['volume_mm3']:.4g} mm3, {found['mass_mg']:.4g} mg, "
+            f"{found['max_depth_mm']:.4g} mm deep at most, over {found['worn_area_mm2']:.4g} mm2",
+            f"rate {self.rate:.4g} mm3 per million cycles; creep {said}",
+            f"range by the wear factor alone: {low:.3g} to {high:.3g} mm3, {slow:.3g} to "
+            f"{fast:.3g} mm3 per million cycles ({self.material.range_source})",
+            f"geometry: {self.case.law.geometry}",
+            *(
+                [f"laws side by side, mm3 per million cycles of the first: {', '.join(others)}"]
+                if others
+                else []
+            ),
+            *([] if self.bands is None else self.bands.lines()),
+            *self._found_lines(),
+            *(f"note: {note}" for note in found["notes"]),
+        ]
+
+    def _found_lines(self) -> list[str]:
+        """Return where force control found the knee on the last cycle; nothing without it."""
+        drive = self.case.motion.drive
+        if drive is None:
+            return []
+        found = drive.ranges(self.last.poses, self.last.failed)
+        places = (
+            f"{name} {found[f'{name}_low_{unit}']:.3g} to {found[f'{name}_high_{unit}']:.3g} {unit}"
+            for name, unit in ((name, UNITS[name][0]) for name in drive.names)
+        )
+        return [f"force control: {', '.join(places)}; {len(self.last.failed)} rows failed"]
+
+    def write(self, folder: Path) -> None:
+        """Write wear.csv, wear.json, wear.vtp, worn_insert.stl and wear.png, all or none.
+
+        Raises:
+            InputError: the folder cannot be written.
+        """
+        from tkamb.studies.wear.picture import draw_wear
+
+        surface, maps = self._worn(), self._maps()
+        with replaced_together(folder) as files:
+            write_rows(files.path("wear.csv"), _table(self._rows()))
+            write_synced(files.path("wear.json"), json.dumps(self.as_dict(), indent=2) + "\n")
+            write_triangles(files.path("wear.vtp"), surface.vertices, surface.faces, maps)
+            in_mm = trimesh.Trimesh(surface.vertices / MILLIMETRE, surface.faces, process=False)
+            in_mm.export(files.path("worn_insert.stl"), file_type="stl")
+            draw_wear(surface, maps, self._rows(), files.path("wear.png"))
+            files.remove(STATE_NAME)
+        remove_shards(folder, SAMPLES_NAME)
+
+    def _worn(self) -> Surface:
+        """Return the worn insert; a left knee's as it is, not mirrored."""
+        surface = self.case.articular.lowered(self.state.fall)
+        if self.setup.side == "right":
+            return surface
+        return Surface(surface.vertices @ MIRROR, surface.faces[:, ::-1], surface.name)
+
+    def _maps(self) -> dict[str, Array]:
+        """Return the maps over all vertices of the insert, zero where nothing can wear."""
+        state, places = self.state, self.case.articular.vertices
+        crept = {} if self.case.creep is None else {"creep_depth_mm": state.creep / MILLIMETRE}
+        named = {
+            "wear_depth_mm": state.wear / MILLIMETRE,
+            **crept,
+            "sliding_mm_per_cycle": self.last.history.distance / MILLIMETRE,
+            "cross_shear_ratio": self.last.history.cross_shear,
+            "peak_pressure_MPa": self.last.peak_pressure / MEGAPASCAL,
+        }
+        maps = {}
+        for name, values in named.items():
+            maps[name] = np.zeros(len(self.case.articular.surface.vertices))
+            maps[name][places] = values
+        return maps
+
+    def _mean_cross_shear(self) -> float:
+        """Return the mean cross-shear ratio, weighted by what the last cycle wears off."""
+        weight = self.last.rate * self.last.area
+        total = float(weight.sum())
+        return float(weight @ self.last.history.cross_shear) / total if total else math.nan
+
+
+def _table(rows: Sequence[dict[str, float]]) -> list[list[str]]:
+    """Return names, then the rows as cells; NaN is an empty one."""
+    cells = [["" if math.isnan(value) else repr(value) for value in row.values()] for row in rows]
+    return [list(rows[0]), *cells]
+
+
+def _known(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,235 @@
+"""A wear simulation from what a user says to what is written."""
+
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tkamb.errors import InputError
+from tkamb.io.scene import Scene
+from tkamb.io.scene.tables import WearTable
+from tkamb.run.guard import interrupt_as_such
+from tkamb.run.results import Results
+from tkamb.run.shards import Shards
+from tkamb.run.workers import Crew
+from tkamb.studies.wear.bands import SAMPLES, Progress, Sampling, check_samples
+from tkamb.studies.wear.kept import keep_state, kept_state, wear_identity
+from tkamb.studies.wear.laws import WearLaw
+from tkamb.studies.wear.materials import DEFAULT_MATERIAL, WearMaterial, wear_material
+from tkamb.studies.wear.report import SAMPLES_NAME, WearReport
+from tkamb.studies.wear.setup import WearSetup, setup_of_results, wear_setup
+from tkamb.studies.wear.simulation import (
+    CycleWear,
+    WearCase,
+    WearState,
+    check_blocks,
+    first_cycle,
+    simulate_wear,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class WearRun:
+    """A wear simulation that is ready to begin.
+
+    Args:
+        setup: bodies, motion, contact.
+        case: what is worn, by what law.
+        material: with sources.
+        cycles: how many.
+        updates: of the geometry.
+        sampling: for bands; None: none.
+    """
+
+    setup: WearSetup
+    case: WearCase
+    material: WearMaterial
+    cycles: int
+    updates: int
+    sampling: Sampling | None = None
+
+    def compute(
+        self,
+        folder: Path | None = None,
+        *,
+        resume: bool = False,
+        progress: Callable[[float], None] = lambda cycles: None,
+        crew: Crew | None = None,
+        sample_progress: Progress = lambda samples, count: samples,
+    ) -> WearReport:
+        """Simulate and return the report.
+
+        Args:
+            folder: where the state is kept after each block; None: nowhere.
+            resume: go on with the state that the folder keeps.
+            progress: is told the cycles that are done.
+            crew: who computes the samples; default: this process.
+            sample_progress: wraps the samples as they come.
+
+        Raises:
+            InputError: what the folder keeps is of another simulation, or no contact is found.
+            KeyboardInterrupt: with a folder, saying what is kept there.
+        """
+        identity = ""
+        if folder is not None:
+            identity = wear_identity(self.setup, self.case, self.cycles, self.updates)
+        state, last = self._simulated(folder, identity, resume, progress)
+        bands = None
+        if self.sampling is not None:
+            shards = None
+            if folder is not None:
+                shards = Shards(folder, {"wear simulation": identity}, resume, SAMPLES_NAME)
+            bands = self.sampling.bands(
+                (self.case, self.cycles, self.updates), state.rows, crew, shards, sample_progress
+            )
+        return WearReport(
+            self.setup,
+            self.case,
+            self.material,
+            state,
+            last,
+            self.cycles,
+            self.updates,
+            first_cycle(self.case, self.material.all_laws()),
+            bands,
+        )
+
+    def _simulated(
+        self,
+        folder: Path | None,
+        identity: str,
+        resume: bool,
+        progress: Callable[[float], None],
+    ) -> tuple[WearState, CycleWear]:
+        """Return the end of the simulation, kept in the folder block by block."""
+
+        def keep(done: WearState) -> None:
+            progress(done.cycles)
+            if folder is not None:
+                keep_state(folder, done, identity)
+
+        state = kept_state(folder, identity) if folder is not None and resume else None
+        try:
+            with interrupt_as_such():
+                return simulate_wear(self.case, self.cycles, self.updates, state=state, keep=keep)
+        except KeyboardInterrupt:
+            kept = None
+            if folder is not None:
+                with suppress(InputError):  # what another simulation left is not ours to tell of
+                    kept = kept_state(folder, identity)
+            if kept is None:
+                raise
+            done = f"{kept.cycles:.6g} cycles are kept"
+            raise KeyboardInterrupt(f"{done}; go on with --resume") from None
+
+
+@dataclass(eq=False)
+class _Asked:
+    """Material and law: what the call asks for, else what the scene's [wear] says.
+
+    Args:
+        law: name; None: not asked for.
+        material: name or file; None: not asked for.
+        wear_factor: mm³/(N m); None: not asked for.
+    """
+
+    law: str | None
+    material: str | Path | None
+    wear_factor: float | None
+
+    def check(self, table: WearTable, scene: Path) -> None:
+        """Find the material and the law, with the scene's table where nothing is asked for.
+
+        Raises:
+            InputError: there is no such material or law, or the material has no such law.
+        """
+        name = self.material
+        if name is None and table.material is not None:
+            name = table.material
+            if name.endswith(".toml"):
+                name = scene.parent / name
+        factor = table.wear_factor_mm3_per_Nm if self.wear_factor is None else self.wear_factor
+        made_of = wear_material(name or DEFAULT_MATERIAL)
+        chosen = made_of.wear_law(self.law or table.law, factor)
+        if factor is not None:
+            made_of = made_of.with_own_factor()
+        self.material_and_law: tuple[WearMaterial, WearLaw] = (made_of, chosen)
+
+
+def prepare_wear(
+    path: str | Path,
+    *,
+    cycles: int,
+    updates: int = 10,
+    law: str | None = None,
+    material: str | Path | None = None,
+    wear_factor: float | None = None,
+    samples: int | None = None,
+    period: float = 1.0,
+    **setup: Any,
+) -> WearRun:
+    """Return a wear simulation, everything about it checked.
+
+    Args:
+        path: a scene file, or a folder that `tkamb run` wrote.
+        cycles: how many.
+        updates: how often the insert's geometry follows.
+        law: a name of `tkamb.studies.wear.laws`; None: the scene's [wear] law, or the material's
+        own.
+        material: a name of `tkamb.studies.wear.materials`, or a material file; None: the scene's,
+            or "conventional".
+        wear_factor: mm³/(N m), in place of the scene's or the material's.
+        samples: for bands, at least 20; 0: none; None: 32 where the scene has [uncertainty].
+        period: s of a simulator's cycle.
+        setup: simulator, springs, contact, …: see `tkamb.studies.wear.setup.wear_setup`.
+
+    Raises:
+        InputError: whatever of it cannot be used.
+    """
+    check_blocks(cycles, updates)
+    check_samples(samples or 0)
+    if not (math.isfinite(period) and 0.05 <= period <= 3600):
+        raise InputError(f"{period} s", "--period", "give 0.05 to 3600 s a cycle")
+    asked = _Asked(law, material, wear_factor)
+    if material is not None:
+        asked.check(WearTable(), Path())  # as early as can be
+    ready = wear_setup(path, period=period, check=asked.check, **setup)
+    made_of, chosen = asked.material_and_law
+    case = _case(ready, made_of, chosen)
+    if samples is None:
+        samples = SAMPLES if ready.uncertainty else 0
+    sampling = Sampling.of(ready, case, samples) if samples else None
+    return WearRun(ready, case, made_of, cycles, updates, sampling)
+
+
+def wear_of_results(
+    scene: Scene, path: Path, results: Results, *, cycles: int, updates: int, frames: int
+) -> WearReport:
+    """Return the wear of an insert by the motion of results that are at hand.
+
+    Material, law and closing of the cycle are those of the scene's [wear].
+
+    Args:
+        scene: of the results, with the contact they were computed with.
+        path: of its file.
+        results: with their maps.
+        cycles: how many.
+        updates: how often the insert's geometry follows.
+        frames: most frames of a cycle.
+
+    Raises:
+        InputError: whatever of it cannot be used.
+    """
+    check_blocks(cycles, updates)
+    asked = _Asked(None, None, None)
+    asked.check(scene.wear or WearTable(), path)
+    made_of, chosen = asked.material_and_law
+    ready = setup_of_results(scene, path, results, frames)
+    return WearRun(ready, _case(ready, made_of, chosen), made_of, cycles, updates).compute()
+
+
+def _case(ready: WearSetup, made_of: WearMaterial, law: WearLaw) -> WearCase:
+    density, creep = made_of.density_kg_per_m3, made_of.creep
+    return WearCase(ready.engine, ready.articular, ready.motion, law, density, creep)

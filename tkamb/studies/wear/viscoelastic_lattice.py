@@ -1,0 +1,156 @@
+"""Linear viscoelastic polyethylene on the lattice: every spring relaxes as one Prony series.
+
+With one relaxation M(t)/M_0 for all springs (Poisson's ratio constant in time) the surface of the
+insert moves by its elastic compliance C_0 and a hereditary integral,
+
+    C_0 f(t) = integral of M(t - s)/M_0 du(s),
+
+at every node, whatever the contact did before: nodes that the femoral component has left carry
+nothing and creep back by the same equation. Over a step in which u is linear in time it reads
+C_0 f' = slope u' + carried, `carried` the part of the history (`PronySeries.response`). A step is
+therefore the elastic contact with the compliance C_0/slope on a surface that is displaced by
+-carried/slope already: the solver of `lattice-linear` finds it.
+
+References: Lee & Radok, J Appl Mech 27:438 (1960), doi:10.1115/1.3644020.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tkamb.contact.lattice.initial_guess import InitialGuess, guessed_depth, initial_guess
+from tkamb.contact.lattice.model import MOST_GROWTHS, REACH, TOUCHING, LinearLattice
+from tkamb.contact.lattice.problem import TangentPlanes, undeformed
+from tkamb.contact.lattice.solver import Solution, Tolerance, solve
+from tkamb.contact.pair import ContactPair
+from tkamb.contact.pressing import check_load
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.frames import Array
+from tkamb.studies.wear.viscoelastic import PronySeries
+
+
+@dataclass(frozen=True, eq=False)
+class ViscoelasticContact:
+    """The contact after a step. Arrays are per contact node, insert frame.
+
+    Args:
+        pose: (4, 4) pose_femoral_in_insert, y as found.
+        pressure: (c,) Pa, force over the node's own area.
+        force: (c, 3) N on the insert.
+        displacement: (c, 3) m, of the contact nodes, in contact or not.
+    """
+
+    pose: Array
+    pressure: Array
+    force: Array
+    displacement: Array
+
+
+class ViscoelasticLattice:
+    """An insert of springs and dampers under a rigid femoral component, step by step.
+
+    Limits: linear (small strain, no yield), frictionless, Poisson's ratio constant: modulus and
+    compressibility relax alike.
+
+    Args:
+        model: the linear lattice, with its resolution.
+        pair: both bodies; the material's modulus is the instantaneous one, M_0.
+        series: how every spring relaxes.
+
+    Attributes:
+        points: (c, 3) m, contact nodes, undeformed.
+    """
+
+    def __init__(self, model: LinearLattice, pair: ContactPair, series: PronySeries) -> None:
+        self._series, self._tolerance = series, Tolerance(model.tolerance)
+        self._state = model.prepare(pair)
+        self.points = self._state.problem.surface_points
+        self._moved = np.zeros_like(self.points)
+        self._memory = np.zeros((len(series.times), *self.points.shape))
+
+    def press(self, load: float, pose: Array, step: float) -> ViscoelasticContact:
+        """Go on by `step` s to a load (N along -y) at a pose whose y is free.
+
+        Raises:
+            InputError: a load that cannot be, or the femoral component is not over the insert.
+            ComputationError: the contact does not come to rest.
+        """
+        check_load(load)
+        return self._step(load, pose, step)
+
+    def hold(self, pose: Array, step: float) -> ViscoelasticContact:
+        """Go on by `step` s to a pose (4, 4); see `press`."""
+        return self._step(None, pose, step)
+
+    def _step(self, load: float | None, pose: Array, step: float) -> ViscoelasticContact:
+        if not step > 0:
+            raise InputError(f"a step of {step:g} s", "viscoelastic", "give seconds above 0")
+        slope, decay, kept = self._series.response(step)
+        carried = np.tensordot(decay, self._memory, 1) - kept.sum() * self._moved
+        pose, force = self._contact(load, np.array(pose, float), slope, -carried / slope)
+        problem = self._state.problem
+        applied = np.zeros_like(problem.solid.nodes)
+        applied[problem.contact_nodes] = force
+        elastic = problem.operator.solve(applied)[problem.contact_nodes]
+        moved = (elastic - carried) / slope
+        change = np.multiply.outer(kept, moved - self._moved)
+        self._memory = (self._memory.T * decay).T + change
+        self._moved = moved
+        pressure = np.linalg.norm(force, axis=1) / self._state.surface.area
+        return ViscoelasticContact(pose, pressure, force, moved)
+
+    def _contact(
+        self, load: float | None, pose: Array, slope: float, offset: Array
+    ) -> tuple[Array, Array]:
+        """Return the pose and the forces (c, 3) N of a step.
+
+        Args:
+            load: N; None: the pose is given.
+            pose: (4, 4).
+            slope: by which the springs are softer than at once.
+            offset: (c, 3) m, displacement of the nodes without contact forces.
+        """
+        gaps, planes = undeformed(self._state.problem, pose)
+        lowest, force = float(gaps.min()), np.zeros_like(offset)
+        if not np.isfinite(lowest):
+            raise InputError("the femoral component does not lie over the insert", "viscoelastic")
+        if load == 0 or (load is None and lowest >= -TOUCHING):
+            return pose, force
+        if load is not None:
+            pose[1, 3] -= lowest
+            gaps, planes = gaps - lowest, planes.raised(-lowest)
+        found = self._solved(load, pose, (gaps, planes), slope, offset)
+        pose[1, 3] -= found.forces.approach if load is not None else 0.0
+        force[found.candidates] = found.forces.force[:, None] * found.planes.normals
+        return pose, force
+
+    def _solved(
+        self,
+        load: float | None,
+        pose: Array,
+        rest: tuple[Array, TangentPlanes],
+        slope: float,
+        offset: Array,
+    ) -> Solution:
+        """Solve with growing sets of candidates until they cover the approach."""
+        (gaps, planes), state = rest, self._state
+        sunk = -float(offset[:, 1].min())  # what crept lies deeper than the gaps say
+        depth = -float(gaps.min())
+        if load is not None:
+            depth = guessed_depth(state.problem, gaps, state.surface.area, load / slope) + sunk
+        for _ in range(MOST_GROWTHS):
+            guess = initial_guess(state.compliance, gaps, planes, depth, load is None, None, None)
+            found = solve(state.problem, pose, load, _softer(guess, slope, offset), self._tolerance)
+            if not found.converged:
+                break
+            covered = load is None or len(guess.candidates) == np.isfinite(gaps).sum()
+            if covered or found.forces.approach * REACH <= guess.reach:
+                return found
+            depth = 1.1 * found.forces.approach
+        raise ComputationError("the contact does not come to rest", "viscoelastic")
+
+
+def _softer(guess: InitialGuess, slope: float, offset: Array) -> InitialGuess:
+    """Return where the solver begins on springs that are softer, and displaced already."""
+    response = replace(guess.response, compliance=guess.response.compliance / np.float32(slope))
+    return replace(guess, response=response, offset=offset[guess.candidates])
