@@ -164,7 +164,8 @@ def test_without_the_tables_neither_muscles_nor_emg_nor_measurements_are_importe
         "tkamb.run.",
     )
     code = (
-        "import sys; from tkamb.io.scene import load_scene; from tkamb.io.scene.case import load_case; "
+        "import sys; from tkamb.io.scene import load_scene; "
+        "from tkamb.io.scene.case import load_case; "
         "from tkamb.run.mechanics import Mechanics; "
         f"m = Mechanics(load_case(load_scene({str(SHIPPED)!r}))); assert m.muscles is None; "
         f"print([n for n in sys.modules if n.startswith({own})])"
