@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tkamb.errors import InputError
-from tkamb.toml_text import check_key, check_limits
+from tkamb.io.toml_text import check_key, check_limits
 
 
 def add_scene_options(command: Any) -> None:

@@ -17,7 +17,7 @@ from tkamb.contact.materials import (
     material,
 )
 from tkamb.errors import InputError, names_near
-from tkamb.toml_text import read_toml
+from tkamb.io.toml_text import read_toml
 from tkamb.units import MEGAPASCAL
 
 KEYS = (

@@ -18,7 +18,7 @@ from tkamb.files import MEGABYTE, read_json, sha256_of
 from tkamb.io.claim import claimed_directory, settle
 from tkamb.run.plug_ins import CONTACT_CODE, contact_code
 from tkamb.run.results import Results, csv_text, read_bands, read_csv
-from tkamb.summary_check import check_summary
+from tkamb.run.summary_check import check_summary
 
 if TYPE_CHECKING:
     from tkamb.run.maps import ContactMaps

@@ -32,7 +32,7 @@ from tkamb.io.scene.tables import (
     WearTable,
 )
 from tkamb.io.scene.uncertainty import UncertaintyTable
-from tkamb.toml_text import read_toml
+from tkamb.io.toml_text import read_toml
 
 if TYPE_CHECKING:
     from tkamb.io.presets.preset import AppliedPreset

@@ -10,11 +10,11 @@ from typing import Any, TypeVar
 
 from tkamb.contact.pair import Bearing
 from tkamb.errors import InputError
+from tkamb.io.toml_text import read_toml
 from tkamb.studies.designs import solids
 from tkamb.studies.designs.femoral import Cam, FemoralComponent
 from tkamb.studies.designs.insert import Insert, Post
 from tkamb.studies.designs.touch import Articulation
-from tkamb.toml_text import read_toml
 
 DESIGN_FILE = "design.toml"
 FEMORAL_MESH, INSERT_MESH, TRAY_MESH = "femoral_component.stl", "insert.stl", "tray.stl"

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from tkamb.errors import InputError, names_near
+from tkamb.io.toml_text import read_toml
 from tkamb.studies.wear.creep import LogarithmicCreep
 from tkamb.studies.wear.laws import WearLaw, law_class, wear_law
-from tkamb.toml_text import read_toml
 
 DEFAULT_MATERIAL = "conventional"
 DENSITY_RANGE = (500.0, 3000.0)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tkamb.errors import InputError, names_near
-from tkamb.toml_text import read_toml
+from tkamb.io.toml_text import read_toml
 from tkamb.units import DEGREE, MILLIMETRE
 
 KINDS = {
