@@ -21,8 +21,8 @@ from tkamb.atomic import replaced_file
 from tkamb.errors import InputError, not_installed
 from tkamb.files import check_file
 from tkamb.geometry.frames import Array
+from tkamb.io.hdf5_file import NotingFile, check_written
 from tkamb.run.maps_check import check_maps_file, check_values
-from tkamb.show.hdf5_file import NotingFile, check_written
 
 if TYPE_CHECKING:
     from pyvista import MultiBlock

@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from tkamb.contact.given_material import material_in_words
 from tkamb.errors import InputError
+from tkamb.io.given_material import material_in_words
 
 WIDTH = 92
 

@@ -82,7 +82,7 @@ class Scene(SceneTable):
 
     @property
     def insert_material(self) -> dict[str, Any]:
-        """What the insert is made of, as `tkamb.contact.given_material` takes it."""
+        """What the insert is made of, as `tkamb.io.given_material` takes it."""
         if self.material is not None:
             return self.material.model_dump()
         return {} if self.contact is None else {"base": self.contact.material}

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tkamb.contact.given_material import given_material
 from tkamb.contact.registry import contact_model
+from tkamb.io.given_material import given_material
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.run.mechanics import Mechanics

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 
 from tkamb.atomic import write_rows
+from tkamb.io.hdf5_file import new_hdf5
 from tkamb.run.results_folder import (
     BANDS_NAME,
     INDICES_NAME,
@@ -15,7 +16,6 @@ from tkamb.run.results_folder import (
     TORNADO_NAME,
     write_results,
 )
-from tkamb.show.hdf5_file import new_hdf5
 
 if TYPE_CHECKING:
     from tkamb.studies.uncertainty.indices import SobolIndex
