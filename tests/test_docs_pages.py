@@ -38,7 +38,8 @@ def test_every_command_line_of_the_page_is_understood(page):
 
 
 def test_every_link_between_the_pages_leads_somewhere():
-    for page in [*DOCS.glob("*.md"), ROOT / "README.md"]:
+    pages = [*DOCS.rglob("*.md"), *ROOT.glob("*.md"), *(ROOT / "models").glob("*/README.md")]
+    for page in pages:
         for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
             if not target.startswith("http"):
                 assert (page.parent / target).exists(), f"{page.name}: {target}"
@@ -56,6 +57,7 @@ def test_the_paper_s_numbers_stand_in_the_pages_that_they_link():
 def test_every_page_is_on_the_site_and_in_the_list():
     site = (ROOT / "scripts" / "mkdocs.yml").read_text(encoding="utf-8")
     listed = (DOCS / "pages.md").read_text(encoding="utf-8")
-    for page in DOCS.glob("*.md"):
-        assert f"- {page.name}\n" in site, f"add {page.name} to nav of scripts/mkdocs.yml"
-        assert page.name == "pages.md" or f"({page.name})" in listed, f"add {page.name} to pages.md"
+    for page in DOCS.rglob("*.md"):
+        name = page.relative_to(DOCS).as_posix()
+        assert f"- {name}\n" in site, f"add {name} to nav of scripts/mkdocs.yml"
+        assert name == "pages.md" or f"({name})" in listed, f"add {name} to pages.md"
