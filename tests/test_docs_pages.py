@@ -2,10 +2,14 @@
 
 import re
 import shlex
+import subprocess
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
+import tkamb
 from tkamb.cli import _parser
 
 ROOT = Path(__file__).parents[1]
@@ -61,3 +65,34 @@ def test_every_page_is_on_the_site_and_in_the_list():
         name = page.relative_to(DOCS).as_posix()
         assert f"- {name}\n" in site, f"add {name} to nav of scripts/mkdocs.yml"
         assert name == "pages.md" or f"({name})" in listed, f"add {name} to pages.md"
+
+
+def test_the_readme_s_python_runs_after_its_first_command():
+    """The demo installs no extra: the example must do without pandas and its like."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0]
+    extras = ("pandas", "pyvista", "daqp", "pooch", "pyarrow", "distributed", "playwright")
+    code = f"import sys\nsys.modules.update(dict.fromkeys({extras}))\n{example}"
+    ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.strip().endswith(")")
+
+
+def test_the_readme_is_two_screens_and_the_changelog_one():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 130
+    assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()) <= 80
+
+
+def test_one_version_everywhere():
+    cited = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"version: {tkamb.__version__}\n" in cited
+    released = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(r"^## (\S+) - \d{4}-\d\d-\d\d$", released, re.M).group(1) == tkamb.__version__
+
+
+def test_all_brings_every_extra_that_a_user_may_want():
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        extras = tomllib.load(file)["project"]["optional-dependencies"]
+    (everything,) = extras["all"]
+    named = set(re.search(r"\[(.+)\]", everything).group(1).split(","))
+    assert named == set(extras) - {"all", "docs", "test"}
