@@ -96,3 +96,12 @@ def test_all_brings_every_extra_that_a_user_may_want():
     (everything,) = extras["all"]
     named = set(re.search(r"\[(.+)\]", everything).group(1).split(","))
     assert named == set(extras) - {"all", "docs", "test"}
+
+
+def test_every_module_that_the_architecture_names_exists():
+    for page in (DOCS / "architecture.md", ROOT / "CONTRIBUTING.md"):
+        text = page.read_text(encoding="utf-8")
+        named = set(re.findall(r"`([a-z_]+(?:/[a-z_0-9]+)*(?:\.py|/))`", text))
+        places = (ROOT / "tkamb", ROOT, ROOT / "tkamb" / "run" / "muscles")
+        missing = [n for n in named if not any((place / n).exists() for place in places)]
+        assert not missing, f"{page.name}: {missing}"
