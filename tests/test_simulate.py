@@ -187,7 +187,7 @@ def test_a_frame_whose_contact_is_out_of_range_fails_and_says_so(monkeypatch):
 
 
 def test_values_of_the_scene_are_changed_by_keyword_or_mapping(bend):
-    by_table = simulate(fast_scene(), frames=range(0, 1), patient={"mass_kg": 80.0})
+    by_table = simulate(fast_scene(), frames=range(1), patient={"mass_kg": 80.0})
     by_name = simulate(
         load_scene(fast_scene()), frames=slice(0, 1), overrides={"patient.mass_kg": 80.0}
     )
@@ -207,7 +207,7 @@ def test_values_of_the_scene_are_changed_by_keyword_or_mapping(bend):
 )
 def test_an_override_that_is_none_is_refused(changes, message):
     with pytest.raises(InputError, match=message):
-        simulate(fast_scene(), frames=range(0, 1), **changes)
+        simulate(fast_scene(), frames=range(1), **changes)
 
 
 def test_a_range_of_frames_is_a_slice(bend):
@@ -222,5 +222,5 @@ def test_a_range_of_frames_is_a_slice(bend):
 
 def test_questions_are_returned(bend):
     assert bend.questions == bend.summary["questions"]
-    doubtful = simulate(fast_scene(), frames=range(0, 1), overrides={"patient.mass_kg": 30.0})
+    doubtful = simulate(fast_scene(), frames=range(1), overrides={"patient.mass_kg": 30.0})
     assert doubtful.questions

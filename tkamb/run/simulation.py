@@ -71,7 +71,9 @@ def simulate(
 
     Raises:
         InputError: the scene or a file that it names cannot be used, a case is given another
-            contact model, resolution, preset or override, no such key, the run to resume is another one, the folder
+        InputError: the scene or a file that it names cannot be used, a case is given another
+            contact model, resolution, preset or override, no such key, the run to resume is
+            another one, the folder
             cannot be claimed (`tkamb.io.claim`), or no such number of workers.
         ComputationError: a worker was killed.
         KeyboardInterrupt: with a folder, what was finished is written there first.

@@ -37,6 +37,10 @@ POST_HELD = (
     "friction as of the condyles; the column force_si_N and its like hold the post's force too."
 )
 
+WITHOUT_MUSCLES = "Without [muscles]"
+"""How a note begins that holds only while the scene has no table [muscles]; `tkamb import` writes
+one."""
+
 MUCH_RESERVE = 0.05
 """Of the coordinate's largest moment."""
 
@@ -63,7 +67,7 @@ def summary_of(
     summary = _origin(case, path) | {"seconds": seconds} | _subject(case) | _counts(columns)
     summary["not_modelled"] = not_modelled(case)
     summary["assumptions"] = assumptions(case)
-    summary["notes"] = list(scene.output.notes)
+    summary["notes"] = _notes(scene)
     summary["scene_tables"] = scene.model_dump(mode="json", exclude_none=True, exclude={"output"})
     if changed := changed_settings():
         summary["changed_settings"] = changed
@@ -96,6 +100,15 @@ def summary_of(
         start = time[0] - percent[0] * slope
         summary["cycle_percent_s"] = [start, start + 100.0 * slope]
     return summary
+
+
+def _notes(scene: Scene) -> list[str]:
+    """Return the scene's notes, without those on a part that it has by now."""
+    return [
+        note
+        for note in scene.output.notes
+        if scene.muscles is None or not note.startswith(WITHOUT_MUSCLES)
+    ]
 
 
 def _origin(case: Case, path: Path | None) -> dict[str, Any]:

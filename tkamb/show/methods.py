@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from tkamb.contact.given_material import material_in_words
 from tkamb.errors import InputError
 
 WIDTH = 92
@@ -323,7 +324,9 @@ def _contact(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[
     else:
         yield "The superior–inferior load was pressed in at the recorded rotation."
     error = summary.get("known_error")
-    if error:
+    if isinstance(error, str):
+        yield "How far this setting of the contact model is off was not measured."
+    elif error:
         yield (
             "On the cases of tkamb's trade-off study this setting was off by at most "
             f"{100 * error['peak_pressure']:.2g} % in peak pressure and "
@@ -333,7 +336,7 @@ def _contact(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[
 
 def _material_words(contact: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     if material:
-        return f"The insert was {material['words']}."
+        return f"The insert was {material_in_words(material)}."
     if contact["material"] == "polyethylene":
         return (
             "The insert was polyethylene: E = 561.5 MPa, nu = 0.45, Ramberg–Osgood with "

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from tkamb.geometry.frames import Array
 from tkamb.run.maps import ContactMaps
 from tkamb.run.metrics import lateral_axis_name, map_rows, stretches
+from tkamb.run.metrics import peak as peak_of
 from tkamb.show.axis import HorizontalAxis
 from tkamb.show.levels import PageGrid, pressure_levels, touched_part
 from tkamb.show.style import BLACK, GREY, PRESSURE_MAP, SIDE_COLOURS, new_figure, settings
@@ -124,11 +125,26 @@ def top_view(results: "Results") -> TopView | None:
 
 
 def mapped_frames(results: "Results", axis: HorizontalAxis, count: int = 8) -> list[int]:
-    """Return at most `count` frames with a pressure map, spread over the motion."""
+    """Return at most `count` frames with a pressure map, spread over the motion.
+
+    The frame of the largest pressure is one of them.
+    """
     frames = np.array(sorted(map_rows(results)), int)
     if not len(frames):
         return []
-    return sorted({int(frames[np.argmin(np.abs(frames - stop))]) for stop in axis.stops(count)})
+    chosen = {int(frames[np.argmin(np.abs(frames - stop))]) for stop in axis.stops(count)}
+    peak = frame_of_peak(results)
+    if peak is not None and peak not in chosen:
+        if len(chosen) >= count:
+            chosen.remove(min(chosen, key=lambda frame: abs(frame - peak)))
+        chosen.add(peak)
+    return sorted(chosen)
+
+
+def frame_of_peak(results: "Results") -> int | None:
+    """Return the frame of the largest pressure; None where it has no map."""
+    largest = peak_of(results, "<side>_peak_pressure_MPa")
+    return largest.frame if largest is not None and largest.frame in map_rows(results) else None
 
 
 def draw_maps(
@@ -292,7 +308,8 @@ def _draw_centres(axes: Axes, view: TopView, results: "Results", frame: int) -> 
 
 def _caption(results: "Results", axis: HorizontalAxis, frame: int) -> str:
     force = results["force_total_BW"][frame]
-    return f"{axis.label.split(' (')[0]} {axis.at(frame)}, {force:.2f} BW"
+    peak = "; peak pressure" if frame == frame_of_peak(results) else ""
+    return f"{axis.label.split(' (')[0]} {axis.at(frame)}, {force:.2f} BW{peak}"
 
 
 def _label_stops(
