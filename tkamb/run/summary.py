@@ -67,7 +67,7 @@ def summary_of(
     summary = _origin(case, path) | {"seconds": seconds} | _subject(case) | _counts(columns)
     summary["not_modelled"] = not_modelled(case)
     summary["assumptions"] = assumptions(case)
-    summary["notes"] = _notes(scene)
+    summary["notes"] = notes_of(scene)
     summary["scene_tables"] = scene.model_dump(mode="json", exclude_none=True, exclude={"output"})
     if changed := changed_settings():
         summary["changed_settings"] = changed
@@ -102,7 +102,7 @@ def summary_of(
     return summary
 
 
-def _notes(scene: Scene) -> list[str]:
+def notes_of(scene: Scene) -> list[str]:
     """Return the scene's notes, without those on a part that it has by now."""
     return [
         note

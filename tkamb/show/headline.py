@@ -76,8 +76,8 @@ def run_title(summary: Mapping[str, Any]) -> str:
 
 
 PEAK_DOUBTS = {
-    AT_EDGE: "that contact reaches the edge of the insert's articular surface",
-    TOO_NARROW: "that contact is too narrow for the map, so that the peak is not resolved",
+    AT_EDGE: "contact reaches the edge of the insert's articular surface",
+    TOO_NARROW: "contact is too narrow for the map, so that the peak is not resolved",
 }
 """Flag of a frame, after "the <side> ", -> words beside the peak pressure."""
 
@@ -236,14 +236,13 @@ def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
     if found is None:
         return None
     detail = f"{found.side}, {_where(results, axis, found.frame)}"
+    doubt = _doubt_of_peak(results, found.side, found.frame)
+    detail += f", where {doubt}" if doubt else ""
     detail += _above_yield(results, found.side)
     error = results.summary.get("known_error")
     if error is not None:
         detail += f"; {_model(results)} {known_error_words(error, PRESSURE_AND_AREA)}"
         detail += OTHER_ERRORS
-    doubt = _doubt_of_peak(results, found.side, found.frame)
-    if doubt:
-        detail += f"; {doubt}"
     large = bool(doubt) or (error is not None and is_large(error, PRESSURE_AND_AREA))
     return Card("Peak contact pressure", f"{found.value:.1f} MPa", detail, large)
 
@@ -276,7 +275,7 @@ def _doubt_of_peak(results: "Results", side: str | None, frame: int) -> str:
     """
     status = str(results.status[frame])
     words = [word for flag, word in PEAK_DOUBTS.items() if f"the {side} {flag}" in status]
-    return ", and ".join(words)
+    return " and ".join(words)
 
 
 def _post(results: "Results", axis: HorizontalAxis) -> Card | None:
