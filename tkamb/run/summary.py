@@ -14,6 +14,7 @@ import numpy as np
 from tkamb import __version__
 from tkamb.code_identity import code_identity
 from tkamb.files import named_files, sha256_of
+from tkamb.io.recordings.gait import GAIT, cycle_percent
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.scene import Scene, scene_files
 from tkamb.io.scene.tables import ContactTable, MusclesTable
@@ -99,7 +100,27 @@ def summary_of(
         slope = (time[-1] - time[0]) / (percent[-1] - percent[0])
         start = time[0] - percent[0] * slope
         summary["cycle_percent_s"] = [start, start + 100.0 * slope]
-    return summary
+    return summary | _gait(case)
+
+
+def _gait(case: Case) -> dict[str, Any]:
+    """Return foot strikes, toe-offs and stances of the force plates, and the gait cycle."""
+    found: dict[str, Any] = {}
+    cycle = case.gait_cycle_s
+    if cycle is not None:
+        found["cycle_percent_s"] = list(cycle)
+    gait = None if case.ground is None else case.ground.gait
+    if gait is None or not gait.foot_strikes + gait.toe_offs or case.motion.cycle_percent is not None:
+        return found
+    offs = [] if cycle is None else [off for off in gait.toe_offs if cycle[0] < off < cycle[1]]
+    found["gait"] = {
+        "foot_strike_s": gait.foot_strikes,
+        "toe_off_s": gait.toe_offs,
+        "stance_s": gait.spans(),
+        "threshold_N": GAIT.contact_force_N,
+        "toe_off_percent": [float(cycle_percent(np.array(off), cycle)) for off in offs if cycle],
+    }
+    return found
 
 
 def notes_of(scene: Scene) -> list[str]:

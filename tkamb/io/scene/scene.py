@@ -150,6 +150,8 @@ class Scene(SceneTable):
             raise ValueError("[material] and [output] both give yield_stress_MPa: give one")
         if self.material and not contact:
             raise ValueError("[material] needs [contact]: nothing else is pressed")
+        if self.output.cycle_s and self.motion.cycle_s:
+            raise ValueError("[motion] cycle_s is the cycle: drop [output] cycle_s")
         if self.tibia and self.motion.markers:
             raise ValueError("[motion.markers] places the shank too: drop [tibia]")
         if self.ground_reaction and not (self.tibia or self.motion.markers):
