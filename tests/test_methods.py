@@ -72,3 +72,9 @@ def test_a_folder_of_an_earlier_version_is_told_what_to_do():
 def test_the_report_holds_the_paragraph(run):
     page = (run / "report.html").read_text(encoding="utf-8")
     assert "Methods paragraph" in page and "Carpentier" in page
+
+
+def test_a_setting_whose_error_was_not_measured_is_said_to_be_so(run):
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    summary["known_error"] = "not measured"
+    assert "was not measured" in " ".join(methods(summary).sentences)

@@ -18,7 +18,7 @@ PARSERS = dict(leaf_parsers(_parser()))
 ALWAYS = {
     "import": "--grf --c3d --trc --motion --side --mass-kg --femoral --insert --interval --out "
     "--scene "
-    "--activity --note --scale-mass --keep-mass --knee --cutoff-hz",
+    "--activity --note --muscles --cycle --scale-mass --keep-mass --knee --cutoff-hz",
     "run": "--as --contact --resolution --out --frames --set --no-cache --force --resume "
     "--workers "
     "--profile --strict --json",
@@ -124,6 +124,7 @@ VALUES = {
     "--workers": "2",
     "--load": "100",
     "--length-unit": "mm",
+    "--cycle": "1:2",
     "--restore-when": "either",
     "--force-unit": "N",
     "--moment-unit": "Nmm",

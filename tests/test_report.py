@@ -662,3 +662,77 @@ def test_nothing_of_a_plot_is_cut_off_and_it_fills_its_picture(bend, gait, width
             numbers = zip(second.get_yticks(), second.get_yticklabels(), strict=True)
             ends = [one.get_window_extent().x1 for at, one in numbers if low <= at <= high]
             assert second.yaxis.label.get_window_extent().x0 > max(ends), panel.name
+
+
+def _peak_card(run):
+    shown = cards(run, horizontal_axis(run))
+    return next(card for card in shown if card.title == "Peak contact pressure")
+
+
+def test_the_yielded_area_beside_the_peak_is_that_of_its_own_condyle():
+    run = make_run("bend", 11)
+    side = metrics.peak(run, "<side>_peak_pressure_MPa").side
+    other = "lateral" if side == "medial" else "medial"
+    run.columns[f"{side}_area_above_yield"] = np.full(11, 0.04)
+    run.columns[f"{other}_area_above_yield"] = np.full(11, 0.31)
+    detail = _peak_card(run).detail
+    assert detail.startswith(side)
+    assert f"4 % of the {side} area and 31 % of the {other} area is above yield" in detail
+
+
+def test_a_known_error_is_said_to_be_that_of_the_contact_model_alone():
+    run = make_run("bend", 11)
+    run.summary["known_error"] = {
+        "peak_pressure": 0.05,
+        "mean_pressure": 0.02,
+        "area": 0.03,
+        "cases": 8,
+    }
+    assert "error of the contact model alone" in _peak_card(run).detail
+    areas = next(panel for panel in panels(run) if panel.name == "areas")
+    assert "error of the contact model alone" in areas.note
+
+
+def test_the_maps_show_the_frame_of_the_largest_pressure():
+    run = make_run("bend", 101)
+    rows = metrics.map_rows(run)
+    last = max(rows)
+    for frame in (last, 37):
+        run.columns["medial_peak_pressure_MPa"][frame] = 99.0 + frame * (frame != last) + 2 * last
+        chosen = mapped_frames(run, horizontal_axis(run))
+        assert frame in chosen and len(chosen) <= 8
+        titles = [
+            axes.get_title()
+            for axes in draw_maps(run, top_view(run), horizontal_axis(run), chosen).axes
+        ]
+        assert ["peak pressure" in title for title in titles if title].count(True) == 1
+
+
+def test_a_curve_that_lies_on_another_is_dashed():
+    run = make_run("bend", 11)
+    run.columns["medial_slip_mm"] = np.linspace(0, 4, 11)
+    run.columns["lateral_slip_mm"] = np.linspace(0, 4, 11) + 1e-3
+    slip = next(panel for panel in panels(run) if panel.name == "slip")
+    assert [line.dashed for line in slip.lines] == [False, True]
+    run.columns["lateral_slip_mm"] = np.linspace(0, 5, 11)
+    slip = next(panel for panel in panels(run) if panel.name == "slip")
+    assert [line.dashed for line in slip.lines] == [False, False]
+
+
+def test_the_outline_of_the_insert_has_no_steps():
+    """Along the straight front flank no point lies farther from its line than half a grid step."""
+    run = make_run("bend", 3)
+    view = top_view(run)
+    _, opacity = view.insert_picture
+    rows, columns = opacity.shape
+    edge = np.array(
+        [
+            np.interp(0.5, opacity[: rows // 2, k], np.arange(rows // 2))
+            for k in range(columns // 4, columns // 2 - 20)
+        ]
+    )
+    raw = (view.grey >= 0)[:, columns // 4 - 8 : columns // 2 - 28].argmax(axis=0)
+    assert np.abs(np.diff(raw)).max() >= 2  # the map's own outline does step
+    assert np.abs(np.diff(edge)).max() < 1.0
+    inside = np.pad(view.grey >= 0, 8)
+    assert opacity.sum() == pytest.approx(inside.sum(), rel=0.02)

@@ -184,3 +184,43 @@ def test_a_frame_whose_contact_is_out_of_range_fails_and_says_so(monkeypatch):
     results = simulate(fast_scene(), contact="foundation", frames=slice(40, 41))
     assert results.status[0].startswith("failed: contact out of range")
     assert np.isnan(results["medial_peak_pressure_MPa"]).all()
+
+
+def test_values_of_the_scene_are_changed_by_keyword_or_mapping(bend):
+    by_table = simulate(fast_scene(), frames=range(1), patient={"mass_kg": 80.0})
+    by_name = simulate(
+        load_scene(fast_scene()), frames=slice(0, 1), overrides={"patient.mass_kg": 80.0}
+    )
+    assert by_table.summary["body_mass_kg"] == by_name.summary["body_mass_kg"] == 80.0
+    assert by_table.summary["overrides"] == {"patient.mass_kg": 80.0}
+    np.testing.assert_array_equal(by_table["force_total_N"], by_name["force_total_N"])
+    assert by_table["force_total_BW"][0] < bend["force_total_BW"][0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"contct": "hertz"}, "contct: is not an option"),
+        ({"patient": {"mas_kg": 80.0}}, "unknown key 'patient.mas_kg'"),
+        ({"patient": {"mass_kg": 80.0}, "overrides": {"patient.mass_kg": 70.0}}, "given twice"),
+    ],
+)
+def test_an_override_that_is_none_is_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        simulate(fast_scene(), frames=range(1), **changes)
+
+
+def test_a_range_of_frames_is_a_slice(bend):
+    np.testing.assert_array_equal(
+        simulate(fast_scene(), frames=range(0, 101, 50))["force_total_N"],
+        simulate(fast_scene(), frames=slice(0, 101, 50))["force_total_N"],
+    )
+    for frames in (range(95, 103), range(-3, 0), range(5, 5), range(9, 3, -1)):
+        with pytest.raises(InputError, match="not in the motion"):
+            simulate(fast_scene(), frames=frames)
+
+
+def test_questions_are_returned(bend):
+    assert bend.questions == bend.summary["questions"]
+    doubtful = simulate(fast_scene(), frames=range(1), overrides={"patient.mass_kg": 30.0})
+    assert doubtful.questions

@@ -3,7 +3,7 @@
 import argparse
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from tkamb.errors import InputError
 from tkamb.io.activities import Activity
@@ -61,6 +61,17 @@ def add_import(commands: Any) -> None:
         help="the scene's contact model; default: %(default)s",
     )
     p.add_argument("--activity", choices=get_args(Activity), help="what the report compares with")
+    p.add_argument(
+        "--muscles",
+        action="store_true",
+        help="all muscles of the model share the load ([muscles]); default: the quadriceps alone",
+    )
+    p.add_argument(
+        "--cycle",
+        type=_cycle,
+        metavar="A:B|plates",
+        help="s, 0 and 100 %% of the gait cycle; plates: two foot strikes that they show",
+    )
     p.add_argument("--note", action="append", default=[], metavar="TEXT", help="for the report")
     scale = p.add_mutually_exclusive_group()
     scale.add_argument(
@@ -154,6 +165,15 @@ def _interval(text: str) -> tuple[float, float]:
     return start, end
 
 
+def _cycle(text: str) -> "tuple[float, float] | Literal['plates']":
+    if text == "plates":
+        return "plates"
+    start, end = _interval(text)
+    if start >= end:
+        raise argparse.ArgumentTypeError(f"'{text}' does not rise")
+    return start, end
+
+
 def _import(options: argparse.Namespace) -> int:
     from tkamb.io.importing.patient import import_patient, write_patient
 
@@ -215,6 +235,8 @@ def import_request(options: argparse.Namespace) -> "ImportRequest":
         activity=options.activity,
         notes=tuple(options.note),
         prefix=options.marker_prefix,
+        muscles=options.muscles,
+        cycle=options.cycle,
         units=GivenUnits(options.length_unit, options.force_unit, options.moment_unit),
     )
 

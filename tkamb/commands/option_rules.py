@@ -59,6 +59,8 @@ RULES: dict[str, tuple[Rule, ...]] = {
         Rule("--contact", needs=MESHES, because="contact is between the two"),
         *(Rule(option, needs=("--poses",)) for option in POSE_OPTIONS),
         Rule("--poses", excludes=("--motion",), because=MODELS_OWN),
+        Rule("--stride", excludes=("--cycle",), because="either says where 0 and 100 % lie"),
+        Rule("--muscles", needs=("--patella",), because="the quadriceps pulls on it"),
         Rule("--stride", excludes=("--interval",), because="either chooses the part"),
         Rule("--plates", needs=("--c3d",), because="other files hold no plates"),
         Rule("--laboratory-axes", excludes=("--motion",), because="the model's ground is meant"),

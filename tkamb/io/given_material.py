@@ -136,7 +136,7 @@ def material_as_json(chosen: Material) -> dict[str, Any]:
 def material_in_words(values: Mapping[str, Any]) -> str:
     """Return in one line what `material_as_json` holds."""
     parts = [
-        f"E {values['young_modulus_MPa']:.4g} MPa",
+        f"E = {values['young_modulus_MPa']:.4g} MPa",
         f"Poisson's ratio {values['poisson_ratio']:.3g}",
     ]
     if values["law"] == "ramberg-osgood":

@@ -162,7 +162,11 @@ COLUMNS: tuple[Column, ...] = (
     Column("contact_seconds", "computing time of the contact", _CONTACT),
     Column("iterations", "of the contact solver", _CONTACT, "integer"),
     Column("status", "ok, or reason words joined by ;", kind="text"),
-    Column("cycle_percent", "per cent of the cycle", "[motion] cycle_s"),
+    Column(
+        "cycle_percent",
+        "per cent of the cycle; NaN outside it",
+        "[motion] cycle_s, [output] cycle_s or two foot strikes",
+    ),
     Column("residual_coronal_Nm", "residual moment about insert x, where one condyle is off"),
     Column("residual_flexion_Nm", "residual moment about insert z, where no quadriceps acts"),
     Column(

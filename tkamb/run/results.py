@@ -87,6 +87,11 @@ class Results:
         return self.columns["status"]
 
     @property
+    def questions(self) -> list[str]:
+        """Return what of the inputs is possible but unlikely, each with the likely mistake."""
+        return list(self.summary.get("questions") or [])
+
+    @property
     def not_modelled(self) -> tuple[str, ...]:
         """Return the columns that hold no number in any frame."""
         return tuple(

@@ -2,7 +2,7 @@
 
 import math
 import time as clock
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tkamb.errors import InputError
 from tkamb.io.claim import claimed_directory
-from tkamb.io.scene import Scene, load_scene, with_preset
+from tkamb.io.scene import Scene, load_scene, with_overrides, with_preset
 from tkamb.io.scene.case import Case, load_case
 from tkamb.run.frames import FRAME_LOOP, ChunkSolver, Finished, FrameSolver, finished_in_order
 from tkamb.run.guard import interrupt_as_such
@@ -32,7 +32,7 @@ def simulate(
     contact: str | None = None,
     resolution_mm: float | None = None,
     preset: str | None = None,
-    frames: slice | None = None,
+    frames: slice | range | None = None,
     directory: str | Path | None = None,
     scene_path: str | Path | None = None,
     progress: Progress = lambda frames: frames,
@@ -40,8 +40,13 @@ def simulate(
     resume: bool = False,
     force: bool = False,
     workers: int = 1,
+    overrides: Mapping[str, Any] | None = None,
+    **tables: Mapping[str, Any],
 ) -> Results:
     """Run a scene and return its results.
+
+    Single values of the scene are changed as by `tkamb run --set`: by their dotted names,
+    `overrides={"patient.mass_kg": 80.0}`, or table by table, `patient={"mass_kg": 80.0}`.
 
     Args:
         scene: a scene, the path of its file, or its case, read already.
@@ -49,7 +54,7 @@ def simulate(
         resolution_mm: spacing of the map points, instead of the scene's.
         preset: name of a study whose choices are laid over the scene, as by `tkamb run --as`
             (`tkamb.io.presets.registry`); contact and resolution_mm still hold.
-        frames: which frames; default all.
+        frames: which frames, a slice or a range; default all.
         directory: folder where the finished frames are kept, see `tkamb.run.recorder`; None
             keeps them in memory.
         scene_path: where the scene came from, for the summary.
@@ -60,17 +65,25 @@ def simulate(
         force: write into the folder even if it holds things that are not tkamb's.
         workers: processes that share the frames; more than one start every tenth frame without
             a guess from the one before, which moves answers within the solver's tolerance.
+        overrides: dotted key of the scene -> value.
+        tables: name of a table of the scene -> key in it -> value; for the table [contact],
+            whose name chooses the contact model here, use `overrides`.
 
     Raises:
         InputError: the scene or a file that it names cannot be used, a case is given another
-            contact model, resolution or preset, the run to resume is another one, the folder
+        InputError: the scene or a file that it names cannot be used, a case is given another
+            contact model, resolution, preset or override, no such key, the run to resume is
+            another one, the folder
             cannot be claimed (`tkamb.io.claim`), or no such number of workers.
         ComputationError: a worker was killed.
         KeyboardInterrupt: with a folder, what was finished is written there first.
     """
     crew = Crew(workers)
+    changes = _dotted(overrides or {}, tables)
     if isinstance(scene, str | Path):
-        scene_path, scene = scene, load_scene(scene)
+        scene_path, scene = scene, load_scene(scene, changes)
+    elif changes:
+        scene = _scene_with(scene, changes)
     start = clock.perf_counter()
     stage("reading scene and recordings")
     if preset is not None:
@@ -197,6 +210,32 @@ class _Run:
         self.solver.before = [recalled(side, mechanics, k, arrays) for k, arrays in last]
 
 
+def _dotted(overrides: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[str, Any]:
+    """Return dotted key -> value of all overrides.
+
+    Raises:
+        InputError: a keyword that is not a table of values, or a key that is given twice.
+    """
+    found = dict(overrides)
+    for name, table in tables.items():
+        if not isinstance(table, Mapping):
+            hint = f'{name}={{"key": value}}, or overrides={{"{name}.key": value}}'
+            raise InputError("is not an option, nor a table of the scene's values", name, hint)
+        for key, value in table.items():
+            dotted = f"{name}.{key}"
+            if dotted in found:
+                raise InputError("is given twice", dotted, "leave one of them out")
+            found[dotted] = value
+    return found
+
+
+def _scene_with(scene: Scene | Case, overrides: dict[str, Any]) -> Scene:
+    """Return the scene with overrides laid over it."""
+    if isinstance(scene, Case):
+        raise InputError("a case has been read already", "overrides", "give its scene instead")
+    return with_overrides(scene, overrides)
+
+
 def _scene_as(
     scene: Scene | Case, preset: str, model: str | None, resolution_mm: float | None
 ) -> Scene:
@@ -223,10 +262,12 @@ def _case_with_contact(scene: Scene | Case, model: str | None, resolution_mm: fl
     return load_case(scene.model_copy(update={"contact": table}))
 
 
-def chosen_frames(frames: slice | None, count: int) -> range:
-    """Return the frames of a slice; its ends must lie inside the motion."""
+def chosen_frames(frames: slice | range | None, count: int) -> range:
+    """Return the frames of a slice or range; its ends must lie inside the motion."""
     if frames is None:
         return range(count)
+    if isinstance(frames, range):
+        return _frames_of_range(frames, count)
     ends = [end for end in (frames.start, frames.stop) if end is not None]
     chosen = range(count)[frames] if frames.step != 0 else range(0)
     if any(not -count <= end <= count for end in ends) or len(chosen) == 0:
@@ -236,3 +277,14 @@ def chosen_frames(frames: slice | None, count: int) -> range:
             f"it has frames 0 to {count - 1}",
         )
     return chosen
+
+
+def _frames_of_range(frames: range, count: int) -> range:
+    """Return a range that rises and whose frames lie inside the motion.
+
+    Unlike the ends of a slice, negative numbers of a range do not count from the end.
+    """
+    if frames.step < 0 or len(frames) == 0 or frames[0] < 0 or frames[-1] >= count:
+        hint = f"it has frames 0 to {count - 1}; a range rises"
+        raise InputError(f"frames {frames} are not in the motion", "frames", hint)
+    return frames

@@ -14,6 +14,7 @@ import numpy as np
 from tkamb import __version__
 from tkamb.code_identity import code_identity
 from tkamb.files import named_files, sha256_of
+from tkamb.io.recordings.gait import GAIT, cycle_percent
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.scene import Scene, scene_files
 from tkamb.io.scene.tables import ContactTable, MusclesTable
@@ -36,6 +37,10 @@ POST_HELD = (
     "Cam and post: the post is held at its anterior face, so that it does not bend at its root; "
     "friction as of the condyles; the column force_si_N and its like hold the post's force too."
 )
+
+WITHOUT_MUSCLES = "Without [muscles]"
+"""How a note begins that holds only while the scene has no table [muscles]; `tkamb import` writes
+one."""
 
 MUCH_RESERVE = 0.05
 """Of the coordinate's largest moment."""
@@ -63,7 +68,7 @@ def summary_of(
     summary = _origin(case, path) | {"seconds": seconds} | _subject(case) | _counts(columns)
     summary["not_modelled"] = not_modelled(case)
     summary["assumptions"] = assumptions(case)
-    summary["notes"] = list(scene.output.notes)
+    summary["notes"] = notes_of(scene)
     summary["scene_tables"] = scene.model_dump(mode="json", exclude_none=True, exclude={"output"})
     if changed := changed_settings():
         summary["changed_settings"] = changed
@@ -95,7 +100,40 @@ def summary_of(
         slope = (time[-1] - time[0]) / (percent[-1] - percent[0])
         start = time[0] - percent[0] * slope
         summary["cycle_percent_s"] = [start, start + 100.0 * slope]
-    return summary
+    return summary | _gait(case)
+
+
+def _gait(case: Case) -> dict[str, Any]:
+    """Return foot strikes, toe-offs and stances of the force plates, and the gait cycle."""
+    found: dict[str, Any] = {}
+    cycle = case.gait_cycle_s
+    if cycle is not None:
+        found["cycle_percent_s"] = list(cycle)
+    gait = None if case.ground is None else case.ground.gait
+    if (
+        gait is None
+        or not gait.foot_strikes + gait.toe_offs
+        or case.motion.cycle_percent is not None
+    ):
+        return found
+    offs = [] if cycle is None else [off for off in gait.toe_offs if cycle[0] < off < cycle[1]]
+    found["gait"] = {
+        "foot_strike_s": gait.foot_strikes,
+        "toe_off_s": gait.toe_offs,
+        "stance_s": gait.spans(),
+        "threshold_N": GAIT.contact_force_N,
+        "toe_off_percent": [float(cycle_percent(np.array(off), cycle)) for off in offs if cycle],
+    }
+    return found
+
+
+def notes_of(scene: Scene) -> list[str]:
+    """Return the scene's notes, without those on a part that it has by now."""
+    return [
+        note
+        for note in scene.output.notes
+        if scene.muscles is None or not note.startswith(WITHOUT_MUSCLES)
+    ]
 
 
 def _origin(case: Case, path: Path | None) -> dict[str, Any]:

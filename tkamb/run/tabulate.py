@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, knee_coordinates
+from tkamb.io.recordings.gait import cycle_percent
 from tkamb.io.scene.case import Case
 from tkamb.knee.contributions import condyle_contributions
 from tkamb.knee.equations import dome_sensitivity
@@ -100,6 +101,8 @@ def _motion_row(case: Case, k: int) -> dict[str, Any]:
     row = {"time_s": motion.time[k]}
     if motion.cycle_percent is not None:
         row["cycle_percent"] = motion.cycle_percent[k]
+    elif case.gait_cycle_s is not None:
+        row["cycle_percent"] = float(cycle_percent(motion.time[k], case.gait_cycle_s))
     for name in ("flexion", "adduction", "axial_rotation"):
         row[f"{name}_deg"] = coordinates[name] / DEGREE
     if motion.markers is not None:

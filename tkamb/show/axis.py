@@ -24,10 +24,12 @@ class HorizontalAxis:
     Args:
         kind: "flexion", "cycle" or "time".
         values: (f,) deg, per cent or s.
+        stances: from and to of each stance of gait on the axis; empty on one of flexion.
     """
 
     kind: str
     values: Array
+    stances: tuple[tuple[float, float], ...] = ()
 
     @property
     def label(self) -> str:
@@ -90,14 +92,32 @@ def horizontal_axis(results: "Results", kind: str | None = None) -> HorizontalAx
         return HorizontalAxis(kind, results["flexion_deg"])
     time = results["time_s"]
     if kind == "time":
-        return HorizontalAxis(kind, time)
+        return HorizontalAxis(kind, time, _stances(results, float(time[0]), float(time[-1])))
     if kind != "cycle":
         raise InputError(f"there is no axis '{kind}'", "axis", f"one of {', '.join(LABELS)}")
     percent = results["cycle_percent"]
     if np.isfinite(percent).all():
-        return HorizontalAxis(kind, percent)
+        return HorizontalAxis(kind, percent, _stances_in_cycle(results))
     start, end = results.summary.get("cycle_percent_s") or (time[0], time[-1])
     percent = 100 * (time - start) / (end - start)
     if percent.max() > 100 + 1e-6 or percent.min() < -1e-6:
         percent = percent % 100
-    return HorizontalAxis(kind, percent)
+    return HorizontalAxis(kind, percent, _stances_in_cycle(results))
+
+
+def _stances(results: "Results", start: float, end: float) -> tuple[tuple[float, float], ...]:
+    """Return the stances (s) that the force plates show, cut at start and end (s)."""
+    found = (results.summary.get("gait") or {}).get("stance_s") or ()
+    cut = [(max(float(on), start), min(float(off), end)) for on, off in found]
+    return tuple((on, off) for on, off in cut if on < off)
+
+
+def _stances_in_cycle(results: "Results") -> tuple[tuple[float, float], ...]:
+    """Return the stances within the cycle, per cent of it."""
+    cycle = results.summary.get("cycle_percent_s")
+    if cycle is None:
+        return ()
+    start, end = (float(time) for time in cycle)
+    scale = 100.0 / (end - start)
+    spans = _stances(results, start, end)
+    return tuple((scale * (on - start), scale * (off - start)) for on, off in spans)

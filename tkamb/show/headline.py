@@ -9,7 +9,7 @@ import numpy as np
 
 from tkamb.contact.articular_edge import AT_EDGE
 from tkamb.contact.narrow import TOO_NARROW
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import SIDES, Array
 from tkamb.run import metrics
 from tkamb.run.agreement import AGREEMENT
 from tkamb.run.known_errors import is_large, known_error_words
@@ -38,6 +38,10 @@ class HeadlineSettings:
 
 HEADLINE = HeadlineSettings()
 
+OTHER_ERRORS = (
+    "; that is the error of the contact model alone: load, pose, shape and material add theirs"
+)
+"""Said beside a known error, which is not the error of the result."""
 PRESSURE_AND_AREA = ("peak_pressure", "mean_pressure", "area")
 
 
@@ -72,8 +76,8 @@ def run_title(summary: Mapping[str, Any]) -> str:
 
 
 PEAK_DOUBTS = {
-    AT_EDGE: "that contact reaches the edge of the insert's articular surface",
-    TOO_NARROW: "that contact is too narrow for the map, so that the peak is not resolved",
+    AT_EDGE: "contact reaches the edge of the insert's articular surface",
+    TOO_NARROW: "contact is too narrow for the map, so that the peak is not resolved",
 }
 """Flag of a frame, after "the <side> ", -> words beside the peak pressure."""
 
@@ -232,24 +236,36 @@ def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
     if found is None:
         return None
     detail = f"{found.side}, {_where(results, axis, found.frame)}"
-    stress = results.summary.get("yield_stress_MPa")
-    above = metrics.peak(results, "<side>_area_above_yield")
-    if stress is not None and above is not None:
-        if above.value > 0:
-            detail += (
-                f"; up to {100 * above.value:.0f} % of the {above.side} area "
-                f"is above yield ({stress:g}\u00a0MPa)"
-            )
-        else:
-            detail += f"; never above yield ({stress:g}\u00a0MPa)"
+    doubt = _doubt_of_peak(results, found.side, found.frame)
+    detail += f", where {doubt}" if doubt else ""
+    detail += _above_yield(results, found.side)
     error = results.summary.get("known_error")
     if error is not None:
         detail += f"; {_model(results)} {known_error_words(error, PRESSURE_AND_AREA)}"
-    doubt = _doubt_of_peak(results, found.side, found.frame)
-    if doubt:
-        detail += f"; {doubt}"
+        detail += OTHER_ERRORS
     large = bool(doubt) or (error is not None and is_large(error, PRESSURE_AND_AREA))
     return Card("Peak contact pressure", f"{found.value:.1f} MPa", detail, large)
+
+
+def _above_yield(results: "Results", first: str) -> str:
+    """Return how much of each condyle's area exceeds the yield stress, in words.
+
+    Args:
+        results: of a run.
+        first: side that is named first, the one whose pressure stands beside it.
+    """
+    stress = results.summary.get("yield_stress_MPa")
+    parts = []
+    for side in sorted(SIDES, key=lambda side: side != first):
+        above = metrics.peak(results, f"{side}_area_above_yield")
+        if above is not None:
+            parts.append((100 * above.value, side))
+    if stress is None or not parts:
+        return ""
+    if not any(percent > 0 for percent, _ in parts):
+        return f"; never above yield ({stress:g}\u00a0MPa)"
+    words = " and ".join(f"{percent:.0f} % of the {side} area" for percent, side in parts)
+    return f"; up to {words} is above yield ({stress:g}\u00a0MPa)"
 
 
 def _doubt_of_peak(results: "Results", side: str | None, frame: int) -> str:
@@ -259,7 +275,7 @@ def _doubt_of_peak(results: "Results", side: str | None, frame: int) -> str:
     """
     status = str(results.status[frame])
     words = [word for flag, word in PEAK_DOUBTS.items() if f"the {side} {flag}" in status]
-    return ", and ".join(words)
+    return " and ".join(words)
 
 
 def _post(results: "Results", axis: HorizontalAxis) -> Card | None:

@@ -324,7 +324,9 @@ def _contact(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[
     else:
         yield "The superior–inferior load was pressed in at the recorded rotation."
     error = summary.get("known_error")
-    if isinstance(error, Mapping):
+    if isinstance(error, str):
+        yield "How far this setting of the contact model is off was not measured."
+    elif isinstance(error, Mapping):
         yield (
             "On the cases of tkamb's trade-off study this setting was off by at most "
             f"{100 * error['peak_pressure']:.2g} % in peak pressure and "

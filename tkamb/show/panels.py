@@ -19,6 +19,7 @@ from tkamb.run.metrics import (
     split_undetermined,
     tension_ratio,
 )
+from tkamb.show.headline import OTHER_ERRORS
 from tkamb.show.style import (
     ANTERIOR,
     BLACK,
@@ -34,6 +35,18 @@ from tkamb.show.style import (
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results
+
+
+@dataclass(frozen=True)
+class PanelSettings:
+    """When one curve of a plot hides another."""
+
+    line_width_share: float = 0.005
+    """Of the curves' height: two that are nowhere farther apart are drawn over each other. A line
+    is 1.5 points wide in a plot of 220."""
+
+
+PANEL = PanelSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +118,28 @@ def panels(results: "Results") -> tuple[Panel, ...]:
 
 
 def _without_empty_lines(panel: Panel) -> Panel:
-    """Return the panel with only the lines that hold a number."""
+    """Return the panel with only the lines that hold a number, none of them hidden."""
     lines = tuple(line for line in panel.lines if np.isfinite(line.values).any())
-    return replace(panel, lines=lines)
+    return replace(panel, lines=_none_hidden(lines))
+
+
+def _none_hidden(lines: Sequence[Line]) -> tuple[Line, ...]:
+    """Return the lines, dashed where one would be drawn exactly over an earlier one."""
+    shown: list[Line] = []
+    for line in lines:
+        covers = any(_coincide(line.values, earlier.values) for earlier in shown)
+        shown.append(replace(line, dashed=True) if covers and not line.behind else line)
+    return tuple(shown)
+
+
+def _coincide(values: Array, others: Array) -> bool:
+    """Say whether two curves (f,) cannot be told apart where both have numbers."""
+    both = np.isfinite(values) & np.isfinite(others)
+    if not both.any():
+        return False
+    height = float(np.ptp(np.concatenate([values[both], others[both]])))
+    apart = float(np.abs(values - others)[both].max())
+    return apart <= PANEL.line_width_share * height
 
 
 def _line(
@@ -240,7 +272,7 @@ def _with_known_error(results: "Results", panel: Panel, names: tuple[str, ...]) 
     if error is None:
         return panel
     words = known_error_words(error, names)
-    note = f"{words[0].upper()}{words[1:]}."
+    note = f"{words[0].upper()}{words[1:]}{OTHER_ERRORS}."
     return replace(panel, note=note, warning=is_large(error, names))
 
 

@@ -61,6 +61,7 @@ HANDLE, COLUMN_GAP = 2.7, 1.4
 """Of a legend's letters: a handle with its gap, and the gap between columns."""
 DASHES = (0, (4, 2))
 SPAN = "#e2e2e2"
+STANCE = "#eef3f7"
 
 
 class Sheet:
@@ -100,6 +101,7 @@ class Sheet:
             return new_figure(self._width, HEIGHT).add_subplot()
 
     def _draw_on(self, axes: Axes, panel: Panel) -> None:
+        _draw_stances(axes, self._axis)
         _draw_lines(axes, panel, self._axis)
         _label_axes(axes, panel, self._axis)
         mark_frames(axes, self._results, self._axis)
@@ -221,6 +223,12 @@ def mark_frames(axes: Axes, results: "Results", axis: HorizontalAxis) -> None:
                 transform=transform,
                 gid=f"frames-{name}",
             )
+
+
+def _draw_stances(axes: Axes, axis: HorizontalAxis) -> None:
+    """Shade the stances of gait behind the curves."""
+    for on, off in axis.stances:
+        axes.axvspan(on, off, facecolor=STANCE, edgecolor="none", zorder=0.2, gid="stance")
 
 
 def _draw_lines(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:

@@ -6,6 +6,7 @@ insert; for a left knee, which is mirrored at input, the picture is mirrored bac
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,10 +18,12 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from tkamb.geometry.frames import Array
 from tkamb.run.maps import ContactMaps
 from tkamb.run.metrics import lateral_axis_name, map_rows, stretches
+from tkamb.run.metrics import peak as peak_of
 from tkamb.show.axis import HorizontalAxis
 from tkamb.show.levels import PageGrid, pressure_levels, touched_part
 from tkamb.show.style import BLACK, GREY, PRESSURE_MAP, SIDE_COLOURS, new_figure, settings
@@ -41,6 +44,11 @@ class PressurePictureSettings:
     rim_share: float = 0.03
     """Share of the scale over which a flat map fades at its rim; elsewhere it fades from
 one point of the grid to the next, so that no steps are seen there."""
+    outline_margin: int = 8
+    """Points of the grid around it on which the insert's smooth outline may lie."""
+    outline_width: float = 0.7
+    """Of the map's edge length: standard deviation of the average that smooths the outline. Half
+    an edge leaves the steps visible, a whole one rounds the notch."""
 
 
 PRESSURE_PICTURE = PressurePictureSettings()
@@ -67,6 +75,7 @@ class TopView:
         self.side = side
         self.sign = -1.0 if side == "left" and lateral == "lateral" else 1.0
         points = maps.points_m
+        self.points = points
         self.across = self.sign * points[:, 2] / MILLIMETRE
         self.up = points[:, 0] / MILLIMETRE
         self.triangles = maps.triangles
@@ -76,6 +85,21 @@ class TopView:
     def page_coordinates(self, ap: Array, ml: Array) -> tuple[Array, Array]:
         """Return page coordinates (mm) of insert x and z (mm)."""
         return self.sign * ml, ap
+
+    @cached_property
+    def insert_picture(self) -> tuple[Array, Array]:
+        """Return grey and opacity (rows, columns) of the insert, some points beyond the grid.
+
+        The map's triangles end in steps of their own size. The outline is where the signed
+        distance from their rim, averaged over such a step, is zero.
+        """
+        grey = np.pad(self.grey, PRESSURE_PICTURE.outline_margin, constant_values=-1.0)
+        over = grey >= 0
+        far, nearest = distance_transform_edt(~over, return_indices=True)
+        signed = distance_transform_edt(over) - far
+        step = _edge_length_mm(self.points, self.triangles) / PRESSURE_PICTURE.step_mm
+        signed = gaussian_filter(signed, PRESSURE_PICTURE.outline_width * step)
+        return grey[tuple(nearest)], np.clip(0.5 + signed, 0.0, 1.0)
 
     @property
     def across_limits(self) -> tuple[float, float]:
@@ -93,10 +117,13 @@ class TopView:
 
     def draw_insert(self, axes: Axes) -> None:
         """Draw the insert in greys that show its dishes, and dress the axes."""
-        over = self.grey >= 0
-        picture = colormaps["gray"](np.where(over, self.grey, self.grey.max()), bytes=True)
-        picture[..., 3] = 255 * over
-        _show(axes, picture, self.grid.extent(), 1.0)
+        grey, opacity = self.insert_picture
+        picture = colormaps["gray"](grey, bytes=True)
+        picture[..., 3] = np.round(255 * opacity)
+        left, right, low, high = self.grid.extent()
+        margin = PRESSURE_PICTURE.step_mm * PRESSURE_PICTURE.outline_margin
+        extent = (left - margin, right + margin, low - margin, high + margin)
+        _show(axes, picture, extent, 1.0)
         axes.set_xlim(self.across_limits)
         axes.set_ylim(self.up_limits)
         axes.set_aspect("equal")
@@ -124,11 +151,26 @@ def top_view(results: "Results") -> TopView | None:
 
 
 def mapped_frames(results: "Results", axis: HorizontalAxis, count: int = 8) -> list[int]:
-    """Return at most `count` frames with a pressure map, spread over the motion."""
+    """Return at most `count` frames with a pressure map, spread over the motion.
+
+    The frame of the largest pressure is one of them.
+    """
     frames = np.array(sorted(map_rows(results)), int)
     if not len(frames):
         return []
-    return sorted({int(frames[np.argmin(np.abs(frames - stop))]) for stop in axis.stops(count)})
+    chosen = {int(frames[np.argmin(np.abs(frames - stop))]) for stop in axis.stops(count)}
+    peak = frame_of_peak(results)
+    if peak is not None and peak not in chosen:
+        if len(chosen) >= count:
+            chosen.remove(min(chosen, key=lambda frame: abs(frame - peak)))
+        chosen.add(peak)
+    return sorted(chosen)
+
+
+def frame_of_peak(results: "Results") -> int | None:
+    """Return the frame of the largest pressure; None where it has no map."""
+    largest = peak_of(results, "<side>_peak_pressure_MPa")
+    return largest.frame if largest is not None and largest.frame in map_rows(results) else None
 
 
 def draw_maps(
@@ -231,6 +273,12 @@ def _pressure(results: "Results") -> Array:
     return results.maps.pressure_Pa / MEGAPASCAL
 
 
+def _edge_length_mm(points: Array, triangles: NDArray[np.int64]) -> float:
+    """Return the median length of the triangles' edges."""
+    edges = points[triangles] - points[np.roll(triangles, 1, axis=1)]
+    return float(np.median(np.linalg.norm(edges, axis=-1))) / MILLIMETRE
+
+
 def _shade(points: Array, triangles: NDArray[np.int64]) -> Array:
     """Return a grey level (n,) per point, lit obliquely from above."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
@@ -292,7 +340,8 @@ def _draw_centres(axes: Axes, view: TopView, results: "Results", frame: int) -> 
 
 def _caption(results: "Results", axis: HorizontalAxis, frame: int) -> str:
     force = results["force_total_BW"][frame]
-    return f"{axis.label.split(' (')[0]} {axis.at(frame)}, {force:.2f} BW"
+    peak = "; peak pressure" if frame == frame_of_peak(results) else ""
+    return f"{axis.label.split(' (')[0]} {axis.at(frame)}, {force:.2f} BW{peak}"
 
 
 def _label_stops(

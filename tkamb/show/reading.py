@@ -88,7 +88,7 @@ def _pressure(results: "Results") -> tuple[list[str], list[str]]:
     ]
     if isinstance(error, str):
         return bears, [f"Pressures and areas as numbers: how far they are off is {error}."]
-    words = known_error_words(error, PRESSURE_AND_AREA)
+    words = f"{known_error_words(error, PRESSURE_AND_AREA)} by the contact model alone"
     if is_large(error, PRESSURE_AND_AREA):
         return bears, [f"Pressures and areas as numbers: {words}."]
     return [f"Pressures and areas of unworn surfaces, {words}.", *bears], []

@@ -86,7 +86,7 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
         conclusions=conclusions(results),
         sentences=_sentences(results.summary),
         maps=maps,
-        legend=_legend(results),
+        legend=_legend(results, axis),
         plots=[_plot(panel, sheet) for panel in progress(panels(results))],
         muscles=_muscles(results, axis),
         wear=wear_section(results),
@@ -176,7 +176,7 @@ def _plot(panel: Panel, sheet: Sheet) -> dict[str, Any]:
     return {"panel": panel, "svg": svg_text(sheet.draw(panel), panel.name)}
 
 
-def _legend(results: "Results") -> list[str]:
+def _legend(results: "Results", axis: HorizontalAxis) -> list[str]:
     """Return what the marks in the plots mean."""
     sentences = [COLOURS]
     if results.bands:
@@ -184,6 +184,11 @@ def _legend(results: "Results") -> list[str]:
             "Shaded: 5 to 95 % of the samples with varied inputs, dotted: their median; "
             "full lines: the scene as it stands."
         )
+    if axis.stances:
+        words = "Shaded blue-grey: stance, the foot on its force plate"
+        offs = results.summary["gait"]["toe_off_percent"] if axis.kind == "cycle" else ()
+        words += "".join(f"; toe-off at {off:.0f} % of the cycle" for off in offs)
+        sentences.append(f"{words}.")
     if flagged(results).any():
         sentences.append("Orange ticks at the bottom: frames to be read with care.")
     if failed(results).any():

@@ -110,6 +110,9 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         request.contact,
         request.activity,
         (*_notes(request, scale, found, bool(tissue.bundles)), *request.notes),
+        request.model if request.muscles else None,
+        request.recording if found.motion else None,
+        request.cycle,
     )
     report = [*_model_lines(model), *_leg_lines(leg), weighed, *links.said, *_patella_line(links)]
     report += [*found.said, *tissue.said]
@@ -180,7 +183,8 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
         for path, text in new.items():
             write_new_text(path, text)
             written.append(path)
-        return marker_lines(load_case(load_scene(scene)))
+        case = load_case(load_scene(scene))
+        return (*marker_lines(case), *_gait_lines(case, patient.scene.cycle == "plates"))
     except BaseException:  # an interrupt too: nothing may stay
         for path in written:
             path.unlink(missing_ok=True)
@@ -188,6 +192,31 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
             for place in made:
                 place.rmdir()
         raise
+
+
+def _gait_lines(case: Case, wanted: bool) -> tuple[str, ...]:
+    """Return what the force plates show of gait, in a line.
+
+    Raises:
+        InputError: a cycle is wanted from the plates, and they show none.
+    """
+    gait = None if case.ground is None else case.ground.gait
+    if wanted and case.gait_cycle_s is None:
+        raise InputError(
+            "the force plates show no two strikes of this foot within the motion",
+            "--cycle plates",
+            "give --cycle A:B, the times (s) of two strikes, from the heel's markers for example",
+        )
+    if gait is None or not gait.foot_strikes:
+        return ()
+    parts = [
+        f"{name} at {', '.join(f'{time:.3f}' for time in times)} s"
+        for name, times in (("foot strikes", gait.foot_strikes), ("toe-offs", gait.toe_offs))
+        if times
+    ]
+    cycle = case.gait_cycle_s
+    last = "" if cycle is None else f"; the gait cycle lies from {cycle[0]:.3f} to {cycle[1]:.3f} s"
+    return (f"force plates: {', '.join(parts)}{last}",)
 
 
 def _same_there(path: Path, text: str) -> bool:
@@ -338,10 +367,13 @@ def _title(request: ImportRequest) -> tuple[str, ...]:
 def _notes(
     request: ImportRequest, scale: float, found: Trial, own_ligaments: bool
 ) -> tuple[str, ...]:
-    notes = [
+    alone = (
         "Without [muscles] only the quadriceps acts: where hamstrings and gastrocnemius act too, "
         "the contact force is too low and the quadriceps force is what the joint moment needs at "
-        "least.",
+        "least."
+    )
+    notes = [
+        *(() if request.muscles else (alone,)),
         *_motion_notes(request, found),
         "Foot and shank are one body with the ankle at its neutral angle.",
     ]

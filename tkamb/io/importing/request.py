@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from tkamb.io.importing.recorded_poses import PoseRecording
 from tkamb.io.importing.scene_text import Meshes
@@ -36,6 +37,8 @@ class ImportRequest:
         activity: what the report compares with; None: with nothing.
         notes: of the user, for the report.
         prefix: of the markers' labels that are used, where several prefixes share a label.
+        muscles: whether the scene has all muscles of the model, which share the load.
+        cycle: s, 0 and 100 % of the gait cycle; "plates": two foot strikes of the plates.
         units: what the recording's units are, where it does not say.
     """
 
@@ -61,4 +64,6 @@ class ImportRequest:
     activity: str | None = None
     notes: tuple[str, ...] = ()
     prefix: str | None = None
+    muscles: bool = False
+    cycle: tuple[float, float] | Literal["plates"] | None = None
     units: GivenUnits = field(default_factory=GivenUnits)

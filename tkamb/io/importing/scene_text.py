@@ -4,6 +4,7 @@ import json
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from tkamb.geometry.frames import Array
 from tkamb.io.importing.links import Links
@@ -91,6 +92,9 @@ class SceneText:
         contact: the contact model.
         activity: what the report compares with; None: with nothing.
         notes: for the report.
+        model: the .osim file whose muscles all act; None: the quadriceps alone.
+        coordinates: of that model, where the recording holds them and not markers.
+        cycle: s, 0 and 100 % of the gait cycle; "plates": as they show it; None: against time.
     """
 
     title: tuple[str, ...]
@@ -109,6 +113,9 @@ class SceneText:
     contact: str
     activity: str | None
     notes: tuple[str, ...]
+    model: Path | None = None
+    coordinates: Path | None = None
+    cycle: tuple[float, float] | Literal["plates"] | None = None
 
     def text(self) -> str:
         """Return the TOML."""
@@ -121,6 +128,7 @@ class SceneText:
             self._ground(),
             *self._implant(),
             self._muscles(),
+            self._all_muscles(),
             self._ligaments(),
             self._contact(),
             self._output(),
@@ -236,6 +244,18 @@ class SceneText:
             'motion = "solved"',
         ]
 
+    def _all_muscles(self) -> list[str]:
+        if self.model is None:
+            return []
+        lines = [
+            "# all muscles of the model share the load; see docs/muscles.md",
+            "[muscles]",
+            f"model = {self._path(self.model)}",
+        ]
+        if self.coordinates is not None:
+            lines.append(f"coordinates = {self._path(self.coordinates)}")
+        return lines
+
     def _bone(self) -> list[str]:
         m = self.meshes
         if m is None or m.femur_bone is None:
@@ -292,8 +312,13 @@ class SceneText:
         ]
 
     def _output(self) -> list[str]:
-        cycle = self.poses is not None and self.poses.given.stride is not None
-        lines = ["[output]", f'axis = "{"cycle" if cycle else "time"}"']
+        stride = self.poses is not None and self.poses.given.stride is not None
+        axis = "cycle" if stride or self.cycle is not None else "time"
+        lines = ["[output]", f'axis = "{axis}"']
+        if self.cycle == "plates":
+            lines.append("# 0 and 100 %: two foot strikes on the force plates")
+        elif self.cycle is not None:
+            lines.append(f"cycle_s = [{self.cycle[0]:g}, {self.cycle[1]:g}]")
         lines += [f"activity = {toml_text(self.activity)}"] if self.activity else []
         return [*lines, "notes = [", *(f"    {toml_text(note)}," for note in self.notes), "]"]
 

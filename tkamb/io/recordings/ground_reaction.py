@@ -21,6 +21,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.io.recordings.c3d import read_c3d
 from tkamb.io.recordings.filtering import differentiate_coordinates
+from tkamb.io.recordings.gait import Gait, find_gait
 from tkamb.io.recordings.laboratory import check_roles, laboratory_rotation
 from tkamb.io.recordings.plate_loads import PLATE_LOAD, around_load, unloaded_level
 from tkamb.io.recordings.recordings import ForceRecording, Side
@@ -61,6 +62,7 @@ class GroundReaction:
         level_assumed: no column says the plate's height, so it is the laboratory's 0.
         drift: number of a plate -> N, what it reads while nobody stands on it, where that is much.
         notices: remarks on what of the file was used.
+        gait: stances that the recording shows; None where there is no recording.
     """
 
     force: Array
@@ -71,6 +73,7 @@ class GroundReaction:
     level_assumed: bool = False
     drift: dict[int, float] = field(default_factory=dict)
     notices: tuple[str, ...] = ()
+    gait: Gait | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +148,7 @@ def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> Gro
         level_assumed=recorded.level_assumed,
         drift=recorded.drift,
         notices=recorded.notices,
+        gait=find_gait(stamps, force[:, 1]),
     )
 
 

@@ -84,6 +84,19 @@ class Case:
         return differentiate_coordinates(time, places, cutoff, name="places of the patella")
 
     @property
+    def gait_cycle_s(self) -> tuple[float, float] | None:
+        """Return 0 and 100 % of the gait cycle (s), as the scene gives or the plates show it.
+
+        None where neither does, or where the motion's own clock is per cent of a cycle.
+        """
+        if self.motion.cycle_percent is not None:
+            return None
+        if self.scene.output.cycle_s is not None:
+            return self.scene.output.cycle_s
+        gait = None if self.ground is None else self.ground.gait
+        return gait and gait.cycle(float(self.motion.time[0]), float(self.motion.time[-1]))
+
+    @property
     def bone(self) -> "Surface | None":
         """The bone that a muscle wraps, femur link; None without one."""
         return next((m.wrap.bone for m in self.muscles if m.wrap and m.wrap.bone), None)

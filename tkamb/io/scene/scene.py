@@ -149,6 +149,8 @@ class Scene(SceneTable):
             raise ValueError("[material] and [output] both give yield_stress_MPa: give one")
         if self.material and not contact:
             raise ValueError("[material] needs [contact]: nothing else is pressed")
+        if self.output.cycle_s and self.motion.cycle_s:
+            raise ValueError("[motion] cycle_s is the cycle: drop [output] cycle_s")
         if self.tibia and self.motion.markers:
             raise ValueError("[motion.markers] places the shank too: drop [tibia]")
         if self.ground_reaction and not (self.tibia or self.motion.markers):
@@ -199,13 +201,35 @@ def with_preset(scene: Scene, preset: str, overrides: dict[str, Any] | None = No
     content = scene.model_dump(exclude_unset=True)
     more = scene.overrides | (overrides or {})
     applied = _apply_preset(content, preset, more, "scene")
-    for key, value in more.items():
+    found = _changed(content, more)
+    found._preset = applied
+    return found
+
+
+def with_overrides(scene: Scene, overrides: dict[str, Any]) -> Scene:
+    """Return a scene with overrides laid over it, as `load_scene` lays them over a file.
+
+    Args:
+        scene: as read; its own overrides and its preset stay.
+        overrides: dotted key -> value; a relative path is relative to the working directory.
+
+    Raises:
+        InputError: an unknown key, or a value out of range.
+    """
+    found = _changed(scene.model_dump(exclude_unset=True), scene.overrides | overrides)
+    found._preset = scene.preset
+    return found
+
+
+def _changed(content: dict[str, Any], overrides: dict[str, Any]) -> Scene:
+    """Return the scene of a content with overrides laid over it."""
+    for key, value in overrides.items():
         _override(content, key, value)
     try:
         found = Scene.model_validate(content)
     except ValidationError as error:
-        raise _complaint(error, Path("scene"), more) from None
-    found._overrides, found._preset = more, applied
+        raise _complaint(error, Path("scene"), overrides) from None
+    found._overrides = overrides
     return found
 
 

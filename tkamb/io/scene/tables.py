@@ -390,6 +390,11 @@ class OutputTable(SceneTable):
     axis: Literal["flexion", "cycle", "time"] = Field(
         "flexion", description="the report's horizontal axis"
     )
+    cycle_s: tuple[Number, Number] | None = Field(
+        None,
+        description="s, 0 and 100 % of the gait cycle; default: two foot strikes of "
+        "[ground_reaction], where it shows them",
+    )
     activity: Activity | None = Field(
         None, description="the report draws what instrumented knees measured in it"
     )
@@ -398,3 +403,9 @@ class OutputTable(SceneTable):
         default_factory=dict,
         description="words of a question -> its answer: a note then, and no flag",
     )
+
+    @model_validator(mode="after")
+    def _cycle_rises(self) -> Self:
+        if self.cycle_s and self.cycle_s[0] >= self.cycle_s[1]:
+            raise ValueError("'cycle_s' must rise")
+        return self

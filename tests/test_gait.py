@@ -1,0 +1,74 @@
+"""Foot strikes, toe-offs and the gait cycle from a force plate."""
+
+import numpy as np
+import pytest
+
+from synthetic_run import make_run
+from tkamb.io.recordings.gait import cycle_percent, find_gait
+from tkamb.show.axis import horizontal_axis
+from tkamb.show.panels import panels
+from tkamb.show.plots import Sheet
+
+RATE_HZ = 1000.0
+
+
+def vertical(time, stances, ramp_s=0.05, load_N=700.0):
+    """Return a force that rises and falls linearly within each stance."""
+    force = np.zeros_like(time)
+    for on, off in stances:
+        force = np.maximum(
+            force, load_N * np.clip(np.minimum(time - on, off - time) / ramp_s, 0.0, 1.0)
+        )
+    return force
+
+
+def test_events_lie_where_the_force_crosses_the_threshold():
+    time = np.arange(0.0, 3.0, 1 / RATE_HZ)
+    gait = find_gait(time, vertical(time, [(0.4, 1.05), (1.5, 2.15)]))
+    late = 0.05 * 20.0 / 700.0  # s, from the first newton to the 20 N of the threshold
+    np.testing.assert_allclose(gait.foot_strikes, [0.4 + late, 1.5 + late], atol=1e-9)
+    np.testing.assert_allclose(gait.toe_offs, [1.05 - late, 2.15 - late], atol=1e-9)
+    assert gait.cycle(0.3, 2.5) == pytest.approx((0.4 + late, 1.5 + late))
+
+
+def test_a_recording_that_begins_on_the_plate_has_no_first_strike():
+    time = np.arange(0.0, 2.0, 1 / RATE_HZ)
+    gait = find_gait(time, vertical(time, [(-0.3, 0.5), (0.9, 3.0)]))
+    assert len(gait.foot_strikes) == len(gait.toe_offs) == 1
+    assert gait.foot_strikes[0] == pytest.approx(0.9, abs=2e-3)
+    assert gait.spans()[0][0] == 0.0
+    assert gait.cycle(0.0, 2.0) is None
+
+
+def test_noise_makes_no_event():
+    time = np.arange(0.0, 2.0, 1 / RATE_HZ)
+    force = vertical(time, [(0.5, 1.2)])
+    force[300:310], force[800:805] = 60.0, 0.0
+    gait = find_gait(time, force)
+    assert len(gait.foot_strikes) == len(gait.toe_offs) == 1
+
+
+def test_there_is_no_event_without_a_foot_or_with_one_that_never_leaves():
+    time = np.arange(0.0, 1.0, 1 / RATE_HZ)
+    for load in (0.0, 500.0):
+        gait = find_gait(time, np.full_like(time, load))
+        assert not gait.foot_strikes + gait.toe_offs and gait.cycle(0.0, 1.0) is None
+
+
+def test_per_cent_is_counted_between_two_strikes_and_not_beyond():
+    percent = cycle_percent(np.array([0.9, 1.0, 1.5, 2.0, 2.1]), (1.0, 2.0))
+    np.testing.assert_allclose(percent, [np.nan, 0.0, 50.0, 100.0, np.nan])
+
+
+@pytest.mark.parametrize(("axis", "to"), [("time", 0.66), ("cycle", 60.0)])
+def test_the_stance_is_shaded(axis, to):
+    run = make_run("gait", 21)
+    run.columns["time_s"] = np.linspace(0.0, 1.1, 21)
+    run.summary["cycle_percent_s"] = [0.0, 1.1]
+    run.summary["gait"] = {"stance_s": [[-0.2, 0.66]], "toe_off_percent": [60.0]}
+    figure = Sheet(run, horizontal_axis(run, axis)).draw(panels(run)[0])
+    (shade,) = [patch for patch in figure.axes[0].patches if patch.get_gid() == "stance"]
+    assert shade.get_x() == pytest.approx(0.0)
+    assert shade.get_x() + shade.get_width() == pytest.approx(to)
+    flexion = Sheet(run, horizontal_axis(run, "flexion")).draw(panels(run)[0])
+    assert not [patch for patch in flexion.axes[0].patches if patch.get_gid() == "stance"]
