@@ -99,7 +99,9 @@ def _maps(out: Path, chance: random.Random) -> None:
             shape = tuple(
                 chance.choice([0, 1, 3, 7, 10**6, 10**9]) for _ in range(max(old.ndim, 1))
             )
-            file.create_dataset(name, shape, "f8", maxshape=shape, chunks=(1,) * len(shape))
+            file.create_dataset(
+                name, shape, "f8", maxshape=(None,) * len(shape), chunks=(1,) * len(shape)
+            )
         elif how == 7:
             file[name] = chance.choice(["text", b"bytes", np.void(b"xx"), 1.0, h5py.Empty("f8")])
         elif how == 8:

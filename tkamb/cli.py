@@ -27,7 +27,7 @@ from tkamb.commands.view import add_view
 from tkamb.commands.wear import add_wear
 from tkamb.geometry.threads import threads
 from tkamb.io.starter import add_new
-from tkamb.run.guard import guarded, log_to_stderr
+from tkamb.run.guard import guarded, log_to_stderr, printable, say
 from tkamb.run.settings import add_settings
 
 if TYPE_CHECKING:
@@ -205,7 +205,10 @@ def _verify(options: argparse.Namespace) -> int:
     from tkamb.run.results_folder import verify_results
 
     verdict = verify_results(options.folder)
-    print("\n".join(f"{options.folder}: {line}" for line in verdict.lines()))
+    for line in verdict.differs:
+        say(f"{options.folder}: {line}")
+    for line in verdict.lines()[len(verdict.differs) :]:
+        print(printable(f"{options.folder}: {line}"))
     return 1 if verdict.differs else 0
 
 

@@ -26,6 +26,9 @@ MESH_LIMIT = 1000 * MEGABYTE
 
 SAVE_AS_UTF8 = "save it as UTF-8 text"
 
+HASH_LIMIT = 100_000 * MEGABYTE
+"""Bytes of a file of which the SHA-256 is taken: five minutes of reading."""
+
 DEEPEST = 100
 """Elements of an XML file inside one another; a URDF has 5, an OpenSim model 20."""
 
@@ -217,13 +220,17 @@ def check_file(path: str | Path, limit: float, *, what: str = "file") -> None:
     os.close(open_regular(path, limit, what=what))
 
 
-def sha256_of(path: str | Path) -> str:
+def sha256_of(path: str | Path, limit: float = HASH_LIMIT) -> str:
     """Return the SHA-256 of a regular file's content, hexadecimal.
 
+    Args:
+        path: the file.
+        limit: bytes.
+
     Raises:
-        InputError: no such file, or it cannot be read.
+        InputError: no such file, too large, or it cannot be read.
     """
-    with os.fdopen(open_regular(path, float("inf")), "rb") as file:
+    with os.fdopen(open_regular(path, limit), "rb") as file:
         try:
             return hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:

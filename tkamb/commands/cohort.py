@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from tkamb.run.guard import say
+
 SHOWN = 10
 """Failed runs that are printed."""
 
@@ -68,4 +70,7 @@ def _cohort(options: argparse.Namespace) -> int:
         print(f"report: {directory / REPORT_NAME}")
     else:
         print(f"kept: {directory / part.folder}; `tkamb cohort --resume` gathers all parts")
-    return 1 if outcomes and len(failed) == len(outcomes) else 0
+    if outcomes and len(failed) == len(outcomes):
+        say("no run could be computed")
+        return 1
+    return 0

@@ -5,6 +5,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from tkamb.run.guard import printable
+
 PAGE_NAME = "compare.html"
 
 
@@ -45,5 +47,6 @@ def _compare(options: argparse.Namespace) -> int:
     with claimed_directory(place, options.force) as folder:
         write_text(folder / PAGE_NAME, html)
     lines = [*table_lines(found), f"page: {folder / PAGE_NAME}"]
-    print(json.dumps(found.as_dict(), indent=2) if options.json else "\n".join(lines))
+    text = json.dumps(found.as_dict(), indent=2) if options.json else "\n".join(lines)
+    print(printable(text))
     return 0

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from tkamb.run.guard import say
+
 T = TypeVar("T")
 NOT_OURS = "write into a folder that is not tkamb's, or another command's"
 
@@ -88,7 +90,10 @@ def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
     print(text if options.json else "\n".join([*lines, f"picture: {directory / 'tradeoff.png'}"]))
     if not whole:
         raise KeyboardInterrupt(_goes_on(directory))
-    return 0 if any(row.errors for row in rows) else 1
+    if not any(row.errors for row in rows):
+        say("no case could be computed")
+        return 1
+    return 0
 
 
 def add_stability(commands: Any) -> None:
@@ -134,7 +139,10 @@ def _study_stability(options: argparse.Namespace, directory: Path) -> int:
     print(text if options.json else "\n".join([*lines, f"picture: {directory / 'stability.png'}"]))
     if not whole:
         raise KeyboardInterrupt(_goes_on(directory))
-    return 1 if any(verdict.failed for verdict in verdicts) else 0
+    if failed := sum(verdict.failed for verdict in verdicts):
+        say(f"{failed} of {len(verdicts)} cases failed")
+        return 1
+    return 0
 
 
 def gather(found: Iterable[T], costs: Sequence[float]) -> tuple[list[T], bool]:

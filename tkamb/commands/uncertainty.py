@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tkamb.commands.scene_options import add_scene_options, overrides_of
+from tkamb.run.guard import say
 
 if TYPE_CHECKING:
     from tkamb.studies.uncertainty.run import Uncertainty
@@ -71,7 +72,10 @@ def _uncertainty(options: argparse.Namespace) -> int:
     for line in warnings_of(found):
         print(f"tkamb: {line}", file=sys.stderr)
     print("\n".join([*headline(found), f"bands: {directory / 'bands.csv'}"]))
-    return 1 if all(one.failed.all() for one in found.samples) else 0
+    if all(one.failed.all() for one in found.samples):
+        say("every frame of every sample failed")
+        return 1
+    return 0
 
 
 def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:

@@ -5,6 +5,7 @@ of the cluster prepares once what the jobs share. A job whose worker dies is don
 another one; a job is a function of its number and content alone, so that changes no answer.
 """
 
+import logging
 import pickle
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -57,17 +58,36 @@ def answers_of_cluster(
         if address == LOCAL:
             place = stack.enter_context(
                 distributed.LocalCluster(
-                    n_workers=workers, threads_per_worker=1, dashboard_address=None
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    dashboard_address=None,
+                    silence_logs=logging.CRITICAL,
+                    protocol="tls://",
+                    security=_own_security(distributed),
                 )
             )
         client = stack.enter_context(_connected(distributed, place, address))
         yield from _answers(distributed, client, task, wanted)
 
 
+def _own_security(distributed: Any) -> Any:
+    """Return certificates for this process alone.
+
+    A scheduler without them takes work, which is code, from every user of the machine.
+    """
+    try:
+        return distributed.Security.temporary()
+    except ImportError:
+        mend = "pip install 'tkamb[cluster]'"
+        raise InputError("cryptography is not installed", "--dask local", mend) from None
+
+
 def check_cluster(address: str) -> None:
     """Raise an InputError where Dask is not installed, or no scheduler answers."""
     distributed = _library()
-    if address != LOCAL:
+    if address == LOCAL:
+        _own_security(distributed)
+    else:
         _connected(distributed, address, address).close()
 
 

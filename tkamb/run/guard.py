@@ -87,9 +87,15 @@ class StreamError(TkambError):
 
 def say(line: str) -> None:
     """Print a line on standard error; where that is gone there is nobody to tell."""
-    plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
     with suppress(OSError, ValueError):
-        print(f"tkamb: {plain}", file=sys.stderr, flush=True)
+        print(f"tkamb: {printable(line)}", file=sys.stderr, flush=True)
+
+
+def printable(text: str) -> str:
+    """Return text of others with what could steer a terminal written out, lines kept."""
+    return "".join(
+        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
+    )
 
 
 def log_to_stderr() -> None:

@@ -19,12 +19,14 @@ class DataFile:
         sha256: of its content, hexadecimal.
         commit: of the repository; None where it is not known where the file is published.
         path: inside the repository; None as `commit`.
+        size: bytes, as registered; None where it is not known.
     """
 
     name: str
     sha256: str
     commit: str | None = None
     path: str | None = None
+    size: int | None = None
 
     def url(self, base: str) -> str | None:
         """Return its address below that of the repository's raw files; None if unknown."""
@@ -63,7 +65,9 @@ def read_dataset(name: str) -> Dataset:
         content["url"],
         Path(content["folder"]),
         tuple(
-            DataFile(file, entry["sha256"], entry.get("commit"), entry.get("path"))
+            DataFile(
+                file, entry["sha256"], entry.get("commit"), entry.get("path"), entry.get("bytes")
+            )
             for file, entry in content["files"].items()
         ),
     )

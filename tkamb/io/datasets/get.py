@@ -5,6 +5,7 @@ What is there already with the right content is kept, so that an interrupted dow
 
 import shutil
 import tempfile
+import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,12 @@ from tkamb.io.datasets.dataset import DataFile, Dataset
 
 TIMEOUT_S = 30
 """s without an answer after which a server counts as gone."""
+LONGEST_S = 1800.0
+"""s that one file may take: 500 MB at 0.3 MB/s."""
+LARGEST = 1_000_000_000
+"""Bytes of a file whose size is not registered."""
+CHUNK = 65_536
+"""Bytes that are asked for at a time."""
 
 
 @dataclass
@@ -111,7 +118,7 @@ def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
     import pooch
     from requests.exceptions import HTTPError, RequestException
 
-    fetch = pooch.HTTPDownloader(timeout=TIMEOUT_S)
+    fetch = _LimitedDownload(LARGEST if file.size is None else file.size)
     known = f"sha256:{file.sha256}"
     mend = "run it again: what is complete is kept; or --from DIR for what you downloaded by hand"
     try:
@@ -128,6 +135,37 @@ def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
         if "hash" not in str(error):
             raise InputError(f"cannot be downloaded ({error})", address, mend) from None
         raise _other_content(address, file) from None
+
+
+@dataclass(frozen=True)
+class _LimitedDownload:
+    """Downloads a file of at most so many bytes in at most `LONGEST_S`, for pooch."""
+
+    size: int
+
+    def __call__(self, url: str, output_file: str, pooch: object) -> None:
+        """Write what the address gives into a file.
+
+        Raises:
+            InputError: it gives more bytes than are registered, or takes too long.
+        """
+        import requests
+
+        end, received = clock.monotonic() + LONGEST_S, 0
+        with (
+            requests.get(url, stream=True, timeout=TIMEOUT_S) as answer,
+            open(output_file, "wb") as file,
+        ):
+            answer.raise_for_status()
+            for chunk in answer.iter_content(CHUNK):
+                received += len(chunk)
+                if received > self.size:
+                    what = f"gives more than the {self.size} bytes that are registered"
+                    raise InputError(what, url, "another version? nothing of it is kept")
+                if clock.monotonic() > end:
+                    what = f"is not there after {LONGEST_S / 60:.0f} minutes"
+                    raise InputError(what, url, "run it again: what is complete is kept")
+                file.write(chunk)
 
 
 def _found(file: DataFile, folder: Path) -> Path | None:

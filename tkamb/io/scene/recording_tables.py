@@ -160,6 +160,7 @@ class MotionTable(SceneTable):
     frames: Count | None = Field(
         None,
         ge=2,
+        le=100_000,
         description="resample to so many frames; default: as recorded. The recording is filtered "
         "at its own samples first; what is found at the frames (a solved patella, roll-slip, "
         "the first guess of coordinates that nobody recorded) is filtered there, so that these "

@@ -7,6 +7,8 @@ trials' scenes with overrides, as `tkamb run --set` gives them.
 import hashlib
 import itertools
 import json
+import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
+from tqdm import tqdm
 
 from tkamb.errors import InputError, names_near
 from tkamb.files import sha256_of
@@ -25,7 +28,8 @@ from tkamb.run.summary import files_in
 
 AXES = ("subject", "trial", "design", "contact")
 GROUP_AXES = ("activity", *AXES[1:])
-MOST_RUNS = 100_000
+MOST_RUNS = 20_000
+"""Scenes are read at 5 ms each, before anything is computed; a run takes a minute."""
 Name = Annotated[str, Field(pattern=r"^[\w .+-]{1,60}$")]
 Overrides = Annotated[
     dict[str, Any],
@@ -108,11 +112,11 @@ class CohortTable(SceneTable):
     @model_validator(mode="after")
     def _names(self) -> Self:
         for axis in AXES:
-            names = [one.name for one in getattr(self, axis)]
-            twice = sorted({name for name in names if names.count(name) > 1})
+            names = Counter(one.name for one in getattr(self, axis))
+            twice = sorted(name for name, count in names.items() if count > 1)
             if twice:
                 raise ValueError(f"[[{axis}]] has two entries called '{twice[0]}'")
-        known = [one.name for one in self.subject]
+        known = {one.name: None for one in self.subject}  # in order, found at once
         for trial in self.trial:
             for name in trial.subjects:
                 if name not in known:
@@ -229,13 +233,12 @@ def load_cohort(path: str | Path, frames: str | None = None) -> Cohort:
 
 def _runs(table: CohortTable, path: Path) -> list[CohortRun]:
     axes: list[Sequence[Any]] = [getattr(table, axis) or (None,) for axis in AXES]
-    count = 1
-    for axis in axes:
-        count *= len(axis)
+    count = math.prod(map(len, axes))
     if count > MOST_RUNS:
         raise InputError(f"makes {count} runs, more than {MOST_RUNS}", path, "split it")
     found: list[CohortRun] = []
-    for subject, trial, design, contact in itertools.product(*axes):
+    each = tqdm(itertools.product(*axes), "reading scenes", count, unit="scene", disable=None)
+    for subject, trial, design, contact in each:
         if trial.subjects and (subject is None or subject.name not in trial.subjects):
             continue
         labels = {

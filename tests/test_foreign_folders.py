@@ -1,0 +1,107 @@
+"""Folders of results from somebody else: nothing outside is read, one line refuses them."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from scenes import MODEL
+from tkamb.cli import main
+
+sys.path.append(str(Path(__file__).parents[1] / "scripts"))
+
+from forged_folders import SECRET, _rehash
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    out = tmp_path_factory.mktemp("foreign") / "results"
+    given = ["--contact", "foundation", "--resolution", "6", "--frames", "0:1"]
+    assert main(["run", str(MODEL / "scene.toml"), *given, "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture
+def copy(results, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(results, out)
+    return out
+
+
+def refused(capfd, *arguments):
+    capfd.readouterr()
+    assert main([str(argument) for argument in arguments]) == 2
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1 and "not foreseen" not in said
+    return said
+
+
+@pytest.mark.parametrize("how", ["external", "link", "soft", "virtual"])
+def test_an_array_in_another_file_is_not_followed(copy, tmp_path, capfd, how):
+    secret = tmp_path / "secret.txt"
+    secret.write_text(SECRET * 10_000)
+    with h5py.File(copy / "contact.h5", "a") as file:
+        shape = file["points_m"].shape
+        del file["points_m"]
+        if how == "external":
+            size = 8 * int(np.prod(shape))
+            file.create_dataset("points_m", shape, "f8", external=[(str(secret), 0, size)])
+        elif how == "link":
+            file["points_m"] = h5py.ExternalLink(str(secret), "/x")
+        elif how == "soft":
+            file["points_m"] = h5py.SoftLink("/gap_m")
+        else:
+            layout = h5py.VirtualLayout(shape, "f8")
+            layout[:] = h5py.VirtualSource(str(secret), "x", shape=shape)
+            file.create_virtual_dataset("points_m", layout)
+    _rehash(copy)
+    said = refused(capfd, "export", copy, "--vtp", "--out", tmp_path / "made")
+    assert "points_m" in said and ("link" in said or "another file" in said)
+    assert not (tmp_path / "made").exists()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("body_mass_kg", "heavy"),
+        ("contact", ["foundation"]),
+        ("material", {"name": "x"}),
+        ("known_error", {"area": 1.0}),
+        ("cycle_percent_s", [1.0]),
+        ("uncertainty", {"samples": 3}),
+        ("frames", 10**400),
+        ("questions", "one"),
+    ],
+)
+def test_a_summary_of_other_kinds_is_refused(copy, capfd, key, value):
+    path = copy / "summary.json"
+    sys.set_int_max_str_digits(0) if value == 10**400 else None
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    _rehash(copy)
+    for command in ("report", "methods"):
+        refused(capfd, command, copy)
+
+
+def test_maps_of_another_shape_are_refused(copy, capfd):
+    with h5py.File(copy / "contact.h5", "a") as file:
+        del file["pressure_Pa"]
+        file.create_dataset("pressure_Pa", (10**6, 10**6), "f8", chunks=(1, 100))
+    _rehash(copy)
+    assert "pressure_Pa" in refused(capfd, "report", copy)
+
+
+def test_verify_writes_control_characters_out_and_errors_to_stderr(copy, capfd):
+    path = copy / "summary.json"
+    summary = json.loads(path.read_text())
+    summary["inputs"] = {"/nothing/\x1b[31mred\nline": "0" * 64}
+    path.write_text(json.dumps(summary))
+    _rehash(copy)
+    capfd.readouterr()
+    assert main(["verify", str(copy)]) == 1
+    shown = capfd.readouterr()
+    assert "\x1b" not in shown.out + shown.err
+    assert "no such file" in shown.err

@@ -1,0 +1,158 @@
+"""Small inputs that would take hours, gigabytes or the whole disk: refused, or told in one line."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from tkamb.commands.scene_options import _setting
+from tkamb.contact.registry import contact_model
+from tkamb.errors import InputError
+from tkamb.files import HASH_LIMIT, sha256_of
+from tkamb.io.claim import claimed_directory, is_ours
+from tkamb.io.recordings.urdf_check import _check_attributes
+from tkamb.io.toml_text import parse_toml
+from tkamb.run.guard import guarded
+from tkamb.studies.wear.kept import STATE_NAME, kept_state
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a." + ".".join("b" * 100_000) + " = 1", "parts"),
+        ("[" + ".".join("b" * 100_000) + "]", "parts"),
+        ("a = " + "1" * 5_000, "digits"),
+        ("a = 0x" + "f" * 5_000, "digits"),
+        ("a = " + "[" * 5_000 + "]" * 5_000, "nests"),
+        ("a = " + "{a=" * 5_000 + "1" + "}" * 5_000, "nests"),
+        ("a = 1\na = 2", "not TOML"),
+    ],
+)
+def test_small_toml_that_is_large_to_read(text, words):
+    with pytest.raises(InputError, match=words):
+        parse_toml(text, "scene.toml")
+
+
+def test_text_that_only_looks_like_structure_is_read():
+    text = 'a = "' + "x." * 50 + "[" * 50 + "1" * 200 + '"  # ' + "[" * 50 + "\nb.c = [[1, 2]]"
+    assert parse_toml(text, "scene.toml")["b"] == {"c": [[1, 2]]}
+    assert _setting("a.b=[1, 2]") == ("a.b", [1, 2])
+
+
+@pytest.mark.parametrize("value", [0, -1.0, float("nan"), float("inf"), 1e300, 1.0])
+def test_a_tolerance_that_is_none(value):
+    with pytest.raises(InputError, match="tolerance"):
+        contact_model("lattice", tolerance=value)
+
+
+def test_a_centre_of_mass_beyond_all_measure():
+    from xml.etree.ElementTree import fromstring
+
+    with pytest.raises(InputError, match="millimetres"):
+        _check_attributes(fromstring('<origin xyz="0 1e300 0"/>'), "leg.urdf")
+    _check_attributes(fromstring('<origin xyz="0 -0.4 0" rpy="0 0 0"/>'), "leg.urdf")
+
+
+def test_a_terabyte_is_not_hashed(tmp_path):
+    path = tmp_path / "large"
+    os.truncate(os.open(path, os.O_CREAT | os.O_WRONLY), int(HASH_LIMIT) + 1)
+    with pytest.raises(InputError, match="MB large"):
+        sha256_of(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"x" * 100, bytes(1000)])
+def test_a_damaged_wear_state_is_one_line(tmp_path, content):
+    (tmp_path / STATE_NAME).write_bytes(content)
+    with pytest.raises(InputError, match="damaged"):
+        kept_state(tmp_path, "identity", 5)
+
+
+def test_a_wear_state_of_other_arrays_is_damaged(tmp_path):
+    arrays = {name: np.zeros(4) for name in ("wear", "creep", "fall")}
+    np.savez(tmp_path / "a.npz", identity="identity", rows="[]", **arrays)
+    (tmp_path / "a.npz").rename(tmp_path / STATE_NAME)
+    with pytest.raises(InputError, match="5 vertices"):
+        kept_state(tmp_path, "identity", 5)
+
+
+WRITER = """
+import resource, sys
+import numpy as np
+from tkamb.run.maps import MapWriter
+from tkamb.errors import InputError
+limit = int(sys.argv[1])
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+chance = np.random.default_rng(1)
+try:
+    with MapWriter(sys.argv[2], chance.random((500, 3)), np.zeros((1, 3), int), {}) as writer:
+        for k in range(40):
+            pressure, gap = chance.random((2, 500))
+            writer.append(k, pressure, gap, chance.random((500, 3)), np.eye(4))
+            writer.flush()
+except InputError as error:
+    print(error)
+    sys.exit(3)
+"""
+
+
+@pytest.mark.parametrize("limit", [100, 5_000, 100_000, 500_000])
+def test_a_full_disk_ends_in_one_line_not_in_a_signal(tmp_path, limit):
+    line = [sys.executable, "-c", WRITER, str(limit), str(tmp_path / "contact.h5")]
+    ran = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert ran.returncode == 3, ran.stderr
+    assert "cannot be written (File too large)" in ran.stdout and not ran.stderr
+
+
+def test_what_is_kept_after_a_failed_write_stays_ours(tmp_path):
+    out = tmp_path / "out"
+
+    def fails():
+        with claimed_directory(out) as folder:
+            (folder / STATE_NAME).touch()
+            raise InputError("cannot be written")
+
+    with pytest.raises(InputError):
+        fails()
+    assert is_ours(out)
+    with claimed_directory(out):
+        pass
+
+
+def test_an_interrupt_without_a_reason_has_one(capfd):
+    import argparse
+
+    def command():
+        raise KeyboardInterrupt
+
+    assert guarded(command, argparse.Namespace()) == 130
+    assert capfd.readouterr().err == "tkamb: interrupted: nothing is kept\n"
+
+
+def test_no_room_is_one_line(capfd):
+    import argparse
+    import errno
+
+    def command():
+        raise OSError(errno.ENOSPC, "No space left on device", "results.csv")
+
+    assert guarded(command, argparse.Namespace()) == 1
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1 and "results.csv: cannot be written" in said
+
+
+def test_a_worker_whose_parent_has_gone_says_nothing():
+    line = [sys.executable, "-m", "tkamb.run.workers"]
+    ran = subprocess.run(line, input=b"", capture_output=True, check=False)
+    assert (ran.returncode, ran.stderr) == (0, b"")
+
+
+def test_an_unknown_drawing_backend_is_not_asked(tmp_path):
+    line = [sys.executable, "-m", "tkamb", "check", "--out", str(tmp_path / "a.png")]
+    from scenes import MODEL
+
+    environment = os.environ | {"MPLBACKEND": "no-such-backend"}
+    line.append(str(MODEL / "scene.toml"))
+    ran = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
