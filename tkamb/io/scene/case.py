@@ -94,7 +94,9 @@ class Case:
         if self.scene.output.cycle_s is not None:
             return self.scene.output.cycle_s
         gait = None if self.ground is None else self.ground.gait
-        return gait and gait.cycle(float(self.motion.time[0]), float(self.motion.time[-1]))
+        if gait is None:
+            return None
+        return gait.cycle(float(self.motion.time[0]), float(self.motion.time[-1]))
 
     @property
     def bone(self) -> "Surface | None":
