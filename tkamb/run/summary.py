@@ -110,7 +110,11 @@ def _gait(case: Case) -> dict[str, Any]:
     if cycle is not None:
         found["cycle_percent_s"] = list(cycle)
     gait = None if case.ground is None else case.ground.gait
-    if gait is None or not gait.foot_strikes + gait.toe_offs or case.motion.cycle_percent is not None:
+    if (
+        gait is None
+        or not gait.foot_strikes + gait.toe_offs
+        or case.motion.cycle_percent is not None
+    ):
         return found
     offs = [] if cycle is None else [off for off in gait.toe_offs if cycle[0] < off < cycle[1]]
     found["gait"] = {
