@@ -114,3 +114,16 @@ def test_the_page_holds_questions_picture_and_files(checked):
     text = check_html(checked, figure)
     assert "ground_reaction.csv" in text and "<svg" in text
     assert "http://" not in text.replace("http://www.w3.org", "")
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_picture_says_which_side_is_medial_and_names_the_ligaments(side, tmp_path):
+    """The MCL stands on the page where "medial" is written, of a right and of a left knee."""
+    scene = MODEL / "scene.toml" if side == "right" else mirrored_scene(tmp_path)
+    figure = draw_leg(check_scene(scene).mechanics)
+    knee = figure.axes[-1]
+    words = {text.get_gid(): text for text in knee.texts}
+    medial = words["side-left"].get_text() == "medial"
+    assert medial == (side == "left")
+    mcl, lcl = (words[f"ligament-{name}"].get_position()[0] for name in ("MCL", "LCL"))
+    assert (mcl < lcl) == medial

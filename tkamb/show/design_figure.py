@@ -19,7 +19,8 @@ WEAR = "volume_mm3_per_Mc"
 """Name of the worn volume in a group's wear; its ends by the wear factor add _low and _high."""
 BANDS = (
     "Dot: mean over the runs. Thick bar: smallest to largest run. Thin bar: pressure, those ends "
-    "with the known error of the contact model; wear, those ends by the range of the wear factor."
+    "with the known error of the contact model; wear, those ends by the range of the wear factor, "
+    "which scales all designs alike."
 )
 
 
