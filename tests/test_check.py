@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from mirrored_patient import write_mirrored_patient
+from scenes import MODEL
 from tkamb.cli import main
 from tkamb.commands.check import check_html
 from tkamb.io.starter import lay_out
 from tkamb.show.check.inventory import _listed
-from tkamb.show.check.leg_picture import leg_frame, shown_frames
+from tkamb.show.check.leg_picture import draw_leg, leg_frame, shown_frames
 from tkamb.show.check.scene_check import check_scene
 
 
@@ -119,7 +121,7 @@ def test_the_page_holds_questions_picture_and_files(checked):
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_the_picture_says_which_side_is_medial_and_names_the_ligaments(side, tmp_path):
     """The MCL stands on the page where "medial" is written, of a right and of a left knee."""
-    scene = MODEL / "scene.toml" if side == "right" else mirrored_scene(tmp_path)
+    scene = MODEL / "scene.toml" if side == "right" else write_mirrored_patient(tmp_path)
     figure = draw_leg(check_scene(scene).mechanics)
     knee = figure.axes[-1]
     words = {text.get_gid(): text for text in knee.texts}
