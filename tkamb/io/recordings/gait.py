@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Mask
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def cycle_percent(time: Array, cycle: tuple[float, float]) -> Array:
     return np.where((percent >= 0.0) & (percent <= 100.0), percent, np.nan)
 
 
-def _runs(chosen: Array) -> list[tuple[int, int]]:
+def _runs(chosen: Mask) -> list[tuple[int, int]]:
     """Return first and last index of each uninterrupted run of a mask (k,)."""
     steps = np.diff(np.concatenate([[0], chosen.astype(np.int8), [0]]))
     firsts, after = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)
