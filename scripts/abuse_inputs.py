@@ -11,6 +11,8 @@ import shutil
 import tomllib
 from pathlib import Path
 
+from forged_folders import forge
+
 MODEL = Path(__file__).resolve().parents[1] / "models" / "deep_knee_bend"
 MESHES = ("femoral_component.stl", "insert.stl")
 TABLES = ("motion.csv", "tibia.csv", "ground_reaction.csv")
@@ -213,8 +215,67 @@ def folders(folder: Path, chance: random.Random) -> list[str]:
     )
 
 
+def forged(folder: Path, chance: random.Random) -> list[str]:
+    """A folder of results from somebody else, of right hashes and wrong content."""
+    results = Path(os.environ["TKAMB_ABUSE_RESULTS"])
+    out = str(forge(folder, results, chance))
+    made = str(folder / "made")
+    return chance.choice(
+        [
+            ["verify", out],
+            ["report", out],
+            ["methods", out],
+            ["export", out, "--vtp", "--out", made],
+            ["export", out, "--sto", str(folder / "made.sto")],
+            ["export", out, "--deck", "ccx", "--frame", "0", "--out", str(folder / "made.inp")],
+            ["compare", str(results), out, "--out", made],
+            ["view", out, "--html", str(folder / "v.html")],
+            ["wear", out, "--cycles", "1", "--updates", "1", "--out", made],
+        ]
+    )
+
+
+def toml(folder: Path, chance: random.Random) -> list[str]:
+    """A scene, material, springs or --set text that is small to write and large to read."""
+    count = chance.choice([100, 5_000, 200_000, 2_000_000])
+    key = chance.choice(["a", "contact.options.x", "motion", "material.table"])
+    text = chance.choice(
+        [
+            f"{key}." + ".".join("a" * count) + " = 1",
+            f"[{'.'.join('a' * count)}]",
+            f"{key} = " + "1" * count,
+            f"{key} = -0x" + "f" * count,
+            f"{key} = " + "[" * count + "]" * count,
+            f"{key} = " + "{a=" * count + "1" + "}" * count,
+            f"{key} = 1e" + "9" * count,
+            f'{key} = "' + "x" * count + '"',
+            "\n".join(f"k{k} = 1" for k in range(min(count, 200_000))),
+            "\n".join(f"[[a]]\n[a.b{k}]" for k in range(min(count, 100_000))),
+            f"{key} = [" + "1," * count + "]",
+            "#" * count,
+        ]
+    )
+    path = folder / "given.toml"
+    path.write_text(text, encoding="utf-8")
+    scene, out = str(MODEL / "scene.toml"), str(folder / "out")
+    return chance.choice(
+        [
+            ["run", str(path), "--out", out],
+            ["check", str(path)],
+            ["run", scene, "--out", out, *RUN, "--set", text.replace(" = ", "=", 1)[:100_000]],
+            ["run", scene, "--out", out, *RUN, "--material", str(path)],
+            ["wear", scene, "--material", str(path), "--out", out],
+            ["wear", scene, "--simulator", str(MODEL / "motion.csv"), "--springs", str(path),
+             "--out", out],
+            ["cohort", str(path), "--out", out],
+            ["press", *(str(MODEL / m) for m in MESHES), "--load", "1", "--material", str(path)],
+        ]
+    )  # fmt: skip
+
+
 KINDS = {
-    kind.__name__: kind for kind in (arguments, odd_files, scenes, tables, urdfs, meshes, folders)
+    kind.__name__: kind
+    for kind in (arguments, odd_files, scenes, tables, urdfs, meshes, folders, forged, toml)
 }
 
 

@@ -1,4 +1,4 @@
-"""The tables of docs/known_errors.md, from the rows of docs/known_error_cases.json alone."""
+"""The tables of docs/known_errors.md, from scripts/data/known_error_cases.json alone."""
 
 from collections.abc import Sequence
 

@@ -15,9 +15,10 @@ COPIED = {
 }  # fmt: skip
 """Page -> the file that it is made from."""
 API = (
-    "simulation.simulate", "scene.scene.load_scene", "scene.scene.Scene", "results.Results",
-    "results_folder.read_results", "output.maps.ContactMaps", "press.press_meshes",
-    "press.PressReport", "check.scene_check", "compare.comparison",
+    "run.simulation.simulate", "io.scene.scene.load_scene", "io.scene.scene.Scene",
+    "run.results.Results", "run.results_folder.read_results", "run.maps.ContactMaps",
+    "knee.knee.Knee", "run.read_scene.read_scene", "run.press.press_meshes",
+    "run.press.PressReport", "show.check.scene_check", "show.compare.comparison",
     "contact.registry.contact_model", "contact.model", "contact.result.ContactResult",
     "contact.pair", "testing", "errors",
 )  # fmt: skip

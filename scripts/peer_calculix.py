@@ -6,8 +6,8 @@
 
 The first line presses every case with every model, each in a process of its own, and writes
 peer_calculix.json, .md and .png; finished rows are kept, and --resume goes on from them. With
---page the JSON is kept in docs/ as well and docs/peer_calculix.md and its picture are made from
-it; alone, --page makes them from docs/peer_calculix.json as it is.
+--page the JSON is kept in scripts/data/ as well, and docs/development/peer_calculix.md and its
+picture are made from it; alone, --page makes them from scripts/data/peer_calculix.json as it is.
 """
 
 import argparse
@@ -50,7 +50,7 @@ LIMITS = {
     ("lattice", "nonlinear"): {"approach": 5.0},
 }
 """Per cent off `PEER`: what was asked for."""
-DOCS = ROOT / "docs"
+DOCS, DATA = ROOT / "docs", ROOT / "scripts" / "data"
 
 
 def study_case(job):
@@ -254,7 +254,7 @@ def main():
     if options.one:
         print(json.dumps(measure(json.loads(options.one))))
         return
-    kept = DOCS / "peer_calculix.json"
+    kept = DATA / "peer_calculix.json"
     rows = measured_rows(options) if options.out else json.loads(kept.read_text(encoding="utf-8"))
     text = json.dumps(rows, indent=1) + "\n"
     if options.out:
@@ -262,7 +262,7 @@ def main():
         write_text(options.out / "peer_calculix.md", "\n".join(block(rows)) + "\n")
         picture(rows).savefig(options.out / "peer_calculix.png", dpi=110)
     if options.page:
-        page = DOCS / "peer_calculix.md"
+        page = DOCS / "development" / "peer_calculix.md"
         write_text(kept, text)
         write_text(page, with_block(page.read_text(encoding="utf-8"), block(rows), "peer"))
         picture(rows).savefig(DOCS / "pictures" / "peer_calculix.png", dpi=110)

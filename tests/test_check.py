@@ -1,6 +1,7 @@
 """`tkamb check`: what a scene gives and what it asks, without a run."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from scenes import MODEL
 from tkamb.cli import main
 from tkamb.commands.check import check_html
 from tkamb.io.starter import lay_out
+from tkamb.run.muscles import static_optimisation
 from tkamb.show.check.inventory import _listed
 from tkamb.show.check.leg_picture import draw_leg, leg_frame, shown_frames
-from tkamb.show.check.scene_check import check_scene
+from tkamb.show.check.scene_check import _missing, check_scene
 
 
 @pytest.fixture(scope="module")
@@ -129,3 +131,15 @@ def test_the_picture_says_which_side_is_medial_and_names_the_ligaments(side, tmp
     assert medial == (side == "left")
     mcl, lcl = (words[f"ligament-{name}"].get_position()[0] for name in ("MCL", "LCL"))
     assert (mcl < lcl) == medial
+
+
+def test_a_solver_that_is_not_installed_is_named_before_a_run(checked, monkeypatch):
+    """The muscles' solver is an extra: the check says so first, and still shows the leg."""
+    monkeypatch.setattr(static_optimisation, "find_spec", lambda name: None)
+    plain = checked.mechanics.case
+    assert _missing(plain) == ()
+    scene = plain.scene.model_copy(update={"muscles": object()})
+    (words,) = _missing(replace(plain, scene=scene))
+    assert "DAQP" in words and "pip install 'tkamb[muscles]'" in words
+    lines = replace(checked, missing=(words,)).lines()
+    assert lines[0] == f"missing: {words}" and "when that is installed" in lines[1]

@@ -2,10 +2,14 @@
 
 import re
 import shlex
+import subprocess
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
+import tkamb
 from tkamb.cli import _parser
 
 ROOT = Path(__file__).parents[1]
@@ -38,7 +42,8 @@ def test_every_command_line_of_the_page_is_understood(page):
 
 
 def test_every_link_between_the_pages_leads_somewhere():
-    for page in [*DOCS.glob("*.md"), ROOT / "README.md"]:
+    pages = [*DOCS.rglob("*.md"), *ROOT.glob("*.md"), *(ROOT / "models").glob("*/README.md")]
+    for page in pages:
         for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
             if not target.startswith("http"):
                 assert (page.parent / target).exists(), f"{page.name}: {target}"
@@ -56,6 +61,47 @@ def test_the_paper_s_numbers_stand_in_the_pages_that_they_link():
 def test_every_page_is_on_the_site_and_in_the_list():
     site = (ROOT / "scripts" / "mkdocs.yml").read_text(encoding="utf-8")
     listed = (DOCS / "pages.md").read_text(encoding="utf-8")
-    for page in DOCS.glob("*.md"):
-        assert f"- {page.name}\n" in site, f"add {page.name} to nav of scripts/mkdocs.yml"
-        assert page.name == "pages.md" or f"({page.name})" in listed, f"add {page.name} to pages.md"
+    for page in DOCS.rglob("*.md"):
+        name = page.relative_to(DOCS).as_posix()
+        assert f"- {name}\n" in site, f"add {name} to nav of scripts/mkdocs.yml"
+        assert name == "pages.md" or f"({name})" in listed, f"add {name} to pages.md"
+
+
+def test_the_readme_s_python_runs_after_its_first_command():
+    """The demo installs no extra: the example must do without pandas and its like."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0]
+    extras = ("pandas", "pyvista", "daqp", "pooch", "pyarrow", "distributed", "playwright")
+    code = f"import sys\nsys.modules.update(dict.fromkeys({extras}))\n{example}"
+    ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.strip().endswith(")")
+
+
+def test_the_readme_is_two_screens_and_the_changelog_one():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 130
+    assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()) <= 80
+
+
+def test_one_version_everywhere():
+    cited = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"version: {tkamb.__version__}\n" in cited
+    released = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(r"^## (\S+) - \d{4}-\d\d-\d\d$", released, re.M).group(1) == tkamb.__version__
+
+
+def test_all_brings_every_extra_that_a_user_may_want():
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        extras = tomllib.load(file)["project"]["optional-dependencies"]
+    (everything,) = extras["all"]
+    named = set(re.search(r"\[(.+)\]", everything).group(1).split(","))
+    assert named == set(extras) - {"all", "docs", "test"}
+
+
+def test_every_module_that_the_architecture_names_exists():
+    for page in (DOCS / "architecture.md", ROOT / "CONTRIBUTING.md"):
+        text = page.read_text(encoding="utf-8")
+        named = set(re.findall(r"`([a-z_]+(?:/[a-z_0-9]+)*(?:\.py|/))`", text))
+        places = (ROOT / "tkamb", ROOT, ROOT / "tkamb" / "run" / "muscles")
+        missing = [n for n in named if not any((place / n).exists() for place in places)]
+        assert not missing, f"{page.name}: {missing}"

@@ -7,9 +7,9 @@ import pytest
 
 from scenes import MODEL, write_scene
 from tkamb.cli import main
-from tkamb.contact.given_material import given_material, material_as_json, named_material
 from tkamb.contact.materials import LinearElastic, material
 from tkamb.errors import InputError
+from tkamb.io.given_material import given_material, material_as_json, named_material
 from tkamb.io.scene import load_scene
 from tkamb.run.press import press_meshes
 from tkamb.run.simulation import simulate

@@ -127,6 +127,21 @@ def shifted(bundle, shift):
     return replace(bundle, proximal=ends[0], distal=ends[1])
 
 
+def test_a_linear_step_is_the_whole_one_to_second_order(plain):
+    read = plain[0]
+    parts = {"implant": read.implant, "contact": read.contact.model, "friction": 0.05}
+    knee = tkamb.Knee(read.model, ligaments=read.ligaments, **parts)
+    q, v, _, external = at(plain, 60)
+    q, apart = pressed(read, q, 1000.0), []
+    for step in (2e-4, 1e-4):
+        ends = [
+            implicit_step(knee, q, v, step, external=external, theta=1.0, linear=linear)[1]
+            for linear in (False, True)
+        ]
+        apart.append(float(np.abs(ends[0] - ends[1]).max()))
+    assert apart[1] < 0.4 * apart[0]
+
+
 def test_friction_only_dissipates(plain):
     read = plain[0]
     bare = tkamb.Knee(read.model, implant=read.implant, contact=read.contact.model)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from lattice_bodies import condyles, dished_insert, pair
-from tkamb.contact.lattice import nonlinear_balance
 from tkamb.contact.lattice.initial_guess import WarmStart, initial_guess
 from tkamb.contact.lattice.linear import compliance, response
 from tkamb.contact.lattice.linear.compliance import ComplianceCache, by_component
@@ -15,8 +14,9 @@ from tkamb.contact.lattice.linear.response import unknowns_of
 from tkamb.contact.lattice.model import warm_start_of
 from tkamb.contact.lattice.nonlinear_balance import elements_that_count
 from tkamb.contact.lattice.problem import Region, undeformed
-from tkamb.contact.lattice.solids.solid import SMALL_STRAIN, Noticed
-from tkamb.contact.lattice.solver import Tolerance, solve
+from tkamb.contact.lattice.settings import LatticeSolverSettings
+from tkamb.contact.lattice.solids.solid import SMALL_STRAIN
+from tkamb.contact.lattice.solver import solve
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult
@@ -61,83 +61,53 @@ def solved(state, x, tolerance, before=None):
         own = moved[start.candidates]
         start = replace(
             start,
-            nonlinear_residual=before.nonlinear_residual,
-            half=before.half,
-            left=before.left,
+            loads=before.loads,
             moved=own,
             region=before.region,
         )
-    return solve(state.problem, pose, LOAD, start, Tolerance(tolerance))
+    return solve(state.problem, pose, LOAD, start, settings(tolerance))
+
+
+def settings(tolerance):
+    """Return settings whose residual force and gap may be as large as a tolerance."""
+    usual = LatticeSolverSettings()
+    return replace(
+        usual,
+        force_tolerance=tolerance,
+        work_tolerance=tolerance * usual.work_tolerance / usual.force_tolerance,
+        gap_tolerance=tolerance / 4,
+    )
 
 
 def imbalance(state, solution):
     """Return what is out of balance anywhere in the solid, relative to the contact forces."""
     problem, touched = state.problem, state.problem.contact_nodes[solution.candidates]
     pushed = solution.forces.force[:, None] * solution.planes.normals
-    applied = solution.nonlinear_residual.copy()
-    applied[touched] += pushed
-    outside = -problem.solid.internal_force(problem.operator.solve(applied))
+    outside = -problem.solid.internal_force(solution.field)
     outside[touched] += pushed
     return np.linalg.norm(outside.ravel()[~problem.held]) / np.linalg.norm(pushed)
 
 
-@pytest.mark.parametrize("tolerance", [1e-3, 1e-4])
+@pytest.mark.parametrize("tolerance", [2e-3, 1e-4])
 def test_the_whole_solid_is_in_balance_from_rest_and_from_a_neighbour(state, tight, tolerance):
-    state = state if tolerance == 1e-3 else tight
+    state = state if tolerance == 2e-3 else tight
     cold = solved(state, 0.0, tolerance)
     warm = solved(state, 0.4e-3, tolerance, cold)
     again = solved(state, 0.4e-3, tolerance)
     for solution in (cold, warm, again):
         assert solution.converged
-        assert imbalance(state, solution) <= 1.05 * tolerance
+        assert imbalance(state, solution) <= tolerance
     assert warm.passes <= again.passes
-    assert warm.forces.approach == pytest.approx(again.forces.approach, rel=5 * tolerance)
+    assert warm.forces.approach == pytest.approx(again.forces.approach, rel=tolerance)
 
 
-def test_what_the_last_contact_leaves_is_foreseen(tight, monkeypatch):
-    """Never more than said; were next to nothing foreseen, more than the tolerance."""
-
-    def along_a_way(share):
-        monkeypatch.setattr(nonlinear_balance, "LEFT", share * left)
-        solutions = [solved(tight, 0.0, 1e-4)]
-        for x in 0.15e-3 * np.arange(1, 9) ** 1.5:
-            solutions.append(solved(tight, x, 1e-4, solutions[-1]))
-        return [(imbalance(tight, one), one.residual) for one in solutions[1:]]
-
-    left = nonlinear_balance.LEFT
-    for found, said in along_a_way(1.0):
-        assert found <= 1.05 * said <= 1.05e-4
-    assert max(along_a_way(0.01))[0] > 5e-4
-
-
-def test_what_softened_elements_will_ask_for_saves_passes(tight, monkeypatch):
-    """And without it, or with much more, the same is found."""
-
-    def along_a_way(times):
-        monkeypatch.setattr(nonlinear_balance, "FURTHER", times * further)
-        solutions = [solved(tight, 0.0, 1e-4)]
-        for x in 0.1e-3 * np.arange(1, 9):
-            solutions.append(solved(tight, x, 1e-4, solutions[-1]))
-        return solutions
-
-    further = nonlinear_balance.FURTHER
-    now, without, too_much = (along_a_way(times) for times in (1.0, 0.0, 4.0))
-    passes = [sum(one.passes for one in found) for found in (now, without, too_much)]
-    assert passes[0] < min(passes[1:])
-    for one, same, again in zip(now, without, too_much, strict=True):
-        found = [x.forces.approach for x in (same, again)]
-        assert found == pytest.approx(2 * [one.forces.approach], rel=1e-4)
-
-
-def test_few_elements_count_and_the_rest_of_the_forces_is_zero(state):
-    found = solved(state, 0.0, 1e-3)
-    region, whole = found.region, state.problem.everywhere
+def test_few_elements_count_and_the_loads_of_the_others_are_left_out(state):
+    cold = solved(state, 0.0, 2e-3)
+    region, whole = cold.region, state.problem.everywhere
     assert whole.whole and not region.whole
     assert len(region.elements) < 0.7 * len(whole.elements)
     assert len(region.fronts.fronts) <= len(whole.fronts.fronts)
-    outside = np.setdiff1d(np.arange(len(found.nonlinear_residual)), region.nodes)
-    assert not found.nonlinear_residual[outside].any()
-    lost = np.linalg.norm(state.problem.solid.nonlinear_residual(found.field), axis=1)
+    lost = np.linalg.norm(state.problem.solid.nonlinear_residual(cold.field), axis=1)
     others = np.setdiff1d(whole.elements, region.elements)
     assert lost[others].max() <= lost[region.elements].min()
 
@@ -196,20 +166,16 @@ def test_the_calibrated_cells_pass_most_of_the_solid_over(pressed):
 
 
 @pytest.mark.parametrize("model", ["lattice"], indirect=True)
-def test_a_region_may_become_the_whole_solid(state, monkeypatch):
-    """Passes that looked at few elements go on with all: none is counted twice, none left out."""
-    cold = solved(state, 0.0, 1e-3)
+def test_a_region_that_is_too_small_is_found_out_and_chosen_anew(state):
+    """Passes that looked at few elements go on with more: none is counted twice or left out."""
+    cold = solved(state, 0.0, 2e-3)
     sizes = np.linalg.norm(state.problem.solid.nonlinear_residual(cold.field), axis=1)
     few = Region.of(state.problem, np.sort(np.argsort(sizes)[-40:]))
-    everything = Noticed(np.arange(len(sizes)), np.zeros(len(sizes)))
-    monkeypatch.setattr(nonlinear_balance, "SHARE", 0.0)
-    monkeypatch.setattr(type(state.problem.solid), "noticeable", lambda *given: everything)
-    found = solved(state, 0.4e-3, 1e-3, replace(cold, region=few))
-    assert found.region.whole and found.converged and found.passes > 1
-    assert imbalance(state, found) <= 1.05e-3
-    assert found.forces.approach == pytest.approx(
-        solved(state, 0.4e-3, 1e-3).forces.approach, rel=5e-3
-    )
+    found = solved(state, 0.4e-3, 2e-3, replace(cold, region=few))
+    assert len(found.region.elements) > 40 and found.converged and found.passes > 1
+    assert imbalance(state, found) <= 2e-3
+    alone = solved(state, 0.4e-3, 2e-3).forces.approach
+    assert found.forces.approach == pytest.approx(alone, rel=5e-4)
 
 
 def test_the_approach_is_that_of_the_pose(state):

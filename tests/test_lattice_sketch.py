@@ -28,7 +28,7 @@ def imbalance(state, result):
     problem, warm = state.problem, result.warm_start
     applied = np.zeros_like(problem.solid.nodes)
     applied[problem.contact_nodes] = result.nodal_force
-    field = problem.operator.solve(applied + warm.nonlinear_residual)
+    field = problem.operator.solve(applied + warm.loads)
     outside = applied - problem.solid.internal_force(field)
     missing = np.linalg.norm(outside.ravel()[~problem.held])
     return missing / np.linalg.norm(applied)
@@ -57,7 +57,7 @@ def test_beyond_the_bound_all_is_looked_at(state, monkeypatch):
     sound = MODEL.press(state, LOAD, far, first, sketch=True)
     assert np.array_equal(sound.warm_start.looked[1], sound.warm_start.pose)
     assert imbalance(state, sound) < 1.2 * MODEL.tolerance
-    monkeypatch.setattr(initial_guess, "UNSEEN_WAY", np.inf)
+    monkeypatch.setattr(initial_guess, "FORCES_ONLY_DISTANCE", np.inf)
     blind = MODEL.press(state, LOAD, far, first, sketch=True)
     assert blind.warm_start.looked[1] is first.warm_start.looked[1]
     assert imbalance(state, blind) > 2 * MODEL.tolerance

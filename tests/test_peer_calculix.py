@@ -159,8 +159,10 @@ def test_small_strain_is_near_calculix_s_finite_strain(varus):
 def test_the_page_is_what_the_script_makes_of_its_json(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "scripts"))
     made = runpy.run_path(str(ROOT / "scripts" / "peer_calculix.py"))
-    rows = json.loads((ROOT / "docs" / "peer_calculix.json").read_text(encoding="utf-8"))
-    text = (ROOT / "docs" / "peer_calculix.md").read_text(encoding="utf-8")
+    rows = json.loads(
+        (ROOT / "scripts" / "data" / "peer_calculix.json").read_text(encoding="utf-8")
+    )
+    text = (ROOT / "docs" / "development" / "peer_calculix.md").read_text(encoding="utf-8")
     assert made["with_block"](text, made["block"](rows), "peer") == text, (
         "run scripts/peer_calculix.py --page"
     )

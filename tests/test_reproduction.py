@@ -13,8 +13,10 @@ from tkamb.studies.validation.reproduction_page import facts, names_in, page
 
 ROOT = Path(__file__).parents[1]
 MODEL = ROOT / "models" / "deep_knee_bend"
-STORED = json.loads((ROOT / "docs" / "dissertation.json").read_text(encoding="utf-8"))
-VALIDATED = json.loads((ROOT / "docs" / "validation.json").read_text(encoding="utf-8"))["values"]
+STORED = json.loads((ROOT / "scripts" / "data" / "dissertation.json").read_text(encoding="utf-8"))
+VALIDATED = json.loads((ROOT / "scripts" / "data" / "validation.json").read_text(encoding="utf-8"))[
+    "values"
+]
 
 
 def test_the_page_is_what_its_numbers_make():

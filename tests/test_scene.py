@@ -7,14 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tkamb.scene import load_scene
 
 from scenes import MODEL, write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, MIRROR, transform
 from tkamb.io.recordings.meshes import load_surface
-from tkamb.io.scene import lines
+from tkamb.io.scene import lines, load_scene
 from tkamb.io.scene.case import load_case
 
 ROOT = Path(__file__).parents[1]

@@ -35,6 +35,7 @@ from tradeoff_blocks import (
 )
 
 ROOT = Path(__file__).parents[1]
+MEASURED = ROOT / "scripts" / "data"
 JSON_KEYS = {
     *("case", "contact", "resolution_mm", "on_front", "status", "reference_known", "values"),
     *TIMES,
@@ -128,22 +129,23 @@ def test_a_block_goes_between_its_markers_and_nowhere_else():
 
 
 def test_the_pages_tables_are_the_study_s():
-    rows = read_rows(ROOT / "docs" / "tradeoff.json")
+    rows = read_rows(MEASURED / "tradeoff.json")
+    body = read_body_rows(MEASURED / "body.json")
     for page, lines, name in (
         ("README.md", short_block(rows), "short"),
         ("docs/studies.md", block(rows), "tradeoff"),
-        ("docs/studies.md", body_block(read_body_rows(ROOT / "docs" / "body.json")), "body"),
+        ("docs/studies.md", body_block(body), "body"),
     ):
         text = (ROOT / page).read_text(encoding="utf-8")
         assert with_block(text, lines, name) == text, f"{page}: run scripts/make_tradeoff_table"
 
 
 def error_cases_rows():
-    return read_error_rows(ROOT / "docs" / "known_error_cases.json")
+    return read_error_rows(MEASURED / "known_error_cases.json")
 
 
 def test_what_runs_say_of_their_error_is_made_from_both_studies():
-    rows, cases = read_rows(ROOT / "docs" / "tradeoff.json"), error_cases_rows()
+    rows, cases = read_rows(MEASURED / "tradeoff.json"), error_cases_rows()
     assert STORED.read_text(encoding="utf-8") == known_errors_json(rows, cases)
     page = (ROOT / "docs" / "known_errors.md").read_text(encoding="utf-8")
     assert with_block(page, tables(cases), "known-errors") == page, (
@@ -169,7 +171,7 @@ def test_the_pairs_behind_the_errors_are_many_and_half_of_them_held_out():
 def test_the_held_out_half_has_no_part_in_the_statement():
     rows = error_cases_rows()
     wild = [replace(r, errors=dict.fromkeys(r.errors, 9.0)) if r.held_out else r for r in rows]
-    study = read_rows(ROOT / "docs" / "tradeoff.json")
+    study = read_rows(MEASURED / "tradeoff.json")
     stated, judged = (json.loads(known_errors_json(study, some)) for some in (rows, wild))
     for one, other in zip(stated, judged, strict=True):
         assert {k: v for k, v in one.items() if k != "covered"} == {

@@ -19,7 +19,7 @@ from tkamb.studies.validation.film import PressureFilm, hertz_field, worst_error
 from tkamb.studies.validation.page import badge, hit, page, published
 
 ROOT = Path(__file__).parents[1]
-STORED = json.loads((ROOT / "docs" / "validation.json").read_text(encoding="utf-8"))
+STORED = json.loads((ROOT / "scripts" / "data" / "validation.json").read_text(encoding="utf-8"))
 VALUES = {row["id"]: row for row in published()["value"]}
 
 
@@ -52,7 +52,7 @@ def test_badge_counts_hits():
 
 def test_cheap_values_are_computed_anew():
     anew = {**benchmarks.film(), **benchmarks.patch(), **benchmarks.refinement()}
-    anew |= benchmarks.speed(ROOT / "docs" / "tradeoff.json")
+    anew |= benchmarks.speed(ROOT / "scripts" / "data" / "tradeoff.json")
     for name, value in anew.items():
         assert value == pytest.approx(STORED["values"][name], rel=1e-3), name
 

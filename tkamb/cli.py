@@ -42,6 +42,7 @@ libraries made: 3 % of a run."""
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `tkamb` and return its exit status: 0 done, 1 nothing computed, 2 bad input."""
     _keep_to_one_thread()
+    os.environ["MPLBACKEND"] = "agg"  # commands draw into files; an unknown one would end them
     gc.set_threshold(*COLLECTED_AT)
     options = argparse.Namespace()
 

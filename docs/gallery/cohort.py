@@ -15,7 +15,7 @@ import pyarrow.parquet as parquet
 import tkamb
 from tkamb.studies.cohort.run import run_cohort
 
-SCENE = Path(tkamb.__file__).parent / "starter" / "files" / "scene.toml"
+SCENE = Path(tkamb.__file__).parent / "io" / "starter" / "files" / "scene.toml"
 SIZES = {"small": 0.9, "middle": 1.0, "large": 1.1}
 
 text = f"""

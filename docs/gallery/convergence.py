@@ -12,7 +12,7 @@ import numpy as np
 import tkamb
 from tkamb.run.press import press_meshes
 
-MESHES = Path(tkamb.__file__).parent / "starter" / "files"
+MESHES = Path(tkamb.__file__).parent / "io" / "starter" / "files"
 SPACINGS = np.array([4.0, 2.0, 1.0, 0.5])  # mm
 
 approach = np.array(

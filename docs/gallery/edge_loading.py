@@ -13,7 +13,7 @@ import numpy as np
 import tkamb
 from tkamb.run.press import press_meshes
 
-MESHES = Path(tkamb.__file__).parent / "starter" / "files"
+MESHES = Path(tkamb.__file__).parent / "io" / "starter" / "files"
 ADDUCTIONS = np.array([-0.3, -0.15, 0.0, 0.15, 0.3])  # deg
 
 

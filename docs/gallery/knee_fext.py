@@ -15,7 +15,7 @@ import trimesh
 
 import tkamb
 
-FILES = Path(tkamb.__file__).parent / "starter" / "files"
+FILES = Path(tkamb.__file__).parent / "io" / "starter" / "files"
 femoral, insert = (
     trimesh.load(FILES / f"{name}.stl").apply_scale(1e-3)
     for name in ("femoral_component", "insert")

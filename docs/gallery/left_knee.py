@@ -14,7 +14,7 @@ import trimesh
 import tkamb
 from tkamb.run.press import press_meshes
 
-MESHES = Path(tkamb.__file__).parent / "starter" / "files"
+MESHES = Path(tkamb.__file__).parent / "io" / "starter" / "files"
 NAMES = ("femoral_component.stl", "insert.stl")
 SETTINGS = {"contact": "foundation", "resolution_mm": 2.0}
 

@@ -13,7 +13,7 @@ import numpy as np
 import tkamb
 from tkamb.run.press import press_meshes
 
-MESHES = Path(tkamb.__file__).parent / "starter" / "files"
+MESHES = Path(tkamb.__file__).parent / "io" / "starter" / "files"
 ROTATIONS = np.array([-5.0, -2.5, 0.0, 2.5, 5.0])  # deg
 
 sides = {"medial": [], "lateral": []}

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import tkamb
 from tkamb.run.press import press_meshes
 
-MESHES = Path(tkamb.__file__).parent / "starter" / "files"
+MESHES = Path(tkamb.__file__).parent / "io" / "starter" / "files"
 
 approach = {
     bearing: press_meshes(

@@ -18,7 +18,7 @@ from tkamb.contact.result import ContactResult
 from tkamb.contact.samples import gaps_along_normals
 from tkamb.run.press import load_pair
 
-MESHES = Path(tkamb.__file__).parent / "starter" / "files"
+MESHES = Path(tkamb.__file__).parent / "io" / "starter" / "files"
 
 
 @dataclass(frozen=True)

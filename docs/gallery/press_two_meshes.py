@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import tkamb
 from tkamb.run.press import press_meshes
 
-MESHES = Path(tkamb.__file__).parent / "starter" / "files"  # what `tkamb new` lays out
+MESHES = Path(tkamb.__file__).parent / "io" / "starter" / "files"  # what `tkamb new` lays out
 
 report = press_meshes(
     MESHES / "femoral_component.stl",

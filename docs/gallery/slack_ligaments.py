@@ -13,7 +13,7 @@ import numpy as np
 import tkamb
 from tkamb.run.columns import is_ligament
 
-SCENE = Path(tkamb.__file__).parent / "starter" / "files" / "scene.toml"
+SCENE = Path(tkamb.__file__).parent / "io" / "starter" / "files" / "scene.toml"
 
 scene = tkamb.load_scene(SCENE, {"contact.model": "foundation", "contact.resolution_mm": 3.0})
 longer = tuple(

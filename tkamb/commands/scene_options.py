@@ -5,6 +5,9 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from tkamb.errors import InputError
+from tkamb.io.toml_text import check_key, check_limits
+
 
 def add_scene_options(command: Any) -> None:
     """Add scene, --contact, --resolution, --out, --frames and --set to a command."""
@@ -71,6 +74,11 @@ def _setting(text: str) -> tuple[str, Any]:
         raise argparse.ArgumentTypeError(f"'{text}' is not TABLE.KEY=VALUE")
     if "\n" in text.strip():
         raise argparse.ArgumentTypeError("is more than one line; give --set for each key")
+    try:
+        check_key(key, f"'{key[:40]}'")
+        check_limits(value, f"'{key.strip()}'")
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
     try:
         return key.strip(), tomllib.loads(f"value = {value.strip()}")["value"]
     except tomllib.TOMLDecodeError:

@@ -19,6 +19,10 @@ from tkamb.units import MILLIMETRE
 COARSEST_MM = 10.0
 """A condyle's contact is 5 to 20 mm across: a coarser map resolves nothing."""
 
+OPTION_RANGES = {"tolerance": (1e-9, 0.1), "patch_radius": (5e-4, 3e-2)}
+"""Option -> least and largest value that it may have. Below the least tolerance rounding decides;
+above the largest the pressures are no answer. Discs of 0.5 to 30 mm fit on a condyle."""
+
 BUILT_IN = {
     "hertz": "tkamb.contact.hertz:Hertz",
     "foundation": "tkamb.contact.foundation:ElasticFoundation",
@@ -115,9 +119,15 @@ def _words(model: type[ContactModel], option: str) -> tuple[Any, ...]:
 
 
 def _check_kind(model: type[ContactModel], option: str, value: Any, where: str) -> None:
-    """Raise an InputError for a value that is not of the option's type."""
+    """Raise an InputError for a value that is not of the option's type, or out of its range."""
     from pydantic import TypeAdapter, ValidationError
 
+    low, high = OPTION_RANGES.get(option, (-math.inf, math.inf))
+    is_number = isinstance(value, float | int) and not isinstance(value, bool)
+    if is_number and not (math.isfinite(value) and low <= value <= high):
+        known = option in OPTION_RANGES
+        mend = f"give {low:g} to {high:g}" if known else "give a finite number"
+        raise InputError(f"option '{option}' cannot be {value!r}", where, mend)
     kind = get_type_hints(model)[option]
     try:
         TypeAdapter(kind).validate_python(value, strict=True)

@@ -177,13 +177,13 @@ def _signed_areas(
         tail, head = flat[np.where(turned, end, start)], flat[np.where(turned, start, end)]
         edge, offset = head - tail, points - tail
         value = edge[:, 0] * offset[:, 1] - edge[:, 1] * offset[:, 0]
-        tail, head = (whole_flat[np.where(t, end, start)] for t in (turned, ~turned))
-        edge, offset = head - tail, whole_points - tail
-        exact = edge[:, 0] * offset[:, 1] - edge[:, 1] * offset[:, 0]
+        tails, heads = (whole_flat[np.where(t, end, start)] for t in (turned, ~turned))
+        edges, offsets = heads - tails, whole_points - tails
+        exact = edges[:, 0] * offsets[:, 1] - edges[:, 1] * offsets[:, 0]
         orientation = np.where(turned, -1, 1)
         area[corner] = value * orientation
         for quadrant, (u, v) in enumerate(((1, 1), (-1, 1), (1, -1), (-1, -1))):
-            moved = np.where(edge[:, 1] != 0, -edge[:, 1] * u, edge[:, 0] * v)
+            moved = np.where(edges[:, 1] != 0, -edges[:, 1] * u, edges[:, 0] * v)
             sides[corner, quadrant] = np.sign(np.where(exact == 0, moved, exact)) * orientation
     return area, sides
 

@@ -139,14 +139,14 @@ def _divided(vertices: Array, faces: Index, dividing: dict[tuple[int, int], Inde
             if edge in dividing:
                 by_face[int(face)].append(corner)
     added: list[tuple[int, int, int]] = []
-    for face, corners in by_face.items():
+    for number, corners in by_face.items():
         ring: list[int] = []
         for corner in range(3):
-            ring.append(int(faces[face, corner]))
+            ring.append(int(faces[number, corner]))
             if corner in corners:
-                edge = ring[-1], int(faces[face, (corner + 1) % 3])
+                edge = ring[-1], int(faces[number, (corner + 1) % 3])
                 ring.extend(int(vertex) for vertex in dividing[edge])
-        a, b, c = vertices[faces[face]]
+        a, b, c = vertices[faces[number]]
         cut = ears(vertices, np.array(ring), np.cross(b - a, c - a))
         added.extend((int(x), int(y), int(z)) for x, y, z in cut)
     kept = np.delete(faces, list(by_face), axis=0)

@@ -67,6 +67,7 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
             return
         _check_ours(path, force)
         fresh = not os.path.lexists(path / MARKER)
+        held_before = set(os.listdir(path))
         with _holding_lock(path):
             _held.add(key)
             try:
@@ -77,7 +78,8 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
                     check_occupants(path, command)
                 yield path
             except InputError:
-                if fresh:
+                # what is kept of an interrupted computation stays ours, so that it can go on
+                if fresh and set(os.listdir(path)) - {MARKER} <= held_before:
                     (path / MARKER).unlink(missing_ok=True)
                 raise
             finally:

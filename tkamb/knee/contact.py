@@ -17,7 +17,7 @@ from tkamb.contact.probe import CondyleWrench, ProbedContact
 from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, cross, pose
-from tkamb.knee.contact_points import CondylePoint
+from tkamb.knee.contact_points import STANDSTILL, CondylePoint
 from tkamb.knee.load import wrench_of
 
 
@@ -116,17 +116,21 @@ class KneeContact:
     def damping(self, contact: ProbedContact, twist: Array) -> Array:
         """Return the derivative (6, 6) of the wrench on the insert by the femur's twist.
 
-        Friction alone has one. Central differences; the contact does not change with the twist.
+        Friction alone has one. With the sliding velocity v of a condyle's point, t its part across
+        the normal and s = sqrt(t.t + v0²), the force mu N t/s changes with v by
+        mu N (P/s - t t^T/s³), P the projector across the normal.
         """
-        if not self.friction or not contact.loads:
-            return np.zeros((6, 6))
-        steps = 1e-6 * np.diag([1.0, 1.0, 1.0, *np.full(3, 1.0 / self._settings.arm)])
-        columns = [
-            (self.wrench(contact, twist + step) - self.wrench(contact, twist - step))
-            / (2.0 * step.sum())
-            for step in steps
-        ]
-        return np.array(columns).T
+        total = np.zeros((6, 6))
+        for load in contact.loads if self.friction else ():
+            normal, point = load.normal, load.point
+            moved = np.hstack([np.eye(3), -_cross_matrix(point)])
+            sliding = moved @ twist
+            tangential = sliding - (sliding @ normal) * normal
+            speed = float(np.sqrt(tangential @ tangential + STANDSTILL**2))
+            across = np.eye(3) - np.outer(normal, normal)
+            slope = across / speed - np.outer(tangential, tangential) / speed**3
+            total += self.friction * load.force * moved.T @ slope @ moved
+        return total
 
     def stiffness(
         self, probe: Any, place: Array, contact: ProbedContact, twist: Array, exact: bool
@@ -158,6 +162,22 @@ class KneeContact:
         return differences(
             lambda moved: self.wrench(self.at(precise, moved), twist), place, settings
         )
+
+
+def _cross_matrix(vector: Array) -> Array:
+    """Return the matrix (3, 3) of vector x."""
+    return np.cross(vector, -np.eye(3))
+
+
+def batch_differences(
+    wrenches: Callable[[Array], Array], place: Array, settings: DifferenceSettings
+) -> Array:
+    """Return what `differences` does, of a function that takes all poses (12, 4, 4) at once."""
+    sizes = settings.step * np.array([1.0, 1.0, 1.0, *np.full(3, 1.0 / settings.arm)])
+    steps = np.concatenate([np.diag(sizes), -np.diag(sizes)])
+    turns = Rotation.from_rotvec(steps[:, 3:]).as_matrix()
+    found = wrenches(pose(turns @ place[:3, :3], turns @ place[:3, 3] + steps[:, :3]))
+    return ((found[:6] - found[6:]) / (2.0 * sizes[:, None])).T
 
 
 def differences(

@@ -23,9 +23,11 @@ from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
 from tkamb.knee.knee import Knee, KneeData
 
-VELOCITY_TOLERANCE = 1e-10
+VELOCITY_TOLERANCE = 1e-8
 """m/s and rad/s: what Newton's method leaves of the step's equation."""
 MAX_NEWTON_STEPS = 40
+REUSE_BELOW = 0.2
+"""The slope of the step's equation is kept while each step of Newton's method leaves less of it."""
 
 
 def implicit_step(
@@ -39,6 +41,7 @@ def implicit_step(
     theta: float = 0.5,
     friction_of_joints: Array | None = None,
     data: KneeData | None = None,
+    linear: bool = False,
 ) -> tuple[Array, Array]:
     """Return q and v one step later.
 
@@ -53,6 +56,8 @@ def implicit_step(
         theta: 0.5: implicit midpoint; 1: implicit Euler.
         friction_of_joints: (nv,) viscous, N·s/m or N·m·s/rad, of the joints.
         data: from `Knee.create_data`, to save time.
+        linear: one step of Newton's method alone, the linearly implicit method of first order: a
+            third of the time, and no check that the step's equation is met.
 
     Raises:
         ComputationError: Newton's method does not converge, or the contact model is out of range:
@@ -62,7 +67,7 @@ def implicit_step(
     drag = np.zeros(model.nv) if friction_of_joints is None else friction_of_joints
     push = np.zeros(model.nv) if tau is None else tau
     cache, ahead, last = model.createData(), np.array(v, float), np.inf
-    change = np.zeros(model.nv)
+    change, slope = np.zeros(model.nv), None
     for _ in range(MAX_NEWTON_STEPS):
         middle = (1.0 - theta) * v + theta * ahead
         place = pin.integrate(model, q, theta * step * middle)
@@ -74,26 +79,44 @@ def implicit_step(
             change = change / 2.0
             ahead = ahead - change
             continue
+        own = forces
         if external is not None:
             forces = pin.StdVec_Force([f + e for f, e in zip(forces, external, strict=True)])
         torque = push - drag * middle
-        pin.computeABADerivatives(model, cache, place, middle, torque, forces)
-        missed = ahead - v - step * cache.ddq
+        missed = ahead - v - step * pin.aba(model, cache, place, middle, torque, forces)
         size = float(np.abs(missed).max())
         if size < VELOCITY_TOLERANCE or (size < 1e3 * VELOCITY_TOLERANCE and size >= last):
             return pin.integrate(model, q, step * middle), ahead
+        if slope is None or size > REUSE_BELOW * last:  # else the slope still serves
+            jacobian = knee.relative_jacobian(place)
+            stiffness = knee.stiffness(place, middle, data, exact=False)
+            stiffness = stiffness + _turning(knee, own, data)
+            damping = knee.damping(place, middle, data)
+            pin.computeABADerivatives(model, cache, place, middle, torque, forces)
+            by_q = cache.ddq_dq - cache.Minv @ jacobian.T @ stiffness @ jacobian
+            by_v = cache.ddq_dv - cache.Minv @ (jacobian.T @ damping @ jacobian + np.diag(drag))
+            slope = np.eye(model.nv) - step * theta * (by_v + theta * step * by_q)
         last = size
-        jacobian = knee.relative_jacobian(place)
-        stiffness = knee.stiffness(place, middle, data, exact=False)
-        damping = knee.damping(place, middle, data)
-        compliance = cache.Minv
-        by_q = cache.ddq_dq - compliance @ jacobian.T @ stiffness @ jacobian
-        by_v = cache.ddq_dv - compliance @ (jacobian.T @ damping @ jacobian + np.diag(drag))
-        slope = np.eye(model.nv) - step * theta * (by_v + theta * step * by_q)
         change = -np.linalg.solve(slope, missed)
         ahead = ahead + change
+        if linear:
+            return pin.integrate(model, q, step * ((1.0 - theta) * v + theta * ahead)), ahead
     raise ComputationError(
         f"a step of {step:g} s does not converge (off by {last:.2g} m/s or rad/s)",
         "implicit_step",
         "shorten the step",
     )
+
+
+def _turning(knee: Knee, forces: Any, data: KneeData) -> Array:
+    """Return what the femur's own turning adds to the stiffness (6, 6), insert frame.
+
+    Derivatives of `pin.aba` hold a force fixed in the joint's frame, while the knee's force on the
+    femur is fixed in the insert's: displaced by xi it turns back by xi x* w against the femur.
+    """
+    bridge, placements = knee.bridge, data.data.oMi
+    insert = placements[bridge.insert.joint] * bridge.insert.placement
+    joint = bridge.component.joint
+    on_femur = insert.actInv(placements[joint]).act(forces[joint])
+    force, moment = pin.skew(on_femur.linear), pin.skew(on_femur.angular)
+    return -np.block([[np.zeros((3, 3)), force], [force, moment]])

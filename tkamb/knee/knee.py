@@ -816,9 +816,9 @@ class Knee:
         """Return the derivative (6, 6) of the wrench of the bundles between femur and tibia."""
         if self._crossing is None:
             return np.zeros((6, 6))
-        from tkamb.knee.contact import DifferenceSettings, differences
+        from tkamb.knee.contact import DifferenceSettings, batch_differences
 
-        return differences(self._crossing.wrench, place.pose, DifferenceSettings(step=1e-7))
+        return batch_differences(self._crossing.wrench, place.pose, DifferenceSettings(step=1e-7))
 
     def _mirrored_matrix(self, matrix: Array) -> Array:
         if not self.left:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.contact.given_material import given_material, material_as_json
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import within_insert
 from tkamb.contact.probe import condyle_wrenches
@@ -26,6 +25,7 @@ from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.geometry.threads import both
+from tkamb.io.given_material import given_material, material_as_json
 from tkamb.io.scene import Scene
 from tkamb.io.scene.case import Case
 from tkamb.knee.contact_points import CondylePoint

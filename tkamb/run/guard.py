@@ -5,6 +5,7 @@ nobody foresaw is one line too; its traceback goes into a file beside the output
 """
 
 import argparse
+import errno
 import io
 import logging
 import os
@@ -20,6 +21,9 @@ from typing import TextIO
 
 from tkamb import __version__
 from tkamb.errors import TkambError
+
+NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""What the system says of a write when the disk, the quota or the limit of a file is full."""
 
 
 def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
@@ -48,8 +52,14 @@ def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
         _silence(sys.stdout)
         return 0
     except KeyboardInterrupt as interrupt:
-        say(f"interrupted: {interrupt or 'nothing is kept'}")
+        say(f"interrupted: {str(interrupt) or 'nothing is kept'}")
         return 130
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            return _unforeseen(error, options)
+        where = "" if error.filename is None else f"{error.filename}: "
+        say(f"{where}cannot be written ({error.strerror}); make room, then run it again")
+        return 1
     except Exception as error:
         return _unforeseen(error, options)
 
@@ -139,14 +149,24 @@ def _silence(stream: object) -> None:
 
 
 def _unforeseen(error: Exception, options: argparse.Namespace) -> int:
+    say(unforeseen_words(error, options))
+    return 1
+
+
+def unforeseen_words(error: Exception, options: argparse.Namespace) -> str:
+    """Return one line on an error that nobody foresaw; its traceback goes into a file.
+
+    Args:
+        error: what was raised.
+        options: of the command line; its `out` says where the file goes.
+    """
     name = type(error).__name__
     reason = " ".join(str(error).split())[:200]
     what = "not enough memory: take a coarser resolution or fewer frames"
     if not isinstance(error, MemoryError):
         what = f"this was not foreseen: {name}{': ' if reason else ''}{reason}"
     log = _write_log(error, options)
-    say(f"{what}; {'no log could be written' if log is None else f'details are in {log}'}")
-    return 1
+    return f"{what}; {'no log could be written' if log is None else f'details are in {log}'}"
 
 
 def _write_log(error: Exception, options: argparse.Namespace) -> Path | None:

@@ -19,7 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from tkamb.atomic import replaced_file
 from tkamb.errors import InputError, not_installed
+from tkamb.files import check_file
 from tkamb.geometry.frames import Array
+from tkamb.io.hdf5_file import NotingFile, check_written
+from tkamb.run.maps_check import check_maps_file, check_values
 
 if TYPE_CHECKING:
     from pyvista import MultiBlock
@@ -59,10 +62,19 @@ class MapWriter:
         self.path = None if path is None else Path(path)
         self._written_frames, self._waiting = 0, list[tuple[Array, ...]]()
         points = np.asarray(points, float)
-        options: dict[str, Any] = {} if path else {"driver": "core", "backing_store": False}
+        self._stream: NotingFile | None = None
         with self._written():
-            self._file = h5py.File(path or "memory", "w", **options)
-            self._begin(points, np.asarray(triangles, np.int64), attributes)
+            if self.path is None:
+                self._file = h5py.File("memory", "w", driver="core", backing_store=False)
+            else:
+                self._stream = NotingFile(self.path)
+                self._file = h5py.File(self._stream, "w")
+        try:
+            with self._written():
+                self._begin(points, np.asarray(triangles, np.int64), attributes)
+        except BaseException:
+            self._close_file()  # left open, HDF5 would fail at the interpreter's end
+            raise
 
     def _begin(
         self, points: Array, triangles: NDArray[np.int64], attributes: Mapping[str, Any]
@@ -172,13 +184,20 @@ class MapWriter:
             try:
                 self.flush()
             finally:
-                self._file.close()
+                self._close_file()
+
+    def _close_file(self) -> None:
+        self._file.close()
+        if self._stream is not None:
+            self._stream.close()
 
     @contextmanager
     def _written(self) -> Iterator[None]:
         """Have what HDF5 says of a disk that is full or gone in one line."""
         try:
             yield
+            if self._stream is not None:
+                check_written(self._stream, self.path)
         except (OSError, RuntimeError) as error:
             reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
             raise InputError(f"cannot be written ({reason})", self.path) from None
@@ -271,7 +290,7 @@ class ContactMaps:
         if not isinstance(self.source, Path):
             return {"units": UNITS, **(self.given_attributes or {})}
         with _opened(self.source) as file:
-            return dict(file.attrs)
+            return {name: file.attrs[name] for name in file.attrs if _is_plain(file.attrs[name])}
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -317,7 +336,7 @@ class ContactMaps:
         with _opened(self.source) as file:
             if name not in file:
                 raise InputError(f"has no '{name}'", self.source, "is it a contact.h5 of tkamb?")
-            return file[name][:frames]
+            return np.asarray(file[name][:frames], None if name == "triangles" else float)
 
 
 def read_maps(path: str | Path) -> ContactMaps:
@@ -327,6 +346,9 @@ def read_maps(path: str | Path) -> ContactMaps:
         InputError: no such file, or not an HDF5 file.
     """
     maps = ContactMaps(Path(path))
+    check_file(path, float("inf"), what="contact.h5")
+    with _opened(maps.source) as file:  # type: ignore[arg-type]
+        check_values(file, path)
     len(maps)
     return maps
 
@@ -348,16 +370,24 @@ def write_maps(maps: ContactMaps, path: Path) -> None:
             writer.append(time, *frame, maps.femoral_pose[k], *places)
 
 
+def _is_plain(value: Any) -> bool:
+    """Say whether an attribute is a text or a number, as tkamb writes them."""
+    return isinstance(value, str | int | float | np.number | np.bool_)
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Have what h5py says of a missing or damaged file in one line."""
+    """Have what h5py says of a missing or damaged file in one line, and only our own file read."""
     try:
         with h5py.File(path, "r") as file:
+            check_maps_file(file, path)
             yield file
     except InputError:
         raise
     except FileNotFoundError:
         raise InputError("no such file", path) from None
-    except (OSError, RuntimeError, KeyError, ValueError) as error:
-        reason = str(error).strip("'\"").splitlines()[0]
+    except MemoryError:
+        raise InputError("needs more memory than there is", path, "run it again") from None
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        reason = (str(error).strip("'\"").splitlines() or [type(error).__name__])[0]
         raise InputError(f"cannot be read as HDF5 ({reason})", path) from None

@@ -10,11 +10,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tkamb.contact.given_material import (
-    material_as_json,
-    material_in_words,
-    named_material,
-)
 from tkamb.contact.materials import Material
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import Bearing, ContactPair
@@ -31,6 +26,11 @@ from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import MIRROR, Array, Index, mirrored_pose
 from tkamb.geometry.frames import pose as pose_matrix
 from tkamb.io.defaults import CONTACT_MODEL
+from tkamb.io.given_material import (
+    material_as_json,
+    material_in_words,
+    named_material,
+)
 from tkamb.io.recordings.meshes import axes_rotation, load_surface, mirrored
 from tkamb.knee.equilibrium.adjusted_press import press_adjusted
 from tkamb.memory import peak_rss

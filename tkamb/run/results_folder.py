@@ -18,6 +18,7 @@ from tkamb.files import MEGABYTE, read_json, sha256_of
 from tkamb.io.claim import claimed_directory, settle
 from tkamb.run.plug_ins import CONTACT_CODE, contact_code
 from tkamb.run.results import Results, csv_text, read_bands, read_csv
+from tkamb.run.summary_check import check_summary
 
 if TYPE_CHECKING:
     from tkamb.run.maps import ContactMaps
@@ -54,6 +55,10 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
         from tkamb.run.maps import read_maps
 
         maps = read_maps(directory / MAPS_NAME)
+        frames = len(next(iter(columns.values()), ()))
+        if len(maps) != frames:
+            what = f"holds {len(maps)} frames, and {CSV_NAME} {frames}"
+            raise InputError(what, directory / MAPS_NAME, "run it again")
     if check and (found := differences(directory, summary)):
         raise InputError(found[0], directory, "`tkamb verify` tells all; run it again")
     there = (directory / BANDS_NAME).exists()
@@ -65,12 +70,13 @@ def read_summary(directory: Path) -> dict[str, Any]:
     """Return a folder's summary.json.
 
     Raises:
-        InputError: no such file, or not a JSON object.
+        InputError: no such file, not a JSON object, or it holds what tkamb does not write.
     """
     path = directory / SUMMARY_NAME
     found = read_json(path, SUMMARY_LIMIT, what="summary of a run")
     if not isinstance(found, dict):
         raise InputError("is no JSON object", path, "is it a folder that `tkamb run` wrote?")
+    check_summary(found, path)
     return found
 
 

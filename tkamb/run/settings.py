@@ -46,7 +46,7 @@ def all_settings() -> list[Setting]:
 
     It imports every module that holds one.
     """
-    rows = []
+    rows: list[Setting] = []
     for path in sorted(PACKAGE.rglob("*.py")):
         text = path.read_text(encoding="utf-8")
         if SUFFIX not in text:

@@ -127,6 +127,11 @@ class _Run:
 
     def prepare(self) -> None:
         """Build both sides of the equilibrium; whatever is wrong with the input shows here."""
+        if self.case.scene.muscles:
+            from tkamb.run.muscles.static_optimisation import solver_is_installed, solver_missing
+
+            if not solver_is_installed():  # before minutes of preparation, not at the first frame
+                raise solver_missing()
         self.solver = FrameSolver(self.case, self.indices)
         side = self.solver.side
         self.seconds = {"read": clock.perf_counter() - self.start}

@@ -5,6 +5,7 @@ input and puts pickled answers on its standard output until the input ends, whic
 when the parent is killed. Nothing of the calling script is run again, as multiprocessing would.
 """
 
+import argparse
 import os
 import pickle
 import queue
@@ -19,7 +20,7 @@ from typing import IO, Any
 
 from tkamb.errors import ComputationError, InputError, TkambError
 from tkamb.geometry import threads
-from tkamb.run.guard import log_to_stderr
+from tkamb.run.guard import log_to_stderr, open_streams, unforeseen_words
 
 MOST_WORKERS = 256
 Numbered = tuple[int, Any]
@@ -202,21 +203,29 @@ def _send(stream: IO[bytes], value: object) -> None:
 def serve() -> None:
     """Be a worker until the standard input ends; whatever else is printed goes to stderr."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    open_streams()
     log_to_stderr()
     jobs = os.fdopen(os.dup(0), "rb")
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    work = _prepared(Task(*pickle.load(jobs)))
-    while True:
-        try:
+    try:
+        work = _prepared(Task(*pickle.load(jobs)))
+        while True:
             number, job = pickle.load(jobs)
-        except EOFError:
-            return
-        try:
-            answer: Numbered | TkambError = number, work(number, job)
-        except TkambError as error:  # the parent's to tell
-            answer = error
-        _send(answers, answer)
+            _send(answers, _answer(work, number, job))
+    except (EOFError, ConnectionError, pickle.UnpicklingError):  # the parent has gone
+        # what is buffered has no reader, and the interpreter would say so at its end
+        os._exit(0)
+
+
+def _answer(work: Callable[[int, Any], Any], number: int, job: Any) -> Numbered | TkambError:
+    """Return the answer to a job, or why there is none, which is the parent's to tell."""
+    try:
+        return number, work(number, job)
+    except TkambError as error:
+        return error
+    except Exception as error:
+        return ComputationError(unforeseen_words(error, argparse.Namespace()))
 
 
 def _prepared(task: Task) -> Callable[[int, Any], Any]:
@@ -224,12 +233,14 @@ def _prepared(task: Task) -> Callable[[int, Any], Any]:
     try:
         return task.prepared()
     except TkambError as error:
-        wrong = error
+        wrong: TkambError = error
+    except Exception as error:
+        wrong = ComputationError(unforeseen_words(error, argparse.Namespace()))
 
-        def refuse(number: int, job: object) -> None:
-            raise wrong
+    def refuse(number: int, job: object) -> None:
+        raise wrong
 
-        return refuse
+    return refuse
 
 
 if __name__ == "__main__":

@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from tkamb.contact.given_material import material_in_words
 from tkamb.errors import InputError
+from tkamb.io.given_material import material_in_words
 
 WIDTH = 92
 
@@ -326,17 +326,19 @@ def _contact(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[
     error = summary.get("known_error")
     if isinstance(error, str):
         yield "How far this setting of the contact model is off was not measured."
-    elif error:
+    elif isinstance(error, Mapping):
         yield (
             "On the cases of tkamb's trade-off study this setting was off by at most "
             f"{100 * error['peak_pressure']:.2g} % in peak pressure and "
             f"{100 * error['area']:.2g} % in area."
         )
+    elif error:
+        yield f"The error of this setting was {error}."
 
 
 def _material_words(contact: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     if material:
-        return f"The insert was {material_in_words(material)}."
+        return f"The insert was of {material_in_words(material)}."
     if contact["material"] == "polyethylene":
         return (
             "The insert was polyethylene: E = 561.5 MPa, nu = 0.45, Ramberg–Osgood with "

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from tkamb.contact.given_material import given_material
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, knee_pose
+from tkamb.io.given_material import given_material
 from tkamb.studies.bodies import balls, block, dishes, flat
 from tkamb.units import DEGREE, MILLIMETRE
 

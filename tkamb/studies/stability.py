@@ -88,7 +88,7 @@ def run_stability(
         workers: cases at a time.
     """
     judges, stored = _Judges(longest, kept), stored_verdicts()
-    pool = ThreadPoolExecutor(workers)
+    pool = ThreadPoolExecutor(workers, initializer=_leave_interrupts_to_parent)
     try:
         for verdict in pool.map(judges.verdict, cases):
             yield replace(verdict, expected=stored.get(verdict.key))
@@ -182,6 +182,14 @@ class _Judges:
             found = receiver.recv()
         verdict: Verdict = found
         return verdict
+
+
+def _leave_interrupts_to_parent() -> None:
+    """Have Ctrl-C end this thread's processes by the parent alone, which kills them.
+
+    A process begins with the signals blocked that the thread which starts it has blocked.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
 def _send_verdict(case: Case, sender: Connection) -> None:

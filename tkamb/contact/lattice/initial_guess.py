@@ -6,38 +6,21 @@ import numpy as np
 
 from tkamb.contact.lattice.linear.compliance import ComplianceCache, ContactResponse
 from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes
+from tkamb.contact.lattice.settings import LatticeSolverSettings
 from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index, Mask
 
-MARGIN = 0.25
-"""Nodes count as candidates this share of the depth beyond first touch."""
-UNSEEN_WAY = 0.1
-"""Of a cell: so far the contact may go without a look at all elements. Measured, not proven: the
-whole solid is then in balance to 1.2 times the tolerance (`tests/test_lattice_sketch.py`)."""
-UNSEEN_GROWTH = 1.1
-"""And so much may its forces grow."""
-ARM = 0.03
-"""m, from the femoral axis to the contact."""
-STRAIGHT = 0.5
-"""Share of a way that may lead aside if the last change is to go on."""
-SPARE = 1.6
+FORCES_ONLY_DISTANCE = 0.1
+"""Of a cell: how far a search that needs forces alone may go from the pose at which the whole solid
+was measured last. The residual there is measured in `tests/test_lattice_sketch.py`."""
+FORCES_ONLY_GROWTH = 1.1
+"""How much the contact forces may have grown there."""
+LEVER_ARM = 0.03
+"""m, from the femoral axis to the contact: turns a rotation into a distance."""
+LARGEST_TURN = 0.5
+"""Share of a step that may lead aside if the last change is extrapolated."""
+SPARE_DEPTH = 1.6
 """The stored compliance covers nodes down to this many times the depth asked for."""
-
-
-@dataclass(frozen=True)
-class Left:
-    """Shares of the imbalance that passes leave; None: not known.
-
-    Args:
-        first: what the first pass of a solution leaves.
-        later: the most that a later one leaves: what is left then goes away more slowly.
-    """
-
-    first: float | None = None
-    later: float | None = None
-
-
-NOT_KNOWN = Left()
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,72 +32,66 @@ class WarmStart:
 
     Args:
         problem: whose solution it was; it serves no other.
-        nonlinear_residual: (n, 3) h, N, or None for a linear material.
+        loads: (n, 3) N, nonlinear loads that its last state asks for; None: linear material.
         moved: (c, 3) m, displacement of the contact nodes that were candidates, else 0.
         depth: m, how far the femoral component went below the lowest contact node.
         region: outside of which h is zero, or None.
         pose: (4, 4) pose_femoral_in_insert where it was.
-        looked: the contact forces' norm, N, and the pose when all elements were last looked at.
+        looked: norm of the contact forces, N, and pose when the whole solid was measured last.
         before: where the solution ended that this one began from, or None.
-        half: L⁻¹ h in elimination order, or None: nobody has worked it out.
-        left: shares of the imbalance that passes leave.
     """
 
     problem: ContactProblem
-    nonlinear_residual: Array | None
+    loads: Array | None
     moved: Array
     depth: float
     region: Region | None
     pose: Array
     looked: tuple[float, Array]
     before: "WarmStart | None" = None
-    half: Array | None = None
-    left: Left = NOT_KNOWN
 
     def near(self, pose: Array) -> bool:
-        """Return whether a pose is within `UNSEEN_WAY` of where all elements were looked at."""
-        reach = UNSEEN_WAY * float(self.problem.solid.spacing.min())
+        """Return whether the whole solid was measured within `FORCES_ONLY_DISTANCE` of a pose."""
+        reach = FORCES_ONLY_DISTANCE * float(self.problem.solid.spacing.min())
         return bool(np.linalg.norm(_way(self.looked[1], pose)) <= reach)
 
-    def foreseen(self, pose: Array) -> "WarmStart":
+    def extrapolated(self, pose: Array) -> "WarmStart":
         """Return what is to be expected at a pose: this, or this and its last change once more.
 
         The change counts as far as the way to the pose goes on along the last one.
         """
-        last, h = self.before, self.nonlinear_residual
-        if last is None or h is None or last.nonlinear_residual is None:
+        last, h = self.before, self.loads
+        if last is None or h is None or last.loads is None:
             return self
         step, way = _way(last.pose, self.pose), _way(self.pose, pose)
         along = float(step @ way) / max(float(step @ step), 1e-300)
-        if not np.linalg.norm(way - along * step) <= STRAIGHT * np.linalg.norm(way):
+        if not np.linalg.norm(way - along * step) <= LARGEST_TURN * np.linalg.norm(way):
             return self
         along = min(max(along, 0.0), 1.0)
         both = self.moved.any(axis=1, keepdims=True) & last.moved.any(axis=1, keepdims=True)
         return replace(
             self,
-            nonlinear_residual=_gone_on(h, last.nonlinear_residual, h, along),
-            half=_gone_on(self.half, last.half, self.half, along),
+            loads=_gone_on(h, last.loads, h, along),
             moved=self.moved + along * np.where(both, self.moved - last.moved, 0.0),
         )
 
     def going_as(self, start: "WarmStart", end: "WarmStart", pose: Array) -> "WarmStart":
         """Return this as if the change from another solution to the one after it had led here.
 
-        `foreseen` at the pose then expects that change once more.
+        `extrapolated` at the pose then expects that change once more.
 
         Args:
             start: where a like step began elsewhere.
             end: where that ended.
             pose: (4, 4) where the step from here leads.
         """
-        h, first, last = self.nonlinear_residual, start.nonlinear_residual, end.nonlinear_residual
+        h, first, last = self.loads, start.loads, end.loads
         if h is None or first is None or last is None:
             return self
         moved = self.moved - (end.moved - start.moved)
         came = replace(
             self,
-            nonlinear_residual=_gone_on(h, first, last, -1.0),
-            half=_gone_on(self.half, start.half, end.half, -1.0),
+            loads=_gone_on(h, first, last, -1.0),
             moved=moved,
             pose=2 * self.pose - pose,
         )
@@ -140,9 +117,9 @@ def _with_change(here: Array, start: Array, end: Array, share: float) -> Array:
 
 
 def _way(start: Array, end: Array) -> Array:
-    """Return the way between two poses (12,), m: turns at `ARM`; what is along y the load asks."""
+    """Return the way between two poses (12,), m, but along y; rotations times `LEVER_ARM`."""
     change = end[:3] - start[:3]
-    change[:, :3] *= ARM
+    change[:, :3] *= LEVER_ARM
     change[1, 3] = 0.0
     return change.ravel()
 
@@ -156,30 +133,26 @@ class InitialGuess:
         response: of the candidates to forces on them.
         active: (m,) first guess of the active set.
         planes: femoral planes over the undeformed candidates.
-        nonlinear_residual: (n, 3) h, N, of an earlier solution, or None.
+        loads: (n, 3) h, N, of an earlier solution, or None.
         moved: (m, 3) m, displacement of the candidates in an earlier solution, or None.
         reach: m, every node with a smaller vertical gap is a candidate.
         region: outside of which h is zero, or None.
         offset: (m, 3) m, displacement of the candidates of a linear material that no contact
             force made, or None.
-        unseen: N, contact forces up to which the elements outside of the region need not be
-            looked at; 0: they are looked at.
-        half: L⁻¹ h in elimination order, or None.
-        left: shares of the imbalance that passes left in earlier solutions.
+        unmeasured: N, norm of the contact forces up to which the region's residual is enough; 0:
+            that of the whole solid is measured.
     """
 
     candidates: Index
     response: ContactResponse
     active: Mask
     planes: TangentPlanes
-    nonlinear_residual: Array | None = None
+    loads: Array | None = None
     moved: Array | None = None
     reach: float = np.inf
     region: Region | None = None
     offset: Array | None = None
-    unseen: float = 0.0
-    half: Array | None = None
-    left: Left = NOT_KNOWN
+    unmeasured: float = 0.0
 
     @property
     def cold(self) -> "InitialGuess":
@@ -197,7 +170,8 @@ def initial_guess(
     at_pose: bool,
     touched: Mask | None,
     warm: WarmStart | None,
-    unseen: float = 0.0,
+    unmeasured: float = 0.0,
+    margin: float = LatticeSolverSettings.candidate_margin,
 ) -> InitialGuess:
     """Return candidates, their response and a first active set.
 
@@ -209,12 +183,13 @@ def initial_guess(
         at_pose: the femoral component stays at the pose: candidates overlap it already.
         touched: (c,) nodes in contact in a neighbouring solution, or None.
         warm: where a neighbouring solution ended, or None.
-        unseen: N, see `InitialGuess`; without `warm` all elements are looked at.
+        unmeasured: see `InitialGuess`.
+        margin: see `LatticeSolverSettings.candidate_margin`.
     """
     lowest = float(gaps.min())
-    reach = lowest + (1 + MARGIN) * depth
+    reach = lowest + (1 + margin) * depth
     nodes = np.flatnonzero(gaps <= reach)
-    spare = np.flatnonzero(gaps <= lowest + SPARE * depth)
+    spare = np.flatnonzero(gaps <= lowest + SPARE_DEPTH * depth)
     level = 0.0 if at_pose else lowest + 0.6 * depth
     active = gaps[nodes] < level
     if touched is not None and touched[nodes].any():
@@ -224,12 +199,10 @@ def initial_guess(
         return guess
     return replace(
         guess,
-        nonlinear_residual=warm.nonlinear_residual,
-        half=warm.half,
-        left=warm.left,
+        loads=warm.loads,
         moved=warm.moved[nodes],
         region=warm.region,
-        unseen=unseen,
+        unmeasured=unmeasured,
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from tkamb.contact.lattice.flags import unseen_flags
 from tkamb.contact.lattice.initial_guess import (
-    UNSEEN_GROWTH,
+    FORCES_ONLY_GROWTH,
     InitialGuess,
     WarmStart,
     guessed_depth,
@@ -33,10 +33,11 @@ from tkamb.contact.lattice.problem import (
     undeformed,
 )
 from tkamb.contact.lattice.report import PressureRule, gaps_of_others, result_of
+from tkamb.contact.lattice.settings import LatticeSolverSettings
 from tkamb.contact.lattice.solids.bbar import BbarHexahedra
 from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
 from tkamb.contact.lattice.solids.solid import Solid
-from tkamb.contact.lattice.solver import Solution, Tolerance, solve
+from tkamb.contact.lattice.solver import Solution, solve
 from tkamb.contact.materials import LinearElastic, Material
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import ContactPair
@@ -47,14 +48,12 @@ from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.units import MILLIMETRE
 
-MOST_GROWTHS = 8
-"""How often the candidate set may grow before it counts as saturated."""
 TOUCHING = 1e-13
 """m; bodies that overlap by less carry nothing: 1e-6 N at 1e7 N/m."""
 COARSE = 1e-3
 """From this tolerance on the factor is kept in 16 bits: they leave an imbalance of 3e-4."""
-ROUGH = 3.0
-"""Times the tolerance, for a step whose end is foreseen: what it changes is known to 1 %."""
+TURNED_TOLERANCE = 3.0
+"""Times the tolerance, for a step that is extrapolated: what it changes is known to 1 %."""
 REACH = 1.08
 """Candidates must cover this many times the approach that was found."""
 
@@ -69,9 +68,8 @@ class CellContact(ContactModel):
 
     Args:
         resolution: m, edge of the cells.
-        tolerance: largest out-of-balance force relative to the contact force, and four times the
-            largest distance of an active node from the femoral surface relative to its
-            displacement.
+        tolerance: scales the tolerances of `LatticeSolverSettings`, which are those of 1e-3: the
+            relative error of the approach is half of it at most.
         pressure_rule: "tributary" (force over the node's own area) or "source" (force over
             total area by number of nodes, Sharma 2008, section 4.5.6).
         newton: solve by full Newton steps (slow; the reference).
@@ -85,6 +83,18 @@ class CellContact(ContactModel):
     pressure_rule: PressureRule = "tributary"
     newton: bool = False
     cache: bool = True
+
+    @property
+    def settings(self) -> LatticeSolverSettings:
+        """What the solver's tolerances are at this model's tolerance."""
+        usual = LatticeSolverSettings()
+        scale = self.tolerance / COARSE
+        return replace(
+            usual,
+            force_tolerance=scale * usual.force_tolerance,
+            work_tolerance=scale * usual.work_tolerance,
+            gap_tolerance=scale * usual.gap_tolerance,
+        )
 
     direction: ClassVar[Direction] = "normal"
     """Nodes are pressed along the femoral normal, or vertically."""
@@ -106,7 +116,7 @@ class CellContact(ContactModel):
         problem = ContactProblem(
             solid, operator, lattice.index, held, femoral, self.direction, surface.lift
         )
-        _rehearse(problem, pair)
+        _warm_up(problem, pair)
         return LatticeState(pair, surface, lattice, problem, ComplianceCache(operator.half))
 
     def _operator(
@@ -204,7 +214,7 @@ class CellContact(ContactModel):
         """Return the probe with stiffness; see `ContactModel`."""
         if self.direction == "vertical":
             return Probe(self, state, guess)
-        rough = replace(self, tolerance=ROUGH * self.tolerance)
+        rough = replace(self, tolerance=TURNED_TOLERANCE * self.tolerance)
         return LatticeProbe(self, state, guess, self.tolerance, rough)
 
     def _solved(
@@ -222,20 +232,28 @@ class CellContact(ContactModel):
         `rest` is what `undeformed` says at the pose.
         """
         gaps, planes = rest
-        tolerance = Tolerance(self.tolerance)
+        settings = self.settings
         last = warm_start_of(state, guess)
-        warm = None if last is None else last.foreseen(pose)
+        warm = None if last is None else last.extrapolated(pose)
         near = sketch and last is not None and last.near(pose)
-        unseen = UNSEEN_GROWTH * last.looked[0] if last is not None and near else 0.0
+        unmeasured = FORCES_ONLY_GROWTH * last.looked[0] if last is not None and near else 0.0
         touched = guess.pressure > 0 if guess and len(guess.pressure) == len(gaps) else None
-        for _ in range(MOST_GROWTHS):
+        for _ in range(settings.max_expansions):
             start = initial_guess(
-                state.compliance, gaps, planes, depth, load is None, touched, warm, unseen
+                state.compliance,
+                gaps,
+                planes,
+                depth,
+                load is None,
+                touched,
+                warm,
+                unmeasured,
+                settings.candidate_margin,
             )
             below = -min(float(gaps.min()), 0.0)
             covered = load is None or len(start.candidates) == np.isfinite(gaps).sum()
             within = np.inf if covered else (start.reach - below) / REACH
-            solution = self._solution(state.problem, pose, load, start, tolerance, within)
+            solution = self._solution(state.problem, pose, load, start, settings, within)
             outgrown = solution.forces.approach > within
             if solution.converged:
                 moved = np.zeros_like(state.surface.points)
@@ -245,9 +263,8 @@ class CellContact(ContactModel):
                 if last is not None and not solution.seen:
                     looked = last.looked
                 warm = WarmStart(
-                    state.problem, solution.nonlinear_residual, moved, below, solution.region,
+                    state.problem, solution.loads, moved, below, solution.region,
                     pose, looked, None if last is None else replace(last, before=None),
-                    solution.half, solution.left,
                 )  # fmt: skip
             others = gaps <= solution.forces.approach * REACH + below
             if not outgrown or _others_clear(state, pose, others, solution):
@@ -266,7 +283,7 @@ class CellContact(ContactModel):
         pose: Array,
         load: float | None,
         guess: InitialGuess,
-        tolerance: Tolerance,
+        settings: LatticeSolverSettings,
         within: float,
     ) -> Solution:
         """Solve by the stored response; by Newton's method when that leaves forces out of balance.
@@ -275,14 +292,18 @@ class CellContact(ContactModel):
         approach beyond `within`, m, is solved again with more candidates.
         """
         if self.newton:
-            return solve_by_newton(problem, pose, load, guess, tolerance)
-        solution = solve(problem, pose, load, guess, tolerance)
-        if solution.converged or solution.balanced or problem.solid.material.is_linear:
+            return solve_by_newton(problem, pose, load, guess, settings)
+        solution = solve(problem, pose, load, guess, settings)
+        if (
+            solution.converged
+            or problem.solid.material.is_linear
+            or solution.gap == solution.residual
+        ):
             return solution
         if solution.forces.approach > within:
             return solution
         try:
-            return solve_by_newton(problem, pose, load, guess, tolerance, solution.field)
+            return solve_by_newton(problem, pose, load, guess, settings, solution.field)
         except ComputationError:
             return solution
 
@@ -362,7 +383,7 @@ def _others_clear(state: LatticeState, pose: Array, near: Mask, solution: Soluti
     return bool((gaps_of_others(state, there, np.flatnonzero(others), solution) > 0).all())
 
 
-def _rehearse(problem: ContactProblem, pair: ContactPair) -> None:
+def _warm_up(problem: ContactProblem, pair: ContactPair) -> None:
     """Have built now what the first rays and the first look at the cells would build."""
     undeformed(problem, np.eye(4))
     pair.touch_at(np.eye(4))

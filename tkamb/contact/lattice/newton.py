@@ -12,9 +12,10 @@ from tkamb.contact.lattice.active_set import ContactForces
 from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.linear.compliance import ContactResponse
 from tkamb.contact.lattice.linear.operator import prepare_operator
-from tkamb.contact.lattice.nonlinear_balance import norms, weight_of
+from tkamb.contact.lattice.nonlinear_balance import Residual
 from tkamb.contact.lattice.problem import ContactProblem, TangentPlanes
-from tkamb.contact.lattice.solver import SlidingNodes, Solution, Tolerance, solve_pass
+from tkamb.contact.lattice.settings import LatticeSolverSettings
+from tkamb.contact.lattice.solver import SlidingNodes, Solution, solve_pass
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, Index, Mask
 
@@ -26,7 +27,7 @@ def solve_by_newton(
     pose: Array,
     load: float | None,
     guess: InitialGuess,
-    tolerance: Tolerance,
+    settings: LatticeSolverSettings,
     field: Array | None = None,
 ) -> Solution:
     """Return the contact at a pose under a load (N), or at approach 0 when load is None.
@@ -36,7 +37,7 @@ def solve_by_newton(
         pose: (4, 4) pose_femoral_in_insert.
         load: N along -y, or None.
         guess: candidates and first active set; its compliance is not used.
-        tolerance: of force and femoral surface; its number of passes is not used.
+        settings: tolerances; the number of passes is not used.
         field: (n, 3) m, where to start; at rest by default.
 
     Raises:
@@ -53,31 +54,32 @@ def solve_by_newton(
         u_full, forces = _step(problem, nodes, points, u, planes, load, active)
         u = u + step * (u_full - u)
         active = forces.active
-        residual = _imbalance(problem, nodes, u, forces.force[:, None] * planes.normals)
-        lost = np.empty(len(problem.everywhere.elements))
-        weight = weight_of(norms(solid.nonlinear_residual(u, None, lost)), lost)
-        missed, ends = sliding.follow(u[nodes], forces), steps == MOST_STEPS
-        allowed = tolerance.force if ends else tolerance.force / weight
-        done = residual <= allowed and tolerance.at_rest(missed, ends)
+        residual = _residual(problem, nodes, u, forces.force[:, None] * planes.normals)
+        gap, ends = sliding.follow(u[nodes], forces), steps == MOST_STEPS
+        done = residual.within(settings)
+        done = done and gap <= (settings.force_tolerance if ends else settings.gap_tolerance)
         if done or ends:
             forces = replace(forces, converged=done and forces.converged)
             h = solid.residual_force(u)
             h[problem.held.reshape(-1, 3)] = 0.0
             return Solution(
-                guess.candidates, forces, planes, u[nodes], u, h, steps, max(residual, missed)
-            )
-        step, last = 0.5 if residual > 2 * last else 1.0, residual
+                guess.candidates, forces, planes, u[nodes], u, h, steps,
+                max(residual.force, gap), work=residual.work, gap=gap,
+            )  # fmt: skip
+        step, last = 0.5 if residual.force > 2 * last else 1.0, residual.force
 
 
-def _imbalance(problem: ContactProblem, nodes: Index, u: Array, force: Array) -> float:
-    """Return what is out of balance at u (n, 3) under forces (m, 3) on nodes, relative to them."""
+def _residual(problem: ContactProblem, nodes: Index, u: Array, force: Array) -> Residual:
+    """Return what is out of balance at u (n, 3) under forces (m, 3) on nodes."""
     outside = -problem.solid.internal_force(u)
     outside[nodes] += force
+    outside[problem.held.reshape(-1, 3)] = 0.0
     size = max(float(np.linalg.norm(force)), 1e-300)
-    residual = float(np.linalg.norm(outside.ravel()[~problem.held])) / size
+    work = max(float(np.vdot(force, u[nodes])), 1e-300)
+    residual = float(np.linalg.norm(outside)) / size
     if not np.isfinite(residual):
         raise ComputationError("Newton's iteration left the range of numbers")
-    return residual
+    return Residual(residual, abs(float(np.vdot(outside, u))) / work)
 
 
 def _step(

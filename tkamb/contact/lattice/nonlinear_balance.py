@@ -1,221 +1,194 @@
-"""The nonlinear residual h of one solution, brought into balance with what it causes.
+"""Residual forces of the displaced solid, and the loads that take them away.
 
-    K u = f_contact + h,    h = K u - f_internal(u)
+The solid is linear but for loads h that stand for what its material carries less:
 
-h is accelerated by Anderson's method; its change is the out-of-balance force. An element's
-share of h falls with a power of its strain (4.5 for polyethylene), so most of the insert is as
-good as linear: passes look at the `Region` where it counts, and at everything once, at the end.
-What the contact under the h that this last look asks for leaves out of balance is foreseen from
-what passes leave of it, not looked at again.
+    K u = f + h,    r = f - f_int(u)
+
+K is the factorised linear stiffness, f the contact forces, f_int the forces of the displaced
+solid under its nonlinear law. At equilibrium r = 0 and h = K u - f_int(u). Every pass solves
+K u = f + h and takes h + r as the next h (modified Newton), accelerated by Anderson's method.
+
+An element's share of h falls with a power of its strain (4.5 for polyethylene). So passes work on
+the `Region` of the elements that count. What the rest asks for, and what the rounding of the
+factor leaves, changes little from pass to pass: it is measured with the whole solid
+(`NonlinearBalance.measure`) and then held constant.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from tkamb.contact.lattice.anderson import AndersonMixer
-from tkamb.contact.lattice.initial_guess import InitialGuess, Left
+from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.problem import ContactProblem, Region
-from tkamb.contact.lattice.solids.solid import Noticed
-from tkamb.geometry.frames import Array, Index, Mask
+from tkamb.contact.lattice.settings import LatticeSolverSettings
+from tkamb.geometry.frames import Array, Mask
 
-SHARE = 0.1
-"""What elements left out may add to the imbalance, relative to the tolerance."""
-PASSED_OVER = 0.03
-"""And what those may that a bound of their strain passes over, when all are looked at."""
-LEFT = 2.5
-"""Times what passes left of the imbalance before, the next may leave of it. What is then foreseen
-is 1.0 to 8.5 times what is found (docs/lattice.md)."""
-OLDER = 1.1
-"""And so many times more with every solution since in which it was not measured."""
-KEPT = 0.8
-"""Share of what passes left before that counts where the last solution measured less."""
-FURTHER = 0.4
-"""Of a change of h and of the stiffness that is lost there: what the next pass would add to it."""
-SOFT = 0.65
-"""Share of its stiffness that a contact may have lost, in the mean, before imbalance counts more:
-that of knees in daily motions stays below (docs/lattice.md)."""
+NEAR = 0.05
+"""Relative residual from which on a region is chosen: a contact far off still grows."""
+OUTSIDE = 0.8
+"""Share of the force tolerance that may stay outside of the region: the rounding of the factor."""
+
+
+@dataclass(frozen=True)
+class Residual:
+    """What the displaced solid leaves out of balance.
+
+    Args:
+        force: |f - f_int(u)| over the free unknowns, relative to |f|.
+        work: |(f - f_int(u)) · u|, relative to f · u, times the softening
+            s = (f_int(u) · u) / (uᵀ K_T u): an estimate of the relative error of the approach.
+    """
+
+    force: float
+    work: float
+
+    def within(self, settings: LatticeSolverSettings) -> bool:
+        """Say whether both are within their tolerances; NaN is not."""
+        return self.force <= settings.force_tolerance and self.work <= settings.work_tolerance
 
 
 class NonlinearBalance:
-    """One solution's nonlinear residual h, brought into balance with what it causes.
-
-    A pass looks at the region where h counts; `look_everywhere` at the rest.
+    """The loads h of one solution, brought into balance with the displacement they cause.
 
     Args:
         problem: solid and operator.
         guess: response of the candidates; h of an earlier solution and its region.
-        tolerance: largest imbalance relative to the contact forces.
+        settings: tolerances.
 
     Attributes:
-        h: (n, 3) N, what the last pass asks for.
-        region: outside of which it is zero.
-        offset: (m, 3) m, displacement of the candidates without contact forces.
-        field: (n, 3) m, displacement of the nodes looked at, 0 elsewhere.
-        residual: imbalance of the elements looked at, relative to the contact forces.
-        foreseen: imbalance that contact forces under h would leave, relative.
-        weight: how much more an imbalance counts, by the stiffness that the contact has lost.
-        half: L⁻¹ h in elimination order.
-        size: N, norm of the contact forces.
-        noticed: elements but which the bound passed over in the last look at all, or None.
+        h: (n, 3) N, the loads taken.
+        region: elements on which passes work; h is zero on other nodes.
+        field: (n, 3) m, displacement of the region's nodes; of all after `measure`.
+        residual: of the region; of the whole solid after `measure`.
+        measured: the residual is that of the whole solid.
     """
 
-    def __init__(self, problem: ContactProblem, guess: InitialGuess, tolerance: float) -> None:
-        self._problem, self._response, self._tolerance = problem, guess.response, tolerance
+    def __init__(
+        self, problem: ContactProblem, guess: InitialGuess, settings: LatticeSolverSettings
+    ) -> None:
+        self._problem, self._response, self._settings = problem, guess.response, settings
+        self._candidates = problem.contact_nodes[guess.candidates]
         self.region = problem.everywhere if guess.region is None else guess.region
-        self.noticed: Noticed | None = None
-        self._earlier, self._left = guess.left, list[float]()
-        self.foreseen, self._last = np.inf, np.nan
-        self._mixer, self.weight = AndersonMixer(), 1.0
-        if guess.nonlinear_residual is not None and guess.half is not None:
-            self.h = guess.nonlinear_residual
-            self._begin(guess.half)
-            return
+        self._constant = np.zeros_like(problem.solid.nodes)
+        self._rounding = np.zeros((len(guess.candidates), 3))
+        self._mixer, self._softening = AndersonMixer(settings.anderson_depth), 1.0
         self.h = np.zeros_like(problem.solid.nodes)
-        if guess.nonlinear_residual is not None:
-            self.h[self.region.nodes] = guess.nonlinear_residual[self.region.nodes]
-        self._begin(problem.operator.start(self.h, self.region.fronts))
+        if guess.loads is not None:
+            self.h[self.region.nodes] = guess.loads[self.region.nodes]
+        self.residual = Residual(np.inf, np.inf)
+        self._begin()
 
-    def respond(self, pushed: Array) -> None:
-        """Work out displacements and imbalance of the region under contact forces (m, 3), N."""
-        operator, region = self._problem.operator, self.region
-        self.size = max(float(np.linalg.norm(pushed)), 1e-300)
-        self._x = self.half.copy()
-        self._response.push(pushed, self._x)
-        operator.factor.backward(self._x, region.fronts)
-        self.field = np.zeros_like(self.h)
-        self.field[region.nodes] = operator.nodal(self._x, region.nodes)
-        if region.whole:
-            self._look_at_all(None)
-        else:
-            self._look(region)
-        if np.isfinite(self._last):
-            self._left.append(self.residual / self._last)
-        self._foresee()
-
-    def look_everywhere(self) -> None:
-        """Look at the rest of the solid, for the residual and the field of all of it."""
-        region, operator = self.region, self._problem.operator
-        if self._narrowed:
-            return
-        factor, every = operator.factor, self._problem.everywhere.fronts.fronts
-        rest = np.setdiff1d(every, region.fronts.fronts, assume_unique=True)
-        factor.backward(self._x, factor.shared(rest))
-        self.field = operator.nodal(self._x)
-        self._look_at_all((region.elements, self._shares, self._lost))
-        self._foresee()
-
-    def advance(self) -> None:
-        """Take the next h."""
-        nodes = self.region.nodes
-        if self._narrowed:  # another set of unknowns: earlier differences do not apply
-            self._mixer = AndersonMixer()
-        mixed = self._mixer.next(self._taken[nodes].ravel(), self._expected(nodes).ravel())
-        self.h = np.zeros_like(self.h)
-        self.h[nodes] = mixed.reshape(-1, 3)
-        self._begin(self._problem.operator.start(self.h, self.region.fronts))
-
-    def _expected(self, nodes: Index) -> Array:
-        """Return what nodes (m, 3) will ask for when they are given what they now ask for, N.
-
-        Elements that have lost stiffness strain more under what they ask for, and ask for more:
-        h at a node goes on by `FURTHER` of its last change and of its elements' lost stiffness.
-        """
-        scatter, shares = self._problem.solid.scatter, self._shares
-        further = FURTHER * scatter.mean(self._lost, shares, self.region.elements)[nodes, None]
-        return self.h[nodes] + further * (self.h[nodes] - self._taken[nodes])
-
-    def _begin(self, half: Array) -> None:
-        """Take h with L⁻¹ of it."""
-        self._taken, self.half, self._narrowed = self.h, half, False
-        self.offset = self._response.displacement(half)
-
-    def _foresee(self) -> None:
-        """Foresee what a contact under the h asked for leaves of the imbalance."""
-        self._last = self.foreseen = self.residual
-        left = self.left
-        share = left.first if not self._left or left.later is None else left.later
-        if share is not None:
-            leaves = LEFT * share * self.residual + SHARE * self._tolerance / self.weight
-            self.foreseen = min(leaves, self.residual)
+    def _begin(self) -> None:
+        self._half = self._problem.operator.start(self.h, self.region.fronts)
 
     @property
-    def left(self) -> Left:
-        """Shares that passes left here, or where there were none, a bit more than before."""
-        return Left(
-            _most(self._left[:1], self._earlier.first), _most(self._left[1:], self._earlier.later)
-        )
+    def offset(self) -> Array:
+        """Displacement (m, 3) of the candidates without contact forces, m."""
+        return self._response.displacement(self._half) + self._rounding
 
-    def _look(self, region: Region) -> None:
-        """Find the imbalance of a region."""
-        solid = self._problem.solid
-        self._lost = np.empty(len(region.elements))
-        self._shares = solid.nonlinear_residual(self.field, region.elements, self._lost)
-        self.weight = weight_of(norms(self._shares), self._lost)
-        self.h = self._summed(self._shares, region.elements)
-        self.residual = float(np.linalg.norm(self.h - self._taken)) / self.size
-
-    def _look_at_all(self, known: tuple[Index, Array, Array] | None) -> None:
-        """Find the imbalance of all elements, and which count.
+    def displace(self, force: Array, moved: Array) -> None:
+        """Find the region's displacement and residual under contact forces.
 
         Args:
-            known: some elements (k,), their shares (k, 3p) of this field, N, and what they have
-                lost of their stiffness (k,); or None.
+            force: (m, 3) N, on the candidates.
+            moved: (m, 3) m, their displacement by the condensed compliance.
         """
-        solid, everywhere = self._problem.solid, self._problem.everywhere.elements
-        allowed = PASSED_OVER * self._tolerance * self.size / self.weight
-        self.noticed = solid.noticeable(self.field, allowed / np.sqrt(len(everywhere)))
-        elements = everywhere
-        if self.noticed is not None:
-            left = np.zeros(len(everywhere), bool)
-            left[self.noticed.elements] = True
-            if known is not None:
-                left[known[0]] = False
-            elements = np.flatnonzero(left)
-        lost = np.empty(len(elements))
-        shares = solid.nonlinear_residual(self.field, elements, lost)
-        if self.noticed is not None and known is not None:
-            elements, lost = np.concatenate([known[0], elements]), np.concatenate([known[2], lost])
-            shares = np.vstack([known[1], shares])
-        size = norms(shares)
-        self.weight = weight_of(size, lost)
-        counts = elements_that_count(size, SHARE * self._tolerance * self.size / self.weight)
-        which = np.flatnonzero(counts)
-        which = which[np.argsort(elements[which])]
-        self.region = Region.of(self._problem, elements[which])
-        self._shares, self._lost = shares[which], lost[which]
-        self.h = self._summed(shares, elements, which)
-        asked = self.h + self._summed(shares, elements, np.flatnonzero(~counts))
-        self.residual = float(np.linalg.norm(asked - self._taken)) / self.size
-        self._narrowed = True
+        operator, region, solid = self._problem.operator, self.region, self._problem.solid
+        self._force, self._moved = force, moved
+        self._x = self._half.copy()
+        self._response.push(force, self._x)
+        operator.factor.backward(self._x, region.fronts)
+        self.measured = False
+        if region.whole:
+            self._measure()
+            return
+        self.field = np.zeros_like(self.h)
+        self.field[region.nodes] = operator.nodal(self._x, region.nodes)
+        shares = solid.nonlinear_residual(self.field, region.elements)
+        self._asked = self._constant + solid.scatter.sum(shares, region.elements)
+        outside = np.zeros_like(self.h)
+        outside[region.nodes] = (self._asked - self.h)[region.nodes]
+        self.residual = self._residual(outside)
 
-    def _summed(self, forces: Array, elements: Index, which: Index | None = None) -> Array:
-        value = self._problem.solid.scatter.sum(forces, elements, which)
-        value.ravel()[self._problem.held_unknowns] = 0.0
-        return value
+    def measure(self) -> None:
+        """Measure the residual of the whole solid, and its displacement."""
+        if self.measured:
+            return
+        factor, every = self._problem.operator.factor, self._problem.everywhere.fronts.fronts
+        rest = np.setdiff1d(every, self.region.fronts.fronts, assume_unique=True)
+        factor.backward(self._x, factor.shared(rest))
+        self._measure()
 
+    def _measure(self) -> None:
+        solid = self._problem.solid
+        self.field = self._problem.operator.nodal(self._x)
+        internal, self._shares, tangent_work = solid.forces(self.field)
+        work = float(np.vdot(internal, self.field))
+        self._softening = work / max(tangent_work, 1e-3 * abs(work), 1e-300)
+        outside = -internal
+        outside[self._candidates] += self._force
+        self._asked = self.h + outside
+        self.residual = self._residual(outside)
+        self.measured = True
+        # The factor is kept with less precision than the compliance.
+        self._rounding = self._rounding + self.field[self._candidates] - self._moved
 
-def norms(shares: Array) -> Array:
-    """Return the norms (k,) of elements' shares of h (k, 3p), N."""
-    return np.sqrt(np.einsum("ij,ij->i", shares, shares))
+    def _residual(self, outside: Array) -> Residual:
+        """Return the residual (n, 3) relative to the contact forces and their work."""
+        outside.ravel()[self._problem.held_unknowns] = 0.0
+        self._size = max(float(np.linalg.norm(self._force)), 1e-300)
+        force = float(np.linalg.norm(outside)) / self._size
+        work = abs(float(np.vdot(outside, self.field)))
+        work *= self._softening / max(float(np.vdot(self._force, self._moved)), 1e-300)
+        # The work changes its sign from time to time: it has not fallen more than the force.
+        last = self.residual
+        if np.isfinite(last.force):
+            work = max(work, min(force / max(last.force, 1e-300), 1.0) * last.work)
+        return Residual(force, work)
 
+    def advance(self) -> None:
+        """Take the next loads h."""
+        self._asked.ravel()[self._problem.held_unknowns] = 0.0
+        if self.measured:
+            self._choose_region()
+        nodes = self.region.nodes
+        mixed = self._mixer.next(self.h[nodes].ravel(), self._asked[nodes].ravel())
+        self.h = np.zeros_like(self.h)
+        self.h[nodes] = mixed.reshape(-1, 3)
+        self._begin()
 
-def weight_of(size: Array, lost: Array) -> float:
-    """Return how much more an imbalance counts, 1 or more, where the contact has softened.
+    def _choose_region(self) -> None:
+        """Choose the elements that count, and hold constant what the others ask for."""
+        most = OUTSIDE * self._settings.force_tolerance * self._size
+        if self.region.whole or self._beyond(self.region, self._asked - self.h) > most:
+            region = self._counting()
+            if self.residual.force > NEAR or self._beyond(region, self._asked) > most:
+                region = self._problem.everywhere
+            if not (region.whole and self.region.whole):  # earlier differences do not apply
+                self._mixer = AndersonMixer(self._settings.anderson_depth)
+            self.region = region
+        elements = self.region.elements
+        known = self._problem.solid.scatter.sum(self._shares[elements], elements)
+        self._constant = self._asked - known
 
-    What passes leave is what they find slowly, the softest of it, and the approach follows it by
-    the tangent stiffness. The cube of that is measured, not proven (docs/lattice.md).
+    def _counting(self) -> Region:
+        """Return the region of the elements that count at the displacement that was measured."""
+        settings, shares = self._settings, self._shares
+        allowed = settings.region_tolerance * settings.force_tolerance * self._size
+        size = np.sqrt(np.einsum("ij,ij->i", shares, shares))
+        return Region.of(self._problem, np.flatnonzero(elements_that_count(size, allowed)))
 
-    Args:
-        size: (k,) norms of the elements' shares of h.
-        lost: (k,) shares of their tangent stiffness that they have lost.
-    """
-    mean = float(size @ lost) / max(float(size.sum()), 1e-300)
-    return float(max(1.0, (1 - SOFT) / max(1 - mean, 1e-3)) ** 3)
+    def next_start(self) -> tuple[Array, Region]:
+        """Return the loads (n, 3), N, and the region with which a next solution may begin."""
+        self._asked.ravel()[self._problem.held_unknowns] = 0.0
+        return self._asked, self._counting() if self.measured else self.region
 
-
-def _most(measured: list[float], earlier: float | None) -> float | None:
-    """Return the most of what was measured and of what was so before, by now; None: nothing."""
-    before = [] if earlier is None else [earlier * (KEPT if measured else OLDER)]
-    return max(measured + before, default=None)
+    def _beyond(self, region: Region, force: Array) -> float:
+        """Return the norm of forces (n, 3) on nodes outside of a region, N."""
+        outside = force.copy()
+        outside[region.nodes] = 0.0
+        return float(np.linalg.norm(outside))
 
 
 def elements_that_count(size: Array, allowed: float) -> Mask:

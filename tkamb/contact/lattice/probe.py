@@ -25,9 +25,9 @@ from tkamb.units import DEGREE
 
 TURN_STEP = 5e-5
 """m: between the places where femoral normals are compared; well below a cell."""
-FORETOLD = 2.0 * DEGREE
-"""Farthest turn between two poses of which one's step of pose foretells the other's: beyond it what
-the foretold step leaves open (1 %) grows to some per cent of what the step changes."""
+LARGEST_EXTRAPOLATION = 2.0 * DEGREE
+"""Farthest turn between two poses of which one's step is used for the other's: beyond it what the
+extrapolated step leaves open (1 %) grows to some per cent of what the step changes."""
 
 
 class Sketches(Protocol):
@@ -57,7 +57,7 @@ class LatticeProbe(Probe):
         state: what its `prepare` returned.
         guess: an earlier result.
         accuracy: the model's tolerance, share of the contact force.
-        rough: the model with a wider tolerance, for steps whose end is foreseen.
+        rough: the model with a wider tolerance, for steps that are extrapolated.
     """
 
     def __init__(
@@ -84,7 +84,12 @@ class LatticeProbe(Probe):
     ) -> ContactResult:
         """Return the forces under a load; see `Probe`."""
         here, *step = (result.warm_start for result in (guess, *(like or ())))
-        if here is None or None in step or not like or _turn(like[0].pose, pose) > FORETOLD:
+        if (
+            here is None
+            or None in step
+            or not like
+            or _turn(like[0].pose, pose) > LARGEST_EXTRAPOLATION
+        ):
             return self._sketches.press(self._state, load, pose, guess, sketch=True)
         guess = replace(guess, warm_start=here.going_as(*step, pose))
         return self._rough.press(self._state, load, pose, guess, sketch=True)

@@ -1,11 +1,33 @@
 """Frictionless contact of the lattice: force, approach and material in one iteration.
 
-Every pass fires the rays through the displaced contact nodes, solves the unilateral contact
-on the stored compliance of the linear operator (approach included), finds the displacement of
-all nodes, and renews the nonlinear residual h, what the material carries less than the linear
-one (`NonlinearBalance`). The contact under the h that the last look at all elements asks for ends
-the iteration. For a linear material h = 0 and the pass is repeated only until the sliding nodes
-rest.
+Find the displacement u, the contact forces lambda >= 0 along the femoral normals n and the
+approach D with
+
+    f_int(u) = f,                  f = sum of lambda n over the nodes in contact
+    gamma lambda = 0, gamma >= 0,  gamma = n · (x - p) + D n_y, the gap of a node at x
+    -sum of lambda n_y = load
+
+f_int are the forces of the displaced solid under its nonlinear law, p the femoral points. One
+pass of the iteration is a modified Newton step with the factorised linear stiffness K:
+
+1. Femoral points and normals: vertical rays through the displaced nodes.
+2. Contact: an active set on the condensed compliance of the candidate nodes, K⁻¹ at those nodes,
+   with the displacement K⁻¹ h of the nonlinear loads h as offset (`active_set.py`).
+3. Displacement: K u = f + h. Residual: r = f - f_int(u).
+4. Next loads: h + r, accelerated by Anderson's method (`anderson.py`).
+
+Passes look at the region of the elements that have softened (`nonlinear_balance.py`). When the
+residual there is within the tolerances, the residual of the whole solid is measured at u: r from
+the law of every element, without any factor; the gap at the displaced nodes, with rays fired
+anew. Only these stop the iteration, and these are reported:
+
+    |r| / |f| <= force_tolerance
+    s |r · u| / (f · u) <= work_tolerance,    s = (f_int(u) · u) / (uᵀ K_T u)
+    |gamma| / max |u| <= gap_tolerance        of active nodes, and overlap of the others
+
+The work of the residual estimates the relative error of the approach: for an error du = e u,
+r = e K_T u. The load and lambda >= 0 hold to rounding in every pass. When no pass gets there,
+Newton's method with a refactorised tangent goes on (`newton.py`).
 """
 
 from dataclasses import dataclass, replace
@@ -13,67 +35,41 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tkamb.contact.lattice.active_set import ContactForces, solve_contact
-from tkamb.contact.lattice.initial_guess import NOT_KNOWN, InitialGuess, Left
+from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.linear.compliance import ContactResponse
 from tkamb.contact.lattice.nonlinear_balance import NonlinearBalance
 from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes, tangent_planes
-from tkamb.contact.lattice.solids.solid import Noticed
+from tkamb.contact.lattice.settings import LatticeSolverSettings
 from tkamb.geometry.frames import Array, Index, Mask
 
-DIVERGED = 100.0
-"""The iteration is given up when the imbalance is this many times the smallest so far."""
-AT_REST = 0.25
-"""Of the tolerance: so far may active nodes be from the femoral surface. At a rim, where its normal
-turns, a peak is off by up to three times as much."""
-SLOW = 0.7
-"""When a pass leaves more than this share of the last distance, sliding steps are halved."""
-SMALLEST_SHARE = 0.125
-
-
-@dataclass(frozen=True)
-class Tolerance:
-    """When the iteration stops.
-
-    Args:
-        force: out-of-balance force and change of contact force, relative.
-        passes: most passes before giving up.
-    """
-
-    force: float = 1e-3
-    passes: int = 40
-
-    def at_rest(self, missed: float, last: bool) -> bool:
-        """Say whether active nodes are near enough to the femoral surface.
-
-        Args:
-            missed: largest distance, relative to what nodes move.
-            last: it is the last pass: what comes to rest slowly is held to the whole tolerance.
-        """
-        return missed <= (self.force if last else AT_REST * self.force)
+DIVERGED = 10.0
+"""Relative residual force at which the iteration is given up."""
+STAGNATION_RATIO = 0.7
+"""The planes are damped when a gap changes its sign and falls by less than to this share."""
+LEAST_DAMPING = 0.125
+"""Smallest share of the way that the planes follow the nodes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What the iteration found.
+    """The state at which the iteration stopped, and what was measured there.
 
     Args:
         candidates: (m,) positions among the contact nodes.
         forces: along the normals, with approach and active set.
         planes: femoral points and normals of the candidates.
         displacement: (m, 3) of the candidates, m.
-        field: (n, 3) displacement of all nodes when they were last looked at, or None (linear
-            material).
-        nonlinear_residual: (n, 3) h, N, that the forces hold with, or None (linear).
+        field: (n, 3) displacement of all nodes, or None (linear material).
+        loads: (n, 3) N, h + r: where a next solution may begin; None (linear material).
         passes: how many.
-        residual: out-of-balance force, as foreseen, or distance from the femoral surface, the
-            larger one, both relative.
-        region: outside of which h is zero, or None.
-        seen: all elements were looked at; else `field` is that of the region.
-        noticed: elements but which the bound passed over, or None (all).
-        half: L⁻¹ h in elimination order, or None.
-        left: shares of the imbalance that passes leave.
-        balanced: some pass had no force out of balance; active nodes may yet have missed the
-            femoral surface.
+        residual: force of the whole solid that is out of balance, relative to the contact
+            forces, or the gap of active nodes, relative to their displacement, the larger one.
+        region: the elements with which a next solution may begin, or None.
+        seen: the residual is that of the whole solid; else that of the region (forces only).
+        noticed: None: strains of all elements are looked at.
+        work: work of the residual force times the softening, relative to that of the contact
+            forces: an estimate of the relative error of the approach.
+        gap: that of active nodes, relative to their displacement.
     """
 
     candidates: Index
@@ -81,19 +77,18 @@ class Solution:
     planes: TangentPlanes
     displacement: Array
     field: Array | None
-    nonlinear_residual: Array | None
+    loads: Array | None
     passes: int
     residual: float
     region: Region | None = None
     seen: bool = True
-    noticed: Noticed | None = None
-    half: Array | None = None
-    left: Left = NOT_KNOWN
-    balanced: bool = False
+    noticed: None = None
+    work: float = 0.0
+    gap: float = 0.0
 
     @property
     def converged(self) -> bool:
-        """Whether forces, surface and active set all came to rest."""
+        """Whether residual force, gap and active set are within their tolerances."""
         return self.forces.converged
 
 
@@ -102,65 +97,52 @@ def solve(
     pose: Array,
     load: float | None,
     guess: InitialGuess,
-    tolerance: Tolerance,
+    settings: LatticeSolverSettings,
 ) -> Solution:
     """Return the contact at a pose under a load (N), or at approach 0 when load is None."""
     if problem.solid.material.is_linear:
-        return _solve_linear(problem, pose, load, guess, tolerance)
-    chosen, active, passes, balanced = guess.candidates, guess.active, 0, False
-    balance = NonlinearBalance(problem, guess, tolerance.force)
-    points = problem.surface_points[chosen]
-    first = balance.offset if guess.moved is None else guess.moved
-    sliding = SlidingNodes(problem, points, first, pose, guess.planes)
-    best: Solution | None = None
-    settled: Solution | None = None
-    warm, enough = guess.nonlinear_residual is not None, tolerance.force
-
-    def found(residual: float, converged: bool) -> Solution:
-        return Solution(
-            chosen,
-            replace(forces, converged=converged and forces.converged),
-            planes,
-            moved,
-            balance.field,
-            balance.h,
-            passes,
-            residual,
-            balance.region,
-            balance.size > guess.unseen,
-            balance.noticed,
-            balance.half,
-            balance.left,
-            balanced,
-        )
-
+        return _solve_linear(problem, pose, load, guess, settings)
+    points = problem.surface_points[guess.candidates]
+    active, passes, warm = guess.active, 0, guess.loads is not None
+    balance = NonlinearBalance(problem, guess, settings)
+    moved = balance.offset if guess.moved is None else guess.moved
+    sliding = SlidingNodes(problem, points, moved, pose, guess.planes)
     while True:
         planes = sliding.planes
         forces, moved = solve_pass(guess.response, balance.offset, points, planes, load, active)
         if warm and not forces.active.any():
             # What a heavier contact left behind holds the nodes down: begin without it.
-            warm, guess = False, guess.cold
-            balance = NonlinearBalance(problem, guess, tolerance.force)
-            sliding = SlidingNodes(problem, points, balance.offset, pose, guess.planes)
-            continue
-        active = forces.active
-        missed = sliding.follow(moved, forces)
-        last = passes == tolerance.passes
-        if balance.foreseen <= enough and tolerance.at_rest(missed, last):
-            settled = found(max(balance.foreseen, missed), True)
-            enough = tolerance.force / balance.weight  # a softened contact goes on to this
-            if balance.foreseen <= enough or last:
-                return settled
-        passes += 1
-        balance.respond(forces.force[:, None] * planes.normals)
-        if balance.foreseen <= enough and balance.size > guess.unseen:
-            balance.look_everywhere()
-        balanced = balanced or balance.residual <= tolerance.force
-        now = found(max(balance.residual, missed), False)
-        best = now if best is None or now.residual < best.residual else best
-        spent = passes >= tolerance.passes and balance.foreseen > enough
-        if spent or passes > tolerance.passes or not now.residual < DIVERGED * best.residual:
-            return settled or replace(_given_up(problem, best, passes), balanced=balanced)
+            return solve(problem, pose, load, guess.cold, settings)
+        active, passes = forces.active, passes + 1
+        gap = sliding.follow(moved, forces)
+        balance.displace(forces.force[:, None] * planes.normals, moved)
+        last = passes == settings.max_passes
+        forces_only = float(np.linalg.norm(forces.force)) <= guess.unmeasured
+        allowed = settings.force_tolerance if last else settings.gap_tolerance
+        last = last or not balance.residual.force < DIVERGED
+        if (last or (balance.residual.within(settings) and gap <= allowed)) and not forces_only:
+            balance.measure()
+        if balance.measured:
+            moved = balance.field[problem.contact_nodes[guess.candidates]]
+            gap = sliding.gap(moved, forces)
+        within = balance.residual.within(settings) and gap <= allowed
+        if last or (within and (balance.measured or forces_only)):
+            loads, region = balance.next_start()
+            return Solution(
+                guess.candidates,
+                replace(forces, converged=within and forces.converged),
+                planes,
+                moved,
+                balance.field,
+                loads,
+                passes,
+                max(balance.residual.force, gap),
+                region,
+                balance.measured,
+                None,
+                balance.residual.work,
+                gap,
+            )
         balance.advance()
 
 
@@ -187,24 +169,14 @@ def solve_pass(
     return forces, offset + response.moved(pushed, forces.force)
 
 
-def _given_up(problem: ContactProblem, best: Solution, passes: int) -> Solution:
-    """Return the best pass with the displacements of the whole solid."""
-    h = best.nonlinear_residual
-    applied = np.zeros_like(problem.solid.nodes) if h is None else h.copy()
-    applied[problem.contact_nodes[best.candidates]] += (
-        best.forces.force[:, None] * best.planes.normals
-    )
-    return replace(best, field=problem.operator.solve(applied), passes=passes, noticed=None)
-
-
 def _solve_linear(
     problem: ContactProblem,
     pose: Array,
     load: float | None,
     guess: InitialGuess,
-    tolerance: Tolerance,
+    settings: LatticeSolverSettings,
 ) -> Solution:
-    """Repeat rays and contact until the sliding nodes rest."""
+    """Repeat rays and contact until active nodes are on the femoral surface."""
     points = problem.surface_points[guess.candidates]
     offset = np.zeros_like(points) if guess.offset is None else guess.offset
     active, passes = guess.active, 0
@@ -212,14 +184,15 @@ def _solve_linear(
     sliding = SlidingNodes(problem, points, first, pose, guess.planes)
     while True:
         passes += 1
-        planes = sliding.planes
+        planes, last = sliding.planes, passes == settings.max_passes
         forces, moved = solve_pass(guess.response, offset, points, planes, load, active)
-        active = forces.active
-        missed = sliding.follow(moved, forces)
-        done = tolerance.at_rest(missed, passes == tolerance.passes)
-        if done or passes == tolerance.passes:
+        active, gap = forces.active, sliding.follow(moved, forces)
+        done = gap <= (settings.force_tolerance if last else settings.gap_tolerance)
+        if done or last:
             forces = replace(forces, converged=done and forces.converged)
-            return Solution(guess.candidates, forces, planes, moved, None, None, passes, missed)
+            return Solution(
+                guess.candidates, forces, planes, moved, None, None, passes, gap, gap=gap
+            )
 
 
 class SlidingNodes:
@@ -247,7 +220,7 @@ class SlidingNodes:
     ) -> None:
         self._problem, self._points, self._pose = problem, points, pose
         self._fired = points + moved
-        self._share, self._last = 1.0, np.inf
+        self._share, self._last, self._gap = 1.0, np.inf, np.zeros(len(points))
         self.planes = planes
         if moved.any():
             self.planes = tangent_planes(problem, self._fired, pose, planes)
@@ -262,17 +235,28 @@ class SlidingNodes:
         """
         positions = self._points + moved
         there = tangent_planes(self._problem, positions, self._pose, self.planes)
+        missed = self._relative_gap(there, moved, forces)
         gap = there.gap(positions) + forces.approach * there.normal_y
-        miss = np.where(forces.active, np.abs(gap), np.maximum(-gap, 0))
-        size = float(np.abs(moved[forces.active]).max(initial=0.0))
-        missed = float(np.nan_to_num(miss, nan=0.0).max()) / max(size, 1e-300)
-        missed = missed if forces.active.any() else np.inf
-        if missed > SLOW * self._last:
-            self._share = max(self._share / 2, SMALLEST_SHARE)
-        self._last = missed
+        gap = np.where(forces.active, gap, 0.0)
+        if missed > STAGNATION_RATIO * self._last and float(gap @ self._gap) < 0:
+            self._share = max(self._share / 2, LEAST_DAMPING)
+        self._last, self._gap = missed, gap
         if self._share == 1.0:
             self._fired, self.planes = positions, there
         else:
             self._fired = self._fired + self._share * (positions - self._fired)
             self.planes = tangent_planes(self._problem, self._fired, self._pose, self.planes)
         return missed
+
+    def gap(self, moved: Array, forces: ContactForces) -> float:
+        """Measure the same distance for nodes displaced by moved (m, 3); renew nothing."""
+        there = tangent_planes(self._problem, self._points + moved, self._pose, self.planes)
+        return self._relative_gap(there, moved, forces)
+
+    def _relative_gap(self, there: TangentPlanes, moved: Array, forces: ContactForces) -> float:
+        if not forces.active.any():
+            return np.inf
+        gap = there.gap(self._points + moved) + forces.approach * there.normal_y
+        miss = np.where(forces.active, np.abs(gap), np.maximum(-gap, 0))
+        size = float(np.abs(moved[forces.active]).max())
+        return float(np.nan_to_num(miss, nan=0.0).max()) / max(size, 1e-300)

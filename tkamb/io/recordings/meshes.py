@@ -170,8 +170,8 @@ def _read_mesh(path: Path) -> tuple[Array, Indices]:
         if suffix == ".stl" and (corners := read_binary_stl(path)) is not None:
             return corners, np.arange(len(corners)).reshape(-1, 3)
         if suffix in (".obj", ".ply"):
-            vertices, corners, ends = read_obj(path) if suffix == ".obj" else read_ply(path)
-            return vertices, triangulated(vertices, corners, ends)
+            vertices, outline, ends = read_obj(path) if suffix == ".obj" else read_ply(path)
+            return vertices, triangulated(vertices, outline, ends)
         return _read_by_trimesh(path)
     except InputError:
         raise

@@ -88,6 +88,12 @@ def check_elements(robot: ElementTree.Element, path: Path) -> None:
         raise InputError(f"has two joints '{twice[0]}'", path, "rename one")
 
 
+_FARTHEST = 10.0
+"""m; the largest coordinate of a place on a link: four times a tall man's height."""
+_HEAVIEST = 1000.0
+"""kg and kg·m²; no segment of a human comes near it."""
+
+
 def _check_attributes(element: ElementTree.Element, where: str) -> None:
     """Raise where a place, an axis or an inertia is misspelt or not numbers."""
     known = _ATTRIBUTES[element.tag]
@@ -99,6 +105,13 @@ def _check_attributes(element: ElementTree.Element, where: str) -> None:
         if not _finite(text, known[key]):
             numbers = "a number" if known[key] == 1 else f"{known[key]} numbers"
             raise InputError(f'<{element.tag} {key}="{text}"> is not {numbers}', where)
+        place = element.tag == "origin" and key == "xyz"
+        if place and np.abs(numbers_of(element, key)).max() > _FARTHEST:
+            mend = "xyz is in metres: is it in millimetres?"
+            raise InputError(f'<origin xyz="{text}"> is beyond {_FARTHEST:g} m', where, mend)
+        if key in ("value", *_INERTIA) and abs(float(text)) > _HEAVIEST:
+            mend = f"give at most {_HEAVIEST:g} (kg, kg·m²)"
+            raise InputError(f'<{element.tag} {key}="{text}"> is of no body', where, mend)
         if key == "rpy" and np.abs(numbers_of(element, key)).max() > _MOST_TURNS:
             mend = "rpy is in radians: is it in degrees?"
             raise InputError(f'<origin rpy="{text}"> turns by several turns', where, mend)

@@ -6,7 +6,6 @@ unknown key is an error. `load_scene` reads and validates it; nothing else is op
 
 import json
 import os
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, get_args
 
@@ -14,7 +13,6 @@ from pydantic import BaseModel, Field, PrivateAttr, ValidationError, model_valid
 from pydantic_core import ErrorDetails
 
 from tkamb.errors import InputError, names_near
-from tkamb.files import read_text
 from tkamb.io.scene.measured import MeasuredTable
 from tkamb.io.scene.recording_tables import GroundReactionTable, MotionTable, TibiaTable
 from tkamb.io.scene.table import SceneTable
@@ -34,6 +32,7 @@ from tkamb.io.scene.tables import (
     WearTable,
 )
 from tkamb.io.scene.uncertainty import UncertaintyTable
+from tkamb.io.toml_text import read_toml
 
 if TYPE_CHECKING:
     from tkamb.io.presets.preset import AppliedPreset
@@ -83,7 +82,7 @@ class Scene(SceneTable):
 
     @property
     def insert_material(self) -> dict[str, Any]:
-        """What the insert is made of, as `tkamb.contact.given_material` takes it."""
+        """What the insert is made of, as `tkamb.io.given_material` takes it."""
         if self.material is not None:
             return self.material.model_dump()
         return {} if self.contact is None else {"base": self.contact.material}
@@ -272,10 +271,7 @@ def _merge(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 
 def _parse(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(read_text(path, what="scene file"))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"is not TOML ({error})", path) from None
+    return read_toml(path, what="scene file")
 
 
 def scene_schema() -> dict[str, Any]:

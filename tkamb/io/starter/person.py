@@ -225,5 +225,5 @@ def _mirror_mesh(path: Path) -> None:
     """Reflect a mesh in the sagittal plane; its triangles keep their outward side."""
     import trimesh
 
-    mesh = trimesh.load(path, process=False)
+    mesh = trimesh.load_mesh(path, process=False)
     trimesh.Trimesh(mesh.vertices @ MIRROR, mesh.faces[:, ::-1], process=False).export(path)

@@ -100,9 +100,15 @@ class Body(Protocol):
     """What the search asks of a body, frame by frame: of a whole motion, or of one instant."""
 
     friction: float
-    ligaments: "Sequence[Ligament]"
     extensor: Any
-    muscles: "SharedMuscles | None"
+
+    @property
+    def ligaments(self) -> "Sequence[Ligament]":
+        """The bundles, with slack lengths."""
+
+    @property
+    def muscles(self) -> "SharedMuscles | None":
+        """Those that share the load; None if the quadriceps alone acts."""
 
     @property
     def sides(self) -> set[str]:

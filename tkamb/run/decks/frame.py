@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from tkamb.contact.given_material import given_material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_class
 from tkamb.errors import InputError
+from tkamb.io.given_material import given_material
 from tkamb.run.decks.calculix import Deck
 from tkamb.run.decks.febio import febio_text
 from tkamb.run.decks.problem import PressProblem, press_problem

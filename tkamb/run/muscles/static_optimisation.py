@@ -21,10 +21,11 @@ Arnstrom et al., IEEE Trans Autom Control 67:4362 (2022), doi:10.1109/TAC.2022.3
 """
 
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 
 import numpy as np
 
-from tkamb.errors import ComputationError, InputError
+from tkamb.errors import ComputationError, InputError, not_installed
 from tkamb.geometry.frames import Array
 
 
@@ -131,6 +132,16 @@ class Shared:
     steps: int
 
 
+def solver_missing() -> InputError:
+    """Return the refusal of a run whose muscles need the solver DAQP, which is not installed."""
+    return not_installed("the solver DAQP", "[muscles]", "muscles")
+
+
+def solver_is_installed() -> bool:
+    """Say whether the solver DAQP, which the extra `muscles` brings, is installed."""
+    return find_spec("daqp") is not None
+
+
 def share_load(problem: LoadSharing) -> Shared:
     """Return the activations of least cost.
 
@@ -192,8 +203,7 @@ def _programme(problem: LoadSharing, hessian: Array, gradient: Array) -> tuple[A
     try:
         import daqp
     except ImportError:
-        mend = "install it: pip install 'tkamb[muscles]'"
-        raise InputError("the solver DAQP is not installed", "muscles", mend) from None
+        raise solver_missing() from None
     scale = _row_scale(problem)
     bounded = np.isfinite(problem.lower) | np.isfinite(problem.upper)
     rows = problem.gain[bounded] / scale[bounded, None]

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.contact.given_material import (
+from tkamb.geometry.frames import KNEE_COORDINATES, Array
+from tkamb.geometry.surface import Surface
+from tkamb.io.given_material import (
     given_material,
     material_as_json,
     material_in_words,
 )
-from tkamb.geometry.frames import KNEE_COORDINATES, Array
-from tkamb.geometry.surface import Surface
 from tkamb.io.scene.case import Case
 from tkamb.run.mechanics import STRAIN_FLEXIONS, Mechanics
 from tkamb.units import DEGREE, MILLIMETRE

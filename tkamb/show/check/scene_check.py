@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tkamb.contact.given_material import given_material
 from tkamb.contact.registry import contact_model
+from tkamb.io.given_material import given_material
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.run.mechanics import Mechanics
@@ -27,6 +27,7 @@ class SceneCheck:
         assumptions: what the numbers would rest on.
         questions: what is unlikely about it, with the likely mistake.
         answered: of these, what the scene answers.
+        missing: packages that a run would need and that are not installed, with the remedy.
     """
 
     scene: Path
@@ -36,12 +37,14 @@ class SceneCheck:
     assumptions: tuple[str, ...]
     questions: tuple[str, ...]
     answered: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
         """Return the check as lines of text."""
         nothing = ["none: nothing unlikely was found; that is no proof"]
         return [
-            f"{self.scene}: can be run",
+            *(f"missing: {sentence}" for sentence in self.missing),
+            f"{self.scene}: can be run{' when that is installed' if self.missing else ''}",
             *(entry.line() for entry in self.entries),
             f"not modelled: {', '.join(self.not_modelled)}",
             *(f"assumed: {sentence}" for sentence in self.assumptions),
@@ -64,6 +67,7 @@ class SceneCheck:
             "assumptions": list(self.assumptions),
             "questions": list(self.questions),
             "answered": list(self.answered),
+            "missing": list(self.missing),
         }
 
 
@@ -102,7 +106,17 @@ def check_scene(
         tuple(assumptions(case)),
         tuple(question.text for question in plausibility.questions),
         plausibility.answered,
+        _missing(case),
     )
+
+
+def _missing(case: Case) -> tuple[str, ...]:
+    """Return the packages that a run of the case needs and that are not installed."""
+    if not case.scene.muscles:
+        return ()
+    from tkamb.run.muscles.static_optimisation import solver_is_installed, solver_missing
+
+    return () if solver_is_installed() else (str(solver_missing()),)
 
 
 def _beyond(case: Case) -> list[str]:

@@ -5,8 +5,10 @@ users of the machine reach the port too: every address starts with a random toke
 user's terminal shows.
 """
 
+import argparse
 import json
 import secrets
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from http import HTTPStatus
@@ -19,6 +21,7 @@ import numpy as np
 from tkamb.contact.registry import contact_names
 from tkamb.errors import InputError, TkambError
 from tkamb.run.contact_side import ContactSide
+from tkamb.run.guard import say, unforeseen_words
 from tkamb.show.style import SIDE_COLOURS
 from tkamb.show.view.draw import lattice_lines
 from tkamb.show.view.drawing import PressureMap
@@ -197,7 +200,7 @@ class ViewServer:
         Handler.content, Handler.switch, Handler.root = content, switch, f"/{self._token}/"
         Handler.bench = None if bench is None else staticmethod(bench)
         try:
-            self._server = ThreadingHTTPServer((HOST, port), Handler)
+            self._server = _QuietServer((HOST, port), Handler)
         except (OSError, OverflowError) as error:
             raise InputError(f"cannot listen ({error})", f"{HOST}:{port}", "--port 0") from None
         self._server.daemon_threads = True
@@ -217,6 +220,16 @@ class ViewServer:
         """Stop."""
         self._server.shutdown()
         self._server.server_close()
+
+
+class _QuietServer(ThreadingHTTPServer):
+    """A server whose clients may leave at any moment: a browser that is closed is no error."""
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say in one line what nobody foresaw; nothing of a client that has gone."""
+        error = sys.exception()
+        if isinstance(error, Exception) and not isinstance(error, ConnectionError | TimeoutError):
+            say(unforeseen_words(error, argparse.Namespace()))
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -7,7 +7,6 @@ trials' scenes with overrides, as `tkamb run --set` gives them.
 import hashlib
 import itertools
 import json
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,9 +16,10 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from tkamb.errors import InputError, names_near
-from tkamb.files import read_text, sha256_of
+from tkamb.files import sha256_of
 from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.table import Count, Number, SceneTable
+from tkamb.io.toml_text import read_toml
 from tkamb.run.frame_choice import frames_slice
 from tkamb.run.summary import files_in
 
@@ -221,10 +221,7 @@ def load_cohort(path: str | Path, frames: str | None = None) -> Cohort:
         InputError: the file or a scene cannot be used.
     """
     path = Path(path)
-    try:
-        content = tomllib.loads(read_text(path, what="cohort file"))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"is not TOML ({error})", path) from None
+    content = read_toml(path, what="cohort file")
     if frames is not None:
         content["frames"] = frames
     try:

@@ -3,7 +3,6 @@
 Keys are the fields of `FemoralComponent`, `Cam`, `Insert` and `Post` with their unit behind them.
 """
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any, TypeVar
 
 from tkamb.contact.pair import Bearing
 from tkamb.errors import InputError
-from tkamb.files import read_text
+from tkamb.io.toml_text import read_toml
 from tkamb.studies.designs import solids
 from tkamb.studies.designs.femoral import Cam, FemoralComponent
 from tkamb.studies.designs.insert import Insert, Post
@@ -75,10 +74,7 @@ def load_design(folder: str | Path) -> Design:
         InputError: no such file, an unknown key, one without its unit, or an impossible value.
     """
     file = Path(folder) / DESIGN_FILE
-    try:
-        rows = tomllib.loads(read_text(file, what="design file"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"is no TOML ({error})", file, "mend the line it names") from None
+    rows = read_toml(file, what="design file")
     unknown = set(rows) - {"title", "bearing", "femoral", "cam", "insert", "post", "sources"}
     if unknown:
         raise InputError(f"unknown key '{min(unknown)}'", file, "see models/designs/README.md")

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 
 from tkamb.atomic import write_rows
+from tkamb.io.hdf5_file import new_hdf5
 from tkamb.run.results_folder import (
     BANDS_NAME,
     INDICES_NAME,
@@ -29,7 +30,7 @@ def write_uncertainty(found: "Uncertainty", folder: Path) -> None:
     """
 
     def write_samples(path: Path) -> None:
-        with h5py.File(path, "w") as file:
+        with new_hdf5(path) as file:
             file["result_names"] = found.names
             file["input_names"] = [one.name for one in found.inputs]
             file["input_units"] = [one.unit for one in found.inputs]

@@ -31,10 +31,10 @@ WORDS = {
 MADE = """\
 Made by `{command}` on {date}, tkamb {version}, in {cpu_minutes:.0f} minutes of processor time.
 Nothing here is typed: numbers of others stand in `tkamb/studies/validation/*.toml` with their
-source, ours in `docs/validation.json`. The designs' radii were chosen before the first press and
-left alone. Two benchmarks were set up anew after a first look, which made hits of four misses:
-the load on the bonded layer (60 N made a contact two cells wide), and how malrotation is measured
-(a difference about the knee's middle, not a ratio about one condyle's axis)."""
+source, ours in `scripts/data/validation.json`. The designs' radii were chosen before the first
+press and left alone. Two benchmarks were set up anew after a first look, which made hits of four
+misses: the load on the bonded layer (60 N made a contact two cells wide), and how malrotation is
+measured (a difference about the knee's middle, not a ratio about one condyle's axis)."""
 COUNTED = """\
 Each condyle is pressed alone by `lattice` at 2 mm with the table's own force (times the body mass
 that the design's areas and pressures imply), at the nominal case and over a Latin hypercube of the

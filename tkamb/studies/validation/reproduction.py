@@ -1,7 +1,7 @@
 """What docs/dissertation.md puts beside Sharma (2008), computed with the preset sharma-2008.
 
 Facts of the source stand in `reproduction.toml`, appendix D in `dissertation_tables.toml`. Numbers
-that docs/validation.json has already are taken from there by the page.
+that scripts/data/validation.json has already are taken from there by the page.
 """
 
 import time

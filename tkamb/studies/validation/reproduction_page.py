@@ -28,7 +28,7 @@ below), and the coupling of body and contact differs.
 MADE = """\
 Made by `{command}` on {date}, tkamb {version}. Nothing in the tables is typed: the source's
 numbers stand in `tkamb/studies/validation/reproduction.toml` and `dissertation_tables.toml`, ours
-in `docs/dissertation.json` and `docs/validation.json`."""
+in `scripts/data/dissertation.json` and `scripts/data/validation.json`."""
 SET = """\
 Why each of them: `tkamb/io/presets/sharma_2008.py`. Another study adds its own by a class and a
 row in `tkamb/io/presets/registry.py`, or from another package through the entry-point group
@@ -76,8 +76,8 @@ def page(
     """Return the page's text.
 
     Args:
-        stored: docs/dissertation.json.
-        validated: values of docs/validation.json.
+        stored: scripts/data/dissertation.json.
+        validated: values of scripts/data/validation.json.
         preset: dotted key -> value of sharma-2008.
     """
     values = {**validated, **stored["values"]}

@@ -2,9 +2,12 @@
 
 import hashlib
 import json
+import math
+import zlib
 from dataclasses import fields
 from io import BytesIO
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -17,6 +20,11 @@ from tkamb.studies.wear.setup import WearSetup
 from tkamb.studies.wear.simulation import WearCase, WearState
 
 STATE_NAME = ".wear.npz"
+UNREADABLE = (
+    *(ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError),
+    *(MemoryError, BadZipFile, zlib.error),
+)
+"""What numpy and zipfile raise for damaged bytes."""
 
 
 def wear_identity(setup: WearSetup, case: WearCase, cycles: int, updates: int) -> str:
@@ -51,8 +59,13 @@ def keep_state(folder: Path, state: WearState, identity: str) -> None:
         np.savez(file, allow_pickle=False, identity=np.asarray(identity), rows=rows, **arrays)
 
 
-def kept_state(folder: Path, identity: str) -> WearState | None:
+def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
     """Return the state that a folder keeps; None where there is none.
+
+    Args:
+        folder: of the simulation.
+        identity: of the simulation to go on with.
+        count: of articular vertices.
 
     Raises:
         InputError: it is of another simulation, or cannot be read.
@@ -63,11 +76,26 @@ def kept_state(folder: Path, identity: str) -> WearState | None:
     try:
         with np.load(BytesIO(read_bytes(path, MESH_LIMIT)), allow_pickle=False) as file:
             content = dict(file)
-    except (ValueError, OSError, EOFError, KeyError) as error:
-        raise InputError(f"cannot be read ({error})", path, "leave --resume out") from None
+    except UNREADABLE as error:
+        raise _damaged(path, str(error) or type(error).__name__) from None
     if str(content.pop("identity", "")) != identity:
         what = "is of another simulation: bodies, motion, law, numbers or code differ"
         raise InputError(what, path, "leave --resume out, or choose another folder with --out")
-    rows = json.loads(str(content.pop("rows")))
-    values = {name: value.item() if value.ndim == 0 else value for name, value in content.items()}
-    return WearState(rows=tuple(rows), **values)
+    try:
+        rows = json.loads(str(content.pop("rows")))
+        values = {name: one.item() if one.ndim == 0 else one for name, one in content.items()}
+        state = WearState(rows=tuple(rows), **values)
+        whole = all(isinstance(row, dict) for row in rows)
+    except (ValueError, KeyError, TypeError) as error:
+        raise _damaged(path, str(error)) from None
+    numbers = (state.cycles, state.step, state.volume, state.creep_volume, state.map_error)
+    if not (whole and all(isinstance(one, float) and math.isfinite(one) for one in numbers)):
+        raise _damaged(path, "its numbers are none")
+    arrays = (state.wear, state.creep, state.fall)
+    if not all(isinstance(one, np.ndarray) and one.shape == (count,) for one in arrays):
+        raise _damaged(path, f"its arrays are not of {count} vertices")
+    return state
+
+
+def _damaged(path: Path, why: str) -> InputError:
+    return InputError(f"is damaged ({why})", path, "leave --resume out to begin again")

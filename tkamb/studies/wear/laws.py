@@ -3,7 +3,7 @@
 A law is a frozen dataclass of its parameters. `wear_law` finds it by name, the built-in ones and
 those of other packages:
 
-    [project.entry-points."tkamb.studies.wear"]
+    [project.entry-points."tkamb.wear"]
     my-law = "my_package.my_module:MyLaw"
 """
 
@@ -250,7 +250,7 @@ BUILT_IN = {
 WEAR_LAWS = NamedClasses(
     "wear law",
     WearLaw,  # type: ignore[type-abstract]
-    "tkamb.studies.wear",
+    "tkamb.wear",
     BUILT_IN,
 )
 

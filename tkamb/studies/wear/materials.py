@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tkamb.errors import InputError, names_near
-from tkamb.files import read_text
+from tkamb.io.toml_text import read_toml
 from tkamb.studies.wear.creep import LogarithmicCreep
 from tkamb.studies.wear.laws import WearLaw, law_class, wear_law
 
@@ -104,10 +104,7 @@ def wear_material(name: str | Path) -> WearMaterial:
     if Path(name).suffix != ".toml":
         mend = f"{names_near(str(name), known)}; or give a material file (.toml)"
         raise InputError(f"no wear material '{name}'", mend=mend)
-    try:
-        content = tomllib.loads(read_text(name, what="wear material"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"is not TOML ({error})", name) from None
+    content = read_toml(name, what="wear material")
     return _material(str(content.pop("name", Path(name).stem)), content, name)
 
 

@@ -110,7 +110,9 @@ class WearRun:
             if folder is not None:
                 keep_state(folder, done, identity)
 
-        state = kept_state(folder, identity) if folder is not None and resume else None
+        count, state = len(self.case.articular.vertices), None
+        if folder is not None and resume:
+            state = kept_state(folder, identity, count)
         try:
             with interrupt_as_such():
                 return simulate_wear(self.case, self.cycles, self.updates, state=state, keep=keep)
@@ -118,7 +120,7 @@ class WearRun:
             kept = None
             if folder is not None:
                 with suppress(InputError):  # what another simulation left is not ours to tell of
-                    kept = kept_state(folder, identity)
+                    kept = kept_state(folder, identity, count)
             if kept is None:
                 raise
             done = f"{kept.cycles:.6g} cycles are kept"

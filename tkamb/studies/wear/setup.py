@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tkamb.contact.given_material import given_material
 from tkamb.contact.registry import contact_model, contact_options
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, knee_pose
+from tkamb.io.given_material import given_material
 from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.io.scene.tables import ContactTable, WearTable

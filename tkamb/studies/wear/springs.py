@@ -1,14 +1,13 @@
 """Springs of a knee simulator that stand for the ligaments, from a file of the user's."""
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tkamb.errors import InputError, names_near
-from tkamb.files import read_text
+from tkamb.io.toml_text import read_toml
 from tkamb.units import DEGREE, MILLIMETRE
 
 KINDS = {
@@ -54,10 +53,7 @@ def read_springs(path: str | Path) -> Springs:
     Raises:
         InputError: an unknown or missing key, or a stiffness or gap that is none.
     """
-    try:
-        content = tomllib.loads(read_text(path, what="springs"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"is not TOML ({error})", path) from None
+    content = read_toml(path, what="springs")
     sources = content.pop("sources", None)
     if not (isinstance(sources, list) and sources and all(isinstance(s, str) for s in sources)):
         raise InputError("sources is no list of texts", path, "say where each number comes from")

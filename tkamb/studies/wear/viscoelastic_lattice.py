@@ -19,9 +19,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tkamb.contact.lattice.initial_guess import InitialGuess, guessed_depth, initial_guess
-from tkamb.contact.lattice.model import MOST_GROWTHS, REACH, TOUCHING, LinearLattice
+from tkamb.contact.lattice.model import REACH, TOUCHING, LinearLattice
 from tkamb.contact.lattice.problem import TangentPlanes, undeformed
-from tkamb.contact.lattice.solver import Solution, Tolerance, solve
+from tkamb.contact.lattice.solver import Solution, solve
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import check_load
 from tkamb.errors import ComputationError, InputError
@@ -62,7 +62,7 @@ class ViscoelasticLattice:
     """
 
     def __init__(self, model: LinearLattice, pair: ContactPair, series: PronySeries) -> None:
-        self._series, self._tolerance = series, Tolerance(model.tolerance)
+        self._series, self._settings = series, model.settings
         self._state = model.prepare(pair)
         self.points = self._state.problem.surface_points
         self._moved = np.zeros_like(self.points)
@@ -138,9 +138,9 @@ class ViscoelasticLattice:
         depth = -float(gaps.min())
         if load is not None:
             depth = guessed_depth(state.problem, gaps, state.surface.area, load / slope) + sunk
-        for _ in range(MOST_GROWTHS):
+        for _ in range(self._settings.max_expansions):
             guess = initial_guess(state.compliance, gaps, planes, depth, load is None, None, None)
-            found = solve(state.problem, pose, load, _softer(guess, slope, offset), self._tolerance)
+            found = solve(state.problem, pose, load, _softer(guess, slope, offset), self._settings)
             if not found.converged:
                 break
             covered = load is None or len(guess.candidates) == np.isfinite(gaps).sum()

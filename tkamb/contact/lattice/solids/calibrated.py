@@ -26,6 +26,7 @@ import scipy.sparse as sparse
 
 from tkamb.contact.lattice.meshing.cells import CORNERS, PAIR_AXES, PAIRS
 from tkamb.contact.lattice.solids.cell_loops import (
+    cell_forces,
     deviatoric_matrices,
     largest_pull,
     shear_forces,
@@ -159,6 +160,27 @@ class CalibratedNetwork(Solid):
 
         in_halves(softened, len(cells))
         return forces
+
+    def forces(self, displacement: Array) -> tuple[Array, Array, float]:
+        """Return f(u) (n, 3), h of each cell (c, 24), N, and uᵀ K_T u, N·m; see `Solid`."""
+        if self.curve.spline is None:
+            return super().forces(displacement)
+        shear, bulk = self.curve.shear_modulus, self.material.bulk_modulus
+        knots, cubic = self.curve.spline.x, self.curve.spline.c
+        residuals = np.empty((len(self.cells), 24))
+
+        def added(some: slice) -> tuple[Array, float]:
+            internal = np.zeros_like(self.nodes)
+            corners, gradients, volume, springs = self._shapes
+            work = cell_forces(
+                corners[some], gradients[some], volume[some], springs,
+                shear, bulk, knots, cubic, LEAST_STRAIN,
+                self.cells[some], displacement, residuals[some], internal,
+            )  # fmt: skip
+            return internal, work
+
+        (first, work), (second, more) = in_halves(added, len(self.cells))
+        return first + second, residuals, work + more
 
     def noticeable(self, displacement: Array, share: float) -> Noticed | None:
         """Return the cells whose share of h may exceed `share`, N; see `Solid`.

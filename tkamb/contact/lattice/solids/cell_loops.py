@@ -311,3 +311,61 @@ def softened_forces(
         for i in range(8):
             for a in range(3):
                 forces[k, 3 * i + a] = softened * force[a, i]
+
+
+@compiled
+def cell_forces(
+    corners: Array,
+    gradients: Array,
+    volumes: Array,
+    springs: Array,
+    shear_modulus: float,
+    bulk_modulus: float,
+    knots: Array,
+    cubic: Array,
+    least: float,
+    nodes: Index,
+    displacement: Array,
+    residuals: Array,
+    internal: Array,
+) -> float:
+    """Add mu_s K_d u + K V g (g · u), N, of cells to the nodes' `internal` (n, 3).
+
+    Return uᵀ K_T u, N·m, K_T the tangent stiffness: V q'(e) e² + K V (g · u)² of each cell,
+    q = 3 mu_s e. And put (mu - mu_s) K_d u of each cell, N, into `residuals` (c, 24). One pass over
+    the cells gives the true force of the solid and what the linear solid carries beyond it.
+
+    Args:
+        corners: (c, 3, 8) m.
+        gradients: (c, 3, 8) 1/m.
+        volumes: (c,) m³.
+        springs: (8, 8) m.
+        shear_modulus: mu, Pa.
+        bulk_modulus: K, Pa.
+        knots: (q,) equivalent strains between which 3 mu_s e is cubic.
+        cubic: (4, q - 1) its coefficients, the highest power first.
+        least: the smallest equivalent strain that is told from none.
+        nodes: (c, 8) of the cells.
+        displacement: (n, 3) m.
+        residuals: (c, 24), written.
+        internal: (n, 3), added to.
+    """
+    u, rest, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))
+    tangent_work = 0.0
+    for cell in range(len(nodes)):
+        x, g, volume = corners[cell], gradients[cell], volumes[cell]
+        energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, rest, force)
+        strain = min(max(np.sqrt(energy / (3 * volume)), least), knots[-1])
+        part = min(np.searchsorted(knots, strain, side="right") - 1, len(knots) - 2)
+        y = strain - knots[part]
+        stress = ((cubic[0, part] * y + cubic[1, part]) * y + cubic[2, part]) * y + cubic[3, part]
+        secant = stress / (3 * strain)
+        slope = (3 * cubic[0, part] * y + 2 * cubic[1, part]) * y + cubic[2, part]
+        dilatation = _along(u[0], g[0]) + _along(u[1], g[1]) + _along(u[2], g[2])
+        pressure = bulk_modulus * volume * dilatation
+        tangent_work += slope * energy / 3 + pressure * dilatation
+        for i in range(8):
+            for a in range(3):
+                residuals[cell, 3 * i + a] = (shear_modulus - secant) * force[a, i]
+                internal[nodes[cell, i], a] += secant * force[a, i] + pressure * g[a, i]
+    return tangent_work

@@ -21,6 +21,8 @@ CHUNK = 2000
 DEVIATORIC = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 DEVIATORIC[:3, :3] -= 2 / 3
 """2 dev eps : dev eps as a form (6, 6) in [xx, yy, zz, 2xy, 2yz, 2zx]."""
+DIFFERENCE = 1e-5
+"""Relative step of the displacement in a finite difference of the internal forces."""
 SMALL_STRAIN = 0.1
 """Elements strained more are always noticed, whatever their law makes of it."""
 
@@ -244,6 +246,22 @@ class Solid(ABC):
             chosen: (k,) elements; all by default.
             lost: (k,) to be written: what elements have lost of their tangent stiffness, 0 to 1.
         """
+
+    def forces(self, displacement: Array) -> tuple[Array, Array, float]:
+        """Return what a displacement (n, 3), m, asks of the solid, element by element.
+
+        No factor is involved: this is what a solution is measured by.
+
+        Returns:
+            Internal forces f(u) (n, 3), N; h = K u - f(u) of each element (k, 3p), N; and
+            uᵀ K_T u, N·m, with the tangent stiffness K_T. Here that is a finite difference.
+        """
+        residuals = self.nonlinear_residual(displacement)
+        internal = self.linear_force(displacement) - self.scatter.sum(residuals)
+        further = (1 + DIFFERENCE) * displacement
+        beyond = self.linear_force(further) - self.residual_force(further)
+        work = float(np.vdot(displacement, beyond - internal)) / DIFFERENCE
+        return internal, residuals, work
 
     def noticeable(self, displacement: Array, share: float) -> Noticed | None:
         """Return the elements whose share of h may matter; None: all may.

@@ -25,8 +25,9 @@ from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.lattice.model import CellContact
 from tkamb.contact.lattice.problem import ContactProblem, Direction, TangentPlanes
 from tkamb.contact.lattice.report import PressureRule
+from tkamb.contact.lattice.settings import LatticeSolverSettings
 from tkamb.contact.lattice.solids.solid import Solid
-from tkamb.contact.lattice.solver import SlidingNodes, Solution, Tolerance
+from tkamb.contact.lattice.solver import SlidingNodes, Solution
 from tkamb.contact.lattice.source.held import CandidateResponse, HeldNodes
 from tkamb.contact.lattice.source.springs import SourceNetwork
 from tkamb.contact.materials import LinearElastic, Material
@@ -98,12 +99,12 @@ class SourceLattice(CellContact):
         pose: Array,
         load: float | None,
         guess: InitialGuess,
-        tolerance: Tolerance,
+        settings: LatticeSolverSettings,
         within: float,
     ) -> Solution:
         if self.loops == "source":
-            return solve_by_loops(problem, pose, load, guess, tolerance)
-        return super()._solution(problem, pose, load, guess, tolerance, within)
+            return solve_by_loops(problem, pose, load, guess, settings)
+        return super()._solution(problem, pose, load, guess, settings, within)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +122,7 @@ def solve_by_loops(
     pose: Array,
     load: float | None,
     guess: InitialGuess,
-    tolerance: Tolerance,
+    solver: LatticeSolverSettings,
     settings: LoopSettings = LoopSettings(),
 ) -> Solution:
     """Return the contact at a pose under a load (N), or at approach 0 when load is None.
@@ -139,7 +140,7 @@ def solve_by_loops(
     while True:
         loops += 1
         planes = sliding.planes
-        target = settings.balance * max(tolerance.force, missed)
+        target = settings.balance * max(solver.force_tolerance, missed)
         pressed = _press(response, points, planes, active, depth, field, target, settings)
         field, moved = pressed.field, pressed.field[nodes]
         reaction = float(pressed.force.sum())
@@ -149,10 +150,10 @@ def solve_by_loops(
         force = np.where(active, np.maximum(pressed.force, 0), 0.0)
         forces = ContactForces(force, opening, depth, active, loops, True)
         last = loops == settings.max_loops
-        settled = tolerance.at_rest(sliding.follow(moved, forces), last)
+        settled = sliding.follow(moved, forces) <= solver.gap_tolerance
         still = bool((changed == active).all())
-        carried = missed <= settings.load * tolerance.force
-        done = still and settled and carried and pressed.residual <= tolerance.force
+        carried = missed <= settings.load * solver.force_tolerance
+        done = still and settled and carried and pressed.residual <= solver.force_tolerance
         if done or last:
             return _solution(guess, forces, planes, pressed, nodes, loops, missed, done)
         if load is not None and still:

@@ -1,6 +1,5 @@
 """A material as a user gives it: the table [material] of a scene, or a file of the same keys."""
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from tkamb.contact.materials import (
     material,
 )
 from tkamb.errors import InputError, names_near
-from tkamb.files import read_text
+from tkamb.io.toml_text import read_toml
 from tkamb.units import MEGAPASCAL
 
 KEYS = (
@@ -97,10 +96,7 @@ def named_material(name: str | Path | Material) -> Material:
         return name
     if Path(name).suffix != ".toml":
         return material(str(name))
-    try:
-        content = tomllib.loads(read_text(name, what="material"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"is not TOML ({error})", name) from None
+    content = read_toml(name, what="material")
     inner = content.get("material")
     if isinstance(inner, dict) and len(content) == 1:
         content = inner

@@ -1,0 +1,89 @@
+"""TOML that users give: read within limits, so that a small text cannot take hours or gigabytes.
+
+Python's reader takes time with the square of a dotted key's parts, memory with nesting, and
+refuses integers of thousands of digits in its own way. Each is refused before it is read.
+"""
+
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tkamb.errors import InputError
+from tkamb.files import MEGABYTE, read_text
+
+
+@dataclass(frozen=True)
+class TomlLimits:
+    """What a TOML text may have. Scenes, cohorts and materials stay a hundred times below."""
+
+    size: int = 8 * MEGABYTE
+    """Bytes of a file: ten seconds of Python's reader."""
+    key_parts: int = 16
+    """Parts of a dotted key or of a table's name; a scene has four."""
+    digits: int = 100
+    """Digits of a number without a point between them; the largest float has 309."""
+    depth: int = 32
+    """Lists and inline tables inside one another; a scene has four."""
+
+
+LIMITS = TomlLimits()
+
+# strings and comments, whose content is no structure; each stands for itself as an empty string
+_STRINGS = re.compile(
+    r'"""(?:\\.|[^\\])*?"""|\'\'\'.*?\'\'\'|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*', re.DOTALL
+)
+_KEYS = re.compile(r'[\w."\- \t]+')
+_BRACKETS = re.compile(r"[\[\]{}]")
+_DIGITS = re.compile(rf"[0-9_]{{{LIMITS.digits + 1},}}|0[xob][0-9a-fA-F_]{{{LIMITS.digits + 1},}}")
+
+
+def read_toml(path: str | Path, *, what: str) -> dict[str, Any]:
+    """Return the content of a TOML file.
+
+    Args:
+        path: the file.
+        what: what to call it in messages.
+
+    Raises:
+        InputError: as `tkamb.files.read_text` and `parse_toml`.
+    """
+    return parse_toml(read_text(path, LIMITS.size, what=what), path)
+
+
+def parse_toml(text: str, where: object) -> dict[str, Any]:
+    """Return the content of TOML text.
+
+    Args:
+        text: to read.
+        where: file or option, for messages.
+
+    Raises:
+        InputError: it is not TOML, or beyond `TomlLimits`.
+    """
+    check_limits(text, where)
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # the parser's own error is a ValueError
+        raise InputError(f"is not TOML ({str(error)[:200]})", where) from None
+
+
+def check_key(dotted: str, where: object) -> None:
+    """Raise an InputError for a dotted key of more parts than any table has."""
+    if dotted.count(".") >= LIMITS.key_parts:
+        raise InputError(f"a key has more than {LIMITS.key_parts} parts", where, "check the dots")
+
+
+def check_limits(text: str, where: object) -> None:
+    """Raise an InputError for TOML text, or a value of it, beyond `TomlLimits`."""
+    structure = _STRINGS.sub('""', text)
+    for found in _KEYS.finditer(structure):
+        check_key(found.group(), where)
+    if _DIGITS.search(structure):
+        raise InputError(f"has a number of more than {LIMITS.digits} digits", where)
+    depth = 0
+    for found in _BRACKETS.finditer(structure):
+        depth = depth + 1 if found.group() in "[{" else max(depth - 1, 0)
+        if depth > LIMITS.depth:
+            raise InputError(f"nests values more than {LIMITS.depth} deep", where)

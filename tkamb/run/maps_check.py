@@ -1,0 +1,118 @@
+"""What a contact.h5 may hold: checked before anything of it is read.
+
+HDF5 can keep an array in any other file (external storage, external links, virtual datasets), so
+that reading a folder of somebody else would read files of one's own. None of these is followed.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.memory import available_memory
+
+WRITTEN = "run it again, or ask whoever sent it for a folder that `tkamb run` wrote"
+FILTERS = frozenset({h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE})
+"""What tkamb compresses with; any other filter could load a library."""
+SHARE_OF_MEMORY = 0.25
+"""Largest array, of the memory that is available: a report holds about three of them."""
+FARTHEST = 10.0
+"""m; no point of a knee is farther from the insert's origin."""
+
+SHAPES = {
+    "pressure_Pa": ("frames", "points"),
+    "gap_m": ("frames", "points"),
+    "nodal_force_N": ("frames", "points", 3),
+    "femoral_pose": ("frames", 4, 4),
+    "contact_points_m": ("frames", 3, 3),
+    "contact_normals": ("frames", 3, 3),
+}
+"""Name -> shape, of the arrays with a row for each frame."""
+SINCE_LATER = ("contact_points_m", "contact_normals")
+"""Arrays that early files do not have."""
+
+
+def check_maps_file(file: Any, path: str | Path) -> None:
+    """Raise unless an open HDF5 file keeps in itself arrays of the shapes that tkamb writes.
+
+    Args:
+        file: open `h5py.File`.
+        path: for the message.
+
+    Raises:
+        InputError: an array is missing, of another shape or type, larger than memory, or kept in
+            another file.
+    """
+    for name in file:
+        _check_link(file, name, path)
+    points = _dataset(file, "points_m", path)
+    triangles = _dataset(file, "triangles", path)
+    times = _dataset(file, "time_s", path)
+    _check(len(points.shape) == 2 and points.shape[1] == 3, "points_m", points, path)
+    _check(len(triangles.shape) == 2 and triangles.shape[1] == 3, "triangles", triangles, path)
+    _check(triangles.dtype.kind in "iu", "triangles", triangles, path)
+    _check(len(times.shape) == 1, "time_s", times, path)
+    frames = times.shape[0]
+    for name, sizes in SHAPES.items():
+        if name in SINCE_LATER and name not in file:
+            continue
+        dataset = _dataset(file, name, path)
+        shape = tuple(points.shape[0] if size == "points" else size for size in sizes[1:])
+        # a kill leaves more rows than times: those of a frame that was not finished
+        whole = len(dataset.shape) == len(sizes) and dataset.shape[0] >= frames
+        _check(whole and dataset.shape[1:] == shape, name, dataset, path)
+
+
+def check_values(file: Any, path: str | Path) -> None:
+    """Raise unless points lie at a knee, triangles name points, and times rise.
+
+    Args:
+        file: as for `check_maps_file`, which it has passed.
+        path: for the message.
+
+    Raises:
+        InputError: they do not.
+    """
+    points, triangles, times = (file[name][()] for name in ("points_m", "triangles", "time_s"))
+    if not (np.abs(points) <= FARTHEST).all():
+        raise InputError(f"'points_m' holds points beyond {FARTHEST:g} m", path, WRITTEN)
+    if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
+        raise InputError("'triangles' names points that are not there", path, WRITTEN)
+    if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+        raise InputError("'time_s' does not rise from frame to frame", path, WRITTEN)
+
+
+def _check_link(file: Any, name: str, path: str | Path) -> None:
+    """Raise unless a name stands for an array or a group of the file itself."""
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+        raise InputError(f"'{name}' is a link, which is not followed", path, WRITTEN)
+
+
+def _dataset(file: Any, name: str, path: str | Path) -> Any:
+    """Return an array of numbers that the file keeps in itself."""
+    if name not in file:
+        raise InputError(f"has no '{name}'", path, "is it a contact.h5 of tkamb?")
+    dataset = file[name]
+    if not isinstance(dataset, h5py.Dataset):
+        raise InputError(f"'{name}' is no array", path, WRITTEN)
+    properties = dataset.id.get_create_plist()
+    if dataset.is_virtual or properties.get_external_count():
+        raise InputError(f"'{name}' is kept in another file, which is not read", path, WRITTEN)
+    filters = {properties.get_filter(k)[0] for k in range(properties.get_nfilters())}
+    if not filters <= FILTERS:
+        raise InputError(f"'{name}' is packed by a filter that is not tkamb's", path, WRITTEN)
+    if dataset.dtype.kind not in "fiu" or dataset.shape is None:
+        raise InputError(f"'{name}' does not hold numbers", path, WRITTEN)
+    size, most = 8.0 * dataset.size, SHARE_OF_MEMORY * available_memory()
+    if size > most:
+        what = f"'{name}' has {size / 1e9:.3g} GB, more than the {most / 1e9:.3g} GB that are read"
+        raise InputError(what, path, "free memory, or run fewer frames")
+    return dataset
+
+
+def _check(right: bool, name: str, dataset: Any, path: str | Path) -> None:
+    if not right:
+        shape = " x ".join(map(str, dataset.shape))
+        raise InputError(f"'{name}' is {dataset.dtype} of {shape}, not as written", path, WRITTEN)
