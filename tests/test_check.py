@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from mirrored_patient import write_mirrored_patient
+from scenes import MODEL
 from tkamb.cli import main
 from tkamb.commands.check import check_html
 from tkamb.io.starter import lay_out
 from tkamb.run.muscles import static_optimisation
 from tkamb.show.check.inventory import _listed
-from tkamb.show.check.leg_picture import leg_frame, shown_frames
+from tkamb.show.check.leg_picture import draw_leg, leg_frame, shown_frames
 from tkamb.show.check.scene_check import _missing, check_scene
 
 
@@ -116,6 +118,19 @@ def test_the_page_holds_questions_picture_and_files(checked):
     text = check_html(checked, figure)
     assert "ground_reaction.csv" in text and "<svg" in text
     assert "http://" not in text.replace("http://www.w3.org", "")
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_picture_says_which_side_is_medial_and_names_the_ligaments(side, tmp_path):
+    """The MCL stands on the page where "medial" is written, of a right and of a left knee."""
+    scene = MODEL / "scene.toml" if side == "right" else write_mirrored_patient(tmp_path)
+    figure = draw_leg(check_scene(scene).mechanics)
+    knee = figure.axes[-1]
+    words = {text.get_gid(): text for text in knee.texts}
+    medial = words["side-left"].get_text() == "medial"
+    assert medial == (side == "left")
+    mcl, lcl = (words[f"ligament-{name}"].get_position()[0] for name in ("MCL", "LCL"))
+    assert (mcl < lcl) == medial
 
 
 def test_a_solver_that_is_not_installed_is_named_before_a_run(checked, monkeypatch):

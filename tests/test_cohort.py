@@ -23,6 +23,7 @@ from tkamb.memory import give_back
 from tkamb.run.simulation import simulate
 from tkamb.run.workers import Crew
 from tkamb.show.cohort_report import _told_apart, cohort_html, draw_groups
+from tkamb.show.design_figure import design_bars, draw_designs, run_error
 from tkamb.studies.cohort.folder import frame_table, write_cohort
 from tkamb.studies.cohort.outcome import Outcome, chosen_map
 from tkamb.studies.cohort.plan import CohortTable, load_cohort
@@ -310,3 +311,101 @@ def test_what_only_refers_to_itself_is_freed_between_runs():
         assert kept() is None
     finally:
         gc.enable()
+
+
+def worn(pressure, area_scale=1.0):
+    """Return the outcome of a run with wear and with its pressures scaled."""
+    one = outcome(1.0, 11)
+    columns = dict(one.columns)
+    for side in ("medial", "lateral"):
+        name = f"{side}_peak_pressure_MPa"
+        columns[name] = columns[name] * pressure
+    wear = {
+        f"volume_mm3_per_Mc{end}": area_scale * v
+        for end, v in (("", 8.0), ("_low", 4.0), ("_high", 16.0))
+    }
+    return replace(one, columns=columns, wear=wear)
+
+
+DESIGNS = """
+        [[trial]]
+        name = "bend"
+        scene = "scene.toml"
+        [[subject]]
+        name = "small"
+        scale = 0.95
+        [[subject]]
+        name = "large"
+        scale = 1.05
+        [[contact]]
+        name = "foundation"
+        resolution_mm = 2.0
+"""
+
+
+@pytest.fixture
+def two_by_two(tmp_path):
+    """Write two thicknesses by two conformities of two people."""
+    for path in KNEE.iterdir():
+        shutil.copy(path, tmp_path)
+    entries = [
+        f'[[design]]\nname = "{t} by {c}"\n'
+        f'factors = {{ thickness = "{t} mm", conformity = "{c}" }}\n'
+        for c in ("0.4", "0.8")
+        for t in (6, 10)
+    ]
+    path = tmp_path / "two.toml"
+    path.write_text(DESIGNS.replace("        ", "") + "".join(entries))
+    return load_cohort(path)
+
+
+def test_two_factors_of_designs_are_axis_and_legend_with_their_bands(two_by_two):
+    outcomes = {run.number: worn(1.0 + 0.1 * run.number, 2.0) for run in two_by_two.runs}
+    bars = design_bars(two_by_two, groups_of(two_by_two, outcomes))
+    assert [(bar.place, bar.series) for bar in bars["pressure"]] == [
+        (f"thickness {t} mm", f"conformity {c}") for c in ("0.4", "0.8") for t in (6, 10)
+    ]
+    error = run_error(two_by_two.runs[0]).peak_pressure
+    first = bars["pressure"][0]
+    own = [
+        max(
+            np.nanmax(outcomes[run.number].columns[f"{side}_peak_pressure_MPa"])
+            for side in ("medial", "lateral")
+        )
+        for run in two_by_two.runs
+        if run.labels["design"] == "6 by 0.4"
+    ]
+    assert (first.low, first.high) == pytest.approx((min(own), max(own)))
+    assert first.mean == pytest.approx(np.mean(own))
+    assert first.least == pytest.approx((1 - error) * min(own))
+    assert first.most == pytest.approx((1 + error) * max(own))
+    wear = bars["wear"][0]
+    assert (wear.mean, wear.least, wear.most) == pytest.approx((16.0, 8.0, 32.0))
+    figure = draw_designs(bars)
+    legend = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert legend == ["conformity 0.4", "conformity 0.8"]
+
+
+def test_the_page_shows_designs_and_the_known_error_of_the_contact_model(two_by_two):
+    outcomes = {run.number: worn(1.0) for run in two_by_two.runs}
+    page = cohort_html(two_by_two, outcomes, groups_of(two_by_two, outcomes))
+    page = page.replace("\xa0", " ")
+    assert "Designs side by side" in page
+    assert "foundation at 2 mm, polyethylene: on" in page
+    assert "error of the contact model alone" in page
+
+
+def test_gait_is_binned_by_per_cent_and_frames_outside_the_cycle_are_in_no_bin(file):
+    percent = np.array([np.nan, 5.0, 15.0, 15.0, np.nan])
+    columns = {
+        "time_s": np.arange(5.0),
+        "flexion_deg": np.full(5, 10.0),
+        "cycle_percent": percent,
+        "force_total_BW": np.array([9.0, 1.0, 2.0, 4.0, 9.0]),
+    }
+    outcomes = {0: Outcome("", columns, ["ok"] * 5)}
+    (group,) = groups_of(load_cohort(file), outcomes)
+    assert group.axis == "cycle_percent"
+    np.testing.assert_allclose(group.edges, [0.0, 10.0, 20.0])
+    np.testing.assert_allclose(group.bins["force_total_BW"], [[1.0, 3.0]])
+    np.testing.assert_allclose(group.peaks["force_total_BW"], [9.0])

@@ -1,9 +1,14 @@
 """Foot strikes, toe-offs and the gait cycle from a force plate."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from pendulum_leg import recorded_leg
 from synthetic_run import make_run
+from tkamb import load_scene, simulate
+from tkamb.cli import main
 from tkamb.io.recordings.gait import cycle_percent, find_gait
 from tkamb.show.axis import horizontal_axis
 from tkamb.show.panels import panels
@@ -72,3 +77,18 @@ def test_the_stance_is_shaded(axis, to):
     assert shade.get_x() + shade.get_width() == pytest.approx(to)
     flexion = Sheet(run, horizontal_axis(run, "flexion")).draw(panels(run)[0])
     assert not [patch for patch in flexion.axes[0].patches if patch.get_gid() == "stance"]
+
+
+def test_an_import_asks_for_muscles_and_a_cycle(tmp_path, capsys):
+    """A leg that never leaves its plate shows no cycle: refused, and nothing is left behind."""
+    arguments = recorded_leg(tmp_path)
+    assert main([*arguments, "--cycle", "plates"]) == 2
+    said = capsys.readouterr().err
+    assert "--cycle plates" in said and len(said.splitlines()) == 1
+    out = Path(arguments[arguments.index("--out") + 1])
+    assert not (out / "scene.toml").exists()
+    assert main([*arguments, "--cycle", "0.5:1.5"]) == 0
+    scene = load_scene(out / "scene.toml")
+    assert scene.output.axis == "cycle" and scene.output.cycle_s == (0.5, 1.5)
+    percent = simulate(scene)["cycle_percent"]
+    assert np.nanmin(percent) >= 0.0 and np.nanmax(percent) <= 100.0

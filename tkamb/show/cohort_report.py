@@ -11,8 +11,11 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from tkamb.geometry.frames import Array
+from tkamb.run.contact_side import insert_material_as_json
+from tkamb.run.known_errors import as_json, is_large, known_error_words
 from tkamb.run.maps import ContactMaps
-from tkamb.show.headline import Card
+from tkamb.show.design_figure import BANDS, design_bars, draw_designs, run_error
+from tkamb.show.headline import OTHER_ERRORS, PRESSURE_AND_AREA, Card
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.pressure_maps import TopView, draw_pressure
 from tkamb.show.style import CYCLE as COLOURS
@@ -67,10 +70,39 @@ def cohort_html(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequenc
         headings=[SHOWN[name][:2] for name in _there(groups)],
         rows=[_row(group, _there(groups)) for group in groups],
         plots=list(_plots(groups)),
+        designs=_designs(cohort, groups),
         maps=_maps(cohort, outcomes, groups),
         failed=_failed(cohort, outcomes)[: COHORT_REPORT.most_failed],
         failed_count=sum(bool(one.reason) for one in outcomes.values()),
     )
+
+
+def _designs(cohort: Cohort, groups: Sequence[Group]) -> dict[str, str] | None:
+    """Return the figure of pressure and wear of designs; None without designs or contact."""
+    bars = design_bars(cohort, groups)
+    if not cohort.table.design or not any(bars.values()):
+        return None
+    return {"svg": svg_text(draw_designs(bars), "designs"), "words": BANDS}
+
+
+def _error_card(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> Card | None:
+    """Return by how much the cohort's contact models are known to err; None without contact."""
+    found: dict[str, str] = {}
+    large = False
+    for n in outcomes:
+        table = cohort.runs[n].scene.contact
+        if table is None:
+            continue
+        said = as_json(run_error(cohort.runs[n]))
+        material = insert_material_as_json(cohort.runs[n].scene)["name"]
+        setting = f"{table.model} at {table.resolution_mm:g} mm, {material}"
+        found[setting] = f"{setting}: {known_error_words(said, PRESSURE_AND_AREA)}"
+        large = large or is_large(said, PRESSURE_AND_AREA)
+    if not found:
+        return None
+    detail = "; ".join(found.values()) + OTHER_ERRORS
+    number = f"{len(found)} setting{'s' * (len(found) > 1)}"
+    return Card("Known error of the contact model", number, detail, large)
 
 
 def _there(groups: Sequence[Group]) -> list[str]:
@@ -110,6 +142,8 @@ def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Gro
     if f"{means[low]:.2f}" == f"{means[high]:.2f}":
         value, detail = f"{means[low]:.2f} BW", "alike in all groups"
     found.append(Card("Peak contact force", value, f"mean of the runs' peaks: {detail}"))
+    error = _error_card(cohort, outcomes)
+    found += [] if error is None else [error]
     if cohort.table.wear is not None:
         found.append(_wear_card(outcomes, groups))
     return found

@@ -170,7 +170,7 @@ def _reason_against(ligament: Ligament, fixed: int) -> str:
 
 
 def _name_muscles(links: Links, said: list[str]) -> None:
-    """Say which muscles cross the knee and do not act."""
+    """Say which muscles cross the knee and do not act without [muscles]."""
     leg = links.leg
     across = [
         muscle.name
@@ -180,8 +180,8 @@ def _name_muscles(links: Links, said: list[str]) -> None:
     ]
     if across:
         said.append(
-            f"{len(across)} muscles run from thigh or pelvis to the shank; none but the "
-            f"quadriceps line acts: {some_names(across)}"
+            f"{len(across)} muscles run from thigh or pelvis to the shank; without --muscles none "
+            f"but the quadriceps line acts: {some_names(across)}"
         )
 
 

@@ -1,6 +1,7 @@
 """A picture of the leg at three frames, in the laboratory, with the plate's force.
 
-Rows: the whole leg from its lateral side and from the front, and the knee from its lateral side.
+Rows: the whole leg from its lateral side and from the front, and the knee from both. Each is
+labelled anterior and posterior, or medial and lateral; the last row names the ligaments.
 The laboratory's y is up; ahead is where the insert's x points, on the mean over the three frames.
 A left knee is mirrored at input and drawn mirrored back.
 """
@@ -13,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MultipleLocator
 
 from tkamb.errors import ComputationError
@@ -63,7 +65,7 @@ class LegFrame:
         frame: of the motion.
         joints: (3, 3) hip, knee, ankle; the knee is the insert frame's origin.
         bodies: the implant's surfaces with their colours.
-        lines: name -> (n, 3) ligaments and tendons, with their colours.
+        lines: (n, 3) ligaments and tendons, with their colours and the ligaments' names.
         force: (3,) N on the foot; None without a plate.
         point: (3,) where it acts.
         loaded: whether the foot stands on the plate; else no arrow is drawn.
@@ -72,7 +74,7 @@ class LegFrame:
     frame: int
     joints: Array
     bodies: tuple[tuple[Surface, str], ...]
-    lines: tuple[tuple[Array, str], ...]
+    lines: tuple[tuple[Array, str, str], ...]
     force: Array | None
     point: Array
     loaded: bool
@@ -112,7 +114,10 @@ def leg_frame(mechanics: Mechanics, k: int) -> LegFrame:
         for surface, pose, colour in parts
         if surface is not None
     )
-    lines = [(transform(to_laboratory, points), c) for points, c in _lines(mechanics, state)]
+    lines = [
+        (transform(to_laboratory, points), colour, name)
+        for points, colour, name in _lines(mechanics, state)
+    ]
     force, point = None, transform(to_laboratory, in_insert[2])
     if case.ground is not None:
         force = case.ground.force[k]
@@ -123,16 +128,23 @@ def leg_frame(mechanics: Mechanics, k: int) -> LegFrame:
     return LegFrame(k, joints, bodies, tuple(lines), force, point, loaded)
 
 
-def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str]]:
-    """Return ligaments, muscle line and patellar ligament with their colours, insert frame."""
-    found = []
+def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str, str]]:
+    """Return ligaments, muscle line and patellar ligament, insert frame; colours and names.
+
+    Only a ligament's first strand has its name.
+    """
+    found: list[tuple[Array, str, str]] = []
+    named: set[str] = set()
     for bundle in mechanics.ligaments:
         poses = {link: state.pose(link) for link in (bundle.proximal.link, bundle.distal.link)}
-        found.append((np.stack(bundle.ends(poses)), LIGAMENT))
+        name = bundle.name.removeprefix("generic_").split("_")[0].rstrip("0123456789")
+        found.append((np.stack(bundle.ends(poses)), LIGAMENT, "" if name in named else name))
+        named.add(name)
     if mechanics.extensor is not None:
         with suppress(ComputationError):  # a patella that is lost there: the run says so
             quadriceps, ligament = mechanics.extensor.paths(state)
-            found += [(quadriceps.points, QUADRICEPS), (ligament.points, PATELLAR_LIGAMENT)]
+            found.append((quadriceps.points, QUADRICEPS, ""))
+            found.append((ligament.points, PATELLAR_LIGAMENT, ""))
     return found
 
 
@@ -144,10 +156,14 @@ class View:
         across: (3,) horizontal, to the right of the page; turned over for a left knee, which
             is computed as a right one and so drawn as it is.
         towards: (3,) horizontal, towards the reader.
+        left: what lies to the left of the page, in words.
+        right: what lies to its right.
     """
 
     across: Array
     towards: Array
+    left: str
+    right: str
 
     def page(self, points: Array) -> Array:
         """Return points (..., 3) m on the page (..., 2), m."""
@@ -161,19 +177,28 @@ def draw_leg(mechanics: Mechanics) -> Figure:
     ahead /= np.linalg.norm(ahead)
     lateral = np.cross(ahead, [0.0, 1.0, 0.0])
     mirror = -1.0 if mechanics.case.scene.patient.side == "left" else 1.0
-    from_side, from_front = View(mirror * ahead, lateral), View(-mirror * lateral, ahead)
+    side, front = ("posterior", "anterior"), ("lateral", "medial")
+    if mirror < 0:
+        side, front = side[::-1], front[::-1]
+    from_side = View(mirror * ahead, lateral, *side)
+    from_front = View(-mirror * lateral, ahead, *front)
     weight = mechanics.case.body_weight
     with settings():
-        figure = new_figure(3.2 * len(frames), 11.5)
-        grid = figure.subplots(3, len(frames), squeeze=False, height_ratios=(1.3, 1.3, 1.0))
+        figure = new_figure(3.2 * len(frames), 14.7)
+        grid = figure.subplots(4, len(frames), squeeze=False, height_ratios=(1.3, 1.3, 1.0, 1.0))
+        views = (from_side, from_front, from_side, from_front)
         for column, one in zip(grid.T, frames, strict=True):
-            for axes, view in zip(column, (from_side, from_front, from_side), strict=True):
+            for axes, view in zip(column, views, strict=True):
                 _draw(axes, one, view, weight)
-            _close_up(column[2], one, from_side)
+                _name_sides(axes, view)
+            for axes, view in zip(column[2:], views[2:], strict=True):
+                _close_up(axes, one, view)
+            _name_ligaments(column[3], one, from_front)
             column[0].set_title(_caption(mechanics, one), fontsize=9)
         _same_limits(grid[0])
         _same_limits(grid[1])
-        words = ("leg, from its lateral side", "leg, from the front", "knee, from its lateral side")
+        places = ("from its lateral side", "from the front")
+        words = [f"{part}, {place}" for part in ("leg", "knee") for place in places]
         for row, label in zip(grid, words, strict=True):
             row[0].set_ylabel(label)
         figure.supxlabel(LEGEND, fontsize=8)
@@ -205,7 +230,7 @@ def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
     shown = [one.joints]
     for surface, colour in one.bodies:
         _draw_surface(axes, surface, view, colour)
-    for points, colour in one.lines:
+    for points, colour, _ in one.lines:
         axes.plot(*view.page(points).T, color=colour, linewidth=1.3)
     if one.force is not None and one.loaded:
         tip = one.point + one.force / weight * LEG_PICTURE.arrow_metres_per_BW
@@ -229,6 +254,27 @@ def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MultipleLocator(0.1))
     axes.tick_params(labelbottom=False, labelleft=False, length=0)
+
+
+def _name_sides(axes: Axes, view: View) -> None:
+    """Write what lies to the left and to the right of the page."""
+    ends = ((0.02, 0.015, "left", view.left), (0.98, 0.05, "right", view.right))
+    for place, height, align, words in ends:  # at two heights: a leg from the front is narrow
+        axes.text(
+            place, height, words, ha=align, va="bottom", fontsize=8, color=GREY,
+            transform=axes.transAxes, gid=f"side-{align}",
+        )  # fmt: skip
+
+
+def _name_ligaments(axes: Axes, one: LegFrame, view: View) -> None:
+    """Write each ligament's name beside the middle of its first strand."""
+    for points, _, name in one.lines:
+        if name:
+            x, y = view.page(points.mean(axis=0))
+            axes.text(
+                x, y, name, fontsize=8, color=LIGAMENT, clip_on=True, gid=f"ligament-{name}",
+                path_effects=[withStroke(linewidth=2.5, foreground="white")],
+            )  # fmt: skip
 
 
 def _draw_surface(axes: Axes, surface: Surface, view: View, colour: str) -> None:

@@ -64,6 +64,11 @@ class DesignTable(SceneTable):
     femoral: Path | None = Field(None, description="mesh of the femoral component")
     insert: Path | None = Field(None, description="mesh of the insert")
     bearing: Literal["fixed", "mobile"] | None = None
+    factors: dict[Name, Name] = Field(
+        default_factory=dict,
+        description="what is varied -> its value, for the figure of designs: the first on its "
+        "horizontal axis, the others in its legend",
+    )
     scenes: dict[Name, Path] = Field(
         default_factory=dict,
         description="trial -> its scene with this implant, where that is a scene of its own",

@@ -112,7 +112,8 @@ def _group(
     columns = [_computed(outcomes[n]) for n in good]
     cycle = bool(columns) and all(CYCLE in one for one in columns)
     axis, width = (CYCLE, CYCLE_BIN) if cycle else ("flexion_deg", width)
-    places = [_places(one[axis], axis, width) for one in columns]
+    there = [np.isfinite(one[axis]) for one in columns]  # frames outside the gait cycle are not
+    places = [_places(one[axis][on], axis, width) for one, on in zip(columns, there, strict=True)]
     first, last = (
         (min(p.min() for p in places), max(p.max() for p in places)) if places else (0, -1)
     )
@@ -121,8 +122,8 @@ def _group(
     bins, peaks = {}, {}
     for name in names:
         missing = [one.get(name, np.full(len(one["time_s"]), np.nan)) for one in columns]
-        pairs = zip(missing, places, strict=True)
-        bins[name] = np.array([_means(v, p - first, len(edges) - 1) for v, p in pairs])
+        parts = zip(missing, there, places, strict=True)
+        bins[name] = np.array([_means(v[on], p - first, len(edges) - 1) for v, on, p in parts])
         peaks[name] = np.array([np.nanmax(v) if np.isfinite(v).any() else np.nan for v in missing])
     worn = dict.fromkeys(name for n in good for name in outcomes[n].wear)
     wear = {
