@@ -39,33 +39,32 @@ RestoreRule = Literal["both", "either"]
 
 @dataclass(frozen=True)
 class AdjustmentSettings:
-    """The limits of the adjustment and the rule by which it is undone.
-
-    Args:
-        largest_angle: rad; a coronal angle from here on is lift-off and is not corrected
-            (Sharma 2008: 0.5 deg, what fluoroscopy errs by).
-        largest_translation: m; the adjustment moves the femur by no more than this along y
-            (Sharma 2008: 0.5 mm, what fluoroscopy errs by).
-        restore_when: "both": the recorded rotation is restored if penetration and coronal angle
-            after the press exceed the adjustment (Sharma 2008); "either": if one of them does.
-        input_change: m; a change of the recorded pose that must not change the answer by a
-            step without a flag. A fifth of what fluoroscopy errs by.
-        largest_recorded_gap: m; with both condyles farther than this from the insert the pose is
-            no recorded contact.
-        level_difference: m; condyles whose gaps differ by less are level as far as a mesh can
-            say, and the femur is not turned.
-        touch_difference: m; difference of the condyles' clearances at which they touch together.
-        max_turns: most steps of the search for the turn at which they do.
-    """
+    """The limits of the adjustment and the rule by which it is undone."""
 
     largest_angle: float = 0.5 * DEGREE
+    """rad: a coronal angle from here on is lift-off and is not corrected (Sharma 2008: 0.5
+    deg, what fluoroscopy errs by)."""
     largest_translation: float = 0.5 * MILLIMETRE
+    """m: the adjustment moves the femur by no more than this along y (Sharma 2008: 0.5 mm,
+    what fluoroscopy errs by)."""
     restore_when: RestoreRule = "both"
+    """"both": the recorded rotation is restored if penetration and coronal angle after the
+    press exceed the adjustment (Sharma 2008); "either": if one of them does."""
     input_change: float = 0.1 * MILLIMETRE
+    """m: a change of the recorded pose that must not change the answer by a step without a
+    flag. A fifth of what fluoroscopy errs by."""
     largest_recorded_gap: float = 3.0 * MILLIMETRE
+    """m: with both condyles farther than this from the insert the pose is no recorded contact."""
     level_difference: float = 5e-6
+    """m: condyles whose gaps differ by less are level as far as a mesh can say, and the femur
+    is not turned."""
     touch_difference: float = 1e-7
+    """m: difference of the condyles' clearances at which they touch together."""
     max_turns: int = 20
+    """Most steps of the search for the turn at which they do."""
+
+
+ADJUSTMENT = AdjustmentSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +92,7 @@ class Adjustment:
     coronal_angle: float
     measured_angle: float
     intercondylar_distance: float
-    settings: AdjustmentSettings = AdjustmentSettings()
+    settings: AdjustmentSettings = ADJUSTMENT
     penetration: float = math.nan
     final_angle: float = math.nan
     restored: bool = False
@@ -103,7 +102,7 @@ class Adjustment:
 def adjust(
     query: ClosestPointQuery,
     recorded: Array,
-    settings: AdjustmentSettings = AdjustmentSettings(),
+    settings: AdjustmentSettings = ADJUSTMENT,
 ) -> Adjustment:
     """Return the adjusted pose.
 

@@ -38,8 +38,16 @@ class HeightFieldSettings:
 
 HEIGHT_FIELD = HeightFieldSettings()
 
-SAME_WALL = 1e-7
-"""m: two bodies nearer to one another touch; ten times what single precision rounds off."""
+
+@dataclass(frozen=True)
+class BodyContactSettings:
+    """Bodies of one mesh that touch."""
+
+    touching_distance: float = 1e-7
+    """m: two bodies nearer to one another touch. Ten times the rounding of single precision."""
+
+
+BODY_CONTACT = BodyContactSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +215,9 @@ def _paired(line: Index, height: Array, rising: Mask, count: int) -> tuple[Index
     ends = np.flatnonzero((winding > 0) != (winding - step > 0))
     line, height = line[ends], height[ends]
     touching = np.zeros(len(ends), bool)
-    touching[1:-1:2] = (np.diff(line)[1::2] == 0) & (np.diff(height)[1::2] <= SAME_WALL)
+    touching[1:-1:2] = (np.diff(line)[1::2] == 0) & (
+        np.diff(height)[1::2] <= BODY_CONTACT.touching_distance
+    )
     touching[2::2] = touching[1:-1:2]
     lines = np.concatenate([lines, line[~touching]])
     heights = np.concatenate([heights, height[~touching]])

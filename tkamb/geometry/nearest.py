@@ -16,7 +16,16 @@ if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
 
 
-_MOST_SAMPLES = 150_000
+@dataclass(frozen=True)
+class NearestSettings:
+    """Nearest points of two surfaces."""
+
+    max_samples: int = 150_000
+    """Samples of a surface at most; it bounds memory and time."""
+
+
+NEAREST = NearestSettings()
+
 FLAT = 1e-14
 """A triangle whose squared area is less, relative to its edges', has no plane."""
 DEEPEST = 64
@@ -96,7 +105,7 @@ def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
     triangles = surface.triangles
     longest = surface.longest_edges
     cuts = np.maximum(np.ceil(longest / spacing).astype(int), 1)
-    while (cuts**2).sum() > max(_MOST_SAMPLES, len(triangles)) and cuts.max() > 1:
+    while (cuts**2).sum() > max(NEAREST.max_samples, len(triangles)) and cuts.max() > 1:
         spacing *= 1.2
         cuts = np.maximum(np.ceil(longest / spacing).astype(int), 1)
     area = surface.areas / cuts**2

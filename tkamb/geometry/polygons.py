@@ -1,16 +1,24 @@
 """Polygons of any number of corners into triangles, concave ones as they are."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.ragged import counted
 
-ROUNDING = 1e-12
-"""Of a polygon's area: a signed area of less is none."""
+
+@dataclass(frozen=True)
+class PolygonSettings:
+    """Polygons of a section."""
+
+    area_rounding: float = 1e-12
+    """1: a signed area below this share of the polygon's extent is zero."""
+    least_area_share: float = 1e-9
+    """1: a polygon that encloses a smaller share of the area that it covers crosses itself."""
 
 
-CROSSED = 1e-9
-"""Of the area that a polygon covers: one that encloses less in all crosses itself."""
+POLYGON = PolygonSettings()
 
 
 class CrossedPolygonError(ValueError):
@@ -44,11 +52,14 @@ def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
     total = np.stack([np.bincount(polygon, part, len(ends)) for part in cross.T], axis=1)
     along = np.einsum("ij,ij->i", cross, total[polygon])
     size = np.einsum("ij,ij->i", total, total)
-    turned = np.unique(polygon[along < -ROUNDING * size[polygon]])
+    turned = np.unique(polygon[along < -POLYGON.area_rounding * size[polygon]])
     longest = np.zeros(len(ends))
     np.maximum.at(longest, polygon, np.einsum("ij,ij->i", c - a, c - a))
     covered = np.bincount(polygon, np.linalg.norm(cross, axis=1), len(ends))
-    if ((np.sqrt(size) < CROSSED * covered) & (covered > CROSSED * longest)).any():
+    if (
+        (np.sqrt(size) < POLYGON.least_area_share * covered)
+        & (covered > POLYGON.least_area_share * longest)
+    ).any():
         raise CrossedPolygonError("a polygon crosses itself")
     if not len(turned):
         return fans
@@ -67,7 +78,7 @@ def ears(vertices: Array, ring: Index, normal: Array) -> Index:
     axis = int(np.argmax(np.abs(normal)))
     plane = [(axis + 1) % 3, (axis + 2) % 3]
     points = vertices[ring][:, plane if normal[axis] > 0 else plane[::-1]]
-    least = ROUNDING * abs(float(normal[axis]))
+    least = POLYGON.area_rounding * abs(float(normal[axis]))
     left, triangles = list(range(len(ring))), []
     at = tried = 0
     flat_ears = False

@@ -40,8 +40,17 @@ PARALLEL = 1e-9
 DEEPEST = 64
 """Boxes that wait at one time: one of each level."""
 NO_TRIANGLE = -1
-TOUCHING = 1e-6
-"""m; shells so near to each other have no gap between them."""
+
+
+@dataclass(frozen=True)
+class RayGapSettings:
+    """Gaps between shells along a ray."""
+
+    touching_distance: float = 1e-6
+    """m: shells so near to each other have no gap between them."""
+
+
+RAY_GAP = RayGapSettings()
 
 
 class RayCaster:
@@ -104,13 +113,13 @@ class RayCaster:
             for k in np.flatnonzero(out):
                 last[number] = own[k]
                 entries = np.flatnonzero(
-                    ~out & (own >= own[k] - TOUCHING) & (np.arange(len(own)) != k)
+                    ~out & (own >= own[k] - RAY_GAP.touching_distance) & (np.arange(len(own)) != k)
                 )
-                later = entries[own[entries] > own[0] + TOUCHING]
+                later = entries[own[entries] > own[0] + RAY_GAP.touching_distance]
                 if not len(later):
                     break
                 next_in = later[0]
-                touching = own[next_in] - own[k] <= TOUCHING
+                touching = own[next_in] - own[k] <= RAY_GAP.touching_distance
                 void = shells[k] == shells[next_in] != shells[0]
                 if not (touching or void):
                     break
