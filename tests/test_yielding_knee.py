@@ -10,9 +10,9 @@ from tkamb.contact.foundation import LinearFoundation
 from tkamb.geometry.frames import knee_pose
 from tkamb.knee.equilibrium import released
 from tkamb.knee.equilibrium.balance import BalanceStatus, Trial, find_balance
-from tkamb.knee.equilibrium.released import KNEE_CHANGE, ReleasedKnee, ahead
+from tkamb.knee.equilibrium.released import RELEASED_KNEE, ReleasedKnee, ahead
 from tkamb.knee.equilibrium.released_forces import SCALE
-from tkamb.knee.equilibrium.starts import FARTHEST_AHEAD, carried_on
+from tkamb.knee.equilibrium.starts import INITIAL_POSE, carried_on
 
 CELL = 1e-3
 
@@ -70,7 +70,7 @@ def test_what_is_ahead_of_passes_that_shrink_is_their_series(ratio):
 
 def test_what_is_ahead_is_not_guessed_from_passes_that_do_not_settle():
     """One short pass after a long one foretells nothing: a search that trusts it ends too soon."""
-    short = 1.5 * KNEE_CHANGE
+    short = 1.5 * RELEASED_KNEE.knee_tolerance
     for ways in ([np.inf, np.inf, short], [np.inf, 1e-3, short], [1e-3, 0.9e-3, short]):
         assert ahead(ways) == 1.0
     assert ahead([1e-3, 4e-4, 3e-4]) == 1.0
@@ -87,7 +87,7 @@ def test_a_search_begins_where_steady_frames_go_on_and_no_farther():
     assert np.array_equal(carried_on(steady[:1]), steady[0])
     assert np.array_equal(carried_on([np.zeros(6), step, np.zeros(6)]), np.zeros(6))
     leap = carried_on([np.zeros(6), 50 * step, 100 * step]) - 100 * step
-    assert np.linalg.norm(leap * SCALE) == pytest.approx(FARTHEST_AHEAD, rel=1e-9)
+    assert np.linalg.norm(leap * SCALE) == pytest.approx(INITIAL_POSE.max_extrapolation, rel=1e-9)
 
 
 def test_what_a_lost_patella_leaves_unknown_is_asked_for_again(monkeypatch):

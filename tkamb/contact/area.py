@@ -1,16 +1,28 @@
 """How much of a surface is in contact, and how much of it is above a pressure."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from tkamb.contact.materials import Material
 from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
 
-NO_EDGE = 0.5
-"""Share of a side where the femoral surface ends, or rises more than it goes along, before the
-neighbour: contact may end anywhere between the two."""
-LEAST_GAP = 1e-12
-"""m; a node that is not in contact is at least this far off."""
+
+@dataclass(frozen=True)
+class ContactAreaSettings:
+    """Contact area from nodal pressures and gaps."""
+
+    unknown_edge_share: float = 0.5
+    """Share of a cell side, 1: where the edge of contact is put if the femoral surface ends,
+    or rises more than it goes along, before the neighbour. Contact may then end anywhere
+    between the two nodes, so the middle is taken."""
+    least_gap: float = 1e-12
+    """m: smallest gap of a node that is not in contact. It keeps a division from zero; gaps
+    that matter are above 1e-7 m."""
+
+
+CONTACT_AREA = ContactAreaSettings()
 
 
 def covered_areas(
@@ -75,12 +87,14 @@ def _share(
     """Return which share of the sides from nodes in contact (m, 2) to others is in contact."""
     distance = np.linalg.norm(points[inside] - points[outside], axis=2)
     smooth = gap[outside] < distance
-    opening = np.where(smooth, np.maximum(gap[outside], LEAST_GAP), distance)
+    opening = np.where(smooth, np.maximum(gap[outside], CONTACT_AREA.least_gap), distance)
     modulus = material.young_modulus / (1.0 - material.poisson_ratio**2)
     square, rise = pressure[inside] ** 2, (0.75 * modulus * opening) ** (2 / 3)
     scale = np.sqrt(rise / (3.0 * square))
     root = 2.0 * scale * np.sinh(np.arcsinh(1.5 * distance / (rise * scale)) / 3.0)
-    return np.where(smooth, np.minimum(square * root**3 / distance, 1.0), NO_EDGE)
+    return np.where(
+        smooth, np.minimum(square * root**3 / distance, 1.0), CONTACT_AREA.unknown_edge_share
+    )
 
 
 def area_above(points: Array, triangles: Index, pressure: Array, level: float) -> float:

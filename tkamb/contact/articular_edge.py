@@ -22,23 +22,20 @@ DOWN = np.array([0.0, -1.0, 0.0])
 
 @dataclass(frozen=True)
 class EdgeSettings:
-    """When contact is at the edge of an insert.
-
-    Args:
-        spacing: m, of the vertical rays that find the edge; the distance is known to half of it.
-        steepest: rad, from the horizontal: what is steeper beside the outline is its rim.
-        rim: m, the rim is at most so wide. What is steep farther inside is a flank of the
-            eminence or of a post.
-        reach: m, contact nearer to the edge is flagged: the radius of a usual insert's rounded
-            rim (1 to 2 mm) and half a map's spacing.
-        share: of the peak pressure, from which a point counts as loaded.
-    """
+    """When contact is at the edge of an insert."""
 
     spacing: float = 0.5 * MILLIMETRE
+    """m: of the vertical rays that find the edge; the distance is known to half of it."""
     steepest: float = 50.0 * DEGREE
+    """rad: from the horizontal: what is steeper beside the outline is its rim."""
     rim: float = 4.0 * MILLIMETRE
+    """m: the rim is at most so wide. What is steep farther inside is a flank of the eminence
+    or of a post."""
     reach: float = 2.5 * MILLIMETRE
+    """m: contact nearer to the edge is flagged: the radius of a usual insert's rounded rim (1
+    to 2 mm) and half a map's spacing."""
     share: float = 0.05
+    """Of the peak pressure, from which a point counts as loaded."""
 
 
 EDGE = EdgeSettings()

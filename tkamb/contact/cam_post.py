@@ -36,13 +36,24 @@ WHERE = "[contact] post"
 TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Rows: the turned axes in the insert frame."""
 UP = np.array([0.0, 1.0, 0.0])
-SKIN = 1e-3
-"""m; rays start so far above the post."""
+
+
+@dataclass(frozen=True)
+class CamPostSettings:
+    """Contact of cam and post."""
+
+    ray_start_height: float = 1e-3
+    """m: height above the post at which rays down begin. Chosen well above the noise of a mesh."""
+    search_margin: float = 3 * MILLIMETRE
+    """m: how far beside the post the cam is still taken, because the femur's medial-lateral
+    position moves it. """
+
+
+CAM_POST = CamPostSettings()
+
 TICKS, ZOOMS = 41, 3
 """Rays along either edge of the grid on which the clearance is looked for, and how often it is made
 twenty times finer: 16 mm are known to less than a micrometre."""
-BESIDE = 3 * MILLIMETRE
-"""How far the cam is taken beside the post, which the femur's ML position moves."""
 NO_LINE_CONTACT = ("hertz",)
 """Models that know no contact along a line."""
 
@@ -83,7 +94,7 @@ class PostPair(ContactPair):
         far, back = float(np.abs(self.femoral.bounds).max()), inverse(pose)
         below = points + (pose[1, 3] - 2 * far) * UP
         up, _ = self.femoral.rays.first(transform(back, below), rotate(back, UP))
-        above = points + (self.insert.bounds[1, 1] + SKIN) * UP
+        above = points + (self.insert.bounds[1, 1] + CAM_POST.ray_start_height) * UP
         down, _ = self.insert.rays.first(above, -UP)
         gap = (below[:, 1] + up) - (above[:, 1] - down)
         return np.where(np.isfinite(gap), gap, np.nan)
@@ -151,7 +162,7 @@ class CamPost:
         front = np.array([high[0], (low[1] + high[1]) / 2, (low[2] + high[2]) / 2])
         self.in_turned = np.eye(4)
         self.in_turned[:3, :3], self.in_turned[:3, 3] = TURN, -TURN @ front
-        cam = cam_of(femoral, split, (high[2] - low[2]) / 2 + BESIDE)
+        cam = cam_of(femoral, split, (high[2] - low[2]) / 2 + CAM_POST.search_margin)
         self._foot = float(low[1])
         self._prepare(model, PostPair(cam, post.moved(self.in_turned), material))
 

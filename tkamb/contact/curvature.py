@@ -7,15 +7,28 @@ import numpy as np
 from tkamb.geometry.frames import Array, inverse, rotate, transform
 from tkamb.geometry.rays import RayCaster
 
-SAMPLES = 21
-"""Rays across a patch."""
-ROUNDS = 12
-SETTLED = 1e-7
-"""m; a contact point that moves less is found."""
-FARTHEST = 3.0
-"""Patch radii that the contact point may move away from where the meshes touch."""
-LEAST_COVER = 0.6
-"""Share of a patch that both meshes must cover."""
+
+@dataclass(frozen=True)
+class CurvatureSettings:
+    """Curvature of the two surfaces at a contact point, from a patch of rays."""
+
+    samples: int = 21
+    """Rays per side of the square patch. Chosen: a quadric has six coefficients, 441 rays
+    average out the mesh."""
+    max_iterations: int = 12
+    """Iterations that find the contact point at most."""
+    position_tolerance: float = 1e-7
+    """m: the contact point has converged when an iteration moves it by less. Far below the
+    size of a triangle."""
+    max_distance: float = 3.0
+    """Patch radii: farthest distance of the contact point from where the meshes touch first.
+    Farther away the two surfaces are not described by the patch."""
+    least_cover: float = 0.6
+    """Share of a patch, 1: part that both meshes must cover. With less the quadric is an
+    extrapolation."""
+
+
+CURVATURE = CurvatureSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +79,7 @@ def osculate(
         not curve apart there.
     """
     point, normal = start, _start_normal(insert, start)
-    for _ in range(ROUNDS):
+    for _ in range(CURVATURE.max_iterations):
         frame = np.stack([*_tangents(normal), normal])
         fits = _fit(insert, femoral, pose, point, frame, radius)
         if fits is None:
@@ -74,9 +87,9 @@ def osculate(
         of_insert, of_femoral = fits
         difference = of_femoral - of_insert
         step = _nearest_place(difference, radius)
-        if step is None or np.linalg.norm(point - start) > FARTHEST * radius:
+        if step is None or np.linalg.norm(point - start) > CURVATURE.max_distance * radius:
             return None
-        if np.linalg.norm(step) < SETTLED:
+        if np.linalg.norm(step) < CURVATURE.position_tolerance:
             return _described(point, frame, of_insert, of_femoral)
         point = point + np.append(step, _value(of_insert, step)) @ frame
         slope = (_slope(of_insert, step) + _slope(of_femoral, step)) / 2
@@ -104,7 +117,7 @@ def _fit(
     insert: RayCaster, femoral: RayCaster, pose: Array, point: Array, frame: Array, radius: float
 ) -> tuple[Array, Array] | None:
     """Return quadric coefficients (6,) of the insert and of the femur over the tangent plane."""
-    ticks = np.linspace(-radius, radius, SAMPLES)
+    ticks = np.linspace(-radius, radius, CURVATURE.samples)
     u, v = (grid.ravel() for grid in np.meshgrid(ticks, ticks))
     disc = u**2 + v**2 <= radius**2 * 1.0001
     u, v = u[disc], v[disc]
@@ -114,7 +127,7 @@ def _fit(
     under, _ = femoral.first(transform(back, places - radius * normal), rotate(back, normal))
     of_insert, of_femoral = radius - over, under - radius
     known = (np.abs(of_insert) < radius) & (np.abs(of_femoral) < radius)
-    if known.mean() < LEAST_COVER:
+    if known.mean() < CURVATURE.least_cover:
         return None
     u, v = u[known], v[known]
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)

@@ -6,8 +6,17 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ellipkm1, elliprd
 
-SLENDEREST = 1e-6
-"""Smallest ratio of semi-axes that is solved for."""
+
+@dataclass(frozen=True)
+class EllipseSettings:
+    """Hertz's contact ellipse."""
+
+    smallest_axis_ratio: float = 1e-6
+    """1: smallest ratio of the semi-axes that is solved for. Below it the contact is a line
+    contact, and elliptic integrals lose their digits."""
+
+
+ELLIPSE = EllipseSettings()
 
 
 @dataclass(frozen=True)
@@ -67,4 +76,4 @@ def _axis_ratio(curvature_ratio: float) -> float:
 
     if curvature_ratio <= 1.0 or excess(0.0) >= 0:
         return 1.0
-    return float(np.exp(brentq(excess, np.log(SLENDEREST), 0.0, xtol=1e-15)))
+    return float(np.exp(brentq(excess, np.log(ELLIPSE.smallest_axis_ratio), 0.0, xtol=1e-15)))

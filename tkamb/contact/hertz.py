@@ -10,17 +10,29 @@ from tkamb.contact.curvature import OsculatingContact, osculate
 from tkamb.contact.ellipse import ContactEllipse, contact_ellipse
 from tkamb.contact.model import ContactModel
 from tkamb.contact.result import CondyleContact, ContactResult, peak_flags, thickness_under
-from tkamb.contact.samples import STEEPEST, SampledContact, SurfaceSamples, gaps_along_normals
+from tkamb.contact.samples import MAP_POINT, SampledContact, SurfaceSamples, gaps_along_normals
 from tkamb.geometry.frames import SIDES, Array, Index
 
-SHORT_AXIS_SUB_CELLS = 10
-"""Sub-cells on the ellipse's short semi-axis, over which the pressure is averaged."""
+
+@dataclass(frozen=True)
+class HertzSettings:
+    """Hertz's contact of a condyle."""
+
+    short_axis_sub_cells: int = 10
+    """Sub-cells on the ellipse's short semi-axis over which the pressure of a map point is
+    averaged."""
+    least_share_on_insert: float = 0.95
+    """1: share of the semi-ellipsoid of pressure that must lie on the insert. With less the
+    contact reaches over the rim and Hertz's solution does not hold."""
+    smallest_curvature_ratio: float = 1e-6
+    """1: smallest ratio of the two relative curvatures that still makes an ellipse; below it,
+    a line contact."""
+
+
+HERTZ = HertzSettings()
+
 FEWEST_SUB_CELLS, MOST_SUB_CELLS = 6, 50
 """Bounds of the sub-cells per edge of a grid cell."""
-LEAST_HELD = 0.95
-"""Share of the semi-ellipsoid that must lie on the insert."""
-FLATTEST = 1e-6
-"""Smallest ratio of the two relative curvatures that still makes an ellipse."""
 
 
 CONFORMING = "conforms to the insert: no ellipse (relative curvature is not positive)"
@@ -100,7 +112,7 @@ class Hertz(ContactModel):
             flat, steep = geometry.contact.relative / 2
             patch = contact_ellipse(flat, steep, depth, plane_modulus)
             pressure[side], share = map_pressure(samples, geometry.contact, patch)
-            if share < LEAST_HELD:
+            if share < HERTZ.least_share_on_insert:
                 return ContactResult.failed(
                     state, pose, f"{SIDES[side]} contact ellipse leaves the insert"
                 )
@@ -141,7 +153,7 @@ def map_pressure(
     pressure = np.zeros(len(samples.points))
     offset = samples.points - contact.point
     wanted = patch.force * contact.normal[1]
-    if patch.short_axis < samples.resolution / MOST_SUB_CELLS * SHORT_AXIS_SUB_CELLS:
+    if patch.short_axis < samples.resolution / MOST_SUB_CELLS * HERTZ.short_axis_sub_cells:
         nearest = int(np.einsum("ij,ij->i", offset, offset).argmin())
         pressure[nearest] = wanted / (samples.area[nearest] * samples.normals[nearest, 1])
         return pressure, 1.0
@@ -160,12 +172,12 @@ def _cell_means(
     patch: ContactEllipse,
 ) -> Array:
     """Return the mean of sqrt(1 - (u/a)² - (v/b)²) over the grid cells of points (m,)."""
-    wanted = int(np.ceil(SHORT_AXIS_SUB_CELLS * samples.resolution / patch.short_axis))
+    wanted = int(np.ceil(HERTZ.short_axis_sub_cells * samples.resolution / patch.short_axis))
     count = min(max(wanted, FEWEST_SUB_CELLS), MOST_SUB_CELLS)
     ticks = ((np.arange(count) + 0.5) / count - 0.5) * samples.resolution
     dx, dz = (grid.ravel() for grid in np.meshgrid(ticks, ticks))
     normals = samples.normals[near]
-    slope = -normals[:, [0, 2]] / np.maximum(normals[:, 1:2], STEEPEST)
+    slope = -normals[:, [0, 2]] / np.maximum(normals[:, 1:2], MAP_POINT.least_normal_y)
     rise = slope[:, :1] * dx + slope[:, 1:] * dz
     offset = np.stack(np.broadcast_arrays(dx, rise, dz), axis=-1)
     positions = (samples.points[near] - contact.point)[:, None] + offset
@@ -229,6 +241,9 @@ def _geometry(
         contact = osculate(
             state.pair.insert.rays, state.pair.femoral.rays, touching, touch.point, patch_radius
         )
-        usable = contact is not None and contact.relative[0] > FLATTEST * contact.relative[1]
+        usable = (
+            contact is not None
+            and contact.relative[0] > HERTZ.smallest_curvature_ratio * contact.relative[1]
+        )
         found.append(CondyleGeometry(-touch.travel, contact if usable else None))
     return found[0], found[1]

@@ -8,7 +8,7 @@ package offers a model through the entry-point group `tkamb.contact`:
 """
 
 import math
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tkamb.contact.model import ContactModel
@@ -16,8 +16,18 @@ from tkamb.contact.named_classes import NamedClasses
 from tkamb.errors import InputError, names_near
 from tkamb.units import MILLIMETRE
 
-COARSEST_MM = 10.0
-"""A condyle's contact is 5 to 20 mm across: a coarser map resolves nothing."""
+
+@dataclass(frozen=True)
+class MapGridSettings:
+    """The spacing of a pressure map."""
+
+    coarsest_mm: float = 10.0
+    """mm: largest spacing that is accepted. A condyle's contact is 5 to 20 mm across; a
+    coarser map resolves nothing."""
+
+
+MAP_GRID = MapGridSettings()
+
 
 BUILT_IN = {
     "hertz": "tkamb.contact.hertz:Hertz",
@@ -82,9 +92,10 @@ def contact_model(
         words, spacing = f"resolution {resolution_mm} mm", resolution_mm * MILLIMETRE
     else:
         words, spacing = f"resolution {resolution} m", resolution
-    if not (math.isfinite(spacing) and 0 < spacing <= COARSEST_MM * MILLIMETRE):
-        mend = f"give more than 0, at most {COARSEST_MM:g} mm ({COARSEST_MM / 1e3:g} m)"
-        raise InputError(words, where, mend)
+    if not (math.isfinite(spacing) and 0 < spacing <= MAP_GRID.coarsest_mm * MILLIMETRE):
+        most = MAP_GRID.coarsest_mm
+        hint = f"give more than 0, at most {most:g} mm ({most / 1e3:g} m)"
+        raise InputError(words, where, hint)
     own = _options(found)
     for option, value in options.items():
         if option not in own:

@@ -14,8 +14,16 @@ from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.equations import KneeLoads
 from tkamb.units import MILLIMETRE
 
-FAR = 5.0 * MILLIMETRE
-"""A contact point that moves farther has jumped: onto eminence or lip, or off it."""
+
+@dataclass(frozen=True)
+class AdjustmentEffectSettings:
+    """What an adjustment of the pose changes."""
+
+    jump_distance: float = 5.0 * MILLIMETRE
+    """m: a contact point that moves farther has jumped onto the eminence or lip, or off it."""
+
+
+ADJUSTMENT_EFFECT = AdjustmentEffectSettings()
 
 
 @dataclass(frozen=True)
@@ -75,5 +83,5 @@ def _largest_move(now: Mapping[str, CondylePoint], before: Mapping[str, CondyleP
     """Return which contact point moved most."""
     moved = {side: float(np.linalg.norm(now[side].point - before[side].point)) for side in now}
     side = max(moved, key=lambda name: moved[name])
-    word = "jumps" if moved[side] > FAR else "moves"
+    word = "jumps" if moved[side] > ADJUSTMENT_EFFECT.jump_distance else "moves"
     return f"the {side} contact point {word} by {moved[side] / MILLIMETRE:.1f} mm"

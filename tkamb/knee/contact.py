@@ -17,26 +17,26 @@ from tkamb.contact.probe import CondyleWrench, ProbedContact
 from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, cross, pose
-from tkamb.knee.contact_points import STANDSTILL, CondylePoint
+from tkamb.knee.contact_points import CONTACT_POINT, CondylePoint
 from tkamb.knee.load import wrench_of
 
 
 @dataclass(frozen=True)
 class DifferenceSettings:
-    """How the stiffness of a model without an exact tangent is found: by central differences.
-
-    Args:
-        step: m, of a translation. Large against what the solver's tolerance leaves open, small
-            against the radius of the contact.
-        exact_step: m, the same for a model without a solver, whose answers are exact.
-        arm: m; a rotation is this step over this arm.
-        tolerance: solver tolerance of a model that has one, for these evaluations.
-    """
+    """How the stiffness of a model without an exact tangent is found: by central differences."""
 
     step: float = 4e-6
+    """m: of a translation. Large against what the solver's tolerance leaves open, small
+    against the radius of the contact."""
     exact_step: float = 1e-9
+    """m: the same for a model without a solver, whose answers are exact."""
     arm: float = 0.025
+    """m: a rotation is this step over this arm."""
     tolerance: float = 1e-6
+    """Solver tolerance of a model that has one, for these evaluations."""
+
+
+CONTACT_DIFFERENCE = DifferenceSettings()
 
 
 class KneeContact:
@@ -58,7 +58,7 @@ class KneeContact:
     ) -> None:
         self.model, self.pair, self.friction = model, pair, friction
         self.state: Any = model.prepare(pair)
-        self._settings = settings or DifferenceSettings()
+        self._settings = settings or CONTACT_DIFFERENCE
 
     def probe(self, guess: ContactResult | None = None) -> Any:
         """Return a new probe (`tkamb.contact.probe.Probe`), which a caller keeps as warm start."""
@@ -126,7 +126,7 @@ class KneeContact:
             moved = np.hstack([np.eye(3), -_cross_matrix(point)])
             sliding = moved @ twist
             tangential = sliding - (sliding @ normal) * normal
-            speed = float(np.sqrt(tangential @ tangential + STANDSTILL**2))
+            speed = float(np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2))
             across = np.eye(3) - np.outer(normal, normal)
             slope = across / speed - np.outer(tangential, tangential) / speed**3
             total += self.friction * load.force * moved.T @ slope @ moved

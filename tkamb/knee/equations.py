@@ -23,8 +23,18 @@ from tkamb.knee.load import PointForces
 from tkamb.knee.load_state import LoadState, contradictions, load_states, wrong_signs
 from tkamb.knee.unknowns import Unknown, muscle_load, solve
 
-RESIDUAL_SHIFT = 0.010
-"""m: how far the residuals' point is moved along y for their sensitivity."""
+
+@dataclass(frozen=True)
+class EquationSettings:
+    """The equations of motion of the leg."""
+
+    residual_shift: float = 0.010
+    """m: shift along y of the point where the residuals act, by which their sensitivity is
+    measured."""
+
+
+EQUATION = EquationSettings()
+
 
 PATELLAR = ("patellar_ligament", "patellofemoral", "patellofemoral_tangential")
 
@@ -282,7 +292,7 @@ class KneeSystem:
         if not self.geometry.condyles:
             return 0.0
         total = np.linalg.norm(self.contact_force(self.solution.values))
-        shifts = np.array([-RESIDUAL_SHIFT, RESIDUAL_SHIFT])[:, None]
+        shifts = np.array([-EQUATION.residual_shift, EQUATION.residual_shift])[:, None]
         about_x, about_z = self._couples.T
         columns = np.stack([self._columns, self._columns])
         columns[:, :, self.names.index("residual_ap")] -= shifts * about_z

@@ -53,11 +53,21 @@ if TYPE_CHECKING:
 
 PATELLAR_LIGAMENT = "patellar_ligament"
 """Its name among the tensions."""
-SAME_PLACE = 1e-9
-"""m and rad: an insert this near to its flat bottom's frame stands in it."""
-POSE_TOLERANCE = 1e-12
-"""m and rad, of the joints that make a pose of the knee."""
-MAX_POSE_STEPS = 30
+
+
+@dataclass(frozen=True)
+class KneeSettings:
+    """The knee object: frames and poses."""
+
+    frame_tolerance: float = 1e-9
+    """m and rad: an insert frame this near to that of its flat bottom is the same frame."""
+    pose_tolerance: float = 1e-12
+    """m and rad: residual of the joint coordinates that make a given pose of the knee."""
+    max_pose_steps: int = 30
+    """Newton steps at most to find these coordinates."""
+
+
+KNEE = KneeSettings()
 
 
 @dataclass(eq=False)
@@ -574,7 +584,7 @@ class Knee:
         from tkamb.geometry.flat_bottom import insert_placement
 
         placement = insert_placement(self.insert)
-        if np.abs(placement - np.eye(4)).max() < SAME_PLACE:
+        if np.abs(placement - np.eye(4)).max() < KNEE.frame_tolerance:
             return place
         self.insert = self.insert.moved(placement)
         mesh_in_insert = mirrored_pose(placement) if left else placement
@@ -938,12 +948,12 @@ class Knee:
             for k in range(model.joints[joint].nv)
         ]
         q = np.array(q, float)
-        for _ in range(MAX_POSE_STEPS):
+        for _ in range(KNEE.max_pose_steps):
             pin.forwardKinematics(model, data, q)
             insert = data.oMi[self.bridge.insert.joint] * self.bridge.insert.placement
             femur = data.oMi[self.bridge.component.joint] * self.bridge.component.placement
             error = pin.log6(wanted * insert.actInv(femur).inverse()).vector
-            if np.abs(error).max() < POSE_TOLERANCE:
+            if np.abs(error).max() < KNEE.pose_tolerance:
                 return q
             jacobian = self.relative_jacobian(q)[:, columns]
             step = np.zeros(model.nv)

@@ -25,11 +25,21 @@ from tkamb.geometry.frames import Array, transform
 from tkamb.knee.load import LinkPoint, PointForces, wrench_of
 from tkamb.units import DEGREE
 
-TOE_STRAIN = 0.03
-"""eps1: the toe region ends at twice this strain, the same for every ligament."""
 
-FARTHEST_REFERENCE = 15.0 * DEGREE
-"""rad: a recorded frame farther than this from the reference flexion is no reference pose."""
+@dataclass(frozen=True)
+class LigamentSettings:
+    """Force-length curve and reference pose of ligaments."""
+
+    toe_strain: float = 0.03
+    """1: eps1 of Blankevoort's curve; the toe region ends at twice this strain, the same for
+    every ligament."""
+    max_reference_distance: float = 15.0 * DEGREE
+    """rad: a recorded frame whose flexion is farther from the reference flexion is no
+    reference pose."""
+
+
+LIGAMENT = LigamentSettings()
+
 
 Law = Literal["two-line", "quadratic-toe"]
 
@@ -38,18 +48,18 @@ def two_line_force(length: ArrayLike, slack_length: ArrayLike, stiffness: ArrayL
     """Return the tension (N) of the two-line law; `stiffness` in N/m, lengths in m."""
     length, slack = np.asarray(length, float), np.asarray(slack_length, float)
     toe = 0.5 * np.asarray(stiffness) * (length - slack)
-    line = np.asarray(stiffness) * (length - (1.0 + TOE_STRAIN) * slack)
+    line = np.asarray(stiffness) * (length - (1.0 + LIGAMENT.toe_strain) * slack)
     strain = (length - slack) / slack
-    return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * TOE_STRAIN, toe, line))
+    return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * LIGAMENT.toe_strain, toe, line))
 
 
 def quadratic_toe_force(length: ArrayLike, slack_length: ArrayLike, stiffness: ArrayLike) -> Array:
     """Return the tension (N) of the quadratic-toe law; `stiffness` in N per unit strain."""
     length, slack = np.asarray(length, float), np.asarray(slack_length, float)
     strain = (length - slack) / slack
-    toe = np.asarray(stiffness) * strain**2 / (4.0 * TOE_STRAIN)
-    line = np.asarray(stiffness) * (strain - TOE_STRAIN)
-    return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * TOE_STRAIN, toe, line))
+    toe = np.asarray(stiffness) * strain**2 / (4.0 * LIGAMENT.toe_strain)
+    line = np.asarray(stiffness) * (strain - LIGAMENT.toe_strain)
+    return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * LIGAMENT.toe_strain, toe, line))
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +223,7 @@ def _with_slack_length(bundle: Ligament, poses: Mapping[str, Array], flexion: Ar
         raise InputError("both ends are the same point", where)
     if not np.isnan(bundle.slack_length):
         return bundle
-    if abs(flexion[reference] - bundle.reference_flexion) > FARTHEST_REFERENCE:
+    if abs(flexion[reference] - bundle.reference_flexion) > LIGAMENT.max_reference_distance:
         raise InputError(
             f"its reference pose is at {bundle.reference_flexion / DEGREE:g} deg of flexion, but "
             f"the nearest recorded frame is at {flexion[reference] / DEGREE:.0f} deg",

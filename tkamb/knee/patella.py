@@ -15,8 +15,17 @@ from tkamb.geometry.frames import Array, inverse, rotate, transform
 from tkamb.knee.patellofemoral import PatellarContact, PatellofemoralContact
 from tkamb.knee.wrapping import TautPath, path_in_link
 
-FLATTEST = 1e-6
-"""Determinant of the contact normal and the ligament's direction: less is one line."""
+
+@dataclass(frozen=True)
+class PatellaSettings:
+    """Equilibrium of the patella."""
+
+    least_determinant: float = 1e-6
+    """1: determinant of contact normal and ligament direction (unit vectors) below which the
+    two are one line."""
+
+
+PATELLA = PatellaSettings()
 
 
 class PatellaStatus(Enum):
@@ -173,7 +182,7 @@ class PatellaFrame:
         )
         pull, hold = -muscle.end_direction[:2], ligament.start_direction[:2]
         sides = np.column_stack([hold, contact.normal[:2]])
-        if abs(np.linalg.det(sides)) < FLATTEST:
+        if abs(np.linalg.det(sides)) < PATELLA.least_determinant:
             raise ComputationError("the patellar ligament runs along the contact normal")
         ligament_force, normal_force = np.linalg.solve(sides, -pull)
         moment = (

@@ -14,7 +14,7 @@ direction of the unbalanced moment until that changes sign.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -23,7 +23,7 @@ from scipy.optimize import brentq
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, transform
 from tkamb.knee.patella import (
-    FLATTEST,
+    PATELLA,
     ExtensorMechanism,
     PatellaBalance,
     PatellaFrame,
@@ -31,31 +31,36 @@ from tkamb.knee.patella import (
     PatellaStatus,
 )
 
-TOLERANCE = 1e-8
-"""m, of gap and ligament length."""
 
-TURN_TOLERANCE = 1e-7
-"""rad, of the rotation at which the moment vanishes."""
+@dataclass(frozen=True)
+class PatellaSearchSettings:
+    """The search for the patella's place."""
 
-FARTHEST_AHEAD = 8.0
-"""Lengths of a chord that a search looks ahead along it."""
+    length_tolerance: float = 1e-8
+    """m: residual of gap and ligament length below which the search has converged."""
+    rotation_tolerance: float = 1e-7
+    """rad: tolerance of the rotation at which the moment vanishes."""
+    max_chord_lengths: float = 8.0
+    """Chord lengths: how far a search extrapolates along a chord."""
+    max_evaluations: int = 14
+    """Evaluations of one approach from a place near by."""
+    lever_arm: float = 0.02
+    """m: arm that makes a rotation comparable to a length when slopes are updated from a step."""
+    max_distance: float = 5e-3
+    """m: a place farther from where the button touched first lies behind the femur."""
 
-MOST_LOOKS = 14
-"""Of one approach to a place near by."""
+
+PATELLA_SEARCH = PatellaSearchSettings()
+
 
 LONGEST_STEP = np.array([5e-3, 5e-3, np.deg2rad(4.0)])
 """m, m and rad, of the coordinates in one step."""
 
-LEVER = 0.02
-"""m: a radian counts as much when slopes are learnt from a step."""
 
 FIRST_STEP = np.deg2rad(0.5)
 NEAR_TURN = np.deg2rad(12.0)
 WIDEST_TURN = np.deg2rad(40.0)
 """rad: first step, reach of a quick look, and end of the search about the guess."""
-
-NEAR = 5e-3
-"""m: a place found farther from where the button first touched lies behind the femur."""
 
 
 class _Lost(ComputationError):
@@ -122,7 +127,7 @@ class _Closing:
 
     @property
     def closed(self) -> bool:
-        return bool(np.abs(self.errors).max() < TOLERANCE)
+        return bool(np.abs(self.errors).max() < PATELLA_SEARCH.length_tolerance)
 
     def step(self, balance: PatellaBalance) -> Array:
         """Return the step (2,) in ap and si from a balance, 5 mm at most."""
@@ -133,7 +138,7 @@ class _Closing:
         if learns:
             missed = self.errors - before - self._slopes @ self._step
             self._slopes += np.outer(missed, self._step) / (self._step @ self._step)
-        if not learns or abs(np.linalg.det(self._slopes)) < FLATTEST:
+        if not learns or abs(np.linalg.det(self._slopes)) < PATELLA.least_determinant:
             self._slopes = _slopes_in_plane(balance)
         step = np.linalg.solve(self._slopes, -self.errors)
         self._step = np.asarray(
@@ -183,7 +188,7 @@ class _Search(PatellaFrame):
             there = self.at_rotation(here.coordinates, float(turn))
             if there.moment * here.moment <= 0.0:
                 return self.between(here, there)
-            ahead = self._chord(here, there, FARTHEST_AHEAD)
+            ahead = self._chord(here, there, PATELLA_SEARCH.max_chord_lengths)
             if ahead is not None:
                 return ahead
             here, step = there, 1.6 * step
@@ -203,7 +208,7 @@ class _Search(PatellaFrame):
 
         ends = (here.coordinates[2], there.coordinates[2])
         try:
-            brentq(moment, *ends, xtol=TURN_TOLERANCE, rtol=1e-12)
+            brentq(moment, *ends, xtol=PATELLA_SEARCH.rotation_tolerance, rtol=1e-12)
         except ValueError:
             # the patella that is followed from one end lies elsewhere at the other, so that the
             # moment there has another sign than the one that was found before
@@ -238,9 +243,9 @@ class _Search(PatellaFrame):
             slopes: (3, 3) of gap, ligament length and moment, about.
             span: rad, least and greatest rotation from the start.
         """
-        scale = np.array([1.0, 1.0, LEVER])
+        scale = np.array([1.0, 1.0, PATELLA_SEARCH.lever_arm])
         coordinates, step, before = start, None, np.zeros(3)
-        for _ in range(MOST_LOOKS):
+        for _ in range(PATELLA_SEARCH.max_evaluations):
             if not span[0] <= coordinates[2] - start[2] <= span[1]:
                 return None
             balance = self.balance(coordinates)
@@ -252,7 +257,10 @@ class _Search(PatellaFrame):
             if not _stable(slopes):
                 return None
             step, before = -np.linalg.solve(slopes, errors), errors
-            if np.abs(errors[:2]).max() < TOLERANCE and abs(step[2]) < TURN_TOLERANCE:
+            if (
+                np.abs(errors[:2]).max() < PATELLA_SEARCH.length_tolerance
+                and abs(step[2]) < PATELLA_SEARCH.rotation_tolerance
+            ):
                 return replace(balance, slopes=slopes)
             step = step / max(1.0, float(np.abs(step / LONGEST_STEP).max()))
             coordinates = coordinates + step
@@ -310,7 +318,7 @@ class _Search(PatellaFrame):
             middle = 0.5 * (free + deep)
             free, deep = (free, middle) if m.contact.touches(place(middle)) else (middle, deep)
         found = self.at_rotation(place(free), rotation)
-        if np.linalg.norm((found.coordinates - place(free))[:2]) > NEAR:
+        if np.linalg.norm((found.coordinates - place(free))[:2]) > PATELLA_SEARCH.max_distance:
             raise _Lost(PatellaStatus.GAP)
         return found
 
@@ -338,7 +346,7 @@ def _slopes_in_plane(balance: PatellaBalance) -> Array:
 def _stable(slopes: Array) -> bool:
     """Say whether a turn with gap and ligament kept is turned back by the moment."""
     plane = slopes[:2, :2]
-    if abs(np.linalg.det(plane)) < FLATTEST:
+    if abs(np.linalg.det(plane)) < PATELLA.least_determinant:
         return False
     return bool(slopes[2, 2] < slopes[2, :2] @ np.linalg.solve(plane, slopes[:2, 2]))
 

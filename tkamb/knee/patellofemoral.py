@@ -37,27 +37,32 @@ from tkamb.geometry.frames import Array, Index, pose, transform
 from tkamb.geometry.normals import sharp_edges
 from tkamb.geometry.surface import Surface
 
-PATCH_DEPTH = 5e-5
-"""m: tau above; a contact of relative radius R is averaged over about sqrt(R tau)."""
 
-SAMPLE_SPACING = 1e-3
-"""m: spacing of the samples of the button, in the patella's coronal plane."""
+@dataclass(frozen=True)
+class PatellofemoralSettings:
+    """Patellofemoral contact with smoothed gaps."""
 
-REACH = 14.0 * PATCH_DEPTH
-"""m: samples farther than this behind the nearest one weigh nothing (exp(-14) = 8e-7, by which the
-gap of a patch of twenty samples jumps by 3e-11 m)."""
+    patch_depth: float = 5e-5
+    """m: tau of the module's equations. A contact of relative radius R is averaged over about
+    sqrt(R tau)."""
+    sample_spacing: float = 1e-3
+    """m: spacing of the button's samples in the patella's coronal plane."""
+    sample_range: float = 14.0 * patch_depth
+    """m: samples farther than this behind the nearest one get no weight. Their weight is
+    exp(-14) = 8e-7, by which the gap of a patch of twenty samples jumps by 3e-11 m."""
+    coarse_samples: int = 60
+    """Samples of a coarse evaluation."""
+    lateral_compliance: float = 0.01
+    """m: c of the module's equations, the shift if the contact force were purely lateral."""
+    tilt_compliance: float = 10.0
+    """rad/m: d of the module's equations, the tilt (5.7 deg) if the whole force acted 10 mm
+    beside the middle."""
+    least_sagittal_part: float = 1e-9
+    """1: sagittal part of a unit normal below which the normal has no sagittal direction."""
 
-COARSE = 60
-"""Samples that a quick look takes."""
 
-LATERAL_YIELD = 0.01
-"""m: c above, the shift if the contact force were purely lateral."""
+PATELLOFEMORAL = PatellofemoralSettings()
 
-TILT_YIELD = 10.0
-"""rad/m: d above, the tilt (5.7 deg) if the whole force acted 10 mm beside the middle."""
-
-SIDEWAYS = 1e-9
-"""Sagittal part of a unit normal below which there is none."""
 
 STRAIGHT = 1e-12
 """m: where the share changes the gap by less through what yields, all goes to the nearer side."""
@@ -97,7 +102,7 @@ class PatellofemoralContact:
 
     Distances of samples that cannot matter are carried over from the position before, with
     what the samples have moved since as a bound: this saves time and changes nothing, since
-    samples beyond `REACH` have no weight.
+    samples beyond `PATELLOFEMORAL.sample_range` have no weight.
 
     Args:
         femoral: femoral component in the patellar joint's frame; triangles share vertices.
@@ -115,8 +120,8 @@ class PatellofemoralContact:
         femoral: Surface,
         patellar: Surface,
         ml: float = 0.0,
-        lateral_yield: float = LATERAL_YIELD,
-        tilt_yield: float = TILT_YIELD,
+        lateral_yield: float = PATELLOFEMORAL.lateral_compliance,
+        tilt_yield: float = PATELLOFEMORAL.tilt_compliance,
     ) -> None:
         self.ml, self._yield = ml, np.array([lateral_yield, tilt_yield])
         self._nearest = femoral.nearest
@@ -154,14 +159,14 @@ class PatellofemoralContact:
         """
         found = np.empty(FIELDS)
         length = _shared(self._sides_at(coordinates), self.ml, self._yield, found)
-        if length < SIDEWAYS:
+        if length < PATELLOFEMORAL.least_sagittal_part:
             raise ComputationError("the femur pushes the patella straight sideways")
         gap, left, shift, tilt, on_edge = found[:5].tolist()
         return PatellarContact(gap, found[5:8], found[8:], left, shift, tilt, on_edge)
 
     def touches(self, coordinates: Array) -> bool:
         """Return whether a few of the samples lie in the femur: a quick look for searches."""
-        few = self._samples[:: max(1, len(self._samples) // COARSE)]
+        few = self._samples[:: max(1, len(self._samples) // PATELLOFEMORAL.coarse_samples)]
         here = transform(self.pose(np.asarray(coordinates, float)), few)
         low, high = self._nearest.surface.bounds
         here = here[((here >= low) & (here <= high)).all(axis=1)]  # beside its box none is in it
@@ -173,14 +178,20 @@ class PatellofemoralContact:
         """Return gap, point, normal and share on edges (2, 8) of both sides, distances renewed."""
         here = transform(self.pose(np.asarray(coordinates, float)), self._samples)
         seen_at, distance = self._seen[:2]
-        which = _which_matter(here, self._left, REACH, seen_at, distance)
+        which = _which_matter(here, self._left, PATELLOFEMORAL.sample_range, seen_at, distance)
         if len(which):
             found = self._nearest.at(here[which])
             _take(
                 which, here, found.distance, found.faces, found.weights, *self._facets, *self._seen
             )
         sides = np.empty((2, 8))
-        _mean_over_sides(self._left, PATCH_DEPTH, REACH, *self._seen[1:], sides)
+        _mean_over_sides(
+            self._left,
+            PATELLOFEMORAL.patch_depth,
+            PATELLOFEMORAL.sample_range,
+            *self._seen[1:],
+            sides,
+        )
         return sides
 
 
@@ -354,9 +365,14 @@ def _shared(sides: Array, middle: float, yields: Array, found: Array) -> float:
 def _joint_side(patellar: Surface) -> Array:
     """Return samples (n, 3) of the surface that a view along the patella's +x shows."""
     low, high = patellar.bounds
-    axes = [np.arange(low[k] + 0.5 * SAMPLE_SPACING, high[k], SAMPLE_SPACING) for k in (1, 2)]
+    axes = [
+        np.arange(
+            low[k] + 0.5 * PATELLOFEMORAL.sample_spacing, high[k], PATELLOFEMORAL.sample_spacing
+        )
+        for k in (1, 2)
+    ]
     y, z = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
-    start = np.column_stack([np.full(len(y), low[0] - SAMPLE_SPACING), y, z])
+    start = np.column_stack([np.full(len(y), low[0] - PATELLOFEMORAL.sample_spacing), y, z])
     distance, _ = patellar.rays.first(start, np.array([1.0, 0.0, 0.0]))
     hit = np.isfinite(distance)
     samples = start[hit] + distance[hit, None] * np.array([1.0, 0.0, 0.0])

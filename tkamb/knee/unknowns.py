@@ -18,14 +18,19 @@ from tkamb.geometry.frames import Array, cross
 from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.load import PointForces
 
-LARGEST_CONDITION = 1e4
-"""Above this condition number (unit columns) a frame counts as singular.
 
-It grows as one over the arm d at which the patellar ligament passes the femorotibial contact:
-7 to 9 m/d on the shipped knee, which has d = 43-45 mm and 148-218, and 9e2 at d = 9 mm.
-1e4 is d = 0.8 mm, where an error of a millimetre in a line of action, which nobody excludes,
-is more than the whole force.
-"""
+@dataclass(frozen=True)
+class UnknownsSettings:
+    """Solvability of the equations for the unknown forces."""
+
+    max_condition: float = 1e4
+    """1: condition number (unit columns) above which a frame counts as singular. It grows as
+    one over the arm d at which the patellar ligament passes the femorotibial contact: 7 to
+    9 m / d. The shipped knee has d = 43 to 45 mm and 148 to 218. The limit is d = 0.8 mm,
+    where an error of 1 mm in a line of action exceeds the whole force."""
+
+
+UNKNOWNS = UnknownsSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +77,7 @@ def solve(names: Sequence[str], columns: Array, right: Array) -> Solution:
     size = np.linalg.norm(columns, axis=0)
     scaled = columns / np.where(size > 0, size, 1.0)
     condition = float(np.linalg.cond(scaled))
-    regular = bool(np.isfinite(condition) and condition < LARGEST_CONDITION)
+    regular = bool(np.isfinite(condition) and condition < UNKNOWNS.max_condition)
     magnitudes = np.linalg.solve(scaled, right) / size if regular else np.full(len(right), np.nan)
     return Solution(dict(zip(names, magnitudes.tolist(), strict=True)), condition, regular)
 

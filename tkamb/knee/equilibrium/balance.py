@@ -28,25 +28,38 @@ import numpy as np
 
 from tkamb.geometry.frames import Array
 
-FORCE_TOLERANCE = 0.05
-"""N (moments over the lever arm): what may be left of a converged coordinate's force, or as much
-as the forces are known to."""
-STEP_TOLERANCE = 2e-6
-"""m: the Newton step that is left of a converged coordinate."""
-SMALLEST_STIFFNESS = 100.0
-"""N/m: a state that gives way by more than 10 mm per newton is indeterminate."""
+
+@dataclass(frozen=True)
+class BalanceSettings:
+    """The iteration that finds the released coordinates."""
+
+    force_tolerance: float = 0.05
+    """N (moments are divided by the lever arm): residual below which a coordinate has
+    converged. The noise of the forces counts instead where it is larger."""
+    step_tolerance: float = 2e-6
+    """m: Newton step below which a coordinate has converged."""
+    least_stiffness: float = 100.0
+    """N/m: a state with a smaller stiffness is indeterminate; it gives way by more than 10 mm
+    per newton."""
+    narrow_radius: float = 1e-6
+    """m: trust radius below which an approximate stiffness is replaced by finite differences,
+    because the steps that it proposes do not reduce the residual."""
+    max_travel: float = 20e-3
+    """m: a coordinate this far from its initial guess is held by nothing."""
+    difference_step: float = 2e-6
+    """m: step of the finite differences where the stiffness is not given."""
+    max_prediction_error: float = 0.5
+    """1: an approximate stiffness is not used along a step if the change of force differs from
+    the predicted one by more than this share."""
+    max_steps: int = 200
+    """Steps at most. A lightly loaded knee that slides 16 mm over lattice cells of 2 mm needs
+    80."""
+
+
+BALANCE = BalanceSettings()
+
 FIRST_RADIUS, WIDEST_RADIUS, NARROWEST_RADIUS = 0.5e-3, 3e-3, 1e-9
 """m: the trust region at the start, and its limits."""
-NARROW_RADIUS = 1e-6
-"""m: where guides to the stiffness still do not help, it is looked at by differences."""
-LONGEST_TRAVEL = 20e-3
-"""m: a coordinate this far from its start is held by nothing."""
-PROBE_STEP = 2e-6
-"""m: of the finite differences where the stiffness is not known."""
-KNOWN = 0.5
-"""A guide that misses more than this part of what it expects along a step says nothing of it."""
-MOST_STEPS = 200
-"""A lightly loaded knee that slides 16 mm over lattice cells of 2 mm needs 80."""
 
 
 class BalanceStatus(Enum):
@@ -166,14 +179,14 @@ class _Search:
         """Return the end of the search."""
         if not self.known:
             return self._end(BalanceStatus.OUT_OF_RANGE)
-        while self._steps < MOST_STEPS:
+        while self._steps < BALANCE.max_steps:
             if not np.isfinite(self.stiffness).all():  # a neighbour of this place is out of range
                 return self._end(BalanceStatus.OUT_OF_RANGE)
             if self._converged():
                 return self._end(self._kind())
             if self._near() or self._travel() > self._reach:
                 return replace(self._end(BalanceStatus.OK), at_rest=False)
-            if self._travel() > LONGEST_TRAVEL:
+            if self._travel() > BALANCE.max_travel:
                 return self._end(BalanceStatus.RUNS_AWAY)
             if self._radius < NARROWEST_RADIUS and (self._own or self._fresh):
                 break
@@ -204,7 +217,7 @@ class _Search:
             self._learn(step, trial)
         if ratio < 0.25:
             self._radius = 0.25 * length
-            lost = self._guide is None or self._radius < NARROW_RADIUS
+            lost = self._guide is None or self._radius < BALANCE.narrow_radius
             if not (self._own or self._fresh) and lost and ratio < 0.05:
                 self._refresh()
         elif ratio > 0.7 and length > 0.8 * self._radius:
@@ -238,8 +251,10 @@ class _Search:
 
     def _differences(self) -> Array:
         self._fresh, self._since = True, 0
-        columns = [self._at(self.x + d).force for d in PROBE_STEP * np.eye(len(self.x))]
-        return (self.force[:, None] - np.array(columns).T) / PROBE_STEP
+        columns = [
+            self._at(self.x + d).force for d in BALANCE.difference_step * np.eye(len(self.x))
+        ]
+        return (self.force[:, None] - np.array(columns).T) / BALANCE.difference_step
 
     def _refresh(self) -> None:
         self.stiffness = self._differences()
@@ -258,18 +273,18 @@ class _Search:
             expected = expected + 0.5 * (trial.stiffness - self._guide) @ step
         missing = (self.force - trial.force) - expected
         learnt = np.outer(missing, step) / (step @ step)
-        strange = np.linalg.norm(missing) > KNOWN * np.linalg.norm(expected)
+        strange = np.linalg.norm(missing) > BALANCE.max_prediction_error * np.linalg.norm(expected)
         if self._guide is not None and strange and not self._fresh:
             learnt = -self._missing
         self._missing, self.stiffness = self._missing + learnt, self.stiffness + learnt
 
     def _converged(self) -> bool:
-        if np.abs(self.force).max() > max(FORCE_TOLERANCE, self._known_to):
+        if np.abs(self.force).max() > max(BALANCE.force_tolerance, self._known_to):
             return False
         left, values, right = np.linalg.svd(self.stiffness)
-        held = values > SMALLEST_STIFFNESS
+        held = values > BALANCE.least_stiffness
         step = right[held].T @ ((left.T @ self.force)[held] / values[held])
-        return bool((np.abs(step) < STEP_TOLERANCE).all())
+        return bool((np.abs(step) < BALANCE.step_tolerance).all())
 
     def _travel(self) -> float:
         return float(np.abs(self.x - self._start).max())
@@ -277,22 +292,22 @@ class _Search:
     def _near(self) -> bool:
         """Return whether the step that is left is short against the way from the start."""
         way = self._left * float(np.linalg.norm(self.x - self._start))
-        if way == 0.0 or self._smallest_stiffness() <= SMALLEST_STIFFNESS:
+        if way == 0.0 or self._smallest_stiffness() <= BALANCE.least_stiffness:
             return False
         step = float(np.linalg.norm(np.linalg.solve(self.stiffness, self.force)))
         return step < min(way, self._radius)
 
     def _kind(self) -> BalanceStatus:
-        if not (self._own or self._fresh) and self._smallest_stiffness() <= SMALLEST_STIFFNESS:
+        if not (self._own or self._fresh) and self._smallest_stiffness() <= BALANCE.least_stiffness:
             self._refresh()
         smallest_stiffness = self._smallest_stiffness()
         if np.isnan(smallest_stiffness):
             return BalanceStatus.OUT_OF_RANGE
-        if smallest_stiffness < -SMALLEST_STIFFNESS:
+        if smallest_stiffness < -BALANCE.least_stiffness:
             return BalanceStatus.UNSTABLE
         return (
             BalanceStatus.OK
-            if smallest_stiffness > SMALLEST_STIFFNESS
+            if smallest_stiffness > BALANCE.least_stiffness
             else BalanceStatus.INDETERMINATE
         )
 

@@ -18,26 +18,38 @@ References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.
 Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tkamb.geometry.frames import Array
-from tkamb.knee.equilibrium.released_forces import LEVER
+from tkamb.knee.equilibrium.released_forces import RELEASED_FORCE
 
 if TYPE_CHECKING:
     from tkamb.knee.crossing import MuscleShare
 
-AGREED = 1.0
-"""N: no muscle's force asked for differs by more from the one held where both agree."""
+
+@dataclass(frozen=True)
+class MuscleIterationSettings:
+    """The iteration between muscle forces and knee equilibrium."""
+
+    muscle_force_tolerance: float = 1.0
+    """N: largest difference, over the muscles, of the force that is needed from the force that
+    is applied, at which the iteration has converged."""
+
+
+MUSCLE_ITERATION = MuscleIterationSettings()
+
 LEAST, MOST = 0.05, 1.0
 """The limits of omega."""
 
 
 STEPS = ((4, 1.0), (8, 0.5), (16, 0.25))
 """Until so many passes are made, how the knee yields goes that part of the way to what is found."""
-TURNS = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
+TURNS = np.array(
+    [1.0, 1.0, 1.0, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm]
+)
 """Makes answers to forces and to moments comparable."""
 
 
@@ -90,7 +102,7 @@ class Relaxation:
             part = -self._part * float(self._last @ change) / max(float(change @ change), 1e-12)
             self._part = float(np.clip(part, LEAST, MOST))
         self._last = away
-        self.settled = bool(np.abs(away).max() < AGREED)
+        self.settled = bool(np.abs(away).max() < MUSCLE_ITERATION.muscle_force_tolerance)
         if not self.settled:
             self._held = replace(
                 asked,

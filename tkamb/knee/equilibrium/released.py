@@ -41,25 +41,38 @@ if TYPE_CHECKING:
     from tkamb.knee.patella import PatellaState
     from tkamb.run.muscles.shared_muscles import SharedMuscles
 
-KNEE_CHANGE = 2e-6
-"""m: the knee moves less than this when the patella is found anew."""
-FORCE_CHANGE = 0.1
-"""N: neither does the contact force,"""
-FORCE_SHARE = 2e-4
-"""of it: or this part of it, by which the patella's jumps from facet to facet change it."""
-MOST_PASSES = 24
-"""Passes by which knee and patella settle; each halves what is left where the knee is soft."""
-LEFT = 0.1
-"""Share of its way that a pass may leave to the next, where muscles make it a few passes anyway."""
-REACH = 3e-3
-"""m: and so far it may go from a contact like the last frame's, from which the muscles' forces are
-known: they hold near by only."""
+
+@dataclass(frozen=True)
+class ReleasedKneeSettings:
+    """The knee with released coordinates and its patella."""
+
+    knee_tolerance: float = 2e-6
+    """m: the iteration between knee and patella has converged when the knee moves by less."""
+    contact_force_tolerance: float = 0.1
+    """N: and when the contact force changes by less than this, or by less than
+    `contact_force_share` of it."""
+    contact_force_share: float = 2e-4
+    """1: see `contact_force_tolerance`. The patella's changes from facet to facet alter the
+    force by about as much."""
+    max_passes: int = 24
+    """Passes between knee and patella at most; each halves the remaining change where the knee
+    is soft."""
+    inner_tolerance_share: float = 0.1
+    """1: share of its own change that a pass may leave to the next one. Muscles make it a few
+    passes anyway."""
+    muscle_force_range: float = 3e-3
+    """m: distance from a contact like the last frame's within which extrapolated muscle forces
+    hold."""
+    slack_force: float = 1e-3
+    """N: an extensor group with a smaller tension is slack."""
+
+
+RELEASED_KNEE = ReleasedKneeSettings()
+
 ABOUT, MOST_HEIGHTS = 0.5, 4
 """Where a search begins the load is to differ by less than this share from the last frame's, at one
 of so many heights."""
 SUPERIOR = KNEE_COORDINATES.index("si")
-SLACK = 1e-3
-"""N: an extensor group of muscles that pulls with less is slack."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,8 +190,8 @@ class ReleasedKnee:
         touch, mixing, ways = None, Relaxation(), [np.inf, np.inf]
         if self._mechanics.muscles and before:
             place, touch = self._carrying(place, before.contact)
-        reach = REACH if touch else np.inf
-        while passes < MOST_PASSES:
+        reach = RELEASED_KNEE.muscle_force_range if touch else np.inf
+        while passes < RELEASED_KNEE.max_passes:
             knee, pushes = self._pass(k, place, middle, slack, knee, touch, mixing, reach)
             touch = knee.contact
             passes, trials = passes + 1, trials + knee.balance.trials
@@ -196,9 +209,12 @@ class ReleasedKnee:
             elif knee.problem or (
                 mixing.settled
                 and knee.balance.at_rest
-                and ahead(ways[-3:]) * ways[-1] < KNEE_CHANGE
+                and ahead(ways[-3:]) * ways[-1] < RELEASED_KNEE.knee_tolerance
                 and ahead(ways[-3:]) * change
-                < max(FORCE_CHANGE, FORCE_SHARE * float(np.linalg.norm(force)))
+                < max(
+                    RELEASED_KNEE.contact_force_tolerance,
+                    RELEASED_KNEE.contact_force_share * float(np.linalg.norm(force)),
+                )
             ):
                 return replace(knee, doubt=mixing.doubt)
         assert knee is not None
@@ -252,11 +268,13 @@ class ReleasedKnee:
             held = None if held is None else muscles.at(k, held)
             share = mixing.mixed(self._share(k, geometry, joint, touch, held, mixing))
             geometry, joint = replace(geometry, share=share), replace(joint, share=share)
-            if slack := muscles.tension(share) < SLACK:
+            if slack := muscles.tension(share) < RELEASED_KNEE.slack_force:
                 joint = self._joint(k, geometry, middle, slack)
         forces = self._forces(k, joint, place, touch)
         stiffness = before.balance.stiffness if before else None
-        balance = forces.balance(stiffness, *((LEFT, reach) if muscles else ()))
+        balance = forces.balance(
+            stiffness, *((RELEASED_KNEE.inner_tolerance_share, reach) if muscles else ())
+        )
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
         if balance.status is not BalanceStatus.OK:
             problem = problem or f"released: {balance.status.value}" + (

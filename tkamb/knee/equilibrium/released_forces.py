@@ -1,6 +1,7 @@
 """What drives free knee coordinates at trial places, in a leg or in a machine."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -14,11 +15,23 @@ from tkamb.knee.load import wrench_of
 if TYPE_CHECKING:
     from tkamb.contact.probe import Probe, ProbedContact
 
-LEVER = 0.025
-"""m: half the usual distance of the condyles; makes rotations comparable to translations."""
-SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
-TINY = 1e-7
-"""m: step of the finite differences of axes and ligaments."""
+
+@dataclass(frozen=True)
+class ReleasedForceSettings:
+    """The forces on released coordinates."""
+
+    lever_arm: float = 0.025
+    """m: arm that makes rotations comparable to translations; half the usual distance of the
+    condyles."""
+    difference_step: float = 1e-7
+    """m: step of the finite differences of joint axes and ligaments."""
+
+
+RELEASED_FORCE = ReleasedForceSettings()
+
+SCALE = np.array(
+    [1.0, 1.0, 1.0, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm]
+)
 
 Sliding = Callable[[Array, Array], Array]
 
@@ -107,9 +120,9 @@ class FreeForces(Generic[J]):
             force = self._joint.imbalance(place, wrench) / self._scale
             return Trial(force, known_to=known_to)
         steps = np.zeros((len(x) + 1, 6))
-        steps[np.arange(len(x)), self._rows] = TINY / self._scale
+        steps[np.arange(len(x)), self._rows] = RELEASED_FORCE.difference_step / self._scale
         forces = self._joint.imbalance(place + steps, wrench) / self._scale
-        change = (forces[:-1] - forces[-1]).T / TINY
+        change = (forces[:-1] - forces[-1]).T / RELEASED_FORCE.difference_step
         twists = knee_axes(place)[self._rows] / self._scale[:, None]
         gain = self._joint.contact_gain(place) / self._scale[:, None]
         tangent = -(change + gain @ stiffness @ twists.T)
@@ -161,11 +174,13 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
         if stiffness is None:
             return None
         steps = np.zeros((len(self._rows) + 1, 6))
-        steps[np.arange(len(self._rows)), self._rows] = TINY / self._scale
+        steps[np.arange(len(self._rows)), self._rows] = RELEASED_FORCE.difference_step / self._scale
         forces = self._joint.whole(place + steps, wrench)
         axes = knee_axes(place)
         twists = axes[self._rows] / self._scale[:, None]
-        change = (forces[:-1] - forces[-1]).T / TINY - axes @ stiffness @ twists.T
+        change = (
+            forces[:-1] - forces[-1]
+        ).T / RELEASED_FORCE.difference_step - axes @ stiffness @ twists.T
         matrix = np.hstack([-change, axes @ self._joint.columns(place)])
         return np.asarray(-np.linalg.solve(matrix, axes)[-1])
 

@@ -1,6 +1,7 @@
 """Where a search for released coordinates begins, and what it finds from there."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -22,10 +23,20 @@ ASTRAY = (
     BalanceStatus.RUNS_AWAY,  # as far from a bad start as from a good one
 )
 """Ends of a search that another start may mend."""
-FARTHEST_AHEAD = 2e-3
-"""m: a search begins at most so far ahead of the last frame."""
-FIRST_DEPTH = 5e-5
-"""m: how deep the search for released coordinates begins."""
+
+
+@dataclass(frozen=True)
+class InitialPoseSettings:
+    """Initial guesses of the released coordinates."""
+
+    max_extrapolation: float = 2e-3
+    """m: an initial guess is extrapolated at most this far from the last frame."""
+    first_penetration: float = 5e-5
+    """m: penetration of the initial guess of a first frame."""
+
+
+INITIAL_POSE = InitialPoseSettings()
+
 AP = KNEE_COORDINATES.index("ap")
 
 
@@ -95,22 +106,24 @@ class Starts:
         gap = self._post.clearance(knee_pose(touching))
         if not gap < 0:
             return touching
-        return self._on_the_dishes(np.array([place[0] + gap + FIRST_DEPTH, *place[1:]]))
+        return self._on_the_dishes(
+            np.array([place[0] + gap + INITIAL_POSE.first_penetration, *place[1:]])
+        )
 
     def _on_the_dishes(self, place: Array) -> Array:
         height = self._pair.first_touch_height(knee_pose(place))
-        return np.array([place[0], height - FIRST_DEPTH, *place[2:]])
+        return np.array([place[0], height - INITIAL_POSE.first_penetration, *place[2:]])
 
 
 def carried_on(found: list[Array]) -> Array:
     """Return the coordinates (6,) after those of up to three frames.
 
     The last step is made again, or that part of it by which the step before foretold it, and no
-    farther than `FARTHEST_AHEAD`: a lightly loaded knee wanders to and fro.
+    farther than `INITIAL_POSE.max_extrapolation`: a lightly loaded knee wanders to and fro.
     """
     if len(found) < 3:
         return found[-1]
     before, step = ((b - a) * SCALE for a, b in pairwise(found))
     part = float(before @ step) / max(float(before @ before), 1e-18)
-    longest = FARTHEST_AHEAD / max(float(np.linalg.norm(step)), 1e-9)
+    longest = INITIAL_POSE.max_extrapolation / max(float(np.linalg.norm(step)), 1e-9)
     return found[-1] + min(max(part, 0.0), 1.0, longest) * (found[-1] - found[-2])

@@ -9,10 +9,18 @@ import numpy as np
 from tkamb.contact.lattice.linear.response import SINGLE, HalfResponse, unknowns_of
 from tkamb.geometry.frames import Array, Index
 
-MOST_STORED = 1500
-"""Nodes of the stored compliance: 80 MB."""
-SPACE = 100
-"""Nodes that may come before the stored compliance has to grow."""
+
+@dataclass(frozen=True)
+class ComplianceSettings:
+    """The stored compliance of candidate nodes."""
+
+    max_nodes: int = 1500
+    """Nodes of the stored compliance. Its matrix then takes 80 MB."""
+    spare_nodes: int = 100
+    """Nodes that may be added before the arrays have to grow. It trades memory against copies."""
+
+
+COMPLIANCE = ComplianceSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,9 +123,9 @@ class ComplianceCache:
         place = np.full(len(self.whole.rank) // 3, -1)
         place[self.nodes] = np.arange(len(self.nodes))
         if (place[wanted] < 0).any():
-            if len(spare) > MOST_STORED:
+            if len(spare) > COMPLIANCE.max_nodes:
                 spare = np.unique(wanted)
-            if len(self.nodes) + np.count_nonzero(place[spare] < 0) > MOST_STORED:
+            if len(self.nodes) + np.count_nonzero(place[spare] < 0) > COMPLIANCE.max_nodes:
                 self.nodes, place[:] = self.nodes[:0], -1
             self._take(spare[place[spare] < 0])
             place[self.nodes] = np.arange(len(self.nodes))
@@ -128,7 +136,9 @@ class ComplianceCache:
         had, new = len(self.nodes), len(nodes)
         count = had + new
         if count > self.stored.shape[1]:
-            larger: Array = np.empty((3, count + SPACE, 3, count + SPACE), SINGLE)
+            larger: Array = np.empty(
+                (3, count + COMPLIANCE.spare_nodes, 3, count + COMPLIANCE.spare_nodes), SINGLE
+            )
             larger[:, :had, :, :had] = self.stored[:, :had, :, :had]
             self.stored = larger
         self.nodes = np.concatenate([self.nodes, nodes])

@@ -24,9 +24,20 @@ from tkamb.contact.pair import Bearing
 from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index, Mask
 
-SEED = 20_240_501
-AHEAD = 128
-"""Fronts that the factorisation may be ahead of the response: they are kept whole so long."""
+
+@dataclass(frozen=True)
+class OperatorSettings:
+    """The linear operator of a lattice."""
+
+    test_vector_seed: int = 20_240_501
+    """Seed of the random vectors by which the operator's error is measured. Fixed, so that a
+    run repeats."""
+    max_fronts_ahead: int = 128
+    """Fronts by which the factorisation may be ahead of the compliance; they stay whole in
+    memory for so long."""
+
+
+OPERATOR = OperatorSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,8 +220,8 @@ def prepare_operator(
         for member, front in enumerate(made):
             boundaries.append(front.boundary)
             waiting.append(other.submit(taken, member, front))
-            if member >= AHEAD:
-                waiting[member - AHEAD].result()
+            if member >= OPERATOR.max_fronts_ahead:
+                waiting[member - OPERATOR.max_fronts_ahead].result()
     rows = [one.result() for one in waiting]
     del waiting
     factor = CholeskyFactor.of(order, starts, tree.parent, boundaries, rows)
@@ -239,7 +250,7 @@ def operator_error(
         solid: that it should be of.
         response_read: called when all of the response has been read, and nothing of the factor.
     """
-    chance = np.random.default_rng(SEED)
+    chance = np.random.default_rng(OPERATOR.test_vector_seed)
     nodes, shape = operator.contact_nodes, solid.nodes.shape
     pressed, touched = np.zeros(shape), np.zeros(shape)
     pressed[nodes, 1] = -1.0

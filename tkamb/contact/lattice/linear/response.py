@@ -27,10 +27,18 @@ SINGLE: Precision = np.float32
 """What a stored operator is kept in: it halves what every solve has to read."""
 
 
-GATHERED = 512
-"""Columns that are copied for BLAS at a time: 3 MB."""
-FEW = 12
-"""Columns up to which products with others are taken where these lie: no copy for BLAS."""
+@dataclass(frozen=True)
+class ResponseSettings:
+    """Products of the factor with columns of forces."""
+
+    gathered_columns: int = 512
+    """Columns that are copied for BLAS at a time, 3 MB: about the size of a processor's cache."""
+    few_columns: int = 12
+    """Columns up to which products are taken in place, because a copy for BLAS costs more than
+    it gains."""
+
+
+RESPONSE = ResponseSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,12 +105,16 @@ class HalfResponse:
             places = self.places[self._edges[block] : self._edges[block + 1]]
             a, b = int(firsts[block]), int(lasts[block])
             few = _gathered(self.values, places[rows[a:b] - first], stop - start)
-            if len(few) <= FEW:
+            if len(few) <= RESPONSE.few_columns:
                 inner[a:b, first:last] += _products(self.values, places, few)
                 continue
-            for part in range(0, last - first, GATHERED):
-                others = _gathered(self.values, places[part : part + GATHERED], stop - start)
-                inner[a:b, first + part : min(first + part + GATHERED, last)] += few @ others.T
+            for part in range(0, last - first, RESPONSE.gathered_columns):
+                others = _gathered(
+                    self.values, places[part : part + RESPONSE.gathered_columns], stop - start
+                )
+                inner[a:b, first + part : min(first + part + RESPONSE.gathered_columns, last)] += (
+                    few @ others.T
+                )
         result = np.zeros((len(rank), len(self.rank)))
         index = np.searchsorted(rows, rank[rank >= 0])
         result[np.ix_(rank >= 0, live)] = inner[np.ix_(index, self.rank[live])]

@@ -17,10 +17,20 @@ from tkamb.geometry.surface import Surface
 
 STEPS = ((0, 1), (0, -1), (2, 1), (2, -1))
 """Axis and sign of the four ways sideways."""
-INSET = 1e-6
-"""Cells that a node stays inside the wall it is moved to, so that rays along y still hit."""
-FIRE_AT = 0.1
-"""Rays sideways start this share of a cell inside the surface that the node lies on."""
+
+
+@dataclass(frozen=True)
+class WallSettings:
+    """Nodes that are moved onto side walls."""
+
+    wall_inset: float = 1e-6
+    """Cells: distance that a node stays inside the wall it is moved to, so that rays along y
+    still hit."""
+    ray_start_cells: float = 0.1
+    """Cells: depth below the node's surface at which rays sideways begin."""
+
+
+WALL_NODE = WallSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +58,7 @@ def _firing_points(field: NodeField) -> Array:
     height = field.points[..., 1]
     for end, step in ((field.upper_end, -1), (field.lower_end, 1)):
         i, j, k = np.nonzero(end & ~(field.upper_end & field.lower_end))
-        result[i, j, k, 1] += FIRE_AT * (height[i, j + step, k] - height[i, j, k])
+        result[i, j, k, 1] += WALL_NODE.ray_start_cells * (height[i, j + step, k] - height[i, j, k])
     return result
 
 
@@ -131,7 +141,7 @@ def _corner_or_wall(start: Array, move: Array, rays: RayCaster) -> Array:
 
     With two walls: the corner, if it is in the part, else the foot on the line between hits.
     """
-    move = move * (1.0 - INSET)
+    move = move * (1.0 - WALL_NODE.wall_inset)
     corner = start.copy()
     corner[:, [0, 2]] += move
     both = np.flatnonzero((move != 0.0).all(axis=1))
@@ -199,7 +209,7 @@ def _admit_at(
 
 def _foot(move: Array) -> Array:
     """Return the foot of the node on the line through its two hits, or its only hit."""
-    move = move * (1.0 + INSET)
+    move = move * (1.0 + WALL_NODE.wall_inset)
     both = (move != 0.0).all(axis=1)
     result = move.copy()
     u, w = move[both].T

@@ -33,8 +33,8 @@ from tkamb.contact.lattice.solids.cell_loops import (
     softened_forces,
     strained_cells,
 )
-from tkamb.contact.lattice.solids.curve import LEAST_STRAIN, ShearCurve
-from tkamb.contact.lattice.solids.solid import SMALL_STRAIN, Noticed, Solid, chunks
+from tkamb.contact.lattice.solids.curve import STRESS_CURVE, ShearCurve
+from tkamb.contact.lattice.solids.solid import SOLID, Noticed, Solid, chunks
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.threads import in_halves
@@ -151,7 +151,12 @@ class CalibratedNetwork(Solid):
         if self.curve.spline is None:
             lost[:] = 0.0
             return np.zeros((len(cells), 24))
-        curve = self.curve.shear_modulus, self.curve.spline.x, self.curve.spline.c, LEAST_STRAIN
+        curve = (
+            self.curve.shear_modulus,
+            self.curve.spline.x,
+            self.curve.spline.c,
+            STRESS_CURVE.least_strain,
+        )
         forces = np.empty((len(cells), 24))
 
         def softened(some: slice) -> None:
@@ -174,7 +179,7 @@ class CalibratedNetwork(Solid):
             corners, gradients, volume, springs = self._shapes
             work = cell_forces(
                 corners[some], gradients[some], volume[some], springs,
-                shear, bulk, knots, cubic, LEAST_STRAIN,
+                shear, bulk, knots, cubic, STRESS_CURVE.least_strain,
                 self.cells[some], displacement, residuals[some], internal,
             )  # fmt: skip
             return internal, work
@@ -190,11 +195,13 @@ class CalibratedNetwork(Solid):
         if self.curve.spline is None:
             return None
         corners, gradients, volume, _ = self._shapes
-        strain = min(self.curve.strain_that_softens(share / self._largest), SMALL_STRAIN)
+        strain = min(
+            self.curve.strain_that_softens(share / self._largest), SOLID.always_checked_strain
+        )
 
         def noticed(some: slice) -> tuple[Index, Array]:
             shapes = corners[some], gradients[some], volume[some], self._stiffest
-            limits = strain, 3 * SMALL_STRAIN
+            limits = strain, 3 * SOLID.always_checked_strain
             found, norms = strained_cells(*shapes, self.cells[some], displacement, *limits)
             return found + some.start, norms
 

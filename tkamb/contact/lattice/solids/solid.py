@@ -16,15 +16,24 @@ from tkamb.errors import InputError
 from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
 
-CHUNK = 2000
-"""Cells whose matrices are at hand at once: 9 MB."""
+
+@dataclass(frozen=True)
+class SolidSettings:
+    """The elements of a lattice."""
+
+    cells_at_once: int = 2000
+    """Cells whose matrices are in memory at once, 9 MB."""
+    always_checked_strain: float = 0.1
+    """1: elements strained more are always checked for yield, whatever their law says."""
+
+
+SOLID = SolidSettings()
+
 DEVIATORIC = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 DEVIATORIC[:3, :3] -= 2 / 3
 """2 dev eps : dev eps as a form (6, 6) in [xx, yy, zz, 2xy, 2yz, 2zx]."""
 DIFFERENCE = 1e-5
 """Relative step of the displacement in a finite difference of the internal forces."""
-SMALL_STRAIN = 0.1
-"""Elements strained more are always noticed, whatever their law makes of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,7 +276,7 @@ class Solid(ABC):
         """Return the elements whose share of h may matter; None: all may.
 
         Of no other is the norm of `nonlinear_residual` above `share`, N, or a principal strain of
-        the mean gradient outside of ±2 `SMALL_STRAIN`.
+        the mean gradient outside of ±2 `SOLID.always_checked_strain`.
 
         Args:
             displacement: (n, 3) m.
@@ -333,8 +342,8 @@ class Solid(ABC):
 
 def chunks(count: int) -> Iterator[slice]:
     """Yield stretches of so many cells."""
-    for first in range(0, count, CHUNK):
-        yield slice(first, min(first + CHUNK, count))
+    for first in range(0, count, SOLID.cells_at_once):
+        yield slice(first, min(first + SOLID.cells_at_once, count))
 
 
 def strain_matrix(gradients: Array) -> Array:

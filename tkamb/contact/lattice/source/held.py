@@ -31,16 +31,16 @@ VERTICAL = 1
 
 @dataclass(frozen=True)
 class ConjugateGradientSettings:
-    """When a linear system counts as solved.
-
-    Args:
-        tolerance: residual relative to the right-hand side. A Newton step need not be exact:
-            its own error is of the order of what the step leaves.
-        max_iterations: a solution is given up to the next Newton step there.
-    """
+    """When a linear system counts as solved."""
 
     tolerance: float = 0.02
+    """Residual relative to the right-hand side. A Newton step need not be exact: its own error
+    is of the order of what the step leaves."""
     max_iterations: int = 60
+    """A solution is given up to the next Newton step there."""
+
+
+CONJUGATE_GRADIENT = ConjugateGradientSettings()
 
 
 class CandidateResponse:
@@ -76,7 +76,7 @@ class HeldNodes:
         self,
         response: CandidateResponse,
         active: Mask,
-        settings: ConjugateGradientSettings = ConjugateGradientSettings(),
+        settings: ConjugateGradientSettings = CONJUGATE_GRADIENT,
     ) -> None:
         self._response, self._active, self._settings = response, active, settings
         self._operator = response.problem.operator

@@ -36,26 +36,26 @@ from tkamb.geometry.frames import Array, Index, Mask
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """How Sharma's loops begin and end.
-
-    Args:
-        max_loops: most changes of the contact set or of D.
-        max_steps: most tangent steps at one D.
-        first_depth: first D, as a share of the depth that the candidates cover. Candidates
-            reach a quarter deeper than the depth that is expected: 1 / 1.25.
-        load: the load may be missed by this share of the tolerance. One more D costs little, and
-            a load that is missed by the whole tolerance moves the forces by as much.
-        balance: what the free nodes may be out of balance by at one D, as a share of what the
-            load is missed by (or of the tolerance, the larger one).
-        smallest_step: a tangent step is halved down to this share while it raises the imbalance.
-    """
+    """How Sharma's loops begin and end."""
 
     max_loops: int = 60
+    """Most changes of the contact set or of D."""
     max_steps: int = 30
+    """Most tangent steps at one D."""
     first_depth: float = 0.8
+    """First D, as a share of the depth that the candidates cover. Candidates reach a quarter
+    deeper than the depth that is expected: 1 / 1.25."""
     load: float = 0.1
+    """The load may be missed by this share of the tolerance. One more D costs little, and a
+    load that is missed by the whole tolerance moves the forces by as much."""
     balance: float = 0.01
+    """What the free nodes may be out of balance by at one D, as a share of what the load is
+    missed by (or of the tolerance, the larger one)."""
     smallest_step: float = 0.05
+    """A tangent step is halved down to this share while it raises the imbalance."""
+
+
+LOOP = LoopSettings()
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def solve_by_loops(
     load: float | None,
     guess: InitialGuess,
     solver: LatticeSolverSettings,
-    settings: LoopSettings = LoopSettings(),
+    settings: LoopSettings = LOOP,
 ) -> Solution:
     """Return the contact at a pose under a load (N), or at approach 0 when load is None.
 
